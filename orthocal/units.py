@@ -83,6 +83,12 @@ def tidy(value: float) -> float:
     return float(f"{value:.12g}") + 0.0
 
 
+def trim_zeros(number: str) -> str:
+    """A decimal number without trailing zeros beyond the second decimal."""
+    integer, _, decimals = number.partition(".")
+    return f"{integer}.{decimals.rstrip('0').ljust(2, '0')}"
+
+
 def format_fixed(value: float, decimals: int, *, sign: bool = False) -> str:
     """Number with fixed decimals, and without a negative zero."""
     return f"{round(value, decimals) + 0.0:{'+' if sign else ''}.{decimals}f}"

@@ -92,10 +92,10 @@ def require_no_readings(directory: Path) -> None:
     if not exists(directory / SESSION):
         return
     try:
-        session, unread = load_rows(directory)
+        session = load_rows(directory)
     except OrthocalError:  # it was not a session
         return
-    count = len(session.readings) - len(unread)
+    count = sum(r.is_read for r in session.readings)
     if count and not session.source.startswith(SIMULATED):
         raise SessionError(
             f"contains {count} readings, which --force does not overwrite; move them first",

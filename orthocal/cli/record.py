@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from orthocal.calibration.assessment_record import Finding
-    from orthocal.measurement.recording import Key, Recording
+    from orthocal.measurement.recording import Recording
+    from orthocal.session.session import ReadingKey
 
 WIDEST = 100
 """Largest width of a line, [columns]."""
@@ -79,7 +80,7 @@ class _Dialogue:
         """Findings about the readings so far."""
         self._can_judge = True
         """Whether readings are judged: the robot can be calibrated."""
-        self._skipped: set[Key] = set()
+        self._skipped: set[ReadingKey] = set()
         self._shown: str | None = None
         """Setup that was described last."""
         self._last: int | None = None
@@ -188,7 +189,7 @@ class _Dialogue:
         """Keep the reading of the row that is asked for; end where none is."""
         if self._asked is None:
             raise _EndOfDialogue
-        if self._recording.rows[self._asked].value is None:
+        if not self._recording.rows[self._asked].is_read:
             raise SessionError("type the reading of the dial, or `skip`, or `help`")
         self._ask_for_next()
 
@@ -197,7 +198,7 @@ class _Dialogue:
         from orthocal.output.text.recording import confirm_reading
 
         recording = self._recording
-        corrected = recording.rows[index].value is not None
+        corrected = recording.rows[index].is_read
         recording.read(index, value)
         row = recording.rows[index]
         self._skipped.discard(row.key)
@@ -225,7 +226,7 @@ class _Dialogue:
         rows = self._recording.rows
         doubted = {i for f in self._warnings for i in find_rows(f, rows)} - {index}
         session = self._recording.measured(without=doubted)
-        position = sum(r.value is not None and i not in doubted for i, r in enumerate(rows[:index]))
+        position = sum(r.is_read and i not in doubted for i, r in enumerate(rows[:index]))
         try:
             mean, std = LinearModel(session).predict_row(session.values, position)
         except (OrthocalError, np.linalg.LinAlgError) as e:
@@ -327,11 +328,7 @@ class _Dialogue:
         if index < 0:
             raise SessionError("this is the first row")
         setup = rows[index].setup
-        if (
-            self._last is not None
-            and rows[self._last].setup != setup
-            and rows[index].value is not None
-        ):
+        if self._last is not None and rows[self._last].setup != setup and rows[index].is_read:
             self._say(
                 self._wrap(
                     f"The stand has been moved since {setup} was read: correct only what was "
@@ -343,11 +340,11 @@ class _Dialogue:
     def _again(self, index: int | None) -> None:
         rows = self._recording.rows
         if index is None:
-            before = [i for i, r in enumerate(rows[: self._asked]) if r.value is not None]
+            before = [i for i, r in enumerate(rows[: self._asked]) if r.is_read]
             index = self._last if self._last is not None or not before else before[-1]
         if index is None:
             raise SessionError("nothing was read yet")
-        if rows[index].value is None:
+        if not rows[index].is_read:
             raise SessionError(f"row {index + 1} was not read yet")
         index = self._recording.repeat(index)
         if self._warnings:  # their lines have changed
@@ -356,14 +353,14 @@ class _Dialogue:
 
     def _skip(self) -> None:
         index = self._require_row()
-        if self._recording.rows[index].value is None:
+        if not self._recording.rows[index].is_read:
             self._skipped.add(self._recording.rows[index].key)
             self._say(f"  Skipped: row {index + 1}")
         self._ask_for_next()
 
     def _drop(self, index: int | None) -> None:
         index = self._require_row() if index is None else index
-        label = self._recording.rows[index].label
+        label = self._recording.rows[index].label_with_cycle
         self._recording.drop(index)
         if self._last is not None and self._last >= index:
             self._last = None if self._last == index else self._last - 1

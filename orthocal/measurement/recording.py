@@ -10,9 +10,10 @@ edited or not.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -28,7 +29,7 @@ from orthocal.measurement.files.schema import LARGEST_READING_MM, MOST_READINGS
 from orthocal.measurement.files.session_file import load_rows
 from orthocal.measurement.files.write_session import readings_table
 from orthocal.runtime.interrupts import postponed_interrupt
-from orthocal.session.session import Conditions, Reading, Session
+from orthocal.session.session import Conditions, Reading, ReadingKey, Session
 from orthocal.units import MM, to_mm
 
 FORMAT = "orthocal/recording/1"
@@ -51,56 +52,6 @@ FIRST_LINE = 2
 BUSY = "these readings are being recorded by another process; one at a time"
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """A row of the readings.csv."""
-
-    setup: str
-    posture: str
-    minus: str | None
-    cycle: int
-    value: float | None
-    """Reading, [m]; None before it is read."""
-    line: int | None = None
-    """Line of the CSV."""
-    conditions: Conditions | None = None
-    """As planned or stated; None for a difference, or where nothing is stated."""
-
-    @property
-    def key(self) -> Key:
-        """Setup, postures, cycle and known approach, which identify the row."""
-        place = self.setup, self.posture, self.minus, self.cycle
-        return place if self.reading.approach is None else (*place, self.reading.approach)
-
-    @property
-    def place(self) -> tuple[str, str, str | None, str | None]:
-        """Setup, postures and approach, which all cycles of the row share."""
-        return self.reading.place
-
-    @property
-    def label(self) -> str:
-        """Setup and postures in words, and the cycle from the second on."""
-        return self.reading.label + (f", cycle {self.cycle}" if self.cycle != 1 else "")
-
-    @property
-    def reading(self) -> Reading:
-        """The row as a reading of a session; 0 before it is read."""
-        return Reading(
-            self.setup,
-            self.posture,
-            self.minus,
-            self.cycle,
-            self.value or 0.0,
-            self.line,
-            conditions=self.conditions,
-        )
-
-
-Cycle = Annotated[int, Field(ge=1, lt=10**9)]
-Key = tuple[str, str, str | None, Cycle] | tuple[str, str, str | None, Cycle, str]
-"""Setup, posture, posture that is taken off, cycle, and the approach where one is known."""
-
-
 class Change(BaseModel):
     """A change of the rows."""
 
@@ -109,7 +60,7 @@ class Change(BaseModel):
     done: Literal["read", "emptied", "added", "dropped"]
     """A value was read for a row; all rows of its setup were emptied; a row was added after it; it
     was deleted."""
-    rows: Annotated[list[Key], Field(min_length=1, max_length=2)]
+    rows: Annotated[list[ReadingKey], Field(min_length=1, max_length=2)]
     """The row, and the added one."""
     reading_mm: Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)] | None = (
         None
@@ -124,7 +75,7 @@ class _JournalLine(Change):
     after: str
 
 
-def change_rows(rows: Sequence[Row], change: Change) -> tuple[Row, ...]:
+def change_rows(rows: Sequence[Reading], change: Change) -> tuple[Reading, ...]:
     """Rows after a change.
 
     Raises:
@@ -143,7 +94,7 @@ def change_rows(rows: Sequence[Row], change: Change) -> tuple[Row, ...]:
         conditions = _merge_conditions(row.conditions, change.conditions)
         row = replace(row, value=change.reading_mm * MM, conditions=conditions)
         if row.key != key and row.key in indices:
-            raise SessionError(f"{row.label} exists already")
+            raise SessionError(f"{row.label_with_cycle} exists already")
         changed[index] = row
     elif change.done == "emptied":
         changed = [_emptied(r) if r.setup == key[0] else r for r in changed]
@@ -154,7 +105,7 @@ def change_rows(rows: Sequence[Row], change: Change) -> tuple[Row, ...]:
             raise SessionError("the added row exists already, or is not named")
         setup, posture, minus, cycle, *approach = added[0]
         conditions = Conditions(approach[0]) if approach else None
-        new = Row(setup, posture, minus, cycle, None, conditions=conditions)
+        new = Reading(setup, posture, minus, cycle, math.nan, conditions=conditions)
         changed.insert(index + 1, new)
     return tuple(replace(row, line=i) for i, row in enumerate(changed, FIRST_LINE))
 
@@ -170,10 +121,10 @@ def _merge_conditions(planned: Conditions | None, stated: Conditions | None) -> 
     )
 
 
-def _emptied(row: Row) -> Row:
+def _emptied(row: Reading) -> Reading:
     """The row before it was read: only its approach is planned."""
     approach = None if row.conditions is None else row.conditions.approach
-    return replace(row, value=None, conditions=Conditions(approach) if approach else None)
+    return replace(row, value=math.nan, conditions=Conditions(approach) if approach else None)
 
 
 class Recording:
@@ -181,7 +132,7 @@ class Recording:
 
     Args:
         session: The session as it was when the recording began.
-        rows: Its rows in the order of measuring.
+        rows: Its rows in the order of measuring; NaN before they are read.
         journal: Journal of the changes.
         digest: Digest of the CSV on disk.
         restored: Number of changes that a killed recording had not written to the CSV.
@@ -191,7 +142,7 @@ class Recording:
     def __init__(
         self,
         session: Session,
-        rows: Sequence[Row],
+        rows: Sequence[Reading],
         journal: Journal,
         *,
         digest: str,
@@ -213,7 +164,7 @@ class Recording:
     @property
     def missing(self) -> tuple[int, ...]:
         """Indices of the rows without a reading."""
-        return tuple(i for i, row in enumerate(self.rows) if row.value is None)
+        return tuple(i for i, row in enumerate(self.rows) if not row.is_read)
 
     def measured(self, *, without: Collection[int] = ()) -> Session:
         """The session with the rows that were read; gauges stay aligned as planned.
@@ -221,19 +172,11 @@ class Recording:
         Args:
             without: Indices of rows to be left out.
         """
-        readings = tuple(row.reading for row in self.rows)
-        session = replace(self.session, readings=readings, sha256="")
-        if not self.missing and not without:
-            return session
-        return session.select(
-            [
-                readings[i]
-                for i, row in enumerate(self.rows)
-                if row.value is not None and i not in without
-            ]
-        )
+        session = replace(self.session, readings=self.rows, sha256="")
+        read = [row for i, row in enumerate(self.rows) if row.is_read and i not in without]
+        return session if len(read) == len(self.rows) else session.select(read)
 
-    def next_empty(self, skipped: frozenset[Key] = frozenset()) -> int | None:
+    def next_empty(self, skipped: frozenset[ReadingKey] = frozenset()) -> int | None:
         """Index of the first row without a reading, except those that are skipped."""
         return next((i for i in self.missing if self.rows[i].key not in skipped), None)
 
@@ -252,9 +195,11 @@ class Recording:
         """
         row = self.rows[index]
         gauge = self.session.gauges[self.session.setups[row.setup].gauge]
-        check_range(to_mm(value), gauge, row.minus is not None, row.label)
+        check_range(to_mm(value), gauge, row.minus is not None, row.label_with_cycle)
         if conditions is not None:
-            check_conditions(conditions, self.session.robot, row.minus is not None, row.label)
+            check_conditions(
+                conditions, self.session.robot, row.minus is not None, row.label_with_cycle
+            )
         reading = round(to_mm(value), DECIMALS)
         self._apply(Change(done="read", rows=[row.key], reading_mm=reading, conditions=conditions))
 
@@ -329,20 +274,20 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
         OrthocalError: If another process records it, or its journal is damaged.
         OutputError: If its directory cannot be written to.
     """
-    session, unread = load_rows(path)
+    session = load_rows(path)
     csv = _csv_of(session)
-    _files_to_add(session, unread)  # refused before anything is written
+    _files_to_add(session)  # refused before anything is written
     with open_journal_file(
         csv.with_name(csv.name + SUFFIX), busy=BUSY, longest=LONGEST_LINE
     ) as journal:
         lines = _read_lines(journal)
         if _is_outdated(session):  # another process may have written before the lock
-            session, unread = load_rows(path)
-        for file, content in _files_to_add(session, unread).items():
+            session = load_rows(path)
+        for file, content in _files_to_add(session).items():
             write_file(file, content)
         if session.readings_path is None:
-            session, unread = load_rows(path)
-        rows = _rows(session.readings, unread)
+            session = load_rows(path)
+        rows = session.readings
         table = read_file(csv, error=SessionError)
         pending, edited = _find_pending(lines, _digest(table))
         for where, change in pending:
@@ -353,7 +298,7 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
         if pending:
             table = _table(rows)
             _write(csv, table)
-            session, _ = load_rows(path)
+            session = load_rows(path)
         recording = Recording(
             session, rows, journal, digest=_digest(table), restored=len(pending), edited=edited
         )
@@ -363,11 +308,11 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
             recording.close()
 
 
-def _files_to_add(session: Session, unread: frozenset[int]) -> dict[Path, bytes]:
+def _files_to_add(session: Session) -> dict[Path, bytes]:
     """Files that make a plan a session: its rows, then the YAML that names them."""
     if session.readings_path is not None or session.path is None:
         return {}
-    csv, table = _csv_of(session), _table(_rows(session.readings, unread))
+    csv, table = _csv_of(session), _table(session.readings)
     return {csv: table, session.path: _yaml_with_readings(session.path, csv, table)}
 
 
@@ -421,25 +366,9 @@ def _csv_of(session: Session) -> Path:
     return (session.path or Path("session.yaml")).parent / "readings.csv"
 
 
-def _rows(readings: Sequence[Reading], unread: frozenset[int]) -> tuple[Row, ...]:
-    return tuple(
-        Row(
-            r.setup,
-            r.posture,
-            r.minus,
-            r.cycle,
-            None if i in unread else r.value,
-            r.line,
-            r.conditions,
-        )
-        for i, r in enumerate(readings)
-    )
-
-
-def _table(rows: Sequence[Row]) -> bytes:
+def _table(rows: Sequence[Reading]) -> bytes:
     """Content of the readings.csv."""
-    readings, values = [r.reading for r in rows], [r.value for r in rows]
-    return readings_table(readings, values, decimals=DECIMALS).encode()
+    return readings_table(rows, decimals=DECIMALS).encode()
 
 
 def _digest(content: bytes) -> str:

@@ -6,6 +6,7 @@ indicator's unknown zero drops out.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -88,6 +89,9 @@ class Setup:
     """Gauge zero: estimated from the setup's readings, or known to be 0 (absolute readings)."""
 
 
+CycleNumber = Annotated[int, Field(ge=1, lt=10**9)]
+
+
 @dataclass(frozen=True, slots=True)
 class Conditions:
     """Conditions under which a reading was taken, as stated."""
@@ -103,6 +107,13 @@ class Conditions:
     """With or without time zone."""
 
 
+ReadingKey = (
+    tuple[str, str, str | None, CycleNumber] | tuple[str, str, str | None, CycleNumber, str]
+)
+"""Setup, posture, posture whose reading is taken off, cycle, and the approach where one is
+known."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
     """Reading of the indicator in a posture, or its difference between two."""
@@ -113,7 +124,7 @@ class Reading:
     """Posture whose reading was taken off; None for a reading as shown."""
     cycle: int = 1
     value: float = 0.0
-    """[m]."""
+    """[m]; NaN in a recording before it is read."""
     line: int | None = None
     """Line in the CSV, for messages."""
     file: Path | None = None
@@ -132,6 +143,12 @@ class Reading:
         return self.setup, self.posture, self.minus, self.approach
 
     @property
+    def key(self) -> ReadingKey:
+        """Setup, postures, cycle and known approach, which identify the reading in its session."""
+        place = self.setup, self.posture, self.minus, self.cycle
+        return place if self.approach is None else (*place, self.approach)
+
+    @property
     def postures(self) -> str:
         """Posture with its approach, or one less another, in words."""
         return describe_postures(self.posture, self.minus, self.approach)
@@ -140,6 +157,16 @@ class Reading:
     def label(self) -> str:
         """Setup and postures in words."""
         return f"{self.setup} {self.postures}"
+
+    @property
+    def label_with_cycle(self) -> str:
+        """Setup and postures in words, and the cycle from the second on."""
+        return self.label + (f", cycle {self.cycle}" if self.cycle > 1 else "")
+
+    @property
+    def is_read(self) -> bool:
+        """True if there is a value."""
+        return not math.isnan(self.value)
 
 
 def known_approach(conditions: Conditions | None) -> str | None:

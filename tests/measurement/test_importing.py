@@ -372,7 +372,7 @@ def test_a_table_is_imported_exactly_or_refused(form, session):
         return
     assert not isinstance(found, str), found
     rows = [
-        (r.setup, r.posture, r.minus, int(r.cycle or 1), Decimal(r.reading))
+        (r.setup, r.posture, r.minus, int(r.cycle or 1), Decimal(r.reading_mm))
         for r in found.long_table.rows
     ]
     assert rows == [(*key, Decimal(value)) for *key, value in form.expected]

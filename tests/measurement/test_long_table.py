@@ -114,7 +114,7 @@ def read(content: bytes, **options) -> dict[tuple[str, str, int], Decimal]:
     table = read_table(path, content, find_header, expected=EXPECTED)
     columns = choose_columns(table.header, {}, where="table")
     long = make_long_table(table, columns, names=NAMES, **options)
-    found = {(r.setup, r.posture, int(r.cycle or 1)): Decimal(r.reading) for r in long.rows}
+    found = {(r.setup, r.posture, int(r.cycle or 1)): Decimal(r.reading_mm) for r in long.rows}
     assert len(found) == len(long.rows)
     return found
 

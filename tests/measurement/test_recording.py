@@ -55,16 +55,16 @@ def plan(tmp_path):
 
 def values(folder):
     """Readings by their rows, [mm]; None where there is none."""
-    session, unread = load_rows(folder)
+    session = load_rows(folder)
     return {
-        (r.setup, r.posture, r.cycle): None if i in unread else round(r.value / MM, 9)
-        for i, r in enumerate(session.readings)
+        (r.setup, r.posture, r.cycle): round(r.value / MM, 9) if r.is_read else None
+        for r in session.readings
     }
 
 
 def test_a_plan_without_readings_gets_its_rows_and_keeps_its_words(plan):
     with open_recording(plan) as r:
-        assert [row.label for row in r.rows][:4] == [
+        assert [row.label_with_cycle for row in r.rows][:4] == [
             *("yx zero", "yx x_max", "yx x_min"),
             "yx zero, cycle 2",
         ]
@@ -145,14 +145,14 @@ def test_repeating_dropping_emptying_and_correcting(plan):
     with open_recording(plan) as r:
         r.read(0, 0.1 * MM)
         assert r.repeat(0) == 1
-        assert r.rows[1].label == "yx zero, cycle 3"
+        assert r.rows[1].label_with_cycle == "yx zero, cycle 3"
         r.read(1, 0.11 * MM)
         r.read(0, 0.2 * MM)
         r.drop(2)
         r.read(7, -0.3 * MM)
-        assert [i for i, row in enumerate(r.rows) if row.value is not None] == [0, 1, 7]
+        assert [i for i, row in enumerate(r.rows) if row.is_read] == [0, 1, 7]
         r.empty(0)
-        assert [i for i, row in enumerate(r.rows) if row.value is not None] == [7]
+        assert [i for i, row in enumerate(r.rows) if row.is_read] == [7]
     found = values(plan)
     assert len(found) == 12
     assert ("yx", "x_max", 1) not in found
@@ -360,9 +360,7 @@ def test_killed_a_hundred_times_no_accepted_reading_is_lost(tmp_path, monkeypatc
             assert r.restored <= 1
             restored += r.restored
             there = {
-                row.key[:2] + row.key[3:]: round(row.value / MM, 9)
-                for row in r.rows
-                if row.value is not None
+                row.key[:2] + row.key[3:]: round(row.value / MM, 9) for row in r.rows if row.is_read
             }
         other = {key: v for key, v in there.items() if accepted.get(key) != v}
         assert accepted.keys() <= there.keys()

@@ -201,8 +201,7 @@ def _line(session: Session, e: Explanation) -> str:
 
 
 def _row(session: Session, i: int) -> str:
-    r = session.readings[i]
-    return r.label + (f", cycle {r.cycle}" if r.cycle > 1 else "")
+    return session.readings[i].label_with_cycle
 
 
 def _subject(session: Session, e: Explanation) -> str:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from orthocal.errors import SessionError
 from orthocal.io.documents import parse_number
+from orthocal.measurement.files.readings_file import CONDITIONS, RawReading
 from orthocal.measurement.files.schema import LARGEST_READING_MM, MOST_READINGS
 from orthocal.robot.model import Robot
-from orthocal.session.session import Conditions, Gauge, Reading, Session
+from orthocal.session.session import Conditions, Gauge, Reading, ReadingKey, Session
 from orthocal.text import shorten
 from orthocal.units import MM
 
@@ -20,36 +20,8 @@ LOWEST_C, HIGHEST_C = -50.0, 100.0
 """No machine is measured outside: it is another unit, [°C]."""
 
 
-@dataclass(frozen=True, slots=True)
-class RawReading:
-    """A row of a table of readings, as text."""
-
-    where: str
-    """File and line, for messages."""
-    line: int
-    setup: str
-    posture: str
-    minus: str
-    cycle: str
-    reading: str
-    """In mm, with a decimal point."""
-    approach: str = ""
-    temperature: str = ""
-    """In °C, with a decimal point."""
-    time: str = ""
-
-    @property
-    def has_conditions(self) -> bool:
-        """True if a condition is stated."""
-        return bool(self.approach or self.temperature or self.time)
-
-
 def check_readings(
-    rows: Iterable[RawReading],
-    plan: Session,
-    *,
-    file: Path,
-    unread: set[int] | None = None,
+    rows: Iterable[RawReading], plan: Session, *, file: Path, partial: bool = False
 ) -> tuple[Reading, ...]:
     """Readings of a table, checked against their session and against each other.
 
@@ -57,28 +29,25 @@ def check_readings(
         rows: The rows.
         plan: The session, for its setups, postures and gauges.
         file: File of the rows, for messages.
-        unread: Filled with the indices of empty cells, whose readings are 0; None to refuse them.
+        partial: Whether cells may be empty; their readings are NaN.
 
     Raises:
         SessionError: Naming file and line.
     """
     rows = iter(rows)
-    checked = CheckedReadings(file)
+    checked = _CheckedReadings(file)
     for row in rows:
         reading = parse_reading(row, plan)
-        if not row.reading:
-            if unread is None:
-                if not checked.readings and not any(r.reading for r in rows):
-                    raise SessionError(
-                        "nothing was read yet; `orthocal record` takes the readings",
-                        where=str(file),
-                    )
+        if not (reading.is_read or partial):
+            if not checked.readings and not any(r.reading_mm for r in rows):
                 raise SessionError(
-                    "reading_mm is empty; expected what the gauge showed, or no row where nothing "
-                    "was read (`orthocal record` takes it, or drops the row)",
-                    where=row.where,
+                    "nothing was read yet; `orthocal record` takes the readings", where=str(file)
                 )
-            unread.add(len(checked.readings))
+            raise SessionError(
+                "reading_mm is empty; expected what the gauge showed, or no row where nothing was "
+                "read (`orthocal record` takes it, or drops the row)",
+                where=row.where,
+            )
         checked.add(row, reading)
     if not checked.readings:
         raise SessionError("holds no readings", where=str(file))
@@ -86,14 +55,16 @@ def check_readings(
 
 
 def parse_reading(row: RawReading, plan: Session) -> Reading:
-    """Reading of a row, checked against its session; 0 for an empty cell.
+    """Reading of a row, checked against its session; NaN for an empty cell.
 
     Raises:
         SessionError: Naming file and line.
     """
     _check_names(row, plan)
     cycle = parse_cycle(row.cycle, row.where)
-    value = parse_number(row.reading or "0", where=row.where, name="reading_mm", error=SessionError)
+    value = math.nan
+    if row.reading_mm:
+        value = parse_number(row.reading_mm, where=row.where, name="reading_mm", error=SessionError)
     conditions = read_conditions(row, plan.robot)
     check_range(value, plan.gauges[plan.setups[row.setup].gauge], bool(row.minus), row.where)
     return Reading(
@@ -107,7 +78,7 @@ def parse_reading(row: RawReading, plan: Session) -> Reading:
     )
 
 
-class CheckedReadings:
+class _CheckedReadings:
     """Readings of a session that neither repeat nor contradict each other.
 
     Args:
@@ -117,7 +88,7 @@ class CheckedReadings:
     def __init__(self, file: Path) -> None:
         self.readings: list[Reading] = []
         self._file = file
-        self._first_lines: dict[tuple[Any, ...], int] = {}
+        self._first_lines: dict[ReadingKey, int] = {}
         self._zone_lines: dict[bool, int] = {}
         self._absolute: set[tuple[str, int]] = set()
         self._differences: dict[tuple[str, int], dict[str, str]] = {}
@@ -128,14 +99,14 @@ class CheckedReadings:
         Raises:
             SessionError: Naming file and line.
         """
-        key = (*reading.place, reading.cycle)
-        if key in self._first_lines:
+        if reading.key in self._first_lines:
             raise SessionError(
                 f"repeats {reading.label} of cycle {reading.cycle}, first in line "
-                f"{self._first_lines[key]}; number repeated measurements in the column 'cycle'",
+                f"{self._first_lines[reading.key]}; number repeated measurements in the column "
+                "'cycle'",
                 where=row.where,
             )
-        self._first_lines[key] = row.line
+        self._first_lines[reading.key] = row.line
         self._check_zone(row, reading.conditions)
         if len(self.readings) >= MOST_READINGS:
             raise SessionError(f"holds more than {MOST_READINGS} readings", where=str(self._file))
@@ -209,18 +180,19 @@ def read_conditions(row: RawReading, robot: Robot) -> Conditions | None:
     Raises:
         SessionError: Naming file, line and column.
     """
-    if not row.has_conditions:
+    stated = {column: text for column in CONDITIONS if (text := getattr(row, column))}
+    if not stated:
         return None
     if row.minus:
-        column = "approach" if row.approach else "temperature_C" if row.temperature else "time"
+        column, text = next(iter(stated.items()))
         raise SessionError(
-            f"{column} is '{shorten(getattr(row, column.removesuffix('_C')))}'; expected an empty "
-            "cell: the row is a difference, and conditions belong to single readings",
+            f"{column} is '{shorten(text)}'; expected an empty cell: the row is a difference, and "
+            "conditions belong to single readings",
             where=row.where,
         )
     return Conditions(
         parse_approach(row.approach, robot, row.where) if row.approach else None,
-        parse_temperature(row.temperature, row.where) if row.temperature else None,
+        parse_temperature(row.temperature_C, row.where) if row.temperature_C else None,
         parse_time(row.time, row.where) if row.time else None,
     )
 
@@ -306,7 +278,7 @@ def parse_cycle(text: str, where: str) -> int:
 
 
 def check_range(value_mm: float, gauge: Gauge, difference: bool, where: str) -> None:
-    """Refuse a reading that no indicator shows, or not this one.
+    """Refuse a reading that no indicator shows, or not this one; accept NaN.
 
     Raises:
         SessionError: At `where`.
@@ -322,7 +294,7 @@ def check_range(value_mm: float, gauge: Gauge, difference: bool, where: str) -> 
     lowest, highest = (v / MM for v in gauge.range)
     if difference:
         lowest, highest = lowest - highest, highest - lowest
-    if not lowest - 1e-9 <= value_mm <= highest + 1e-9:
+    if value_mm < lowest - 1e-9 or value_mm > highest + 1e-9:
         kind = "a difference" if difference else "a reading"
         raise SessionError(
             f"reading_mm is {value_mm:g}; the gauge's range allows {kind} from "

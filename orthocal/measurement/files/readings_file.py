@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, fields, replace
 from decimal import Decimal
 from itertools import islice
 from pathlib import Path
@@ -28,21 +29,73 @@ from orthocal.io.tables.numerals import (
 )
 from orthocal.io.tables.table import Table, read_table
 from orthocal.io.tables.workbook import ZIP_SIGNATURE
-from orthocal.measurement.files.readings_checks import RawReading
 from orthocal.measurement.files.schema import MOST_READINGS
 from orthocal.measurement.importing.headings import EXPECTED, Columns, choose_columns, find_header
 from orthocal.text import composed, shorten
+from orthocal.units import trim_zeros
+
+
+@dataclass(frozen=True, slots=True)
+class RawReading:
+    """A row of a table of readings, as text; fields after the first two are the columns."""
+
+    where: str
+    """File and line, for messages."""
+    line: int
+    setup: str
+    posture: str
+    minus: str = ""
+    cycle: str = ""
+    reading_mm: str = ""
+    """With a decimal point."""
+    approach: str = ""
+    temperature_C: str = ""
+    """With a decimal point."""
+    time: str = ""
+
+
+COLUMNS = tuple(field.name for field in fields(RawReading))[2:]
+"""Columns of a readings.csv, in order."""
 
 REQUIRED = ("setup", "posture", "reading_mm")
-OPTIONAL = ("minus", "cycle", "approach", "temperature_C", "time")
+OPTIONAL = tuple(name for name in COLUMNS if name not in REQUIRED)
+
+COLUMN_OF_ROLE = {"reading": "reading_mm", "temperature": "temperature_C"}
+"""Roles of columns in other tables, where the column of a readings.csv has another name."""
+
+CONDITIONS = ("approach", "temperature_C", "time")
+"""Columns that state conditions."""
+
+MEASURED = ("temperature_C", "time")
+"""Conditions that are measured with a reading, not planned."""
+
+UNSTATED = {"cycle": "1"}
+"""Values of optional columns that need not be stated."""
+
+
+def format_readings(rows: Sequence[RawReading], *, blank: bool = False) -> str:
+    """Text of a readings.csv without the optional columns that no row needs.
+
+    Args:
+        rows: The rows.
+        blank: Leave the cells of measured conditions empty.
+    """
+    columns = [
+        c
+        for c in COLUMNS
+        if c in REQUIRED or any(getattr(r, c) not in ("", UNSTATED.get(c)) for r in rows)
+    ]
+    cells = [
+        ["" if blank and c in MEASURED else getattr(r, c) or UNSTATED.get(c, "") for c in columns]
+        for r in rows
+    ]
+    lines = [columns, *cells]  # ISO 8601 allows a comma in a fraction of a second
+    return "".join(",".join(c.replace(",", ".") for c in line) + "\n" for line in lines)
 
 
 def mm_text(value: Decimal) -> str:
     """A reading in mm as a readings.csv has it: exactly, with two decimals at least."""
-    if not -30 < value.adjusted() < 30:
-        return f"{value:e}"
-    integer, _, decimals = f"{value:f}".partition(".")
-    return f"{integer}.{decimals.rstrip('0').ljust(2, '0')}"
+    return trim_zeros(f"{value:f}") if -30 < value.adjusted() < 30 else f"{value:e}"
 
 
 def is_house(header: Iterable[str]) -> bool:
@@ -131,25 +184,14 @@ def _plain_rows(path: Path, content: bytes) -> Iterator[RawReading]:
 
     sign: Sign | None = None
     if not content.isascii() or b'"' in content or b";" in content:
-        cells = []
+        numerals = []
         # what is wrong with a row is told when it is read
         with suppress(SessionError):
             for line, row in islice(rows(), MOST_READINGS + 1):
-                cells.append(Numeral(row["reading_mm"], line))
-        sign = _plain_sign(cells, path)
-    for line, row in rows():
-        yield RawReading(
-            where=f"{path}:{line}",
-            line=line,
-            setup=row["setup"],
-            posture=row["posture"],
-            minus=row.get("minus", ""),
-            cycle=row.get("cycle", ""),
-            reading=_house_number(row["reading_mm"], sign),
-            approach=row.get("approach", ""),
-            temperature=_house_number(row.get("temperature_C", ""), sign),
-            time=row.get("time", ""),
-        )
+                numerals.append(Numeral(row["reading_mm"], line))
+        sign = _plain_sign(numerals, path)
+    for line, cells in rows():
+        yield _with_house_numbers(RawReading(f"{path}:{line}", line, **cells), sign)
 
 
 ASK = "write it with a decimal point, or use `orthocal import --decimal comma|point`"
@@ -162,12 +204,22 @@ def _plain_sign(cells: Sequence[Numeral], path: Path) -> Sign | None:
     return decide_sign(cells, house=True, ask=ASK, place=lambda line: f"{path}:{line}").sign
 
 
-def _house_number(text: str, sign: Sign | None) -> str:
-    """A number in the form of a readings.csv; other text is unchanged, to be refused later."""
-    if sign == "comma":
-        value = parse_numeral(text, sign)
-        return text if value is None else mm_text(value)
-    return text if sign is None else plain_minus(text)
+def _with_house_numbers(row: RawReading, sign: Sign | None) -> RawReading:
+    """A row with numbers in the form of a readings.csv; other text is left to be refused later."""
+    if sign is None:
+        return row
+    return replace(
+        row,
+        reading_mm=_house_number(row.reading_mm, sign),
+        temperature_C=_house_number(row.temperature_C, sign),
+    )
+
+
+def _house_number(text: str, sign: Sign) -> str:
+    if sign == "point":
+        return plain_minus(text)
+    value = parse_numeral(text, sign)
+    return text if value is None else mm_text(value)
 
 
 def _clean_table(path: Path, content: bytes) -> tuple[Table, Columns] | None:
@@ -201,8 +253,8 @@ def _clean_table(path: Path, content: bytes) -> tuple[Table, Columns] | None:
 def _table_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
     require_whole_cells(table, columns)
     (reading,) = columns.readings
-    cells = [Numeral(row.cell(reading.index).text, row.line) for row in table.rows]
-    sign = decide_sign(cells, house=is_house(table.header), ask=ASK, place=table.place).sign
+    numerals = [Numeral(row.cell(reading.index).text, row.line) for row in table.rows]
+    sign = decide_sign(numerals, house=is_house(table.header), ask=ASK, place=table.place).sign
     width = len(table.header)
     for row in table.rows:
         where = table.place(row.line)
@@ -212,24 +264,15 @@ def _table_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
             raise SessionError(
                 f"has {count} fields; expected {width} ({shorten(names)})", where=where
             )
-        text = {
-            name: "" if index is None else composed(row.cell(index).text.strip())
-            for name, index in (
-                ("setup", columns.setup),
-                ("posture", columns.posture),
-                ("minus", columns.minus),
-                ("cycle", columns.cycle),
-                ("reading", reading.index),
-                ("approach", columns.approach),
-                ("temperature", columns.temperature),
-                ("time", columns.time),
-            )
+        cells = {
+            COLUMN_OF_ROLE.get(role, role): composed(row.cell(index).text.strip())
+            for role, index in (*columns.single.items(), ("reading", reading.index))
         }
-        for name in ("reading", "temperature"):
-            value = None if sign is None else parse_numeral(text[name], sign)
+        for name in COLUMN_OF_ROLE.values():
+            value = None if sign is None else parse_numeral(cells.get(name, ""), sign)
             if value is not None:
-                text[name] = mm_text(value)
-        yield RawReading(where, row.line, **text)
+                cells[name] = mm_text(value)
+        yield RawReading(where, row.line, **cells)
 
 
 _WHOLE = re.compile(r"[-+\u2212\u2013]?[0-9]+")

@@ -6,6 +6,7 @@ They are checked against the robot and the nominal machine.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import islice
@@ -63,14 +64,14 @@ def load_session(path: str | Path) -> Session:
 
 
 def _load_session(
-    file: Path, content: bytes, keys: SessionKeys, *, unread: set[int] | None = None
+    file: Path, content: bytes, keys: SessionKeys, *, partial: bool = False
 ) -> Session:
-    """A session with readings; `unread` collects the indices of empty cells."""
+    """A session with readings; with `partial`, those of empty cells are NaN."""
     plan, readings_path = _build_unread(file, keys)
     table = read_file(readings_path, error=SessionError)
     with content_withheld_outside(file.parent, readings_path):
         rows = read_rows(readings_path, table)
-        readings = check_readings(rows, plan, file=readings_path, unread=unread)
+        readings = check_readings(rows, plan, file=readings_path, partial=partial)
     digest = hashlib.sha256(content + b"\0" + table).hexdigest()
     session = replace(plan, readings=readings, readings_path=readings_path, sha256=digest)
     check_contacts(session)
@@ -113,16 +114,17 @@ def load_plan(path: str | Path) -> Session:
         SessionError: Naming file and key.
         RobotError: If the robot does not load.
     """
-    session, _ = load_rows(path)
-    return session
+    session = load_rows(path)
+    return replace(
+        session,
+        readings=tuple(r if r.is_read else replace(r, value=0.0) for r in session.readings),
+    )
 
 
-def load_rows(path: str | Path) -> tuple[Session, frozenset[int]]:
-    """Read a plan, as `load_plan` does, and which of its readings are not there yet.
+def load_rows(path: str | Path) -> Session:
+    """Read a plan as `load_plan` does; readings that are not there yet are NaN.
 
-    Returns:
-        The plan, and indices of its readings that are 0 because nothing was read: of a session with
-        readings its empty cells; else all of them, and it has no `readings_path`.
+    These are the empty cells of a session with readings; else all, and it has no `readings_path`.
 
     Raises:
         SessionError: Naming file and key.
@@ -130,9 +132,7 @@ def load_rows(path: str | Path) -> tuple[Session, frozenset[int]]:
     """
     file, content, keys = _read_keys(Path(path))
     if keys.readings is not None:
-        unread: set[int] = set()
-        session = _load_session(file, content, keys, unread=unread)
-        return session, frozenset(unread)
+        return _load_session(file, content, keys, partial=True)
     read = _read_setups(file, keys)
     count = keys.cycles * sum(len(s.postures or keys.postures) for s, _ in read.values())
     if count > MOST_READINGS:
@@ -142,16 +142,15 @@ def load_rows(path: str | Path) -> tuple[Session, frozenset[int]]:
             where=f"{file}: cycles",
         )
     plan = _build_plan(file, keys, read)
-    readings = []
-    for name, (setup, _) in read.items():
-        readings += [
-            Reading(name, posture, None, cycle, 0.0, None)
-            for cycle in range(1, keys.cycles + 1)
-            for posture in setup.postures or plan.postures
-        ]
-    session = replace(plan, readings=tuple(readings))
+    readings = tuple(
+        Reading(name, posture, None, cycle, math.nan)
+        for name, (setup, _) in read.items()
+        for cycle in range(1, keys.cycles + 1)
+        for posture in setup.postures or plan.postures
+    )
+    session = replace(plan, readings=readings)
     check_contacts(session)
-    return session, frozenset(range(len(readings)))
+    return session
 
 
 def read_purpose(

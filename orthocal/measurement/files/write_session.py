@@ -12,23 +12,12 @@ import yaml
 
 from orthocal.errors import SessionError
 from orthocal.io.files import exists, write_file, write_files
+from orthocal.measurement.files.readings_file import RawReading, format_readings
 from orthocal.robot.loading import packaged_robots, robot_digest
 from orthocal.sensors.protocol import default_zero
 from orthocal.sensors.registry import write_sensor
 from orthocal.session.session import Conditions, Gauge, Purpose, Reading, Session
-from orthocal.units import MM, tidy, to_mm
-
-COLUMNS = (
-    *("setup", "posture", "minus", "cycle", "reading_mm"),
-    *("approach", "temperature_C", "time"),
-)
-"""Columns of a readings.csv; all but `setup`, `posture` and `reading_mm` may be absent."""
-
-UNSTATED = {"cycle": "1"}
-"""Values of optional columns that need not be stated."""
-
-MEASURED = ("temperature_C", "time")
-"""Conditions that are measured with a reading, not planned."""
+from orthocal.units import MM, tidy, to_mm, trim_zeros
 
 
 def session_document(session: Session, *, readings: str = "readings.csv") -> dict[str, Any]:
@@ -132,8 +121,7 @@ def write_session(
     text = head + yaml.safe_dump(
         document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=100
     )
-    values = [None if blank else r.value for r in session.readings]
-    table = readings_table(session.readings, values, decimals=decimals, blank=blank)
+    table = readings_table(session.readings, decimals=decimals, blank=blank)
     files = {"session.yaml": text, "readings.csv": table, **(extra or {})}
     write_files(folder, files)
     return folder / "session.yaml"
@@ -158,66 +146,32 @@ def _place_robot(session: Session, folder: Path) -> str:
     return f"./{robot.name}"
 
 
-def readings_table(
-    rows: Sequence[Reading],
-    values: Sequence[float | None],
-    *,
-    decimals: int = 6,
-    blank: bool = False,
-) -> str:
-    """Text of a readings.csv.
+def readings_table(readings: Sequence[Reading], *, decimals: int = 6, blank: bool = False) -> str:
+    """Text of a readings.csv; cells of readings that are NaN are empty.
 
     Args:
-        rows: What is read where, under which conditions.
-        values: Their readings, [m]; None for a cell that stays empty.
+        readings: The readings, in order.
         decimals: Decimals of a reading in mm.
-        blank: Leave the cells of measured conditions empty.
+        blank: Leave readings and measured conditions empty.
     """
-    cells = [
-        {
-            "setup": r.setup,
-            "posture": r.posture,
-            "minus": r.minus or "",
-            "cycle": str(r.cycle),
-            "reading_mm": "" if value is None else _trim(f"{value / MM:.{decimals}f}"),
-            **condition_cells(r.conditions),
-        }
-        for r, value in zip(rows, values, strict=True)
-    ]
-    return format_cells(cells, blank=blank)
-
-
-def format_cells(rows: Sequence[Mapping[str, str]], *, blank: bool = False) -> str:
-    """Text of a readings.csv without the optional columns that no row needs.
-
-    Args:
-        rows: Cells by column.
-        blank: Leave the cells of measured conditions empty.
-    """
-    columns = used_columns(rows)
-    empty = MEASURED if blank else ()
-    lines = [columns, *(["" if c in empty else row[c] for c in columns] for row in rows)]
-    return "".join(",".join(line) + "\n" for line in lines)
-
-
-def condition_cells(conditions: Conditions | None) -> dict[str, str]:
-    """Cells of the conditions of a row; empty for those that are not stated."""
-    c = conditions or Conditions()
-    return {
-        "approach": c.approach or "",
-        "temperature_C": "" if c.temperature is None else f"{c.temperature:.12g}",
-        "time": "" if c.time is None else c.time.isoformat(),
-    }
-
-
-def used_columns(rows: Sequence[Mapping[str, str]]) -> list[str]:
-    """Columns of a readings.csv without the optional ones that no row needs."""
-    needed = {"setup", "posture", "reading_mm"}
-    needed |= {c for c in COLUMNS if any(row[c] not in ("", UNSTATED.get(c)) for row in rows)}
-    return [c for c in COLUMNS if c in needed]
-
-
-def _trim(number: str) -> str:
-    """A decimal number without trailing zeros beyond the second decimal."""
-    integer, _, decimals = number.partition(".")
-    return f"{integer}.{decimals.rstrip('0').ljust(2, '0')}"
+    rows = []
+    for r in readings:
+        conditions, value, temperature = r.conditions or Conditions(), "", ""
+        if r.is_read and not blank:
+            value = trim_zeros(f"{r.value / MM:.{decimals}f}")
+        if conditions.temperature is not None:
+            temperature = f"{conditions.temperature:.12g}"
+        row = RawReading(
+            where="",
+            line=0,
+            setup=r.setup,
+            posture=r.posture,
+            minus=r.minus or "",
+            cycle=str(r.cycle),
+            reading_mm=value,
+            approach=conditions.approach or "",
+            temperature_C=temperature,
+            time="" if conditions.time is None else conditions.time.isoformat(),
+        )
+        rows.append(row)
+    return format_readings(rows, blank=blank)

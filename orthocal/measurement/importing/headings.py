@@ -20,10 +20,10 @@ from orthocal.text import composed, shorten
 Role = Literal["setup", "posture", "minus", "cycle", "approach", "temperature", "time", "reading"]
 """Role of a column."""
 
-SINGLE: tuple[Role, ...] = (
-    *("setup", "posture", "minus", "cycle"),
-    *("approach", "temperature", "time"),
-)
+KEYS: tuple[Role, ...] = ("setup", "posture", "minus", "cycle")
+"""Roles of columns that identify a reading."""
+
+SINGLE: tuple[Role, ...] = (*KEYS, "approach", "temperature", "time")
 """Roles of one column at most."""
 
 EXPECTED = "the headings setup, posture and reading"
@@ -110,24 +110,18 @@ class ReadingColumn:
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """Indices of the columns of a table, by their roles."""
+    """Roles of the columns of a table."""
 
-    setup: int
-    posture: int
-    minus: int | None
-    cycle: int | None
+    single: Mapping[Role, int]
+    """Indices of the columns with a role in SINGLE, in that order."""
     readings: tuple[ReadingColumn, ...]
     extra: tuple[int, ...]
     """Columns with a heading that has no role."""
-    approach: int | None = None
-    temperature: int | None = None
-    time: int | None = None
 
     @property
     def keys(self) -> tuple[int, ...]:
         """Columns that identify a reading."""
-        indices = (self.setup, self.posture, self.minus, self.cycle)
-        return tuple(i for i in indices if i is not None)
+        return tuple(i for role, i in self.single.items() if role in KEYS)
 
 
 def parse_unit(text: str) -> UnitName | None:
@@ -276,7 +270,7 @@ def choose_columns(texts: Sequence[str], assigned: Mapping[str, str], *, where: 
             )
             raise SessionError(f"column '{shorten(name)}' {problem}", where=f"{where}: {key}")
     headings = _read_headings(texts, assigned)
-    single: dict[str, int] = {}
+    single: dict[Role, int] = {}
     for role in SINGLE:
         places = [i for i, h in enumerate(headings) if h is not None and h.role == role]
         if len(places) > 1:
@@ -296,15 +290,9 @@ def choose_columns(texts: Sequence[str], assigned: Mapping[str, str], *, where: 
     _check_readings(texts, readings, single.get("cycle"), where)
     used = {r.index for r in readings} | set(single.values())
     return Columns(
-        setup=single["setup"],
-        posture=single["posture"],
-        minus=single.get("minus"),
-        cycle=single.get("cycle"),
+        single=single,
         readings=tuple(readings),
         extra=tuple(i for i, text in enumerate(texts) if i not in used and text.strip()),
-        approach=single.get("approach"),
-        temperature=single.get("temperature"),
-        time=single.get("time"),
     )
 
 

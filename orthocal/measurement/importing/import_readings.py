@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
 from typing import Literal, cast, get_args
 
@@ -13,16 +13,14 @@ from orthocal.errors import SessionError
 from orthocal.io.files import content_withheld_outside, exists, read_file, write_file
 from orthocal.io.tables.numerals import Sign
 from orthocal.io.tables.table import Table, read_table
-from orthocal.measurement.files.readings_checks import (
-    CheckedReadings,
+from orthocal.measurement.files.readings_checks import check_readings, parse_reading, parse_time
+from orthocal.measurement.files.readings_file import (
+    CONDITIONS,
     RawReading,
-    check_readings,
-    parse_reading,
-    parse_time,
+    format_readings,
+    read_rows,
 )
-from orthocal.measurement.files.readings_file import read_rows
 from orthocal.measurement.files.session_file import check_contacts, load_unread
-from orthocal.measurement.files.write_session import format_cells
 from orthocal.measurement.importing.headings import (
     EXPECTED,
     UNITS,
@@ -38,9 +36,6 @@ from orthocal.text import shorten
 
 Key = tuple[str, str, str, int]
 """Setup, posture, minus and cycle of a reading."""
-
-CONDITIONS = ("approach", "temperature", "time")
-"""Fields of a row that state conditions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,17 +137,16 @@ def import_readings(
         separator_known=options.separator is not None,
         fill=options.fill,
     )
-    new = zip(long_table.rows, check_readings(long_table.rows, plan, file=path), strict=True)
+    readings = check_readings(long_table.rows, plan, file=path)
+    new = list(zip(long_table.rows, readings, strict=True))
     with content_withheld_outside((plan.path or Path(session)).parent, readings_path):
         existing = [
             (row, parse_reading(row, plan))
             for row in _read_existing(readings_path, path, long_table, overwrite)
         ]
-    merged, counts = _merge(existing, list(new), overwrite)
-    checked = CheckedReadings(readings_path)
-    for row, reading in merged:
-        checked.add(row, reading)
-    check_contacts(replace(plan, readings=tuple(checked.readings)))
+    merged, counts = _merge(existing, new, overwrite)
+    readings = check_readings(merged, plan, file=readings_path, partial=True)
+    check_contacts(replace(plan, readings=readings))
     return TableImport(
         options=options,
         table=content,
@@ -160,12 +154,12 @@ def import_readings(
         long_table=long_table,
         session=plan.path or Path(session),
         readings_path=readings_path,
-        text=_format_readings([row for row, _ in merged]),
+        text=format_readings(merged),
         filled=counts["filled"],
         replaced=counts["replaced"],
         unchanged=counts["unchanged"],
         added=counts["added"],
-        empty=sum(not row.reading for row, _ in merged),
+        empty=sum(not row.reading_mm for row in merged),
     )
 
 
@@ -193,15 +187,17 @@ def _check_options(options: TableOptions) -> None:
 
 def _without_clock_times(table: Table, columns: Columns) -> Columns:
     """Columns without one of times that are not those of a session, such as a clock's."""
-    if columns.time is None:
+    at = columns.single.get("time")
+    if at is None:
         return columns
-    texts = (row.cell(columns.time).text.strip() for row in table.rows)
+    texts = (row.cell(at).text.strip() for row in table.rows)
     try:
         for text in texts:
             if text:
                 parse_time(text, "")
     except SessionError:
-        return replace(columns, time=None, extra=tuple(sorted((*columns.extra, columns.time))))
+        single = {role: i for role, i in columns.single.items() if i != at}
+        return replace(columns, single=single, extra=tuple(sorted((*columns.extra, at))))
     return columns
 
 
@@ -223,7 +219,7 @@ def _read_existing(
             "is the session's own table; --replace rewrites it with its readings only",
             where=str(table),
         )
-    rows = [replace(row, reading="") for row in (*long_table.rows, *long_table.missing)]
+    rows = [replace(row, reading_mm="") for row in (*long_table.rows, *long_table.missing)]
     return sorted(rows, key=lambda row: row.line)
 
 
@@ -237,7 +233,7 @@ def _key(reading: Reading) -> Key:
 
 def _merge(
     existing: Sequence[_Row], new: Sequence[_Row], overwrite: bool
-) -> tuple[list[_Row], Counter[str]]:
+) -> tuple[list[RawReading], Counter[str]]:
     """Merge new readings into the existing rows; further readings follow at the end.
 
     Returns:
@@ -250,21 +246,21 @@ def _merge(
     for row in new:
         pending.setdefault(_key(row[1]), []).append(row)
     places = Counter(_key(reading) for _, reading in existing)
-    rows: list[_Row] = []
+    rows: list[RawReading] = []
     counts: Counter[str] = Counter()
     differing: list[_Row] = []
     for row in existing:
         key = _key(row[1])
         match = _match(row[0], pending.get(key, []), places[key] == 1)
         if match is None:
-            rows.append(row)
+            rows.append(row[0])
             continue
         pending[key].remove(match)
         change = _change(row, match)
         counts[change] += 1
         if change == "replaced" and not differing:
             differing = [row, match]
-        rows.append(row if change == "unchanged" else _update(row, match))
+        rows.append(row[0] if change == "unchanged" else _update(row[0], match[0]))
     if differing and not overwrite:
         (first, _), (other, _) = differing
         more = counts["replaced"] - 1
@@ -274,7 +270,7 @@ def _merge(
             "--replace overwrites existing readings",
             where=first.where,
         )
-    added = [row for of_place in pending.values() for row in of_place]
+    added = [row for of_place in pending.values() for row, _ in of_place]
     counts["added"] = len(added)
     return [*rows, *added], counts
 
@@ -291,53 +287,24 @@ def _match(row: RawReading, among: Sequence[_Row], alone: bool) -> _Row | None:
 def _change(row: _Row, match: _Row) -> Literal["replaced", "filled", "unchanged"]:
     """Effect of a new reading on an existing row."""
     (text, old), (_, new) = row, match
-    before, after = ([getattr(r.conditions, name, None) for name in CONDITIONS] for r in (old, new))
+    before, after = (astuple(r.conditions or Conditions()) for r in (old, new))
     pairs = list(zip(before, after, strict=True))
-    if (text.reading and old.value != new.value) or any(
+    if (text.reading_mm and old.value != new.value) or any(
         one is not None and other is not None and one != other for one, other in pairs
     ):
         return "replaced"
-    filled = not text.reading or any(one is None and other is not None for one, other in pairs)
+    filled = not text.reading_mm or any(one is None and other is not None for one, other in pairs)
     return "filled" if filled else "unchanged"
 
 
-def _update(row: _Row, match: _Row) -> _Row:
+def _update(row: RawReading, other: RawReading) -> RawReading:
     """An existing row with the reading and the stated conditions of another."""
-    (text, old), (new_text, new) = row, match
-    texts = {name: getattr(new_text, name) or getattr(text, name) for name in CONDITIONS}
-    stated = {
-        name: value
-        for r in (old, new)
-        for name in CONDITIONS
-        if (value := getattr(r.conditions, name, None)) is not None
-    }
-    conditions = Conditions(**stated) if stated else None
-    return (
-        replace(text, reading=new_text.reading, **texts),
-        replace(old, value=new.value, conditions=conditions),
-    )
+    conditions = {name: getattr(other, name) or getattr(row, name) for name in CONDITIONS}
+    return replace(row, reading_mm=other.reading_mm, **conditions)
 
 
 def _describe(row: RawReading) -> str:
     """Reading and conditions of a row, for messages."""
-    temperature = f"{row.temperature} °C" if row.temperature else ""
-    parts = f"{row.reading} mm" if row.reading else "", row.approach, temperature, row.time
+    temperature = f"{row.temperature_C} °C" if row.temperature_C else ""
+    parts = f"{row.reading_mm} mm" if row.reading_mm else "", row.approach, temperature, row.time
     return ", ".join(part for part in parts if part)
-
-
-def _format_readings(rows: Sequence[RawReading]) -> str:
-    """Content of a readings.csv without the optional columns that no row needs."""
-    cells = [
-        {
-            "setup": r.setup,
-            "posture": r.posture,
-            "minus": r.minus,
-            "cycle": r.cycle or "1",
-            "reading_mm": r.reading,
-            "approach": r.approach,
-            "temperature_C": r.temperature,
-            "time": r.time.replace(",", "."),  # ISO 8601 allows both in a fraction of a second
-        }
-        for r in rows
-    ]
-    return format_cells(cells)

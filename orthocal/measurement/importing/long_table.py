@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from decimal import Decimal, localcontext
 from itertools import chain
 
@@ -24,23 +24,28 @@ from orthocal.io.tables.numerals import (
     tidy_text,
 )
 from orthocal.io.tables.table import Table
-from orthocal.measurement.files.readings_checks import RawReading
 from orthocal.measurement.files.readings_file import (
+    RawReading,
     decide_sign,
     is_house,
     mm_text,
     require_whole_cells,
 )
 from orthocal.measurement.importing.headings import (
+    SINGLE,
     UNITS,
     Columns,
     ReadingColumn,
+    Role,
     UnitName,
     parse_unit,
 )
 from orthocal.text import composed, shorten
 
 NO_READING = "no reading"
+
+NAMED: tuple[Role, ...] = ("setup", "posture")
+"""Columns that no row of a reading leaves empty."""
 
 SkippedRows = list[tuple[int, str]]
 """Lines of the table that are not imported, with the reason."""
@@ -55,20 +60,13 @@ _NUMBER_AND_WORD = re.compile(r"(.*[0-9.,])\s*([^0-9.,\s].*)", re.S)
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A cell of a column of readings, with the names of its row as written."""
+    """A cell of a column of readings."""
 
-    line: int
+    row: RawReading
+    """The row with names as written, without its reading."""
     column: ReadingColumn
-    setup: str
-    posture: str
-    minus: str
-    cycle: str
-    missing: bool
-    """True if the cell has no reading."""
-    conditions: Mapping[str, str] = field(default_factory=dict)
-    """Cells of the conditions, by the fields of `RawReading`."""
-    number: str = ""
-    """Text of the number without its unit."""
+    number: str | None
+    """Text of the number without its unit; None if the cell has no reading."""
     value: Decimal | None = None
     """Value of a workbook's number."""
     unit: UnitName | None = None
@@ -127,30 +125,26 @@ def make_long_table(
     unit_assumed = False
     rows, missing = [], []
     for entry in entries:
-        where = table.place(entry.line, entry.column.index)
-        written = (entry.setup, entry.posture, entry.minus)
+        written = (entry.row.setup, entry.row.posture, entry.row.minus)
         meant = [
             _session_name(name, of_session)
             for name, of_session in zip(written, (setups, postures, postures), strict=True)
         ]
         setup, posture, minus = meant
-        row = RawReading(
-            where, entry.line, setup, posture, minus, entry.cycle, "", **entry.conditions
-        )
-        if entry.missing:
+        row = replace(entry.row, setup=setup, posture=posture, minus=minus)
+        if entry.number is None:
             if row.setup in setups and row.posture in postures:
                 missing.append(row)
-            elif (entry.line, NO_READING) not in skipped[-1:]:
-                skipped.append((entry.line, NO_READING))
+            elif (row.line, NO_READING) not in skipped[-1:]:
+                skipped.append((row.line, NO_READING))
             continue
         renamed |= {old: new for old, new in zip(written, meant, strict=True) if old != new}
-        value = _parse_value(entry, sign.sign, where)
-        entry_unit = _choose_unit(entry, unit, where, table.header[entry.column.index])
+        value = _parse_value(entry, sign.sign)
+        entry_unit = _choose_unit(entry, unit, table.header[entry.column.index])
         units[entry_unit] = None
         unit_assumed |= entry.unit is None
         with localcontext(prec=2 * LONGEST_NUMBER):
-            text = mm_text(value * UNITS[entry_unit])
-        rows.append(replace(row, reading=text))
+            rows.append(replace(row, reading_mm=mm_text(value * UNITS[entry_unit])))
     return LongTable(
         rows=tuple(rows),
         missing=tuple(missing),
@@ -173,7 +167,7 @@ def _read_entries(
                 "is merged with cells below; expected one cell for each reading",
                 where=table.place(top, column),
             )
-    above = {"setup": "", "posture": ""}
+    above = dict.fromkeys(NAMED, "")
     units_below: dict[int, UnitName] = {}
     rows = table.fill_merged(columns.keys)
     for first in rows:
@@ -184,7 +178,7 @@ def _read_entries(
             rows = chain([first], rows)
         break
     for row in rows:
-        names = {role: _name(row.cell(getattr(columns, role))) for role in above}
+        names = {role: _name(row.cell(columns.single[role])) for role in NAMED}
         filled_cells = [r for r in columns.readings if not _is_missing(row.cell(r.index))]
         beyond = sum(not c.is_blank for c in row.cells[len(table.header) :])
         if beyond:
@@ -200,32 +194,34 @@ def _read_entries(
                     f"has a reading but no {role}; --fill copies the {role} from the row above",
                     where=table.place(row.line),
                 )
-        minus, cycle = (_name(row.cell(i)) for i in (columns.minus, columns.cycle))
-        conditions = _read_conditions(row, columns)
+        cells = _read_optional_cells(row, columns) | {role: names[role] for role in NAMED}
         for r in columns.readings:
-            identity = (row.line, r, names["setup"], names["posture"], minus)
-            numbered = cycle if r.cycle is None else str(r.cycle)
-            if r not in filled_cells:
-                yield Entry(*identity, numbered, True, conditions)
-                continue
             where = table.place(row.line, r.index)
+            numbered = cells if r.cycle is None else {**cells, "cycle": str(r.cycle)}
+            entry = Entry(RawReading(where, row.line, **numbered), r, None)
+            if r not in filled_cells:
+                yield entry
+                continue
             number, value, unit = _read_number(row.cell(r.index), where)
             stated = r.unit or units_below.get(r.index)
             if unit and stated and unit != stated:
                 raise SessionError(
                     f"the reading is in {unit}, and its heading says {stated}", where=where
                 )
-            yield Entry(*identity, numbered, False, conditions, number, value, unit or stated)
+            yield replace(entry, number=number, value=value, unit=unit or stated)
 
 
-def _read_conditions(row: Row, columns: Columns) -> dict[str, str]:
-    """Cells of the conditions of a row, by the fields of `RawReading`."""
-    temperature = row.cell(columns.temperature).text.strip()
+def _read_optional_cells(row: Row, columns: Columns) -> dict[str, str]:
+    """Cells of a row in the optional columns of a readings.csv."""
+    cells = {role: row.cell(columns.single.get(role)) for role in SINGLE}
+    temperature = cells["temperature"].text.strip()
     value = parse_numeral(temperature, "comma" if "," in temperature else "point")
     return {
-        "approach": _name(row.cell(columns.approach)),
-        "temperature": temperature if value is None else f"{value:f}",
-        "time": row.cell(columns.time).text.strip(),
+        "minus": _name(cells["minus"]),
+        "cycle": _name(cells["cycle"]),
+        "approach": _name(cells["approach"]),
+        "temperature_C": temperature if value is None else f"{value:f}",
+        "time": cells["time"].text.strip(),
     }
 
 
@@ -288,25 +284,29 @@ def _read_number(cell: Cell, where: str) -> tuple[str, Decimal | None, UnitName 
 def _decide_decimal_sign(table: Table, entries: list[Entry], stated: Sign | None) -> DecimalSign:
     if stated is not None:
         return DecimalSign(stated, None)
-    numerals = [Numeral(e.number, e.line) for e in entries if not e.missing and e.value is None]
+    numerals = [
+        Numeral(e.number, e.row.line) for e in entries if e.number is not None and e.value is None
+    ]
     return decide_sign(numerals, house=is_house(table.header), ask=CHOOSE_SIGN, place=table.place)
 
 
-def _parse_value(entry: Entry, sign: Sign | None, where: str) -> Decimal:
+def _parse_value(entry: Entry, sign: Sign | None) -> Decimal:
     if entry.value is not None:
         return entry.value
-    value = parse_numeral(entry.number, sign or "point")
+    number = entry.number or ""
+    value = parse_numeral(number, sign or "point")
     if value is None:
         hint = ""
-        if any(parse_numeral(entry.number, s) is not None for s in ("point", "comma")):
+        if any(parse_numeral(number, s) is not None for s in ("point", "comma")):
             hint = f" with a decimal {sign}"
         raise SessionError(
-            f"the reading is '{shorten(entry.number)}'; expected a number{hint}", where=where
+            f"the reading is '{shorten(number)}'; expected a number{hint}", where=entry.row.where
         )
     return value
 
 
-def _choose_unit(entry: Entry, stated: UnitName | None, where: str, heading: str) -> UnitName:
+def _choose_unit(entry: Entry, stated: UnitName | None, heading: str) -> UnitName:
+    where = entry.row.where
     if stated and entry.unit and stated != entry.unit:
         raise SessionError(
             f"the reading is in {entry.unit}, which contradicts --unit {stated}", where=where

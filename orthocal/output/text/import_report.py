@@ -8,9 +8,7 @@ from typing import Any
 
 from orthocal.io.tables.cell import column_letters
 from orthocal.io.tables.table import Table
-from orthocal.measurement.files.readings_checks import RawReading
-from orthocal.measurement.files.readings_file import is_house
-from orthocal.measurement.importing.headings import SINGLE
+from orthocal.measurement.files.readings_file import RawReading, is_house
 from orthocal.measurement.importing.import_readings import TableImport
 from orthocal.output.text.layout import counted
 
@@ -89,11 +87,7 @@ def _describe_decimal_sign(result: TableImport) -> str:
 
 def _columns_by_role(result: TableImport) -> list[tuple[str, str]]:
     columns, table = result.columns, result.table
-    roles = [
-        (role, _describe_column(table, index))
-        for role in SINGLE
-        if (index := getattr(columns, role)) is not None
-    ]
+    roles = [(role, _describe_column(table, index)) for role, index in columns.single.items()]
     readings = [
         _describe_column(table, r.index) + (f" as cycle {r.cycle}" if r.cycle is not None else "")
         for r in columns.readings
@@ -159,7 +153,7 @@ def format_import_json(result: TableImport, *, written: bool) -> str:
                 "posture": row.posture,
                 "minus": row.minus or None,
                 "cycle": int(row.cycle or 1),
-                "reading_mm": float(row.reading),
+                "reading_mm": float(row.reading_mm),
                 **_conditions(row),
             }
             for row in long_table.rows
@@ -179,7 +173,7 @@ def _conditions(row: RawReading) -> dict[str, str | float]:
     """Stated conditions of a row."""
     conditions = {
         "approach": row.approach,
-        "temperature_C": float(row.temperature) if row.temperature else "",
+        "temperature_C": float(row.temperature_C) if row.temperature_C else "",
         "time": row.time,
     }
     return {name: value for name, value in conditions.items() if value != ""}

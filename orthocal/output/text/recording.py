@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from orthocal.assessment.wording import counted, joined, mm, name_direction
 from orthocal.calibration.assessment_record import Finding
 from orthocal.measurement.motion.motion import Guidance
-from orthocal.measurement.recording import Recording, Row
-from orthocal.session.session import Session, Setup
+from orthocal.measurement.recording import Recording
+from orthocal.session.session import Reading, Session, Setup
 from orthocal.text import printable
-from orthocal.units import DRIVE_UNITS, MM, format_fixed, to_mm
+from orthocal.units import DRIVE_UNITS, MM, format_fixed, to_mm, trim_zeros
 
 GLUE = "\u00a0"
 """Space at which no line ends."""
@@ -46,8 +46,7 @@ def wrap(text: str, width: int, *, indent: str = "", first: str | None = None) -
 
 def show_mm(value: float) -> str:
     """A reading in mm with all its decimals, two at least."""
-    integer, _, decimals = f"{to_mm(value) + 0.0:.6f}".partition(".")
-    return f"{integer}.{decimals.rstrip('0').ljust(2, '0')}"
+    return trim_zeros(f"{to_mm(value) + 0.0:.6f}")
 
 
 def describe_session(recording: Recording, *, width: int) -> str:
@@ -77,7 +76,7 @@ def describe_session(recording: Recording, *, width: int) -> str:
 
 
 def describe_setup(
-    session: Session, guidance: Guidance, rows: Sequence[Row], name: str, *, width: int
+    session: Session, guidance: Guidance, rows: Sequence[Reading], name: str, *, width: int
 ) -> str:
     """Position of the gauge of a setup, and preparation of its dial."""
     setup = session.setups[name]
@@ -89,7 +88,7 @@ def describe_setup(
         f"{counted(len(of_setup), 'reading')}"
     )
     parts = [f"Read: {setup.sensor.describe()}", _stand(guidance, name), _gauge(session, setup)]
-    if any(r.value is not None for r in of_setup) and any(r.minus is None for r in of_setup):
+    if any(r.is_read for r in of_setup) and any(r.minus is None for r in of_setup):
         parts.append(
             "This setup has readings: neither stand nor dial may have moved since. If one has, "
             "`restart` the setup."
@@ -138,15 +137,16 @@ def _middle(session: Session, setup: Setup) -> str:
 
 
 def describe_row(
-    session: Session, guidance: Guidance, rows: Sequence[Row], index: int, *, width: int
+    session: Session, guidance: Guidance, rows: Sequence[Reading], index: int, *, width: int
 ) -> str:
     """Next reading, and the posture of the machine for it."""
     row = rows[index]
-    lines = [wrap(f"{index + 1} of {len(rows)} (line {row.line} of the table): {row.label}", width)]
+    place = f"{index + 1} of {len(rows)} (line {row.line} of the table)"
+    lines = [wrap(f"{place}: {row.label_with_cycle}", width)]
     for posture in (row.posture, *([row.minus] if row.minus else [])):
         name = f"{posture}: " if row.minus else ""
         lines.append(_coordinates(session, guidance, posture, name, width))
-    if row.value is not None:
+    if row.is_read:
         lines.append(
             wrap(f"Recorded: {show_mm(row.value)} mm; Enter keeps it.", width, indent="  ")
         )
@@ -166,11 +166,11 @@ def _coordinates(session: Session, guidance: Guidance, posture: str, name: str, 
     return "\n".join(lines)
 
 
-def confirm_reading(rows: Sequence[Row], index: int, *, width: int) -> str:
+def confirm_reading(rows: Sequence[Reading], index: int, *, width: int) -> str:
     """Confirmation that a reading is on disk."""
     row = rows[index]
-    value = "" if row.value is None else show_mm(row.value)
-    return wrap(f"Recorded: row {index + 1}, {row.label}: {value} mm", width, indent="  ")
+    text = f"Recorded: row {index + 1}, {row.label_with_cycle}: {show_mm(row.value)} mm"
+    return wrap(text, width, indent="  ")
 
 
 def describe_prediction(mean: float, std: float, *, width: int) -> str:
@@ -187,7 +187,7 @@ def describe_prediction(mean: float, std: float, *, width: int) -> str:
     return wrap(text, width, indent="  ")
 
 
-def describe_warning(finding: Finding, rows: Sequence[Row], *, width: int) -> str:
+def describe_warning(finding: Finding, rows: Sequence[Reading], *, width: int) -> str:
     """A finding about the readings so far, in the words of `check`."""
     indices = find_rows(finding, rows)
     where = f" ({_spans([i + 1 for i in indices])})" if indices else ""
@@ -195,12 +195,12 @@ def describe_warning(finding: Finding, rows: Sequence[Row], *, width: int) -> st
     return wrap(f"{kind}{where}: {finding.words}", width, indent="  ", first="! ")
 
 
-def find_rows(finding: Finding, rows: Sequence[Row]) -> list[int]:
+def find_rows(finding: Finding, rows: Sequence[Reading]) -> list[int]:
     """Indices of the rows with a reading that a finding names, by line or by setup."""
     lines = {p.line for p in finding.places if p.line is not None}
     setups = {p.setup for p in finding.places if p.line is None}
     named = [row.line in lines or row.setup in setups for row in rows]
-    return [i for i, row in enumerate(rows) if named[i] and row.value is not None]
+    return [i for i, row in enumerate(rows) if named[i] and row.is_read]
 
 
 def describe_resolved(findings: Sequence[Finding], *, width: int) -> str:
@@ -212,13 +212,13 @@ def describe_resolved(findings: Sequence[Finding], *, width: int) -> str:
     return wrap(f"Resolved: {joined(names)}.", width, indent="  ")
 
 
-def list_rows(rows: Sequence[Row], *, width: int) -> str:
+def list_rows(rows: Sequence[Reading], *, width: int) -> str:
     """All rows and their readings."""
     last = len(str(len(rows)))
     return "\n".join(
         wrap(
-            f"{i + 1:>{last}}  {r.label}: ".replace("  ", GLUE * 2)
-            + ("not read" if r.value is None else f"{show_mm(r.value)}{GLUE}mm"),
+            f"{i + 1:>{last}}  {r.label_with_cycle}: ".replace("  ", GLUE * 2)
+            + (f"{show_mm(r.value)}{GLUE}mm" if r.is_read else "not read"),
             width,
             indent=" " * (last + 2),
         )
