@@ -24,7 +24,7 @@ from orthocal.assessment.judgement import judge_session
 from orthocal.assessment.plausibility import find_implausible
 from orthocal.calibration.file import calibration_json
 from orthocal.errors import RobotError
-from orthocal.output.text.heading import describe_machine
+from orthocal.output.text.answer import describe_machine
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 

@@ -9,7 +9,7 @@ import pytest
 
 from orthocal import calibrate, validate_calibration
 from orthocal.assessment.comparison import compare_models
-from orthocal.output.text.layout import add_row, table_of, to_text
+from orthocal.output.text.layout import table_of, to_text
 from orthocal.output.text.summary import render_result
 
 NUMBER = re.compile(r"[-+−]?\d+(?:\.\d+)?")
@@ -41,8 +41,8 @@ def test_no_number_is_cut_however_narrow_it_gets(name, details, width, results):
 
 
 def test_a_table_that_does_not_fit_is_told_row_by_row():
-    table = table_of("parameter", "exact", "interval", "unit")
-    add_row(table, "x_slide.offset", "-0.527", "-1.759 … +0.705", "mm")
+    row = ("x_slide.offset", "-0.527", "-1.759 … +0.705", "mm")
+    table = table_of(("parameter", "exact", "interval", "unit"), [row])
     assert to_text(table, width=60).splitlines()[-1].split()[0] == "x_slide.offset"
     assert to_text(table, width=30).splitlines() == [
         "x_slide.offset",

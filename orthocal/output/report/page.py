@@ -28,9 +28,12 @@ from orthocal.output.report.reading_plots import plot_residuals, plot_setups, pl
 from orthocal.output.report.tool_map import Field, plot_tool_map
 from orthocal.output.scene.drawing import draw_scene
 from orthocal.output.text.accuracy import render_tool
-from orthocal.output.text.answer import render_answer
-from orthocal.output.text.entries import render_values
-from orthocal.output.text.heading import render_method, render_subject
+from orthocal.output.text.answer import (
+    render_answer,
+    render_method,
+    render_subject,
+    render_values,
+)
 from orthocal.output.text.layout import mm, plain, signed, to_markup
 from orthocal.output.text.tables import (
     render_findings,

@@ -20,6 +20,7 @@ from orthocal.output.report.figure import (
     BEFORE,
     UNSEEN,
     Look,
+    Plot,
     draw_legend,
     open_figure,
     open_list,
@@ -154,6 +155,15 @@ def plot_sensitivity(s: SensitivitySummary) -> Figure:
     bar = figure.colorbar(image, ax=axes, fraction=0.04, ticks=ticks, format=text)
     bar.minorticks_off()
     return figure
+
+
+PLOTS: dict[str, Plot[...]] = {
+    "accuracy": plot_machines,
+    "linearisation": plot_linearisation,
+    "sensitivity": plot_sensitivity,
+    "bootstrap": plot_bootstrap,
+}
+"""Plots of studies by their kind."""
 
 
 @plot("plan")

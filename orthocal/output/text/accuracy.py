@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Group, RenderableType
+from rich.console import RenderableType
 from rich.text import Text
 
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.assessment.remaining_errors import RemainingError, find_remaining_errors
 from orthocal.assessment.tool_error import (
-    ErrorSize,
     ErrorSizes,
     ToolAccuracy,
     assess_remaining,
@@ -25,7 +24,7 @@ from orthocal.assessment.tool_error import (
 from orthocal.assessment.words.entries import describe_tool_error
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
-from orthocal.output.text.layout import add_row, print_rich, table_of, um
+from orthocal.output.text.layout import noted, print_rich, table_of, um
 from orthocal.units import MM, UM, read_limit
 
 Array = NDArray[np.float64]
@@ -80,12 +79,13 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
         rows.append(("uncertainty after calibration", accuracy.after.sizes))
     if remaining is not None and scale > 1.0:
         rows.append((f"  with tolerances × {scale:.1f}", remaining.sizes))
-    table = table_of("[µm]", "RMS", "95 %", "worst point", "translation removed", "absolute")
+    cells = []
     for name, sizes in rows:
         a = sizes.aligned
         aligned = (None,) * 3 if a is None else (a.rms, a.percentile_95, a.largest)
         values = (*aligned, sizes.relative.rms, sizes.absolute.rms)
-        add_row(table, name, *("" if v is None else um(v) for v in values))
+        cells.append((name, *("" if v is None else um(v) for v in values)))
+    headers = ("[µm]", "RMS", "95 %", "worst point", "translation removed", "absolute")
     notes = [f"Over {accuracy.workspace.words}. {COLUMNS_NOTE}"]
     if accuracy.after is None:
         notes.append(
@@ -98,7 +98,7 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
             keep = assessment_of(calibration).keeps_offsets
             notes.append(describe_tool_error(summary, keep=keep))
         notes += describe_remaining(find_remaining_errors(calibration, accuracy, count=2))
-    return Group(table, *map(Text, notes))
+    return noted(table_of(headers, cells), *notes)
 
 
 def describe_remaining(errors: Iterable[RemainingError]) -> list[str]:
@@ -132,16 +132,12 @@ def format_points(rows: Array) -> str:
 def accuracy_json(calibration: Calibration, accuracy: ToolAccuracy) -> str:
     """Tool errors over a region as JSON, SI units."""
 
-    def size(s: ErrorSize | None) -> dict[str, float] | None:
-        if s is None:
-            return None
-        return {"rms": s.rms, "percentile_95": s.percentile_95, "largest": s.largest}
-
-    def all_sizes(sizes: ErrorSizes) -> dict[str, Any]:
+    def sizes(field: ErrorSizes) -> dict[str, Any]:
+        names = ("rms", "percentile_95", "largest")
+        forms = {"aligned": field.aligned, "relative": field.relative, "absolute": field.absolute}
         return {
-            "aligned": size(sizes.aligned),
-            "relative": size(sizes.relative),
-            "absolute": size(sizes.absolute),
+            form: None if size is None else {name: getattr(size, name) for name in names}
+            for form, size in forms.items()
         }
 
     after = accuracy.after
@@ -151,9 +147,9 @@ def accuracy_json(calibration: Calibration, accuracy: ToolAccuracy) -> str:
         "model": calibration.model,
         "points": len(accuracy.workspace.points),
         "box": None if accuracy.workspace.box is None else accuracy.workspace.box.tolist(),
-        "deviation": all_sizes(accuracy.measure(accuracy.deviation)),
-        "offsets_entered": all_sizes(accuracy.measure(accuracy.error_after_offsets)),
-        "uncertainty_before": all_sizes(accuracy.before.sizes),
-        "uncertainty_after": None if after is None else all_sizes(after.sizes),
+        "deviation": sizes(accuracy.measure(accuracy.deviation)),
+        "offsets_entered": sizes(accuracy.measure(accuracy.error_after_offsets)),
+        "uncertainty_before": sizes(accuracy.before.sizes),
+        "uncertainty_after": None if after is None else sizes(after.sizes),
     }
     return json.dumps(document, indent=1, allow_nan=False) + "\n"

@@ -1,4 +1,4 @@
-"""Short answer of a calibration: the decision, what to enter, the tool error, the next step."""
+"""Short answer of a calibration: subject, decision, values to enter, tool error, next step."""
 
 from __future__ import annotations
 
@@ -7,22 +7,35 @@ from pathlib import Path
 
 from rich.console import Group, RenderableType
 from rich.padding import Padding
+from rich.table import Table
 from rich.text import Text
 
-from orthocal.assessment.assess import assessment_of
+from orthocal.assessment.assess import assessment_of, expanded_uncertainty
+from orthocal.assessment.plausibility import describe_legs
 from orthocal.assessment.wording import joined
 from orthocal.assessment.words.entries import describe_compensated
 from orthocal.calibration.assessment_record import (
     Assessment,
+    ControllerEntry,
     Decision,
     Finding,
     FindingKind,
     Verdict,
 )
 from orthocal.calibration.calibration import Calibration
-from orthocal.output.text.entries import short_entry_table
-from orthocal.output.text.heading import render_subject
-from orthocal.output.text.layout import bullets, print_rich
+from orthocal.output.text.layout import (
+    EXPANDED,
+    bullets,
+    counted,
+    list_places,
+    noted,
+    plain,
+    print_rich,
+    short_name,
+    signed,
+    table_of,
+)
+from orthocal.units import DRIVE_UNITS
 
 MOST_LISTED = 4
 """Further findings that the short answer lists."""
@@ -39,6 +52,9 @@ LISTED: tuple[FindingKind, ...] = (
 """Kinds of notes that the short answer lists."""
 
 STYLES: dict[Verdict, str] = {"enter": "bold green", "review": "bold yellow", "reject": "bold red"}
+
+LONGEST_LINE = 150
+"""Characters of a line with names from files, in the short answer."""
 
 MORE = "--details prints all readings, residuals, parameters and tool errors."
 
@@ -58,7 +74,7 @@ def render_answer(
     parts += [_decision(assessment.decision), Text()]
     if assessment.entries and assessment.decision.verdict != "reject":
         parts += [
-            _indented(short_entry_table(calibration)),
+            _indented(entry_table(calibration)),
             *_entry_notes(calibration, assessment),
             Text(),
         ]
@@ -114,10 +130,10 @@ def _tool(calibration: Calibration, assessment: Assessment) -> list[RenderableTy
     if assessment.tool is None:
         unreached = assessment.of_kind("out of reach")
         return [Text(unreached[0].text if unreached else "The tool error is unknown.")]
-    lines = [Text(f.text) for f in assessment.of_kind("tool error")]
+    lines: list[RenderableType] = [Text(f.text) for f in assessment.of_kind("tool error")]
     if not calibration.only_offsets:
         lines.append(Text(describe_compensated(assessment.tool.compensated)))
-    return [*lines]
+    return lines
 
 
 def _listed(calibration: Calibration, assessment: Assessment) -> Sequence[Finding]:
@@ -146,3 +162,131 @@ def _next_step(assessment: Assessment, saved: Path | None) -> str:
 
 def _indented(part: RenderableType) -> RenderableType:
     return Padding(part, (0, 0, 0, 2))
+
+
+def render_subject(calibration: Calibration) -> RenderableType:
+    """Machine and readings of a calibration, in four lines."""
+    title = short_name(calibration.session.title, LONGEST_LINE)
+    return Group(
+        Text(
+            f"Calibration of {calibration.robot_record.name}, model '{calibration.model}'",
+            style="bold",
+        ),
+        *([Text(title)] if title else []),
+        Text(short_name(f"Machine: {describe_machine(calibration)}", LONGEST_LINE)),
+        Text(short_name(_measured(calibration), LONGEST_LINE)),
+    )
+
+
+def render_method(calibration: Calibration, *, effort: bool = True) -> RenderableType:
+    """Source of the readings, model and solver.
+
+    Args:
+        calibration: The calibration.
+        effort: Whether to state iterations and time of the solver.
+    """
+    source, solver = calibration.session.source, calibration.solver
+    with_prior = sum(p.prior for p in calibration.free)
+    prior = "tolerances as prior" if with_prior else "no prior"
+    if 0 < with_prior < len(calibration.free):
+        prior = f"{with_prior} with a prior"
+    kind = "base parameter" if calibration.base else "parameter"
+    loss = ", Huber's loss" if solver.loss == "huber" else ""
+    lines = [f"Source: {source}"] if source else []
+    lines.append(f"Estimated: {counted(len(calibration.free), kind)}, {prior}{loss}")
+    if effort:
+        lines.append(
+            f"Solver: {solver.name}, {solver.status}, {counted(solver.iterations, 'iteration')}, "
+            f"{solver.seconds_build + solver.seconds_solve:.2f} s"
+        )
+    return Group(*map(Text, lines))
+
+
+def _measured(calibration: Calibration) -> str:
+    kind = "difference" if calibration.rows_are_differences else "reading"
+    read = {r.setup for r in calibration.residuals}
+    setups = [s for s in calibration.setups if s.name in read]
+    unread = [s.name for s in calibration.setups if s.name not in read]
+    places = list_places(s.sensor.place for s in setups)
+    used = {name for r in calibration.residuals for name in (r.posture, r.minus) if name}
+    return (
+        f"Measured: {counted(len(calibration.residuals), kind)} in "
+        f"{counted(len(used), 'posture')}, {counted(len(setups), 'setup')} on {places}"
+        + (f"; no reading of {', '.join(unread)}" if unread else "")
+    )
+
+
+def describe_machine(calibration: Calibration) -> str:
+    """Dimensions of the machine: legs and travel."""
+    travel = {}
+    for name, unit, *ends in calibration.robot_record.travel:
+        word, size = DRIVE_UNITS[unit]
+        low, high = ("∞" if v is None else f"{v / size:g}" for v in ends)
+        travel[name] = f"{low} … {high} {word.replace('deg', '°')}".replace("∞ …", "−∞ …")
+    words = []
+    if calibration.robot_record.legs:
+        words.append(describe_legs(dict(calibration.robot_record.legs)))
+    if len(set(travel.values())) == 1:
+        words.append(f"travel {next(iter(travel.values()))}")
+    else:
+        words.append(f"travel {', '.join(f'{n} {t}' for n, t in travel.items())}")
+    return ", ".join(words)
+
+
+def render_values(calibration: Calibration) -> RenderableType:
+    """Meaning of the values to enter, and those that the short answer does not list."""
+    assessment = assessment_of(calibration)
+    if not assessment.entries:
+        return noted(Text("None: no offset was identified."), EXPANDED)
+    complete = assessment.decision.verdict != "reject" and calibration.only_offsets
+    table = entry_table(calibration, identified=not calibration.only_offsets)
+    notes = [_example(calibration, assessment.entries[0])]
+    notes += [f.text for f in assessment.of_kind("controller not stated")]
+    notes.append(EXPANDED)
+    if not calibration.only_offsets:
+        notes.append(
+            "The values to enter minimise the tool error in a controller that corrects nothing "
+            "else: they compensate a part of the other errors. The identified offsets belong to a "
+            "controller that corrects all errors (`orthocal inverse`)."
+        )
+    return noted(Group() if complete else table, *notes)
+
+
+def entry_table(calibration: Calibration, *, identified: bool = False) -> Table:
+    """Values to enter, drive by drive.
+
+    Args:
+        calibration: The calibration.
+        identified: Whether to list the identified offsets, too.
+    """
+    assessment = assessment_of(calibration)
+    enter = "estimate" if assessment.of_kind("no change needed") else "enter"
+    stated = any(e.active is not None for e in assessment.entries)
+    columns = ["now", enter] if stated else ["add" if enter == "enter" else enter]
+    rows = []
+    for e in assessment.entries:
+        factor = e.edge_factor
+        now = [] if e.active is None else [signed(e.active * factor)]
+        estimate = [signed(e.identified * factor)] if identified else []
+        half = e.held or plain(expanded_uncertainty(calibration, e) * factor)
+        rows.append((e.drive, *now, signed(e.enter * factor), half, *estimate, e.edge_unit))
+    headers = ("drive", *columns, "±", *(["identified"] if identified else []), "unit")
+    return table_of(headers, rows)
+
+
+def _example(calibration: Calibration, entry: ControllerEntry) -> str:
+    """Meaning of an offset, by the first drive at its mechanical zero."""
+    drive = next(d for d in calibration.robot.drives if d.name == entry.drive)
+    factor, unit = drive.edge_factor, drive.edge_unit
+    meaning = "Slider coordinate = encoder coordinate + offset"
+    if entry.active is None:
+        return f"{meaning}. Add these values to the present offsets."
+    at, actual = drive.zero * factor, (drive.zero + entry.identified) * factor
+    shown = ""
+    if drive.direction < 0 or drive.joint_zero is not None:
+        joint = float(drive.to_joint(drive.zero)) * factor
+        shown = f" (the controller's joint shows {joint:.3f} {unit})"
+    return (
+        f"{meaning}. With {drive.name}'s encoder at {at:.3f} {unit}{shown}, its slider is at "
+        f"{actual:.3f} {unit}. Enter the complete offset in place of the present one."
+    )

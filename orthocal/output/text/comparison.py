@@ -14,10 +14,10 @@ from orthocal.output.text.layout import (
     MANY_ROWS,
     NOISE_SOURCES,
     WORST_ROWS,
-    add_row,
     bullets,
     counted,
     mm,
+    noted,
     plain,
     section,
     signed,
@@ -46,8 +46,7 @@ def render_comparison(comparison: Comparison, *, all_rows: bool = False) -> Rend
 
 
 def _scores(comparison: Comparison) -> RenderableType:
-    sizes = ("free", "effective", "RMS [mm]", "χ²", "dof", "AICc", "BIC", "ln evidence")
-    table = table_of("model", "", *sizes, "CV [mm]", "tool [µm]", left=2)
+    rows: list[tuple[str, ...]] = []
     for result in comparison.results:
         after = None if result.tool is None else result.tool.after
         checked = result.spare > 0
@@ -62,8 +61,7 @@ def _scores(comparison: Comparison) -> RenderableType:
                 _short(score.aicc if score.dof >= FEWEST_DOF else math.inf),
                 _short(score.bic),
             )
-            add_row(
-                table,
+            row = (
                 result.model if first else "",
                 "linear" if first else "exact",
                 str(result.n_free) if first else "",
@@ -73,15 +71,17 @@ def _scores(comparison: Comparison) -> RenderableType:
                 plain(score.unseen_rms / MM, 4),
                 "" if after is None or first else um(after.sizes.headline.rms),
             )
+            rows.append(row)
     for u in comparison.undetermined:
-        add_row(table, u.model, "", str(u.n_free), "", "not identifiable", *([""] * 8))
-    return Group(
-        table,
-        Text("–: no redundant reading checks this model"),
-        Text("effective: number of parameters that the readings determine"),
-        Text("AICc, BIC: lower is better; ln evidence (0: complete model): higher is better"),
-        Text("CV: cross-validation, RMS error of predicting each setup from all others"),
-        Text("tool: RMS uncertainty after calibration, workpiece aligned on the machine"),
+        rows.append((u.model, "", str(u.n_free), "", "not identifiable", *([""] * 7)))
+    sizes = ("free", "effective", "RMS [mm]", "χ²", "dof", "AICc", "BIC", "ln evidence")
+    return noted(
+        table_of(("model", "", *sizes, "CV [mm]", "tool [µm]"), rows, left=2),
+        "–: no redundant reading checks this model",
+        "effective: number of parameters that the readings determine",
+        "AICc, BIC: lower is better; ln evidence (0: complete model): higher is better",
+        "CV: cross-validation, RMS error of predicting each setup from all others",
+        "tool: RMS uncertainty after calibration, workpiece aligned on the machine",
     )
 
 
@@ -93,7 +93,6 @@ def _estimates(comparison: Comparison, all_rows: bool) -> RenderableType:
     small = [r for r in results if r.n_free <= 12]
     named = {n for r in small for n in r.exact.estimates}
     shown = [n for n in names if all_rows or n in named or n.endswith(".offset")]
-    table = table_of("parameter", "model", "linear", "exact", "±", "unit", left=2)
     parameters = results[0].calibration.robot.parameters
     half = {
         r.model: dict(
@@ -105,6 +104,7 @@ def _estimates(comparison: Comparison, all_rows: bool) -> RenderableType:
         )
         for r in results
     }
+    rows = []
     for name in shown:
         p, first = parameters[name], True
         for r in results:
@@ -113,28 +113,30 @@ def _estimates(comparison: Comparison, all_rows: bool) -> RenderableType:
             linear, exact = (s.estimates[name] for s in (r.linearised, r.exact))
             numbers = [signed(v * p.edge_factor) for v in (linear, exact)]
             spread = plain(half[r.model][name] * p.edge_factor)
-            add_row(table, name if first else "", r.model, *numbers, spread, p.edge_unit)
+            rows.append((name if first else "", r.model, *numbers, spread, p.edge_unit))
             first = False
-    lines: list[RenderableType] = [table, Text(EXPANDED)]
-    if len(shown) < len(names):
-        lines.append(Text(f"{len(names) - len(shown)} more; --all lists every parameter."))
-    return Group(*lines)
+    omitted = len(names) - len(shown)
+    return noted(
+        table_of(("parameter", "model", "linear", "exact", "±", "unit"), rows, left=2),
+        EXPANDED,
+        f"{omitted} more; --all lists every parameter." if omitted else "",
+    )
 
 
 def _residuals(comparison: Comparison, all_rows: bool) -> RenderableType:
     results = comparison.results
     if not results:
         return Text("No model is identifiable.")
-    table = table_of("reading", *(f"{r.model} [mm]" for r in results))
     order: Sequence[int] = range(len(comparison.labels))
     note = ""
     if len(comparison.labels) > MANY_ROWS and not all_rows:
         largest = [max(abs(r.exact.residuals[i]) for r in results) for i in order]
         order = sorted(order, key=lambda i: -largest[i])[:WORST_ROWS]
         note = f"The {WORST_ROWS} largest of {len(comparison.labels)}; --all lists every reading."
-    for i in order:
-        add_row(table, comparison.labels[i], *(signed(r.exact.residuals[i] / MM) for r in results))
-    return Group(table, Text(note)) if note else table
+    rows = [
+        (comparison.labels[i], *(signed(r.exact.residuals[i] / MM) for r in results)) for i in order
+    ]
+    return noted(table_of(("reading", *(f"{r.model} [mm]" for r in results)), rows), note)
 
 
 FEWEST_DOF = 3.0

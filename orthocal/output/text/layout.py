@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import groupby
 
 from rich import box
@@ -183,20 +183,25 @@ def bullets(sentences: list[str]) -> RenderableType:
     return Group(*(Text(f"{BULLET}{s}") for s in sentences))
 
 
-def table_of(*columns: str, left: int = 1) -> Table:
-    """A table with a rule under its header; columns after the first are numbers."""
+def noted(body: RenderableType, *notes: str) -> RenderableType:
+    """A table with notes below it; empty notes are left out."""
+    return Group(body, *(Text(note) for note in notes if note))
+
+
+def table_of(headers: Sequence[str], rows: Iterable[Sequence[str]], *, left: int = 1) -> Table:
+    """A table with a rule under its header; columns after the first `left` are numbers.
+
+    Cells are plain text: names come from files, and are not markup.
+    """
     table = NumberTable(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
-    for i, column in enumerate(columns):
-        word = i < left or column == "unit"
+    for i, header in enumerate(headers):
+        word = i < left or header == "unit"
         table.add_column(
-            Text(column), justify="left" if word else "right", overflow="fold", no_wrap=i >= left
+            Text(header), justify="left" if word else "right", overflow="fold", no_wrap=i >= left
         )
+    for row in rows:
+        table.add_row(*(Text(printable(cell)) for cell in row))
     return table
-
-
-def add_row(table: Table, *cells: str) -> None:
-    """Add a row of plain text: names come from files, and are not markup."""
-    table.add_row(*(Text(printable(cell)) for cell in cells))
 
 
 def _plain(cell: RenderableType) -> str:
@@ -218,37 +223,37 @@ def true_minus(text: str) -> str:
     return text.replace("-", "−")
 
 
-def choose_rows(
-    rows: tuple[ResidualRow, ...],
-    all_rows: bool,
-    *,
-    key: Callable[[ResidualRow], float] = lambda r: abs(r.residual),
-) -> tuple[Iterable[ResidualRow], str]:
-    """All rows, or the worst of many with a note."""
-    if all_rows or len(rows) <= MANY_ROWS:
-        return rows, ""
-    worst = sorted(rows, key=key, reverse=True)[:WORST_ROWS]
-    return worst, f"The {WORST_ROWS} largest of {len(rows)}; --all lists every reading."
-
-
 def residual_table(
-    rows: Iterable[ResidualRow],
+    residuals: Sequence[ResidualRow],
     columns: Mapping[str, Callable[[ResidualRow], str]],
-    *,
-    cycles: bool,
-) -> Table:
-    """A table of readings.
+    *notes: str,
+    all_rows: bool,
+    key: Callable[[ResidualRow], float] = lambda r: abs(r.residual),
+) -> RenderableType:
+    """A table of readings, the worst of many or all, with notes.
 
     Args:
-        rows: The readings.
+        residuals: The readings.
         columns: Headers of the columns with numbers, and their cells.
-        cycles: Whether to list the cycle of each reading.
+        notes: Notes below the table.
+        all_rows: Whether to list all.
+        key: Size by which the worst are chosen.
     """
-    table = table_of("setup", "posture", *(["cycle"] if cycles else []), *columns, left=2)
-    for r in rows:
-        names = (r.setup, r.postures, *([str(r.cycle)] if cycles else []))
-        add_row(table, *names, *(cell(r) for cell in columns.values()))
-    return table
+    cycles = any(r.cycle != 1 for r in residuals)
+    rows, note = residuals, ""
+    if len(residuals) > MANY_ROWS and not all_rows:
+        rows = sorted(residuals, key=key, reverse=True)[:WORST_ROWS]
+        note = f"The {WORST_ROWS} largest of {len(residuals)}; --all lists every reading."
+    cells = [
+        (
+            *(r.setup, r.postures),
+            *([str(r.cycle)] if cycles else []),
+            *(cell(r) for cell in columns.values()),
+        )
+        for r in rows
+    ]
+    headers = ("setup", "posture", *(["cycle"] if cycles else []), *columns)
+    return noted(table_of(headers, cells, left=2), *notes, note)
 
 
 def short_name(text: str, longest: int = LONGEST_NAME) -> str:

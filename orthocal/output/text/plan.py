@@ -12,7 +12,7 @@ from rich.text import Text
 
 from orthocal.kinematics.workspace import find_workspace
 from orthocal.output.text.accuracy import describe_remaining
-from orthocal.output.text.layout import add_row, bullets, counted, plain, section, table_of
+from orthocal.output.text.layout import bullets, counted, plain, section, table_of
 from orthocal.planning.cost_curve import ENOUGH, HOUR, Stage
 from orthocal.planning.expected_error import Criterion, Expected
 from orthocal.planning.plan import MeasuringPlan
@@ -223,26 +223,19 @@ def _when_enough(plan: MeasuringPlan) -> str:
 
 
 def _alternatives(plan: MeasuringPlan, closing: int) -> RenderableType:
-    table = table_of("plan", "setups", "readings", "time", "tool error [µm]", "absolute [µm]")
     s = plan.session
-    add_row(
-        table,
-        "this one",
-        str(len(s.setups)),
-        f"{len(s.readings) - closing} + {closing}",
-        show_duration(plan.minutes),
-        show_um(plan.expected),
-        plain(plan.expected.sizes.absolute.rms / UM, 0),
-    )
-    for a in plan.compared:
+    read = len(s.readings) - closing
+    this = Alternative("this one", len(s.setups), read, plan.minutes, plan.expected)
+    rows = []
+    for a in (this, *plan.compared):
         absolute, error = "", OUT_OF_RANGE
         if a.expected is not None:
             absolute = plain(a.expected.sizes.absolute.rms / UM, 0)
             error = show_um(a.expected)
-        add_row(
-            table, a.name, str(a.setups), str(a.readings), show_duration(a.minutes), error, absolute
-        )
-    return table
+        count = f"{read} + {closing}" if a is this else str(a.readings)
+        rows.append((a.name, str(a.setups), count, show_duration(a.minutes), error, absolute))
+    headers = ("plan", "setups", "readings", "time", "tool error [µm]", "absolute [µm]")
+    return table_of(headers, rows)
 
 
 def _helps(plan: MeasuringPlan) -> list[str]:
@@ -267,11 +260,13 @@ def _helps(plan: MeasuringPlan) -> list[str]:
 
 def _setups(plan: MeasuringPlan) -> RenderableType:
     s = plan.session
-    table = table_of("setup", "gauge", "postures", left=3)
-    for setup in list(s.setups.values())[:MOST_LISTED]:
-        postures = [r.posture for r in s.readings if r.setup == setup.name]
-        add_row(table, setup.name, setup.sensor.describe(), " ".join(postures))
-    more = len(s.setups) - MOST_LISTED
-    if more <= 0:
-        return table
-    return Group(table, Padding(Text(f"and {more} more"), (0, 0, 0, 2)))
+    rows = [
+        (
+            setup.name,
+            setup.sensor.describe(),
+            " ".join(r.posture for r in s.readings if r.setup == setup.name),
+        )
+        for setup in list(s.setups.values())[:MOST_LISTED]
+    ]
+    table, more = table_of(("setup", "gauge", "postures"), rows, left=3), len(s.setups) - len(rows)
+    return Group(table, Padding(Text(f"and {more} more"), (0, 0, 0, 2))) if more else table

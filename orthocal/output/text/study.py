@@ -13,14 +13,14 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from orthocal.kinematics.workspace import describe_box
-from orthocal.output.text.layout import add_row, counted, plain, section, table_of
+from orthocal.output.text.layout import counted, noted, plain, section, table_of
 from orthocal.study.accuracy import (
     AccuracyStudy,
     AccuracySummary,
     EstimationError,
     summarise_accuracy,
 )
-from orthocal.study.bootstrap import BootstrapSummary, summarise_bootstrap
+from orthocal.study.bootstrap import BootstrapSummary, Scatter, summarise_bootstrap
 from orthocal.study.linearisation import (
     LinearisationSummary,
     MethodErrors,
@@ -54,29 +54,25 @@ METHOD_NAMES = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ReportTable:
-    """A table of a report."""
-
-    title: str
-    header: tuple[str, ...]
-    rows: Sequence[Sequence[str]]
-    left: int = 1
-    """Number of left-aligned columns."""
-    omitted: str = ""
-    """Sentence about rows or columns that are not listed."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class StudyReport:
     """Answer, tables, plot and plain data of a study."""
 
+    kind: str
+    """Kind of the study."""
     answer: str
-    tables: tuple[ReportTable, ...]
-    draw: Callable[[], str]
-    """Function that draws the plot as an SVG file."""
+    tables: tuple[RenderableType, ...]
+    """Tables with their titles."""
+    plotted: tuple[Any, ...]
+    """Arguments of the plot."""
     document: dict[str, Any]
     """Summary as plain data."""
     notes: tuple[str, ...] = ()
+
+    def draw(self) -> str:
+        """Draw the plot as an SVG file."""
+        from orthocal.output.report.study_plots import PLOTS
+
+        return PLOTS[self.kind].document(*self.plotted)
 
 
 def report_study(table: StudyTable, *, all_rows: bool = False) -> StudyReport:
@@ -109,31 +105,34 @@ def study_json(table: StudyTable, report: StudyReport) -> str:
 
 def render_report(report: StudyReport) -> RenderableType:
     """A report as text, the answer first."""
-    parts: list[RenderableType] = [Text(report.answer, style="bold")]
-    for table in report.tables:
-        body = table_of(*table.header, left=table.left)
-        for row in table.rows:
-            add_row(body, *row)
-        parts.append(section(table.title, body))
-        if table.omitted:
-            parts.append(Text(table.omitted))
-    return Group(*parts, *map(Text, report.notes))
+    return Group(Text(report.answer, style="bold"), *report.tables, *map(Text, report.notes))
+
+
+def _parameters(
+    estimates: Sequence[EstimationError | Scatter], names: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Name and unit of each parameter, and attributes of its estimate in this unit."""
+    return [
+        {
+            "name": e.parameter.name,
+            "unit": e.parameter.edge_unit,
+            **{name: float(getattr(e, name) * e.parameter.edge_factor) for name in names},
+        }
+        for e in estimates
+    ]
 
 
 def _accuracy(table: StudyTable, all_rows: bool) -> StudyReport:
     study: Any = table.study
     s = summarise_accuracy(study, table)
-    predicted = {name: math.nan for name in ("aligned_um", "shift_out_um", "absolute_um")}
+    predicted = dict.fromkeys(("aligned_um", "shift_out_um", "absolute_um"), math.nan)
     if s.predicted is not None:
         sizes = s.predicted.sizes
         values = (s.predicted.headline.rms, sizes.relative.rms, sizes.absolute.rms)
         predicted = {name: v / UM for name, v in zip(predicted, values, strict=True)}
-    parameters = []
-    for e in s.parameters:
-        f, unit = e.parameter.edge_factor, e.parameter.edge_unit
-        std = {"rms": e.rms * f, "standard_error": e.standard_error * f}
-        std["predicted"] = e.predicted * f
-        parameters.append({"name": e.parameter.name, "unit": unit, **std, "relative": e.relative})
+    parameters = _parameters(s.parameters, ("rms", "standard_error", "predicted"))
+    for row, e in zip(parameters, s.parameters, strict=True):
+        row["relative"] = e.relative
     document = {
         "machines": s.machines,
         "failed": dict(s.failed),
@@ -147,20 +146,15 @@ def _accuracy(table: StudyTable, all_rows: bool) -> StudyReport:
         "predicted": None if s.predicted is None else predicted,
         "parameters": parameters,
     }
-    tables: tuple[ReportTable, ...] = ()
+    tables: tuple[RenderableType, ...] = ()
     if s.machines:
-        tables = (_tool_table(s, predicted), _estimate_table(s.parameters, all_rows))
-    notes = [
+        tables = (_tool_table(s, predicted), _estimate_table(parameters, all_rows))
+    notes = tuple(
         f"Not calibrated: {counted(n, 'machine')} ({reason})." for reason, n in s.failed.items()
-    ]
-    answer = _accuracy_answer(study, s, predicted["aligned_um"] * UM)
-
-    def draw() -> str:
-        from orthocal.output.report.study_plots import plot_machines
-
-        return plot_machines.document(table, predicted["aligned_um"])
-
-    return StudyReport(answer, tables, draw, document, tuple(notes))
+    )
+    aligned = predicted["aligned_um"]
+    answer = _accuracy_answer(study, s, aligned * UM)
+    return StudyReport("accuracy", answer, tables, (table, aligned), document, notes)
 
 
 def _accuracy_answer(study: AccuracyStudy, s: AccuracySummary, predicted: float) -> str:
@@ -184,7 +178,7 @@ def _accuracy_answer(study: AccuracyStudy, s: AccuracySummary, predicted: float)
     return " ".join(sentences)
 
 
-def _tool_table(s: AccuracySummary, predicted: dict[str, float]) -> ReportTable:
+def _tool_table(s: AccuracySummary, predicted: dict[str, float]) -> RenderableType:
     aligned, shift, absolute = (_um(v * UM) for v in predicted.values())
     rows = (
         ("aligned", _um(s.before), _um(s.after), _um(s.standard_error), aligned),
@@ -193,41 +187,47 @@ def _tool_table(s: AccuracySummary, predicted: dict[str, float]) -> ReportTable:
         ("worst point, aligned", "", _um(s.worst_point), "", ""),
     )
     header = ("[µm]", "before", "after", "std. error", "predicted")
-    return ReportTable("Tool error, RMS", header, rows)
+    return section("Tool error, RMS", table_of(header, rows))
 
 
-def _estimate_table(errors: tuple[EstimationError, ...], all_rows: bool) -> ReportTable:
-    shown = errors if all_rows else errors[:MOST_ROWS]
-    rows = []
-    for e in shown:
-        f = e.parameter.edge_factor
-        values = [_number(v * f) for v in (e.rms, e.standard_error, e.predicted)]
-        relative = f"{100.0 * e.relative:.0f} %"
-        rows.append((e.parameter.name, *values, relative, e.parameter.edge_unit))
+def _estimate_table(parameters: Sequence[dict[str, Any]], all_rows: bool) -> RenderableType:
+    shown = parameters if all_rows else parameters[:MOST_ROWS]
+    rows = [
+        (
+            p["name"],
+            *(_number(p[name]) for name in ("rms", "standard_error", "predicted")),
+            f"{100.0 * p['relative']:.0f} %",
+            p["unit"],
+        )
+        for p in shown
+    ]
     header = ("parameter", "error", "std. error", "predicted", "of its prior", "unit")
     omitted = ""
-    if len(shown) < len(errors):
-        omitted = f"The {len(shown)} least certain of {len(errors)}; --all lists all."
-    return ReportTable("Errors of the estimates, RMS", header, rows, omitted=omitted)
+    if len(shown) < len(parameters):
+        omitted = f"The {len(shown)} least certain of {len(parameters)}; --all lists all."
+    return section("Errors of the estimates, RMS", noted(table_of(header, rows), omitted))
 
 
 def _bootstrap(table: StudyTable, all_rows: bool) -> StudyReport:
     s = summarise_bootstrap(table.study, table)  # type: ignore[arg-type] # by its kind
-    shown = s.parameters if all_rows else s.parameters[:MOST_ROWS]
-    rows, parameters = [], []
-    for p in s.parameters:
-        f, unit = p.parameter.edge_factor, p.parameter.edge_unit
-        names = ("estimate", "std", "standard_error", "low", "high", "predicted", "total_std")
-        v = {name: float(getattr(p, name) * f) for name in names}
-        parameters.append({"name": p.parameter.name, "unit": unit, **v})
-        stds = (_number(v[name]) for name in ("std", "predicted"))
-        interval = f"{v['low']:+.3f} … {v['high']:+.3f}"
-        total = _number(v["total_std"])
-        rows.append((p.parameter.name, f"{v['estimate']:+.3f}", *stds, interval, total, unit))
+    names = ("estimate", "std", "standard_error", "low", "high", "predicted", "total_std")
+    parameters = _parameters(s.parameters, names)
+    shown = parameters if all_rows else parameters[:MOST_ROWS]
+    rows = [
+        (
+            p["name"],
+            f"{p['estimate']:+.3f}",
+            *(_number(p[name]) for name in ("std", "predicted")),
+            f"{p['low']:+.3f} … {p['high']:+.3f}",
+            _number(p["total_std"]),
+            p["unit"],
+        )
+        for p in shown
+    ]
     header = ("parameter", "estimate", "std", "predicted std", "95 % of draws", "total std", "unit")
     omitted = ""
-    if len(shown) < len(rows):
-        omitted = f"The first {len(shown)} of {len(rows)}; --all lists all."
+    if len(shown) < len(parameters):
+        omitted = f"The first {len(shown)} of {len(parameters)}; --all lists all."
     notes = (
         "std and predicted std: by noise alone. Total std: with the prior, but without errors "
         "that are not identified.",
@@ -238,14 +238,8 @@ def _bootstrap(table: StudyTable, all_rows: bool) -> StudyReport:
         "fewest_cycles": s.fewest_cycles,
         "parameters": parameters,
     }
-    tables = (ReportTable("Estimates", header, rows[: len(shown)], omitted=omitted),)
-
-    def draw() -> str:
-        from orthocal.output.report.study_plots import plot_bootstrap
-
-        return plot_bootstrap.document(s)
-
-    return StudyReport(_bootstrap_answer(s), tables, draw, document, notes)
+    tables = (section("Estimates", noted(table_of(header, rows), omitted)),)
+    return StudyReport("bootstrap", _bootstrap_answer(s), tables, (s,), document, notes)
 
 
 def _bootstrap_answer(s: BootstrapSummary) -> str:
@@ -276,16 +270,23 @@ def _linearisation(table: StudyTable, all_rows: bool) -> StudyReport:
     steps = (str(s.steps[i] or "none") for i in chosen)
     errors.append(("Gauss-Newton steps to convergence", *steps))
     limits = [
-        (METHOD_NAMES[m.name], *("-" if v is None else f"{v:.3g}" for v in _limits(m)))
+        (
+            METHOD_NAMES[m.name],
+            *(
+                "-" if size is None else f"{size:.3g}"
+                for size in (m.exceeds_resolution, m.exceeds_noise, m.fails)
+            ),
+        )
         for m in s.methods
     ]
     sizes = tuple(f"{s.sizes[i]:.3g}" for i in chosen)
     limit_header = ("smallest size", "error > resolution", "error > standard error", "fails")
     tables = (
-        ReportTable(
-            "Error of the estimates, RMS over directions [mm]", ("size [mm]", *sizes), errors
+        section(
+            "Error of the estimates, RMS over directions [mm]",
+            table_of(("size [mm]", *sizes), errors),
         ),
-        ReportTable("Limits of the methods [mm]", limit_header, limits),
+        section("Limits of the methods [mm]", table_of(limit_header, limits)),
     )
     document = {
         "sizes_mm": s.sizes.tolist(),
@@ -305,17 +306,8 @@ def _linearisation(table: StudyTable, all_rows: bool) -> StudyReport:
             for m in s.methods
         ],
     }
-
-    def draw() -> str:
-        from orthocal.output.report.study_plots import plot_linearisation
-
-        return plot_linearisation.document(s, METHOD_NAMES)
-
-    return StudyReport(_linearisation_answer(s), tables, draw, document)
-
-
-def _limits(m: MethodErrors) -> tuple[float | None, ...]:
-    return m.exceeds_resolution, m.exceeds_noise, m.fails
+    answer = _linearisation_answer(s)
+    return StudyReport("linearisation", answer, tables, (s, METHOD_NAMES), document)
 
 
 def _linearisation_answer(s: LinearisationSummary) -> str:
@@ -365,14 +357,13 @@ def _sensitivity(table: StudyTable, all_rows: bool) -> StudyReport:
         for (posture, output), row in zip(s.rows, s.derivatives, strict=True)
     ]
     units = ", ".join(sorted({s.units[i] for i in shown}))
-    derivatives = ReportTable(
+    omitted = f"The {len(shown)} most influential of {count} errors; --all lists all."
+    derivatives = section(
         f"First derivatives at the nominal machine [{units}]",
-        ("posture", "output", *(s.parameters[i] for i in shown)),
-        rows,
-        left=2,
-        omitted=""
-        if len(shown) == count
-        else f"The {len(shown)} most influential of {count} errors; --all lists all.",
+        noted(
+            table_of(("posture", "output", *(s.parameters[i] for i in shown)), rows, left=2),
+            omitted if len(shown) < count else "",
+        ),
     )
     document = {
         "parameters": [{"name": n, "unit": u} for n, u in zip(s.parameters, s.units, strict=True)],
@@ -388,13 +379,7 @@ def _sensitivity(table: StudyTable, all_rows: bool) -> StudyReport:
             )
         ],
     }
-
-    def draw() -> str:
-        from orthocal.output.report.study_plots import plot_sensitivity
-
-        return plot_sensitivity.document(s)
-
-    return StudyReport(_sensitivity_answer(s), (derivatives,), draw, document)
+    return StudyReport("sensitivity", _sensitivity_answer(s), (derivatives,), (s,), document)
 
 
 def _sensitivity_answer(s: SensitivitySummary) -> str:

@@ -13,7 +13,7 @@ from orthocal.arguments import require_kind
 from orthocal.assessment.assess import assessment_of
 from orthocal.calibration.assessment_record import Assessment
 from orthocal.calibration.calibration import Calibration
-from orthocal.output.text.answer import MORE, render_answer
+from orthocal.output.text.answer import MORE, render_answer, render_method, render_values
 from orthocal.output.text.layout import print_rich, section, to_markup, to_text
 
 if TYPE_CHECKING:
@@ -98,8 +98,6 @@ def render_calibration(
         return Group(answer, Text(MORE))
     from orthocal.output.text import tables
     from orthocal.output.text.accuracy import render_tool
-    from orthocal.output.text.entries import render_values
-    from orthocal.output.text.heading import render_method
 
     sections: dict[str, RenderableType | None] = {
         "Method": render_method(calibration),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from rich.console import Group, RenderableType
 from rich.text import Text
@@ -12,13 +13,13 @@ from orthocal.assessment.fit_findings import find_held, find_unresolved
 from orthocal.assessment.words.fit import FEW_NAMES
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
+from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.output.text.layout import (
     NOISE_SOURCES,
-    add_row,
     bullets,
-    choose_rows,
     counted,
     mm,
+    noted,
     plain,
     residual_table,
     signed,
@@ -54,7 +55,7 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
     by_noise = all_rows and any(p.std_scatter < p.std for p in c.free)
     in_std = c.solver.tells_linearisation and not profiled
     shifts = in_std and not prior
-    table = table_of(
+    headers = (
         "parameter",
         *(["linearised"] if linear else ["linear", "exact"]),
         "±",
@@ -66,17 +67,14 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
         "unit",
     )
     few = all_rows or len(c.free) <= MANY_PARAMETERS
-    listed = [
-        (p, half)
-        for p, half in zip(c.free, c.expanded_uncertainties.tolist(), strict=True)
-        if few or _is_listed(p)
-    ]
-    for p, half in listed:
+    rows = []
+    for p, half in zip(c.free, c.expanded_uncertainties.tolist(), strict=True):
+        if not (few or _is_listed(p)):
+            continue
         f, shift = p.edge_factor, p.value - p.linear
         noise = float(expanded_uncertainty(p.std_scatter, p.std_scatter, dof=c.dof))
         resolved = f"{p.data_share:.0%}" if math.isfinite(p.data_share) else ""
-        add_row(
-            table,
+        row = (
             p.name,
             *([] if linear else [signed(p.linear * f)]),
             signed(p.value * f),
@@ -88,10 +86,12 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
             *([f"{shift / p.std:+.3f}" if p.std > 0.0 else ""] if in_std else []),
             p.edge_unit,
         )
-    return Group(table, *_parameter_notes(c, omitted=len(c.free) - len(listed), by_noise=by_noise))
+        rows.append(row)
+    notes = _parameter_notes(c, omitted=len(c.free) - len(rows), by_noise=by_noise)
+    return noted(table_of(headers, rows), *notes)
 
 
-def _parameter_notes(c: Calibration, *, omitted: int, by_noise: bool) -> list[RenderableType]:
+def _parameter_notes(c: Calibration, *, omitted: int, by_noise: bool) -> list[str]:
     """Sentences under the table of the parameters."""
     notes = []
     if omitted:
@@ -110,7 +110,7 @@ def _parameter_notes(c: Calibration, *, omitted: int, by_noise: bool) -> list[Re
         listed = ", ".join(f"{a} with {b} {r:+.2f}" for a, b, r in pairs[:MOST_PAIRS])
         more = f", and {len(pairs) - MOST_PAIRS} more" if len(pairs) > MOST_PAIRS else ""
         notes.append(f"Correlations above 0.5: {listed}{more}")
-    return [Text(note) for note in notes]
+    return notes
 
 
 def _is_listed(p: ParameterEstimate) -> bool:
@@ -190,21 +190,6 @@ def render_readings(
     residuals = calibration.residuals
     if worst_first:
         residuals = tuple(sorted(residuals, key=lambda r: -max(abs(r.deviation), abs(r.residual))))
-    rows, note = choose_rows(residuals, all_rows)
-    table = residual_table(
-        rows,
-        {
-            "measured [mm]": lambda r: signed(r.measured / MM),
-            "before [mm]": lambda r: signed(r.deviation / MM),
-            "after [mm]": lambda r: signed(r.residual / MM),
-            "in σ": lambda r: _ratio(r.residual, noise * (math.sqrt(2.0) if r.minus else 1.0)),
-            "studentised": lambda r: (
-                f"{r.studentised:+.1f}" if math.isfinite(r.studentised) else ""
-            ),
-            "influence": lambda r: f"{r.influence:.1f}",
-        },
-        cycles=any(r.cycle != 1 for r in residuals),
-    )
     notes = [
         "before, after: measured less nominal, measured less calibrated",
         "studentised: deviation from the prediction by all other readings, in its σ; influence: "
@@ -212,7 +197,15 @@ def render_readings(
     ]
     if not calibration.rows_are_differences:
         notes[0] += ", each with its best gauge zeros"
-    return Group(table, *(Text(n) for n in (*notes, note) if n))
+    columns: dict[str, Callable[[ResidualRow], str]] = {
+        "measured [mm]": lambda r: signed(r.measured / MM),
+        "before [mm]": lambda r: signed(r.deviation / MM),
+        "after [mm]": lambda r: signed(r.residual / MM),
+        "in σ": lambda r: _ratio(r.residual, noise * (math.sqrt(2.0) if r.minus else 1.0)),
+        "studentised": lambda r: f"{r.studentised:+.1f}" if math.isfinite(r.studentised) else "",
+        "influence": lambda r: f"{r.influence:.1f}",
+    }
+    return residual_table(residuals, columns, *notes, all_rows=all_rows)
 
 
 def _ratio(value: float, std: float) -> str:
@@ -222,13 +215,13 @@ def _ratio(value: float, std: float) -> str:
 def render_fit(calibration: Calibration) -> RenderableType:
     """RMS and largest deviation before and after calibration, and the noise."""
     c, noise = calibration, calibration.noise
-    table = table_of("", "before", "after", "")
+    rows = []
     for name, before, after in (
         ("RMS [mm]", c.rms_before, c.rms_after),
         ("largest [mm]", c.largest_before, c.largest_after),
     ):
         change = f"{after / before - 1.0:+.0%}" if before > NOTHING else ""
-        add_row(table, name, mm(before), mm(after), change)
+        rows.append((name, mm(before), mm(after), change))
     row = "a difference" if c.rows_are_differences else "a reading"
     dof = "" if math.isinf(c.dof) else f", {c.dof:.3g} degrees of freedom"
     text = f"σ of {row}: {mm(c.sigma)} mm, {NOISE_SOURCES[noise.source]}{dof}"
@@ -245,27 +238,27 @@ def render_fit(calibration: Calibration) -> RenderableType:
         if c.rows_are_differences:
             text += f", {mm(c.session.gauge_sigma * math.sqrt(2.0))} mm a difference"
         lines.append(text)
-    return Group(table, *map(Text, lines))
+    return noted(table_of(("", "before", "after", ""), rows), *lines)
 
 
 def render_sensors(calibration: Calibration) -> RenderableType | None:
     """Noise of several gauges, and nuisance parameters; None if there is neither."""
     parts: list[RenderableType] = []
     if len(calibration.gauges) > 1:
-        table = table_of("gauge", "readings", "σ stated", "σ estimated", "unit")
-        for gauge in calibration.gauges:
-            stated = "" if gauge.sigma is None else mm(gauge.sigma)
-            add_row(table, gauge.name, str(gauge.readings), stated, mm(gauge.noise), "mm")
+        rows = [
+            (g.name, str(g.readings), "" if g.sigma is None else mm(g.sigma), mm(g.noise), "mm")
+            for g in calibration.gauges
+        ]
+        table = table_of(("gauge", "readings", "σ stated", "σ estimated", "unit"), rows)
         note = "Weights are by σ estimated: from repeated cycles, else from the residuals."
-        parts += [table, Text(note)]
+        parts.append(noted(table, note))
     if calibration.sensors:
-        table = table_of("nuisance parameter", "estimate", "±", "tolerance", "unit")
+        rows = []
         for p in calibration.sensors:
             half = float(expanded_uncertainty(p.std, p.std_scatter, dof=calibration.dof))
-            values = (
-                signed(p.value * p.edge_factor),
-                *(plain(v * p.edge_factor) for v in (half, show_limit(p.prior_std))),
-            )
-            add_row(table, p.name, *values, p.edge_unit)
-        parts += [table, Text("Estimated together with the errors of the machine.")]
+            f = p.edge_factor
+            limits = (plain(half * f), plain(show_limit(p.prior_std) * f))
+            rows.append((p.name, signed(p.value * f), *limits, p.edge_unit))
+        table = table_of(("nuisance parameter", "estimate", "±", "tolerance", "unit"), rows)
+        parts.append(noted(table, "Estimated together with the errors of the machine."))
     return Group(*parts) if parts else None

@@ -7,11 +7,9 @@ from rich.text import Text
 
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.validation import Validation
-from orthocal.output.text.entries import short_entry_table
+from orthocal.output.text.answer import entry_table
 from orthocal.output.text.layout import (
-    add_row,
     bullets,
-    choose_rows,
     mm,
     residual_table,
     section,
@@ -32,27 +30,25 @@ def render_validation(validation: Validation, *, all_rows: bool = False) -> Rend
         section("Interpretation", bullets([verdict, *findings])),
     ]
     if validation.mistake is not None and validation.enter:
-        enter = table_of("drive", "enter", "unit")
-        for entry in validation.enter:
-            add_row(enter, entry.drive, signed(entry.enter * entry.edge_factor), entry.edge_unit)
-        parts.append(section("Values to enter", enter))
-    table = table_of("", "predicted", "measured", "after a refit")
+        rows = [(e.drive, signed(e.enter * e.edge_factor), e.edge_unit) for e in validation.enter]
+        parts.append(section("Values to enter", table_of(("drive", "enter", "unit"), rows)))
     rms = (validation.expected_rms, refit.rms_before, refit.rms_after)
     largest = (validation.expected_largest, refit.largest_before, refit.largest_after)
-    for name, values in (("RMS [mm]", rms), ("largest [mm]", largest)):
-        add_row(table, name, *(mm(v) for v in values))
-    parts.append(section("Deviations with the calibrated offsets active", table))
+    deviations = table_of(
+        ("", "predicted", "measured", "after a refit"),
+        [("RMS [mm]", *map(mm, rms)), ("largest [mm]", *map(mm, largest))],
+    )
+    parts.append(section("Deviations with the calibrated offsets active", deviations))
     if assessment_of(refit).entries:
-        parts.append(section("Offsets of a refit", short_entry_table(refit)))
-    rows, note = choose_rows(refit.residuals, all_rows, key=lambda r: abs(r.deviation))
+        parts.append(section("Offsets of a refit", entry_table(refit)))
     readings = residual_table(
-        rows,
+        refit.residuals,
         {
             "deviation [mm]": lambda r: signed(r.deviation / MM),
             "after a refit [mm]": lambda r: signed(r.residual / MM),
         },
-        cycles=any(r.cycle != 1 for r in refit.residuals),
+        all_rows=all_rows,
+        key=lambda r: abs(r.deviation),
     )
-    listed = Group(readings, Text(note)) if note else readings
-    parts.append(section("Readings of the new session", listed))
+    parts.append(section("Readings of the new session", readings))
     return Group(*parts)

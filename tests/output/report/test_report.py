@@ -18,7 +18,7 @@ from orthocal.assessment.words.entries import describe_compensated, describe_too
 from orthocal.calibration.file import write_calibration
 from orthocal.io.html import items, paragraph, table
 from orthocal.output.report.page import _provenance, build_report
-from orthocal.output.text.layout import add_row, bullets, section, table_of, to_markup
+from orthocal.output.text.layout import bullets, section, table_of, to_markup
 
 EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)> & $x_{$'
 
@@ -283,8 +283,7 @@ def test_pieces_of_html_are_escaped():
 
 
 def test_rich_renderables_become_html():
-    printed = table_of("name", "value", "unit")
-    add_row(printed, "[b]x[/b]", "1", "mm")
+    printed = table_of(("name", "value", "unit"), [("[b]x[/b]", "1", "mm")])
     content = Group(
         section("T", Group(Text("before"), printed)), bullets(["one", "two"]), Text("end")
     )
