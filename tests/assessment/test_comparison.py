@@ -14,6 +14,7 @@ from orthocal.assessment.comparison import compare_models
 from orthocal.assessment.recommendation import STRONG
 from orthocal.errors import ParameterError
 from orthocal.estimation.fit import fit_problem
+from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.statistics.zeros import project_out_zeros
@@ -33,9 +34,16 @@ def cycles(raw_cycles):
 
 
 @pytest.fixture(scope="module")
+def workshop(root):
+    return compare_models(root / "examples/workshop", models=["offsets", "full"])
+
+
+@pytest.fixture(scope="module")
 def lines(root):
     session = load_session(root / "tests/sessions/lines")
-    return compare_models(session, models=["offsets", "full"], tolerances=OFFSETS)
+    # the same optima as Ipopt's (`test_solvers`), in less time
+    quick = SolverOptions("variable-projection")
+    return compare_models(session, models=["offsets", "full"], tolerances=OFFSETS, options=quick)
 
 
 def test_the_complete_model_is_recommended_for_table_1(table1):
@@ -57,6 +65,29 @@ def test_the_complete_model_is_recommended_for_table_1(table1):
     assert found.of_kind("repetition unknown")  # no reading is left to check it
 
 
+RECOMMENDED = {
+    "table1": ("full", -117.1),
+    "cycles": ("offsets", 11.8),
+    "workshop": ("full", -43.8),
+}
+"""Recommended model, and ln evidence of offsets against the complete model at the stated noise."""
+
+
+@pytest.mark.parametrize("name", RECOMMENDED)
+def test_one_recommendation_for_calibrate_and_compare(name, request, root):
+    examples = {"table1": "table1/experiment-2", "cycles": "raw-cycles"}
+    compared = request.getfixturevalue(name)
+    model, evidence = RECOMMENDED[name]
+    assert compared.recommendation.model == model
+    assert compared.recommendation.of("offsets") == pytest.approx(evidence, abs=0.5)
+    session = load_session(root / "examples" / examples.get(name, name))
+    calibration = calibrate(session, solver="variable-projection")
+    (first,) = compared.assessment.of_kind("recommended")
+    (second,) = calibration.assessment.of_kind("recommended")
+    assert model in first.text
+    assert model in second.text
+
+
 def test_residuals_of_offsets_repeat(root, experiment_2):
     again = load_session(root / "examples/table1/experiment-3")
     found = compare_models(experiment_2, models=["offsets"], repeat=again)
@@ -69,9 +100,8 @@ def test_residuals_of_offsets_repeat(root, experiment_2):
     assert excess.numbers["ratio"] == pytest.approx(9.8, abs=0.05)
 
 
-def test_the_tool_error_is_that_of_calibrate(raw_cycles):
-    compared = compare_models(raw_cycles, models=["offsets", "full"])
-    calibration = calibrate(raw_cycles, compared.best.model)
+def test_the_tool_error_is_that_of_calibrate(raw_cycles, cycles):
+    compared, calibration = cycles, calibrate(raw_cycles, cycles.best.model)
     (first,) = compared.assessment.of_kind("tool error")
     (second,) = calibration.assessment.of_kind("tool error")
     assert first.text == second.text
