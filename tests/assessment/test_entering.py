@@ -13,7 +13,15 @@ from machines import write_orthoglide
 
 from orthocal import Choice, calibrate, load_plan, simulate_session
 from orthocal.assessment.calibrated_tool import find_tool
-from orthocal.assessment.controller_entries import choose_offsets, entered_offsets, find_entries
+from orthocal.assessment.controller_entries import (
+    choose_offsets,
+    compute_entries,
+    entered_offsets,
+    find_entries,
+)
+from orthocal.assessment.judgement import find_tolerance_scale
+from orthocal.assessment.tool_error import assess_placed, summarise_tool
+from orthocal.calibration.identify import identify
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 
 
@@ -84,18 +92,20 @@ def test_what_is_promised_with_the_offsets_entered_is_kept(quarter):
         drawn = machines.draw(np.random.default_rng(100 + seed))
         errors = machines.machine.split_errors(drawn)
         session = simulate_session(quarter, errors, seed=seed).session
-        full, alone = (
-            calibrate(session, m, solver="variable-projection") for m in ("full", "offsets")
+        (full, _), (alone, _) = (
+            identify(session, m, solver="variable-projection") for m in ("full", "offsets")
         )
-        space = find_tool(alone).workspace
-        identified = np.array([e.identified for e in find_entries(full)])
+        tool = find_tool(full)
+        entries = compute_entries(full, tool)
         for name, offsets in (
-            ("chosen", entered_offsets(full)),
-            ("identified", identified),
-            ("offsets", entered_offsets(alone)),
+            ("chosen", [e.enter for e in entries]),
+            ("identified", [e.identified for e in entries]),
+            ("offsets", alone.offsets),
         ):
-            left[name].append(error_left(quarter, errors, offsets, space))
-        left["promised"].append(full.assessment.tool.entered)
+            left[name].append(error_left(quarter, errors, np.array(offsets), tool.workspace))
+        accuracy = assess_placed(full, tool, entries)
+        promised = summarise_tool(full, accuracy, scale=find_tolerance_scale(session))
+        left["promised"].append(promised.entered)
     rms = {name: np.sqrt(np.mean(np.square(values))) for name, values in left.items()}
     assert rms["chosen"] < 0.9 * rms["identified"]
     assert rms["chosen"] < 0.9 * rms["offsets"]
