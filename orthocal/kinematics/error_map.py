@@ -77,15 +77,6 @@ class MachineGeometry:
         )
         return MachineGeometry(self.map, placements, drive_errors)
 
-    def of_machines(self, part: slice, count: int) -> MachineGeometry:
-        """Geometry of some machines out of `count`."""
-
-        def rows_of(values: Array) -> Array:
-            each = len(values) // count
-            return values[part.start * each : part.stop * each]
-
-        return MachineGeometry(self.map, rows_of(self.placements), rows_of(self.drive_errors))
-
     def _combine(self, commands: Array) -> tuple[Array, Array]:
         """Commands of all machines, one a row, and drive errors, shape (n_machines, n)."""
         errors = self.drive_errors.reshape(-1, self.drive_errors.shape[-1])

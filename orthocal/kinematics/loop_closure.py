@@ -8,8 +8,8 @@ enough to stay in the assembly mode in which the machine was built.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -69,47 +69,58 @@ MAX_POINTS = 4096
 """Postures of a batch of machines that are solved together, for the memory of their Jacobians."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class System:
-    """Equations r(x, p) = 0 of many postures, in metres: square, or with redundant rows."""
+    """Equations r(x, p) = 0 of many postures, in metres: closures, then coordinates of the tool.
 
-    evaluate: Evaluate
-    """(x, p, geometry) to residuals, (n, n_rows), and Jacobians by x, (n, n_rows, n_x)."""
-    n_rows: int
-    n_x: int
-    start: Array
-    """x of the nominal machine's reference posture, shape (n_x,)."""
-    origin: Array
-    """p of the nominal machine's reference posture, shape (n_p,)."""
-    units: Array
-    """Metres per unit of x, shape (n_x,)."""
-    lower: Array
-    upper: Array
-    """Bounds of x, shape (n_x,)."""
-    names: tuple[str, ...]
-    """Joint of each x."""
-    row_units: Array
-    """Metres per unit of each row, already multiplied in, shape (n_rows,)."""
-    turns: NDArray[np.bool_]
-    """Mask of the rows that are rotations, shape (n_rows,)."""
-    length: float
-    """Length that converts rotations to displacements, [m]."""
-    shortest: bool = False
-    """Take the shortest steps that close the loops, for robots with free motions: the solution of a
-    system that is singular up to rounding is no useful step."""
+    Args:
+        robot: The robot.
+        evaluate: (x, p, geometry) to residuals, (n, n_rows), and Jacobians by x, (n, n_rows, n_x).
+        index: Joint coordinates that are x, shape (n_x,).
+        start: x of the nominal machine's reference posture, shape (n_x,).
+        origin: p of the nominal machine's reference posture, shape (n_p,).
+        n_tool: Number of tool coordinates.
+
+    Attributes:
+        shortest: Take the shortest steps that close the loops, for robots with free motions: the
+            solution of a system that is singular up to rounding is no useful step.
+        units: Metres per unit of x, shape (n_x,).
+        lower: Lower bounds of x, shape (n_x,).
+        upper: Upper bounds of x, shape (n_x,).
+        names: Joint of each x.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        evaluate: Evaluate,
+        *,
+        index: Indices,
+        start: Array,
+        origin: Array,
+        n_tool: int = 0,
+    ) -> None:
+        self.robot, self.evaluate, self.start, self.origin = robot, evaluate, start, origin
+        self.n_x = index.size
+        self.shortest = robot.closure_rows + n_tool != index.size
+        self.units = coordinate_units(robot)[index]
+        self.lower, self.upper = (limits[index] for limits in coordinate_limits(robot))
+        joints = coordinate_joints(robot.model)
+        self.names = tuple(str(robot.model.names[joints[k]]) for k in index.tolist())
+        self._row_units = np.append(closure_row_units(robot), np.ones(n_tool))
+        self._turns = np.append(closure_turns(robot), np.zeros(n_tool, dtype=np.bool_))
 
     def step(self, residuals: Array, jacobians: Array) -> Array:
         """Newton steps, shape (n, n_x); least squares where rows depend on each other."""
-        if self.n_rows == self.n_x and not self.shortest:
-            try:
-                steps = np.asarray(np.linalg.solve(jacobians, -residuals[..., None])[..., 0])
-            except np.linalg.LinAlgError:
-                return self._shortest_step(residuals, jacobians)
-            singular = ~(np.abs(steps).max(axis=1, initial=0.0) < MAX_NEWTON_STEP)
-            if singular.any():
-                steps[singular] = self._shortest_step(residuals[singular], jacobians[singular])
-            return steps
-        return self._shortest_step(residuals, jacobians)
+        if self.shortest:
+            return self._shortest_step(residuals, jacobians)
+        try:
+            steps = np.asarray(np.linalg.solve(jacobians, -residuals[..., None])[..., 0])
+        except np.linalg.LinAlgError:
+            return self._shortest_step(residuals, jacobians)
+        singular = ~(np.abs(steps).max(axis=1, initial=0.0) < MAX_NEWTON_STEP)
+        if singular.any():
+            steps[singular] = self._shortest_step(residuals[singular], jacobians[singular])
+        return steps
 
     def _shortest_step(self, residuals: Array, jacobians: Array) -> Array:
         steps = np.full((len(residuals), self.n_x), np.nan)  # no step: the caller drops the posture
@@ -119,29 +130,27 @@ class System:
             steps[usable] = -(inverse @ residuals[usable][..., None])[..., 0]
         return steps
 
+    def regular_step(self, residuals: Array, jacobians: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Newton steps, and a mask of the Jacobians that are certainly not singular.
+
+        The ratio of singular values is at least 1/(|A| |A⁻¹|) by Frobenius' norm, with the inverse
+        that the step needs anyway.
+        """
+        try:
+            if self.shortest:
+                raise np.linalg.LinAlgError
+            inverses = np.linalg.inv(jacobians)
+        except np.linalg.LinAlgError:
+            return self.step(residuals, jacobians), np.zeros(len(residuals), dtype=np.bool_)
+        size = np.linalg.norm(jacobians / self.units, axis=(1, 2))
+        inverse_size = np.linalg.norm(inverses * self.units[:, None], axis=(1, 2))
+        steps = -(inverses @ residuals[..., None])[..., 0]
+        return steps, np.asarray(size * inverse_size < SAFETY / SINGULAR_BELOW)
+
     def describe(self, x: Array, p: Array, geometry: MachineGeometry) -> str:
         """Openings of the loops of one posture, in words."""
         residuals, _ = self.evaluate(x[None], p[None], geometry)
-        return describe_opening(residuals[0] / self.row_units, self.turns)
-
-    def within_limits(self, x: Array) -> NDArray[np.bool_]:
-        """Mask of the postures with all joints within their limits, shape (n,)."""
-        inside = (x >= self.lower - LIMIT_TOLERANCE) & (x <= self.upper + LIMIT_TOLERANCE)
-        return np.asarray(inside.all(axis=1))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Batch:
-    """The geometry of machines in K postures each, point by point."""
-
-    geometry: MachineGeometry
-    """Geometry of each machine, or of each machine in each posture."""
-    machines: int
-    postures: int
-
-    def at(self, points: NDArray[np.intp]) -> MachineGeometry:
-        """Geometry of points s K + k: one row for all of them, or a row for each."""
-        return self.geometry.at(points, self.machines * self.postures)
+        return describe_opening(residuals[0] / self._row_units, self._turns)
 
 
 def solve_closures(
@@ -184,219 +193,203 @@ def solve_closures(
     if first.shape[-1:] != (system.n_x,):
         raise ValueError(f"found the shape {first.shape}; expected {system.n_x} start values a row")
     begin = np.broadcast_to(first, (machines, count, system.n_x))
-    result = np.empty(begin.shape)
-    size = max(1, MAX_POINTS // max(count, 1))
-    for i in range(0, machines, size):
-        part = slice(i, min(i + size, machines))
-        n = part.stop - i
-        block = geometry.of_machines(part, machines)
-        refused: Failures | None = None if failures is None else {}
-        result[part] = _follow(
+    x = np.array(begin).reshape(-1, system.n_x)
+    for i in range(0, len(x), MAX_POINTS):
+        points = np.arange(i, min(i + MAX_POINTS, len(x)))
+        path = _Path(
             system,
-            np.tile(targets, (n, 1)),
-            _Batch(block, n, max(count, 1)),
-            begin[part].reshape(n * count, system.n_x),
-            _Refusals(list(labels) * n, refused),
-            restart=start is not None,
+            targets[points % count],
+            geometry.at(points, len(x)),
+            points=points,
+            labels=labels,
+            failures=failures,
             allow_singular=allow_singular,
-        ).reshape(n, count, system.n_x)
-        for point, error in (refused or {}).items():
-            if failures is not None:
-                failures.setdefault(i * count + point, error)
-    return result
+        )
+        x[points] = path.follow(x[points], restart=start is not None)
+    return x.reshape(begin.shape)
 
 
-class _Refusals:
-    """Points that cannot be reached.
+class _Path:
+    """Continuation of some points of a batch of machines from the reference posture to targets.
 
     Args:
-        labels: Names of the points, for messages.
-        failures: Filled with the refused points; without it the first refusal raises.
+        system: The equations.
+        targets: p of each point, shape (n, n_p).
+        geometry: One row for all points, or a row for each.
+        points: Index of each point in the batch, shape (n,).
+        labels: Names of the postures of a machine, for messages.
+        failures: As for `LoopClosure.close`.
+        allow_singular: Accept targets that leave motions free.
     """
 
-    def __init__(self, labels: Sequence[str], failures: Failures | None) -> None:
-        self._labels, self._failures = labels, failures
-        self.mask = np.zeros(len(labels), dtype=np.bool_)
+    def __init__(
+        self,
+        system: System,
+        targets: Array,
+        geometry: MachineGeometry,
+        *,
+        points: NDArray[np.intp],
+        labels: Sequence[str],
+        failures: Failures | None,
+        allow_singular: bool,
+    ) -> None:
+        self._system, self._targets, self._geometry = system, targets, geometry
+        self._points, self._labels, self._failures = points, labels, failures
+        self._allow_singular = allow_singular
+        length = system.robot.characteristic_length
+        self._tolerance = CLOSED * max(1.0, length)
+        self._moves = LARGEST_CONTINUATION_MOVE * np.where(system.units == 1.0, length, 1.0)
+        self._refused = np.zeros(len(points), dtype=np.bool_)
 
-    def add(self, point: int, reason: str, residual: float | None) -> None:
-        """Refuse a point.
+    def _refuse(self, i: int, reason: str, residual: float | None = None) -> None:
+        """Record that a point cannot be reached.
 
         Raises:
-            ClosureError: If refusals are not collected.
+            ClosureError: If failures are not collected.
         """
-        error = ClosureError(reason, posture=self._labels[point], residual=residual)
+        point = int(self._points[i])
+        posture = self._labels[point % len(self._labels)]
+        error = ClosureError(reason, posture=posture, residual=residual)
         if self._failures is None:
             raise error
         self._failures.setdefault(point, error)
-        self.mask[point] = True
+        self._refused[i] = True
 
+    def follow(self, start: Array, *, restart: bool) -> Array:
+        """Solutions, NaN at refused points, shape (n, n_x).
 
-def _follow(
-    system: System,
-    targets: Array,
-    batch: _Batch,
-    start: Array,
-    refusals: _Refusals,
-    *,
-    restart: bool,
-    allow_singular: bool,
-) -> Array:
-    """Continuation of the points of a batch; arguments as for `solve_closures`."""
-    tolerance = CLOSED * max(1.0, system.length)
-    count = len(targets)
-    regular = np.full(count, allow_singular)
-    for i in np.flatnonzero(~np.isfinite(targets).all(axis=1)).tolist():
-        refusals.add(i, "has coordinates that are not numbers", None)
-    x = np.array(start)
-    moves = np.where(system.units == 1.0, system.length, 1.0)
-    done, step = np.zeros(count), np.ones(count)
-    pending = np.flatnonzero(~refusals.mask)
-    fresh = np.full(count, restart)
-    while pending.size:
-        reach = np.minimum(1.0, done[pending] + step[pending])
-        path = system.origin + reach[:, None] * (targets[pending] - system.origin)
-        geometry = batch.at(pending)
-        trial, worst, checked = _newton(
-            system, x[pending], path, geometry, tolerance, check=not allow_singular
-        )
-        moved = np.abs((trial - x[pending]) / moves).max(axis=1, initial=0.0)
-        good = (worst < tolerance) & (moved < LARGEST_CONTINUATION_MOVE)
-        x[pending[good]] = trial[good]
-        done[pending[good]] = reach[good]
-        if not allow_singular:
-            regular[pending[good]] = checked[good]
-        retry = pending[~good & fresh[pending]]  # the start was no help: use the reference posture
-        x[retry], step[retry] = system.start, 2.0
-        fresh[pending] = False
-        step[pending[~good]] *= 0.5
-        for i in pending[~good & (step[pending] < SMALLEST_CONTINUATION_STEP)].tolist():
-            at = batch.at(np.array([i]))
-            last, final, _ = _newton(system, x[[i]], targets[[i]], at, tolerance, check=False)
+        Args:
+            start: x to start from, shape (n, n_x).
+            restart: Begin again at the reference posture where the start does not help.
+        """
+        system, targets, count = self._system, self._targets, len(self._targets)
+        for i in np.flatnonzero(~np.isfinite(targets).all(axis=1)).tolist():
+            self._refuse(i, "has coordinates that are not numbers")
+        x, regular = np.array(start), np.full(count, self._allow_singular)
+        done, step = np.zeros(count), np.ones(count)
+        pending, fresh = np.flatnonzero(~self._refused), np.full(count, restart)
+        while pending.size:
+            reach = np.minimum(1.0, done[pending] + step[pending])
+            path = system.origin + reach[:, None] * (targets[pending] - system.origin)
+            trial, worst, checked = self._newton(pending, x[pending], path)
+            moved = (np.abs(trial - x[pending]) < self._moves).all(axis=1)
+            good = (worst < self._tolerance) & moved
+            reached, failed = pending[good], pending[~good]
+            x[reached], done[reached] = trial[good], reach[good]
+            if not self._allow_singular:
+                regular[reached] = checked[good]
+            retry = failed[fresh[failed]]  # the start was no help: use the reference posture
+            x[retry], step[retry] = system.start, 2.0
+            fresh[pending] = False
+            step[failed] *= 0.5
+            for i in failed[step[failed] < SMALLEST_CONTINUATION_STEP].tolist():
+                self._refuse_unreached(i, x[[i]], done[i])
+            pending = pending[(done[pending] < 1.0) & ~self._refused[pending]]
+        self._refuse_outside_limits(x)
+        uncertain = np.flatnonzero(~regular & ~self._refused)
+        if uncertain.size and system.n_x:
+            self._refuse_singular(x, uncertain)
+        x[self._refused] = np.nan
+        return x
+
+    def _refuse_unreached(self, i: int, x: Array, done: float) -> None:
+        """Refuse a point that continuation does not reach beyond a part of the way."""
+        target = self._targets[[i]]
+        last, worst, _ = self._newton(np.array([i]), x, target)
+        if worst[0] < self._tolerance:
             reason = (
                 "cannot be reached from the mechanical zero without changing the way in "
-                f"which the loops are assembled, {done[i]:.0%} of the way"
-                if final[0] < tolerance
-                else "cannot be reached: the loops stay open by "
-                f"{system.describe(last[0], targets[i], at)}, {done[i]:.0%} of the way "
+                f"which the loops are assembled, {done:.0%} of the way"
+            )
+        else:
+            at = self._geometry.at(np.array([i]), len(self._points))
+            reason = (
+                "cannot be reached: the loops stay open by "
+                f"{self._system.describe(last[0], target[0], at)}, {done:.0%} of the way "
                 "from the mechanical zero"
             )
-            refusals.add(i, reason, float(final[0]))
-        pending = pending[(done[pending] < 1.0) & ~refusals.mask[pending]]
-    _refuse_outside_limits(system, x, refusals)
-    uncertain = np.flatnonzero(~regular & ~refusals.mask)
-    if uncertain.size and system.n_x:
-        _refuse_singular(system, targets, x, batch, uncertain, refusals)
-    x[refusals.mask] = np.nan
-    return x
+        self._refuse(i, reason, float(worst[0]))
 
+    def _refuse_outside_limits(self, x: Array) -> None:
+        """Refuse solutions with a joint outside its limits."""
+        system = self._system
+        beyond = np.maximum(x - system.upper, system.lower - x)
+        outside = ~(beyond <= LIMIT_TOLERANCE).all(axis=1)
+        for i in np.flatnonzero(outside & ~self._refused).tolist():
+            j = int(beyond[i].argmax())
+            unit, size = DRIVE_UNITS["m" if system.units[j] == 1.0 else "rad"]
+            reason = (
+                f"cannot be reached: joint '{system.names[j]}' would be at "
+                f"{x[i][j] / size:.4g} {unit}, outside its limits "
+                f"{system.lower[j] / size:g} ... {system.upper[j] / size:g} {unit}"
+            )
+            self._refuse(i, reason, 0.0)
 
-def _refuse_outside_limits(system: System, x: Array, refusals: _Refusals) -> None:
-    """Refuse solutions with a joint outside its limits."""
-    for i in np.flatnonzero(~system.within_limits(x) & ~refusals.mask).tolist():
-        j = int(np.maximum(x[i] - system.upper, system.lower - x[i]).argmax())
-        unit, size = DRIVE_UNITS["m" if system.units[j] == 1.0 else "rad"]
-        reason = (
-            f"cannot be reached: joint '{system.names[j]}' would be at "
-            f"{x[i][j] / size:.4g} {unit}, outside its limits "
-            f"{system.lower[j] / size:g} ... {system.upper[j] / size:g} {unit}"
-        )
-        refusals.add(i, reason, 0.0)
+    def _refuse_singular(self, x: Array, rows: NDArray[np.intp]) -> None:
+        """Refuse solutions at some points that leave motions free, the most singular one first."""
+        system, at = self._system, self._geometry.at(rows, len(self._points))
+        _, jacobians = system.evaluate(x[rows], self._targets[rows], at)
+        values = np.linalg.svd(jacobians / system.units, compute_uv=False)
+        smallest = values[:, system.n_x - 1] if values.shape[1] >= system.n_x else 0.0
+        largest = values.max(axis=1, initial=0.0)  # without closures there are no values
+        ratio = np.broadcast_to(smallest / np.maximum(largest, 1e-300), rows.shape)
+        for k in np.argsort(ratio)[: int((ratio < SINGULAR_BELOW).sum())].tolist():
+            rank = int((values[k] > SINGULAR_BELOW * largest[k]).sum())
+            reason = (
+                f"is singular: the drives leave {system.n_x - rank} of {system.n_x} passive "
+                "motions free"
+            )
+            self._refuse(int(rows[k]), reason)
 
+    def _newton(
+        self, points: NDArray[np.intp], start: Array, p: Array
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Damped Newton's method of some points at once.
 
-def _refuse_singular(
-    system: System,
-    targets: Array,
-    x: Array,
-    batch: _Batch,
-    points: NDArray[np.intp],
-    refusals: _Refusals,
-) -> None:
-    """Refuse solutions at some points that leave motions free, the most singular one first."""
-    _, jacobians = system.evaluate(x[points], targets[points], batch.at(points))
-    values = np.linalg.svd(jacobians / system.units, compute_uv=False)
-    smallest = values[:, system.n_x - 1] if values.shape[1] >= system.n_x else 0.0
-    largest = values.max(axis=1, initial=0.0)  # without closures there are no values
-    ratio = np.broadcast_to(smallest / np.maximum(largest, 1e-300), points.shape)
-    for k in np.argsort(ratio)[: int((ratio < SINGULAR_BELOW).sum())].tolist():
-        rank = int((values[k] > SINGULAR_BELOW * largest[k]).sum())
-        reason = (
-            f"is singular: the drives leave {system.n_x - rank} of {system.n_x} passive motions "
-            "free"
-        )
-        refusals.add(int(points[k]), reason, None)
+        Returns:
+            Solutions, shape (n, n_x), the largest residual of each, shape (n,), [m], and a mask of
+            the solutions that are certainly not singular (if that matters).
+        """
+        system, tolerance, x = self._system, self._tolerance, np.array(start)
 
+        def evaluate(rows: NDArray[np.intp], x: Array) -> tuple[Array, Array, Array]:
+            at = self._geometry.at(points[rows], len(self._points))
+            residuals, jacobians = system.evaluate(x, p[rows], at)
+            return residuals, jacobians, np.abs(residuals).max(axis=1, initial=0.0)
 
-def _newton(
-    system: System,
-    x: Array,
-    p: Array,
-    geometry: MachineGeometry,
-    tolerance: float,
-    *,
-    check: bool,
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Damped Newton's method of many points at once.
-
-    Returns:
-        Solutions, shape (n, n_x), the largest residual of each, shape (n,), [m], and a mask of
-        the solutions that are certainly not singular (if checked).
-    """
-    x = np.array(x)
-    residuals, jacobians = system.evaluate(x, p, geometry)
-    worst = np.abs(residuals).max(axis=1, initial=0.0)
-    active = np.flatnonzero(worst >= tolerance)
-    for _ in range(MAX_NEWTON_STEPS):
-        if not active.size:
-            break
-        step = system.step(residuals[active], jacobians[active])
-        usable = np.isfinite(step).all(axis=1)
-        active, step = active[usable], step[usable]
-        scale = np.ones(len(active))
-        pending = np.arange(len(active))
-        moved = np.zeros(len(active), dtype=bool)
-        for _ in range(MAX_STEP_HALVINGS):
-            rows = active[pending]
-            trial = x[rows] + scale[pending, None] * step[pending]
-            r, j = system.evaluate(trial, p[rows], geometry.at(rows, len(x)))
-            size = np.abs(r).max(axis=1, initial=0.0)
-            better = size < worst[rows]
-            good = rows[better]
-            x[good], residuals[good], jacobians[good] = trial[better], r[better], j[better]
-            worst[good] = size[better]
-            moved[pending[better]] = True
-            pending = pending[~better]
-            scale[pending] *= 0.25
-            if not pending.size:
+        residuals, jacobians, worst = evaluate(np.arange(len(x)), x)
+        active = np.flatnonzero(worst >= tolerance)
+        for _ in range(MAX_NEWTON_STEPS):
+            if not active.size:
                 break
-        active = active[moved]
-        active = active[worst[active] >= tolerance]
-    regular = np.zeros(len(x), dtype=np.bool_)
-    closed = np.flatnonzero((worst < tolerance) & np.isfinite(jacobians).all(axis=(1, 2)))
-    if closed.size and system.n_x:  # a last step without evaluation: its Jacobian is at hand
-        step, regular[closed] = _last_step(system, residuals[closed], jacobians[closed], check)
-        small = np.abs(step).max(axis=1) < MAX_LAST_STEP
-        x[closed[small]] += step[small]
-    return x, worst, regular
-
-
-def _last_step(
-    system: System, residuals: Array, jacobians: Array, check: bool
-) -> tuple[Array, NDArray[np.bool_] | bool]:
-    """Newton steps, and a mask of the Jacobians that are certainly not singular (if checked).
-
-    The ratio of singular values is at least 1/(|A| |A⁻¹|) by Frobenius' norm, with the inverse that
-    the step needs anyway.
-    """
-    if check and system.n_rows == system.n_x:
-        try:
-            inverses = np.linalg.inv(jacobians)
-        except np.linalg.LinAlgError:
-            return system.step(residuals, jacobians), False
-        size = np.linalg.norm(jacobians / system.units, axis=(1, 2))
-        inverse_size = np.linalg.norm(inverses * system.units[:, None], axis=(1, 2))
-        steps = -(inverses @ residuals[..., None])[..., 0]
-        return steps, np.asarray(size * inverse_size < SAFETY / SINGULAR_BELOW)
-    return system.step(residuals, jacobians), False
+            step = system.step(residuals[active], jacobians[active])
+            usable = np.isfinite(step).all(axis=1)
+            rows, step = active[usable], step[usable]
+            moved = []
+            for _ in range(MAX_STEP_HALVINGS):
+                trial = x[rows] + step
+                r, j, size = evaluate(rows, trial)
+                better = size < worst[rows]
+                good = rows[better]
+                x[good], residuals[good], jacobians[good] = trial[better], r[better], j[better]
+                worst[good] = size[better]
+                moved.append(good)
+                rows, step = rows[~better], 0.25 * step[~better]
+                if not rows.size:
+                    break
+            active = np.sort(np.concatenate(moved))
+            active = active[worst[active] >= tolerance]
+        regular = np.zeros(len(x), dtype=np.bool_)
+        closed = np.flatnonzero((worst < tolerance) & np.isfinite(jacobians).all(axis=(1, 2)))
+        if closed.size and system.n_x:  # a last step without evaluation: its Jacobian is at hand
+            found = residuals[closed], jacobians[closed]
+            if self._allow_singular:
+                step = system.step(*found)
+            else:
+                step, regular[closed] = system.regular_step(*found)
+            small = np.abs(step).max(axis=1) < MAX_LAST_STEP
+            x[closed[small]] += step[small]
+        return x, worst, regular
 
 
 class LoopClosure:
@@ -462,8 +455,10 @@ class LoopClosure:
         """
         d, single = self._as_commands(drives)
         geometry, batch = self._batch(theta, errors, d)
-        system = replace(self._closing, shortest=allow_free)
-
+        system = self._closing
+        if allow_free:
+            system = copy.copy(system)
+            system.shortest = True
         passive = solve_closures(
             system,
             d,
@@ -511,7 +506,6 @@ class LoopClosure:
         self,
         points: ArrayLike,
         *,
-        theta: ArrayLike | None = None,
         names: Sequence[str] | None = None,
         failures: Failures | None = None,
     ) -> Array:
@@ -520,7 +514,6 @@ class LoopClosure:
         Args:
             points: The coordinates of the tool that the drives control, shape (K, n_drives) or
                 (n_drives,), [m].
-            theta: Values of the free parameters, shape (n_free,); 0 by default.
             names: Names of the postures, for messages.
             failures: As for `close`.
 
@@ -532,14 +525,13 @@ class LoopClosure:
             RobotError: If the robot has no tool centre point with as many coordinates as drives.
         """
         p, single = as_rows(points, len(require_tcp(self.robot).coordinates), "coordinates")
-        drives, _ = self.reach(p, theta=theta, names=names, failures=failures)
+        drives, _ = self.reach(p, names=names, failures=failures)
         return drives[0] if single else drives
 
     def reach(
         self,
         points: Array,
         *,
-        theta: ArrayLike | None = None,
         start: Array | None = None,
         names: Sequence[str] | None = None,
         failures: Failures | None = None,
@@ -548,7 +540,6 @@ class LoopClosure:
 
         Args:
             points: As for `inverse`, shape (K, n_drives).
-            theta: As for `inverse`.
             start: Drive and passive coordinates to start from, shape (K, n_drives + n_passive); the
                 reference posture by default.
             names: As for `inverse`.
@@ -560,8 +551,8 @@ class LoopClosure:
         Raises:
             ClosureError, RobotError: As `inverse`.
         """
-        geometry, _ = self._batch(theta, None)
-        x = solve_closures(
+        geometry, _ = self._batch(None, None)
+        (x,) = solve_closures(
             self._inverting,
             points,
             geometry,
@@ -569,7 +560,7 @@ class LoopClosure:
             start=start,
             names=names,
             failures=failures,
-        )[0]
+        )
         return x[:, : len(self.robot.drives)], x[:, len(self.robot.drives) :]
 
     def tcp(
@@ -648,8 +639,13 @@ class LoopClosure:
             g, g_q = function(actuated, x, geometry.placements)
             return g, g_q
 
-        origin = map_.command(robot.drive_zero)
-        return _build_system(robot, evaluate, robot.passive_index, robot.reference_passive, origin)
+        return System(
+            robot,
+            evaluate,
+            index=robot.passive_index,
+            start=robot.reference_passive,
+            origin=map_.command(robot.drive_zero),
+        )
 
     @cached_property
     def _inverting(self) -> System:
@@ -672,44 +668,7 @@ class LoopClosure:
         index = np.concatenate([robot.drive_index, robot.passive_index])
         origin = nominal_closure(robot).tcp(robot.drive_zero, robot.reference_passive)[chosen]
         start = np.concatenate([robot.drive_zero, robot.reference_passive])
-        return _build_system(robot, evaluate, index, start, origin, n_tool=len(chosen))
-
-
-def _build_system(
-    robot: Robot,
-    evaluate: Evaluate,
-    index: Indices,
-    start: Array,
-    origin: Array,
-    *,
-    n_tool: int = 0,
-) -> System:
-    """System of closure rows, followed by rows of tool coordinates.
-
-    Args:
-        robot: The robot.
-        evaluate: As for `System`.
-        index: Joint coordinates that are x, shape (n_x,).
-        start: As for `System`.
-        origin: As for `System`.
-        n_tool: Number of tool coordinates.
-    """
-    lower, upper = coordinate_limits(robot)
-    joints = coordinate_joints(robot.model)
-    return System(
-        evaluate=evaluate,
-        n_rows=robot.closure_rows + n_tool,
-        n_x=index.size,
-        start=start,
-        origin=origin,
-        units=coordinate_units(robot)[index],
-        lower=lower[index],
-        upper=upper[index],
-        names=tuple(str(robot.model.names[joints[k]]) for k in index.tolist()),
-        row_units=np.append(closure_row_units(robot), np.ones(n_tool)),
-        turns=np.append(closure_turns(robot), np.zeros(n_tool, dtype=np.bool_)),
-        length=robot.characteristic_length,
-    )
+        return System(robot, evaluate, index=index, start=start, origin=origin, n_tool=len(chosen))
 
 
 @cached_per_robot(maxsize=8)
