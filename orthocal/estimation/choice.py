@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from orthocal.arguments import require_kind, require_names, require_numbers
@@ -59,19 +59,7 @@ class Choice:
     @property
     def document(self) -> dict[str, Any]:
         """Plain data of the choice."""
-
-        def plain(values: Mapping[str, Known]) -> dict[str, Any]:
-            return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
-
-        return {
-            "model": self.model,
-            "free": list(self.free),
-            "prior": self.prior,
-            "known": plain(self.known),
-            "tolerances": plain(self.tolerances),
-            "bounds": plain(self.bounds),
-            "base": self.base,
-        }
+        return asdict(self)
 
     def select(self, parameters: ParameterSet) -> Selection:
         """The free parameters among those of a robot, in SI.

@@ -16,19 +16,11 @@ from orthocal.statistics.zeros import project_out_zeros
 
 Array = NDArray[np.float64]
 
-TWELVE_ROWS = (
-    "xy+",
-    "yx+",
-    "xy-",
-    "yx-",
-    "yz+",
-    "zy+",
-    "yz-",
-    "zy-",
-    "xz+",
-    "zx+",
-    "xz-",
-    "zx-",
+TWELVE_ROWS = tuple(
+    f"{row}{sign}"
+    for rows in (("xy", "yx"), ("yz", "zy"), ("xz", "zx"))
+    for sign in "+-"
+    for row in rows
 )
 """Rows of equation (8): direction, leg, and + or − for maximum or minimum less zero posture.
 

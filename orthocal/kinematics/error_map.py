@@ -86,16 +86,6 @@ class MachineGeometry:
         return *self.drive_errors.shape[:-1], *commands.shape[:-1]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ErrorJacobian:
-    """Derivatives of placements and drives by n parameters."""
-
-    twists: Array
-    """∂ξ of every moved placement in its own frame, shape (..., 6 n_moved, n), [m, rad]."""
-    drive_errors: Array
-    """Derivative of the errors on which the drives depend, shape (n_drive_errors, n)."""
-
-
 class ErrorMap:
     """The elementary errors of a robot in a fixed order, shape (..., n_errors), [m, rad, 1].
 
@@ -254,8 +244,10 @@ class ErrorMap:
         *,
         command: Array | None = None,
         right: Array | None = None,
-    ) -> ErrorJacobian:
-        """Derivatives of placements and drives by parameters.
+    ) -> Array:
+        """Derivatives of placements by parameters.
+
+        ∂ξ of every moved placement in its own frame, shape (..., 6 n_moved, n), [m, rad].
 
         Args:
             errors: Point of differentiation, shape (..., n_errors), [SI].
@@ -267,8 +259,7 @@ class ErrorMap:
         n = columns.shape[1]
         inner = self.twist_columns(errors, columns, command)
         twists = right @ inner.reshape(*inner.shape[:-2], len(self.moved), 6, n)
-        twists = twists.reshape(*twists.shape[:-3], 6 * len(self.moved), n)
-        return ErrorJacobian(twists, columns[self.drive_errors])
+        return twists.reshape(*twists.shape[:-3], 6 * len(self.moved), n)
 
     def right_jacobians(self, errors: ArrayLike, command: Array | None = None) -> Array:
         """Right Jacobian T(δ) of every moved placement, shape (..., n_moved, 6, 6)."""

@@ -42,7 +42,9 @@ class ToolSensitivity:
         self.closure = LoopClosure(robot, fixed=at)
         self._functions = robot_functions(robot)
         errors = self._functions.errors
-        self._by_errors = errors.jacobian(self.closure.errors(), errors.columns(self.free))
+        columns = errors.columns(self.free)
+        self._twists = errors.jacobian(self.closure.errors(), columns)
+        self._drive_errors = columns[errors.drive_errors]
 
     def __call__(
         self,
@@ -68,7 +70,7 @@ class ToolSensitivity:
         d = np.atleast_2d(np.asarray(drives, dtype=np.float64))
         if passive is None:
             passive = self.closure.close(d, names=names)
-        geometry, by_errors = self.closure.geometry(), self._by_errors
+        geometry = self.closure.geometry()
         arguments = geometry.drives(d), passive, geometry.placements
         _, p_a, p_q, p_t = self._functions.tool_jacobian(*arguments)
         _, g_a, g_q, nonzeros = self._functions.closure_jacobian(*arguments)
@@ -81,7 +83,7 @@ class ToolSensitivity:
         twists = p_t - self._times_twists(multiplier, nonzeros)
         _, by_drive_errors = geometry.drive_derivatives(d)
         drives = (p_a - multiplier @ g_a) @ by_drive_errors
-        return np.asarray(twists @ by_errors.twists + drives @ by_errors.drive_errors)
+        return np.asarray(twists @ self._twists + drives @ self._drive_errors)
 
     def _times_twists(self, multiplier: Array, nonzeros: Array) -> Array:
         """Rows times ∂g by twists, shape (K, 3, n_twists) of (K, 3, n_rows) and (K, nnz)."""

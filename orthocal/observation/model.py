@@ -14,8 +14,8 @@ and studies all use this module.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -97,7 +97,7 @@ class _Readings:
     """By the errors of the drives, in the posture and in the reference posture."""
     by_passive: Array
     by_nuisance: Array
-    by_twists: tuple[tuple[Indices, Indices, Array], ...]
+    by_twists: Sequence[tuple[Indices, Indices, Array]]
     """Of each sensor group: positions, (n,), columns, (nnz,), and nonzeros, (S, n, nnz)."""
 
 
@@ -203,8 +203,6 @@ class ObservationModel:
         errors: Array,
         passive: Array,
         nuisance: Array | None = None,
-        *,
-        aligned: bool = True,
     ) -> Array:
         """Readings with gauge zeros at 0.
 
@@ -214,12 +212,11 @@ class ObservationModel:
                 front for a batch, [m, rad].
             nuisance: Nuisance parameters as deviations from the manual alignment, shape
                 (n_nuisance,), with S in front for a batch, [SI]; 0 by default.
-            aligned: Add the manual alignment to the nuisance parameters.
 
         Returns:
             Shape (n_entries,), with S in front for a batch, [m].
         """
-        at, q, nu = self._batch(errors, passive, nuisance, aligned=aligned)
+        at, q, nu = self._batch(errors, passive, nuisance)
         variants, n_sets = self.geometries(at), len(at)
         result = np.empty((n_sets, self.observations.size))
         actuated = variants[0].drives(self.states.commands)
@@ -256,7 +253,7 @@ class ObservationModel:
             nuisance: As for `predict`.
             free: The free parameters.
             noise: Divisor of each entry's reading, shape (n_entries,); 1 by default.
-            aligned: As for `predict`.
+            aligned: Add the manual alignment to the nuisance parameters.
 
         Raises:
             LinAlgError: If a posture is singular.
@@ -276,7 +273,7 @@ class ObservationModel:
         )
 
     def _batch(
-        self, errors: Array, passive: Array, nuisance: Array | None, *, aligned: bool
+        self, errors: Array, passive: Array, nuisance: Array | None, *, aligned: bool = True
     ) -> tuple[Array, Array, Array]:
         """Errors, passive coordinates and nuisance parameters with a leading dimension."""
         at, n = np.atleast_2d(errors), len(self.nuisance.parameters)
@@ -465,14 +462,14 @@ class Linearisation:
         model, (k, m) = self._model, block.entries.shape
         n_sets, actuated, q = len(passive), self._actuated, passive[:, block.states]
         n_drive_errors = self._by_drive_errors.shape[-1]
+        by_twists: list[tuple[Indices, Indices, Array]] = []
         result = _Readings(
             np.empty((n_sets, k * m)),
             np.zeros((n_sets, k * m, n_drive_errors)),
             np.zeros((n_sets, k * m, q.shape[2])),
             np.zeros((n_sets, k * m, nuisance.shape[1])),
-            (),
+            by_twists,
         )
-        by_twists = []
         for index, where, place in block.members:
             group, at = model.groups[index], where // m
             states, setups = block.states[at], group.setups[place]
@@ -495,7 +492,7 @@ class Linearisation:
             result.by_nuisance[:, where[:, None], group.nuisance[place]] = h_nu
             _, columns = group.reading.jacobian.pattern("by_twists")
             by_twists.append((where, columns, nonzeros))
-        return replace(result, by_twists=tuple(by_twists))
+        return result
 
     def _machine_rows(self, block: _Block, closures: _Closures, readings: _Readings) -> Array:
         """∂h by the machine's parameters with the loops closed, shape (S, k m, n_machine)."""
@@ -547,7 +544,7 @@ class _TwistChain:
         jacobian = self._map.jacobian(
             self._errors, self._columns, command=self._command, right=self._right
         )
-        matrix = jacobian.twists[:, self._used]
+        matrix = jacobian[:, self._used]
         if not self._sparse:
             return matrix
         from scipy.sparse import csr_array

@@ -24,9 +24,6 @@ SETTLED_WITHIN = 1e-11
 
 MOST_STEPS_WITHIN = 100
 
-ROWS_AT_ONCE = 2048
-"""Rows of the Jacobian that are multiplied at once: they stay in the processor's cache."""
-
 FEW = 50
 """Size of systems that NumPy solves faster than SciPy's triangular solver is imported."""
 
@@ -202,35 +199,19 @@ class Task:
         return State(theta, passive, deviation, zeros, cost + prior)
 
     def _solve(self, square: Array, gradient: Array, theta: Array) -> Array:
-        """Step s that minimises ½ sᵀ A s − bᵀ s within the bounds, shape (n_free,).
-
-        Parameters with a bound come last in the triangular factor, so that its last rows are a
-        problem in them alone; the others follow.
-        """
+        """Step s that minimises ½ sᵀ A s − bᵀ s within the bounds, shape (n_free,)."""
         low, high = self.low - theta, self.high - theta
-        bounded = np.isfinite(low) | np.isfinite(high)
-        order = np.argsort(bounded, kind="stable")
-        n_open = int((~bounded).sum())
         scale = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
-        scaled = (square * np.outer(scale, scale))[np.ix_(order, order)]
-        target = (gradient * scale)[order]
-        step = np.empty_like(theta)
+        scaled, target = square * np.outer(scale, scale), gradient * scale
         try:
             factor: Array = np.asarray(np.linalg.cholesky(scaled).T, dtype=np.float64)
         except np.linalg.LinAlgError:  # undetermined parameters: the smallest change
             values, vectors = np.linalg.eigh(scaled)
             large = values > 1e-13 * values.max(initial=0.0)
-            step[order] = vectors[:, large] @ ((vectors[:, large].T @ target) / values[large])
-            return np.asarray(np.clip(step * scale, low, high))
-        target = _solve_triangular(factor, target, transposed=True)
-        last = slice(n_open, None)
-        limits = ((side / scale)[order][last] for side in (low, high))
-        solution = np.empty_like(target)
-        solution[last] = _bounded(factor[last, last], target[last], *limits)
-        solution[:n_open] = _solve_triangular(
-            factor[:n_open, :n_open], target[:n_open] - factor[:n_open, last] @ solution[last]
-        )
-        step[order] = solution
+            step = vectors[:, large] @ ((vectors[:, large].T @ target) / values[large])
+        else:
+            target = _solve_triangular(factor, target, transposed=True)
+            step = _bounded(factor, target, low / scale, high / scale)
         return np.asarray(np.clip(step * scale, low, high))
 
     def _off(self, theta: Array) -> Array:
@@ -238,36 +219,13 @@ class Task:
         return np.asarray(theta - self.problem.prior_mean / self.problem.theta_scale)
 
     def _square(self, jacobian: Array, weights: Array) -> Array:
-        """Jᵀ W J of rows minus the weighted mean of those with the same free zero.
-
-        Works on some zeros at a time: a large Jacobian is read once and never copied completely.
-        """
+        """Jᵀ W J of rows minus the weighted mean of those with the same free zero."""
         o = self.problem.observations
-        zero = o.zero
-        order = np.argsort(zero, kind="stable")
-        starts = np.flatnonzero(np.diff(zero[order], prepend=-1))
-        ends = np.append(starts[1:], zero.size)
-        result = np.zeros((jacobian.shape[1], jacobian.shape[1]))
-        first = 0
-        while first < starts.size:
-            last = max(first + 1, int(np.searchsorted(ends, starts[first] + ROWS_AT_ONCE, "right")))
-            rows, groups = order[starts[first] : ends[last - 1]], starts[first:last] - starts[first]
-            counts = ends[first:last] - starts[first:last]
-            part, weight = jacobian[rows], weights[rows]
-            at_zero = o.zero_known[zero[order[starts[first:last]]]]
-            if (weight != 1.0).any():
-                means = np.add.reduceat(part * weight[:, None], groups, axis=0)
-                means /= np.add.reduceat(weight, groups)[:, None]
-                means[at_zero] = 0.0
-                part -= np.repeat(means, counts, axis=0)
-                part *= np.sqrt(weight)[:, None]
-            else:
-                means = np.add.reduceat(part, groups, axis=0) / counts[:, None]
-                means[at_zero] = 0.0
-                part -= np.repeat(means, counts, axis=0)
-            result += part.T @ part
-            first = last
-        return result
+        sums = o.sum_by_zero(jacobian, weights)
+        sums[o.zero_known] = 0.0
+        counts = np.bincount(o.zero, weights, minlength=o.n_zeros)
+        weighted = jacobian if (weights == 1.0).all() else jacobian * weights[:, None]
+        return np.asarray(jacobian.T @ weighted - sums.T @ (sums / counts[:, None]))
 
 
 def _solve_triangular(factor: Array, target: Array, *, transposed: bool = False) -> Array:
