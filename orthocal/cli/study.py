@@ -186,10 +186,10 @@ def linearisation(
 ) -> None:
     """Compare linearised with exact identification as errors grow."""
     from orthocal.builder.machine_file import Dimensions
+    from orthocal.planning.first_plan import PAPER_GAUGE, Displacements
     from orthocal.robot.model import Robot
     from orthocal.session.session import Gauge
     from orthocal.study.linearisation import build_linearisation_study
-    from orthocal.study.paper_plan import PAPER_GAUGE, Displacements
 
     scale = leg_mm * MM / Dimensions().leg if leg_mm is not None and leg_mm > 0.0 else 1.0
     usual = Displacements()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,8 @@ from orthocal.observation.model import nominal_sensitivity
 from orthocal.observation.observations import build_observations
 from orthocal.planning.equipment import Equipment, choose_box, reachable
 from orthocal.robot.model import Leg, Robot
-from orthocal.sensors.leg_indicator import Direction, LegIndicator, Section
-from orthocal.sensors.protocol import Sensor
-from orthocal.sensors.rod_indicator import RodByBall, RodByBlade
+from orthocal.sensors.direction import Direction
+from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Posture, Reading, Session, Setup
 from orthocal.statistics.noise import noise_floor
@@ -159,25 +158,18 @@ def list_candidates(robot: Robot, equipment: Equipment, *, reference: str = "") 
         names = _add_postures(robot, leg, equipment, postures)
         for name, sensor in _sensors(leg, equipment):
             setups[name] = Setup(name, sensor)
-            readings += [Reading(name, p, None, 1, 0.0, None) for p in names]
+            readings += [Reading(name, p) for p in names]
             if len(readings) > MOST_CANDIDATES * 10:
                 break
     session = Session(
         robot=robot,
         robot_reference=reference or robot.name,
-        title="",
-        source="",
         gauges={"": equipment.gauge},
         postures=postures,
         setups=setups,
         readings=tuple(readings),
-        controller_offsets=None,
-        path=None,
-        readings_path=None,
-        sha256="",
     )
-    session = _with_lateral_positions(session)
-    return _touching(session)
+    return _touching(_with_lateral_positions(session))
 
 
 def measure_candidates(
@@ -304,27 +296,14 @@ def _name(point: Array, robot: Robot, middle: Array) -> str:
     return "_".join(parts) or "zero"
 
 
-def _sensors(leg: Leg, equipment: Equipment) -> Iterator[tuple[str, Sensor]]:
+def _sensors(leg: Leg, equipment: Equipment) -> Iterator[tuple[str, LegIndicator]]:
     """Possible indicators at a leg, with names."""
     for direction in _directions(leg):
         word = direction if isinstance(direction, str) else "d"
         for part in equipment.sections:
-            section = Section("fraction", part)
-            if equipment.tip is None or not (leg.rods or equipment.rods):
-                yield (
-                    f"{word}{leg.name}_{part:g}",
-                    LegIndicator(leg.name, direction, section, equipment.mounting),
-                )
-                continue
-            for rod in equipment.rods or tuple(leg.rods)[:1]:
-                if rod not in leg.rods:
-                    known = ", ".join(leg.rods) or "none"
-                    raise ParameterError(
-                        f"'{rod}' is not a rod of leg {leg.name}; rods: {known}", where="touches"
-                    )
-                kind = RodByBall if equipment.tip.form == "ball" else RodByBlade
-                sensor = kind(leg.name, rod, direction, section, equipment.tip, equipment.mounting)
-                yield f"{word}{leg.name}_{rod}_{part:g}", sensor
+            for sensor in equipment.list_sensors(leg, direction, part):
+                rod = "" if sensor.rod is None else f"_{sensor.rod}"
+                yield f"{word}{leg.name}{rod}_{part:g}", sensor
 
 
 def _directions(leg: Leg) -> list[Direction]:
@@ -344,38 +323,27 @@ def _directions(leg: Leg) -> list[Direction]:
 
 def _with_lateral_positions(session: Session) -> Session:
     """Candidates with further gauges where the rod is in displaced postures."""
-    wide = Tip("blade", 0.0, 10.0)
-    reads: dict[str, list[Reading]] = {name: [] for name in session.setups}
-    for reading in session.readings:
-        reads[reading.setup].append(reading)
-    blades = {
-        name: replace(
-            s,
-            sensor=RodByBlade(
-                s.sensor.leg, s.sensor.rod, s.sensor.direction, s.sensor.section, wide
-            ),
-        )
-        for name, s in session.setups.items()
-        if isinstance(s.sensor, RodByBall | RodByBlade)
-    }
-    if not blades:
+    robot, wide = session.robot, Tip("blade", 0.0, 10.0)
+    sensors = {name: indicator_of(setup) for name, setup in session.setups.items()}
+    views = {n: Setup(n, s.on_rod(s.rod, wide)) for n, s in sensors.items() if s.rod is not None}
+    if not views:
         return session
-    setups = {n: s for n, s in session.setups.items() if n not in blades}
-    readings = [r for r in session.readings if r.setup not in blades]
-    on_rods = tuple(r for r in session.readings if r.setup in blades)
-    found = locate_contacts(replace(session, setups=blades, readings=on_rods))
+    setups = {n: s for n, s in session.setups.items() if n not in views}
+    readings = [r for r in session.readings if r.setup not in views]
+    read: dict[str, list[Reading]] = {name: [] for name in sensors}
+    for reading in session.readings:
+        read[reading.setup].append(reading)
+    on_rods = tuple(r for name in views for r in read[name])
+    found = locate_contacts(replace(session, setups=views, readings=on_rods))
     for name, (postures, contact) in found.items():
-        sensor = session.setups[name].sensor
-        if not isinstance(sensor, RodByBall | RodByBlade):
-            continue
-        side = sensor.constants(session.robot)[8:11]
-        start = sensor.constants(session.robot)[11:14]
+        sensor = sensors[name]
+        constants, half = sensor.constants(robot), _lateral_room(sensor, robot)
+        side, start = constants[8:11], constants[11:14]
         aside = dict(zip(postures, ((contact.points - start) @ side).tolist(), strict=True))
-        half = _lateral_room(sensor, session.robot)
         step = max(round(OVERLAP * half / MM), 1) * MM
         lowest, highest = (round(f(aside.values()) / step) for f in (min, max))
-        for k in range(int(lowest), int(highest) + 1):
-            near = [r for r in reads[name] if abs(aside[r.posture] - k * step) <= half]
+        for k in range(lowest, highest + 1):
+            near = [r for r in read[name] if abs(aside[r.posture] - k * step) <= half]
             own = name if k == 0 else f"{name}_{k * step / MM:+.3g}"
             x, y, z = (float(v) for v in (k * step * side).round(9) + 0.0)
             setups[own] = Setup(own, replace(sensor, beside=(x, y, z)))
@@ -383,24 +351,15 @@ def _with_lateral_positions(session: Session) -> Session:
     return replace(session, setups=setups, readings=tuple(readings))
 
 
-def lateral_distance(sensor: Sensor) -> float:
-    """Distance of a sensor's tip from the rod in the mechanical zero, [m]."""
-    if isinstance(sensor, RodByBall | RodByBlade):
-        return float(np.linalg.norm(sensor.beside))
-    return 0.0
+def indicator_of(setup: Setup) -> LegIndicator:
+    """Sensor of a candidate setup."""
+    return cast(LegIndicator, setup.sensor)
 
 
-def without_lateral(sensor: Sensor) -> Sensor:
-    """Sensor with its tip on the rod in the mechanical zero."""
-    if isinstance(sensor, RodByBall | RodByBlade):
-        return replace(sensor, beside=(0.0, 0.0, 0.0))
-    return sensor
-
-
-def _lateral_room(sensor: RodByBall | RodByBlade, robot: Robot) -> float:
+def _lateral_room(sensor: LegIndicator, robot: Robot) -> float:
     """Largest lateral distance of a rod from a tip, [m]."""
     if sensor.tip.form == "ball":
-        return STEEPEST * (robot.legs[sensor.leg].rods[sensor.rod].radius + sensor.tip.radius)
+        return STEEPEST * float(sensor.constants(robot)[14])  # radii of rod and ball
     return ON_BLADE * sensor.tip.width
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.errors import ClosureError, SessionError
+from orthocal.errors import ClosureError, ParameterError, SessionError
 from orthocal.io.documents import read_yaml, validate
 from orthocal.io.fields import read_only
 from orthocal.kinematics.function_cache import cached_per_robot
@@ -19,10 +19,10 @@ from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.files.schema import GaugeKeys
 from orthocal.planning.expected_error import state_noise
-from orthocal.robot.model import Robot, require_commanded_tool
-from orthocal.sensors.leg_indicator import LegIndicator
+from orthocal.robot.model import Leg, Robot, require_commanded_tool
+from orthocal.sensors.direction import Direction
+from orthocal.sensors.leg_indicator import LegIndicator, Section
 from orthocal.sensors.mounting import USUAL, Mounting, MountingKeys
-from orthocal.sensors.rod_indicator import RodIndicator
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Gauge, Session
 from orthocal.units import MM
@@ -82,6 +82,24 @@ class Equipment:
     range has room."""
     minutes_a_setup: float = MINUTES_A_SETUP
     minutes_a_reading: float = MINUTES_A_READING
+
+    def list_sensors(self, leg: Leg, direction: Direction, fraction: float) -> list[LegIndicator]:
+        """Indicators at a section of a leg: one for each rod that the tip can touch.
+
+        Raises:
+            ParameterError: If the leg has no such rod.
+        """
+        section = Section("fraction", fraction)
+        line = LegIndicator(leg.name, direction, section, self.mounting)
+        if self.tip is None or not (leg.rods or self.rods):
+            return [line]
+        for rod in self.rods:
+            if rod not in leg.rods:
+                known = ", ".join(leg.rods) or "none"
+                raise ParameterError(
+                    f"'{rod}' is not a rod of leg {leg.name}; rods: {known}", where="touches"
+                )
+        return [line.on_rod(rod, self.tip) for rod in self.rods or tuple(leg.rods)[:1]]
 
     def minutes(self, setups: int, readings: int) -> float:
         """Duration of setups and their readings."""
@@ -218,14 +236,13 @@ def equipment_of(session: Session, equipment: Equipment) -> Equipment:
         SessionError: If the repeatability of the readings is unknown.
     """
     session = state_noise(session)
-    sensors = [s.sensor for s in session.setups.values()]
-    on_rods = [s for s in sensors if isinstance(s, RodIndicator)]
-    on_lines = [s for s in sensors if isinstance(s, LegIndicator)]
-    if on_rods:
-        rods = equipment.rods or tuple(dict.fromkeys(s.rod for s in on_rods))
-        mounting = replace(on_rods[0].mounting, stand=None)
-        return replace(
-            equipment, gauge=session.gauge, tip=on_rods[0].tip, mounting=mounting, rods=rods
-        )
-    mounting = replace(on_lines[0].mounting, stand=None) if on_lines else equipment.mounting
-    return replace(equipment, gauge=session.gauge, tip=None, mounting=mounting)
+    sensors = [s.sensor for s in session.setups.values() if isinstance(s.sensor, LegIndicator)]
+    sensors.sort(key=lambda s: s.rod is None)  # those on rods first
+    equipment = replace(equipment, gauge=session.gauge, tip=None)
+    if not sensors:
+        return equipment
+    equipment = replace(equipment, mounting=replace(sensors[0].mounting, stand=None))
+    rods = tuple(dict.fromkeys(s.rod for s in sensors if s.rod is not None))
+    if not rods:
+        return equipment
+    return replace(equipment, tip=sensors[0].tip, rods=equipment.rods or rods)

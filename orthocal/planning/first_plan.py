@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.errors import RobotError
+from orthocal.errors import ParameterError, RobotError
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.planning.equipment import Equipment, choose_box
-from orthocal.robot.model import Leg, Robot
-from orthocal.sensors.leg_indicator import LegIndicator, Section
-from orthocal.sensors.protocol import Sensor
-from orthocal.sensors.rod_indicator import RodByBall, RodByBlade
-from orthocal.session.session import Posture, Reading, Session, Setup
+from orthocal.robot.model import Robot
+from orthocal.sensors.mounting import EXACT
+from orthocal.session.session import Gauge, Posture, Reading, Session, Setup
 from orthocal.units import MM
 
 Array = NDArray[np.float64]
@@ -33,8 +30,19 @@ SECTIONS = (0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65)
 LEAST = 0.01
 """Least reach of the tool to either side of the mechanical zero, [m]."""
 
-PAPER = (-0.1, 0.06)
-"""Least and largest displacement along an axis in the paper, [m]; the project inferred them."""
+PAPER_GAUGE = Gauge(20e-6, 10e-6, None)
+"""Repeatability 0.02 mm, resolution 10 µm (paper, section 4)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Displacements:
+    """Tool displacements in the paper's maximum and minimum postures, [m].
+
+    The paper does not state them; the project inferred the defaults.
+    """
+
+    maximum: float = 0.06
+    minimum: float = -0.1
 
 
 def first_equipment(robot: Robot, equipment: Equipment) -> Equipment:
@@ -55,7 +63,9 @@ def first_equipment(robot: Robot, equipment: Equipment) -> Equipment:
         )
     least = min(leg.length for leg in robot.legs.values())
     room = 0.5 * least - min(CLEAR, 0.2 * least)
-    low, high = (_whole(np.clip(v, -room, room)) for v in (low, high))
+    # whole steps, rounded towards zero
+    steps = (np.trunc(np.clip(v, -room, room) / STEP + np.sign(v) * 1e-9) for v in (low, high))
+    low, high = (STEP * v for v in steps)
     clear = min(CLEAR, 0.2 * least)
     sections = tuple(
         s
@@ -68,68 +78,80 @@ def first_equipment(robot: Robot, equipment: Equipment) -> Equipment:
     )
 
 
-def paper_plan(robot: Robot, equipment: Equipment, *, reference: str = "") -> Session:
-    """The paper's plan: each leg in the mechanical zero and at both ends, in two directions.
+def paper_plan(robot: Robot, equipment: Equipment) -> Session:
+    """The paper's plan (section 3.1) within the reach of a machine of any dimensions.
 
-    Six setups at mid-leg and seven postures on an Orthoglide: +60 and −100 mm, or the reach of a
-    machine of other dimensions. Each setup ends with the zero, where it began.
+    Each leg is read at its middle in two directions, in the mechanical zero and at both ends. On an
+    Orthoglide these are six setups and seven postures, +60 and −100 mm. Each setup ends with the
+    zero, where it began.
 
     Args:
         robot: The robot.
         equipment: Gauge and tip; its box limits the postures.
-        reference: Name of the robot in the session; by default its own.
 
     Raises:
         RobotError: If the tool of the machine hardly moves.
     """
     equipment = first_equipment(robot, equipment)
-    middle, box = tool_at_zero(robot), equipment.box
-    low, high = (np.zeros_like(middle), np.zeros_like(middle)) if box is None else box.T - middle
+    usual = Displacements()
+    box = np.asarray(equipment.box) - tool_at_zero(robot)[:, None]
+    ends = np.clip(box, usual.minimum, usual.maximum)
+    return _read_legs(robot, equipment, ends, "Zero, largest and least of each leg", closing=True)
+
+
+def build_paper_plan(robot: Robot, displacements: Displacements, gauge: Gauge) -> Session:
+    """The paper's plan on a machine of the Orthoglide type, with an exact gauge on the legs' lines.
+
+    Raises:
+        ParameterError: If the machine is not of the Orthoglide type.
+        ClosureError: If it cannot reach a posture.
+    """
+    legs = list(robot.legs.values())
+    fits = [leg.name for leg in legs] == list("xyz") and robot.tcp is not None
+    if not (fits and all(np.abs(leg.axis[i]) > 0.999 for i, leg in enumerate(legs))):
+        raise ParameterError(
+            "has no legs x, y, z along these axes, which the paper's plan needs; name a session",
+            where=robot.name,
+        )
+    equipment = Equipment(gauge=gauge, tip=None, mounting=EXACT)
+    ends = np.tile([displacements.minimum, displacements.maximum], (3, 1))
+    session = _read_legs(robot, equipment, ends, "The paper's plan", closing=False)
+    return session.with_controller(np.zeros(len(robot.drives)))
+
+
+def _read_legs(
+    robot: Robot, equipment: Equipment, ends: Array, title: str, *, closing: bool
+) -> Session:
+    """Session in which each leg is read in the mechanical zero and at both ends of its axis.
+
+    Args:
+        robot: The robot.
+        equipment: Gauge and tip.
+        ends: Least and largest displacement along each axis, shape (n_coordinates, 2), [m].
+        title: Title of the session.
+        closing: Whether each setup ends with the zero, where it began.
+    """
+    middle = tool_at_zero(robot)
     points, setups, readings = {"zero": middle}, {}, []
     for leg in robot.legs.values():
         own = int(np.abs(leg.axis).argmax())
-        names = ["zero"]
-        for end, most, reach in (("max", PAPER[1], high), ("min", -PAPER[0], -low)):
-            name = f"{'xyz'[own]}_{end}"
-            shift = np.zeros_like(middle)
-            shift[own] = min(most, float(reach[own])) * (1.0 if end == "max" else -1.0)
-            points[name] = middle + shift
-            names.append(name)
+        extremes = {f"{'xyz'[own]}_{name}": ends[own, i] for name, i in (("max", 1), ("min", 0))}
+        for name, shift in extremes.items():
+            points[name] = middle + shift * np.eye(len(middle))[own]
         for k in (k for k in range(3) if k != own):
             setup = f"{'xyz'[k]}{leg.name}"
-            setups[setup] = Setup(setup, _sensor(leg, "xyz"[k], equipment))
-            readings += [Reading(setup, p, None, 1, 0.0, None) for p in names]
-            readings.append(Reading(setup, "zero", None, 2, 0.0, None))
+            setups[setup] = Setup(setup, equipment.list_sensors(leg, "xyz"[k], 0.5)[0])
+            readings += [Reading(setup, posture) for posture in ("zero", *extremes)]
+            readings += [Reading(setup, "zero", cycle=2)] if closing else []
     drives = nominal_closure(robot).inverse(np.array(list(points.values())), names=list(points))
     return Session(
         robot=robot,
-        robot_reference=reference or robot.name,
-        title="Zero, largest and least of each leg",
-        source="",
+        robot_reference=robot.name,
+        title=title,
         gauges={"": equipment.gauge},
         postures={
             n: Posture(n, "tcp_mm", p, d) for (n, p), d in zip(points.items(), drives, strict=True)
         },
         setups=setups,
         readings=tuple(readings),
-        controller_offsets=None,
-        path=None,
-        readings_path=None,
-        sha256="",
     )
-
-
-def _sensor(leg: Leg, direction: str, equipment: Equipment) -> Sensor:
-    """Indicator at mid-leg, on the leg's first rod if it has a tip."""
-    section = Section("fraction", 0.5)
-    if equipment.tip is None or not leg.rods:
-        return LegIndicator(leg.name, direction, section, equipment.mounting)
-    rod = next((r for r in equipment.rods if r in leg.rods), next(iter(leg.rods)))
-    kind = RodByBall if equipment.tip.form == "ball" else RodByBlade
-    return kind(leg.name, rod, direction, section, equipment.tip, equipment.mounting)
-
-
-def _whole(values: Array) -> Array:
-    """Values rounded towards zero to whole steps, [m]."""
-    steps = np.array([math.floor(abs(v) / STEP + 1e-9) for v in values])
-    return np.asarray(np.sign(values) * steps * STEP)

@@ -21,10 +21,9 @@ from orthocal.measurement.joining import join_sessions
 from orthocal.planning.candidates import (
     FEWEST,
     Candidates,
-    lateral_distance,
+    indicator_of,
     list_candidates,
     measure_candidates,
-    without_lateral,
 )
 from orthocal.planning.cost_curve import (
     HOUR,
@@ -47,6 +46,7 @@ from orthocal.planning.plan_comparison import Alternative, Comparison
 from orthocal.planning.selection import KILLED, PlannedSetup, PlannedSetups, SetupSearch
 from orthocal.robot.model import Robot
 from orthocal.runtime.worker_pool import call_in_parallel, run_in_parallel, worker_budget
+from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.session.session import Posture, Purpose, Reading, Session, Setup
 from orthocal.statistics.zeros import project_out_zeros
 from orthocal.units import UM
@@ -434,18 +434,22 @@ def _simplify(candidates: Candidates, planned: PlannedSetups, search: SetupSearc
     session, setups = candidates.session, candidates.setups
 
     def distance(which: int) -> float:
-        return lateral_distance(session.setups[setups[which].name].sensor)
+        return float(np.linalg.norm(indicator_of(session.setups[setups[which].name]).beside))
+
+    def without_lateral(which: int) -> LegIndicator:
+        sensor = indicator_of(session.setups[setups[which].name])
+        return replace(sensor, beside=(0.0, 0.0, 0.0))
 
     most = (1.0 + SIMPLER) * planned.error
     for k, old in enumerate(planned.setups):
         candidate = setups[old.candidate]
         postures = [session.readings[i].posture for i in candidate.rows[list(old.chosen)]]
-        base = without_lateral(session.setups[candidate.name].sensor)
+        base = without_lateral(old.candidate)
         others = planned.information - search.information_of(old)
         for which in sorted(range(len(setups)), key=distance):
             if distance(which) >= distance(old.candidate):
                 break
-            if without_lateral(session.setups[setups[which].name].sensor) != base:
+            if without_lateral(which) != base:
                 continue
             rows = {session.readings[r].posture: i for i, r in enumerate(setups[which].rows)}
             if not set(postures) <= set(rows):

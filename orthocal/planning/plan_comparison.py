@@ -13,8 +13,7 @@ from orthocal.measurement.joining import join_sessions
 from orthocal.planning.candidates import Candidates, CandidateSetup
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import Expected, ToolForecast
-from orthocal.sensors.leg_indicator import LegIndicator
-from orthocal.sensors.rod_indicator import RodByBall, RodByBlade, RodIndicator
+from orthocal.sensors.leg_indicator import BallIndicator, LegIndicator
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Gauge, Reading, Session, Setup
 
@@ -77,7 +76,7 @@ class Comparison:
             ("a dial of half the scatter and resolution", _with_finer_dial),
             ("each leg's gauges on one square block", _with_blocks),
         ]
-        if any(isinstance(s.sensor, RodByBall) for s in self.plan.setups.values()):
+        if any(isinstance(s.sensor, BallIndicator) for s in self.plan.setups.values()):
             changes.append(("a blade instead of the ball", _with_blade))
         found = []
         for name, change in changes:
@@ -98,9 +97,7 @@ class Comparison:
         best: dict[tuple[str, object], tuple[float, CandidateSetup]] = {}
         for setup in self.candidates.setups:
             sensor = self.candidates.session.setups[setup.name].sensor
-            if not isinstance(sensor, LegIndicator | RodIndicator):
-                continue
-            if isinstance(sensor, RodIndicator) and any(sensor.beside):
+            if not isinstance(sensor, LegIndicator) or any(sensor.beside):
                 continue
             key = (sensor.leg, sensor.direction)
             distance = abs(sensor.section.value - MIDDLE)
@@ -178,7 +175,7 @@ def _with_finer_dial(session: Session) -> Session:
 def _with_blocks(session: Session) -> Session:
     def change(setup: Setup) -> Setup:
         sensor = setup.sensor
-        if not isinstance(sensor, LegIndicator | RodIndicator):
+        if not isinstance(sensor, LegIndicator):
             return setup
         mounting = replace(sensor.mounting, stand=f"block_{sensor.leg}")
         return replace(setup, sensor=replace(sensor, mounting=mounting))
@@ -189,9 +186,8 @@ def _with_blocks(session: Session) -> Session:
 def _with_blade(session: Session) -> Session:
     def change(setup: Setup) -> Setup:
         s = setup.sensor
-        if not isinstance(s, RodByBall):
+        if not isinstance(s, BallIndicator) or s.rod is None:
             return setup
-        sensor = RodByBlade(s.leg, s.rod, s.direction, s.section, BLADE, s.mounting, s.beside)
-        return replace(setup, sensor=sensor)
+        return replace(setup, sensor=s.on_rod(s.rod, BLADE, s.beside))
 
     return replace(session, setups={n: change(s) for n, s in session.setups.items()})

@@ -16,9 +16,8 @@ from orthocal.errors import OrthocalError
 from orthocal.io.documents import validate
 from orthocal.io.fields import As
 from orthocal.runtime.registry import Registry
-from orthocal.sensors.leg_indicator import LegIndicator
+from orthocal.sensors.leg_indicator import LegIndicator, LegKeys
 from orthocal.sensors.protocol import Sensor, SetupKeys
-from orthocal.sensors.rod_indicator import RodKeys, read_leg
 
 DEFAULT = LegIndicator.kind
 
@@ -35,7 +34,7 @@ def _read_kind(name: str, offered: type[Sensor]) -> Kind:
     return offered.keys, offered.from_keys
 
 
-_KINDS = Registry[Kind](GROUP, "sensor", _read_kind, {DEFAULT: (RodKeys, read_leg)})
+_KINDS = Registry[Kind](GROUP, "sensor", _read_kind, {DEFAULT: (LegKeys, LegIndicator.from_keys)})
 
 
 def register_sensor(kind: type[Sensor]) -> None:

@@ -29,7 +29,7 @@ LARGEST_TIP_MM = 100.0
 
 
 def touch_by_blade(
-    *, at: ca.SX, along: ca.SX, radius: ca.SX, edge: ca.SX, tip: ca.SX, direction: ca.SX
+    at: ca.SX, along: ca.SX, radius: ca.SX, tip: ca.SX, direction: ca.SX, edge: ca.SX
 ) -> ca.SX:
     """Reading of an indicator with a blade, [m].
 
@@ -37,16 +37,23 @@ def touch_by_blade(
         at: A point of the rod's axis, shape (3,), [m].
         along: The rod's axis, of any length, shape (3,).
         radius: Of the rod, and of the edge where that is a pin, [m].
-        edge: The blade's edge, of any length, shape (3,).
         tip: A point of the edge at reading 0, shape (3,), [m].
         direction: Of the plunger, in which the reading grows; a unit vector, shape (3,).
+        edge: The blade's edge, of any length, shape (3,).
     """
     normal = ca.cross(edge, along)
     normal = normal * ca.sign(ca.dot(normal, direction))
     return (ca.dot(at - tip, normal) + radius * ca.norm_2(normal)) / ca.dot(direction, normal)
 
 
-def touch_by_ball(*, at: ca.SX, along: ca.SX, radius: ca.SX, tip: ca.SX, direction: ca.SX) -> ca.SX:
+def touch_by_ball(
+    at: ca.SX,
+    along: ca.SX,
+    radius: ca.SX,
+    tip: ca.SX,
+    direction: ca.SX,
+    edge: ca.SX | None = None,
+) -> ca.SX:
     """Reading of an indicator with a ball, [m]; NaN if the ball passes the rod.
 
     Args:
@@ -55,7 +62,9 @@ def touch_by_ball(*, at: ca.SX, along: ca.SX, radius: ca.SX, tip: ca.SX, directi
         radius: Of the rod and the ball together, [m].
         tip: The ball's centre at reading 0, shape (3,), [m].
         direction: Of the plunger, in which the reading grows; a unit vector, shape (3,).
+        edge: Not used: a ball has none.
     """
+    del edge
     unit = along / ca.norm_2(along)
     apart = tip - at
     apart = apart - ca.dot(apart, unit) * unit

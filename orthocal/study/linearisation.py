@@ -28,12 +28,12 @@ from orthocal.estimation.linear import (
 )
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.variable_projection import VariableProjection
+from orthocal.planning.first_plan import PAPER_GAUGE, Displacements, build_paper_plan
 from orthocal.robot.model import Robot
 from orthocal.sensors.mounting import EXACT
 from orthocal.session.session import Gauge, Session
 from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
-from orthocal.study.paper_plan import PAPER_GAUGE, Displacements, build_paper_plan
 from orthocal.study.portable_session import PortableSession
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study, prepare_once

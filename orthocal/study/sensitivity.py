@@ -18,9 +18,9 @@ from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.measurement.files.session_file import check_contacts
 from orthocal.observation.observations import drive_table
+from orthocal.planning.first_plan import Displacements, build_paper_plan
 from orthocal.robot.model import Robot
 from orthocal.session.session import Gauge, Posture, Reading, Session
-from orthocal.study.paper_plan import Displacements, build_paper_plan
 from orthocal.study.portable_session import PortableSession
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study

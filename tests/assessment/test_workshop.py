@@ -19,7 +19,7 @@ from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import cube
-from orthocal.sensors.rod_indicator import RodByBall
+from orthocal.sensors.mounting import USUAL
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Gauge
 from orthocal.statistics.chance import confidence_factor
@@ -51,9 +51,7 @@ def on_rods(plan):
     """A plan of lines, read by the workshop's ball on rod a."""
     ball = Tip("ball", 1.5e-3)
     setups = {
-        name: replace(
-            s, sensor=RodByBall(s.sensor.leg, "a", s.sensor.direction, s.sensor.section, ball)
-        )
+        name: replace(s, sensor=replace(s.sensor, mounting=USUAL).on_rod("a", ball))
         for name, s in plan.setups.items()
     }
     return replace(plan, setups=setups, gauges={"": Gauge(NOISE, STEP, None)})

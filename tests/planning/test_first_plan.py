@@ -14,8 +14,6 @@ from orthocal.errors import RobotError
 from orthocal.measurement.files.session_file import check_contacts
 from orthocal.planning.equipment import Equipment, reachable
 from orthocal.planning.first_plan import CLEAR, first_equipment, paper_plan
-from orthocal.sensors.leg_indicator import LegIndicator
-from orthocal.sensors.rod_indicator import RodByBlade
 from orthocal.sensors.tips import Tip
 
 
@@ -64,9 +62,9 @@ def test_the_paper_plan_of_other_dimensions_is_within_reach(tmp_path, sizes):
 def test_the_paper_plan_uses_the_given_equipment(orthoglide):
     blade = Equipment(tip=Tip("blade", 0.0, 0.02), rods=("b",))
     sensors = [s.sensor for s in paper_plan(orthoglide, blade).setups.values()]
-    assert {(type(s), s.rod) for s in sensors} == {(RodByBlade, "b")}
+    assert {(s.tip.form, s.rod) for s in sensors} == {("blade", "b")}
     none = paper_plan(orthoglide, replace(blade, tip=None))
-    assert {type(s.sensor) for s in none.setups.values()} == {LegIndicator}
+    assert {s.sensor.rod for s in none.setups.values()} == {None}
 
 
 def test_a_machine_that_hardly_moves_is_refused(tmp_path):

@@ -12,6 +12,7 @@ from orthocal import Choice, load_plan, load_robot
 from orthocal.errors import ParameterError, SessionError
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import cube, gauss_box
+from orthocal.planning.first_plan import Displacements, build_paper_plan
 from orthocal.session.session import Gauge
 from orthocal.study.accuracy import (
     CALIBRATED,
@@ -19,7 +20,6 @@ from orthocal.study.accuracy import (
     build_accuracy_study,
     summarise_accuracy,
 )
-from orthocal.study.paper_plan import Displacements, build_paper_plan
 from orthocal.study.runner import StudyTable, run_study
 from orthocal.study.study import run_task
 

@@ -148,7 +148,7 @@ def test_gauss_newton_diverges_on_short_legs(tmp_path):
     robot = make_robot(
         Dimensions(leg=0.15, lower=0.06, upper=0.24, attachment=0.02), tmp_path / "m"
     )
-    from orthocal.study.paper_plan import Displacements
+    from orthocal.planning.first_plan import Displacements
 
     study = build_linearisation_study(
         robot, sizes=[1.0, 60.0], directions=4, displacements=Displacements(0.03, -0.05)

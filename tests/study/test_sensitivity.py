@@ -8,7 +8,7 @@ from machines import place
 
 from orthocal import load_plan
 from orthocal.errors import ClosureError, ParameterError, SessionError
-from orthocal.study.paper_plan import Displacements
+from orthocal.planning.first_plan import Displacements
 from orthocal.study.runner import run_study
 from orthocal.study.sensitivity import build_sensitivity_study, summarise_sensitivity
 

@@ -12,7 +12,6 @@ from orthocal.estimation.problem import build_problem
 from orthocal.robot.model import Robot
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.protocol import Sensor
-from orthocal.sensors.rod_indicator import RodByBlade
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Session
 from orthocal.statistics.zeros import project_out_zeros
@@ -77,9 +76,6 @@ def _first_order(session: Session) -> Array:
 
 def _rod_sensors(sensor: Sensor, robot: Robot) -> dict[str, Sensor]:
     """Sensors on the rods that a gauge of the line model may touch, by rod; empty for others."""
-    if not isinstance(sensor, LegIndicator):
+    if not isinstance(sensor, LegIndicator) or sensor.rod is not None:
         return {}
-    return {
-        rod: RodByBlade(sensor.leg, rod, sensor.direction, sensor.section, EDGE, sensor.mounting)
-        for rod in robot.legs[sensor.leg].rods
-    }
+    return {rod: sensor.on_rod(rod, EDGE) for rod in robot.legs[sensor.leg].rods}

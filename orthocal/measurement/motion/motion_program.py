@@ -20,7 +20,7 @@ from orthocal.errors import ParameterError
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.motion import Role, SetupMotion, Stop, shown_joints
 from orthocal.robot.model import Robot
-from orthocal.sensors.rod_indicator import RodByBall
+from orthocal.sensors.leg_indicator import BallIndicator
 from orthocal.session.session import Session
 from orthocal.text import comment_safe
 from orthocal.units import DRIVE_UNITS, MM, format_fixed
@@ -116,7 +116,7 @@ def write_program(
         *PREAMBLE,
         f"F{options.feed:g}",
     ]
-    ball = isinstance(session.setups[motion.setup].sensor, RodByBall)
+    ball = isinstance(session.setups[motion.setup].sensor, BallIndicator)
     mount = f"mount the gauge, {'centre its ball on the rod' if ball else 'align it'}"
     stops = motion.stops if motion.alignment is None else (motion.alignment, *motion.stops)
     for i, stop in enumerate(stops):
