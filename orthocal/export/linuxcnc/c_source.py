@@ -6,6 +6,7 @@ depends on the machine only by the coordinates that the drives command.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.resources import files
 from string import Template
 
@@ -55,8 +56,8 @@ def write_core(calibration: Calibration, approximation: Approximation) -> dict[s
         "nominal": _write_nominal(inverse.nominal, drives, calibration.active_offsets),
     }
     return {
-        "orthocal_core.c": _fill("orthocal_core.c", core),
-        "orthocal_core.h": _fill("orthocal_core.h", common),
+        "orthocal_core.c": fill_template("orthocal_core.c", core),
+        "orthocal_core.h": fill_template("orthocal_core.h", common),
     }
 
 
@@ -65,7 +66,7 @@ def write_component(approximation: Approximation) -> dict[str, str]:
     coordinates = approximation.coordinates
     identity = [k for k in range(len(LETTERS)) if k not in coordinates]
     values = {"commanded": braced(coordinates), "identity": braced(identity)}
-    return {"orthocal_kins.c": _fill("orthocal_kins.c", values)}
+    return {"orthocal_kins.c": fill_template("orthocal_kins.c", values)}
 
 
 def _write_nominal(form: NominalForm, drives: tuple[Drive, ...], active: Array) -> str:
@@ -82,7 +83,7 @@ def _write_nominal(form: NominalForm, drives: tuple[Drive, ...], active: Array) 
             "at_middle": braced(joints(form.values)),
             "jacobian": braced(form.jacobian * (directions * MM / sizes)[:, None]),
         }
-        return _fill("tangent.c", values)
+        return fill_template("tangent.c", values)
     values = {
         "axis": braced(form.axes),
         "anchor": braced(form.anchors / MM),
@@ -91,7 +92,7 @@ def _write_nominal(form: NominalForm, drives: tuple[Drive, ...], active: Array) 
         "direction": braced(directions),
         "at_zero": braced(joints(np.zeros(len(drives)))),
     }
-    return _fill("slides.c", values)
+    return fill_template("slides.c", values)
 
 
 def braced(values: ArrayLike, *, indent: int = 4) -> str:
@@ -112,6 +113,7 @@ def braced(values: ArrayLike, *, indent: int = 4) -> str:
     return "{\n" + ",\n".join(f"{pad}{part}" for part in lines) + f"\n{' ' * (indent - 4)}}}"
 
 
-def _fill(name: str, values: dict[str, object] | dict[str, str]) -> str:
+def fill_template(name: str, values: Mapping[str, object]) -> str:
+    """Text of a file in templates/ with values in place of its $names."""
     template = files("orthocal.export.linuxcnc").joinpath("templates", name)
     return Template(template.read_text(encoding="utf-8")).substitute(values)

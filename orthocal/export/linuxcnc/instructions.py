@@ -16,6 +16,7 @@ from orthocal.export.linuxcnc.approximation import (
     millimetres,
     rounded_up,
 )
+from orthocal.export.linuxcnc.c_source import fill_template
 from orthocal.export.linuxcnc.home_offsets import JointHome
 from orthocal.export.linuxcnc.nominal_form import Tangent
 from orthocal.text import comment_safe
@@ -110,7 +111,6 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str
             home.joint_unit,
         )
         rows.append(f"| {' | '.join(cells)} |")
-    table = "\n".join(rows)
     unit, size = DRIVE_UNITS[homes[0].unit]
     active = ", ".join(f"{v / size:.6g}" for v in entered_offsets(calibration))
     scope = "The calibration identified offsets of the drives only."
@@ -119,32 +119,14 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str
             "The calibration identified more than offsets. These offsets minimise the tool error\n"
             "while nothing else is corrected."
         )
-    return f"""\
-# {comment_safe(calibration.robot.name)}: HOME_OFFSET for LinuxCNC
-
-{scope} Enter them as HOME_OFFSET; the kinematics do not change.
-
-| section | drive | counts | HOME_OFFSET | change | ± | unit |
-|---|---|---|---|---|---|---|
-{table}
-
-±: expanded uncertainty (k = 2).
-
-1. Copy your INI file, so that you can restore it.
-2. Enter HOME_OFFSET of the table in each section. Add the same change to MIN_LIMIT and MAX_LIMIT:
-   they belong to positions of the slide. `joints.ini` in this directory has the lines. HOME does
-   not change.
-3. Restart LinuxCNC and home every joint. The change takes effect then.
-4. Check before you move the machine: with a slide in its old position, its joint displays the old
-   value plus the change above.
-5. Measure again and run `orthocal validate`. The entered offsets are active now. State them in the
-   next session.yaml: `controller: {{offsets_{unit}: [{active}]}}`.
-
-Home slowly: homing repeats to the distance that a joint moves in one servo period at
-HOME_LATCH_VEL.
-
-All numbers are in mm and degrees. If your INI has `LINEAR_UNITS = inch`, divide lengths by 25.4.
-"""
+    values = {
+        "robot": comment_safe(calibration.robot.name),
+        "scope": scope,
+        "table": "\n".join(rows),
+        "unit": unit,
+        "active": active,
+    }
+    return fill_template("home_offset.md", values)
 
 
 def write_module_page(
@@ -167,51 +149,25 @@ def write_module_page(
     if approximation.beyond is not None:
         error = rounded_up(approximation.beyond / UM)
         beyond = f" {BEYOND / MM:g} mm beyond a face the error is up to {error} µm."
-    achieved = rounded_up(max(approximation.achieved, SMALLEST_ERROR) / UM)
-    longer = rounded_up(approximation.longer / UM)
-    drives = ", ".join(comment_safe(h.drive) for h in homes)
     reason = "The calibration identified more than offsets."
     if calibration.only_offsets:
         reason = "The calibration identified offsets only; a module was requested."
     old = [f"JOINT_{i} {h.show(h.old)}" for i, h in enumerate(homes) if h.old is not None]
-    old_values = f" ({', '.join(old)})" if old else ""
-    return f"""\
-# {comment_safe(calibration.robot.name)}: kinematics for LinuxCNC
-
-{reason} This module contains the kinematics of the calibrated machine.
-{form}
-
-**The error at the tool is at most {achieved} µm** over {approximation.region} mm,
-for a tip at {millimetres(approximation.tool)} mm in the frame of the tool centre point.
-This is the largest error at {approximation.checked} points that were not fitted, plus 10 %.
-{nominal}The uncertainty of the calibration itself is in its report.
-
-## Build and enter
-
-1. If there is no `halcompile`: `sudo apt install linuxcnc-uspace-dev`.
-2. In this directory: `sudo halcompile --install orthocal_kins.c`. It needs all three C files.
-3. Copy your INI file, so that you can restore it. Enter the lines of `kinematics.ini` of this
-   directory.
-4. **HOME_OFFSET remains that of the measurement**{old_values}: the module contains the offsets.
-   Entered as HOME_OFFSET too, they would count twice. Soft limits of joints do not change either.
-5. Restart LinuxCNC and home every joint.
-
-Take readings for orthocal with nominal kinematics: restore the old INI lines before you measure
-again.
-
-The drives are joints 0 to {len(homes) - 1}: {drives}. Joints after them equal the coordinates
-{", ".join(letters)}.
-
-## Limits
-
-- **Region.** Beyond {approximation.region} mm the correction is that of the nearest
-  face.{beyond} `--half-side-mm` sets a larger region.
-- **Tool.** The platform is tilted. The error of a tip {LONGER / MM:g} mm farther in any direction
-  is up to {longer} µm: for another tool, export again with `--tool`. Tool offsets (G43) and work
-  offsets work as usual: LinuxCNC adds them before the kinematics.
-- **Units.** The module uses mm and degrees: `LINEAR_UNITS = mm`, `ANGULAR_UNITS = degree`.
-- If a leg does not reach a point, the module returns an error, and LinuxCNC stops.
-- The forward kinematics invert the same numbers by iteration, to less than a nanometre.
-
-`orthocal_core.c` needs no LinuxCNC: any controller that runs C99 can call it.
-"""
+    values = {
+        "robot": comment_safe(calibration.robot.name),
+        "reason": reason,
+        "form": form,
+        "achieved": rounded_up(max(approximation.achieved, SMALLEST_ERROR) / UM),
+        "region": approximation.region,
+        "tool": millimetres(approximation.tool),
+        "checked": approximation.checked,
+        "nominal": nominal,
+        "old_values": f" ({', '.join(old)})" if old else "",
+        "last": len(homes) - 1,
+        "drives": ", ".join(comment_safe(h.drive) for h in homes),
+        "others": ", ".join(letters),
+        "beyond": beyond,
+        "longer_mm": f"{LONGER / MM:g}",
+        "longer": rounded_up(approximation.longer / UM),
+    }
+    return fill_template("kinematics.md", values)
