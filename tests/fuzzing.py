@@ -236,6 +236,18 @@ TEXTS = [
 ]
 
 
+NUMERALS = ("1e3", "-5000", "0.0001", "299", "1e-300", "0x10", "1_0", "١")
+
+WORDS = (
+    *"G0 G1 G2 G3 G20 G21 G90 G91 G90.1 G91.1 G18 G80 G54 G55 G59.3 G61 M0 M2 M30 % N1".split(),
+    *"F0 F1e3 F0.0001 X0 Y0 X-40 Y40 X1000 Y-1e3 I0 J0 I-5 R0 R-5 P2 P10000 Z1 A1 G38.2".split(),
+    *"G92 #1=2 / ( ) G-0 M3.0 G1.0 X+.5".split(),
+    *("G4 P1", "M6 T1", "o1 sub", "\t", "\r", " " * 1200, "X" + "0" * 300, "Y0." + "1" * 300),
+    *("(" + "c" * 260 + ")", ";" + "\xe9" * 400),
+)
+"""What stands in programs, or nearly."""
+
+
 def odd(rng: random.Random) -> Any:
     """A value that nobody expects."""
     kind = rng.random()
@@ -320,13 +332,15 @@ def change_bytes(rng: random.Random, data: bytes) -> bytes:
     return data[:at] + data[other : other + rng.choice((5, 50))] + data[at:]
 
 
-def change_table(rng: random.Random, text: str, separator: str = ",") -> str:
-    """Spoil the cells and rows of a CSV."""
-    rows = [line.split(separator) for line in text.splitlines()]
+def change_rows(
+    rng: random.Random, text: str, separator: str = ",", words: tuple[str, ...] = NUMERALS
+) -> str:
+    """Spoil the cells and rows of a CSV, or the words and lines of a program."""
+    rows = [line.split(separator) for line in text.split("\n")]
     row = rng.choice(rows)
-    how = rng.randrange(6)
+    how, at = rng.randrange(9), rng.randrange(len(row))
     if how == 0:
-        row[rng.randrange(len(row))] = str(odd(rng))
+        row[at] = str(odd(rng))
     elif how == 1:
         rows.insert(rng.randrange(len(rows)), list(row))
     elif how == 2:
@@ -334,12 +348,14 @@ def change_table(rng: random.Random, text: str, separator: str = ",") -> str:
     elif how == 3:
         row.insert(rng.randrange(len(row) + 1), str(odd(rng)))
     elif how == 4:
-        column = rng.randrange(len(row))
-        row[column] = rng.choice([r[column] for r in rows if len(r) > column])
+        row[at] = rng.choice([r[at] for r in rows if len(r) > at])
+    elif how == 5:
+        row.insert(rng.randrange(len(row) + 1), rng.choice(words))
+    elif how == 6:
+        row[at] = row[at][:1] + str(rng.choice(NUMBERS))
     else:
-        number = rng.choice(("1e3", "-5000", "0.0001", "299", "1e-300", "0x10", "1_0", "١"))
-        row[-1] = number
-    return rng.choice(("\n", "\n", "\n", "\r\n", "\r")).join(separator.join(r) for r in rows) + "\n"
+        row[-1 if how == 7 else at] = rng.choice(words)
+    return rng.choice(("\n", "\n", "\n", "\r\n", "\r")).join(separator.join(r) for r in rows)
 
 
 def change_xml(rng: random.Random, data: bytes) -> bytes:
@@ -368,39 +384,6 @@ def change_xml(rng: random.Random, data: bytes) -> bytes:
             given = rng.choice(values) if rng.random() < 0.5 else str(odd(rng))
             element.attrib[key] = given
     return bytes(etree.tostring(root))
-
-
-WORDS = (
-    *"G0 G1 G2 G3 G20 G21 G90 G91 G90.1 G91.1 G18 G80 G54 G55 G59.3 G61 M0 M2 M30 % N1".split(),
-    *"F0 F1e3 F0.0001 X0 Y0 X-40 Y40 X1000 Y-1e3 I0 J0 I-5 R0 R-5 P2 P10000 Z1 A1 G38.2".split(),
-    *"G92 #1=2 / ( ) G-0 M3.0 G1.0 X+.5".split(),
-    *("G4 P1", "M6 T1", "o1 sub", "\t", "\r", " " * 1200, "X" + "0" * 300, "Y0." + "1" * 300),
-    *("(" + "c" * 260 + ")", ";" + "\xe9" * 400),
-)
-"""What stands in programs, or nearly."""
-
-
-def change_program(rng: random.Random, text: str) -> str:
-    """Spoil the words and lines of a program."""
-    lines = text.split("\n")
-    at = rng.randrange(len(lines))
-    words = lines[at].split(" ")
-    how = rng.randrange(8)
-    if how < 3:
-        words[rng.randrange(len(words))] = rng.choice(WORDS)
-    elif how == 3:
-        words.insert(rng.randrange(len(words) + 1), str(odd(rng)))
-    elif how == 4:
-        lines.insert(rng.randrange(len(lines)), rng.choice(lines))
-    elif how == 5:
-        words.insert(rng.randrange(len(words) + 1), rng.choice(WORDS))
-    elif how == 6:
-        k = rng.randrange(len(words))
-        words[k] = words[k][:1] + str(rng.choice(NUMBERS))
-    lines[at] = " ".join(words)
-    if how == 7:
-        del lines[at]
-    return rng.choice(("\n", "\n", "\n", "\r\n")).join(lines)
 
 
 def change_journal(rng: random.Random, text: str) -> str:
@@ -481,17 +464,17 @@ def mutate_structure(rng: random.Random, kind: str, data: bytes) -> bytes:
     if kind == "workbook":
         return change_workbook(rng, data)
     if kind == "table":
-        text = change_table(rng, data.decode(), rng.choice((";", ";", ";", ",")))
+        text = change_rows(rng, data.decode(), rng.choice((";", ";", ";", ",")))
         if rng.random() < 0.2:
             text = text.replace(";", rng.choice(("\t", ",", "|", " ")))
         encoding = rng.choice(ENCODINGS) if rng.random() < 0.5 else "utf-8"
         return text.encode(encoding, errors="surrogatepass" if "utf" in encoding else "replace")
     if kind in ("joints", "points", "readings"):
-        return change_table(rng, data.decode()).encode(errors="surrogatepass")
+        return change_rows(rng, data.decode()).encode(errors="surrogatepass")
     if kind == "urdf":
         return change_xml(rng, data)
     if kind == "program":
-        return change_program(rng, data.decode()).encode(errors="surrogatepass")
+        return change_rows(rng, data.decode(), " ", WORDS).encode(errors="surrogatepass")
     if kind in ("journal", "study"):
         return change_journal(rng, data.decode()).encode(errors="surrogatepass")
     document = json.loads(data) if kind == "calibration" else copy.deepcopy(_load_yaml(data))
@@ -729,8 +712,9 @@ def work(good_folder: Path, seed: int, first: int, last: int, *, thorough: float
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         shutil.copytree(good_folder, folder, dirs_exist_ok=True)
-        for kind in ("calibration", "urdf", "workbook"):  # what is imported at first takes its time
-            use(kind, folder, random.Random(0), thorough=1.0)
+        if thorough:
+            for kind in ("calibration", "urdf", "workbook"):  # the first imports take their time
+                use(kind, folder, random.Random(0), thorough=1.0)
         for index in range(first, last):
             faulthandler.dump_traceback_later(HANGS, exit=True)
             kind, data, rng = make_case(seed, index, good)

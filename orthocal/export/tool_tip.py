@@ -24,8 +24,7 @@ TOLERANCE = 1e-12
 """Largest distance of a tip from its target, [m]."""
 
 MOST_STEPS = 60
-
-MOST_AT_ONCE = 1000
+"""Largest number of corrections of a point."""
 
 LARGEST_COORDINATE = 10.0
 """Largest coordinate of a tip; a larger one is in another unit, [m]."""
@@ -77,14 +76,16 @@ class ToolTip:
 
     def place(self, drives: Array, *, start: Array | None = None) -> Array:
         """Tips at drive coordinates, shape (k, n), [m]."""
-        return self._tips(self.poses(drives, start=start))
+        poses = self.poses(drives, start=start)
+        tips = poses[:, :3, 3] + poses[:, :3, :3] @ self.tool
+        return np.asarray(tips[:, self.coordinates])
 
     def poses(self, drives: Array, *, start: Array | None = None) -> Array:
         """Poses of the robot's tool centre point, shape (k, 4, 4), [1, m]."""
-        parts = _parts(len(drives))
-        return np.concatenate(
-            [self._poses(drives[p], None if start is None else start[p]) for p in parts]
-        )
+        machine = self._closure.geometry()
+        passive = self._closure.close(drives, start=start)
+        (poses,) = self._pose(machine.drives(drives), passive, machine.placements)
+        return np.asarray(poses)
 
     def reach(self, points: Array, *, failures: Failures | None = None) -> tuple[Array, Array]:
         """Drive and passive coordinates that bring the tip to its targets.
@@ -98,40 +99,16 @@ class ToolTip:
             ClosureError: If a point is out of reach.
             ExportError: If the iteration diverges because the platform turns too much.
         """
-        results = []
-        for part in _parts(len(points)):
-            of_part: Failures | None = None if failures is None else {}
-            results.append(self._reach(points[part], of_part))
-            if failures is not None and of_part:
-                failures.update({part.start + i: e for i, e in of_part.items()})
-        drives, passive = (np.concatenate(part) for part in zip(*results, strict=True))
-        return drives, passive
-
-    def _reach(self, points: Array, failures: Failures | None) -> tuple[Array, Array]:
         shifted, targets, start = np.array(points), self.targets(points), None
         for _ in range(MOST_STEPS):
             drives, passive = self._closure.reach(shifted, start=start, failures=failures)
             reached = np.isfinite(drives).all(axis=1)
             if not self.tool.any() or not reached.any():
                 return drives, passive
-            missing = targets[reached] - self._tips(self._poses(drives[reached], passive[reached]))
+            missing = targets[reached] - self.place(drives[reached], start=passive[reached])
             if np.abs(missing).max() < TOLERANCE:
                 return drives, passive
             shifted[reached] += missing
             shifted[~reached] = np.nan  # refused already
             start = np.hstack([drives, passive])
         raise ExportError("the platform turns too much for a tool this long; use a shorter one")
-
-    def _poses(self, drives: Array, start: Array | None) -> Array:
-        machine = self._closure.geometry()
-        passive = self._closure.close(drives, start=start)
-        (poses,) = self._pose(machine.drives(drives), passive, machine.placements)
-        return np.asarray(poses)
-
-    def _tips(self, poses: Array) -> Array:
-        tips = poses[:, :3, 3] + poses[:, :3, :3] @ self.tool
-        return np.asarray(tips[:, self.coordinates])
-
-
-def _parts(count: int) -> list[slice]:
-    return [slice(i, i + MOST_AT_ONCE) for i in range(0, count, MOST_AT_ONCE)]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import io
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -217,40 +216,6 @@ def _check_texts(document: object) -> None:
                     raise ValueError(problem)
 
 
-def read_csv_rows(
-    path: Path,
-    *,
-    required: tuple[str, ...],
-    optional: tuple[str, ...] = (),
-    error: type[OrthocalError],
-    content: bytes | None = None,
-) -> Iterator[tuple[int, dict[str, str]]]:
-    """Rows of a CSV file with a header: line number, and cells by column. Blank lines are skipped.
-
-    The separator is a semicolon if the header has no comma.
-
-    Args:
-        path: The file.
-        required: Required columns.
-        optional: Optional columns.
-        error: Kind of error to raise.
-        content: Content of the file, if it was read before.
-
-    Raises:
-        OrthocalError: Of kind `error`, naming file and line.
-    """
-    text = read_text(path, error=error, content=content)
-    lines = io.StringIO(text, newline=None)
-    yield from csv_rows(
-        lines,
-        name=str(path),
-        required=required,
-        optional=optional,
-        error=error,
-        most=MOST_CSV_ROWS,
-    )
-
-
 def csv_rows(
     lines: Iterable[str],
     *,
@@ -260,7 +225,9 @@ def csv_rows(
     error: type[OrthocalError],
     most: int | None = None,
 ) -> Iterator[tuple[int, dict[str, str]]]:
-    """Rows of a CSV file from a stream of lines, as in `read_csv_rows`.
+    """Rows of a CSV file with a header: line number, and cells by column. Blank lines are skipped.
+
+    The separator is a semicolon if the header has no comma.
 
     Args:
         lines: Lines with their line ends.

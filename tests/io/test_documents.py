@@ -13,8 +13,8 @@ from orthocal import Choice, calibrate, load_calibration, load_session
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.file import calibration_document, write_calibration
 from orthocal.errors import OrthocalError, SessionError, SolverError
-from orthocal.io import documents
-from orthocal.io.documents import MOST_JSON_VALUES, read_csv_rows, read_json
+from orthocal.io.documents import MOST_JSON_VALUES, csv_rows, read_json
+from orthocal.measurement.files.readings_file import read_rows
 
 PROMPT = 5.0
 """Largest processor time of a refusal, [s]."""
@@ -65,20 +65,22 @@ def test_many_values_are_refused(refused):
     assert f"expected at most {MOST_JSON_VALUES}" in message
 
 
-def test_a_csv_with_too_many_rows_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(documents, "MOST_CSV_ROWS", 1000)
-    path = tmp_path / "file"
-    path.write_text("a,b\n" + "1,2\n" * 1000)
+def test_a_csv_with_too_many_rows_is_refused():
+    lines = ["a,b\n", *["1,2\n"] * 1000]
+    rows = csv_rows(lines, name="f", required=("a", "b"), error=SessionError, most=1000)
     with pytest.raises(SessionError, match="has more than 1000 rows"):
-        list(read_csv_rows(path, required=("a", "b"), error=SessionError))
+        list(rows)
 
 
 @pytest.mark.parametrize("ending", ["\n", "\r\n", "\r"])
-def test_line_ends_of_a_csv(ending, tmp_path):
-    path = tmp_path / "file"
-    path.write_bytes(ending.join(["a,b", "1,2", "", "3,4", ""]).encode())
-    rows = list(read_csv_rows(path, required=("a", "b"), error=SessionError))
-    assert rows == [(2, {"a": "1", "b": "2"}), (4, {"a": "3", "b": "4"})]
+def test_line_ends_of_readings(ending, tmp_path):
+    path = tmp_path / "readings.csv"
+    lines = ["setup,posture,reading_mm", "yx,zero,1", "", "yx,x_max,2", ""]
+    rows = list(read_rows(path, ending.join(lines).encode()))
+    assert [(r.line, r.posture, r.reading_mm) for r in rows] == [
+        (2, "zero", "1"),
+        (4, "x_max", "2"),
+    ]
 
 
 @pytest.mark.parametrize("where", ["key", "value", "item"])

@@ -287,14 +287,10 @@ RESET = ["G92.1", "G49", *(f"G10 L2 P{k} X0 Y0 Z0 R0" for k in (1, 2)), "G54 G90
 
 CONTROLLER_STATES = {
     "initial": [],
-    "G54 set": ["G10 L2 P1 X11 Y-7 Z5"],
-    "G55 active": ["G10 L2 P2 X-9 Y4 Z8", "G55"],
-    "G92 active": ["G92 X5 Y6 Z7"],
-    "G54 rotated": ["G10 L2 P1 R30"],
-    "tool length active": ["G43.1 X3 Z-5"],
-    "incremental inches": ["G20 G91 G18"],
+    "G54 set and rotated": ["G10 L2 P1 X11 Y-7 Z5 R30"],
     "all": ["G10 L2 P2 X3 Y-2 Z6 R-40", "G55", "G92 X1 Y2 Z3", "G43.1 X3 Z-5", "G20 G91 G18"],
 }
+"""Lines before the program; no two displacements in `all` cancel."""
 
 
 def test_linuxcnc_joints_do_not_depend_on_offsets_rotation_or_tool_length(small, motions, tmp_path):

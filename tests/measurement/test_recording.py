@@ -25,7 +25,8 @@ from orthocal.measurement.recording import SUFFIX, open_recording
 from orthocal.runtime.interrupts import ending_at_interrupt
 from orthocal.units import MM
 
-KILLS = 100
+KILLS = 25
+"""A third of kills fall between journal and CSV: 25 without one are unlikely (4e-5)."""
 FORK = multiprocessing.get_context("fork")
 
 PLAN = """# a comment that stays
@@ -316,10 +317,10 @@ def talk(folder, lines, said):
 KEPT = re.compile(r"Recorded: row \d+, (\S+) (\S+?)(?:, cycle (\d+))?: (-?[0-9.]+) mm\n")
 
 
-def test_killed_a_hundred_times_no_accepted_reading_is_lost(tmp_path, monkeypatch):
+def test_killed_many_times_no_accepted_reading_is_lost(tmp_path, monkeypatch):
     """Killed while lines come in as fast as they are taken, among them corrections and repeats."""
     monkeypatch.setenv("COLUMNS", "100")
-    folder = make_plan(tmp_path / "session", cycles=150)  # more than are read before all ends
+    folder = make_plan(tmp_path / "session", cycles=60)  # more than are read before all ends
     monkeypatch.setattr(command._Dialogue, "_is_doubtful", lambda *_: False)
     monkeypatch.setattr(command._Dialogue, "_judge", lambda *_: None)
     robot = load_plan(folder).robot

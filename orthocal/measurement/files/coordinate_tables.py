@@ -45,8 +45,7 @@ def read_points(path: Path, robot: Robot) -> Block:
     Raises:
         SessionError: Naming file and line.
     """
-    columns, ignored = _point_columns(robot)
-    blocks = list(_stream(path, columns, ignored=ignored, name=str(path), most=MOST_CSV_ROWS))
+    blocks = list(stream_points(path, robot, name=str(path), most=MOST_CSV_ROWS))
     return [name for names, _ in blocks for name in names], np.concatenate([v for _, v in blocks])
 
 
@@ -64,19 +63,24 @@ def stream_joints(source: Path | BinaryIO, robot: Robot, *, name: str) -> Iterat
     yield from _stream(source, drive_columns(robot), name=name)
 
 
-def stream_points(source: Path | BinaryIO, robot: Robot, *, name: str) -> Iterator[Block]:
+def stream_points(
+    source: Path | BinaryIO, robot: Robot, *, name: str, most: int | None = None
+) -> Iterator[Block]:
     """Read tool points of any number like `read_points`, block by block.
 
     Args:
         source: A file, or an open stream.
         robot: The robot.
         name: Name of the source, for messages.
+        most: Largest number of rows.
 
     Raises:
         SessionError: Naming file and line.
     """
-    columns, ignored = _point_columns(robot)
-    yield from _stream(source, columns, ignored=ignored, name=name)
+    controlled = range(3) if robot.tcp is None else robot.tcp.coordinates
+    columns = {name: f for i, (name, f) in enumerate(TOOL_COLUMNS.items()) if i in controlled}
+    ignored = tuple(name for name in TOOL_COLUMNS if name not in columns)
+    yield from _stream(source, columns, ignored=ignored, name=name, most=most)
 
 
 def format_rows(columns: dict[str, float], values: Array) -> str:
@@ -87,13 +91,6 @@ def format_rows(columns: dict[str, float], values: Array) -> str:
         (",".join(f"{v:.6f}" for v in row) if np.isfinite(row).all() else empty) + "\n"
         for row in scaled
     )
-
-
-def _point_columns(robot: Robot) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Columns of the coordinates that the drives control, and of the others."""
-    controlled = range(3) if robot.tcp is None else robot.tcp.coordinates
-    columns = {name: f for i, (name, f) in enumerate(TOOL_COLUMNS.items()) if i in controlled}
-    return columns, tuple(name for name in TOOL_COLUMNS if name not in columns)
 
 
 def _stream(

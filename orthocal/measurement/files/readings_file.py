@@ -7,6 +7,7 @@ taken where it can mean one thing only; whatever is less clear is for `orthocal 
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -16,7 +17,7 @@ from itertools import islice
 from pathlib import Path
 
 from orthocal.errors import SessionError
-from orthocal.io.documents import read_csv_rows
+from orthocal.io.documents import MOST_CSV_ROWS, csv_rows, read_text
 from orthocal.io.tables.delimited import SEPARATORS, decode, stated_separator
 from orthocal.io.tables.numerals import (
     DecimalSign,
@@ -176,10 +177,16 @@ def read_rows(path: Path, content: bytes) -> Iterator[RawReading]:
 
 def _plain_rows(path: Path, content: bytes) -> Iterator[RawReading]:
     """Rows below the headings of a readings.csv."""
+    text = read_text(path, error=SessionError, content=content)
 
     def rows() -> Iterator[tuple[int, dict[str, str]]]:
-        return read_csv_rows(
-            path, required=REQUIRED, optional=OPTIONAL, error=SessionError, content=content
+        return csv_rows(
+            io.StringIO(text, newline=None),
+            name=str(path),
+            required=REQUIRED,
+            optional=OPTIONAL,
+            error=SessionError,
+            most=MOST_CSV_ROWS,
         )
 
     sign: Sign | None = None
