@@ -58,6 +58,11 @@ class Visit:
         seen = (frame or self.page).evaluate(f"(viewer.set_dirty(), {drawn})")
         self.wait_for(f"{drawn} > {seen}", frame=frame)
 
+    def resize(self, size):
+        """Change the size of the window and wait until the page has been drawn."""
+        self.page.set_viewport_size({"width": size[0], "height": size[1]})
+        self.wait_until_drawn()
+
     def picture(self):
         """Screenshot of the page, shape (height, width, 3)."""
         return np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB"))

@@ -7,23 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from browser import SIZES, SMALL, open_browser, require_browser, visit
-from folders import session_folder
+from calibrated import EXPERIMENT_2, calibrated, report_of, scene_of, session_of
 from PIL import Image
 
-from orthocal import LiveScene, calibrate, draw_scene, load_robot, load_session, write_report
+from orthocal import LiveScene, draw_scene
 from orthocal.measurement.files.session_file import load_plan
 from orthocal.output.report.parameter_plots import plot_correlations
 from orthocal.viewer.browser import take_picture
 
 EXPECTED = ("zx −1.140 → −0.130 mm", "x_max − x_min", "Before: measured − nominal", "leg z")
-
-
-def by_size(size):
-    return f"{size[0]}x{size[1]}"
-
-
-def by_name_and_size(case):
-    return f"{case[0]}-{by_size(case[1])}"
 
 
 @pytest.fixture(scope="module")
@@ -33,37 +25,35 @@ def browser():
 
 
 @pytest.fixture(scope="module")
-def calibration(experiment_2):
-    return calibrate(experiment_2)
+def opened(browser, tmp_path_factory):
+    """Function that opens a page and keeps it open and drawn; tests leave it as it was."""
+    pages = {}
+
+    def open_page(name, page, *, suffix="", drawn=True):
+        if name not in pages:
+            path = tmp_path_factory.mktemp("page") / "page.html"
+            path.write_text(page(), encoding="utf-8")
+            visited = visit(browser, path.as_uri() + suffix, size=SIZES[1])
+            pages[name] = (visited, visited.__enter__())
+            if drawn:
+                pages[name][1].wait_until_drawn()
+        return pages[name][1]
+
+    yield open_page
+    for visited, _ in pages.values():
+        visited.__exit__(None, None, None)
 
 
-@pytest.fixture(scope="module")
-def page(calibration, tmp_path_factory):
-    return draw_scene(calibration).save(tmp_path_factory.mktemp("page") / "scene.html")
+@pytest.fixture
+def drawn(opened):
+    """The page of the calibration."""
+    return opened("calibration", scene_of(EXPERIMENT_2).to_html)
 
 
-@pytest.fixture(scope="module", params=SIZES, ids=by_size)
-def drawn(browser, page, request):
-    """The page of the calibration, open and drawn; tests do not change it."""
-    with visit(browser, page.as_uri(), size=request.param) as found:
-        found.wait_until_drawn()
-        yield found, request.param
-
-
-@pytest.fixture(scope="module")
-def session_drawn(browser, root, tmp_path_factory, request):
-    """The page of a session, open and drawn, and its size."""
-    name, size = request.param
-    scene = draw_scene(load_session(session_folder(root, name)))
-    path = scene.save(tmp_path_factory.mktemp("session") / "page.html")
-    with visit(browser, path.as_uri(), size=size) as found:
-        found.wait_until_drawn()
-        yield found, size
-
-
-@pytest.fixture(scope="module")
-def report(calibration, tmp_path_factory):
-    return write_report(calibration, tmp_path_factory.mktemp("report") / "report.html")
+@pytest.fixture
+def report(opened):
+    """The report of the calibration."""
+    return opened("report", lambda: report_of(EXPERIMENT_2), drawn=False)
 
 
 def count_colours(picture):
@@ -122,152 +112,150 @@ def test_setups_with_any_names_are_drawn(browser, raw_cycles, tmp_path):
     assert all(any(name in node for node in nodes) for name in odd.values()), nodes
 
 
-def test_scene_draws_without_requests(drawn, page):
-    found, _ = drawn
-    assert found.messages == []
-    assert found.requests == [page.as_uri()]
-    assert is_drawn(found.canvas())
-    text = found.page.inner_text("body")
+def test_scene_draws_without_requests(drawn):
+    assert drawn.messages == []
+    assert drawn.requests == [drawn.page.url]
+    assert is_drawn(drawn.canvas())
+    text = drawn.page.inner_text("body")
     for expected in EXPECTED:
         assert expected in text
     assert "Leg x is furthest from parallel: −1.140 mm" in text
     assert "deviation × 12" in text
 
 
-def test_whole_machine_is_in_view_beside_the_panels(drawn):
-    found, size = drawn
-    left, right, top, bottom = found.page.evaluate(
-        """() => {
-             const data = JSON.parse(document.getElementById('scene-data').textContent);
-             const at = data.camera.points.map(([x, y, z]) =>
-               new MeshCat.THREE.Vector3(x, z, -y).project(viewer.camera));
-             const x = at.map((p) => ((p.x + 1) / 2) * window.innerWidth);
-             const y = at.map((p) => ((1 - p.y) / 2) * window.innerHeight);
-             return [Math.min(...x), Math.max(...x), Math.min(...y), Math.max(...y)];
-           }"""
-    )
-    panel = found.page.evaluate("document.getElementById('panel').getBoundingClientRect().right")
-    assert left > panel
-    assert right < size[0]
-    assert top > 0
-    assert bottom < size[1]
-    assert (right - left) * (bottom - top) > 0.2 * size[0] * size[1]
+def test_whole_machine_is_in_view_beside_the_panels_at_every_size(drawn):
+    for size in SIZES:
+        drawn.resize(size)
+        left, right, top, bottom = drawn.page.evaluate(
+            """() => {
+                 const data = JSON.parse(document.getElementById('scene-data').textContent);
+                 const at = data.camera.points.map(([x, y, z]) =>
+                   new MeshCat.THREE.Vector3(x, z, -y).project(viewer.camera));
+                 const x = at.map((p) => ((p.x + 1) / 2) * window.innerWidth);
+                 const y = at.map((p) => ((1 - p.y) / 2) * window.innerHeight);
+                 return [Math.min(...x), Math.max(...x), Math.min(...y), Math.max(...y)];
+               }"""
+        )
+        panel = drawn.page.evaluate(
+            "document.getElementById('panel').getBoundingClientRect().right"
+        )
+        assert panel < left < right < size[0]
+        assert 0 < top < bottom < size[1]
+        assert (right - left) * (bottom - top) > 0.2 * size[0] * size[1]
 
 
-NAMES = ("table1/experiment-2", "lines", "sweep")
-LABELLED = [(name, size) for name in NAMES for size in SIZES]
+def scene_page(name):
+    """Page of the calibration of an example, or of a session without its calibration."""
+    return (scene_of(name) if name == EXPERIMENT_2 else draw_scene(session_of(name))).to_html()
 
 
-@pytest.mark.parametrize("session_drawn", LABELLED, ids=by_name_and_size, indirect=True)
-def test_no_label_covers_another_or_a_panel(session_drawn):
-    found, size = session_drawn
-    rectangles = boxes(found.page)
-    assert sum("mm" in r[4] for r in rectangles) >= 6
-    for i, (left, top, right, bottom, text) in enumerate(rectangles):
-        for l2, t2, r2, b2, other in rectangles[i + 1 :]:
-            apart = right <= l2 or r2 <= left or bottom <= t2 or b2 <= top
-            assert apart, f"{text!r} and {other!r} overlap"
-        assert left >= 0
-        assert top >= 0
-        assert right <= size[0] + 1
-        assert bottom <= size[1] + 1
+@pytest.mark.parametrize("name", [EXPERIMENT_2, "lines", "sweep"])
+def test_no_label_covers_another_or_a_panel_or_a_dial_at_any_size(opened, name):
+    key = "calibration" if name == EXPERIMENT_2 else name
+    found = opened(key, lambda: scene_page(name))
+    for size in SIZES:
+        found.resize(size)
+        assert found.messages == []
+        rectangles = boxes(found.page)
+        assert sum("mm" in r[4] for r in rectangles) >= 6
+        for i, (left, top, right, bottom, text) in enumerate(rectangles):
+            for l2, t2, r2, b2, other in rectangles[i + 1 :]:
+                apart = right <= l2 or r2 <= left or bottom <= t2 or b2 <= top
+                assert apart, f"{text!r} and {other!r} overlap"
+            assert min(left, top) >= 0
+            assert right <= size[0] + 1
+            assert bottom <= size[1] + 1
+        # six of the 18 dials of the sweep have a label, the worst of each leg and direction
+        labels = [r for r in rectangles if " mm" in r[4] and len(r[4]) < 80]
+        places = found.page.evaluate(
+            """() => JSON.parse(document.getElementById('scene-data').textContent).labels
+                 .filter((label) => label.node.startsWith('Gauges/'))
+                 .map(({ at: [[x, y, z]] }) => new MeshCat.THREE.Vector3(x, z, -y)
+                   .project(viewer.camera))
+                 .map((p) => [((p.x + 1) / 2) * window.innerWidth,
+                              ((1 - p.y) / 2) * window.innerHeight])"""
+        )
+        assert len(places) == (18 if name == "sweep" else 6)
+        assert len(labels) == 6
+        for left, top, right, bottom, text in labels:
+            covered = [p for p in places if left <= p[0] <= right and top <= p[1] <= bottom]
+            assert not covered, f"{text!r} covers {covered}"
 
 
-SWEPT = [("sweep", size) for size in SIZES]
-
-
-@pytest.mark.parametrize("session_drawn", SWEPT, ids=by_name_and_size, indirect=True)
-def test_labels_cover_no_dial(session_drawn):
-    """Six of 18 dials have a label, the worst of each leg and direction."""
-    found, _ = session_drawn
-    dials = found.page.evaluate(
-        """() => JSON.parse(document.getElementById('scene-data').textContent).labels
-             .filter((label) => label.node.startsWith('Gauges/'))
-             .map(({ at: [[x, y, z]] }) => new MeshCat.THREE.Vector3(x, z, -y)
-               .project(viewer.camera))
-             .map((p) => [((p.x + 1) / 2) * window.innerWidth,
-                          ((1 - p.y) / 2) * window.innerHeight])"""
-    )
-    labels = [r for r in boxes(found.page) if " mm" in r[4] and len(r[4]) < 80]
-    assert len(dials) == 18
-    assert len(labels) == 6
-    for left, top, right, bottom, text in labels:
-        covered = [d for d in dials if left <= d[0] <= right and top <= d[1] <= bottom]
-        assert not covered, f"{text!r} covers {covered}"
-
-
-@pytest.mark.parametrize("size", SIZES, ids=by_size)
-def test_text_of_the_panel_fits_into_the_picture(browser, calibration, tmp_path, size):
-    page = draw_scene(calibration, show="all").save(tmp_path / "page.html")
-    with visit(browser, f"{page.as_uri()}#picture", size=size) as found:
-        found.wait_until_drawn()
+def test_text_of_the_panel_fits_into_the_picture(opened):
+    page = scene_of(EXPERIMENT_2, show="all").to_html
+    found = opened("picture", page, suffix="#picture")
+    assert found.messages == []
+    assert count_colours(found.canvas()) > 300  # with ellipsoids at the tool
+    for size in SIZES:
+        found.resize(size)
         text, room = found.page.evaluate(
             "(({ scrollHeight, clientHeight }) => [scrollHeight, clientHeight])"
             "(document.getElementById('panel'))"
         )
-    assert text <= room
+        assert text <= room
 
 
-def test_measurement_plays(browser, page):
+def test_measurement_plays(drawn):
     """The controls and the button move machine and labels."""
-    with visit(browser, page.as_uri(), size=SIZES[1]) as found:
-        found.wait_until_drawn()
-        steps = found.page.evaluate(
-            "JSON.parse(document.getElementById('scene-data').textContent).steps"
-        )
-        pictures, captions = [], []
-        for name in ("overview", "x_max", "y_min"):
-            step = next(s for s in steps if s["name"] == name)
-            seek(found, (step["start"] + step["end"]) / 2)
-            pictures.append(found.canvas())
-            captions.append(found.page.inner_text("#bar span"))
-            labels = [r[4] for r in boxes(found.page) if " mm" in r[4]]
-            if name == "x_max":
-                assert any(text.startswith("zx −1.140") for text in labels)
-                assert not any(text.startswith("zy") for text in labels)
-        for one, two in ((0, 1), (1, 2), (0, 2)):
-            changed = np.abs(pictures[one].astype(int) - pictures[two].astype(int)).max(axis=-1)
-            assert (changed > 40).mean() > 0.005
-        assert captions[1].startswith("x_max, leg x: ")
-        assert captions[2].startswith("y_min, leg y: subtracted from the readings at y_max")
-        found.page.evaluate("viewer.animator.reset()")
-        found.page.click("#bar button")
-        found.wait_for("viewer.animator.time > 2.5")
-        moving = found.canvas()
-        assert (np.abs(moving.astype(int) - pictures[0].astype(int)).max(axis=-1) > 40).any()
-        assert found.page.inner_text("#bar button") == "❚❚ Pause"
-        assert found.messages == []
+    drawn.resize(SIZES[1])
+    steps = drawn.page.evaluate(
+        "JSON.parse(document.getElementById('scene-data').textContent).steps"
+    )
+    pictures, captions = [], []
+    for name in ("overview", "x_max", "y_min"):
+        step = next(s for s in steps if s["name"] == name)
+        seek(drawn, (step["start"] + step["end"]) / 2)
+        pictures.append(drawn.canvas())
+        captions.append(drawn.page.inner_text("#bar span"))
+        labels = [r[4] for r in boxes(drawn.page) if " mm" in r[4]]
+        if name == "x_max":
+            assert any(text.startswith("zx −1.140") for text in labels)
+            assert not any(text.startswith("zy") for text in labels)
+    for one, two in ((0, 1), (1, 2), (0, 2)):
+        changed = np.abs(pictures[one].astype(int) - pictures[two].astype(int)).max(axis=-1)
+        assert (changed > 40).mean() > 0.005
+    assert captions[1].startswith("x_max, leg x: ")
+    assert captions[2].startswith("y_min, leg y: subtracted from the readings at y_max")
+    drawn.page.evaluate("viewer.animator.reset()")
+    drawn.page.click("#bar button")
+    drawn.wait_for("viewer.animator.time > 2.5")
+    moving = drawn.canvas()
+    assert (np.abs(moving.astype(int) - pictures[0].astype(int)).max(axis=-1) > 40).any()
+    assert drawn.page.inner_text("#bar button") == "❚❚ Pause"
+    assert drawn.messages == []
+    drawn.page.evaluate("viewer.animator.pause()")
+    seek(drawn, 0)
 
 
-def test_boxes_of_the_legend_show_and_hide(browser, page):
-    with visit(browser, page.as_uri(), size=SIZES[1]) as found:
-        found.wait_until_drawn()
-        before = found.canvas()
-        found.page.click("#legend label:has-text('Calibrated machine')")
-        found.wait_for("!viewer.scene_tree.find(['Machine, calibrated']).object.visible")
-        assert (found.canvas() != before).any()
-        assert any("zx" in r[4] and "→" in r[4] for r in boxes(found.page)[2:])
-        found.page.click("#legend label:has-text('Gauges')")
-        found.wait_for("!document.getElementById('labels').innerText.includes('→')")
-        # the legend shows what meshcat's controls have hidden
-        found.page.evaluate(
-            "viewer.set_property(['Leg lines'], 'visible', false); viewer.set_dirty()"
-        )
-        found.wait_for(
-            """![...document.querySelectorAll('#legend label')]
-                 .find((e) => e.textContent.startsWith('Leg,')).querySelector('input').checked"""
-        )
+def test_boxes_of_the_legend_show_and_hide(drawn):
+    machine = "#legend label:has-text('Calibrated machine')"
+    before = drawn.canvas()
+    drawn.page.click(machine)
+    drawn.wait_for("!viewer.scene_tree.find(['Machine, calibrated']).object.visible")
+    assert (drawn.canvas() != before).any()
+    assert any("zx" in r[4] and "→" in r[4] for r in boxes(drawn.page)[2:])
+    drawn.page.click("#legend label:has-text('Gauges')")
+    drawn.wait_for("!document.getElementById('labels').innerText.includes('→')")
+    # the legend shows what meshcat's controls have hidden
+    line = "viewer.set_property(['Leg lines'], 'visible', {}); viewer.set_dirty()"
+    drawn.page.evaluate(line.format("false"))
+    drawn.wait_for(
+        """![...document.querySelectorAll('#legend label')]
+             .find((e) => e.textContent.startsWith('Leg,')).querySelector('input').checked"""
+    )
+    drawn.page.evaluate(line.format("true"))
+    for label in (machine, "#legend label:has-text('Gauges')"):
+        drawn.page.click(label)
+    drawn.wait_until_drawn()
 
 
-def test_other_scenes_draw_too(browser, root, tmp_path, raw_cycles):
-    calibrated = calibrate(raw_cycles)
+def test_other_scenes_draw_too(browser, root, tmp_path, fivebar):
+    """A robot without readings and with sticks for links, a plan, and a single posture."""
     scenes = {
-        "robot": draw_scene(load_robot("orthoglide")),
-        "fivebar": draw_scene(load_robot(root / "tests/robots/fivebar")),
+        "fivebar": draw_scene(fivebar),
         "plan": draw_scene(load_plan(root / "tests/sessions/lines/plan.yaml")),
-        "session": draw_scene(raw_cycles),
-        "tool": draw_scene(calibrated, show="all"),
-        "true": draw_scene(calibrated, posture="x_max", exaggeration=1.0),
+        "true": scene_of("raw-cycles", posture="x_max", exaggeration=1.0),
     }
     for name, scene in scenes.items():
         path = scene.save(tmp_path / f"{name}.html")
@@ -278,8 +266,8 @@ def test_other_scenes_draw_too(browser, root, tmp_path, raw_cycles):
             assert count_colours(found.canvas()) > 300, name
 
 
-def test_live_page_draws_what_the_server_sends(browser, calibration):
-    scene = draw_scene(calibration)
+def test_live_page_draws_what_the_server_sends(browser, orthoglide):
+    scene = draw_scene(orthoglide)
     with LiveScene(scene) as live, visit(browser, live.url, size=SMALL, online=True) as found:
         found.wait_for(f"viewer.num_messages_received >= {len(scene.commands)}")
         found.wait_until_drawn()
@@ -287,47 +275,50 @@ def test_live_page_draws_what_the_server_sends(browser, calibration):
         assert is_drawn(found.canvas())
         assert found.messages == []
         assert {u.split("/")[2] for u in found.requests} == {f"127.0.0.1:{live.port}"}
-        scene.set_property("Machine, calibrated", "visible", False)
-        found.wait_for("!viewer.scene_tree.find(['Machine, calibrated']).object.visible")
+        scene.set_property("Machine", "visible", False)
+        found.wait_for("!viewer.scene_tree.find(['Machine']).object.visible")
 
 
 # ---- the report
 
 
-def test_report_opens_without_requests(browser, report):
-    with visit(browser, report.as_uri(), size=(1000, 900)) as found:
-        assert found.page.title().startswith("Calibration of orthoglide")
-        text = found.page.inner_text("body")
-        for expected in ("x_slide", "-0.527", "Findings", "SHA-256"):
-            assert expected in text
-        found.page.locator("iframe").scroll_into_view_if_needed()
-        frame = found.page.frame_locator("iframe")
-        frame.locator("#headline").wait_for(timeout=60_000)
-        handle = found.page.query_selector("iframe").content_frame()
-        found.wait_until_drawn(frame=handle)
-        assert is_drawn(found.picture())
-        assert found.messages == []
-        outside = [u for u in found.requests if not u.startswith(("about:", "data:"))]
-        assert outside == [report.as_uri()]
+def test_report_opens_without_requests_and_prints(report, tmp_path):
+    """It is drawn with its scene; the printed report has several pages."""
+    assert report.page.title().startswith("Calibration of orthoglide")
+    text = report.page.inner_text("body")
+    for expected in ("x_slide", "-0.527", "Findings", "SHA-256"):
+        assert expected in text
+    report.page.locator("iframe").scroll_into_view_if_needed()
+    report.page.frame_locator("iframe").locator("#headline").wait_for(timeout=60_000)
+    handle = report.page.query_selector("iframe").content_frame()
+    report.wait_until_drawn(frame=handle)
+    assert is_drawn(report.picture())
+    assert report.messages == []
+    outside = [u for u in report.requests if not u.startswith(("about:", "data:"))]
+    assert outside == [report.page.url]
+    data = report.page.pdf(path=str(tmp_path / "report.pdf"), format="A4", print_background=True)
+    assert data.startswith(b"%PDF")
+    assert data.count(b"/Type /Page\n") + data.count(b"/Type /Page ") >= 3
+
+    # ---- pictures
 
 
-def test_report_is_as_wide_as_its_window(browser, report):
+def test_report_is_as_wide_as_its_window(report):
     """No figure is wider than the window at either size."""
     for size in SIZES:
-        with visit(browser, report.as_uri(), size=size) as found:
-            width = found.page.evaluate("document.documentElement.scrollWidth")
-            assert width <= size[0]
-            for figure in found.page.query_selector_all("figure svg"):
-                box = figure.bounding_box()
-                assert box["x"] >= 0
-                assert box["x"] + box["width"] <= size[0] + 1
+        report.page.set_viewport_size({"width": size[0], "height": size[1]})
+        width = report.page.evaluate("document.documentElement.scrollWidth")
+        assert width <= size[0]
+        for figure in report.page.query_selector_all("figure svg"):
+            box = figure.bounding_box()
+            assert box["x"] >= 0
+            assert box["x"] + box["width"] <= size[0] + 1
 
 
-def test_no_text_of_a_plot_is_cut_off(browser, root, tmp_path):
+def test_no_text_of_a_plot_is_cut_off(browser, tmp_path):
     """Browsers may draw text wider than matplotlib does, here the names of 40 parameters."""
-    calibration = calibrate(load_session(root / "examples/workshop"), "full")
     path = tmp_path / "plot.html"
-    path.write_text(plot_correlations(calibration), encoding="utf-8")
+    path.write_text(plot_correlations(calibrated("workshop", "full")), encoding="utf-8")
     with visit(browser, path.as_uri()) as found:
         texts = found.page.evaluate(
             """() => {
@@ -344,24 +335,10 @@ def test_no_text_of_a_plot_is_cut_off(browser, root, tmp_path):
         assert min(gaps) >= 0.0, text
 
 
-def test_report_prints(browser, report, tmp_path):
-    """The printed report has several pages."""
-    with visit(browser, report.as_uri()) as found:
-        found.page.locator("iframe").scroll_into_view_if_needed()
-        handle = found.page.query_selector("iframe").content_frame()
-        found.wait_until_drawn(frame=handle)
-        data = found.page.pdf(path=str(tmp_path / "report.pdf"), format="A4", print_background=True)
-    assert data.startswith(b"%PDF")
-    assert data.count(b"/Type /Page\n") + data.count(b"/Type /Page ") >= 3
-
-
-# ---- pictures
-
-
-def test_picture_has_the_requested_size(page, tmp_path):
+def test_picture_has_the_requested_size(tmp_path):
     require_browser()
-    width, height = SIZES[1]
-    text = page.read_text(encoding="utf-8")
+    width, height = 640, 480
+    text = scene_of(EXPERIMENT_2).to_html()
     path = take_picture(text, tmp_path / "a.png", width=width, height=height)
     with Image.open(path) as image:
         assert image.size == (width, height)

@@ -1,0 +1,37 @@
+"""Sessions, calibrations, scenes and reports of the examples, each made once in a process."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from conftest import ROOT
+from folders import session_folder
+
+from orthocal import calibrate, draw_scene, load_session
+from orthocal.output.report.page import build_report
+
+EXPERIMENT_2 = "table1/experiment-2"
+
+
+@cache
+def session_of(name):
+    """The session of an example, or of a directory in tests/sessions."""
+    return load_session(session_folder(ROOT, name))
+
+
+@cache
+def calibrated(name, model=None):
+    """Calibration of an example with a model; by default the model of its session."""
+    return calibrate(session_of(name), model)
+
+
+@cache
+def scene_of(name, model=None, **options):
+    """Scene of the calibration of an example; tests do not change it."""
+    return draw_scene(calibrated(name, model), **options)
+
+
+@cache
+def report_of(name, model=None):
+    """Report of the calibration of an example."""
+    return build_report(calibrated(name, model))
