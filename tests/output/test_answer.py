@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import plans
 import pytest
-from folders import session_folder
+from calibrated import calibrated, session_of
 from machines import write_orthoglide
 from rich.console import Group
 
@@ -17,7 +17,6 @@ from orthocal import (
     SolverOptions,
     calibrate,
     load_plan,
-    load_session,
     simulate_session,
     summarize,
 )
@@ -37,13 +36,13 @@ NOT_SAID = (
 """Words of the field that a short answer does without."""
 
 EXAMPLES = {
-    "raw-cycles": "offsets",
+    "raw-cycles": None,
     "sweep": "offsets",
     "lines": "offsets",
     "workshop": "full",
-    **{f"table1/experiment-{n}": "offsets" for n in ("1-printed", "1-corrected", "2", "3")},
+    **{f"table1/experiment-{n}": None for n in ("1-printed", "1-corrected", "2", "3")},
 }
-"""Examples and their models."""
+"""Examples and their models; None for the model of the session, which is offsets."""
 
 
 def machine_of_250_mm(folder):
@@ -57,17 +56,12 @@ def machine_of_250_mm(folder):
 class Answers(dict):
     """Calibrations by name, each made when it is first asked for."""
 
-    def __init__(self, root, directory):
+    def __init__(self, directory):
         super().__init__()
-        self.root, self.directory = root, directory
-        self.cycles = load_session(root / "examples/raw-cycles")
+        self.directory, self.cycles = directory, session_of("raw-cycles")
 
     def __missing__(self, name):
-        if name in EXAMPLES:
-            session = load_session(session_folder(self.root, name))
-            self[name] = calibrate(session, EXAMPLES[name])
-        else:
-            self[name] = OTHERS[name](self)
+        self[name] = calibrated(name, EXAMPLES[name]) if name in EXAMPLES else OTHERS[name](self)
         return self[name]
 
 
@@ -84,13 +78,11 @@ def outliers(session):
 
 OTHERS = {
     "turned": lambda a: calibrate(reversed_sign(a.cycles, "zx")),
-    "turned lines": lambda a: calibrate(
-        reversed_sign(load_session(a.root / "tests/sessions/lines"), "yx"), "offsets"
-    ),
+    "turned lines": lambda a: calibrate(reversed_sign(session_of("lines"), "yx"), "offsets"),
     "slips": lambda a: calibrate(outliers(a.cycles)),
     "huber": lambda a: calibrate(outliers(a.cycles), solver=SolverOptions(loss=Loss("huber"))),
     "inches": lambda a: calibrate(a.cycles.with_values(np.round(a.cycles.values / 25.4, 7))),
-    "full": lambda a: calibrate(load_session(a.root / "examples/sweep"), "full"),
+    "full": lambda a: calibrated("sweep", "full"),
     "lengths": lambda a: calibrate(a.cycles, "lengths"),
     "250 mm": lambda a: calibrate(machine_of_250_mm(a.directory), "offsets"),
     "no tool": lambda a: calibrate(replace(a.cycles, robot=replace(a.cycles.robot, tcp=None))),
@@ -102,8 +94,8 @@ CASES = [*EXAMPLES, *OTHERS]
 
 
 @pytest.fixture(scope="module")
-def answers(root, tmp_path_factory):
-    return Answers(root, tmp_path_factory.mktemp("short"))
+def answers(tmp_path_factory):
+    return Answers(tmp_path_factory.mktemp("short"))
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -256,19 +248,17 @@ def test_details_and_all_hold_the_answer_and_the_rest(answers):
 
 
 def test_notebook_and_report_show_the_same_answer(answers):
-    reports = {}
+    report = build_report(answers["turned"])
     for name in ("table1/experiment-2", "turned", "slips"):
-        calibration = answers[name]
-        decision = calibration.assessment.decision
-        notebook, reports[name] = calibration._repr_html_(), build_report(calibration)
-        for page in (notebook, reports[name]):
-            assert decision.headline in page
-            for finding in calibration.assessment.findings:
+        found, notebook = answers[name].assessment, answers[name]._repr_html_()
+        for page in (notebook, report) if name == "turned" else (notebook,):
+            assert found.decision.headline in page
+            for finding in found.findings:
                 if finding.severity != "note" or finding.kind == "tool error":
                     assert finding.text.replace("'", "&#x27;") in page
         assert "studentised" not in notebook
     headline = answers["turned"].assessment.decision.headline
-    assert reports["turned"].index(headline) < reports["turned"].index("<td>x_slide</td>")
+    assert report.index(headline) < report.index("<td>x_slide</td>")
 
 
 def test_an_answer_without_heading_is_the_rest_of_it(answers):

@@ -6,8 +6,9 @@ import re
 from dataclasses import replace
 
 import pytest
+from calibrated import EXPERIMENT_2, calibrated
 
-from orthocal import calibrate, validate_calibration
+from orthocal import validate_calibration
 from orthocal.assessment.comparison import compare_models
 from orthocal.output.text.layout import table_of, to_text
 from orthocal.output.text.summary import render_result
@@ -17,10 +18,10 @@ NUMBER = re.compile(r"[-+−]?\d+(?:\.\d+)?")
 
 @pytest.fixture(scope="module")
 def results(experiment_2):
-    calibration = calibrate(experiment_2, "full")
+    calibration = calibrated(EXPERIMENT_2, "full")
     unstated = replace(experiment_2, controller_offsets=None)
     return {
-        "offsets": calibrate(experiment_2),
+        "offsets": calibrated(EXPERIMENT_2),
         "full": calibration,
         "validation": validate_calibration(calibration, unstated),
         "comparison": compare_models(experiment_2, models=["offsets", "lengths"]),

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from calibrated import EXPERIMENT_2, calibrated
 
-from orthocal import calibrate, load_session, summarize
+from orthocal import calibrate, summarize
 
 
 @pytest.fixture(scope="module")
-def table1(root):
-    return calibrate(load_session(root / "examples/table1/experiment-2"))
+def table1():
+    return calibrated(EXPERIMENT_2)
 
 
 def line(text, beginning):
@@ -26,18 +27,8 @@ def test_linear_and_exact_stand_side_by_side(table1):
 
 def test_every_reading_is_listed_before_and_after(table1):
     text = summarize(table1, details=True)
-    assert line(text, "zx").split() == [
-        "zx",
-        "x_max",
-        "−",
-        "x_min",
-        "-1.140",
-        "-1.140",
-        "-0.130",
-        "-0.5",
-        "-0.6",
-        "0.6",
-    ]
+    row = line(text, "zx").split()
+    assert row == "zx x_max − x_min -1.140 -1.140 -0.130 -0.5 -0.6 0.6".split()
     assert line(text, "RMS [mm]").split()[-3:] == ["0.622", "0.195", "-69%"]
     assert line(text, "largest").split()[-3:] == ["1.140", "0.278", "-76%"]
 
@@ -59,8 +50,8 @@ def test_details_list_the_values_to_enter_and_significant_changes(table1):
     assert found.text in text
 
 
-def test_an_unstated_controller_is_said_to_be_so(root):
-    result = calibrate(load_session(root / "examples/table1/experiment-3"))
+def test_an_unstated_controller_is_said_to_be_so():
+    result = calibrated("table1/experiment-3")
     (found,) = result.assessment.of_kind("controller not stated")
     text = " ".join(summarize(result, details=True).split())
     assert found.text in text
@@ -99,7 +90,7 @@ def three_stated_rows(session):
 
 EXPLAINED = {
     "fits": (lambda c, e: calibrate(_silent(c)), {"scatter_mm": 0.0102}),
-    "model error": (lambda c, e: calibrate(e), {"ratio": 9.8, "sigma_mm": 0.195}),
+    "model error": (lambda c, e: calibrated(EXPERIMENT_2), {"ratio": 9.8, "sigma_mm": 0.195}),
     "model error beside cycles": (lambda c, e: every_time(c), {}),
     "noise from residuals": (lambda c, e: once(c), {}),
     "noise unknown": (lambda c, e: three_rows(e), {}),
@@ -118,8 +109,8 @@ def test_a_fit_is_explained(raw_cycles, experiment_2, case):
     assert " ".join(found.text.split()) in " ".join(summarize(result, details=True).split())
 
 
-def test_a_prior_marks_what_the_readings_leave_open(root):
-    result = calibrate(load_session(root / "examples/table1/experiment-2"), "lengths")
+def test_a_prior_marks_what_the_readings_leave_open():
+    result = calibrated(EXPERIMENT_2, "lengths")
     text = summarize(result, details=True)
     assert line(text, "x_leg.length").split()[4] == "0%"
     assert line(text, "x_slide.offset").split()[4] == "99%"
@@ -127,8 +118,8 @@ def test_a_prior_marks_what_the_readings_leave_open(root):
     assert "tolerances as prior" in text
 
 
-def test_many_readings_are_cut_unless_all_are_asked_for(raw_cycles):
-    result = calibrate(raw_cycles)
+def test_many_readings_are_cut_unless_all_are_asked_for():
+    result = calibrated("raw-cycles")
     long = replace(result, residuals=result.residuals * 3)
     assert "The 20 largest of 162" in summarize(long, details=True)
     assert "The 20 largest" not in summarize(long, all_rows=True)

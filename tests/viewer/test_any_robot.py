@@ -53,9 +53,15 @@ ROBOTS = {
 }
 
 
+@pytest.fixture(scope="module")
+def robots(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("robots")
+    return {name: load_robot(write(folder / name)) for name, write in ROBOTS.items()}
+
+
 @pytest.fixture(params=ROBOTS)
-def robot(request, tmp_path):
-    return load_robot(ROBOTS[request.param](tmp_path / request.param))
+def robot(request, robots):
+    return robots[request.param]
 
 
 def test_links_are_where_pinocchio_places_them(robot):
@@ -67,7 +73,14 @@ def test_links_are_where_pinocchio_places_them(robot):
     for link in drawn:
         expected = data.oMf[robot.frame_id(link)].homogeneous
         assert np.abs(scene.pose(f"{drawing.MACHINE}/{link}") - expected).max() < KINEMATICS
-    assert any(fact.startswith("Mechanical zero: ") for fact in scene.facts)
+    facts = " ".join(scene.facts)
+    assert facts.startswith("Mechanical zero: ")
+    assert "Mechanical zero: " in scene.to_html()
+    moved = [d.name for d in robot.drives if d.zero_computed]
+    assert ("Computed by closing the loops" in facts) == bool(moved)
+    assert all(name in facts for name in moved)
+    free = count_free_motions(robot)
+    assert (f"The loops leave {free} passive motion" in facts) == bool(free)
 
 
 def test_every_drive_moves_within_the_size_of_the_machine(robot):
@@ -81,23 +94,12 @@ def test_every_drive_moves_within_the_size_of_the_machine(robot):
         assert np.abs(residual).max(initial=0.0) < CLOSED
 
 
-def test_computed_zeros_and_free_motions_are_stated(robot):
-    facts = " ".join(draw_scene(robot).facts)
-    found = [d.name for d in robot.drives if d.zero_computed]
-    assert ("Computed by closing the loops" in facts) == bool(found)
-    assert all(name in facts for name in found)
-    free = count_free_motions(robot)
-    assert (f"The loops leave {free} passive motion" in facts) == bool(free)
+def test_only_the_wide_linkage_has_a_computed_zero(robots):
+    assert [name for name, r in robots.items() if r.drives[0].zero_computed] == ["wide"]
 
 
-def test_only_the_wide_linkage_has_a_computed_zero(tmp_path):
-    found = {n: load_robot(w(tmp_path / n)).drives[0].zero_computed for n, w in ROBOTS.items()}
-    assert [name for name, moved in found.items() if moved] == ["wide"]
-
-
-@pytest.mark.parametrize("name", ROBOTS)
-def test_view_writes_its_page(name, tmp_path, monkeypatch, capsys):
-    folder, page = ROBOTS[name](tmp_path / name), tmp_path / "page.html"
+def test_view_writes_its_page(robots, tmp_path, monkeypatch, capsys):
+    folder, page = robots["balls"].urdf.parent, tmp_path / "page.html"
     monkeypatch.setattr(sys, "argv", ["orthocal", "view", str(folder), "--html", str(page)])
     with pytest.raises(SystemExit) as stopped:
         main()

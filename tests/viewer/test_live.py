@@ -66,13 +66,13 @@ def test_server_without_free_descriptors_refuses_connections_quietly():
         assert process.stderr is not None
         port = int(process.stdout.readline())
         clients = [socket.create_connection(("127.0.0.1", port), 20) for _ in range(30)]
-        time.sleep(0.5)
+        time.sleep(0.3)
         before = processor_time(process.pid)
-        time.sleep(2.0)
-        assert processor_time(process.pid) - before < 0.5
+        time.sleep(1.0)
+        assert processor_time(process.pid) - before < 0.25
         for client in clients:
             client.close()
-        time.sleep(0.5)
+        time.sleep(0.3)
         assert get(port)[0] == 200
         assert len(get(port, "/main.min.js")[1]) > 100_000
         process.stdin.close()
@@ -270,26 +270,18 @@ def test_two_views_find_two_ports(scene):
 # ---- in another process
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_view_ends_cleanly_on_a_signal(number):
+    """It has no children, and its port is free even if it is killed."""
     process, port = start()
     assert [a for a, _ in listening(process.pid)] == ["0100007F"]
     assert children(process.pid) == []
     assert get(port)[0] == 200
     process.send_signal(number)
     _, errors = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 0
+    assert process.returncode == (-number if number == signal.SIGKILL else 0)
     assert errors == "Open this in a browser on this machine; Ctrl-C ends.\n"
     assert not is_open(port)
-
-
-def test_port_is_free_after_a_kill():
-    process, port = start()
-    process.kill()
-    process.wait(PATIENCE)
-    process.stdout.close()
-    process.stderr.close()
-    wait_until(lambda: not is_open(port), "the port's end")
 
 
 BUSY = """

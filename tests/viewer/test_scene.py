@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 import pytest
-from folders import session_folder
+from calibrated import EXPERIMENT_2, calibrated, scene_of, session_of
 from gauges import exact
 from tolerances import KINEMATICS
 
@@ -31,18 +31,18 @@ from orthocal.viewer.shapes import arrow_parts, head_length
 
 
 @pytest.fixture(scope="module")
-def calibration(experiment_2):
-    return calibrate(experiment_2)
+def calibration():
+    return calibrated(EXPERIMENT_2)
 
 
 @pytest.fixture(scope="module")
-def scene(calibration):
-    return draw_scene(calibration)
+def scene():
+    return scene_of(EXPERIMENT_2)
 
 
 @pytest.fixture(scope="module")
-def full(root):
-    return calibrate(load_session(root / "examples/sweep"), "full")
+def full():
+    return calibrated("sweep", "full")
 
 
 def world(scene, path):
@@ -119,7 +119,7 @@ def test_nominal_links_are_where_pinocchio_places_them(orthoglide):
 def test_true_scale_is_the_calibrated_machine_of_pinocchio(full):
     """Calibrated links and ghost in a posture, with loops closed by Pinocchio."""
     posture = next(p for p in full.postures if p.name == "y_+60")
-    scene = draw_scene(full, posture="y_+60", exaggeration=1.0)
+    scene = scene_of("sweep", "full", posture="y_+60", exaggeration=1.0)
     machine = full.robot.with_errors(full.errors)
     passive = machine.close_with_pinocchio(posture.drives, np.array(posture.passive))
     real = placed(machine, posture.drives, passive)
@@ -138,8 +138,8 @@ def test_true_scale_is_the_calibrated_machine_of_pinocchio(full):
 
 
 def test_deviation_is_enlarged_by_the_stated_factor(full):
-    true = draw_scene(full, posture="x_+60", exaggeration=1.0)
-    large = draw_scene(full, posture="x_+60", exaggeration=25.0)
+    true = scene_of("sweep", "full", posture="y_+60", exaggeration=1.0)
+    large = draw_scene(full, posture="y_+60", exaggeration=25.0)
     assert large.exaggeration == 25.0
     assert any("× 25" in fact for fact in large.facts)
     assert any("true scale" in fact for fact in true.facts)
@@ -158,12 +158,10 @@ def test_deviation_is_enlarged_by_the_stated_factor(full):
 
 
 @pytest.mark.parametrize("name", ["table1/experiment-2", "raw-cycles", "lines"])
-def test_default_factor_makes_the_largest_deviation_a_twentieth_of_the_machine(root, name):
-    found = calibrate(load_session(session_folder(root, name)))
-    scene = draw_scene(found)
+def test_default_factor_makes_the_largest_deviation_a_twentieth_of_the_machine(name):
+    scene = scene_of(name)
     size = np.ptp(scene.camera.points, axis=0).max()
-    true = draw_scene(found, exaggeration=1.0)
-    fact = next(f for f in true.facts if "largest" in f)
+    fact = next(f for f in scene.facts if "largest" in f)
     largest = float(fact.split("largest ")[1].split(" mm")[0]) * 1e-3
     assert 0.03 * size < scene.exaggeration * largest <= 0.0501 * size
 
@@ -263,7 +261,7 @@ def test_scene_states_the_offsets_to_enter(scene, calibration):
 
 
 def test_of_many_gauges_the_overview_names_the_worst(full):
-    scene = draw_scene(full)
+    scene = scene_of("sweep", "full")
     named = [
         label.texts[0].split()[0] for label in scene.labels if label.texts[0] and label.rank > 0
     ]
@@ -274,11 +272,9 @@ def test_of_many_gauges_the_overview_names_the_worst(full):
 
 
 @pytest.mark.parametrize("name", ["table1/experiment-2", "raw-cycles", "lines", "sweep"])
-def test_deviations_of_a_session_are_those_of_its_calibration(root, name):
+def test_deviations_of_a_session_are_those_of_its_calibration(name):
     """Two ways to the same numbers: without a fit, and from the residuals of a fit."""
-    session = exact(
-        load_session(session_folder(root, name))
-    )  # without nuisance parameters of the mounting
+    session = exact(session_of(name))  # without nuisance parameters of the mounting
     rows = calibrate(session).residuals
     mean = {}
     for row in rows:
@@ -310,8 +306,8 @@ def test_plan_shows_the_places_of_the_gauges(root):
 # ---- animation
 
 
-def test_measurement_goes_from_zero_through_every_leg(raw_cycles):
-    scene = draw_scene(calibrate(raw_cycles))
+def test_measurement_goes_from_zero_through_every_leg():
+    scene = scene_of("raw-cycles")
     names = [s.name for s in scene.steps]
     legs = [["zero", f"{leg}_max", f"{leg}_min"] for leg in "xyz"]
     assert names == ["overview", *legs[0], *legs[1], *legs[2], "overview"]
@@ -344,9 +340,8 @@ def test_animation_reaches_every_posture_at_the_stated_time(full):
                 assert turn == pytest.approx(real[link][:3, :3], abs=1e-11)
 
 
-def test_arrows_follow_the_readings_of_every_posture(raw_cycles):
-    found = calibrate(raw_cycles)
-    scene = draw_scene(found)
+def test_arrows_follow_the_readings_of_every_posture():
+    found, scene = calibrated("raw-cycles"), scene_of("raw-cycles")
     tracks, head = animation(scene), head_length(readings.arrow_width(dial(scene)))
     step = next(s for s in scene.steps if s.name == "y_min")
     for setup in ("xy", "zy", "yx"):
@@ -366,9 +361,9 @@ def test_every_animated_node_is_one_that_is_drawn(scene):
         assert any(n == path or n.startswith(f"{path}/") for n in scene.nodes), path
 
 
-def test_many_postures_are_thinned_out_for_the_animation(root, monkeypatch):
+def test_many_postures_are_thinned_out_for_the_animation(monkeypatch):
     monkeypatch.setattr("orthocal.output.scene.deviations.MOST_STOPS", 20)
-    scene = draw_scene(load_session(root / "examples/sweep"))
+    scene = draw_scene(session_of("sweep"))
     assert len(scene.steps) == 22
     assert any("stops at 20 of 30 postures" in fact for fact in scene.facts)
 
@@ -413,7 +408,7 @@ def test_errors_of_the_tool_are_those_of_the_calibration(full):
     )
 
 
-def test_choice_of_what_is_shown_at_first(calibration):
+def test_choice_of_what_is_shown_at_first(calibration, scene):
     def hidden(scene):
         return {
             c["path"].strip("/")
@@ -421,11 +416,11 @@ def test_choice_of_what_is_shown_at_first(calibration):
             if c["type"] == "set_property" and c["property"] == "visible" and not c["value"]
         }
 
-    assert hidden(draw_scene(calibration)) == {tool_errors.TOOL_NOW, tool_errors.TOOL_UNCERTAINTY}
-    assert hidden(draw_scene(calibration, show="tool")) == {
+    assert hidden(scene) == {tool_errors.TOOL_NOW, tool_errors.TOOL_UNCERTAINTY}
+    assert hidden(scene_of(EXPERIMENT_2, show="tool")) == {
         *(readings.GAUGES, readings.BEFORE, readings.AFTER)
     }
-    assert hidden(draw_scene(calibration, show="all")) == set()
+    assert hidden(scene_of(EXPERIMENT_2, show="all")) == set()
     with pytest.raises(ParameterError, match="'everything' is none of readings, tool, all"):
         draw_scene(calibration, show="everything")
 
@@ -497,7 +492,7 @@ def test_arrows_do_not_reach_through_the_ground(calibration, posture):
 
 
 def test_headline_of_the_tool_states_error_and_uncertainty(calibration):
-    scene = draw_scene(calibration, show="tool")
+    scene = scene_of(EXPERIMENT_2, show="tool")
     found = assess_tool(calibration)
     largest = np.linalg.norm(found.align(found.deviation), axis=1).max() * 1e6
     assert scene.headline.startswith(f"Tool error now: up to {largest:.0f} µm over ±60 mm")
@@ -519,17 +514,13 @@ def test_only_machines_sessions_and_calibrations_are_drawn():
 # ---- the page
 
 
-def test_same_calibration_makes_the_same_page(calibration):
-    assert draw_scene(calibration).to_html() == draw_scene(calibration).to_html()
+def test_loaded_calibration_makes_the_same_page(calibration, scene, tmp_path):
+    path = write_calibration(calibration, tmp_path / "calibration.json")
+    assert draw_scene(load_calibration(path)).to_html() == scene.to_html()
 
 
 def test_the_page_is_what_meshcats_own_interface_gives(scene):
     assert scene.visualizer.static_html() == scene.to_html()
-
-
-def test_loaded_calibration_makes_the_same_scene(calibration, tmp_path):
-    path = write_calibration(calibration, tmp_path / "calibration.json")
-    assert draw_scene(load_calibration(path)).to_html() == draw_scene(calibration).to_html()
 
 
 def rename_setups(session, names):
@@ -546,13 +537,12 @@ def rename_setups(session, names):
 TAKEN = ("constructor", "__proto__", "toString", "hasOwnProperty", "<object>")
 
 
-@pytest.mark.parametrize("name", TAKEN)
-def test_reserved_names_of_the_viewer_are_not_used_for_nodes(name, raw_cycles):
+def test_reserved_names_of_the_viewer_are_not_used_for_nodes(raw_cycles):
     """The viewer keeps nodes in plain JavaScript objects, which have some keys already."""
-    session = rename_setups(raw_cycles, {"yx": name})
-    scene = draw_scene(session)
+    names = dict(zip(list(raw_cycles.setups)[: len(TAKEN)], TAKEN, strict=True))
+    scene = draw_scene(rename_setups(raw_cycles, names))
     parts = {part for path in scene.nodes for part in path.split("/")}
-    assert f"{name} (name)" in parts
+    assert {f"{name} (name)" for name in TAKEN} <= parts
     assert not parts & set(TAKEN)
     assert len(scene.nodes) == len(draw_scene(raw_cycles).nodes)
 
@@ -575,15 +565,8 @@ def test_names_from_files_stay_in_the_data(raw_cycles):
     """Titles, setups and postures from files can neither end a script nor begin an element."""
     evil = "</script><img src=x onerror=alert(1)>"
     names = {r.setup for r in raw_cycles.readings}
-    session = replace(
-        raw_cycles,
-        title=evil,
-        source=evil,
-        setups={
-            f"{n}/{evil}": replace(s, name=f"{n}/{evil}") for n, s in raw_cycles.setups.items()
-        },
-        readings=tuple(replace(r, setup=f"{r.setup}/{evil}") for r in raw_cycles.readings),
-    )
+    session = rename_setups(raw_cycles, {n: f"{n}/{evil}" for n in raw_cycles.setups})
+    session = replace(session, title=evil, source=evil)
     scene = draw_scene(session)
     page = scene.to_html()
     assert page.lower().count("</script>") == draw_scene(raw_cycles).to_html().count("</script>")

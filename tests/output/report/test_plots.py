@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import matplotlib
 import numpy as np
 import pytest
+from calibrated import EXPERIMENT_2, calibrated
 from scipy import stats
 
 from orthocal import Choice, calibrate, load_session
@@ -50,18 +51,18 @@ NAMES = ("$x_{$", "<b>&\"'", "机器", "bell\x07", "n" * 200)
 
 
 @pytest.fixture(scope="module")
-def table1(experiment_2):
-    return calibrate(experiment_2)
+def table1():
+    return calibrated(EXPERIMENT_2)
 
 
 @pytest.fixture(scope="module")
-def sweep(root):
-    return calibrate(load_session(root / "examples/sweep"), "full")
+def sweep():
+    return calibrated("sweep", "full")
 
 
 @pytest.fixture(scope="module")
-def raw(raw_cycles):
-    return calibrate(raw_cycles)
+def raw():
+    return calibrated("raw-cycles")
 
 
 @pytest.fixture(scope="module")

@@ -8,11 +8,12 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from calibrated import EXPERIMENT_2, calibrated, report_of
 from rich.console import Group
 from rich.panel import Panel
 from rich.text import Text
 
-from orthocal import Choice, calibrate, load_calibration, load_session
+from orthocal import Choice, calibrate, load_calibration
 from orthocal.assessment.assess import expanded_uncertainty
 from orthocal.assessment.words.entries import describe_compensated, describe_tool_error
 from orthocal.calibration.file import write_calibration
@@ -66,13 +67,13 @@ class Reader(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def calibration(experiment_2):
-    return calibrate(experiment_2)
+def calibration():
+    return calibrated(EXPERIMENT_2)
 
 
 @pytest.fixture(scope="module")
-def page(calibration):
-    return build_report(calibration)
+def page():
+    return report_of(EXPERIMENT_2)
 
 
 @pytest.fixture(scope="module")
@@ -151,8 +152,8 @@ def test_scene_is_embedded_whole(read):
     assert "Leg x is furthest from parallel" in frame
 
 
-def test_full_model_shows_the_error_with_offsets_entered(root):
-    found = calibrate(load_session(root / "examples/sweep"), "full")
+def test_full_model_shows_the_error_with_offsets_entered():
+    found = calibrated("sweep", "full")
     page = build_report(found)
     assert "without any other correction" in page
     read = Reader(page)
@@ -164,11 +165,9 @@ def test_full_model_shows_the_error_with_offsets_entered(root):
     assert {p.name for p in found.free} <= listed
 
 
-def test_same_calibration_makes_the_same_report(calibration, page, tmp_path):
-    assert build_report(calibration) == page
+def test_loaded_calibration_makes_the_same_report(calibration, page, tmp_path):
     path = write_calibration(calibration, tmp_path / "calibration.json")
-    loaded = build_report(load_calibration(path))
-    assert loaded == page
+    assert build_report(load_calibration(path)) == page
 
 
 def test_texts_from_files_are_escaped(raw_cycles):
@@ -195,18 +194,7 @@ def test_texts_from_files_are_escaped(raw_cycles):
     assert frame.tags.count("script") == 3
     for part in (found._repr_html_(), session._repr_html_()):
         seen = Reader(part)
-        assert set(seen.tags) <= {
-            "p",
-            "table",
-            "thead",
-            "tbody",
-            "tr",
-            "th",
-            "td",
-            "ul",
-            "li",
-            "code",
-        }
+        assert set(seen.tags) <= set("p table thead tbody tr th td ul li code".split())
         assert any(EVIL in t for t in seen.text["p"])
 
 
@@ -251,8 +239,8 @@ def test_calibration_in_a_notebook(calibration):
     assert describe_tool_error(calibration.assessment.tool) in words
 
 
-def test_calibration_with_many_parameters_lists_what_to_enter(root):
-    found = calibrate(load_session(root / "examples/sweep"), "full")
+def test_calibration_with_many_parameters_lists_what_to_enter():
+    found = calibrated("sweep", "full")
     read = Reader(found._repr_html_())
     assert [r[0] for r in read.rows[1:]] == ["x_slide", "y_slide", "z_slide"]
     compensated = describe_compensated(found.assessment.tool.compensated)

@@ -53,11 +53,16 @@ def plan(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def drawn(plan):
-    """The pictures of all setups, and their SVG."""
+    """The pictures of all setups with their placed labels, and their SVG."""
     pictures = []
-    to_svg = Picture.to_svg
+    place_labels = Picture.place_labels
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Picture, "to_svg", lambda p, t: (pictures.append(p), to_svg(p, t))[1])
+
+        def place(picture):
+            pictures.append((picture, place_labels(picture)))
+            return pictures[-1][1]
+
+        patch.setattr(Picture, "place_labels", place)
         page = sheet_files(plan)["sheet.html"]
     return pictures, re.findall(r"<svg.*?</svg>", page)
 
@@ -69,10 +74,9 @@ def overlap(one, other):
 def test_no_label_overlaps_another_or_the_border(plan, drawn):
     pictures, _ = drawn
     assert len(pictures) == 2 * len(plan.setups) == 2 * 50
-    texts = [label.text for picture in pictures for label in picture.labels]
+    texts = [label.text for picture, _ in pictures for label in picture.labels]
     assert sum("off centre" in text for text in texts) == 20
-    for picture in pictures:
-        placed = picture.place_labels()
+    for picture, placed in pictures:
         assert len(placed) == len(picture.labels)
         for one, other in combinations(placed, 2):
             assert not overlap(one[1], other[1]), (one[0].text, other[0].text)
@@ -93,12 +97,10 @@ def test_labels_in_a_browser_are_inside_their_boxes(drawn, tmp_path):
                  [...svg.querySelectorAll('text')].map((text) => text.getBBox()).map((box) =>
                    [box.x, box.y, box.x + box.width, box.y + box.height]))"""
         )
-    for picture, texts in zip(pictures, extents, strict=True):
+    for (_, placed), texts in zip(pictures, extents, strict=True):
         for one, other in combinations(texts, 2):
             assert not overlap(one, other)
-        for (label, box), (left, top, right, bottom) in zip(
-            picture.place_labels(), texts, strict=True
-        ):
+        for (label, box), (left, top, right, bottom) in zip(placed, texts, strict=True):
             assert left >= box.left - ROUNDED, label.text
             assert top >= box.top - ROUNDED, label.text
             assert right <= box.right + ROUNDED, label.text
