@@ -193,7 +193,7 @@ def solve_closures(
     if first.shape[-1:] != (system.n_x,):
         raise ValueError(f"found the shape {first.shape}; expected {system.n_x} start values a row")
     begin = np.broadcast_to(first, (machines, count, system.n_x))
-    x = np.array(begin).reshape(-1, system.n_x)
+    x = np.array(begin).reshape(machines * count, system.n_x)
     for i in range(0, len(x), MAX_POINTS):
         points = np.arange(i, min(i + MAX_POINTS, len(x)))
         path = _Path(

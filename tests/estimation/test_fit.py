@@ -111,8 +111,8 @@ def test_the_robust_covariance_is_that_of_many_simulated_calibrations(plan):
     information = decompose(jacobian, o)
     measured = entries + sigma * rng.normal(size=(300, entries.size))
     solved = BatchProgram(problem, options=options).solve(measured, sigma=sigma)
-    for values, theta in zip(measured, solved.theta, strict=True):
-        left = values - problem.predict(theta)
+    predicted, _, _ = problem.simulate(solved.theta)
+    for left, theta in zip(measured - predicted, solved.theta, strict=True):
         residual = project_out_zeros(left, o) / sigma
         covariance = information.covariance(
             sigma=sigma,

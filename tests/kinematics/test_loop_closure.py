@@ -27,13 +27,13 @@ def reachable_points(count, seed=1):
     return found[:count]
 
 
-def test_closed_loops_equal_the_closed_forms_on_ten_thousand_points(orthoglide):
-    points = reachable_points(10_000)
+def test_closed_loops_equal_the_closed_forms_on_many_points(orthoglide):
+    points = reachable_points(3000)
     joints = closed_form.inverse(points, length=LENGTH)
     closure = LoopClosure(orthoglide)
     assert np.abs(closure.forward(joints) - points).max() < CLOSED_FORM
     assert np.abs(closed_form.direct(joints, length=LENGTH) - points).max() < CLOSED_FORM
-    assert np.abs(closure.inverse(points[:2000]) - joints[:2000]).max() < CLOSED_FORM
+    assert np.abs(closure.inverse(points[:1000]) - joints[:1000]).max() < CLOSED_FORM
 
 
 def test_offsets_and_lengths_act_as_in_the_closed_forms(orthoglide):
@@ -122,7 +122,7 @@ def test_another_robot_goes_the_same_way(biglide):
 def test_far_postures_stay_in_the_branch_the_machine_is_built_in(orthoglide):
     """Plain Newton from the mechanical zero would assemble some of these the other way."""
     rng = np.random.default_rng(1)
-    points = rng.uniform(-0.19, 0.19, (2000, 3))
+    points = rng.uniform(-0.19, 0.19, (1000, 3))
     joints = closed_form.inverse(points, length=LENGTH)
     joints = joints[np.all((joints > 0.12) & (joints < 0.39), axis=1)]
     expected = closed_form.direct(joints, length=LENGTH, root=-1)

@@ -190,8 +190,8 @@ def test_predicted_covariance_is_that_of_many_simulated_calibrations(root, model
     _, found, reached = problem.simulate(solved.theta)
     assert reached.all()
     whitened = []
-    for truth, theta, passive in zip(truths, solved.theta, found, strict=True):
-        _, jacobian = problem.linearise(theta, passive)
+    _, jacobians = problem.linearise(solved.theta, found)
+    for truth, theta, jacobian in zip(truths, solved.theta, jacobians, strict=True):
         covariance = decompose(jacobian, problem.observations).covariance(
             sigma=sigma, precision=problem.prior_precision
         )

@@ -102,14 +102,14 @@ def test_studentised_residuals_of_noise_are_students(root, form):
     rows = tuple(r for r in plan.readings if r.cycle == 1)
     plan = replace(plan, readings=rows).with_gauge(replace(plan.gauge, resolution=None))
     values, alarms = [], 0
-    problem = None
+    solver = SolverOptions(solver="variable-projection")
     for seed in range(30):
         session = simulate_session(plan, TRUTH, seed=seed).session
         session = session.with_gauge(Gauge(None, None, None))
         if form == "differences":
             session = differences_of(session)
         problem = build_problem(session, model="offsets")
-        found = diagnose_readings(fit_problem(problem))
+        found = diagnose_readings(fit_problem(problem, options=solver))
         values.append(found.studentised)
         alarms += found.suspicious.size > 0
     t = np.array(values)
@@ -174,11 +174,11 @@ def test_only_the_wrong_reading_is_suspicious(root, model):
     row = next(i for i, r in enumerate(session.readings) if r.value > 13.5e-3)
     values = session.values.copy()
     values[row] *= -1.0
-    spoilt = session.with_values(values)
-    sound = calibrate(session, model)
+    spoilt, solver = session.with_values(values), "variable-projection"
+    sound = calibrate(session, model, solver=solver)
     distances = []
     for loss in ("huber", "squares"):
-        result = calibrate(spoilt, model, solver=SolverOptions(loss=Loss(loss)))
+        result = calibrate(spoilt, model, solver=SolverOptions(solver, loss=Loss(loss)))
         assert [r.line for r in result.suspicious] == [session.readings[row].line]
         distances.append(result["z_slide.offset"].value - sound["z_slide.offset"].value)
     assert abs(distances[0]) < 0.1 * abs(distances[1])
@@ -202,7 +202,7 @@ def test_errors_that_make_no_machine_are_refused(readings):
     assert "huber" not in str(caught.value)
 
 
-@pytest.mark.parametrize("experiment", ["1-printed", "1-corrected", "2", "3"])
+@pytest.mark.parametrize("experiment", ["1-printed", "2"])
 def test_hubers_loss_converges_on_few_readings(root, experiment):
     session = load_session(root / f"examples/table1/experiment-{experiment}")
     options = SolverOptions(loss=Loss("huber"))

@@ -64,15 +64,18 @@ def machines(plan):
     return theta, np.array(left)
 
 
-def test_residuals_of_machines_with_all_errors_are_as_large_as_foretold(plan, machines):
-    result = calibrate(simulate_session(plan, {}, exact=True).session)
+@pytest.fixture(scope="module")
+def result(plan):
+    return calibrate(simulate_session(plan, {}, exact=True).session)
+
+
+def test_residuals_of_machines_with_all_errors_are_as_large_as_foretold(result, machines):
     rms = np.sqrt(np.mean(machines[1] ** 2))
     assert rms == pytest.approx(result.unmodelled.residual_rms, rel=0.06)
 
 
-def test_one_machine_in_a_hundred_leaves_as_much_as_is_called_worse(plan, machines):
+def test_one_machine_in_a_hundred_leaves_as_much_as_is_called_worse(result, machines):
     """Residuals' squares scatter as χ² of so many parts does; few machines are beyond its 99 %."""
-    result = calibrate(simulate_session(plan, {}, exact=True).session)
     parts = result.unmodelled.residual_dof
     squares = np.mean(machines[1] ** 2, axis=1) / result.unmodelled.residual_rms**2
     assert 2.0 / squares.var() == pytest.approx(parts, rel=0.25)
@@ -80,9 +83,8 @@ def test_one_machine_in_a_hundred_leaves_as_much_as_is_called_worse(plan, machin
     assert 0.0 < beyond < 0.025  # 10 of 1,000, and three standard deviations
 
 
-def test_the_offsets_of_machines_with_all_errors_scatter_as_foretold(plan, machines):
+def test_the_offsets_of_machines_with_all_errors_scatter_as_foretold(result, machines):
     """Whitened by the covariance foretold they are standard normal."""
-    result = calibrate(simulate_session(plan, {}, exact=True).session)
     root = np.linalg.cholesky(result.unmodelled.bias_covariance)
     white = np.linalg.solve(root, machines[0].T)
     spread = np.linalg.eigvalsh(white @ white.T / white.shape[1])
@@ -122,18 +124,19 @@ def test_with_a_sum_free_its_parts_may_still_differ(plan):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("model", "least"), [("offsets", 0.93), ("lengths", 0.93)])
-def test_intervals_hold_what_they_say_with_all_errors_at_their_tolerances(
-    plan, model, least, monkeypatch
-):
-    """200 sessions: what scatter alone would promise is missed by far, all together is not."""
+@pytest.mark.parametrize("model", ["offsets", "lengths"])
+def test_intervals_hold_what_they_say_with_all_errors_at_their_tolerances(plan, model, monkeypatch):
+    """100 sessions: what scatter alone would promise is missed by far, all together is not.
+
+    Of 300 intervals of three offsets 95 % have a standard error of 1.3 %.
+    """
     machines = DrawnMachines(plan, model=model)
     # they hardly change from machine to machine, and take longest to find
     monkeypatch.setattr(recording, "find_other_errors", lambda *_, **__: machines.others)
     known = machines.machine.free
     free = [known.index(n) if n in known else -1 for n in machines.problem.free]
     hits, scatter_hits, count = 0, 0, 0
-    for seed in range(200):
+    for seed in range(100):
         rng = np.random.default_rng(seed)
         errors = machines.draw(rng)
         fit = machines.fit(machines.read(rng, errors))
@@ -143,5 +146,5 @@ def test_intervals_hold_what_they_say_with_all_errors_at_their_tolerances(
                 hits += low <= errors[at] <= high
                 scatter_hits += abs(p.value - errors[at]) < 2.0 * p.std_scatter
                 count += 1
-    assert least < hits / count < 0.99
+    assert 0.93 < hits / count < 0.99
     assert scatter_hits / count < 0.6

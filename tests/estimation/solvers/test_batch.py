@@ -15,8 +15,8 @@ from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 
 SIGMA = 10e-6
-SETS = 60
-SHOWN = 8
+SETS = 40
+SHOWN = 4
 """Sets that are solved alone too."""
 
 AGREED = 1e-6
@@ -74,12 +74,12 @@ def sweep(root):
 @pytest.mark.parametrize("loss", ["squares", "huber"])
 def test_many_parameters_are_solved_at_once(sweep, loss):
     options = SolverOptions(loss=Loss(loss))
-    values, _ = draw(sweep, spread=1.0, sets=100)
-    values[:, 3] += 40e-6  # an outlier
+    values, _ = draw(sweep, spread=1.0)
+    values[:, 3] += 40e-6  # an outlier in each set
     found = BatchProgram(sweep, options=options).solve(values, sigma=SIGMA)
     assert not found.alone.any()
     program = VariableProjection(sweep, options=options)
-    for i in range(SHOWN // 2):
+    for i in (0, 3):
         alone = program.solve(sigma=SIGMA, values=values[i])
         assert np.abs((alone.theta - found.theta[i]) / sweep.theta_scale).max() < AGREED
         assert np.abs(alone.zeros - found.zeros[i]).max() < 1e-9
@@ -93,7 +93,7 @@ def test_a_bound_or_a_machine_far_off_is_solved_alone(root):
     bounds = {"x_slide.offset": (-1e-3, 1e-3)}
     session = exact(load_session(root / "examples/sweep"))
     problem = build_problem(session, model="full", bounds=bounds)
-    values, truth = draw(problem, spread=0.4, sets=100)
+    values, truth = draw(problem)
     values[3] += 2e-3 * np.sin(np.arange(values.shape[1]))  # hardly a machine reads like this
     found = BatchProgram(problem).solve(values, sigma=SIGMA)
     held = np.abs(truth[:, 0]) > 1.2e-3
@@ -120,8 +120,8 @@ def test_a_set_is_solved_alike_beside_any_others(sweep):
 def test_a_set_far_from_the_others_is_solved_as_well(root):
     session = exact(load_session(root / "examples/table1/experiment-2"))
     problem = build_problem(session, model="offsets")
-    values, _ = draw(problem, spread=0.01)
-    values = np.tile(values, (40, 1))
+    values, _ = draw(problem, spread=0.01, sets=60)
+    values = np.tile(values, (8, 1))
     values[7] = problem.predict(np.full(3, 2.0) * problem.theta_scale)
     found = BatchProgram(problem).solve(values, sigma=SIGMA)
     assert np.abs(found.theta[7] / problem.theta_scale - 2.0).max() < AGREED

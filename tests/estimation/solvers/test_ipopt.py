@@ -111,18 +111,15 @@ def test_the_gauss_newton_hessian_is_the_exact_one_without_curvature(perfect):
     assert np.abs(matrices[0] - matrices[1]).max() / scale < 1e-9
 
 
-@pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
-def test_perfect_data_give_the_truth_back_from_any_start(perfect, seed, hessian):
-    rng = np.random.default_rng(seed)
-    start = rng.uniform(-0.02, 0.02, 3)
-    if seed == 0:
-        start = np.array([0.02, -0.02, 0.02])
+def test_perfect_data_give_the_truth_back_from_any_start(perfect, hessian):
     problem = build_problem(perfect, model="offsets")
     program = NonlinearProgram(problem, options=SolverOptions(hessian=hessian))
-    solution = program.solve(sigma=1e-5, start=start)
-    assert np.abs(solution.theta - list(TRUTH.values())).max() < TRUTH_BACK
-    assert solution.closure < 1e-11
+    random = np.random.default_rng(0).uniform(-0.02, 0.02, (7, 3))
+    for start in ([0.02, -0.02, 0.02], *random):
+        solution = program.solve(sigma=1e-5, start=start)
+        assert np.abs(solution.theta - list(TRUTH.values())).max() < TRUTH_BACK
+        assert solution.closure < 1e-11
 
 
 @pytest.mark.parametrize(
@@ -171,12 +168,10 @@ def test_new_readings_do_not_rebuild(plan):
     assert np.abs(again.theta - fresh.theta).max() < SAME_OPTIMUM
 
 
-@pytest.mark.parametrize("experiment", ["1-printed", "1-corrected"])
-def test_where_gauss_newton_does_not_converge_the_exact_hessian_does(root, experiment):
+def test_where_gauss_newton_does_not_converge_the_exact_hessian_does(root):
     """Six readings on the straight part of Huber's loss: where it ends its slope is 0."""
-    problem = build_problem(
-        load_session(root / f"examples/table1/experiment-{experiment}"), model="full"
-    )
+    session = load_session(root / "examples/table1/experiment-1-printed")
+    problem = build_problem(session, model="full")
     program, sigma = NonlinearProgram(problem, options=SolverOptions(loss=HUBER)), 2e-5
     solution = program.solve(sigma=sigma, start=linearise_at_reference(problem).solve(sigma=sigma))
     assert solution.hessian == "exact"
