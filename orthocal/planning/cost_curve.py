@@ -47,7 +47,7 @@ def compute_curve(
         planned: Setups of the plan.
         equipment: Equipment, for the duration.
     """
-    stages = [Stage(0, 0, 0.0, search.error_of(search.prior))]
+    stages = [Stage(0, 0, 0.0, search.empty.error)]
     fewest = min(math.ceil(LONGER * planned), MOST_SETUPS)
     try:
         for n, plan in enumerate(search.grow([each] * MOST_SETUPS), 1):

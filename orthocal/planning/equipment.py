@@ -25,7 +25,6 @@ from orthocal.sensors.leg_indicator import LegIndicator, Section
 from orthocal.sensors.mounting import USUAL, Mounting, MountingKeys
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Gauge, Session
-from orthocal.units import MM
 
 Array = NDArray[np.float64]
 
@@ -215,11 +214,7 @@ def load_dial(path: str | Path, equipment: Equipment) -> Equipment:
         )
     return replace(
         equipment,
-        gauge=Gauge(
-            None if gauge.sigma_mm is None else gauge.sigma_mm * MM,
-            None if gauge.resolution_mm is None else gauge.resolution_mm * MM,
-            None if gauge.range_mm is None else (gauge.range_mm[0] * MM, gauge.range_mm[1] * MM),
-        ),
+        gauge=gauge.to_gauge(),
         tip=None if gauge.tip is None else Tip.from_keys(gauge.tip),
         mounting=mounting,
     )

@@ -147,7 +147,6 @@ class ToolForecast:
         self,
         session: Session,
         *,
-        sigma: float | None = None,
         weight: float | None = None,
         entered: bool = True,
         machines: Sequence[Array] | None = None,
@@ -159,9 +158,8 @@ class ToolForecast:
 
         Args:
             session: Setups and postures; the values of the readings are not used.
-            sigma: Standard deviation of a reading, [m]; by default as stated of the gauge.
-            weight: Standard deviation with which readings are weighted, [m]: more than sigma if
-                the model omits errors; by default the same.
+            weight: Standard deviation with which readings are weighted, [m]: more than that of the
+                gauge if the model omits errors; by default the same.
             entered: Whether the identified offsets have been entered before, so that those of the
                 drives are small; else they are drawn from their priors.
             machines: Machines instead of drawn ones: free parameters of the session's problem,
@@ -172,7 +170,7 @@ class ToolForecast:
         """
         problem = self.problem(session)
         others = self._jacobian_of_others(session)
-        noise = noise_of(session) if sigma is None else sigma
+        noise = noise_of(session)
         drawn = list(self._draw(problem, entered=entered)) if machines is None else machines
         _, closed, reached = problem.simulate(np.array(drawn))
 
@@ -194,11 +192,11 @@ class ToolForecast:
             )
         return replace(self._expected(np.mean(found, axis=0)), lost=lost)
 
-    def about_nominal(self, session: Session, *, sigma: float | None = None) -> Expected:
+    def about_nominal(self, session: Session) -> Expected:
         """Expected tool error to first order about the nominal machine, as in the search."""
         problem = self.problem(session)
         others = self._jacobian_of_others(session)
-        noise = noise_of(session) if sigma is None else sigma
+        noise = noise_of(session)
         covariance, _ = self._posterior(problem, others, problem.reference, noise)
         if covariance is None:
             raise ClosureError("cannot be read", posture="the planned ones")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +35,7 @@ PAPER_GAUGE = Gauge(20e-6, 10e-6, None)
 """Repeatability 0.02 mm, resolution 10 µm (paper, section 4)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Displacements:
+class Displacements(NamedTuple):
     """Tool displacements in the paper's maximum and minimum postures, [m].
 
     The paper does not state them; the project inferred the defaults.

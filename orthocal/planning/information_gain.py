@@ -116,13 +116,6 @@ class SetupGain:
                 spread += both * np.outer(a.sensitivity, other.sensitivity)
         return SetupGain(self.setup, spread, effect, spread.diagonal().copy(), self.noise)
 
-    def gain(self, rows: list[int]) -> float:
-        """Gain of several readings together."""
-        effect = self.effect[rows]
-        return float(
-            np.vdot(effect, np.linalg.solve(self._covariance(self.spread[rows], rows), effect))
-        )
-
     def gains(self, sets: Indices) -> Array:
         """Gains of sets of readings, the gauge aligned in the first of each, shape (n_sets,).
 

@@ -156,8 +156,9 @@ def plan_readings(
         SessionError: If the repeatability of the existing readings is unknown.
     """
     say = report or (lambda text: None)
-    measured = None if measured is None else state_noise(measured)
     equipment = equipment or Equipment()
+    options = _list_counts(setups, readings, hours, equipment)
+    measured = None if measured is None else state_noise(measured)
     chosen = choose(choice, measured, usual=MODEL)
     robot = (robot if measured is None else measured.robot).with_tolerances(chosen.tolerances)
     measured = None if measured is None else measured.with_tolerances(chosen.tolerances)
@@ -172,9 +173,7 @@ def plan_readings(
         _prior(candidates, forecast, measured),
         forecast.weigh(criterion, len(candidates.state)),
     )
-    counts = _counts(
-        setups, readings, hours, equipment, partial(_choose_counts, search, seed, workers)
-    )
+    counts = options[0] if len(options) == 1 else _choose_counts(search, seed, workers, options)
     say(f"choosing readings of {len(counts)} setups")
     planned = search.choose(
         counts, seed=seed, starts=starts, workers=workers, report=_reporter(say, criterion)
@@ -376,14 +375,10 @@ def _information(problem: CalibrationProblem, state: Sequence[str], measured: Se
     return result
 
 
-def _counts(
-    setups: int | None,
-    readings: int | None,
-    hours: float | None,
-    equipment: Equipment,
-    choose_counts: Callable[[Sequence[list[int]]], list[int]],
-) -> list[int]:
-    """Readings of each setup."""
+def _list_counts(
+    setups: int | None, readings: int | None, hours: float | None, equipment: Equipment
+) -> list[list[int]]:
+    """Possible numbers of readings of each setup."""
     if hours is not None:
         if setups is not None or readings is not None:
             raise ParameterError("found with --setups or --readings; expected one", where="--hours")
@@ -399,7 +394,7 @@ def _counts(
                 f"{READINGS_A_SETUP[0]} readings, and at most {MOST_SETUPS} setups",
                 where="--hours",
             )
-        return choose_counts(options)
+        return options
     count = USUAL_SETUPS if setups is None else setups
     total = READINGS_A_SETUP[0] * count if readings is None else readings
     if not 1 <= count <= MOST_SETUPS:
@@ -410,7 +405,7 @@ def _counts(
             "setups: the first one only determines the gauge zero",
             where="--readings",
         )
-    return [total // count + (i < total % count) for i in range(count)]
+    return [[total // count + (i < total % count) for i in range(count)]]
 
 
 def _choose_counts(

@@ -10,10 +10,10 @@ import numpy as np
 from orthocal.errors import OrthocalError
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.joining import join_sessions
-from orthocal.planning.candidates import Candidates, CandidateSetup
+from orthocal.planning.candidates import Candidates, CandidateSetup, indicator_of
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import Expected, ToolForecast
-from orthocal.sensors.leg_indicator import BallIndicator, LegIndicator
+from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Gauge, Reading, Session, Setup
 
@@ -76,7 +76,7 @@ class Comparison:
             ("a dial of half the scatter and resolution", _with_finer_dial),
             ("each leg's gauges on one square block", _with_blocks),
         ]
-        if any(isinstance(s.sensor, BallIndicator) for s in self.plan.setups.values()):
+        if any(indicator_of(s).tip.form == "ball" for s in self.plan.setups.values()):
             changes.append(("a blade instead of the ball", _with_blade))
         found = []
         for name, change in changes:
@@ -96,8 +96,8 @@ class Comparison:
         """Setups at mid-leg, with the tip on the rod in the mechanical zero."""
         best: dict[tuple[str, object], tuple[float, CandidateSetup]] = {}
         for setup in self.candidates.setups:
-            sensor = self.candidates.session.setups[setup.name].sensor
-            if not isinstance(sensor, LegIndicator) or any(sensor.beside):
+            sensor = indicator_of(self.candidates.session.setups[setup.name])
+            if any(sensor.beside):
                 continue
             key = (sensor.leg, sensor.direction)
             distance = abs(sensor.section.value - MIDDLE)
@@ -164,30 +164,24 @@ def _evenly(line: Sequence[int], zero: int, count: int) -> list[int]:
 
 def _with_finer_dial(session: Session) -> Session:
     old = session.gauge
-    gauge = Gauge(
-        None if old.sigma is None else FINER * old.sigma,
-        None if old.resolution is None else FINER * old.resolution,
-        old.range,
-    )
-    return replace(session, gauges={"": gauge})
+    sigma, resolution = (None if v is None else FINER * v for v in (old.sigma, old.resolution))
+    return replace(session, gauges={"": Gauge(sigma, resolution, old.range)})
 
 
 def _with_blocks(session: Session) -> Session:
-    def change(setup: Setup) -> Setup:
-        sensor = setup.sensor
-        if not isinstance(sensor, LegIndicator):
-            return setup
-        mounting = replace(sensor.mounting, stand=f"block_{sensor.leg}")
-        return replace(setup, sensor=replace(sensor, mounting=mounting))
+    def on_block(s: LegIndicator) -> LegIndicator:
+        return replace(s, mounting=replace(s.mounting, stand=f"block_{s.leg}"))
 
-    return replace(session, setups={n: change(s) for n, s in session.setups.items()})
+    return _with_sensors(session, on_block)
 
 
 def _with_blade(session: Session) -> Session:
-    def change(setup: Setup) -> Setup:
-        s = setup.sensor
-        if not isinstance(s, BallIndicator) or s.rod is None:
-            return setup
-        return replace(setup, sensor=s.on_rod(s.rod, BLADE, s.beside))
+    def by_blade(s: LegIndicator) -> LegIndicator:
+        return s if s.rod is None else s.on_rod(s.rod, BLADE, s.beside)
 
-    return replace(session, setups={n: change(s) for n, s in session.setups.items()})
+    return _with_sensors(session, by_blade)
+
+
+def _with_sensors(session: Session, change: Callable[[LegIndicator], LegIndicator]) -> Session:
+    changed = {n: replace(s, sensor=change(indicator_of(s))) for n, s in session.setups.items()}
+    return replace(session, setups=changed)

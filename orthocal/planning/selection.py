@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import zip_longest
 from typing import cast
 
 import numpy as np
@@ -82,14 +83,9 @@ class PlannedSetups:
     """Criterion as an error: √tr(T C)."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Start:
-    """Beginning of a search."""
-
-    counts: tuple[int, ...]
-    """Readings of each setup."""
-    setups: tuple[PlannedSetup | None, ...]
-    """First setups, drawn at random; None where the best one is added."""
+_Start = Sequence[tuple[int, PlannedSetup | None]]
+"""Beginning of a search: readings of each setup, and the setup if it was drawn at random, or None
+where the best one is added."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,12 +174,9 @@ class SetupSearch:
         After each addition one of the setups is exchanged in turn: the first ones were chosen
         without the others.
         """
-        information = np.array(self.prior)
-        plan = PlannedSetups((), information, self.error_of(information))
+        plan = self.empty
         for n, count in enumerate(counts):
-            added = self._find_best(plan.information, count)
-            information = plan.information + self.information_of(added)
-            plan = PlannedSetups((*plan.setups, added), information, self.error_of(information))
+            plan = self._extend(plan, self._find_best(plan.information, count))
             if n:
                 plan = self._exchange(plan, (n - 1) % (n + 1))
             yield plan
@@ -191,14 +184,9 @@ class SetupSearch:
     def run(self, start: _Start) -> PlannedSetups:
         """Setups of one start: added one after the other, then exchanged."""
         with threadpool_limits(1):  # on several threads sums may be rounded differently
-            information, setups = np.array(self.prior), []
-            for k, count in enumerate(start.counts):
-                added = start.setups[k] if k < len(start.setups) else None
-                if added is None:
-                    added = self._find_best(information, count)
-                setups.append(added)
-                information = information + self.information_of(added)
-            found = PlannedSetups(tuple(setups), information, self.error_of(information))
+            found = self.empty
+            for count, drawn in start:
+                found = self._extend(found, drawn or self._find_best(found.information, count))
             for _ in range(MOST_ROUNDS):
                 before = found.error
                 for k in range(len(found.setups)):
@@ -206,6 +194,15 @@ class SetupSearch:
                 if found.error > before * (1.0 - LEAST_IMPROVEMENT):
                     break
             return found
+
+    @property
+    def empty(self) -> PlannedSetups:
+        """Plan without a setup."""
+        return PlannedSetups((), self.prior, self.error_of(self.prior))
+
+    def _extend(self, plan: PlannedSetups, added: PlannedSetup) -> PlannedSetups:
+        information = plan.information + self.information_of(added)
+        return PlannedSetups((*plan.setups, added), information, self.error_of(information))
 
     def information_of(self, *setups: PlannedSetup) -> Array:
         """Inverse covariance of the state from the readings of setups, (n_state, n_state)."""
@@ -224,14 +221,15 @@ class SetupSearch:
         root = self.weigh(covariance)
         return float(np.sqrt(np.vdot(root, covariance @ root)))
 
-    def _draw_starts(self, counts: Sequence[int], seed: int, starts: int) -> tuple[_Start, ...]:
+    def _draw_starts(self, counts: Sequence[int], seed: int, starts: int) -> Sequence[_Start]:
         """First start without random numbers; in the others the first half of setups is random."""
-        rng, drawn = np.random.default_rng(seed), [_Start(tuple(counts), ())]
+        rng, half = np.random.default_rng(seed), (len(counts) + 1) // 2
+        drawn: list[_Start] = [[(count, None) for count in counts]]
         for _ in range(1, starts):
-            shuffled = tuple(counts[i] for i in rng.permutation(len(counts)))
-            half = shuffled[: (len(shuffled) + 1) // 2]
-            drawn.append(_Start(shuffled, tuple(self._draw_setup(n, rng) for n in half)))
-        return tuple(drawn)
+            shuffled = [counts[i] for i in rng.permutation(len(counts))]
+            setups = [self._draw_setup(n, rng) for n in shuffled[:half]]
+            drawn.append(list(zip_longest(shuffled, setups)))
+        return drawn
 
     def _draw_setup(self, count: int, rng: np.random.Generator) -> PlannedSetup | None:
         """Random setup; None where the drawn one cannot have that many readings."""
@@ -277,7 +275,7 @@ class SetupSearch:
         return best
 
 
-def _run(search: SetupSearch, starts: tuple[_Start, ...], which: int) -> PlannedSetups:
+def _run(search: SetupSearch, starts: Sequence[_Start], which: int) -> PlannedSetups:
     return search.run(starts[which])
 
 
@@ -344,7 +342,7 @@ class Gains:
         """Error with a setup, without an inverse; 0 where the weight depends on the covariance."""
         if self.total is None:
             return 0.0
-        gain = self.setup(planned.candidate, planned.chosen[0]).gain(list(planned.chosen))
+        (gain,) = self.setup(planned.candidate).gains(np.array([planned.chosen]))
         return math.sqrt(max(self.total - gain, 0.0))
 
     def exchange_first(self, planned: PlannedSetup) -> PlannedSetup:

@@ -22,7 +22,7 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
 from orthocal.estimation.solvers.batch import BatchProgram
-from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.kinematics.loop_closure import Failures, LoopClosure
 from orthocal.kinematics.workspace import (
     Workspace,
     cube_limits,
@@ -39,14 +39,9 @@ from orthocal.planning.expected_error import (
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import Parameter, ParameterSet
 from orthocal.session.session import Session
-from orthocal.study.batch import (
-    columns_in_edge_units,
-    estimate_batch,
-    tool_positions,
-)
 from orthocal.study.portable_session import PortableSession
 from orthocal.study.runner import StudyTable
-from orthocal.study.study import Columns, Study, prepare_once
+from orthocal.study.study import Columns, Study, columns_in_edge_units, prepare_once
 from orthocal.units import UM
 
 Array = NDArray[np.float64]
@@ -72,14 +67,10 @@ class AccuracyStudy(Study):
     counted: ClassVar[str] = "machines"
     cases_per_task: ClassVar[int] = 100
 
-    session: PortableSession
-    """The planned readings; their values are not used."""
     choice: Choice
     """Identified errors."""
-    drawn: tuple[str, ...]
-    """Names of the errors that are random."""
-    prior_std: Mapping[str, float]
-    """Standard deviations of the random errors, [SI]."""
+    drawn: Mapping[str, float]
+    """Names of the errors that are random, with their standard deviations, [SI]."""
     fixed: Mapping[str, float]
     """Errors that all machines have, [SI]."""
     machines: int
@@ -88,26 +79,33 @@ class AccuracyStudy(Study):
     """Box over which the tool's error is computed, relative to the mechanical zero, [m]."""
 
     @property
-    def record(self) -> dict[str, Any]:
-        """Everything that the table depends on."""
-        return {
-            **self.session.record,
-            "choice": self.choice.document,
-            "drawn": {n: self.prior_std[n] for n in self.drawn},
-            "fixed": dict(self.fixed),
-            "machines": self.machines,
-            "seed": self.seed,
-            "box": self.box,
-        }
-
-    @property
     def count(self) -> int:
         """Number of machines."""
         return self.machines
 
     def prepare(self) -> _Prepared:
         """Problems of the identified and of all errors, and the workspace."""
-        return _Prepared.of(self)
+        session = self.session.unpack()
+        robot = session.robot
+        problem = weigh_readings(CalibrationProblem(session, self.choice.select(robot.parameters)))
+        workspace = gauss_box(robot, self.box)
+        closure = LoopClosure(robot)
+        nominal = closure.inverse(workspace.points)
+        drives = nominal - session.active_offsets
+        limits = [limits_of(session, r) or (-np.inf, np.inf) for r in session.readings]
+        prepared = _Prepared(
+            session=session,
+            problem=problem,
+            truth=CalibrationProblem(session, _true_selection(self, robot), noise=problem.noise),
+            program=BatchProgram(problem),
+            workspace=workspace,
+            drives=drives,
+            passive=closure.close(drives),
+            positions=closure.tcp(nominal, closure.close(nominal)),
+            limits=np.array(limits).T,
+            sigma=noise_of(session),
+        )
+        return replace(prepared, sigma=_weighting_sigma(self, prepared))
 
     def run(self, prepared: _Prepared, task: int) -> Columns:
         """Errors of each machine before and after its calibration."""
@@ -118,7 +116,7 @@ class AccuracyStudy(Study):
         good = np.flatnonzero(status == CALIBRATED)
         if good.size:
             values = measured.values[good]
-            theta[good], converged = estimate_batch(p.program, p.problem, values, p.sigma)
+            theta[good], converged = p.estimate(values)
             _set_reason(status, good[~converged], NOT_CONVERGED)
         before, after = p.tool_errors(measured.errors, theta, status)
         theta[status != CALIBRATED] = np.nan
@@ -151,8 +149,8 @@ class AccuracyStudy(Study):
         Errors that are not identified count with their prior covariance.
         """
         p: _Prepared = prepare_once(self)
-        others = {n: self.prior_std[n] for n in self.drawn}
-        forecast = ToolForecast(p.robot, p.problem.machine_selection, p.workspace, others=others)
+        selection = p.problem.machine_selection
+        forecast = ToolForecast(p.robot, selection, p.workspace, others=self.drawn)
         count = min(PREDICTED_MACHINES, self.machines)
         machines = [self._true_parameters(p, number) for number in range(count)]
         return forecast.after(p.session, weight=p.sigma, machines=machines)
@@ -198,30 +196,6 @@ class _Prepared:
         """The nominal robot."""
         return self.session.robot
 
-    @classmethod
-    def of(cls, study: AccuracyStudy) -> _Prepared:
-        session = study.session.unpack()
-        robot = session.robot
-        problem = weigh_readings(CalibrationProblem(session, study.choice.select(robot.parameters)))
-        workspace = gauss_box(robot, study.box)
-        closure = LoopClosure(robot)
-        nominal = closure.inverse(workspace.points)
-        drives = nominal - session.active_offsets
-        limits = [limits_of(session, r) or (-np.inf, np.inf) for r in session.readings]
-        prepared = cls(
-            session=session,
-            problem=problem,
-            truth=CalibrationProblem(session, _true_selection(study, robot), noise=problem.noise),
-            program=BatchProgram(problem),
-            workspace=workspace,
-            drives=drives,
-            passive=closure.close(drives),
-            positions=closure.tcp(nominal, closure.close(nominal)),
-            limits=np.array(limits).T,
-            sigma=noise_of(session),
-        )
-        return replace(prepared, sigma=_weighting_sigma(study, prepared))
-
     def measure(self, study: AccuracyStudy, numbers: Sequence[int]) -> _Measured:
         """Random machines and their readings."""
         draws, generators = zip(*(study.draw(self, n) for n in numbers), strict=True)
@@ -255,13 +229,45 @@ class _Prepared:
         tools = np.full((2, *self.positions.shape, len(status)), np.nan)
         for tool, errors in zip(tools, (true, estimated), strict=True):
             if good.size:
-                positions, closed = tool_positions(
-                    self.robot, errors[good], self.drives, self.passive
-                )
+                positions, closed = self.tool_positions(errors[good])
                 _set_reason(status, good[~closed], NOT_ASSEMBLED)
                 tool[..., good] = positions
         tools[..., status != CALIBRATED] = np.nan
         return tools[0] - self.positions[..., None], tools[0] - tools[1]
+
+    def tool_positions(self, errors: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Tool positions of machines, shape (K, 3, n_sets), [m], and whether their loops close.
+
+        Args:
+            errors: All elementary errors of each machine, shape (n_sets, n_errors), [SI].
+        """
+        closure, failures = LoopClosure(self.robot), Failures()
+        q = closure.close(self.drives, errors=errors, start=self.passive, failures=failures)
+        closed = np.ones(len(errors), dtype=np.bool_)
+        closed[[i // len(self.drives) for i in failures]] = False
+        return np.moveaxis(closure.tcp(self.drives, q, errors=errors), 0, -1), closed
+
+    def estimate(self, values: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Estimates of machines, and whether each calibration converges.
+
+        Args:
+            values: Readings, shape (n_sets, n_entries), [m of the first gauge].
+
+        Returns:
+            Free parameters, shape (n_sets, n_free), [SI], NaN where the calibration fails.
+        """
+        theta = np.full((len(values), self.problem.n_free), np.nan)
+        converged = np.ones(len(values), dtype=np.bool_)
+        try:
+            return self.program.solve(values, sigma=self.sigma).theta, converged
+        except (SolverError, ClosureError):  # one by one, to find the machines that fail
+            for i in range(len(values)):
+                try:
+                    program = BatchProgram(self.problem)
+                    theta[i] = program.solve(values[i : i + 1], sigma=self.sigma).theta[0]
+                except (SolverError, ClosureError):
+                    converged[i] = False
+            return theta, converged
 
     def identified_part(self, errors: Array) -> Array:
         """True values of the identified parameters, shape (n_sets, n_machine), [SI].
@@ -341,8 +347,7 @@ def build_accuracy_study(
     return AccuracyStudy(
         session=PortableSession.of(session.with_values(np.zeros(len(session.readings)))),
         choice=chosen,
-        drawn=names,
-        prior_std={n: stated.get(n, parameters[n].prior_std) for n in names},
+        drawn={n: stated.get(n, parameters[n].prior_std) for n in names},
         fixed=fixed,
         machines=machines,
         seed=seed,
@@ -362,7 +367,7 @@ def _without_sums(names: Sequence[str], parameters: ParameterSet) -> tuple[str, 
 def _true_selection(study: AccuracyStudy, robot: Robot) -> Selection:
     """All errors of the machines: random ones with their priors, and fixed ones."""
     parameters = tuple(
-        replace(robot.parameters[n], prior_std=study.prior_std[n]) for n in study.drawn
+        replace(robot.parameters[n], prior_std=std) for n, std in study.drawn.items()
     )
     n = len(parameters)
     return Selection(
@@ -466,7 +471,7 @@ def summarise_accuracy(study: AccuracyStudy, table: StudyTable) -> AccuracySumma
         values = column(f"error.{p.name}_{p.edge_unit}") / p.edge_factor
         rms, standard_error = _root_mean_square(values)
         std = np.nan if predicted is None else float(np.sqrt(predicted.covariance[i, i]))
-        relative = rms / study.prior_std.get(p.name, p.prior_std)
+        relative = rms / study.drawn.get(p.name, p.prior_std)
         errors.append(EstimationError(p, rms, standard_error, std, relative))
     after, standard_error = tool("tool_um")
     return AccuracySummary(

@@ -7,9 +7,8 @@ not their total uncertainty.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +23,9 @@ from orthocal.estimation.weighting import leverages
 from orthocal.observation.observations import Observations
 from orthocal.robot.parameters import Parameter
 from orthocal.session.session import Session
-from orthocal.study.batch import columns_in_edge_units
 from orthocal.study.portable_session import PortableSession
 from orthocal.study.runner import StudyTable
-from orthocal.study.study import Columns, Study, prepare_once
+from orthocal.study.study import Columns, Study, columns_in_edge_units, prepare_once
 
 Array = NDArray[np.float64]
 
@@ -44,22 +42,10 @@ class BootstrapStudy(Study):
     kind: ClassVar[str] = "bootstrap"
     counted: ClassVar[str] = "draws"
 
-    session: PortableSession
     choice: Choice
     by: Resampled
     draws: int
     seed: int
-
-    @property
-    def record(self) -> dict[str, Any]:
-        """Everything that the table depends on."""
-        return {
-            **self.session.record,
-            "choice": self.choice.document,
-            "by": self.by,
-            "draws": self.draws,
-            "seed": self.seed,
-        }
 
     @property
     def count(self) -> int:
@@ -68,12 +54,23 @@ class BootstrapStudy(Study):
 
     def prepare(self) -> _Prepared:
         """Fit of the session, and the data to draw from."""
-        return _Prepared.of(self)
+        session = self.session.unpack()
+        problem = CalibrationProblem(session, self.choice.select(session.robot.parameters))
+        fit = fit_problem(problem, options=SolverOptions(solver="variable-projection"))
+        return _Prepared(
+            fit=fit,
+            values=problem.values,
+            fitted=fit.prediction,
+            residuals=_rescaled_residuals(fit),
+            cycles=find_cycles(session, problem.observations) if self.by == "cycles" else (),
+            program=BatchProgram(problem, options=fit.program.options),
+        )
 
     def run(self, prepared: _Prepared, task: int) -> Columns:
         """Estimates of each draw."""
         numbers = self.case_numbers(task)
-        values = prepared.draw_each(self, numbers)
+        generators = (np.random.default_rng((self.seed, n)) for n in numbers)
+        values = np.array([prepared.draw(rng, self.by) for rng in generators])
         theta = prepared.program.solve(values, sigma=prepared.fit.sigma).theta
         estimates = columns_in_edge_units("", prepared.fit.problem, theta)
         return {"draw": list(numbers), **estimates}
@@ -93,25 +90,6 @@ class _Prepared:
     cycles: tuple[tuple[NDArray[np.int64], ...], ...]
     """Entries of each cycle of each setup, in the same order of postures."""
     program: BatchProgram
-
-    @classmethod
-    def of(cls, study: BootstrapStudy) -> _Prepared:
-        session = study.session.unpack()
-        problem = CalibrationProblem(session, study.choice.select(session.robot.parameters))
-        fit = fit_problem(problem, options=SolverOptions(solver="variable-projection"))
-        return cls(
-            fit=fit,
-            values=problem.values,
-            fitted=fit.prediction,
-            residuals=_rescaled_residuals(fit),
-            cycles=find_cycles(session, problem.observations) if study.by == "cycles" else (),
-            program=BatchProgram(problem, options=fit.program.options),
-        )
-
-    def draw_each(self, study: BootstrapStudy, numbers: Sequence[int]) -> Array:
-        """Readings of these draws, shape (n_draws, n_entries), [m of the first gauge]."""
-        generators = (np.random.default_rng((study.seed, n)) for n in numbers)
-        return np.array([self.draw(rng, study.by) for rng in generators])
 
     def draw(self, rng: np.random.Generator, by: Resampled) -> Array:
         """Resampled readings of the session, shape (n_entries,), [m of the first gauge]."""
@@ -256,7 +234,10 @@ def _rescaled_residuals(fit: Fit) -> Array:
         SessionError: If parameters and gauge zeros explain all of the noise.
     """
     o = fit.problem.observations
-    leverage = leverages(fit.jacobian, o, _posterior(fit), fit.sigma)
+    posterior = fit.information.covariance(
+        sigma=fit.sigma, precision=fit.problem.prior_precision, held=fit.held
+    )
+    leverage = leverages(fit.jacobian, o, posterior, fit.sigma)
     share = 1.0 - leverage - 1.0 / np.bincount(o.zero, minlength=o.n_zeros)[o.zero]
     if not share.sum() > 1.0:
         raise SessionError(
@@ -267,10 +248,3 @@ def _rescaled_residuals(fit: Fit) -> Array:
     usable = share > SMALLEST_SHARE
     residuals = fit.residual[usable] / np.sqrt(share[usable])
     return np.asarray(residuals - residuals.mean())
-
-
-def _posterior(fit: Fit) -> Array:
-    """Covariance of the scaled free parameters."""
-    return fit.information.covariance(
-        sigma=fit.sigma, precision=fit.problem.prior_precision, held=fit.held
-    )

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.errors import ClosureError, ParameterError, SolverError
-from orthocal.estimation.choice import Choice
 from orthocal.estimation.fit import require_determined
 from orthocal.estimation.linear import (
     SIX_ROWS,
@@ -26,7 +25,7 @@ from orthocal.estimation.linear import (
     solve_equation_8,
     twelve_row_covariance,
 )
-from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.planning.first_plan import PAPER_GAUGE, Displacements, build_paper_plan
 from orthocal.robot.model import Robot
@@ -73,7 +72,6 @@ class LinearisationStudy(Study):
     kind: ClassVar[str] = "linearisation"
     counted: ClassVar[str] = "machines"
 
-    session: PortableSession
     free: tuple[str, ...]
     """Names of the parameters that have errors and are identified."""
     sizes: tuple[float, ...]
@@ -88,30 +86,33 @@ class LinearisationStudy(Study):
     """Resolution of a reading, [m]."""
 
     @property
-    def record(self) -> dict[str, Any]:
-        """Everything that the table depends on."""
-        d = self.displacements
-        return {
-            **self.session.record,
-            "free": list(self.free),
-            "sizes": list(self.sizes),
-            "directions": [list(v) for v in self.directions],
-            "displacements": None if d is None else [d.maximum, d.minimum],
-            "sigma": self.sigma,
-            "resolution": self.resolution,
-        }
-
-    @property
     def count(self) -> int:
         """Number of machines: each size in each direction."""
         return len(self.sizes) * len(self.directions)
 
     def prepare(self) -> _Prepared:
         """The problem, its linearisation, and the paper's equations."""
-        session = self.session.unpack()
-        selection = Choice(free=self.free, prior=False).select(session.robot.parameters)
-        problem = CalibrationProblem(session, selection)
-        return _Prepared.of(problem, self.displacements)
+        problem = build_problem(self.session.unpack(), free=self.free, prior=False)
+        if problem.n_free > problem.n_machine:
+            raise ParameterError(
+                f"{problem.free[problem.n_machine]} is a nuisance parameter; this study requires "
+                "exact sensors, which only indicators support",
+                where="sensors",
+            )
+        linearisation = linearise_at_reference(problem)
+        require_determined(problem, linearisation.information)
+        matrices, differences = {}, np.zeros((0, problem.observations.size))
+        if self.displacements is not None:
+            differences = _paper_differences(problem.session)
+            for n in (6, 12):
+                matrices[n] = leg_parallelism_matrix(
+                    length=next(iter(problem.robot.legs.values())).length,
+                    displacement_max=self.displacements.maximum,
+                    displacement_min=self.displacements.minimum,
+                    rows=n,
+                )
+        program = VariableProjection(problem)
+        return _Prepared(problem, linearisation, program, matrices, differences)
 
     def run(self, prepared: _Prepared, task: int) -> Columns:
         """Errors of each method's estimates, [mm or mrad]; None where the method fails."""
@@ -140,28 +141,6 @@ class _Prepared:
     """The paper's matrices by their number of rows; empty for other plans."""
     differences: Array
     """The paper's twelve differences of readings, shape (12, n_entries)."""
-
-    @classmethod
-    def of(cls, problem: CalibrationProblem, displacements: Displacements | None) -> _Prepared:
-        if problem.n_free > problem.n_machine:
-            raise ParameterError(
-                f"{problem.free[problem.n_machine]} is a nuisance parameter; this study requires "
-                "exact sensors, which only indicators support",
-                where="sensors",
-            )
-        linearisation = linearise_at_reference(problem)
-        require_determined(problem, linearisation.information)
-        matrices, differences = {}, np.zeros((0, problem.observations.size))
-        if displacements is not None:
-            differences = _paper_differences(problem.session)
-            for n in (6, 12):
-                matrices[n] = leg_parallelism_matrix(
-                    length=next(iter(problem.robot.legs.values())).length,
-                    displacement_max=displacements.maximum,
-                    displacement_min=displacements.minimum,
-                    rows=n,
-                )
-        return cls(problem, linearisation, VariableProjection(problem), matrices, differences)
 
     def paper_methods(self) -> Iterator[tuple[str, Array, Array | None]]:
         """Name, differences of readings (n_rows, n_entries) and covariance of each of them."""

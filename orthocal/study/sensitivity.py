@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,14 +38,8 @@ class SensitivityStudy(Study):
     kind: ClassVar[str] = "sensitivity"
     counted: ClassVar[str] = "tables"
 
-    session: PortableSession
-    names: tuple[str, ...]
+    parameters: tuple[str, ...]
     """Names of the error parameters."""
-
-    @property
-    def record(self) -> dict[str, Any]:
-        """Everything that the table depends on."""
-        return {**self.session.record, "parameters": list(self.names)}
 
     @property
     def count(self) -> int:
@@ -54,7 +48,7 @@ class SensitivityStudy(Study):
 
     def prepare(self) -> CalibrationProblem:
         """The readings, with all parameters free."""
-        return build_problem(self.session.unpack(), free=self.names, prior=True)
+        return build_problem(self.session.unpack(), free=self.parameters, prior=True)
 
     def run(self, prepared: CalibrationProblem, task: int) -> Columns:
         """A row for each parameter of each reading and tool coordinate."""
@@ -160,7 +154,7 @@ class SensitivitySummary:
 
 def summarise_sensitivity(study: SensitivityStudy, table: StudyTable) -> SensitivitySummary:
     """Summary of the table of a sensitivity study."""
-    columns, n = table.columns, len(study.names)
+    columns, n = table.columns, len(study.parameters)
     pairs = list(zip(columns["posture"], columns["output"], strict=True))[::n]
 
     def matrix(name: str) -> Array:
@@ -168,7 +162,7 @@ def summarise_sensitivity(study: SensitivityStudy, table: StudyTable) -> Sensiti
 
     return SensitivitySummary(
         rows=tuple((str(posture), str(output)) for posture, output in pairs),
-        parameters=study.names,
+        parameters=study.parameters,
         units=tuple(str(u) for u in columns["unit"][:n]),
         derivatives=matrix("derivative"),
         per_prior_std=matrix("um_per_prior_std") * UM,

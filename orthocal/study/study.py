@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from operator import attrgetter
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from orthocal import __version__
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.study.portable_session import PortableSession
 
 Cell = float | int | str | bool | None
 Columns = Mapping[str, Sequence[Cell]]
@@ -22,18 +28,19 @@ DIGITS = 9
 """Significant digits of a number in a table: later ones depend on the processor's summation."""
 
 
+@dataclass(frozen=True, eq=False)
 class Study(ABC):
-    """A study. Two studies with equal documents produce the same table, byte by byte."""
+    """A study; its fields are its arguments.
+
+    Two studies with equal documents produce the same table, byte by byte.
+    """
 
     kind: ClassVar[str]
     counted: ClassVar[str]
     """Plural noun for the cases of the study, such as machines."""
     cases_per_task: ClassVar[int] = 250
 
-    @property
-    @abstractmethod
-    def record(self) -> dict[str, Any]:
-        """Everything that the table depends on, as plain data."""
+    session: PortableSession
 
     @property
     @abstractmethod
@@ -61,8 +68,12 @@ class Study(ABC):
 
     @cached_property
     def document(self) -> dict[str, Any]:
-        """The record with the version of orthocal that produces the table."""
-        return {"kind": self.kind, "orthocal": __version__, **self.record}
+        """Everything that the table depends on, as plain data: session, fields and version."""
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        del fields["session"]
+        document = {"kind": self.kind, "orthocal": __version__, **self.session.record, **fields}
+        plain: dict[str, Any] = json.loads(json.dumps(document, default=attrgetter("document")))
+        return plain
 
     @cached_property
     def digest(self) -> str:
@@ -88,6 +99,22 @@ def run_task(study: Study, task: int) -> dict[str, list[Cell]]:
 def prepare_once(study: Study) -> Any:  # noqa: ANN401 - as `prepare`
     """Data shared by all tasks of a study, prepared once in this process."""
     return study.prepare()
+
+
+def columns_in_edge_units(
+    prefix: str, problem: CalibrationProblem, values: NDArray[np.float64]
+) -> dict[str, Sequence[float]]:
+    """Columns of parameters, named with the unit that users read.
+
+    Args:
+        prefix: Start of each column's name.
+        problem: The problem.
+        values: Shape (n_sets, n_machine), [SI].
+    """
+    return {
+        f"{prefix}{p.name}_{p.edge_unit}": list(values[:, i] * p.edge_factor)
+        for i, p in enumerate(problem.machine_selection.parameters)
+    }
 
 
 def _round_column(cells: Sequence[Cell]) -> list[Cell]:

@@ -48,7 +48,7 @@ def test_a_gain_is_the_reduction_of_the_error(drawn):
     kind, information, root, taking = drawn
     for rows in ([2], [0, 3], [1, 4, 6, 2]):
         taken = left(kind, information, root, []) - left(kind, information, root, rows)
-        assert taking.gain(rows) == pytest.approx(taken, rel=1e-9)
+        assert taking.gains(np.array([rows])) == pytest.approx(taken, rel=1e-9)
 
 
 def test_the_gain_of_one_further_reading(drawn):
@@ -124,7 +124,7 @@ def test_gains_with_the_gauge_aligned_in_the_first_posture(seed):
         scatter = ends[0, 0] + ends[1, 1] - 2.0 * ends[0, 1] + 2.0 * SIGMA**2
         assert gain == pytest.approx(float(across @ across) / scatter, rel=1e-10)
         for rows in ([first, second], [first, (second + 1) % READINGS, second]):
-            exact = begun.gain(rows)
+            (exact,) = begun.gains(np.array([rows]))
             (whole,) = SetupGain.of(kind, covariance, covariance @ root, SIGMA).gains(
                 np.array([rows])
             )

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from orthocal.io.documents import Count, Name, Number, PositiveNumber
 from orthocal.sensors.mounting import LARGEST_SCALE
 from orthocal.sensors.tips import TipKeys
+from orthocal.session.session import Gauge
 from orthocal.units import DEG, MM, MRAD, Unit
 
 Vector = Annotated[list[Number], Field(min_length=1, max_length=12)]
@@ -61,6 +62,14 @@ class GaugeKeys(_Keys):
     """What it touches with, in setups that do not say so themselves."""
     scale_tolerance: Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)] | None = None
     """How well it shows a millimetre, likewise."""
+
+    def to_gauge(self) -> Gauge:
+        """The gauge in SI units."""
+        return Gauge(
+            None if self.sigma_mm is None else self.sigma_mm * MM,
+            None if self.resolution_mm is None else self.resolution_mm * MM,
+            None if self.range_mm is None else (self.range_mm[0] * MM, self.range_mm[1] * MM),
+        )
 
     @model_validator(mode="after")
     def _range_rises(self) -> GaugeKeys:

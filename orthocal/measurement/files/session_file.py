@@ -35,7 +35,7 @@ from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import NuisanceParameter, Sensor, SetupKeys, default_zero
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Gauge, Purpose, Reading, Session, Setup
-from orthocal.units import MM, show_limit
+from orthocal.units import show_limit
 
 SESSION = "session.yaml"
 
@@ -313,14 +313,7 @@ def _check_shared(setups: Mapping[str, Setup], file: str) -> None:
 
 def _build_gauges(keys: SessionKeys) -> dict[str, Gauge]:
     gauges = keys.gauges or {"": keys.gauge or GaugeKeys()}
-    return {
-        name: Gauge(
-            None if g.sigma_mm is None else g.sigma_mm * MM,
-            None if g.resolution_mm is None else g.resolution_mm * MM,
-            None if g.range_mm is None else (g.range_mm[0] * MM, g.range_mm[1] * MM),
-        )
-        for name, g in gauges.items()
-    }
+    return {name: g.to_gauge() for name, g in gauges.items()}
 
 
 def _gauge_of(setup: SetupKeys, gauges: Mapping[str, Gauge], where: str) -> str:
