@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -40,11 +40,20 @@ class Tails:
         """Some of the patterns."""
         return Tails(self.segments, self.segment[chosen], self.start[chosen])
 
-    def by_segment(self) -> Iterator[tuple[Indices, Indices, Array]]:
-        """Patterns of each segment that has any, with its rows and base vector."""
-        used, begin = np.unique(self.segment, return_index=True)
-        for s, members in zip(used, np.split(np.arange(self.segment.size), begin[1:]), strict=True):
-            yield members, *self.segments[s]
+    def product(self, matrix: Array, *, power: int = 1) -> Array:
+        """Matrix product of the patterns, to a power element by element, shape (h, m).
+
+        Args:
+            matrix: Shape (n_rows, m).
+            power: Exponent of the elements of the patterns.
+        """
+        result = np.empty((self.segment.size, matrix.shape[1]))
+        for s in np.unique(self.segment):
+            members = slice(*np.searchsorted(self.segment, (s, s + 1)))
+            rows, base = self.segments[s]
+            products = base[::-1, None] ** power * matrix[rows[::-1]]
+            result[members] = np.cumsum(products, axis=0)[::-1][self.start[members]]
+        return result
 
     def to_sparse(self, count: int) -> Sparse:
         """Patterns as a sparse matrix, shape (h, count)."""
@@ -55,21 +64,24 @@ class Tails:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patterns:
-    """Vectors over the rows of a session, one per hypothesis: a sparse part plus tails."""
+    """Vectors over the rows of a session, one per hypothesis: a sparse part plus tails.
+
+    No row is in both parts of a pattern with a value other than 0.
+    """
 
     rows: Sparse
     """Sparse part, shape (h, n_rows), [m]."""
     tails: Tails | None = None
 
-    @property
-    def count(self) -> int:
-        """Number of patterns."""
-        return int(self.rows.shape[0])
-
     def select(self, chosen: slice) -> Patterns:
         """Some of the patterns."""
         tails = None if self.tails is None else self.tails.select(chosen)
         return Patterns(self.rows[chosen], tails)
+
+    def product(self, matrix: Array) -> Array:
+        """Matrix product of the patterns with a matrix over the rows, (n_rows, m): (h, m)."""
+        product = np.asarray(self.rows @ matrix)
+        return product if self.tails is None else product + self.tails.product(matrix)
 
     def to_sparse(self) -> Sparse:
         """All patterns written out, shape (h, n_rows)."""

@@ -20,7 +20,6 @@ from orthocal.hypotheses.hypothesis import (
     MachineShift,
     Patterns,
     Sparse,
-    Tails,
     row_products,
 )
 from orthocal.hypotheses.likelihood import Likelihood, Products, build_likelihood
@@ -291,25 +290,13 @@ class LinearModel:
         directions = about.likelihood.directions
         patterns = self._write_out(patterns)
         entries = patterns.rows @ self.to_entries
-        sums = np.asarray(entries @ self._incidence)
-        along = np.asarray(entries @ directions.T)
         square = row_products(entries, entries)
-        cross = np.asarray(entries @ deviation)
-        if patterns.tails is not None:
-            tails, o = patterns.tails, self.problem.observations
-            square += 2.0 * self._overlap(tails, entries)
-            for members, rows, base in tails.by_segment():
-                at, zero = o.plus[rows], o.zero[o.plus[rows[0]]]
-                values, start = base / self.problem.noise[at], tails.start[members]
-
-                def tail(x: Array, start: Indices = start) -> Array:
-                    return np.asarray(np.cumsum(x[::-1], axis=0)[::-1][start])
-
-                along[members] += tail(values[:, None] * directions[:, at].T)
-                square[members] += tail(values**2)
-                cross[members] += tail(values * deviation[at])
-                sums[members, zero] += tail(values)
-        square = square - (sums**2) @ (1.0 / self._counts)
+        if patterns.tails is not None:  # an entry is a row over its noise
+            scale = np.asarray(self.to_entries.sum(axis=1))
+            square += patterns.tails.product(scale[:, None] ** 2, power=2)[:, 0]
+        square -= self._sums_by_zero(patterns) ** 2 @ (1.0 / self._counts)
+        along = patterns.product(self.to_entries @ directions.T)
+        cross = patterns.product((self.to_entries @ deviation)[:, None])[:, 0]
         return Products(along, np.maximum(square, 0.0)), cross
 
     def inner(self, patterns: Patterns, others: Patterns) -> Array:
@@ -317,20 +304,16 @@ class LinearModel:
 
         Args:
             patterns: Over the rows, shape (h, n_rows).
-            others: The same number, without tails.
+            others: The same number, without tails. Tails are 0 in their rows.
         """
         patterns = self._write_out(patterns)
-        one, other = patterns.rows @ self.to_entries, others.rows @ self.to_entries
-        result = row_products(one, other)
-        sums = np.asarray(one @ self._incidence)
-        if patterns.tails is not None:
-            tails, o = patterns.tails, self.problem.observations
-            result = result + self._overlap(tails, other)
-            for members, rows, base in tails.by_segment():
-                at = o.plus[rows]
-                total = np.cumsum((base / self.problem.noise[at])[::-1])[::-1]
-                sums[members, o.zero[at[0]]] += total[tails.start[members]]
-        return np.asarray(result - (sums * (other @ self._incidence)) @ (1 / self._counts))
+        one, other = (p.rows @ self.to_entries for p in (patterns, others))
+        means = self._sums_by_zero(patterns) * self._sums_by_zero(others) @ (1.0 / self._counts)
+        return row_products(one, other) - means
+
+    def _sums_by_zero(self, patterns: Patterns) -> Array:
+        """Sums of the entries of patterns over each gauge zero, shape (h, n_zeros), [m]."""
+        return patterns.product(np.asarray(self.to_entries @ self._incidence))
 
     def _write_out(self, patterns: Patterns) -> Patterns:
         """Patterns without tails, where cumulative sums do not apply or gain little."""
@@ -338,25 +321,6 @@ class LinearModel:
         if patterns.tails is None or (self._has_single_zeros and not few):
             return patterns
         return Patterns(patterns.to_sparse())
-
-    def _overlap(self, tails: Tails, entries: Sparse) -> Array:
-        """Inner products of tails with sparse vectors over the entries, pair by pair."""
-        o = self.problem.observations
-        result = np.zeros(tails.segment.size)
-        position = np.full(o.size, -1)
-        base = np.zeros(o.size)
-        start = np.repeat(tails.start, np.diff(entries.indptr))
-        pattern = np.repeat(np.arange(result.size), np.diff(entries.indptr))
-        for members, rows, values in tails.by_segment():
-            at = o.plus[rows]
-            position[at], base[at] = np.arange(rows.size), values / self.problem.noise[at]
-            chosen = slice(entries.indptr[members[0]], entries.indptr[members[-1] + 1])
-            columns = entries.indices[chosen]
-            shared = np.where(position[columns] >= start[chosen], base[columns], 0.0)
-            shared = entries.data[chosen] * shared
-            np.add.at(result, pattern[chosen], shared)
-            position[at], base[at] = -1, 0.0
-        return result
 
     @property
     def _has_single_zeros(self) -> bool:
