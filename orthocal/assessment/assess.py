@@ -144,10 +144,10 @@ def assessment_of(calibration: Calibration) -> Assessment:
     return calibration.assessment or assess(calibration)
 
 
-def check_session(session: Session, judgement: Judgement | None = None) -> Assessment:
+def check_session(session: Session) -> Assessment:
     """The assessment of readings before anything is calibrated from them."""
     require_kind(session, Session, expected="a Session, such as load_session(...)")
-    found = judgement or judge_session(session)
+    found = judge_session(session)
     findings = found.findings
     if found.verdict == "enter":
         within = found.tolerance_scale == 1.0

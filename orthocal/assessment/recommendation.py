@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from orthocal.errors import OrthocalError
 from orthocal.estimation.selection import complete_model
 from orthocal.hypotheses.likelihood import NOISE_SCALES, log_of_sum, noise_weights
-from orthocal.hypotheses.linear_model import Linearisation, LinearModel
+from orthocal.hypotheses.linear_model import LinearModel
 from orthocal.measurement.joining import split_sessions
 from orthocal.session.session import Session
 
@@ -111,22 +111,14 @@ def _evidence(session: Session, model: str) -> tuple[float, Array]:
         readings = LinearModel(part, model)
         about = readings.most_likely(part.values)
         deviation = readings.entries(part.values[None])[0] - about.expected
-        logs = _log_evidence(about, deviation, np.append(1.0, SCALES), stated=readings.stated)
-        total += float(logs[0])
-        by_scale += logs[1:]
+        stated = readings.stated
+        noises, weights = (
+            (np.ones(1), np.zeros(1)) if stated else (NOISE_SCALES, noise_weights(stated=False))
+        )
+        scales = np.append(1.0, SCALES)
+        likelihood = about.likelihood
+        logs = likelihood.log_densities(likelihood.products(deviation[None]), scales, noises)
+        evidence = log_of_sum(logs.reshape(scales.size, -1) + weights, axis=1)
+        total += float(evidence[0])
+        by_scale += evidence[1:]
     return total, by_scale
-
-
-def _log_evidence(about: Linearisation, deviation: Array, scales: Array, *, stated: bool) -> Array:
-    """Ln p(y | M) for tolerances times each scale, shape (n_scales,)."""
-    likelihood = about.likelihood
-    along = likelihood.directions @ deviation
-    rest = max(float(deviation @ deviation - along @ along), 0.0)
-    multiples, weights = np.ones(1), np.zeros(1)
-    if not stated:
-        multiples, weights = NOISE_SCALES, noise_weights(stated=False)
-    noise = (multiples * likelihood.sigma) ** 2  # (s,)
-    variance = scales[:, None, None] ** 2 * likelihood.variances[:, None] + noise  # (e, r, s)
-    logs = -0.5 * ((along[:, None] ** 2 / variance) + np.log(variance)).sum(axis=1)
-    logs -= 0.5 * (rest / noise + max(likelihood.dof - along.size, 0) * np.log(noise))
-    return np.asarray(log_of_sum(logs + weights, axis=1))

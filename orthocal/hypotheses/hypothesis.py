@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.hypotheses.anomaly import Explanation
-from orthocal.session.session import Session
+from orthocal.session.session import Gauge, Session
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -127,7 +127,8 @@ class Family:
     effects: Patterns | None = None
     """Effects on the rows per unit of an unknown amount."""
     log_volume: Array | None = None
-    """Logarithm of the factor by which the edit scales a volume of readings, shape (h,)."""
+    """Logarithm of the factor by which the edit scales a volume of readings, shape (h,); of silent
+    rows, the logarithm of the density of what they show."""
     groups: Sequence[Sequence[Indices]] = ()
     """Rows that share an unknown amount, several groups per hypothesis."""
     silent: Sequence[Indices] = ()
@@ -195,6 +196,10 @@ class Rows:
     def of_setups(self, setups: Sequence[str]) -> Indices:
         """Rows of some setups."""
         return np.concatenate([self.setups[name] for name in setups])
+
+    def gauge(self, row: int) -> Gauge:
+        """Gauge that shows a row."""
+        return self.session.gauges[self.session.setups[self.session.readings[row].setup].gauge]
 
     def posture(self, row: int) -> str:
         """Posture of a row, or the difference of two."""

@@ -88,16 +88,13 @@ class Likelihood:
     weights: Array
     """Logarithms of the prior weights of all pairs (e, s), shape (g,)."""
 
-    @property
-    def noise(self) -> Array:
-        """s² σ² of all pairs, shape (g,), [m²]."""
-        return np.asarray(np.tile((NOISE_SCALES * self.sigma) ** 2, TOLERANCE_SCALES.size))
-
-    @property
-    def variance(self) -> Array:
-        """Variance along each direction for all pairs, shape (r, g), [m²]."""
-        scale = np.repeat(TOLERANCE_SCALES**2, NOISE_SCALES.size)
-        return np.asarray(self.variances[:, None] * scale + self.noise)
+    def grid(
+        self, tolerance_scales: Array = TOLERANCE_SCALES, noise_scales: Array = NOISE_SCALES
+    ) -> tuple[Array, Array]:
+        """Variance of the noise, (g,), and along each direction, (r, g), of pairs (e, s), [m²]."""
+        noise = np.tile((noise_scales * self.sigma) ** 2, tolerance_scales.size)
+        scale = np.repeat(tolerance_scales**2, noise_scales.size)
+        return noise, self.variances[:, None] * scale + noise
 
     def products(self, vectors: Array) -> Products:
         """Products of dense vectors, zeros projected out, shape (h, n_entries), [m]."""
@@ -146,9 +143,10 @@ class Likelihood:
         Returns:
             Shape (h,).
         """
-        logs = self._on_grid(deviations)
+        logs = self.log_densities(deviations)
         if effects is not None and cross is not None:
-            inverse, noise = 1.0 / self.variance, self.noise
+            noise, variance = self.grid()
+            inverse = 1.0 / variance
             perpendicular = np.maximum(effects.square - (effects.along**2).sum(axis=1), 0.0)
             remaining = cross - (effects.along * deviations.along).sum(axis=1)
             information = effects.along**2 @ inverse + perpendicular[:, None] / noise
@@ -163,9 +161,14 @@ class Likelihood:
             gains.append(0.5 * (tau * slope**2 / widened - np.log(widened)))
         return np.asarray(log_of_sum(np.array(gains), axis=0) - np.log(AMOUNTS.size))
 
-    def _on_grid(self, deviations: Products) -> Array:
-        """Logarithms for all pairs (e, s), shape (h, g)."""
-        variance, noise = self.variance, self.noise
+    def log_densities(
+        self,
+        deviations: Products,
+        tolerance_scales: Array = TOLERANCE_SCALES,
+        noise_scales: Array = NOISE_SCALES,
+    ) -> Array:
+        """Logarithms of normal densities for all pairs (e, s), up to a constant, shape (h, g)."""
+        noise, variance = self.grid(tolerance_scales, noise_scales)
         perpendicular = np.maximum(deviations.square - (deviations.along**2).sum(axis=1), 0.0)
         squares = deviations.along**2 @ (1.0 / variance) + perpendicular[:, None] / noise
         logs = -0.5 * (squares + np.log(variance).sum(axis=0))
@@ -182,7 +185,7 @@ class Likelihood:
                 group share one prior standard deviation τ.
             silent: Indicators of rows that say nothing, zeros projected out, (m, n_entries).
         """
-        logs = self._on_grid(self.products(deviation[None]))[0] + self.weights
+        logs = self.log_densities(self.products(deviation[None]))[0] + self.weights
         sizes = [len(g) for g in groups]
         n_silent = 0 if silent is None else len(silent)
         if not sum(sizes) + n_silent:
@@ -221,7 +224,7 @@ class Likelihood:
 
     def _gram(self, deviation: Array, vectors: Array) -> tuple[Array, Array]:
         """W V⁻¹ Wᵀ, shape (g, k, k), and W V⁻¹ d, shape (g, k), for all pairs (e, s)."""
-        inverse, inverse_noise = 1.0 / self.variance, 1.0 / self.noise
+        inverse_noise, inverse = (1.0 / v for v in self.grid())
         along, components = self.directions @ deviation, vectors @ self.directions.T
         perpendicular = vectors - components @ self.directions
         gram = np.einsum("kr,rg,lr->gkl", components, inverse, components)

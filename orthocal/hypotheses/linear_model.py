@@ -327,9 +327,13 @@ class LinearModel:
         """True if all rows are single readings, so that the rows of a setup share one zero."""
         return bool((self.problem.observations.minus < 0).all())
 
-    def rms(self, rows: Array, about: Linearisation) -> float:
-        """RMS residual of a machine within its tolerances, to first order, [m]."""
-        deviation = self.entries(rows[None])[0] - about.expected
+    def rms(self, deviation: Array, about: Linearisation) -> float:
+        """RMS residual of a machine within its tolerances, to first order, [m].
+
+        Args:
+            deviation: Readings less predictions, shape (n_entries,), zeros projected out, [m].
+            about: The linearisation.
+        """
         errors = about.errors_for(deviation)
         along = about.sizes * (about.errors.T @ errors)
         residuals = (deviation - along @ about.likelihood.directions) * self.problem.noise

@@ -63,7 +63,7 @@ class _Scaled:
     """Vectors at one pair (e, s) of scales, in coordinates in which V is the identity."""
 
     def __init__(self, likelihood: Likelihood, vectors: Sequence[Array], g: int) -> None:
-        noise, variance = likelihood.noise[g], likelihood.variance[:, g]
+        noise, variance = (v[..., g] for v in likelihood.grid())
         scale = np.full(vectors[0].shape[-1], 1.0 / np.sqrt(noise))
         scale[: variance.size] = 1.0 / np.sqrt(variance)
         self.vectors = tuple(v * scale for v in vectors)

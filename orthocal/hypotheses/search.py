@@ -106,19 +106,17 @@ CHUNK = 4096
 """Hypotheses that are scored at a time, for their memory."""
 
 
-def find_anomalies(session: Session, model: str | None = None) -> Anomalies:
+def find_anomalies(session: Session) -> Anomalies:
     """Find what is wrong with a session, from its readings and its robot alone.
 
     Args:
         session: A session, or several joined ones; rows that were not read are not in it.
-        model: Model of the errors that the machine may have; all by default.
 
     Raises:
         ClosureError: If the machine cannot reach a posture.
         RobotError: If closures of the robot depend on each other.
-        ParameterError: If the model is unknown.
     """
-    linear = LinearModel(session, model)
+    linear = LinearModel(session)
     if len(session.readings) < 2 or linear.dof < 1:
         return Anomalies((), 0.0, True, 0.0, 0.0, 1.0, 1.0)
     return _Search(session, linear).run()
@@ -223,7 +221,7 @@ class _Search:
                 groups.append(model.shift_entries(about, t.shift)[None])
                 steps.append(groups[-1][0])
             elif t.silent is not None:
-                silent.append(model.entries(_indicators(t.silent, self.values.size)))
+                silent.append(model.entries(_marks(list(t.silent[:, None]), self.values.size)))
         return (
             groups,
             np.concatenate(silent) if silent else None,
@@ -318,19 +316,27 @@ class _Search:
         likelihood = state.about.likelihood
         deviation = state.remaining
         base = likelihood.products(deviation[None])
-        sound = float(likelihood.score(base)[0])
+        sound, rows_count = float(likelihood.score(base)[0]), self.values.size
         for family in families:
             if family.groups:
                 logs = np.array(
                     [
                         likelihood.score_set(
-                            deviation, [self.model.entries(_marks(g, self.values.size))]
+                            deviation, [self.model.entries(_marks(g, rows_count))]
                         ).log_likelihood
                         for g in family.groups
                     ]
                 )
             elif family.silent:
-                logs = np.array([self._score_silent(state, rows) for rows in family.silent])
+                logs = np.array(
+                    [
+                        likelihood.score_set(
+                            deviation,
+                            silent=self.model.entries(_marks(list(rows[:, None]), rows_count)),
+                        ).log_likelihood
+                        for rows in family.silent
+                    ]
+                )
             elif family.shifts:
                 logs = self._score_shifts(state, family)
             else:
@@ -366,17 +372,6 @@ class _Search:
             )
         return about.likelihood.score(products, added, cross + inner)
 
-    def _score_silent(self, state: HypothesisSet, rows: NDArray[np.int64]) -> float:
-        vectors = self.model.entries(_indicators(rows, self.values.size))
-        return state.about.likelihood.score_set(state.remaining, (), vectors).log_likelihood - len(
-            rows
-        ) * float(np.log(self._resolution(int(rows[0]))))
-
-    def _resolution(self, row: int) -> float:
-        """Step of the gauge of a row, or its noise, [m]."""
-        setup = self.session.setups[self.session.readings[row].setup]
-        return self.session.gauges[setup.gauge].resolution or self.model.sigma
-
     def _score_shifts(self, state: HypothesisSet, family: Family) -> Array:
         likelihood = state.about.likelihood
         vectors = np.array([self.model.shift_entries(state.about, s) for s in family.shifts])
@@ -395,9 +390,7 @@ class _Search:
         if family.groups:
             return Term(explanation, prior, effects=_marks(family.groups[h], rows.count))
         if family.silent:
-            silent = family.silent[h]
-            prior -= len(silent) * float(np.log(self._resolution(int(silent[0]))))
-            return Term(explanation, prior, silent=silent)
+            return Term(explanation, prior, silent=family.silent[h])
         if family.shifts:
             shift = family.shifts[h]
             if not family.known:
@@ -500,8 +493,8 @@ class _Search:
             tuple(named),
             state.log_posterior - sound.log_posterior,
             silent or self.is_plausible(state),
-            self.model.rms(self.values, sound.about),
-            _rms(self.model, state),
+            self.model.rms(sound.remaining, sound.about),
+            self.model.rms(state.remaining, state.about),
             state.score.tolerance_scale,
             state.score.noise_scale,
         )
@@ -510,7 +503,7 @@ class _Search:
 def _families(model: LinearModel, rows: Rows, *, grouped: bool = True) -> Iterator[Family]:
     if grouped:
         yield from wrong_units_and_signs(rows, model.sigma)
-    yield from displaced_gauges(rows)
+    yield from displaced_gauges(rows, model.sigma)
     yield from wrong_readings(rows)
     yield from swapped_rows(rows)
     yield from row_offsets(rows)
@@ -535,19 +528,5 @@ def _prior(family: Family) -> Array:
     return prior if family.log_volume is None else prior + family.log_volume
 
 
-def _indicators(rows: NDArray[np.int64], count: int) -> Array:
-    """One vector per row that is 1 there, shape (k, count)."""
-    return _marks(list(rows[:, None]), count)
-
-
 def _marks(groups: Sequence[NDArray[np.int64]], count: int) -> Array:
     return to_dense(marks(groups, count).rows)
-
-
-def _rms(model: LinearModel, state: HypothesisSet) -> float:
-    """RMS of what remains of the corrected rows, [m]."""
-    errors = state.about.errors_for(state.remaining)
-    along = state.about.sizes * (state.about.errors.T @ errors)
-    residuals = state.remaining - along @ state.about.likelihood.directions
-    rows = model.problem.observations.rows(residuals * model.problem.noise)
-    return float(np.sqrt(np.mean(rows**2)))

@@ -229,7 +229,7 @@ def test_tails_by_cumulative_sums_equal_those_written_out(cycles):
     about = model.linearise(np.zeros(model.problem.n_free), (), None, slopes=False)
     deviation = model.entries(session.values[None])[0] - about.expected
     tested = 0
-    for family in (*displaced_gauges(rows), *row_offsets(rows)):
+    for family in (*displaced_gauges(rows, model.sigma), *row_offsets(rows)):
         for patterns in (family.edits, family.effects):
             if patterns is None or patterns.tails is None:
                 continue

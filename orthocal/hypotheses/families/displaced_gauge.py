@@ -25,9 +25,14 @@ MOST_STUCK = 16
 """Readings of a run that are used."""
 
 
-def displaced_gauges(rows: Rows) -> Iterator[Family]:
-    """Gauges displaced within a setup or for one cycle, drifts, stuck dials."""
-    for family in (_displaced(rows), _cycle_apart(rows), _drift(rows), _stuck(rows)):
+def displaced_gauges(rows: Rows, sigma: float) -> Iterator[Family]:
+    """Gauges displaced within a setup or for one cycle, drifts, stuck dials.
+
+    Args:
+        rows: The rows.
+        sigma: Standard deviation of a reading, [m].
+    """
+    for family in (_displaced(rows), _cycle_apart(rows), _drift(rows), _stuck(rows, sigma)):
         if family is not None:
             yield family
 
@@ -101,7 +106,7 @@ def _drift(rows: Rows) -> Family | None:
     return Family(explain, len(groups), len(groups), effects=effects)
 
 
-def _stuck(rows: Rows) -> Family | None:
+def _stuck(rows: Rows, sigma: float) -> Family | None:
     runs: list[Indices] = []
     for indices in rows.setups.values():
         if not rows.single[indices].all():
@@ -120,4 +125,7 @@ def _stuck(rows: Rows) -> Family | None:
         return Explanation("stuck dial", "setup", tuple(runs[h].tolist()), names=(setup,))
 
     silent = [run[1 : MOST_STUCK + 1] for run in runs]
-    return Family(explain, len(runs), rows.count * MOST_STUCK, silent=silent)
+    steps = np.array([rows.gauge(int(run[0])).resolution or sigma for run in runs])
+    volume = -np.log(steps) * [len(indices) for indices in silent]
+    size = rows.count * MOST_STUCK
+    return Family(explain, len(runs), size, log_volume=volume, silent=silent)
