@@ -1,4 +1,4 @@
-"""Numbers, lists and directions in sentences."""
+"""Findings of each severity; numbers, lists and directions in sentences."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.calibration.assessment_record import Finding, FindingKind, Place
 from orthocal.units import MM, UM
 
 Array = NDArray[np.float64]
@@ -17,6 +18,40 @@ LARGEST_IN_UM = 0.1 * MM
 
 ALONG_AXIS = 0.9999
 """Cosine above which a direction is named after an axis of the world."""
+
+
+def note(
+    kind: FindingKind,
+    text: str,
+    action: str = "",
+    places: Sequence[Place] = (),
+    /,
+    **numbers: float,
+) -> Finding:
+    """Finding that only informs, with numbers whose names end in their unit."""
+    return Finding(kind, "note", text, action, numbers, tuple(places))
+
+
+def review(
+    kind: FindingKind,
+    text: str,
+    action: str = "",
+    places: Sequence[Place] = (),
+    /,
+    **numbers: float,
+) -> Finding:
+    """Finding that asks the user to check the readings."""
+    return Finding(kind, "review", text, action, numbers, tuple(places))
+
+
+def reject(kind: FindingKind, text: str, action: str = "", /, **numbers: float) -> Finding:
+    """Finding that forbids to use the readings."""
+    return Finding(kind, "reject", text, action, numbers)
+
+
+def named(*names: str) -> tuple[Place, ...]:
+    """Parameters, or drives, as places."""
+    return tuple(Place(parameter=name) for name in names)
 
 
 def mm(value: float) -> str:

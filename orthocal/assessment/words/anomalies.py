@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from orthocal.assessment.wording import joined, lengths, plain, signed, um
+from orthocal.assessment.wording import joined, lengths, note, plain, review, signed, um
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, Explanation
 from orthocal.session.session import Session
@@ -52,20 +52,19 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
         }
     action = "Read it again, or leave it out." if anomaly.causes else _remedy(session, e)
     text = f"{text} {_odds(result, anomaly)}"
-    return Finding(e.kind, "review", text, action, numbers, _places(session, e))
+    return review(e.kind, text, action, _places(session, e), **numbers)
 
 
 def _ambiguous(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding:
     every = (anomaly.explanation, *anomaly.alternatives)
     ways = "; ".join(_text(session, e) + _line(session, e) for e in every)
-    return Finding(
+    return review(
         "ambiguous",
-        "review",
         f"The readings contradict each other as if one of these had happened: {ways}. "
         f"{_odds(result, anomaly)}",
         "Look at these readings, and read again what may be wrong.",
-        _numbers(result, anomaly),
         tuple(p for e in every for p in _places(session, e)[:1]),
+        **_numbers(result, anomaly),
     )
 
 
@@ -74,9 +73,8 @@ def _unexplained(session: Session, result: Anomalies) -> Finding:
     what = "What was found above explains" if result.found else "No single change explains"
     remains = f" ({before} RMS, {after} RMS once corrected)" if result.found else f" ({before} RMS)"
     which = "The sessions do" if session.joined else "The readings do"
-    return Finding(
+    return review(
         "inconsistent readings",
-        "review",
         f"{which} not fit one machine{remains}. {what} "
         f"{'only a part' if result.found else 'it'}: several parts may have changed, or several "
         "readings are wrong.",
@@ -107,13 +105,12 @@ def _between_sessions(session: Session, anomaly: Anomaly) -> Finding:
                 numbers[f"{drive.name}_active_{drive.edge_unit}"] = active * drive.edge_factor
     names = e.drives or e.parameters
     file = _file_of(session, e.sessions[0])
-    return Finding(
+    return review(
         e.kind,
-        "review",
         text,
         _session_remedy(session, e),
-        numbers,
         tuple(Place(file=file, parameter=name) for name in names) or (Place(file=file),),
+        **numbers,
     )
 
 
@@ -125,9 +122,8 @@ def describe_no_change(sizes: dict[str, float], unseen: Sequence[str]) -> Findin
         unseen: Drives of which no change would have been detected.
     """
     if not sizes:
-        return Finding(
+        return note(
             "change unknown",
-            "note",
             "Whether the machine changed between the sessions is unknown: the sessions have too "
             "few setups and postures in common.",
             "Read some of the same setups and postures in each session.",
@@ -139,9 +135,7 @@ def describe_no_change(sizes: dict[str, float], unseen: Sequence[str]) -> Findin
     )
     if unseen:
         text += f" A change of {joined(tuple(unseen), 'or')} would not."
-    return Finding(
-        "no change", "note", text, numbers={f"seen_from_{u}": size for u, size in sizes.items()}
-    )
+    return note("no change", text, **{f"seen_from_{u}": size for u, size in sizes.items()})
 
 
 def _numbers(result: Anomalies, anomaly: Anomaly) -> dict[str, float]:

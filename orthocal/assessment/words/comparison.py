@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from orthocal.assessment.recommendation import Recommendation
-from orthocal.assessment.wording import lengths, mm, times
+from orthocal.assessment.wording import lengths, mm, note, times
 from orthocal.assessment.words.entries import describe_compensated
 from orthocal.calibration.assessment_record import Finding
 from orthocal.units import MM, UM
@@ -30,25 +30,17 @@ def describe_recommendation(found: Recommendation, *, chosen: str | None = None)
     if math.isfinite(other) and chosen != found.model:
         reason += f" ln evidence against {chosen}: {other:+.0f}."
     findings = [
-        Finding(
-            "recommended",
-            "note",
-            f"Recommended model: {found.model}. {reason}",
-            numbers={"log_evidence": evidence},
-        )
+        note("recommended", f"Recommended model: {found.model}. {reason}", log_evidence=evidence)
     ]
     if found.tolerance_scale != 1.0:
         findings.append(
-            Finding(
+            note(
                 "tolerances differ",
-                "note",
                 f"The readings support tolerances of {found.tolerance_scale:.2g} times the stated "
                 f"ones strongly (ln evidence {found.scale_evidence:+.0f}).",
                 "State other tolerances in the session or by --tolerance if that is plausible.",
-                {
-                    "tolerance_scale": found.tolerance_scale,
-                    "log_evidence": found.scale_evidence,
-                },
+                tolerance_scale=found.tolerance_scale,
+                log_evidence=found.scale_evidence,
             )
         )
     return findings
@@ -57,28 +49,24 @@ def describe_recommendation(found: Recommendation, *, chosen: str | None = None)
 def not_recommended(model: str, evidence: float, unseen: float, best_unseen: float) -> Finding:
     """A model that is not recommended, and why."""
     predicts = f"it predicts left-out setups to {mm(unseen)} mm instead of {mm(best_unseen)} mm"
-    return Finding(
+    return note(
         "not recommended",
-        "note",
         f"{model}: ln evidence {evidence:+.1f} relative to the recommended model; {predicts}.",
-        numbers={
-            "log_evidence": evidence,
-            "unseen_rms_mm": unseen / MM,
-            "recommended_unseen_rms_mm": best_unseen / MM,
-        },
+        log_evidence=evidence,
+        unseen_rms_mm=unseen / MM,
+        recommended_unseen_rms_mm=best_unseen / MM,
     )
 
 
 def not_determined(model: str, reason: str) -> Finding:
     """A model that the readings do not determine."""
-    return Finding("not determined", "note", f"{model}: not determined. {reason}.")
+    return note("not determined", f"{model}: not determined. {reason}.")
 
 
 def noise_unknown() -> Finding:
     """Nothing states the noise."""
-    return Finding(
+    return note(
         "noise unknown",
-        "note",
         "Whether the residuals are noise is unknown: nothing states the noise of the gauge.",
         "Repeat readings in cycles, or state gauge.sigma_mm.",
     )
@@ -86,33 +74,27 @@ def noise_unknown() -> Finding:
 
 def residuals_are_noise(model: str, sizes: str, source: str) -> Finding:
     """Residuals agree with the noise."""
-    return Finding("fits", "note", f"The residuals of {model} are noise: {sizes} ({source}).")
+    return note("fits", f"The residuals of {model} are noise: {sizes} ({source}).")
 
 
 def residuals_exceed_noise(model: str, sizes: str, source: str, ratio: float) -> Finding:
     """Residuals exceed the noise."""
-    return Finding(
+    return note(
         "model error",
-        "note",
         f"The residuals of {model} exceed the noise {times(ratio)}: {sizes} ({source}). The model "
         "leaves out errors of the machine.",
-        numbers={"ratio": ratio},
+        ratio=ratio,
     )
 
 
 def compensated(rms: float) -> Finding:
     """Expected tool error with a controller that corrects all errors."""
-    return Finding(
-        "tool error", "note", describe_compensated(rms), numbers={"compensated_um": rms / UM}
-    )
+    return note("tool error", describe_compensated(rms), compensated_um=rms / UM)
 
 
 def linearisation_cost(rms: float) -> Finding:
     """Tool error that linearisation costs."""
     (size,) = lengths(rms)
-    return Finding(
-        "linearisation error",
-        "note",
-        f"Linearisation costs {size} RMS at the tool.",
-        numbers={"cost_um": rms / UM},
+    return note(
+        "linearisation error", f"Linearisation costs {size} RMS at the tool.", cost_um=rms / UM
     )

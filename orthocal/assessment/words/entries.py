@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from orthocal.assessment.wording import joined, lengths
-from orthocal.assessment.words.fit import named
+from orthocal.assessment.wording import joined, lengths, named, note
 from orthocal.calibration.assessment_record import Finding, ToolErrorSummary, Verdict
 from orthocal.units import UM
 
@@ -33,18 +32,17 @@ def next_step(session: str | None) -> str:
 def sound(readings: int, *, within_tolerances: bool) -> Finding:
     """No anomaly was found."""
     noun = "reading agrees" if readings == 1 else "readings agree"
-    return Finding(
+    return note(
         "fits",
-        "note",
         f"The {readings} {noun} with each other"
         + (" and with a machine within its tolerances." if within_tolerances else "."),
-        numbers={"readings": float(readings)},
+        readings=float(readings),
     )
 
 
 def no_offset() -> Finding:
     """No offset was identified."""
-    return Finding("no offset", "note", "No offset was identified.")
+    return note("no offset", "No offset was identified.")
 
 
 def no_change_needed(drives: Sequence[str], ratio: float, tool: ToolErrorSummary | None) -> Finding:
@@ -54,22 +52,22 @@ def no_change_needed(drives: Sequence[str], ratio: float, tool: ToolErrorSummary
     if tool is not None:
         numbers |= {"now_um": tool.now / UM, "entered_um": tool.entered / UM}
         too = ", and entering them does not change the expected tool error significantly"
-    return Finding(
+    return note(
         "no change needed",
-        "note",
         f"No offset differs significantly from its present value{too}.",
-        numbers=numbers,
-        places=named(*drives),
+        "",
+        named(*drives),
+        **numbers,
     )
 
 
 def must_change(drives: Sequence[str]) -> Finding:
     """Offsets that differ significantly from their present value."""
-    return Finding(
+    return note(
         "must change",
-        "note",
         f"Significantly different from the present value: {joined(drives)}.",
-        places=named(*drives),
+        "",
+        named(*drives),
     )
 
 
@@ -77,19 +75,18 @@ def not_significant(drives: Sequence[str]) -> Finding:
     """Offsets that do not differ significantly from their present value."""
     verb = "does" if len(drives) == 1 else "do"
     noun = "its present value" if len(drives) == 1 else "their present values"
-    return Finding(
+    return note(
         "not significant",
-        "note",
         f"{joined(drives)} {verb} not differ significantly from {noun}.",
-        places=named(*drives),
+        "",
+        named(*drives),
     )
 
 
 def controller_not_stated(drives: Sequence[str]) -> Finding:
     """The session does not state the offsets that were active."""
-    return Finding(
+    return note(
         "controller not stated",
-        "note",
         "The session does not state the offsets that were active (`controller`).",
         f"Add these values to the present offsets of {joined(drives)}.",
     )
@@ -118,20 +115,17 @@ def describe_compensated(rms: float) -> str:
 
 def tool_error(tool: ToolErrorSummary, *, keep: bool) -> Finding:
     """Expected error of the tool."""
-    return Finding(
+    return note(
         "tool error",
-        "note",
         describe_tool_error(tool, keep=keep),
-        numbers={
-            "entered_um": tool.entered / UM,
-            "now_um": tool.now / UM,
-            "compensated_um": tool.compensated / UM,
-            "entered_absolute_um": tool.entered_absolute / UM,
-            "now_absolute_um": tool.now_absolute / UM,
-        },
+        entered_um=tool.entered / UM,
+        now_um=tool.now / UM,
+        compensated_um=tool.compensated / UM,
+        entered_absolute_um=tool.entered_absolute / UM,
+        now_absolute_um=tool.now_absolute / UM,
     )
 
 
 def out_of_reach(reason: str) -> Finding:
     """The tool error cannot be computed."""
-    return Finding("out of reach", "note", f"The tool error is unknown: {reason}.")
+    return note("out of reach", f"The tool error is unknown: {reason}.")

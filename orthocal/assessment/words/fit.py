@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from orthocal.assessment.wording import mm, plain, times
+from orthocal.assessment.wording import mm, named, note, plain, times
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.statistics.identifiability import Combination
@@ -14,16 +14,10 @@ FEW_NAMES = 6
 """Parameters up to which all are named."""
 
 
-def named(*names: str) -> tuple[Place, ...]:
-    """Parameters, or drives, as places."""
-    return tuple(Place(parameter=name) for name in names)
-
-
 def noise_unknown() -> Finding:
     """As many parameters as readings, and nothing stated of the gauge."""
-    return Finding(
+    return note(
         "noise unknown",
-        "note",
         "There are as many parameters as readings and the session does not state the gauge's "
         "noise: the uncertainty is unknown.",
         "State gauge.sigma_mm, or repeat the readings in cycles.",
@@ -32,43 +26,37 @@ def noise_unknown() -> Finding:
 
 def noise_from_residuals(sigma: float) -> Finding:
     """Only the residuals say how large the noise is."""
-    return Finding(
+    return note(
         "noise from residuals",
-        "note",
         "The noise is estimated from the residuals alone, so an error of the model looks like "
         "noise.",
         "Repeat readings in cycles, or state gauge.sigma_mm.",
-        {"sigma_mm": sigma / MM},
+        sigma_mm=sigma / MM,
     )
 
 
 def noise_as_stated(sigma: float) -> Finding:
     """Uncertainties rest on the stated noise alone."""
-    return Finding(
+    return note(
         "noise as stated",
-        "note",
         "The uncertainty rests on the stated noise of the gauge.",
-        numbers={"sigma_mm": sigma / MM},
+        sigma_mm=sigma / MM,
     )
 
 
 def fits_stated_noise(sigma: float) -> Finding:
     """Residuals agree with the stated noise."""
-    return Finding(
-        "fits",
-        "note",
-        "The residuals agree with the stated noise of the gauge.",
-        numbers={"sigma_mm": sigma / MM},
+    return note(
+        "fits", "The residuals agree with the stated noise of the gauge.", sigma_mm=sigma / MM
     )
 
 
 def fits_cycles(scatter: float) -> Finding:
     """Residuals agree with the scatter of repeated readings."""
-    return Finding(
+    return note(
         "fits",
-        "note",
         "The residuals agree with the scatter of repeated readings: the model fits.",
-        numbers={"scatter_mm": scatter / MM},
+        scatter_mm=scatter / MM,
     )
 
 
@@ -85,64 +73,56 @@ def model_error(
         factor: Standard deviation of a row over that of a reading.
         larger: Whether a larger model may explain it.
     """
-    return Finding(
+    return note(
         "model error",
-        "note",
         f"The residuals, σ = {mm(sigma * factor)} mm of {row}, are {times(sigma / reference)} "
         f"{source} ({mm(reference * factor)} mm): leg, axis and mounting errors, not noise.",
         "`orthocal compare` shows whether the readings support a larger model." if larger else "",
-        {
-            "sigma_mm": sigma / MM,
-            "noise_mm": reference / MM,
-            "ratio": sigma / reference,
-        },
+        sigma_mm=sigma / MM,
+        noise_mm=reference / MM,
+        ratio=sigma / reference,
     )
 
 
 def gauge_overstated(sigma: float, stated: float) -> Finding:
     """Residuals are far smaller than the stated noise."""
-    return Finding(
+    return note(
         "gauge overstated",
-        "note",
         f"The residuals are only {sigma / stated:.2g} of the stated noise: it is too large, or the "
         "readings were smoothed.",
-        numbers={
-            "sigma_mm": sigma / MM,
-            "gauge_sigma_mm": stated / MM,
-            "ratio": sigma / stated,
-        },
+        sigma_mm=sigma / MM,
+        gauge_sigma_mm=stated / MM,
+        ratio=sigma / stated,
     )
 
 
 def no_redundancy(readings: int, parameters: int) -> Finding:
     """The parameters can take up every independent reading."""
-    return Finding(
+    return note(
         "no redundancy",
-        "note",
         f"With {readings} independent readings and {parameters} parameters the fit cannot be "
         "checked against the readings. It relies on the stated tolerances.",
-        numbers={"independent_readings": float(readings), "parameters": float(parameters)},
+        independent_readings=float(readings),
+        parameters=float(parameters),
     )
 
 
 def nothing_depends(names: Sequence[str]) -> Finding:
     """No reading depends on any free parameter."""
-    return Finding(
+    return note(
         "nothing moved",
-        "note",
         "No reading depends on any free parameter, so all keep their start values.",
         "Read setups and postures that depend on the parameters.",
-        places=named(*names),
+        named(*names),
     )
 
 
 def nothing_deviates(rms: float) -> Finding:
     """The readings show no deviation that the parameters explain."""
-    return Finding(
+    return note(
         "nothing moved",
-        "note",
         f"The readings show no deviation that these parameters explain (RMS {mm(rms)} mm).",
-        numbers={"before_rms_mm": rms / MM},
+        before_rms_mm=rms / MM,
     )
 
 
@@ -162,23 +142,23 @@ def held_by_bound(p: ParameterEstimate, *, offset: bool) -> Finding:
 
 def linearisation_error(p: ParameterEstimate, change: float, std: float) -> Finding:
     """Largest difference of the linearised and the exact estimate."""
-    return Finding(
+    return note(
         "linearisation error",
-        "note",
         f"Linearisation changes the estimates by at most {plain(change * p.edge_factor)} "
         f"{p.edge_unit} ({p.name}), {change / std:.2g} of its standard deviation.",
-        numbers={"part_of_std": change / std},
-        places=named(p.name),
+        "",
+        named(p.name),
+        part_of_std=change / std,
     )
 
 
 def inseparable(combination: Combination) -> Finding:
     """Parameters that these readings determine only as a sum."""
-    return Finding(
+    return note(
         "inseparable",
-        "note",
         f"Determined only in combination: {combination.words}.",
-        places=named(*combination.names),
+        "",
+        named(*combination.names),
     )
 
 
@@ -187,24 +167,24 @@ def below_noise(names: Sequence[str]) -> Finding:
     count = len(names)
     listed = f" ({', '.join(names)})" if count <= FEW_NAMES else ""
     noun = "parameter moves" if count == 1 else "parameters move"
-    return Finding(
+    return note(
         "below the noise",
-        "note",
         f"{count} {noun} all readings together by less than the noise, at one prior standard "
         f"deviation{listed}.",
-        numbers={"parameters": float(count)},
-        places=named(*names),
+        "",
+        named(*names),
+        parameters=float(count),
     )
 
 
 def line_assumed(size: float, setup: str, touches: str, sigma: float) -> Finding:
     """Readings are modelled as of the line between the rods, which nothing touches."""
-    return Finding(
+    return note(
         "line assumed",
-        "note",
         f"The readings are modelled as of the line between the rods of a leg. Readings of a rod "
         f"differ from that by about {mm(size)} mm (setup {setup}).",
         f"State what is touched (`touches: {touches}`, and the gauge's `tip`).",
-        {"off_line_mm": size / MM, "sigma_mm": sigma / MM},
         (Place(setup=setup),),
+        off_line_mm=size / MM,
+        sigma_mm=sigma / MM,
     )

@@ -4,42 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from orthocal.assessment.wording import mm
+from orthocal.assessment.wording import mm, note, reject, review
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.units import MM, UM
 
 
 def wrong_dimensions(legs: str, nominal: float, measured: float) -> Finding:
     """The nominal machine would show far more than the gauge saw, [m] RMS."""
-    return Finding(
+    return reject(
         "wrong dimensions",
-        "reject",
         f"The postures do not belong to this machine: the robot with {legs} would have moved the "
         f"gauge by {nominal / MM:.1f} mm RMS, and it moved by {measured / MM:.1f} mm.",
         "Check `robot` and the joint coordinates of the postures.",
-        numbers={"nominal_rms_mm": nominal / MM, "measured_rms_mm": measured / MM},
+        nominal_rms_mm=nominal / MM,
+        measured_rms_mm=measured / MM,
     )
 
 
 def beyond_tolerances(scale: float, limit: float) -> Finding:
     """Only many times the stated tolerances would explain the readings."""
-    return Finding(
+    return reject(
         "beyond tolerances",
-        "reject",
         f"Only a machine with {scale:.1f} times the stated tolerances explains these readings. "
         f"More than {limit:g} times is no machine in working order.",
         "Check signs, rows and setups. If they are right, adjust the machine mechanically first.",
-        numbers={"tolerance_scale": scale},
+        tolerance_scale=scale,
     )
 
 
 def above_tolerances(scale: float) -> Finding:
     """Errors of the machine exceed their tolerances by a plausible factor."""
-    return Finding(
+    return note(
         "above tolerances",
-        "note",
         f"The errors of this machine correspond to {scale:.1f} times the stated tolerances.",
-        numbers={"tolerance_scale": scale},
+        tolerance_scale=scale,
     )
 
 
@@ -47,67 +45,64 @@ def finer_than_gauge(
     count: int, total: int, step: float, where: str, value: float, places: Sequence[Place]
 ) -> Finding:
     """Readings lie between the steps of the gauge."""
-    return Finding(
+    return review(
         "finer than the gauge",
-        "review",
         f"{count} of {total} readings have more digits than the gauge shows (resolution "
         f"{step / MM:g} mm). The first is {value / MM:.6g} mm in {where}.",
         "Make sure that the readings are in mm, not in inches, and that the resolution is right.",
-        numbers={"finer": float(count), "resolution_mm": step / MM},
-        places=tuple(places),
+        places,
+        finer=float(count),
+        resolution_mm=step / MM,
     )
 
 
 def residuals_too_small(left: float, rounding: float, step: float) -> Finding:
     """Residuals are smaller than rounding to the gauge's steps leaves."""
-    return Finding(
+    return review(
         "residuals too small",
-        "review",
         f"The readings agree to {left / UM:.2g} µm. Rounding to the gauge's resolution of "
         f"{step / MM:g} mm alone leaves {rounding / UM:.2g} µm. They are in another unit, were "
         "computed, or the dial did not move.",
         "Make sure that the readings are what the dial showed, in mm.",
-        numbers={
-            "residual_um": left / UM,
-            "rounding_um": rounding / UM,
-            "resolution_mm": step / MM,
-        },
+        residual_um=left / UM,
+        rounding_um=rounding / UM,
+        resolution_mm=step / MM,
     )
 
 
 def sigma_too_large(given: float, scatter: float) -> Finding:
     """The stated noise of the gauge is far above what its readings scatter by."""
-    return Finding(
+    return review(
         "sigma too large",
-        "review",
         f"The session states a noise of {given / MM:g} mm (gauge.sigma_mm). Its readings scatter "
         f"by {scatter / MM:.2g} mm.",
         "Make sure that gauge.sigma_mm is in mm.",
-        numbers={"given_mm": given / MM, "scatter_mm": scatter / MM, "ratio": given / scatter},
+        given_mm=given / MM,
+        scatter_mm=scatter / MM,
+        ratio=given / scatter,
     )
 
 
 def postures_too_near(posture: str, gap: float, largest: float) -> Finding:
     """Two postures are hardly apart, beside others that are far apart."""
-    return Finding(
+    return review(
         "postures too near",
-        "review",
         f"Posture '{posture}' is {gap / MM:.2g} mm from another one. Others are up to "
         f"{largest / MM:.0f} mm apart.",
         "Make sure that its coordinates are in mm, not in metres.",
-        numbers={"gap_mm": gap / MM, "largest_mm": largest / MM},
-        places=(Place(posture=posture),),
+        (Place(posture=posture),),
+        gap_mm=gap / MM,
+        largest_mm=largest / MM,
     )
 
 
 def legs_differ(legs: str, lengths: dict[str, float]) -> Finding:
     """Legs have different nominal lengths although all drives are alike."""
-    return Finding(
+    return review(
         "legs differ",
-        "review",
         f"The nominal machine has legs of different lengths ({legs}) and drives that are alike.",
         "Make sure that the length was changed in every place of the URDF.",
-        numbers={f"{name}_mm": length / MM for name, length in lengths.items()},
+        **{f"{name}_mm": length / MM for name, length in lengths.items()},
     )
 
 
@@ -115,12 +110,12 @@ def scattered_repeats(
     scatter: float, gauge: float, label: str, shown: str, places: Sequence[Place]
 ) -> Finding:
     """Repeated readings differ by far more than the gauge's noise."""
-    return Finding(
+    return review(
         "scattered repeats",
-        "review",
         f"Repeated readings scatter by {mm(scatter)} mm. The gauge's noise explains {mm(gauge)} "
         f"mm. They differ most at {label}: {shown} mm.",
         "Check these for a wrong sign or row, and read them again.",
-        numbers={"scatter_mm": scatter / MM, "gauge_mm": gauge / MM},
-        places=tuple(places),
+        places,
+        scatter_mm=scatter / MM,
+        gauge_mm=gauge / MM,
     )

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from orthocal.assessment.predictive import FEWEST, Repetition
-from orthocal.assessment.wording import joined, mm
-from orthocal.assessment.words.fit import named
+from orthocal.assessment.wording import joined, mm, named, note, review
 from orthocal.calibration.assessment_record import Finding, Place
 
 CONFIRMED = "The calibration is confirmed."
@@ -18,12 +17,11 @@ AGAIN = "Calibrate again from this session."
 
 def nothing_predicted(numbers: Mapping[str, float]) -> Finding:
     """The calibration had no redundancy, so it predicts nothing."""
-    return Finding(
+    return review(
         "nothing predicted",
-        "review",
         "The calibration had no redundant readings, so it predicts no deviations to compare with.",
         "Calibrate from more readings, then measure again.",
-        numbers,
+        **numbers,
     )
 
 
@@ -61,17 +59,12 @@ def larger_than_predicted(
             )
         )
         text += f" A fit of the new readings leaves {mm(refit)} mm RMS: {reason}."
-    return Finding("larger than predicted", "review", text, action, numbers, (place,))
+    return review("larger than predicted", text, action, (place,), **numbers)
 
 
 def as_predicted(achieved: float, expected: float, numbers: Mapping[str, float]) -> Finding:
     """Deviations are as the calibration predicts."""
-    return Finding(
-        "as predicted",
-        "note",
-        _agreement(achieved, expected),
-        numbers=numbers,
-    )
+    return note("as predicted", _agreement(achieved, expected), **numbers)
 
 
 def further_change(
@@ -79,13 +72,12 @@ def further_change(
 ) -> Finding:
     """Deviations are as predicted, and the new readings improve what to enter significantly."""
     what = f"the offsets of {joined(drives)}" if drives else "the expected tool error"
-    return Finding(
+    return note(
         "further change",
-        "note",
         f"{_agreement(achieved, expected)} The new readings determine {what} better.",
         AGAIN,
-        numbers,
         named(*drives),
+        **numbers,
     )
 
 
@@ -111,22 +103,21 @@ def describe_repetition(repetition: Repetition, *, new: bool = False, title: str
         why = f"the fit absorbs nearly all of the {r.matched} shared rows"
         why = "too few rows are shared" if r.matched < FEWEST else why
         text = f"Whether the residuals repeat{where} is unknown: {why}."
-        return Finding("repetition unknown", "note", text, numbers=numbers)
+        return note("repetition unknown", text, **numbers)
     if r.repeats:
         text = (
             f"The residuals repeat{where} {size}: they are unmodelled errors, which more readings "
             "of the same kind do not reduce."
         )
-        return Finding("residuals repeat", "note", text, numbers=numbers)
+        return note("residuals repeat", text, **numbers)
     meaning = "they are new in this session" if new else "they look like noise"
     text = f"The residuals do not repeat{where} {size}: {meaning}."
-    return Finding("residuals differ", "note", text, numbers=numbers)
+    return note("residuals differ", text, **numbers)
 
 
 def controller_assumed() -> Finding:
     """The session does not state the active offsets; the identified ones are assumed."""
-    return Finding(
+    return note(
         "controller not stated",
-        "note",
         "The session does not state which offsets were active; the values to enter are assumed.",
     )
