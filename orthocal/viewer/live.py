@@ -7,18 +7,16 @@ only requests for that name from its own pages, so that no other web page can re
 from __future__ import annotations
 
 import asyncio
-import errno
 import logging
 import os
 import signal
 import socket
 import threading
-import time
-from contextlib import suppress
 from types import TracebackType
 from typing import Any
 
 import tornado.httpserver
+import tornado.iostream
 import tornado.web
 import tornado.websocket
 
@@ -30,9 +28,7 @@ FIRST_PORT = 7000
 PORTS_TRIED = 100
 
 PAUSE = 0.1
-"""Delay before the next connection if the process has no free file descriptor, [s]."""
-
-_EXHAUSTED = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
+"""Delay before the next connection if no file descriptor is free, [s]."""
 
 _HOSTS = r"(localhost|127\.0\.0\.1)"  # tornado removes the port
 
@@ -69,47 +65,6 @@ class _Viewer(_SameOrigin):
     def get(self) -> None:
         self.set_header("Content-Type", "text/javascript; charset=utf-8")
         self.finish(viewer_script())
-
-
-class _Listener(socket.socket):
-    """A listening socket that closes new connections if the process has no free descriptor.
-
-    Otherwise the event loop would report the same connection again and again.
-    """
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:  # noqa: ANN401 - as the socket's
-        super().__init__(*args, **kwargs)
-        self._spare = os.open(os.devnull, os.O_RDONLY)
-
-    def accept(self) -> tuple[socket.socket, Any]:
-        """Accept a connection, or close it if no descriptor is free."""
-        try:
-            return super().accept()
-        except OSError as e:
-            if e.errno not in _EXHAUSTED:
-                raise
-        self._refuse()
-        raise BlockingIOError  # as if there were no connection
-
-    def close(self) -> None:
-        """Close the socket and the spare descriptor."""
-        self._free_spare()
-        super().close()
-
-    def _refuse(self) -> None:
-        """Accept a connection with the spare descriptor and close it."""
-        self._free_spare()
-        with suppress(OSError):
-            super().accept()[0].close()
-        try:
-            self._spare = os.open(os.devnull, os.O_RDONLY)
-        except OSError:
-            time.sleep(PAUSE)  # another thread has used the descriptor
-
-    def _free_spare(self) -> None:
-        if self._spare >= 0:
-            os.close(self._spare)
-            self._spare = -1
 
 
 class _Commands(_SameOrigin, tornado.websocket.WebSocketHandler):
@@ -165,8 +120,9 @@ class LiveScene:
         self._socket = _listen(port)
         self.port = int(self._socket.getsockname()[1])
         self._ready = threading.Event()
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._thread = threading.Thread(target=self._serve, name="orthocal-live", daemon=True)
+        self._thread = threading.Thread(
+            target=lambda: asyncio.run(self._serve()), name="orthocal-live", daemon=True
+        )
         self._thread.start()
         self._ready.wait()
 
@@ -191,8 +147,8 @@ class LiveScene:
 
     def close(self) -> None:
         """Stop the server and free its port."""
-        if self._loop is not None and self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self._loop.stop)
+        if self._thread.is_alive():
+            self._loop.call_soon_threadsafe(self._end.set)
             self._thread.join()
 
     def __enter__(self) -> LiveScene:
@@ -206,39 +162,48 @@ class LiveScene:
     ) -> None:
         self.close()
 
-    def _serve(self) -> None:
-        self._loop = loop = asyncio.new_event_loop()
-        asyncio.set_event_loop(loop)
+    async def _serve(self) -> None:
+        self._loop, self._end = asyncio.get_running_loop(), asyncio.Event()
         listeners: set[_Commands] = set()
+        tasks: set[asyncio.Task[None]] = set()
         server = tornado.httpserver.HTTPServer(_application(self.scene, listeners))
-        loop.call_soon(server.add_socket, self._socket)
-        loop.call_soon(self._ready.set)
+        accepting = asyncio.create_task(_accept(server, self._socket))
 
         def send() -> None:
             for listener in tuple(listeners):
-                task = loop.create_task(listener.catch_up())
+                task = asyncio.create_task(listener.catch_up())
                 tasks.add(task)  # the loop keeps no reference
                 task.add_done_callback(tasks.discard)
 
-        tasks: set[asyncio.Task[None]] = set()
-
         def change() -> None:
-            loop.call_soon_threadsafe(send)
+            self._loop.call_soon_threadsafe(send)
 
         self.scene.listeners.append(change)
+        self._ready.set()
         try:
-            loop.run_forever()
+            await self._end.wait()
         finally:
             self.scene.listeners.remove(change)
-            server.stop()
+            accepting.cancel()
+            await asyncio.wait([accepting])
+            self._socket.close()
             for listener in tuple(listeners):
                 listener.close()
-            loop.run_until_complete(server.close_all_connections())
-            pending = asyncio.all_tasks(loop)
-            for task in pending:
-                task.cancel()
-            loop.run_until_complete(asyncio.gather(*pending, return_exceptions=True))
-            loop.close()
+            await server.close_all_connections()
+
+
+async def _accept(server: tornado.httpserver.HTTPServer, listening: socket.socket) -> None:
+    """Accept connections; they wait while the process has no free file descriptor.
+
+    Tornado's own loop would try to accept the same connection again and again.
+    """
+    while True:
+        try:
+            connection, address = await asyncio.get_running_loop().sock_accept(listening)
+        except OSError:
+            await asyncio.sleep(PAUSE)
+        else:
+            server.handle_stream(tornado.iostream.IOStream(connection), address)
 
 
 def _application(scene: Scene, listeners: set[_Commands]) -> tornado.web.Application:
@@ -260,12 +225,11 @@ def _listen(port: int | None) -> socket.socket:
     for candidate in candidates:
         try:
             server = socket.create_server((ADDRESS, candidate), backlog=128)
-            listener = _Listener(fileno=server.detach())
         except OSError as e:
             reason = str(e.strerror)
             continue
-        listener.setblocking(False)
-        return listener
+        server.setblocking(False)
+        return server
     if port is not None:
         raise OrthocalError(f"cannot listen on port {port} of {ADDRESS}: {reason}", where="port")
     raise OrthocalError(

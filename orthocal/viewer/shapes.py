@@ -165,12 +165,10 @@ def draw_arrow(
     scene.add(f"{path}/head", cone(head_length(width), 1.3 * width), look, head)
     if times is None:
         return
-    for part, name, values in (
-        ("shaft", "scale", [p.shaft for p in parts]),
-        ("head", "position", [(0.0, 0.0, p.foot) for p in parts]),
-        ("head", "scale", [p.head for p in parts]),
-    ):
-        scene.track(f"{path}/{part}", name, "vector3", times, np.array(values))
+    feet = np.array([(0.0, 0.0, p.foot) for p in parts])
+    scene.track(f"{path}/shaft", "scale", "vector3", times, np.array([p.shaft for p in parts]))
+    scene.track(f"{path}/head", "position", "vector3", times, feet)
+    scene.track(f"{path}/head", "scale", "vector3", times, np.array([p.head for p in parts]))
 
 
 def dial_distance(size: float) -> float:

@@ -170,38 +170,20 @@ def _check_mesh(robot: Robot, part: pin.GeometryObject) -> None:
 
 
 def _sticks(robot: Robot) -> Iterator[Visual]:
-    """A ball at every link, and a stick to each joint and link mounted on it."""
-    model = robot.model
-    radius = 0.012 * robot.characteristic_length
-    for i, frame in enumerate(model.frames):
-        if frame.type != pin.FrameType.BODY:
+    """A ball at every link, and a stick to each joint mounted on it."""
+    model, radius = robot.model, 0.012 * robot.characteristic_length
+    for i, link in enumerate(model.frames):
+        if link.type != pin.FrameType.BODY:
             continue
-        yield _stick(frame.name, np.zeros(3), radius)
-        for k in range(1, model.njoints):
-            if model.parents[k] == frame.parentJoint and i == _body_of(model, frame.parentJoint):
-                end = frame.placement.inverse() * model.jointPlacements[k]
-                yield _stick(frame.name, np.asarray(end.translation), radius)
-        for other in model.frames:
-            fixed = other.type == pin.FrameType.BODY and other.name != frame.name
-            if fixed and other.parentJoint == frame.parentJoint and _is_mounted_on(model, other, i):
-                end = frame.placement.inverse() * other.placement
-                yield _stick(frame.name, np.asarray(end.translation), radius)
-
-
-def _body_of(model: pin.Model, joint: int) -> int:
-    """Index of the first link that a joint carries."""
-    bodies = (
-        i
-        for i, f in enumerate(model.frames)
-        if f.type == pin.FrameType.BODY and f.parentJoint == joint
-    )
-    return next(bodies, -1)
-
-
-def _is_mounted_on(model: pin.Model, frame: pin.Frame, body: int) -> bool:
-    """True if one fixed joint mounts a link on another."""
-    mount = model.frames[frame.parentFrame]
-    return mount.type == pin.FrameType.FIXED_JOINT and int(mount.parentFrame) == body
+        yield _stick(link.name, np.zeros(3), radius)
+        for mount in model.frames:
+            if mount.parentFrame != i:
+                continue
+            place = mount.placement
+            if mount.type == pin.FrameType.JOINT:
+                place = model.jointPlacements[mount.parentJoint]
+            end = link.placement.inverse() * place
+            yield _stick(link.name, np.asarray(end.translation), radius)
 
 
 def _stick(link: str, end: Array, radius: float) -> Visual:
