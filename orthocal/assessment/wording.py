@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +89,13 @@ def times(ratio: float) -> str:
 def joined(names: Sequence[str], word: str = "and") -> str:
     """Names as a list in a sentence: a, b and c."""
     return f" {word} ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+
+
+def runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
+    """First and last of each run of consecutive numbers in an ascending sequence."""
+    by_run = groupby(enumerate(numbers), key=lambda place: place[1] - place[0])
+    found = [[number for _, number in run] for _, run in by_run]
+    return [(run[0], run[-1]) for run in found]
 
 
 def count_of(value: int) -> str:

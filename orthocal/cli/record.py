@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import shutil
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -23,9 +22,6 @@ if TYPE_CHECKING:
     from orthocal.calibration.assessment_record import Finding
     from orthocal.measurement.recording import Recording
     from orthocal.session.session import ReadingKey
-
-WIDEST = 100
-"""Largest width of a line, [columns]."""
 
 LONGEST_LINE = 10_000
 """Characters of a line that are read at a time; a reading has ten."""
@@ -71,11 +67,11 @@ class _Dialogue:
     """Questions and answers about the rows of a recording."""
 
     def __init__(self, recording: Recording, path: str) -> None:
-        from orthocal.measurement.motion.motion import guide
+        from orthocal.output.text.recording import RecordingText
 
         self._recording = recording
         self._path = path
-        self._guidance = guide(recording.session)
+        self._text = RecordingText(recording)
         self._warnings: tuple[Finding, ...] = ()
         """Findings about the readings so far."""
         self._can_judge = True
@@ -88,16 +84,9 @@ class _Dialogue:
         self._asked: int | None = None
         """Index of the row that is asked for; None where all are read or skipped."""
 
-    @property
-    def _width(self) -> int:
-        return min(shutil.get_terminal_size((WIDEST, 24)).columns, WIDEST)
-
     def run(self) -> None:
         """Ask for readings until none is missing and Enter is typed, or the input ends."""
-        from orthocal.output.text.recording import describe_session
-
-        recording = self._recording
-        self._say(describe_session(recording, width=self._width))
+        self._say(self._text.introduction())
         with raised_interrupt(), suppress(_EndOfDialogue):
             self._judge()
             self._ask_for_next()
@@ -106,9 +95,7 @@ class _Dialogue:
 
     def conclude(self) -> None:
         """Print the missing rows and the next command."""
-        from orthocal.output.text.recording import conclude
-
-        self._say("", conclude(self._recording, self._warnings, self._path, width=self._width))
+        self._say("", self._text.conclusion(self._warnings, self._path))
 
     def _ask_for(self, index: int | None) -> None:
         """Ask for a row; None to ask for no more."""
@@ -124,18 +111,15 @@ class _Dialogue:
         return self._recording.next_empty(frozenset(self._skipped))
 
     def _show(self) -> None:
-        from orthocal.output.text.recording import describe_row, describe_setup, describe_state
-
-        r, index, width = self._recording, self._asked, self._width
+        index = self._asked
         if index is None:
-            self._say("", describe_state(r, self._warnings, width=width))
+            self._say("", self._text.state(self._warnings))
             return
-        setup = r.rows[index].setup
+        setup = self._recording.rows[index].setup
         if setup != self._shown:
-            words = describe_setup(r.session, self._guidance, r.rows, setup, width=width)
-            self._say("", words)
+            self._say("", self._text.setup(setup))
             self._shown = setup
-        self._say("", describe_row(r.session, self._guidance, r.rows, index, width=width))
+        self._say("", self._text.row(index))
 
     def _read_line(self) -> str:
         """The next line that is typed.
@@ -147,7 +131,7 @@ class _Dialogue:
         if self._asked is not None:
             row = self._recording.rows[self._asked]
             prompt = printable(f"{row.setup} {row.posture} [mm]> ")
-            if len(prompt) > self._width // 2:
+            if len(prompt) > self._text.width // 2:
                 prompt = f"row {self._asked + 1} [mm]> "
         if sys.stdin is None:
             raise _EndOfDialogue
@@ -164,7 +148,7 @@ class _Dialogue:
         self._say(prompt.rstrip())
         line = _read_piped_line()
         if line and not line.endswith("\n"):
-            self._say(self._wrap(f"Not recorded: '{shorten(line)}', a line without an end."))
+            self._note(f"Not recorded: '{shorten(line)}', a line without an end.")
         if not line.endswith("\n"):
             raise _EndOfDialogue
         return line
@@ -183,7 +167,7 @@ class _Dialogue:
                 index = self._require_row()
                 self._record(index, parse_typed_reading(line))
         except SessionError as e:
-            self._say(self._wrap(f"Not recorded: {e}."))
+            self._note(f"Not recorded: {e}.")
 
     def _keep(self) -> None:
         """Keep the reading of the row that is asked for; end where none is."""
@@ -195,15 +179,13 @@ class _Dialogue:
 
     def _record(self, index: int, value: float) -> None:
         """Record a reading, compare it with its prediction, and judge the readings if necessary."""
-        from orthocal.output.text.recording import confirm_reading
-
         recording = self._recording
         corrected = recording.rows[index].is_read
         recording.read(index, value)
         row = recording.rows[index]
         self._skipped.discard(row.key)
         self._last = index
-        self._say(confirm_reading(recording.rows, index, width=self._width))
+        self._say(self._text.confirmation(index))
         following = self._next
         is_end_of_setup = following is None or recording.rows[following].setup != row.setup
         if self._is_doubtful(index) or is_end_of_setup or corrected:
@@ -219,7 +201,7 @@ class _Dialogue:
 
         from orthocal.assessment.judgement import is_doubtful
         from orthocal.hypotheses.linear_model import LinearModel
-        from orthocal.output.text.recording import describe_prediction, find_rows
+        from orthocal.output.text.recording import find_rows
 
         if not self._can_judge:
             return False
@@ -232,7 +214,7 @@ class _Dialogue:
         except (OrthocalError, np.linalg.LinAlgError) as e:
             self._stop_judging(e)
             return False
-        if prediction := describe_prediction(mean, std, width=self._width):
+        if prediction := self._text.prediction(mean, std):
             self._say(prediction)
         return is_doubtful(session, position, mean, std)
 
@@ -244,7 +226,6 @@ class _Dialogue:
         import numpy as np
 
         from orthocal.assessment.judgement import find_warnings, judge_session
-        from orthocal.output.text.recording import describe_resolved, describe_warning
 
         recording = self._recording
         if not self._can_judge or len(recording.missing) == len(recording.rows):
@@ -263,14 +244,14 @@ class _Dialogue:
         self._warnings = warnings
         if recording.missing:
             for finding in new:
-                self._say(describe_warning(finding, recording.rows, width=self._width))
+                self._say(self._text.warning(finding))
         if resolved:
-            self._say(describe_resolved(resolved, width=self._width))
+            self._say(self._text.resolved(resolved))
 
     def _stop_judging(self, error: Exception) -> None:
         """Print once why readings cannot be judged; they are recorded all the same."""
         self._can_judge = False
-        self._say(self._wrap(f"Readings are recorded without a check: {error}."))
+        self._note(f"Readings are recorded without a check: {error}.")
 
     def _command(self, word: str, arguments: list[str]) -> None:
         """Execute a command.
@@ -278,7 +259,7 @@ class _Dialogue:
         Raises:
             SessionError: If it is unknown, or cannot be executed now.
         """
-        from orthocal.output.text.recording import COMMANDS, list_commands, list_rows
+        from orthocal.output.text.recording import COMMANDS
 
         word = {"?": "help", "exit": "quit"}.get(word, word)
         names = [name for name in COMMANDS if name.startswith(word)]
@@ -300,9 +281,9 @@ class _Dialogue:
         elif name == "restart":
             self._restart()
         elif name == "list":
-            self._say(list_rows(self._recording.rows, width=self._width))
+            self._say(self._text.list_rows())
         elif name == "help":
-            self._say(list_commands(width=self._width))
+            self._say(self._text.list_commands())
         elif name == "show":
             self._shown = None
             self._show()
@@ -329,11 +310,9 @@ class _Dialogue:
             raise SessionError("this is the first row")
         setup = rows[index].setup
         if self._last is not None and rows[self._last].setup != setup and rows[index].is_read:
-            self._say(
-                self._wrap(
-                    f"The stand has been moved since {setup} was read: correct only what was "
-                    "mistyped. To read there again, `restart` the setup."
-                )
+            self._note(
+                f"The stand has been moved since {setup} was read: correct only what was "
+                "mistyped. To read there again, `restart` the setup."
             )
         self._ask_for(index)
 
@@ -364,7 +343,7 @@ class _Dialogue:
         self._recording.drop(index)
         if self._last is not None and self._last >= index:
             self._last = None if self._last == index else self._last - 1
-        self._say(self._wrap(f"Deleted: row {index + 1}, {label}"))
+        self._note(f"Deleted: row {index + 1}, {label}")
         self._judge()
         self._ask_for_next()
 
@@ -377,14 +356,13 @@ class _Dialogue:
         recording.empty(index)
         self._skipped -= {r.key for r in recording.rows if r.setup == setup}
         self._shown, self._last = None, None
-        self._say(self._wrap(f"Deleted: all readings of {setup}"))
+        self._note(f"Deleted: all readings of {setup}")
         self._judge()
         self._ask_for(next(i for i, r in enumerate(recording.rows) if r.setup == setup))
 
-    def _wrap(self, text: str) -> str:
-        from orthocal.output.text.recording import wrap
-
-        return wrap(text, self._width, indent="  ")
+    def _note(self, text: str) -> None:
+        """Print an indented paragraph."""
+        self._say(self._text.wrap(text, indent="  "))
 
     def _say(self, *texts: str) -> None:
         for text in texts:

@@ -14,10 +14,9 @@ from orthocal.assessment.predictive import chance_of_deviations, expect_rms
 from orthocal.assessment.validation import validate_calibration
 from orthocal.calibration.refit import repeat_calibration, repeat_fit
 from orthocal.errors import SessionError
-from orthocal.measurement.motion.motion import guide
 from orthocal.measurement.recording import open_recording
 from orthocal.observation.simulate import simulate_session
-from orthocal.output.text.recording import describe_row
+from orthocal.output.text.recording import RecordingText
 from orthocal.statistics.chance import BY_CHANCE
 
 OFFSETS = {"motor_a.offset": 8e-3, "motor_b.offset": -5e-3}
@@ -263,9 +262,7 @@ def test_somebody_who_records_is_shown_degrees_as_the_controller_has_them(root, 
     robot = write_fivebar(root, tmp_path / "rails")
     folder = write_plan(tmp_path / "s", robot, "{offsets_mrad: [6, -2]}")
     with open_recording(folder) as recording:
-        shown = describe_row(
-            recording.session, guide(recording.session), recording.rows, 1, width=100
-        )
+        shown = RecordingText(recording).row(1)
     assert shown.splitlines()[:2] == [
         "2 of 18 (line 3 of the table): ya p-10",
         "  joints motor_a -6.000 deg, motor_b 0.000 deg",

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
+from orthocal.assessment.wording import counted, runs
 from orthocal.io.tables.cell import column_letters
 from orthocal.io.tables.table import Table
 from orthocal.measurement.files.readings_file import RawReading, is_house
 from orthocal.measurement.importing.import_readings import TableImport
-from orthocal.output.text.layout import counted
 
 UNIT_SYMBOLS = {"um": "µm"}
 """Symbols of units that have another symbol than their name."""
@@ -103,16 +103,11 @@ def _describe_column(table: Table, index: int) -> str:
 
 def _format_rows(lines: Iterable[int]) -> str:
     """Numbers of rows as ranges, such as `rows 3, 7-12`."""
-    ranges: list[list[int]] = []
-    numbers: Sequence[int] = sorted(set(lines))
-    for line in numbers:
-        if ranges and line == ranges[-1][1] + 1:
-            ranges[-1][1] = line
-        else:
-            ranges.append([line, line])
-    texts = [str(a) if a == b else f"{a}-{b}" for a, b in ranges[:MOST_RANGES]]
+    numbers = sorted(set(lines))
+    ranges = [str(a) if a == b else f"{a}-{b}" for a, b in runs(numbers)]
     more = f" and {len(ranges) - MOST_RANGES} more" if len(ranges) > MOST_RANGES else ""
-    return f"{'row' if len(numbers) == 1 else 'rows'} {', '.join(texts)}{more}"
+    word = "row" if len(numbers) == 1 else "rows"
+    return f"{word} {', '.join(ranges[:MOST_RANGES])}{more}"
 
 
 def _describe_changes(result: TableImport) -> str:

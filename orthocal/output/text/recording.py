@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 import shlex
+import shutil
 import textwrap
 from collections.abc import Sequence
 
-from orthocal.assessment.wording import counted, joined, mm, name_direction
+from orthocal.assessment.wording import counted, joined, mm, name_direction, runs
 from orthocal.calibration.assessment_record import Finding
-from orthocal.measurement.motion.motion import Guidance
+from orthocal.measurement.motion.motion import guide
 from orthocal.measurement.recording import Recording
 from orthocal.session.session import Reading, Session, Setup
 from orthocal.text import printable
 from orthocal.units import DRIVE_UNITS, MM, format_fixed, to_mm, trim_zeros
+
+WIDEST = 100
+"""Largest width of a line, [columns]."""
 
 GLUE = "\u00a0"
 """Space at which no line ends."""
@@ -32,90 +36,245 @@ COMMANDS = {
 """Commands instead of a reading; any unique beginning of the name suffices."""
 
 
-def wrap(text: str, width: int, *, indent: str = "", first: str | None = None) -> str:
-    """A paragraph in lines of at most `width` columns."""
-    lines = textwrap.wrap(
-        printable(text, keep=GLUE),
-        max(width, 20),
-        initial_indent=indent if first is None else first,
-        subsequent_indent=indent,
-        break_on_hyphens=False,
-    )
-    return "\n".join(lines).replace(GLUE, " ")
+class RecordingText:
+    """Texts of the dialogue about a recording, in lines of the terminal's width."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._session = recording.session
+        self._guidance = guide(recording.session)
+
+    @property
+    def width(self) -> int:
+        """Width of the terminal, [columns]."""
+        return min(shutil.get_terminal_size((WIDEST, 24)).columns, WIDEST)
+
+    def wrap(self, text: str, *, indent: str = "", first: str | None = None) -> str:
+        """A paragraph in lines.
+
+        Args:
+            text: The paragraph.
+            indent: Beginning of each line.
+            first: Beginning of the first line, if it is another.
+        """
+        lines = textwrap.wrap(
+            printable(text, keep=GLUE),
+            max(self.width, 20),
+            initial_indent=indent if first is None else first,
+            subsequent_indent=indent,
+            break_on_hyphens=False,
+        )
+        return "\n".join(lines).replace(GLUE, " ")
+
+    def introduction(self) -> str:
+        """Number of readings, state of the recording, and how to type readings."""
+        recording, session, rows = self._recording, self._session, self._recording.rows
+        restored = recording.restored
+        done = len(rows) - len(recording.missing)
+        title = f"{session.title}: " if session.title else ""
+        count = counted(len({r.setup for r in rows}), "setup")
+        state = "none is recorded yet" if not done else f"{done} are recorded"
+        parts = [
+            f"{title}{counted(len(rows), 'reading')} in {count} on {session.robot.name}; {state}."
+        ]
+        if restored:
+            parts.append(
+                f"The last recording was interrupted; {counted(restored, 'change')} of it "
+                f"{'was' if restored == 1 else 'were'} restored."
+            )
+        if recording.edited:
+            parts.append(
+                f"{recording.path.name} was edited after the last recording was interrupted; its "
+                "content counts."
+            )
+        parts.append(
+            "Type the reading of the dial in mm. It is on disk before the next question. `help` "
+            "lists the commands."
+        )
+        parts.append("Approach every posture from the same side, from a millimetre before it.")
+        return "\n".join(self.wrap(part) for part in parts)
+
+    def setup(self, name: str) -> str:
+        """Position of the gauge of a setup, and preparation of its dial."""
+        session, rows = self._session, self._recording.rows
+        setup = session.setups[name]
+        names = list(dict.fromkeys(r.setup for r in rows))
+        of_setup = [r for r in rows if r.setup == name]
+        aligned = self._guidance.aligned_at[name]
+        title = (
+            f"Setup {name}, {names.index(name) + 1} of {len(names)}: "
+            f"{counted(len(of_setup), 'reading')}"
+        )
+        parts = [f"Read: {setup.sensor.describe()}", self._stand(name), _gauge(session, setup)]
+        if any(r.is_read for r in of_setup) and any(r.minus is None for r in of_setup):
+            parts.append(
+                "This setup has readings: neither stand nor dial may have moved since. If one has, "
+                "`restart` the setup."
+            )
+        else:
+            parts.append(
+                f"Go to {aligned}, align the gauge and set the dial to {_middle(session, setup)} "
+                "there. From then on touch neither stand nor dial until the setup is complete."
+            )
+        if all(r.minus is not None for r in of_setup):
+            parts.append(
+                "Each row is a difference: the reading in its first posture minus that in its "
+                "second."
+            )
+        lines = [self.wrap(title), *(self.wrap(part, indent="  ") for part in parts if part)]
+        if aligned != (of_setup[0].minus or of_setup[0].posture):
+            lines.append(self._coordinates(aligned, f"{aligned}: "))
+        return "\n".join(lines)
+
+    def _stand(self, setup: str) -> str:
+        guidance = self._guidance
+        aligned = guidance.aligned_at[setup]
+        at = ", ".join(f"{format_fixed(v / MM, 1)}" for v in guidance.touched(setup, aligned))
+        side = name_direction(guidance.contacts[setup][1].direction)
+        return (
+            f"Stand: on the {side} side, so that the tip touches at ({at}) mm in {aligned}. Push "
+            f"the plunger in: the dial has to grow, as it does where the machine moves to {side}."
+        )
+
+    def row(self, index: int) -> str:
+        """Next reading, and the posture of the machine for it."""
+        rows = self._recording.rows
+        row = rows[index]
+        place = f"{index + 1} of {len(rows)} (line {row.line} of the table)"
+        lines = [self.wrap(f"{place}: {row.label_with_cycle}")]
+        for posture in (row.posture, *([row.minus] if row.minus else [])):
+            name = f"{posture}: " if row.minus else ""
+            lines.append(self._coordinates(posture, name))
+        if row.is_read:
+            lines.append(
+                self.wrap(f"Recorded: {show_mm(row.value)} mm; Enter keeps it.", indent="  ")
+            )
+        return "\n".join(lines)
+
+    def _coordinates(self, posture: str, name: str) -> str:
+        guidance, parts = self._guidance, []
+        for drive, value in zip(self._session.robot.drives, guidance.joints[posture], strict=True):
+            unit, size = DRIVE_UNITS[drive.unit]
+            parts.append(f"{drive.name} {format_fixed(value / size, 3)} {unit}".replace(" ", GLUE))
+        lines = [self.wrap(f"{name}joints {', '.join(parts)}", indent="  ")]
+        if posture in guidance.tool:
+            values = zip("xyz", guidance.tool[posture], strict=True)
+            tool = ", ".join(f"{axis}{GLUE}{format_fixed(v / MM, 3)}" for axis, v in values)
+            lines.append(self.wrap(f"{name}tool {tool}{GLUE}mm", indent="  "))
+        return "\n".join(lines)
+
+    def confirmation(self, index: int) -> str:
+        """Confirmation that a reading is on disk."""
+        row = self._recording.rows[index]
+        text = f"Recorded: row {index + 1}, {row.label_with_cycle}: {show_mm(row.value)} mm"
+        return self.wrap(text, indent="  ")
+
+    def prediction(self, mean: float, std: float) -> str:
+        """Prediction of a reading by the others, with its expanded uncertainty (k = 2).
+
+        Args:
+            mean: Predicted reading, [m].
+            std: Its standard deviation, [m]; infinite without a prediction.
+        """
+        if math.isinf(std):
+            return ""
+        text = f"The other readings predict {format_fixed(mean / MM, 3)} ± {mm(2.0 * std)} mm."
+        return self.wrap(text, indent="  ")
+
+    def warning(self, finding: Finding) -> str:
+        """A finding about the readings so far, in the words of `check`."""
+        indices = find_rows(finding, self._recording.rows)
+        where = f" ({_spans([i + 1 for i in indices])})" if indices else ""
+        kind = finding.kind.capitalize()
+        return self.wrap(f"{kind}{where}: {finding.words}", indent="  ", first="! ")
+
+    def resolved(self, findings: Sequence[Finding]) -> str:
+        """Warnings that the readings no longer support."""
+        names = [
+            " ".join([f.kind, *(n for p in f.places[:1] for n in (p.setup, p.posture) if n)])
+            for f in findings
+        ]
+        return self.wrap(f"Resolved: {joined(names)}.", indent="  ")
+
+    def list_rows(self) -> str:
+        """All rows and their readings."""
+        rows = self._recording.rows
+        last = len(str(len(rows)))
+        return "\n".join(
+            self.wrap(
+                f"{i + 1:>{last}}  {r.label_with_cycle}: ".replace("  ", GLUE * 2)
+                + (f"{show_mm(r.value)}{GLUE}mm" if r.is_read else "not read"),
+                indent=" " * (last + 2),
+            )
+            for i, r in enumerate(rows)
+        )
+
+    def list_commands(self) -> str:
+        """Readings and commands that can be typed."""
+        lines = [
+            self.wrap("A reading in mm, such as -0.12 or -0,12; or"),
+            *(
+                self.wrap(f"{name}: {words}", indent="    ", first="  ")
+                for name, words in COMMANDS.items()
+            ),
+            self.wrap("Ctrl-D and Ctrl-C end, too. Enter alone keeps the recorded reading."),
+        ]
+        return "\n".join(lines)
+
+    def state(self, warnings: Sequence[Finding]) -> str:
+        """State of a recording in which no row is asked for, with all its warnings."""
+        skipped = len(self._recording.missing)
+        state = f"{skipped} skipped." if skipped else "All readings are recorded."
+        if warnings:
+            state += " Check these first:"
+        words = [self.warning(f) for f in warnings]
+        return "\n".join([self.wrap(state), *words, self.wrap("Enter ends; `back` corrects.")])
+
+    def conclusion(self, warnings: Sequence[Finding], path: str) -> str:
+        """Missing rows and the next command, on a line of its own and not wrapped.
+
+        Args:
+            warnings: Findings about its readings.
+            path: Path of the session as it was typed.
+        """
+        recording, session, rows = self._recording, self._session, self._recording.rows
+        command = printable(shlex.quote(path))
+        if recording.missing:
+            parts = []
+            for setup in dict.fromkeys(rows[i].setup for i in recording.missing):
+                numbers = [i + 1 for i in recording.missing if rows[i].setup == setup]
+                every = len(numbers) == sum(r.setup == setup for r in rows)
+                parts.append(f"{setup} {'all' if every else _spans(numbers)}")
+            count = len(recording.missing)
+            state = (
+                f"{count} of {counted(len(rows), 'reading')} {'is' if count == 1 else 'are'} "
+                f"missing: {joined(parts)}."
+            )
+            return f"{self.wrap(state)}\nContinue with:\n  orthocal record {command}"
+        lines = [f"All {counted(len(rows), 'reading')} are recorded."]
+        if session.controller_offsets is None:
+            keys = "offsets_mm" if session.robot.drives[0].unit == "m" else "offsets_deg"
+            zeros = ", ".join("0" for _ in session.robot.drives)
+            lines.append(
+                "State in session.yaml which offsets are active in the controller, one number per "
+                f"drive, such as `controller: {{{keys}: [{zeros}]}}`. Without them only their "
+                "changes can be calculated."
+            )
+        following = f"Next:\n  orthocal calibrate {command}"
+        if warnings:
+            following = f"Next: correct or repeat these readings,\n  orthocal record {command}"
+        elif session.controller_offsets is not None and any(session.controller_offsets):
+            following = (
+                "Next: validate the offsets that were entered, by their calibration,\n"
+                f"  orthocal validate CALIBRATION {command}\n"
+                f"or identify new ones:\n  orthocal calibrate {command}"
+            )
+        return "\n".join([*(self.wrap(line) for line in lines), following])
 
 
 def show_mm(value: float) -> str:
     """A reading in mm with all its decimals, two at least."""
     return trim_zeros(f"{to_mm(value) + 0.0:.6f}")
-
-
-def describe_session(recording: Recording, *, width: int) -> str:
-    """Number of readings, state of the recording, and how to type readings."""
-    session, rows, restored = recording.session, recording.rows, recording.restored
-    done = len(rows) - len(recording.missing)
-    title = f"{session.title}: " if session.title else ""
-    count = counted(len({r.setup for r in rows}), "setup")
-    state = "none is recorded yet" if not done else f"{done} are recorded"
-    parts = [f"{title}{counted(len(rows), 'reading')} in {count} on {session.robot.name}; {state}."]
-    if restored:
-        parts.append(
-            f"The last recording was interrupted; {counted(restored, 'change')} of it "
-            f"{'was' if restored == 1 else 'were'} restored."
-        )
-    if recording.edited:
-        parts.append(
-            f"{recording.path.name} was edited after the last recording was interrupted; its "
-            "content counts."
-        )
-    parts.append(
-        "Type the reading of the dial in mm. It is on disk before the next question. `help` lists "
-        "the commands."
-    )
-    parts.append("Approach every posture from the same side, from a millimetre before it.")
-    return "\n".join(wrap(part, width) for part in parts)
-
-
-def describe_setup(
-    session: Session, guidance: Guidance, rows: Sequence[Reading], name: str, *, width: int
-) -> str:
-    """Position of the gauge of a setup, and preparation of its dial."""
-    setup = session.setups[name]
-    names = list(dict.fromkeys(r.setup for r in rows))
-    of_setup = [r for r in rows if r.setup == name]
-    aligned = guidance.aligned_at[name]
-    title = (
-        f"Setup {name}, {names.index(name) + 1} of {len(names)}: "
-        f"{counted(len(of_setup), 'reading')}"
-    )
-    parts = [f"Read: {setup.sensor.describe()}", _stand(guidance, name), _gauge(session, setup)]
-    if any(r.is_read for r in of_setup) and any(r.minus is None for r in of_setup):
-        parts.append(
-            "This setup has readings: neither stand nor dial may have moved since. If one has, "
-            "`restart` the setup."
-        )
-    else:
-        parts.append(
-            f"Go to {aligned}, align the gauge and set the dial to {_middle(session, setup)} there."
-            " From then on touch neither stand nor dial until the setup is complete."
-        )
-    if all(r.minus is not None for r in of_setup):
-        parts.append(
-            "Each row is a difference: the reading in its first posture minus that in its second."
-        )
-    lines = [wrap(title, width), *(wrap(part, width, indent="  ") for part in parts if part)]
-    if aligned != (of_setup[0].minus or of_setup[0].posture):
-        lines.append(_coordinates(session, guidance, aligned, f"{aligned}: ", width))
-    return "\n".join(lines)
-
-
-def _stand(guidance: Guidance, setup: str) -> str:
-    aligned = guidance.aligned_at[setup]
-    at = ", ".join(f"{format_fixed(v / MM, 1)}" for v in guidance.touched(setup, aligned))
-    side = name_direction(guidance.contacts[setup][1].direction)
-    return (
-        f"Stand: on the {side} side, so that the tip touches at ({at}) mm in {aligned}. Push the "
-        f"plunger in: the dial has to grow, as it does where the machine moves to {side}."
-    )
 
 
 def _gauge(session: Session, setup: Setup) -> str:
@@ -136,65 +295,6 @@ def _middle(session: Session, setup: Setup) -> str:
     return f"about {0.5 * (limits[0] + limits[1]) / MM + 0.0:g} mm, the middle of its range,"
 
 
-def describe_row(
-    session: Session, guidance: Guidance, rows: Sequence[Reading], index: int, *, width: int
-) -> str:
-    """Next reading, and the posture of the machine for it."""
-    row = rows[index]
-    place = f"{index + 1} of {len(rows)} (line {row.line} of the table)"
-    lines = [wrap(f"{place}: {row.label_with_cycle}", width)]
-    for posture in (row.posture, *([row.minus] if row.minus else [])):
-        name = f"{posture}: " if row.minus else ""
-        lines.append(_coordinates(session, guidance, posture, name, width))
-    if row.is_read:
-        lines.append(
-            wrap(f"Recorded: {show_mm(row.value)} mm; Enter keeps it.", width, indent="  ")
-        )
-    return "\n".join(lines)
-
-
-def _coordinates(session: Session, guidance: Guidance, posture: str, name: str, width: int) -> str:
-    parts = []
-    for drive, value in zip(session.robot.drives, guidance.joints[posture], strict=True):
-        unit, size = DRIVE_UNITS[drive.unit]
-        parts.append(f"{drive.name} {format_fixed(value / size, 3)} {unit}".replace(" ", GLUE))
-    lines = [wrap(f"{name}joints {', '.join(parts)}", width, indent="  ")]
-    if posture in guidance.tool:
-        values = zip("xyz", guidance.tool[posture], strict=True)
-        tool = ", ".join(f"{axis}{GLUE}{format_fixed(v / MM, 3)}" for axis, v in values)
-        lines.append(wrap(f"{name}tool {tool}{GLUE}mm", width, indent="  "))
-    return "\n".join(lines)
-
-
-def confirm_reading(rows: Sequence[Reading], index: int, *, width: int) -> str:
-    """Confirmation that a reading is on disk."""
-    row = rows[index]
-    text = f"Recorded: row {index + 1}, {row.label_with_cycle}: {show_mm(row.value)} mm"
-    return wrap(text, width, indent="  ")
-
-
-def describe_prediction(mean: float, std: float, *, width: int) -> str:
-    """Prediction of a reading by the others, with its expanded uncertainty (k = 2).
-
-    Args:
-        mean: Predicted reading, [m].
-        std: Its standard deviation, [m]; infinite without a prediction.
-        width: Columns.
-    """
-    if math.isinf(std):
-        return ""
-    text = f"The other readings predict {format_fixed(mean / MM, 3)} ± {mm(2.0 * std)} mm."
-    return wrap(text, width, indent="  ")
-
-
-def describe_warning(finding: Finding, rows: Sequence[Reading], *, width: int) -> str:
-    """A finding about the readings so far, in the words of `check`."""
-    indices = find_rows(finding, rows)
-    where = f" ({_spans([i + 1 for i in indices])})" if indices else ""
-    kind = finding.kind.capitalize()
-    return wrap(f"{kind}{where}: {finding.words}", width, indent="  ", first="! ")
-
-
 def find_rows(finding: Finding, rows: Sequence[Reading]) -> list[int]:
     """Indices of the rows with a reading that a finding names, by line or by setup."""
     lines = {p.line for p in finding.places if p.line is not None}
@@ -203,103 +303,7 @@ def find_rows(finding: Finding, rows: Sequence[Reading]) -> list[int]:
     return [i for i, row in enumerate(rows) if named[i] and row.is_read]
 
 
-def describe_resolved(findings: Sequence[Finding], *, width: int) -> str:
-    """Warnings that the readings no longer support."""
-    names = [
-        " ".join([f.kind, *(n for p in f.places[:1] for n in (p.setup, p.posture) if n)])
-        for f in findings
-    ]
-    return wrap(f"Resolved: {joined(names)}.", width, indent="  ")
-
-
-def list_rows(rows: Sequence[Reading], *, width: int) -> str:
-    """All rows and their readings."""
-    last = len(str(len(rows)))
-    return "\n".join(
-        wrap(
-            f"{i + 1:>{last}}  {r.label_with_cycle}: ".replace("  ", GLUE * 2)
-            + (f"{show_mm(r.value)}{GLUE}mm" if r.is_read else "not read"),
-            width,
-            indent=" " * (last + 2),
-        )
-        for i, r in enumerate(rows)
-    )
-
-
-def list_commands(*, width: int) -> str:
-    """Readings and commands that can be typed."""
-    lines = [
-        wrap("A reading in mm, such as -0.12 or -0,12; or", width),
-        *(
-            wrap(f"{name}: {words}", width, indent="    ", first="  ")
-            for name, words in COMMANDS.items()
-        ),
-        wrap("Ctrl-D and Ctrl-C end, too. Enter alone keeps the recorded reading.", width),
-    ]
-    return "\n".join(lines)
-
-
-def describe_state(recording: Recording, warnings: Sequence[Finding], *, width: int) -> str:
-    """State of a recording in which no row is asked for, with all its warnings."""
-    skipped = len(recording.missing)
-    state = f"{skipped} skipped." if skipped else "All readings are recorded."
-    if warnings:
-        state += " Check these first:"
-    words = [describe_warning(f, recording.rows, width=width) for f in warnings]
-    return "\n".join([wrap(state, width), *words, wrap("Enter ends; `back` corrects.", width)])
-
-
-def conclude(recording: Recording, warnings: Sequence[Finding], path: str, *, width: int) -> str:
-    """Missing rows and the next command, on a line of its own and not wrapped.
-
-    Args:
-        recording: The recording.
-        warnings: Findings about its readings.
-        path: Path of the session as it was typed.
-        width: Columns.
-    """
-    session, rows = recording.session, recording.rows
-    command = printable(shlex.quote(path))
-    if recording.missing:
-        parts = []
-        for setup in dict.fromkeys(rows[i].setup for i in recording.missing):
-            numbers = [i + 1 for i in recording.missing if rows[i].setup == setup]
-            every = len(numbers) == sum(r.setup == setup for r in rows)
-            parts.append(f"{setup} {'all' if every else _spans(numbers)}")
-        count = len(recording.missing)
-        state = (
-            f"{count} of {counted(len(rows), 'reading')} {'is' if count == 1 else 'are'} missing: "
-            f"{joined(parts)}."
-        )
-        return f"{wrap(state, width)}\nContinue with:\n  orthocal record {command}"
-    lines = [f"All {counted(len(rows), 'reading')} are recorded."]
-    if session.controller_offsets is None:
-        keys = "offsets_mm" if session.robot.drives[0].unit == "m" else "offsets_deg"
-        zeros = ", ".join("0" for _ in session.robot.drives)
-        lines.append(
-            "State in session.yaml which offsets are active in the controller, one number per "
-            f"drive, such as `controller: {{{keys}: [{zeros}]}}`. Without them only their changes "
-            "can be calculated."
-        )
-    following = f"Next:\n  orthocal calibrate {command}"
-    if warnings:
-        following = f"Next: correct or repeat these readings,\n  orthocal record {command}"
-    elif session.controller_offsets is not None and any(session.controller_offsets):
-        following = (
-            "Next: validate the offsets that were entered, by their calibration,\n"
-            f"  orthocal validate CALIBRATION {command}\n"
-            f"or identify new ones:\n  orthocal calibrate {command}"
-        )
-    return "\n".join([*(wrap(line, width) for line in lines), following])
-
-
 def _spans(numbers: Sequence[int]) -> str:
     """Numbers of rows in words: rows 3, 5 to 8."""
-    spans: list[list[int]] = []
-    for n in numbers:
-        if spans and n == spans[-1][-1] + 1:
-            spans[-1] = [spans[-1][0], n]
-        else:
-            spans.append([n])
-    words = [f"{s[0]} to {s[-1]}" if len(s) > 1 else str(s[0]) for s in spans]
+    words = [str(a) if a == b else f"{a} to {b}" for a, b in runs(numbers)]
     return f"{'row' if len(numbers) == 1 else 'rows'} {', '.join(words)}"
