@@ -35,7 +35,7 @@ from orthocal.observation.observations import build_observations
 from orthocal.robot.model import Robot
 from orthocal.runtime.worker_pool import call_in_parallel, current_worker_budget
 from orthocal.session.session import Session
-from orthocal.statistics.information import posterior_covariance
+from orthocal.statistics.information import Information
 from orthocal.statistics.noise import estimate_repeatability, noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -249,7 +249,7 @@ class ToolForecast:
         precision = np.maximum(problem.prior_precision, VAGUE)
         weight = noise if weight is None else weight
         slopes = project_out_zeros(jacobian, part)
-        inverse = posterior_covariance(slopes, sigma=weight, precision=precision)
+        inverse = Information(slopes).covariance(sigma=weight, precision=precision)
         scale = problem.theta_scale[:n]
         spread = inverse
         if weight != noise:  # readings scatter less than their weight implies

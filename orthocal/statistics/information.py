@@ -5,7 +5,7 @@ All quantities are in scaled parameters θ̂ = θ/(prior std), with gauge zeros 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,16 +26,36 @@ MOST_LOST = 2
 """Largest number of null space directions that a message lists."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Information:
-    """Identification Jacobian, zeros eliminated, with its singular value decomposition."""
+    """Identification Jacobian, zeros eliminated, with its singular value decomposition.
 
-    factor: Array
-    """A matrix with the same product FᵀF as the Jacobian, shape (n, n_free), [m per prior std]."""
-    singular_values: Array
-    """Descending, shape (n_free,), padded with zeros, [m per prior std]."""
-    directions: Array
-    """Right singular vectors as rows, shape (n_free, n_free)."""
+    Args:
+        factor: The Jacobian, or another matrix with the same product FᵀF, shape (n, n_free),
+            [m per prior std].
+
+    Attributes:
+        factor: Such a matrix with at most 2 n_free rows.
+    """
+
+    def __init__(self, factor: Array) -> None:
+        if len(factor) > 2 * factor.shape[1]:  # same singular values, far fewer rows
+            factor = np.asarray(np.linalg.qr(factor, mode="r"))
+        self.factor = factor
+
+    @cached_property
+    def _decomposition(self) -> tuple[Array, Array]:
+        _, values, directions = np.linalg.svd(self.factor, full_matrices=True)
+        return np.append(values, np.zeros(len(directions) - len(values))), directions
+
+    @property
+    def singular_values(self) -> Array:
+        """Descending, shape (n_free,), padded with zeros, [m per prior std]."""
+        return self._decomposition[0]
+
+    @property
+    def directions(self) -> Array:
+        """Right singular vectors as rows, shape (n_free, n_free)."""
+        return self._decomposition[1]
 
     @property
     def rank(self) -> int:
@@ -150,18 +170,6 @@ def _inverse_square(matrix: Array) -> Array:
     return np.asarray(half @ half.T)
 
 
-def posterior_covariance(factor: Array, *, sigma: float, precision: Array) -> Array:
-    """Covariance as of `Information.covariance`, without a decomposition, (n_free, n_free).
-
-    Args:
-        factor: A Jacobian, zeros eliminated, shape (n, n_free), [m per prior std].
-        sigma: Standard deviation of one reading, [m].
-        precision: Diagonal of P, shape (n_free,).
-    """
-    inverse = _inverse_square(np.vstack([factor / sigma, np.diag(np.sqrt(precision))]))
-    return 0.5 * (inverse + inverse.T)
-
-
 def marginalise(information: Information, kept: int, *, sigma: float) -> Information:
     """Information about the first parameters, the others marginalised over their priors.
 
@@ -177,12 +185,12 @@ def marginalise(information: Information, kept: int, *, sigma: float) -> Informa
     rows[-count:, kept:] = np.eye(count)
     basis, _ = np.linalg.qr(rows[:, kept:])
     remaining = rows[:, :kept] - basis @ (basis.T @ rows[:, :kept])
-    return _information(sigma * remaining)
+    return Information(sigma * remaining)
 
 
 def take_for_known(information: Information, kept: int) -> Information:
     """Information about the first parameters, all others known exactly."""
-    return _information(information.factor[:, :kept])
+    return Information(information.factor[:, :kept])
 
 
 def decompose(jacobian: Array, observations: Observations) -> Information:
@@ -192,16 +200,7 @@ def decompose(jacobian: Array, observations: Observations) -> Information:
         jacobian: dh/dθ̂, shape (n_entries, n_free), [m per prior std].
         observations: Zeros of the entries.
     """
-    return _information(project_out_zeros(jacobian, observations))
-
-
-def _information(factor: Array) -> Information:
-    if len(factor) > 2 * factor.shape[1]:  # same singular values, far fewer rows
-        factor = np.asarray(np.linalg.qr(factor, mode="r"))
-    _, values, directions = np.linalg.svd(factor, full_matrices=True)
-    padded = np.zeros(factor.shape[1])
-    padded[: len(values)] = values
-    return Information(factor, padded, directions)
+    return Information(project_out_zeros(jacobian, observations))
 
 
 def require_identifiable(

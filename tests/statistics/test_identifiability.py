@@ -22,13 +22,6 @@ from orthocal.statistics.identifiability import (
 from orthocal.statistics.information import Information, decompose
 
 
-def information(jacobian):
-    _, values, directions = np.linalg.svd(jacobian)
-    padded = np.zeros(jacobian.shape[1])
-    padded[: len(values)] = values
-    return Information(jacobian, padded, directions)
-
-
 def parameters(*names, prior_stds=None):
     prior_stds = prior_stds or [1.0] * len(names)
     return [Parameter(n, "m", t, ((n, 1.0),)) for n, t in zip(names, prior_stds, strict=True)]
@@ -41,7 +34,7 @@ C = np.array([0.0, 0.0, 0.5, 0.0])
 
 def analyse(columns, names, *, sigma=0.1, prior_stds=None):
     return analyse_identifiability(
-        information(np.column_stack(columns)),
+        Information(np.column_stack(columns)),
         parameters(*names, prior_stds=prior_stds),
         sigma=sigma,
         n_postures=4,

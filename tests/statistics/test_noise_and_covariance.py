@@ -209,8 +209,18 @@ def test_predicted_covariance_is_that_of_many_simulated_calibrations(root, model
     assert 0.93 < inside < 0.97
 
 
+@pytest.mark.parametrize("rows", [4, 9, 40])
+def test_a_covariance_is_the_inverse_of_what_readings_and_prior_say(rows):
+    rng = np.random.default_rng(rows)
+    factor, sigma = rng.normal(size=(rows, 6)), 0.3
+    precision = np.array([1.0, 1.0, 1.0, 1e-3, 1.0, 1.0])
+    found = Information(factor).covariance(sigma=sigma, precision=precision)
+    expected = np.linalg.inv(factor.T @ factor / sigma**2 + np.diag(precision))
+    assert np.allclose(found, expected, rtol=1e-9, atol=1e-12)
+
+
 def test_an_information_without_readings_has_no_rank():
-    information = Information(np.zeros((0, 2)), np.zeros(2), np.eye(2))
+    information = Information(np.zeros((0, 2)))
     assert information.rank == 0
     assert not information.identifiable.any()
 

@@ -131,13 +131,8 @@ def _weighted_information(fit: Fit) -> Information:
     """Information of the readings with the weights of a robust loss."""
     if not fit.loss.robust:
         return fit.information
-    o, weights = fit.problem.observations, fit.weights
-    centred = project_out_zeros(fit.jacobian, o, weights=weights)
-    return Information(
-        np.sqrt(weights)[:, None] * centred,
-        fit.information.singular_values,
-        fit.information.directions,
-    )
+    centred = project_out_zeros(fit.jacobian, fit.problem.observations, weights=fit.weights)
+    return Information(np.sqrt(fit.weights)[:, None] * centred)
 
 
 def _inverse_covariance(o: Observations, group: NDArray[np.int64]) -> Array | None:

@@ -7,7 +7,6 @@ that every set has the optimum that it has alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,7 +87,8 @@ class BatchProgram:
         )
         numbers = max(problem.observations.size * n, 1)
         size = max(1, min(MAX_NUMBERS // numbers, MAX_POSTURES // max(problem.n_states, 1)))
-        for part in _parts(n_sets, size):
+        for first in range(0, n_sets, size):
+            part = slice(first, first + size)
             self._solve_part(shared, y[part], solution, part)
         program = VariableProjection(problem, options=self.options)
         for i in np.flatnonzero(solution.alone).tolist():
@@ -131,7 +131,7 @@ class BatchProgram:
             active = active[~settled & (sizes[0, active] < MAX_STEP_SIZE)]
             if not active.size:
                 break
-        theta, zeros, objective, good = shared.evaluate(y, theta, reading)
+        zeros, objective, good = shared.evaluate(y, theta, reading)
         solution.theta[part], solution.zeros[part] = theta * problem.theta_scale, zeros
         solution.objective[part], solution.alone[part] = objective, ~(good & converged)
 
@@ -203,19 +203,14 @@ class _Shared:
 
     def evaluate(
         self, y: Array, theta: Array, reading: Array
-    ) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-        """θ̂, zeros, objective, and a mask of the sets that are finite and within the bounds."""
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Zeros, objective, and a mask of the sets that are finite and within the bounds."""
         _, zeros, cost = self.residual((y - reading) / self.sigma)
         objective = cost + 0.5 * (self._precision * (theta - self._mean) ** 2).sum(axis=1)
         within = ((theta > self._low) & (theta < self._high)).all(axis=1)
-        return theta, zeros * self.sigma, objective, within & np.isfinite(objective)
+        return zeros * self.sigma, objective, within & np.isfinite(objective)
 
     def _centre(self, values: Array) -> Array:
         """Rows minus the mean of those with the same free zero, shape as given."""
         means = self._free_zeros.T @ values / self._counts[:, None]
         return np.asarray(values - means[self.problem.observations.zero])
-
-
-def _parts(count: int, size: int) -> Iterator[slice]:
-    for first in range(0, count, size):
-        yield slice(first, first + size)

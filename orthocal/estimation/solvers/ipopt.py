@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -19,7 +19,13 @@ from orthocal.errors import OrthocalError, SolverError
 from orthocal.estimation.options import OptionValue, SolverOptions
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.estimation.solvers.nlp import ProgramFunctions
-from orthocal.estimation.solvers.program import Program, Solution, SolverInput, no_convergence
+from orthocal.estimation.solvers.program import (
+    Program,
+    Solution,
+    SolverInput,
+    no_convergence,
+    scaled_bounds,
+)
 from orthocal.runtime.interrupts import noticed_interrupt
 
 Array = NDArray[np.float64]
@@ -140,7 +146,7 @@ class NonlinearProgram(Program):
     def _run(self, readings: SolverInput, widening: float = 1.0) -> Solution:
         """One run of Ipopt, with a multiple of the width of a robust loss."""
         problem, sigma, held = self.problem, readings.sigma, readings.held
-        lower, upper = (self._bounds(side, held) for side in ("lower", "upper"))
+        lower, upper = self._bounds(held)
         theta = np.clip(
             readings.start,
             lower[: self._n_theta] * problem.theta_scale,
@@ -323,17 +329,14 @@ class NonlinearProgram(Program):
             },
         )
 
-    def _bounds(self, side: Literal["lower", "upper"], held: Mapping[int, float]) -> Array:
+    def _bounds(self, held: Mapping[int, float]) -> tuple[Array, Array]:
         """Bounds of all variables, scaled; a known zero is fixed at 0."""
         problem = self.problem
-        k = problem.n_states * self._n_passive + self._n_zeros
-        k += int(problem.model.alignment.aligned.sum())
-        bounds = getattr(problem.selection, side) / problem.theta_scale
-        for i, value in held.items():
-            bounds[i] = value / problem.theta_scale[i]
-        others = np.full(k, -np.inf if side == "lower" else np.inf)
-        others[: self._n_zeros][problem.observations.zero_known] = 0.0
-        return np.concatenate([bounds, others])
+        k = problem.n_states * self._n_passive + int(problem.model.alignment.aligned.sum())
+        limits = np.full(self._n_zeros + k, np.inf)
+        limits[: self._n_zeros][problem.observations.zero_known] = 0.0
+        lower, upper = scaled_bounds(problem, held)
+        return np.concatenate([lower, -limits]), np.concatenate([upper, limits])
 
 
 def _plain(options: Mapping[str, OptionValue]) -> dict[str, float | int | str]:

@@ -174,7 +174,7 @@ class ProgramFunctions:
         gradient.add(local, np.zeros_like(local), ca.vec(by_local))
 
         summed, separate = functions["hessian"].map(count, masks, [True, False])(*arguments)
-        rows, columns = _triangle(n_t)
+        rows, columns = np.triu_indices(n_t)
         hessian.add(one.theta_index[rows], one.theta_index[columns], lam_f * summed)
         rows, columns = _rest_of_triangle(variables.shape[1], n_t)
         rows, columns = variables[:, rows], variables[:, columns]
@@ -305,7 +305,7 @@ class ProgramFunctions:
         def pick(rows: Indices, columns: Indices) -> ca.SX:
             return ca.vertcat(*(second[int(i), int(j)] for i, j in zip(rows, columns, strict=True)))
 
-        triangle = _triangle(n_t), _rest_of_triangle(row.numel(), n_t)
+        triangle = np.triu_indices(n_t), _rest_of_triangle(row.numel(), n_t)
         outputs = {
             "reading": [one.reading / noise],
             "objective": [weight * loss.value(residual, width)],
@@ -433,14 +433,8 @@ def _columns(rows: Array) -> ca.MX:
     return ca.MX(ca.DM(rows.T))
 
 
-def _triangle(n: int) -> tuple[Indices, Indices]:
-    """Rows and columns of an upper triangle."""
-    rows, columns = np.triu_indices(n)
-    return rows.astype(np.int64), columns.astype(np.int64)
-
-
 def _rest_of_triangle(n: int, n_first: int) -> tuple[Indices, Indices]:
     """The upper triangle of n variables without that of the first ones."""
-    rows, columns = _triangle(n)
+    rows, columns = np.triu_indices(n)
     others = columns >= n_first
     return rows[others], columns[others]

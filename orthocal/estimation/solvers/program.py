@@ -132,6 +132,16 @@ class Program(ABC):
         """Solve for one set of readings."""
 
 
+def scaled_bounds(problem: CalibrationProblem, held: Mapping[int, float]) -> tuple[Array, Array]:
+    """Lower and upper bounds of θ̂, shape (n_free,), equal for held parameters."""
+    lower, upper = (
+        b / problem.theta_scale for b in (problem.selection.lower, problem.selection.upper)
+    )
+    for i, value in held.items():
+        lower[i] = upper[i] = value / problem.theta_scale[i]
+    return lower, upper
+
+
 def no_convergence(options: SolverOptions) -> str:
     """Advice after a solver did not converge."""
     return "there is no result. Look for a reading with a wrong sign or in a wrong row first" + (

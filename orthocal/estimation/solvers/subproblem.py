@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from orthocal.errors import SolverError
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.program import Solution, SolverInput
+from orthocal.estimation.solvers.program import Solution, SolverInput, scaled_bounds
 from orthocal.observation.model import Linearisation
 
 Array = NDArray[np.float64]
@@ -61,10 +61,7 @@ class Task:
     def __init__(self, problem: CalibrationProblem, loss: Loss, readings: SolverInput) -> None:
         self.problem, self.loss, self.readings = problem, loss, readings
         self.sigma, self.weights = readings.sigma, readings.weights
-        self.low = problem.selection.lower / problem.theta_scale
-        self.high = problem.selection.upper / problem.theta_scale
-        for i, value in readings.held.items():
-            self.low[i] = self.high[i] = value / problem.theta_scale[i]
+        self.low, self.high = scaled_bounds(problem, readings.held)
 
     def clip(self, theta: Array) -> Array:
         """θ̂ within the bounds, shape (n_free,) of free parameters in SI."""
