@@ -120,16 +120,16 @@ def simulate_tool_error(plan, workspace, *, machines):
     assert reached.all()
     values = values + sigma * rng.normal(size=values.shape)
     found = BatchProgram(problem).solve(values, sigma=sigma).theta
-    drives = LoopClosure(robot).inverse(workspace.points)
-    closure, n = LoopClosure(robot, free=names), problem.n_machine
-    squares = []
-    for truth, estimate in zip(theta, found, strict=True):
-        missed = closure.forward(drives, theta=estimate[:n]) - closure.forward(
-            drives, theta=truth[:n]
-        )
-        aligned = workspace.remove_motion(missed, workspace.points)
-        squares.append(workspace.weights @ (aligned**2).sum(axis=1))
-    return float(np.sqrt(np.mean(squares)))
+    closure, columns = LoopClosure(robot), problem.functions.errors.columns(names)
+    drives = closure.inverse(workspace.points)
+
+    def tools(values):
+        errors = closure.errors() + values[:, : len(names)] @ columns.T
+        return closure.tcp(drives, closure.close(drives, errors=errors), errors=errors)
+
+    missed = np.moveaxis(tools(found) - tools(theta), 0, -1)
+    aligned = workspace.remove_motion(missed, workspace.points)
+    return float(np.sqrt(np.mean(workspace.weights @ (aligned**2).sum(axis=1))))
 
 
 def test_calibrated_machines_have_the_expected_tool_error(planned):
@@ -213,7 +213,10 @@ def test_sections_near_the_tool_are_best_for_the_papers_six_equations(orthoglide
 def test_further_setups_combine_with_the_measured_session(orthoglide, root):
     measured = load_session(root / "examples/workshop")
     choice = Choice("full", tolerances=OFFSETS)
-    plan = plan_readings(orthoglide, choice, setups=2, measured=measured, starts=1)
+    equipment = Equipment(along=5, across=0.0, sections=(0.5,))
+    plan = plan_readings(
+        orthoglide, choice, setups=2, measured=measured, equipment=equipment, starts=1
+    )
     forecast = plan.forecast
     assert plan.known.headline.rms == pytest.approx(forecast.after(measured).headline.rms)
     assert plan.expected.headline.rms < plan.known.headline.rms

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from gauges import exact
@@ -54,9 +56,12 @@ def test_standard_errors_of_the_papers_plan():
     plan = build_paper_plan(robot, Displacements(), Gauge(SIGMA, None, None))
     choice = Choice("offsets", tolerances={"*.offset_mm": 0.1})
     study = build_accuracy_study(plan, choice, drawn=["*.offset"], machines=2000)
-    columns = run_study(study).columns
-    errors = np.array([columns[f"error.{a}_slide.offset_mm"] for a in "xyz"])
-    spread = np.sqrt((errors**2).mean(axis=1)) * 1e-3 / SIGMA
+    prepared = study.prepare()  # without the tool errors of `run_study`
+    measured = prepared.measure(study, range(2000))
+    theta, converged = prepared.estimate(measured.values)
+    assert converged.all()
+    errors = theta - prepared.identified_part(measured.errors)
+    spread = np.sqrt((errors**2).mean(axis=0)) / SIGMA
     doubt = 1.942 / np.sqrt(2.0 * 2000)
     assert np.abs(spread - 1.942).max() < 3.0 * doubt + 0.0005
 
@@ -74,7 +79,7 @@ def test_estimates_without_noise_equal_the_truth(orthoglide):
 
 def test_tool_error_of_one_machine_agrees_with_pinocchio(workshop):
     """Tool errors with true and estimated errors, loops closed by Pinocchio."""
-    choice = Choice("offsets", tolerances=NEAR)
+    choice = Choice("full", tolerances=NEAR)
     study = build_accuracy_study(workshop, choice, machines=4, half_side=0.05)
     rows = run_task(study, 0)
     robot, prepared = workshop.robot, study.prepare()
@@ -82,11 +87,10 @@ def test_tool_error_of_one_machine_agrees_with_pinocchio(workshop):
     drives = LoopClosure(robot).inverse(space.points)
     drawn, _ = study.draw(prepared, 2)
     truth = dict(zip(study.drawn, drawn * prepared.truth.theta_scale, strict=False))
-    found = {
-        f"{a}_slide.offset": 1e-3
-        * (rows[f"true.{a}_slide.offset_mm"][2] + rows[f"error.{a}_slide.offset_mm"][2])
-        for a in "xyz"
-    }
+    found = {}
+    for p in prepared.problem.machine_selection.parameters:
+        true, error = (rows[f"{kind}.{p.name}_{p.edge_unit}"][2] for kind in ("true", "error"))
+        found[p.name] = (true + error) / p.edge_factor
     real, known, nominal = (
         np.array([place(robot.with_errors(e), d, "tcp") for d in drives])
         for e in (truth, found, {})
@@ -120,8 +124,6 @@ def test_fixed_errors(workshop):
 
 
 def test_readings_out_of_range_are_counted(workshop):
-    from dataclasses import replace
-
     narrow = replace(workshop, gauges={"": Gauge(SIGMA, 1e-5, (-0.5e-3, 0.5e-3))})
     study = build_accuracy_study(narrow, "offsets", drawn=["*.offset"], machines=100)
     table = run_study(study)
@@ -161,8 +163,6 @@ def test_invalid_arguments(workshop, arguments, error, message):
 
 
 def test_missing_noise(workshop):
-    from dataclasses import replace
-
     silent = replace(workshop, gauges={"": Gauge(None, 1e-5, None)})
     with pytest.raises(SessionError, match=r"gauge.sigma_mm: is missing"):
         build_accuracy_study(silent)

@@ -30,6 +30,8 @@ from orthocal.study.runner import JOURNAL, open_results, run_study, to_parquet
 from orthocal.study.study import prepare_once, round_cell, run_task
 
 KILLS = 20
+DRAWS = 60
+"""Draws of each task."""
 FORK = multiprocessing.get_context("fork")
 
 
@@ -43,8 +45,13 @@ def results(table):
 
 @pytest.fixture(scope="module")
 def study(root):
-    """Twelve tasks of a tenth of a second or so."""
-    found = build_bootstrap_study(session_of(root), draws=3000)
+    """Twelve tasks of some hundredths of a second."""
+    return small_tasks(build_bootstrap_study(session_of(root), draws=12 * DRAWS))
+
+
+def small_tasks(found):
+    """The study with few draws in each task; its copies in other processes have as few."""
+    object.__setattr__(found, "cases_per_task", DRAWS)
     run_task(found, 0)  # what is prepared is there in every fork
     return found
 
@@ -176,13 +183,13 @@ def test_finished_tasks_are_not_computed_again(study, tmp_path, monkeypatch):
     monkeypatch.setattr("orthocal.study.runner.run_task", None)
     told = []
     run_study(study, folder=tmp_path, report=told.append)
-    assert [(p.done, p.kept) for p in told] == [(3000, 3000)]
+    assert [(p.done, p.kept) for p in told] == [(12 * DRAWS, 12 * DRAWS)]
 
 
 def test_progress(study):
     told = []
     run_study(study, report=told.append)
-    assert [p.done for p in told] == [250 * i for i in range(13)]
+    assert [p.done for p in told] == [DRAWS * i for i in range(13)]
     assert told[0].seconds_left is None
     assert told[1].seconds_left > 0.0
     assert told[-1].seconds_left == 0.0
@@ -190,7 +197,7 @@ def test_progress(study):
 
 def test_directory_of_another_study(study, root, tmp_path):
     run_study(study, folder=tmp_path)
-    other = build_bootstrap_study(session_of(root), draws=3000, seed=1)
+    other = small_tasks(build_bootstrap_study(session_of(root), draws=12 * DRAWS, seed=1))
     with pytest.raises(
         OrthocalError, match=r"results\.jsonl: belongs to another study \(different: seed\)"
     ):
@@ -289,7 +296,7 @@ def test_a_cluster_with_a_killed_worker(cluster, study, undisturbed):
     killed = []
 
     def kill_one(progress):
-        if progress.done > 250 and not killed:
+        if progress.done > DRAWS and not killed:
             workers[0].send_signal(signal.SIGKILL)
             killed.append(progress.done)
 

@@ -27,7 +27,7 @@ def run(monkeypatch, capsys, *words):
 QUICK = {
     "accuracy": [
         *("examples/workshop/plan.yaml", "--machines", 110, "--model", "offsets"),
-        *("--tolerance", "*.offset_mm=0.4"),
+        *("--tolerance", "*.offset_mm=0.4", "--draw", "*.offset"),
     ],
     "linearisation": ["--sizes", 6, "--directions", 50, "--largest-mm", 10],
     "sensitivity": ["--free", "offsets"],
