@@ -34,3 +34,10 @@ PRINTED = 6e-6
 
 SAME_OPTIMUM = 1e-9
 """[m] One optimum by two routes of Ipopt, each to a gradient of 1e-6 on the scaled problem."""
+
+SAME_NUMBER = 1e-6
+"""[1] One number by two formulas of linear algebra, or two evaluations of one optimum."""
+
+LAST_SIGMA = 1e-6
+"""[1] Quantities of the last σ against those of the σ before it, which differ in the experiment by
+the mounting alone."""
