@@ -59,7 +59,6 @@ def describe_machine(
     *,
     name: str,
     counting: Sequence[Counting] = (AS_DRIVE,) * 3,
-    where: str = "dimensions",
     description: str | None = None,
     tolerances: Mapping[str, float] | None = None,
 ) -> dict[str, str]:
@@ -69,7 +68,6 @@ def describe_machine(
         dimensions: Dimensions of the machine.
         name: Name of its directory and files.
         counting: Relation of the controller's joints x, y and z to the drives.
-        where: Place for messages.
         description: YAML of the robot to change; by default the packaged one.
         tolerances: Names or globs with their unit, such as *.offset_mm, mapped to tolerances that
             replace the packaged ones; not with a description, which has its own.
@@ -79,10 +77,10 @@ def describe_machine(
     """
     impossible = dimensions.find_problem()
     if impossible:
-        raise RobotError(impossible[1], where=where)
+        raise RobotError(impossible[1], where="dimensions")
     problem = find_counting_problem(counting)
     if problem:
-        raise RobotError(problem, where=where)
+        raise RobotError(problem, where="dimensions")
     folder = packaged_robots()[PATTERN]
     urdf, packaged = (
         read_file(folder / f"{PATTERN}.{kind}", error=RobotError) for kind in ("urdf", "yaml")

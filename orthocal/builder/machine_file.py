@@ -29,15 +29,6 @@ STEEPEST = 0.9
 LARGEST_SHOWN = 100.0
 """Largest coordinate of a controller's joint in the mechanical zero, [m]."""
 
-KEYS = {
-    "leg": "leg_mm",
-    "travel": "travel_mm",
-    "attachment": "attachment_mm",
-    "rods_apart": "rods_apart_mm",
-    "rod_radius": "rod_radius_mm",
-}
-"""Field that `Dimensions.find_problem` names, to its key in machine.yaml."""
-
 
 @dataclass(frozen=True, slots=True)
 class Dimensions:
@@ -61,7 +52,11 @@ class Dimensions:
     ±60 mm that the machine reaches."""
 
     def find_problem(self) -> tuple[str, str] | None:
-        """Name of the dimension that is impossible, and why; None if all are possible."""
+        """Name of the first impossible dimension, and why; None if all are possible.
+
+        A dimension is compared with the ones before it: leg, travel, attachment, rods_apart,
+        rod_radius.
+        """
         leg = self.leg
         if not SHORTEST_LEG <= leg <= LONGEST_LEG:
             return "leg", (
@@ -85,8 +80,7 @@ class Dimensions:
                 f"length, {in_mm(leg)} mm"
             )
         if not self.rod_radius > 0.0 or not 2.0 * self.rod_radius < self.rods_apart <= leg:
-            thick = self.rod_radius > 0.0 and self.rods_apart > 2.0 * self.rod_radius
-            return "rods_apart" if thick else "rod_radius", (
+            return "rod_radius" if 0.0 < self.rods_apart <= leg else "rods_apart", (
                 f"rods of radius {in_mm(self.rod_radius)} mm, {in_mm(self.rods_apart)} mm apart; "
                 f"expected them to clear each other, within {in_mm(leg)} mm"
             )
@@ -179,7 +173,7 @@ def read_machine(path: Path) -> tuple[Dimensions, tuple[Counting, ...]]:
     )
     problem = dimensions.find_problem()
     if problem:
-        raise RobotError(problem[1], where=f"{path}: {KEYS[problem[0]]}")
+        raise RobotError(problem[1], where=f"{path}: {problem[0]}_mm")
     joints = (keys.joints.x_slide, keys.joints.y_slide, keys.joints.z_slide)
     counting = tuple(
         Counting(j.counts == "up", None if j.at_zero_mm is None else j.at_zero_mm * MM)

@@ -4,19 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
 
-from typer import Option
-
+import orthocal
 from orthocal.cli.files import require_new_files
-from orthocal.cli.options import Anyway, CalibrationPath, OutDirectory, app
+from orthocal.cli.options import Anyway, CalibrationPath, OutDirectory, command
 from orthocal.cli.printing import put_note, put_out
 from orthocal.cli.sheet import sheet_or_problem
 from orthocal.errors import ParameterError
-
-if TYPE_CHECKING:
-    from orthocal.calibration.calibration import Calibration
-    from orthocal.session.session import Session
 
 FILES = ("session.yaml", "readings.csv", "sheet.html")
 
@@ -24,17 +18,11 @@ DIGITS = 7
 """Decimals of an offset, [m, rad]: offsets to enter are printed to 0.1 µm."""
 
 
-@app.command()
+@command()
 def again(
     calibration: CalibrationPath,
     out: OutDirectory,
-    session: Annotated[
-        Path | None,
-        Option(
-            metavar="SESSION",
-            help="Session with the setups and postures; default: that of the calibration.",
-        ),
-    ] = None,
+    session: Path | None = None,
     anyway: Anyway = False,
 ) -> None:
     """Plan the same readings again, with the identified offsets.
@@ -42,13 +30,14 @@ def again(
     The directory receives session.yaml, an empty readings.csv and a measuring sheet.
 
     Exit code 3: the verdict is not to enter the offsets; nothing is written.
+
+    Args:
+        session (SESSION): Session with the setups and postures; default: that of the calibration.
     """
-    from orthocal.calibration.file import load_calibration
     from orthocal.export.formats import require_entering
-    from orthocal.measurement.files.write_session import write_session
 
     require_new_files(out, FILES, remedy="expected a new directory")
-    result = load_calibration(calibration)
+    result = orthocal.load_calibration(calibration)
     if not anyway:
         require_entering(result)
     new = _plan_again(result, session)
@@ -59,7 +48,7 @@ def again(
     sheet, problem = sheet_or_problem(new)
     if problem:
         put_note(problem)
-    write_session(new, out, comment=comment, extra=sheet, blank=True)
+    orthocal.write_session(new, out, comment=comment, extra=sheet, blank=True)
     offsets = ", ".join(
         f"{d.name} {v * d.edge_factor:+.4f} {d.edge_unit}"
         for d, v in zip(new.robot.drives, new.active_offsets.tolist(), strict=True)
@@ -72,15 +61,13 @@ def again(
     put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, and a sheet")
 
 
-def _plan_again(calibration: Calibration, path: Path | None) -> Session:
+def _plan_again(calibration: orthocal.Calibration, path: Path | None) -> orthocal.Session:
     """The rows of a session, with the offsets to enter as active offsets."""
     from orthocal.assessment.controller_entries import entered_offsets
     from orthocal.calibration.recorded_robot import require_calibrated_robot
-    from orthocal.calibration.refit import restore_session
-    from orthocal.measurement.files.session_file import load_plan
 
     if path is not None:
-        planned = load_plan(path)
+        planned = orthocal.load_plan(path)
         require_calibrated_robot(calibration, planned)
     elif calibration.session.parts:
         raise ParameterError(
@@ -88,7 +75,7 @@ def _plan_again(calibration: Calibration, path: Path | None) -> Session:
             where="--session",
         )
     else:
-        planned = restore_session(calibration)
+        planned = orthocal.restore_session(calibration)
     offsets = entered_offsets(calibration).round(DIGITS) + 0.0
     title = planned.title.removeprefix("Simulated: ")
     return replace(planned.with_controller(offsets), title=title, source="", seed=None)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
+import orthocal
+from orthocal.cli.files import load_joined
+from orthocal.cli.options import Json, SessionPaths, command
+from orthocal.cli.printing import deliver_judged
 
-from orthocal.cli.files import load_each_once
-from orthocal.cli.options import Json, SessionPaths, app
-from orthocal.cli.printing import deliver
 
-
-@app.command()
+@command()
 def check(sessions: SessionPaths, json: Json = False) -> None:
     """Check readings for mistakes: signs, units, rows, the gauge.
 
@@ -17,15 +16,4 @@ def check(sessions: SessionPaths, json: Json = False) -> None:
 
     Exit code 0: no anomaly. 3: check the readings before you continue.
     """
-    from orthocal.assessment.assess import check_session
-    from orthocal.measurement.joining import join_sessions
-    from orthocal.output.text.answer import print_decision
-    from orthocal.output.text.summary import result_json
-
-    assessment = check_session(join_sessions(load_each_once(sessions)))
-    deliver(
-        partial(result_json, assessment),
-        partial(print_decision, assessment),
-        json=json,
-        decision=assessment.decision,
-    )
+    deliver_judged(orthocal.check_session(load_joined(sessions)), json=json)

@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
-from typing import Annotated
 
-from typer import Option
-
-from orthocal.cli.calibrate import judgement_on_failure
+import orthocal
 from orthocal.cli.files import load_each_once
-from orthocal.cli.options import AllRows, Json, SessionPaths, Tolerances, app, split_globs
-from orthocal.cli.printing import deliver
+from orthocal.cli.options import (
+    AllRows,
+    Json,
+    SessionPaths,
+    Tolerances,
+    command,
+    read_tolerances,
+    split_globs,
+)
+from orthocal.cli.printing import deliver_judged, judgement_on_failure
 
 
-@app.command()
+@command()
 def compare(
     sessions: SessionPaths,
-    models: Annotated[
-        str | None,
-        Option(metavar="MODELS", help="Models, separated by commas; default: all of the robot."),
-    ] = None,
-    repeat: Annotated[
-        list[Path] | None,
-        Option(
-            metavar="SESSION",
-            help="Another session, to see which residuals repeat. Can be repeated.",
-        ),
-    ] = None,
+    models: str | None = None,
+    repeat: list[Path] | None = None,
     tolerance: Tolerances = None,
     json: Json = False,
     all_rows: AllRows = False,
@@ -35,24 +30,17 @@ def compare(
     """Compare models, and recommend the one that readings support.
 
     Exit code 3: review or reject the readings; the verdict is that of `calibrate`.
-    """
-    from orthocal.assessment.comparison import compare_models
-    from orthocal.estimation.selection import read_tolerances
-    from orthocal.measurement.joining import join_sessions
-    from orthocal.output.text.summary import print_summary, result_json
 
+    Args:
+        models (MODELS): Models, separated by commas; default: all of the robot.
+        repeat (SESSION): Another session, to see which residuals repeat. Can be repeated.
+    """
     loaded = load_each_once(sessions)
-    parameters = loaded[0].robot.parameters
-    with judgement_on_failure(join_sessions(loaded), json=json):
-        comparison = compare_models(
+    with judgement_on_failure(orthocal.join_sessions(loaded), json=json):
+        comparison = orthocal.compare_models(
             loaded,
             models=split_globs([models] if models else None),
-            tolerances=read_tolerances(tolerance or [], parameters, where="--tolerance"),
+            tolerances=read_tolerances(tolerance, loaded[0].robot),
             repeat=load_each_once(repeat) if repeat else None,
         )
-    deliver(
-        partial(result_json, comparison),
-        partial(print_summary, comparison, all_rows=all_rows),
-        json=json,
-        decision=comparison.assessment.decision,
-    )
+    deliver_judged(comparison, json=json, all_rows=all_rows)

@@ -14,15 +14,16 @@ from enum import StrEnum
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated, BinaryIO
 
-from typer import Argument, Option
+from typer import Option
 
-from orthocal.cli.options import Anyway, CalibrationPath, ToolTip, app, read_vector
+import orthocal
+from orthocal.cli.options import Anyway, CalibrationPath, ToolTip, command, read_vector
 from orthocal.cli.printing import put_note, put_part
 from orthocal.errors import GcodeError, OutputError, ParameterError
+from orthocal.io.files import read_parts, require_writable_file, write_file
 from orthocal.units import DRIVE_UNITS, MM, UM, format_fixed
 
 if TYPE_CHECKING:
-    from orthocal.calibration.calibration import Calibration
     from orthocal.export.correction_field import CorrectionField
     from orthocal.gcode.path import Vector
     from orthocal.gcode.program import Summary
@@ -41,51 +42,16 @@ class Offsets(StrEnum):
     ACTIVE = "active"
 
 
-@app.command()
+@command()
 def correct(
     calibration: CalibrationPath,
-    program: Annotated[
-        Path, Argument(metavar="PROGRAM", help="G-code file; - for standard input.")
-    ],
-    within_um: Annotated[
-        float,
-        Option(
-            "--within",
-            metavar="UM",
-            min=0.01,
-            max=1000.0,
-            help="Largest distance of the written path from the corrected path, µm.",
-        ),
-    ] = 1.0,
-    offsets: Annotated[
-        Offsets,
-        Option(
-            help="Offsets in the controller when the program runs: those that `calibrate` says to "
-            "enter, or those that were active during the measurement."
-        ),
-    ] = Offsets.ENTERED,
-    work_offset: Annotated[
-        list[str] | None,
-        Option(
-            "--work-offset-mm",
-            metavar="[G54=]X,Y,Z",
-            help="Zero of the program in machine coordinates; repeat for G55 ...",
-        ),
-    ] = None,
-    start: Annotated[
-        str | None,
-        Option(
-            "--start-mm",
-            metavar="X,Y,Z",
-            help="Position that the controller displays before the program; needed if the first "
-            "motion does not have X, Y and Z.",
-        ),
-    ] = None,
+    program: Path,
+    within: Annotated[float, Option(min=0.01, max=1000.0)] = 1.0,
+    offsets: Offsets = Offsets.ENTERED,
+    work_offset_mm: list[str] | None = None,
+    start_mm: str | None = None,
     tool: ToolTip = None,
-    out: Annotated[
-        Path | None,
-        Option(metavar="FILE", help="File for the corrected program; default: standard output."),
-    ] = None,
+    out: Path | None = None,
     anyway: Anyway = False,
 ) -> None:
     """Correct a G-code program for the errors of the machine.
@@ -96,34 +62,41 @@ def correct(
     the reason are reported, and nothing is written.
 
     Exit code 3: the verdict is not to enter the calibration.
+
+    Args:
+        program (PROGRAM): G-code file; - for standard input.
+        within (UM): Largest distance of the written path from the corrected path, µm.
+        offsets: Offsets in the controller when the program runs: those that `calibrate` says to
+            enter, or those that were active during the measurement.
+        work_offset_mm ([G54=]X,Y,Z): Zero of the program in machine coordinates; repeat for G55 ...
+        start_mm (X,Y,Z): Position that the controller displays before the program; needed if the
+            first motion does not have X, Y and Z.
+        out (FILE): File for the corrected program; default: standard output.
     """
     from orthocal.assessment.controller_entries import entered_offsets
-    from orthocal.calibration.file import load_calibration
     from orthocal.export.correction_field import CorrectionField
     from orthocal.export.formats import require_entering, warn_against_verdict
-    from orthocal.export.linuxcnc.export import ExportOptions
     from orthocal.gcode.interpreter import Interpreter
     from orthocal.gcode.program import ProgramCorrector
-    from orthocal.io.files import require_writable_file, write_file
 
-    zeros = _read_offsets(work_offset or [])
-    position = None if start is None else read_vector(start, "--start-mm")
-    tip = ExportOptions(tool=None if tool is None else read_vector(tool, "--tool")).tool
+    zeros = _read_offsets(work_offset_mm or [])
+    position = None if start_mm is None else read_vector(start_mm, "--start-mm")
+    tip = orthocal.ExportOptions(tool=None if tool is None else read_vector(tool, "--tool")).tool
     if out is not None:
         require_writable_file(out)
-    result = load_calibration(calibration)
+    result = orthocal.load_calibration(calibration)
     if not anyway:
         require_entering(result)
     warning = warn_against_verdict(result)
     active = offsets is Offsets.ACTIVE
     values = result.active_offsets if active else entered_offsets(result)
-    within = within_um * UM
-    field = CorrectionField(result, values, within=within, tool=tip or (0.0, 0.0, 0.0))
+    tolerance = within * UM
+    field = CorrectionField(result, values, within=tolerance, tool=tip or (0.0, 0.0, 0.0))
     file = "standard input" if str(program) == "-" else str(program)
     interpreter = Interpreter(
         file, axes=field.axes, offsets=zeros, start=position, one_tool=tip is not None
     )
-    corrector = ProgramCorrector(interpreter, field, within=within)
+    corrector = ProgramCorrector(interpreter, field, within=tolerance)
     with tempfile.TemporaryFile() as spool:  # nothing is written before all lines are corrected
         with _frozen():
             texts = corrector.run(_lines(program, file))
@@ -138,7 +111,7 @@ def correct(
                 put_part(part)
             sys.stdout.flush()
     notes = [
-        _describe(corrector.summary, field, within),
+        _describe(corrector.summary, field, tolerance),
         _describe_controller(result, values, active=active),
         _describe_tool(tip, interpreter.tools.used),
         warning,
@@ -164,7 +137,6 @@ def _frozen() -> Iterator[None]:
 
 def _lines(program: Path, file: str) -> Iterator[str]:
     from orthocal.gcode.lines import LONGEST_LINE
-    from orthocal.io.files import read_parts
 
     if str(program) != "-":
         source: Path | BinaryIO = program
@@ -262,7 +234,9 @@ def _describe_tool(tip: Vector | None, tools: Sequence[str]) -> str:
     )
 
 
-def _describe_controller(result: Calibration, values: Iterable[float], *, active: bool) -> str:
+def _describe_controller(
+    result: orthocal.Calibration, values: Iterable[float], *, active: bool
+) -> str:
     listed = []
     for drive, value in zip(result.robot.drives, values, strict=True):
         unit, size = DRIVE_UNITS[drive.unit]

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import orthocal
 from orthocal.errors import OrthocalError, SessionError
-
-if TYPE_CHECKING:
-    from orthocal.session.session import Session
+from orthocal.io.files import exists, require_writable
 
 SIMULATED = "Simulated"
 """First word of the source of a simulated session."""
@@ -18,17 +16,15 @@ FEWEST_DIFFERENT = 4
 """Number of different values from which equal readings show that a session is a copy."""
 
 
-def load_each_once(paths: Sequence[Path]) -> list[Session]:
+def load_each_once(paths: Sequence[Path]) -> list[orthocal.Session]:
     """Load sessions, and refuse those whose readings would count twice.
 
     Raises:
         SessionError: If two sessions are the same, or have the same readings.
     """
-    from orthocal.measurement.files.session_file import load_session
-
-    sessions: list[Session] = []
+    sessions: list[orthocal.Session] = []
     for path in paths:
-        session = load_session(path)
+        session = orthocal.load_session(path)
         if any(session.sha256 == other.sha256 for other in sessions):
             raise SessionError(
                 "is the same session as one before it; its readings would count twice",
@@ -44,7 +40,12 @@ def load_each_once(paths: Sequence[Path]) -> list[Session]:
     return sessions
 
 
-def _same_readings(one: Session, other: Session) -> bool:
+def load_joined(paths: Sequence[Path]) -> orthocal.Session:
+    """Load sessions as one; for the errors see `load_each_once`."""
+    return orthocal.join_sessions(load_each_once(paths))
+
+
+def _same_readings(one: orthocal.Session, other: orthocal.Session) -> bool:
     """True for the same rows with the same values, which two measurements do not give."""
     rows = [
         [(r.setup, r.posture, r.minus, r.cycle, r.value) for r in s.readings] for s in (one, other)
@@ -72,8 +73,6 @@ def require_new_files(
     Raises:
         OrthocalError: If the directory cannot be written, or of kind `error`, if a file exists.
     """
-    from orthocal.io.files import exists, require_writable
-
     require_writable(directory)
     for name in names:
         if exists(directory / name) and not force:
@@ -86,7 +85,6 @@ def require_no_readings(directory: Path) -> None:
     Raises:
         SessionError: If the session of the directory has readings that were not simulated.
     """
-    from orthocal.io.files import exists
     from orthocal.measurement.files.session_file import SESSION, load_rows
 
     if not exists(directory / SESSION):

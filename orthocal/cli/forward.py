@@ -6,52 +6,42 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-from typer import Argument
-
-from orthocal.cli.options import CalibrationPath, app
+import orthocal
+from orthocal.cli.options import CalibrationPath, command
 from orthocal.cli.printing import print_rows
 from orthocal.errors import SessionError
 
 if TYPE_CHECKING:
     from orthocal.assessment.tool_tables import Chunk
-    from orthocal.calibration.calibration import Calibration
     from orthocal.measurement.files.coordinate_tables import Block
 
 
-@app.command()
-def forward(
-    calibration: CalibrationPath,
-    joints: Annotated[
-        Path,
-        Argument(
-            metavar="JOINTS.csv",
-            help="Columns of the drives, such as x_slide_mm; - for standard input.",
-        ),
-    ],
-) -> None:
+@command()
+def forward(calibration: CalibrationPath, joints: Path) -> None:
     """Print tool positions for drive coordinates, as CSV.
 
     Drive coordinates are those of the encoders, without any offset of the controller. Tables can
     have any size: rows from a pipe are evaluated in blocks as they arrive.
 
     Exit code 3: some rows cannot be reached; they are named, and their cells are empty.
+
+    Args:
+        joints (JOINTS.csv): Columns of the drives, such as x_slide_mm; - for standard input.
     """
     from orthocal.assessment.tool_tables import forward_blocks
-    from orthocal.calibration.file import load_calibration
     from orthocal.measurement.files.coordinate_tables import TOOL_COLUMNS, stream_joints
 
-    print_transformed(
-        load_calibration(calibration), joints, stream_joints, forward_blocks, TOOL_COLUMNS
-    )
+    result = orthocal.load_calibration(calibration)
+    print_transformed(result, joints, stream_joints, forward_blocks, TOOL_COLUMNS)
 
 
 def print_transformed(
-    calibration: Calibration,
+    calibration: orthocal.Calibration,
     path: Path,
     stream: Callable[..., Iterator[Block]],
-    transform: Callable[[Calibration, Iterable[Block]], Iterator[Chunk]],
+    transform: Callable[[orthocal.Calibration, Iterable[Block]], Iterator[Chunk]],
     columns: dict[str, float],
 ) -> None:
     """Print a transformed table; a file is checked completely before its first row is printed.

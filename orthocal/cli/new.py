@@ -7,11 +7,10 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
 
 import typer
-from typer import Argument, Option
 
+import orthocal
 from orthocal.cli.files import require_new_files, require_no_readings
 from orthocal.cli.options import (
     Force,
@@ -20,75 +19,35 @@ from orthocal.cli.options import (
     Model,
     Tolerances,
     WorkspaceMm,
-    app,
+    command,
+    read_tolerances,
     read_workspace,
 )
 from orthocal.cli.printing import put_note, put_out
 from orthocal.errors import OrthocalError, ParameterError, RobotError
-
-if TYPE_CHECKING:
-    from orthocal.builder.machine_file import Counting, Dimensions
-    from orthocal.planning.equipment import Equipment
-    from orthocal.planning.plan import MeasuringPlan
-    from orthocal.robot.model import Robot
-    from orthocal.session.session import Session
+from orthocal.io.files import exists, read_file, require_plain_name, write_files
 
 FIRST = "first"
 """Directory of the first session, in that of the machine."""
 
 
-@app.command()
+@command()
 def new(
-    folder: Annotated[
-        Path, Argument(metavar="DIRECTORY", help="Directory of the machine; it is created.")
-    ],
-    leg_mm: Annotated[
-        str | None, Option(metavar="MM", help="Length of a leg, from hinge to hinge of a rod.")
-    ] = None,
-    travel_mm: Annotated[
-        str | None,
-        Option(
-            metavar="LEAST:LARGEST",
-            help="Travel of a slider; its coordinate is the leg length where the legs are parallel "
-            "to their axes, and more further out.",
-        ),
-    ] = None,
-    attachment_mm: Annotated[
-        str | None,
-        Option(metavar="MM", help="Distance from slider to hinge, and from hinge to tool."),
-    ] = None,
-    rods_apart_mm: Annotated[
-        str | None, Option(metavar="MM", help="Distance of the axes of a leg's two rods.")
-    ] = None,
-    rod_radius_mm: Annotated[str | None, Option(metavar="MM", help="Radius of a rod.")] = None,
-    counts: Annotated[
-        str | None,
-        Option(
-            metavar="up|down[,...]",
-            help="Direction in which a joint of the controller counts as its slider moves "
-            "outwards: one for all, or x,y,z.",
-        ),
-    ] = None,
-    at_zero_mm: Annotated[
-        str | None,
-        Option(
-            metavar="MM[,...]",
-            help="Coordinate that the controller shows where the legs are parallel to their axes: "
-            "one for all, or x,y,z.",
-        ),
-    ] = None,
+    folder: Path,
+    leg_mm: str | None = None,
+    travel_mm: str | None = None,
+    attachment_mm: str | None = None,
+    rods_apart_mm: str | None = None,
+    rod_radius_mm: str | None = None,
+    counts: str | None = None,
+    at_zero_mm: str | None = None,
     workspace_mm: WorkspaceMm = None,
-    paper: Annotated[
-        bool, Option("--paper", help="Use the paper's seven postures and six setups; no search.")
-    ] = False,
+    paper: bool = False,
     hours: Hours = None,
     gauge: Gauge = None,
     model: Model = None,
     tolerance: Tolerances = None,
-    again: Annotated[
-        bool,
-        Option("--again", help="Make URDF, YAML and sheets again from DIRECTORY/machine.yaml."),
-    ] = False,
+    again: bool = False,
     force: Force = False,
 ) -> None:
     """Make a machine of your dimensions, a first plan and its sheet.
@@ -96,6 +55,21 @@ def new(
     Missing dimensions are asked for at a terminal.
 
     Exit code 3 with --again: a plan is old.
+
+    Args:
+        folder (DIRECTORY): Directory of the machine; it is created.
+        leg_mm (MM): Length of a leg, from hinge to hinge of a rod.
+        travel_mm (LEAST:LARGEST): Travel of a slider; its coordinate is the leg length where the
+            legs are parallel to their axes, and more further out.
+        attachment_mm (MM): Distance from slider to hinge, and from hinge to tool.
+        rods_apart_mm (MM): Distance of the axes of a leg's two rods.
+        rod_radius_mm (MM): Radius of a rod.
+        counts (up|down[,...]): Direction in which a joint of the controller counts as its slider
+            moves outwards: one for all, or x,y,z.
+        at_zero_mm (MM[,...]): Coordinate that the controller shows where the legs are parallel to
+            their axes: one for all, or x,y,z.
+        paper: Use the paper's seven postures and six setups; no search.
+        again: Make URDF, YAML and sheets again from DIRECTORY/machine.yaml.
     """
     dimensions = {
         "--leg-mm": leg_mm,
@@ -116,40 +90,30 @@ def new(
         raise ParameterError("found with --paper, whose setups are fixed", where="--hours")
     from orthocal.builder.build import describe_machine
     from orthocal.cli.dialogue import ask_tolerance, find_answers
-    from orthocal.effects.loading import load_robot
-    from orthocal.io.files import write_files
-    from orthocal.measurement.files.write_session import write_session
-    from orthocal.planning.equipment import Equipment, load_dial
+    from orthocal.planning.equipment import load_dial
 
     name = _require_new(folder, force=force)
-    equipment = Equipment() if gauge is None else load_dial(gauge, Equipment())
-    answers, asked = find_answers(dimensions), None in dimensions.values()
-    machine = answers.dimensions
-    if asked or workspace_mm is not None:
-        machine = _with_workspace(machine, answers.counting, workspace_mm)
-    if asked and tolerance is None:
-        tolerance = ask_tolerance()
-
-    def describe(tolerances: Mapping[str, float] | None = None) -> dict[str, str]:
-        return describe_machine(
-            machine,
-            name=name,
-            counting=answers.counting,
-            where=str(folder),
-            tolerances=tolerances,
-        )
-
+    equipment = orthocal.Equipment()
+    if gauge is not None:
+        equipment = load_dial(gauge, equipment)
+    machine, counting = find_answers(dimensions)
+    asked = None in dimensions.values()
     with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
-        write_files(Path(trial) / name, describe())
-        robot = load_robot(Path(trial) / name)
-        plan, session = _plan(
-            robot, equipment, paper=paper, hours=hours, model=model, tolerance=tolerance
-        )
+        robot = orthocal.make_robot(machine, Path(trial) / name, counting=counting)
+        if asked or workspace_mm is not None:
+            robot = _with_workspace(robot, workspace_mm)
+        if asked and tolerance is None:
+            tolerance = ask_tolerance()
+        if robot.workspace is not None:
+            box = tuple((low, high) for low, high in robot.workspace.tolist())
+            machine = replace(machine, workspace=box)
+        tolerances = read_tolerances(tolerance, robot)
+        plan, session = _plan(robot, equipment, tolerances, paper=paper, hours=hours, model=model)
         put_note("orthocal: drawing the measuring sheet")
         files = _draw(plan, session)
     stated = session.robot.parameters.stated
-    write_files(folder, describe(stated))
-    robot = load_robot(folder).with_tolerances(stated)
+    write_files(folder, describe_machine(machine, name=name, counting=counting, tolerances=stated))
+    robot = orthocal.load_robot(folder).with_tolerances(stated)
     session = replace(session, robot=robot, robot_reference=str(folder.resolve()))
     comment = (
         "A plan. Print sheet.html and measure: run `orthocal record .` in this directory, or fill\n"
@@ -157,14 +121,13 @@ def new(
         "orthocal calibrate .\n"
         "offsets_mm: those that are active in the controller during the measurement."
     )
-    write_session(session, folder / FIRST, comment=comment, extra=files, blank=True)
+    orthocal.write_session(session, folder / FIRST, comment=comment, extra=files, blank=True)
     _report(folder, machine.words, plan, session, files)
 
 
 def _require_new(folder: Path, *, force: bool) -> str:
     """Name of a directory; refuse one that is in use or cannot be written."""
     from orthocal.builder.machine_file import MACHINE
-    from orthocal.io.files import require_plain_name
     from orthocal.robot.loading import packaged_robots
 
     name = folder.resolve().name
@@ -189,54 +152,43 @@ def _require_new(folder: Path, *, force: bool) -> str:
     return name
 
 
-def _with_workspace(
-    dimensions: Dimensions, counting: tuple[Counting, Counting, Counting], option: str | None
-) -> Dimensions:
-    """Dimensions with the workspace of the option or of an answer.
+def _with_workspace(robot: orthocal.Robot, option: str | None) -> orthocal.Robot:
+    """Robot with the workspace of the option or of an answer.
 
     Raises:
         ParameterError: If the machine does not reach the workspace.
     """
-    from orthocal.builder.build import make_robot
-    from orthocal.cli.dialogue import Box, ask_workspace
+    from orthocal.cli.dialogue import ask_workspace
     from orthocal.kinematics.workspace import describe_box, find_workspace
 
-    with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
-        robot = make_robot(dimensions, Path(trial) / "trial", counting=counting)
-
-        def read(text: str) -> Box:
-            return tuple((low, high) for low, high in read_workspace(text, robot).tolist())
-
-        if option is not None:
-            return replace(dimensions, workspace=read(option))
-        usual = describe_box(find_workspace(robot).limits)
-        return replace(dimensions, workspace=ask_workspace(usual, read))
+    if option is not None:
+        return replace(robot, workspace=read_workspace(option, robot))
+    usual = describe_box(find_workspace(robot).limits)
+    box = ask_workspace(usual, lambda text: read_workspace(text, robot))
+    return robot if box is None else replace(robot, workspace=box)
 
 
 def _plan(
-    robot: Robot,
-    equipment: Equipment,
+    robot: orthocal.Robot,
+    equipment: orthocal.Equipment,
+    tolerances: Mapping[str, float],
     *,
     paper: bool,
     hours: float | None,
     model: str | None,
-    tolerance: list[str] | None,
-) -> tuple[MeasuringPlan | None, Session]:
+) -> tuple[orthocal.MeasuringPlan | None, orthocal.Session]:
     """Plan, and its session with no active offsets; no plan for the paper's readings."""
-    from orthocal.estimation.choice import Choice
-    from orthocal.estimation.selection import read_tolerances
     from orthocal.planning.first_plan import first_equipment, paper_plan
-    from orthocal.planning.plan import MODEL, plan_readings
+    from orthocal.planning.plan import MODEL
     from orthocal.session.session import Purpose
 
-    tolerances = read_tolerances(tolerance or [], robot.parameters, where="--tolerance")
-    choice = Choice(model or MODEL, tolerances=tolerances)
+    choice = orthocal.Choice(model or MODEL, tolerances=tolerances)
     choice.select(robot.parameters)
     zeros = [0.0] * len(robot.drives)
     if paper:
         session = paper_plan(robot, equipment).with_tolerances(tolerances).with_controller(zeros)
         return None, replace(session, purpose=Purpose(model or MODEL))
-    plan = plan_readings(
+    plan = orthocal.plan_readings(
         robot,
         choice,
         hours=hours,
@@ -246,7 +198,7 @@ def _plan(
     return plan, plan.session.with_controller(zeros)
 
 
-def _draw(plan: MeasuringPlan | None, session: Session) -> dict[str, str]:
+def _draw(plan: orthocal.MeasuringPlan | None, session: orthocal.Session) -> dict[str, str]:
     """Files beside session.yaml and readings.csv."""
     from orthocal.output.sheet.page import sheet_files
     from orthocal.output.text.plan import draw_plan, plan_json
@@ -258,8 +210,8 @@ def _draw(plan: MeasuringPlan | None, session: Session) -> dict[str, str]:
 def _report(
     folder: Path,
     dimensions: str,
-    plan: MeasuringPlan | None,
-    session: Session,
+    plan: orthocal.MeasuringPlan | None,
+    session: orthocal.Session,
     files: dict[str, str],
 ) -> None:
     """Print the expected tool error, the files and the next commands."""
@@ -299,11 +251,10 @@ def _make_again(folder: Path) -> None:
         typer.Exit: With code 3 if a plan is old.
     """
     from orthocal.builder.build import remake_robot
-    from orthocal.io.files import exists
     from orthocal.kinematics.workspace import find_unreached
     from orthocal.output.sheet.page import SHEET
 
-    def check(robot: Robot) -> None:
+    def check(robot: orthocal.Robot) -> None:
         problem = "" if robot.workspace is None else find_unreached(robot, robot.workspace)
         if problem:
             raise RobotError(problem, where=f"{folder / 'machine.yaml'}: workspace_mm")
@@ -323,14 +274,12 @@ def _make_again(folder: Path) -> None:
         raise typer.Exit(3)
 
 
-def _remake_sheet(sheet: Path, robot: Robot) -> list[str]:
+def _remake_sheet(sheet: Path, robot: orthocal.Robot) -> list[str]:
     """Make the sheet of a plan without readings again; changes for which the plan is old."""
-    from orthocal.io.files import write_files
-    from orthocal.measurement.files.session_file import load_plan
     from orthocal.output.sheet.page import sheet_files
 
     try:
-        session = load_plan(sheet.parent)
+        session = orthocal.load_plan(sheet.parent)
         if any(r.value for r in session.readings):
             put_note(
                 f"orthocal: {sheet.parent}: has readings, which belong to the dimensions at that "
@@ -345,13 +294,12 @@ def _remake_sheet(sheet: Path, robot: Robot) -> list[str]:
         return ["the machine does not reach its postures"]
 
 
-def _changes_since(folder: Path, robot: Robot) -> list[str]:
+def _changes_since(folder: Path, robot: orthocal.Robot) -> list[str]:
     """Differences of travel and workspace from those for which a plan was made.
 
     Raises:
         OrthocalError: If plan.json cannot be read.
     """
-    from orthocal.io.files import exists, read_file
     from orthocal.output.text.plan import PLAN_BASIS, describe_basis
 
     file = folder / "plan.json"

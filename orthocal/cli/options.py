@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import inspect
+import re
+from collections.abc import Callable, Sequence
+from copy import copy
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
 
 import typer
 from typer import Argument, Option
 from typer.core import TyperGroup
 
+import orthocal
 from orthocal.errors import ParameterError
 from orthocal.units import MM
 
@@ -17,9 +21,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from orthocal.robot.model import Robot
-
     Array = NDArray[np.float64]
+
+Command = TypeVar("Command", bound=Callable[..., None])
 
 LARGEST_MM = 1e4
 """Largest coordinate of a box, displacement and size of errors, [mm]."""
@@ -62,6 +66,44 @@ app = make_group(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+
+_ENTRY = re.compile(r"^ {4}(\w+)(?: \((.+?)\))?: (.+(?:\n {8}.+)*)", re.MULTILINE)
+"""Entry of a docstring: name, metavar and help of a parameter."""
+
+
+def command(group: typer.Typer = app, *, name: str | None = None) -> Callable[[Command], Command]:
+    """Decorator of commands, whose arguments and options are described in their docstrings.
+
+    An entry under Args is `name (METAVAR): help`. A parameter without a default is an argument,
+    every other an option. An `Option` in its annotation states limits and other names.
+
+    Args:
+        group: Group of the command.
+        name: Name of the command; default: that of the function.
+    """
+
+    def register(function: Command) -> Command:
+        text, _, entries = (inspect.getdoc(function) or "").partition("\n\nArgs:\n")
+        hints: dict[str, Any] = get_type_hints(function, include_extras=True)
+        parameters = inspect.signature(function).parameters
+        for parameter, metavar, words in _ENTRY.findall(entries):
+            default = parameters[parameter].default
+            if hasattr(hints[parameter], "__metadata__"):
+                kind, info = get_args(hints[parameter])
+                info = copy(info)
+            elif default is inspect.Parameter.empty:
+                kind, info = hints[parameter], Argument()
+            else:  # a flag has no negative form
+                flag = [f"--{parameter.replace('_', '-')}"] if default is False else []
+                kind, info = hints[parameter], Option(*flag)
+            info.metavar, info.help = metavar or None, " ".join(words.split())
+            hints[parameter] = Annotated[kind, info]
+        function.__annotations__ = hints
+        group.command(name, help=text)(function)
+        return function
+
+    return register
+
 
 SessionPath = Annotated[
     Path, Argument(metavar="SESSION", help="session.yaml, or the directory that contains it.")
@@ -148,6 +190,7 @@ ToolTip = Annotated[
         help="Tip of the tool in the frame of the tool centre point, mm; default: 0,0,0.",
     ),
 ]
+Positive = Annotated[int | None, Option(min=1)]
 Seed = Annotated[int, Option(min=0, metavar="N", help="Seed of the random numbers.")]
 Workers = Annotated[
     int | None,
@@ -175,6 +218,33 @@ Anyway = Annotated[
 def split_globs(texts: Sequence[str] | None) -> list[str]:
     """Globs of repeated options, each with several separated by commas."""
     return [glob.strip() for text in texts or [] for glob in text.split(",") if glob.strip()]
+
+
+def load_robot_or_session(subject: str) -> tuple[orthocal.Session | None, orthocal.Robot]:
+    """Session of a path, or None for a robot, and the robot.
+
+    Raises:
+        OrthocalError: If it is neither, or does not load.
+    """
+    from orthocal.output.text.subject import load_subject
+
+    source = load_subject(subject)
+    if isinstance(source, orthocal.Session):
+        return source, source.robot
+    if isinstance(source, orthocal.Robot):
+        return None, source
+    raise ParameterError("is a calibration; expected a robot or a session", where=subject)
+
+
+def read_tolerances(texts: Sequence[str] | None, robot: orthocal.Robot) -> dict[str, float]:
+    """Tolerances of `--tolerance`, as in `Choice`.
+
+    Raises:
+        ParameterError: If a text is not GLOB=VALUE, or its glob selects no error of the robot.
+    """
+    from orthocal.estimation import selection
+
+    return selection.read_tolerances(texts or [], robot.parameters, where="--tolerance")
 
 
 def read_number(text: str, option: str, name: str = "it") -> float:
@@ -250,7 +320,7 @@ def read_box(text: str, letters: str, *, where: str) -> Array:
     return np.array(rows * (len(letters) if len(rows) == 1 else 1)) * MM
 
 
-def read_workspace(text: str, robot: Robot, *, where: str = "--workspace-mm") -> Array:
+def read_workspace(text: str, robot: orthocal.Robot, *, where: str = "--workspace-mm") -> Array:
     """Workspace of an option, which the nominal machine must reach, shape (n, 2), [m].
 
     Raises:

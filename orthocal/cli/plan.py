@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
-from typer import Argument, Option
+from typer import Option
 
+import orthocal
 from orthocal.cli.files import require_new_files, require_no_readings
 from orthocal.cli.options import (
     Details,
@@ -17,13 +17,16 @@ from orthocal.cli.options import (
     Json,
     Model,
     OptionalOutDirectory,
+    Positive,
     Seed,
     Tolerances,
     Workers,
     WorkspaceMm,
-    app,
+    command,
+    load_robot_or_session,
     read_box,
     read_numbers,
+    read_tolerances,
     read_workspace,
     require_between,
     split_globs,
@@ -33,85 +36,29 @@ from orthocal.cli.sheet import sheet_or_problem
 from orthocal.errors import ParameterError
 from orthocal.units import MM
 
-if TYPE_CHECKING:
-    from orthocal.planning.equipment import Equipment
-    from orthocal.planning.plan import MeasuringPlan
-    from orthocal.robot.model import Robot
-    from orthocal.session.session import Session
-
 FILES = ("session.yaml", "readings.csv", "plan.json", "plan.svg", "sheet.html")
 
 
-@app.command()
+@command()
 def plan(
-    subject: Annotated[
-        str,
-        Argument(
-            metavar="ROBOT|SESSION",
-            help="A robot, or a measured session that the plan complements.",
-        ),
-    ],
+    subject: str,
     model: Model = None,
-    setups: Annotated[
-        int | None, Option(min=1, metavar="N", help="Number of setups; default: 6.")
-    ] = None,
-    readings: Annotated[
-        int | None,
-        Option(min=2, metavar="N", help="Number of readings in all setups; default: 3 per setup."),
-    ] = None,
+    setups: Positive = None,
+    readings: Annotated[int | None, Option(min=2)] = None,
     hours: Hours = None,
-    add: Annotated[
-        int | None, Option(min=1, metavar="N", help="Number of further setups for a session.")
-    ] = None,
+    add: Positive = None,
     gauge: Gauge = None,
-    touches: Annotated[
-        str | None,
-        Option(metavar="RODS", help="Rods that the gauge can touch, separated by commas."),
-    ] = None,
-    sections: Annotated[
-        str | None,
-        Option(
-            metavar="FRACTIONS",
-            help="Sections as fractions of a leg's length from its root; default: 0.25,0.5,0.75.",
-        ),
-    ] = None,
-    box: Annotated[
-        str | None,
-        Option(
-            metavar="LOW:HIGH,...",
-            help="Region of the postures, mm: one range for all coordinates or one for each; "
-            "default: up to 100 mm from the mechanical zero.",
-        ),
-    ] = None,
-    along: Annotated[
-        int, Option(min=2, max=50, metavar="N", help="Number of positions along a leg's direction.")
-    ] = 9,
-    across_mm: Annotated[
-        float, Option(metavar="MM", help="Displacement across that direction, to either side.")
-    ] = 20.0,
-    minutes_a_setup: Annotated[
-        float, Option(metavar="MINUTES", help="Duration of a setup.")
-    ] = 10.0,
-    minutes_a_reading: Annotated[
-        float, Option(metavar="MINUTES", help="Duration of a reading.")
-    ] = 0.5,
+    touches: str | None = None,
+    sections: str | None = None,
+    box: str | None = None,
+    along: Annotated[int, Option(min=2, max=50)] = 9,
+    across_mm: float = 20.0,
+    minutes_a_setup: float = 10.0,
+    minutes_a_reading: float = 0.5,
     workspace_mm: WorkspaceMm = None,
-    criterion: Annotated[
-        str,
-        Option(
-            metavar="aligned|relative|absolute|worst|A|D|E",
-            help="Figure to minimise: RMS tool error after aligning the workpiece, "
-            "after shifting it, or absolute; worst tool error; or trace, determinant or "
-            "largest eigenvalue of the covariance.",
-        ),
-    ] = "aligned",
+    criterion: str = "aligned",
     tolerance: Tolerances = None,
-    starts: Annotated[
-        int | None,
-        Option(
-            min=1, max=100, metavar="N", help="Number of starts of the search; default: 3 or more."
-        ),
-    ] = None,
+    starts: Annotated[int | None, Option(min=1, max=100)] = None,
     seed: Seed = 0,
     workers: Workers = None,
     out: OptionalOutDirectory = None,
@@ -122,14 +69,30 @@ def plan(
     """Choose setups and postures for the smallest tool error.
 
     With --out the directory receives session.yaml, an empty readings.csv and a measuring sheet.
+
+    Args:
+        subject (ROBOT|SESSION): A robot, or a measured session that the plan complements.
+        setups (N): Number of setups; default: 6.
+        readings (N): Number of readings in all setups; default: 3 per setup.
+        add (N): Number of further setups for a session.
+        touches (RODS): Rods that the gauge can touch, separated by commas.
+        sections (FRACTIONS): Sections as fractions of a leg's length from its root; default:
+            0.25,0.5,0.75.
+        box (LOW:HIGH,...): Region of the postures, mm: one range for all coordinates or one for
+            each; default: up to 100 mm from the mechanical zero.
+        along (N): Number of positions along a leg's direction.
+        across_mm (MM): Displacement across that direction, to either side.
+        minutes_a_setup (MINUTES): Duration of a setup.
+        minutes_a_reading (MINUTES): Duration of a reading.
+        criterion (aligned|relative|absolute|worst|A|D|E): Figure to minimise: RMS tool error after
+            aligning the workpiece, after shifting it, or absolute; worst tool error; or trace,
+            determinant or largest eigenvalue of the covariance.
+        starts (N): Number of starts of the search; default: 3 or more.
     """
-    from orthocal.estimation.choice import Choice
-    from orthocal.estimation.selection import read_tolerances
     from orthocal.kinematics.workspace import box_workspace, coordinate_letters
     from orthocal.output.text.plan import plan_json
     from orthocal.output.text.summary import print_summary
     from orthocal.planning.expected_error import CRITERIA
-    from orthocal.planning.plan import plan_readings
     from orthocal.runtime.worker_pool import available_cores, worker_budget
 
     if criterion not in CRITERIA:
@@ -139,7 +102,9 @@ def plan(
     if out is not None:
         require_new_files(out, FILES, force=force)
         require_no_readings(out)
-    robot, measured, reference = _load(subject)
+    session, robot = load_robot_or_session(subject)
+    measured = None if session is None else orthocal.load_session(subject)
+    reference = subject if measured is None else measured.robot_reference
     if add is not None and measured is None:
         raise ParameterError("needs a session; found a robot", where="--add")
     if add is not None and setups is not None:
@@ -155,14 +120,13 @@ def plan(
         minutes_a_setup=minutes_a_setup,
         minutes_a_reading=minutes_a_reading,
     )
-    tolerances = read_tolerances(tolerance or [], robot.parameters, where="--tolerance")
     workspace = None
     if workspace_mm is not None:
         workspace = box_workspace(robot, read_workspace(workspace_mm, robot))
     count = workers or available_cores()
-    found = plan_readings(
+    chosen = orthocal.plan_readings(
         robot,
-        Choice(model, tolerances=tolerances),
+        orthocal.Choice(model, tolerances=read_tolerances(tolerance, robot)),
         setups=setups if add is None else add,
         readings=readings,
         hours=hours,
@@ -176,7 +140,7 @@ def plan(
         workers=count,
         report=lambda text: put_note(f"orthocal: {text}"),
     )
-    deliver(partial(plan_json, found), partial(print_summary, found, details=details), json=json)
+    deliver(lambda: plan_json(chosen), lambda: print_summary(chosen, details=details), json=json)
     if gauge is not None and equipment.tip is None:
         put_note(
             f"orthocal: {gauge} states no tip: the plan is for the line between the rods, which "
@@ -184,12 +148,11 @@ def plan(
         )
     if out is not None:
         with worker_budget(count):
-            _write(found, out)
+            _write(chosen, out)
 
 
-def _write(plan: MeasuringPlan, directory: Path) -> None:
+def _write(plan: orthocal.MeasuringPlan, directory: Path) -> None:
     """Write a plan as a session with its sheet and its figure."""
-    from orthocal.measurement.files.write_session import write_session
     from orthocal.output.text.plan import draw_plan, plan_json
     from orthocal.runtime.worker_pool import call_in_parallel
 
@@ -208,39 +171,22 @@ def _write(plan: MeasuringPlan, directory: Path) -> None:
     if problem:
         put_note(problem)
     files = {"plan.json": plan_json(plan), "plan.svg": figure, **sheet}
-    path = write_session(plan.session, directory, comment=comment, extra=files, blank=True)
+    path = orthocal.write_session(plan.session, directory, comment=comment, extra=files, blank=True)
     paper = ", sheet.html and its programs" if sheet else ""
     put_note(f"Wrote {path}, an empty readings.csv, plan.json, plan.svg{paper}")
 
 
-def _load(subject: str) -> tuple[Robot, Session | None, str]:
-    """Robot, measured session, and the name of the robot in a session."""
-    from orthocal.output.text.subject import load_subject
-    from orthocal.robot.model import Robot
-    from orthocal.session.session import Session
-
-    found = load_subject(subject)
-    if isinstance(found, Session):
-        from orthocal.measurement.files.session_file import load_session
-
-        measured = load_session(subject)
-        return measured.robot, measured, measured.robot_reference
-    if isinstance(found, Robot):
-        return found, None, subject
-    raise ParameterError("is a calibration; expected a robot or a session", where=subject)
-
-
 def _equipment(
     gauge: Path | None,
-    measured: Session | None,
+    measured: orthocal.Session | None,
     *,
     rods: list[str],
     sections: str | None,
     across_mm: float,
     **others: Any,  # noqa: ANN401 - fields of the equipment
-) -> Equipment:
+) -> orthocal.Equipment:
     """Equipment of the options, with the gauge of a file or of a measured session."""
-    from orthocal.planning.equipment import SECTIONS, Equipment, equipment_of, load_dial
+    from orthocal.planning.equipment import SECTIONS, equipment_of, load_dial
 
     for name in ("minutes_a_setup", "minutes_a_reading"):
         require_between(others[name], 0.0, 1e4, f"--{name.replace('_', '-')}")
@@ -252,7 +198,9 @@ def _equipment(
             raise ParameterError(
                 f"found {value:g}; expected 0 (root) to 1 (tip)", where="--sections"
             )
-    equipment = Equipment(rods=tuple(rods), sections=fractions, across=across_mm * MM, **others)
+    equipment = orthocal.Equipment(
+        rods=tuple(rods), sections=fractions, across=across_mm * MM, **others
+    )
     if gauge is not None:
         return load_dial(gauge, equipment)
     return equipment if measured is None else equipment_of(measured, equipment)

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
-from orthocal.errors import SessionError
+import orthocal
+from orthocal.errors import ClosureError, OrthocalError, SessionError, SolverError
+from orthocal.io.files import Content, write_files
 from orthocal.text import printable
 
 if TYPE_CHECKING:
     from orthocal.assessment.tool_tables import Chunk
-    from orthocal.calibration.assessment_record import Decision
-    from orthocal.io.files import Content
+
+    Judged = orthocal.Assessment | orthocal.Calibration | orthocal.Comparison | orthocal.Validation
 
 
 def put_out(text: str) -> None:
@@ -41,9 +44,8 @@ def deliver(
     json: bool,
     out: Path | None = None,
     files: Callable[[], Mapping[str, Content]] = dict,
-    decision: Decision | None = None,
 ) -> None:
-    """Print a result, write its files, and exit with the code of its decision.
+    """Print a result and write its files.
 
     Args:
         document: The result as JSON.
@@ -51,10 +53,6 @@ def deliver(
         json: True to print JSON instead of text.
         out: Directory of the files; None to write none.
         files: Names and contents of the files.
-        decision: Decision about the result, if there is one.
-
-    Raises:
-        typer.Exit: With the code of the decision if it is not 0.
     """
     if json:
         put_out(document().rstrip("\n"))
@@ -62,14 +60,54 @@ def deliver(
         show()
     if out is not None:
         write_results(out, files())
-    if decision is not None and decision.exit_code:
-        raise typer.Exit(decision.exit_code)
+
+
+def deliver_judged(
+    result: Judged,
+    *,
+    json: bool,
+    out: Path | None = None,
+    files: Callable[[], Mapping[str, Content]] = dict,
+    **shown: Any,  # noqa: ANN401 - arguments of `print_summary`
+) -> None:
+    """Print a result with a decision about readings, and exit with its code; see `deliver`.
+
+    Raises:
+        typer.Exit: With the code of the decision if it is not 0.
+    """
+    from orthocal.calibration.assessment_record import Assessment
+    from orthocal.output.text.answer import print_decision
+    from orthocal.output.text.summary import assessment_in, print_summary, result_json
+
+    def show() -> None:
+        if isinstance(result, Assessment):
+            print_decision(result)
+        else:
+            print_summary(result, **shown)
+
+    deliver(lambda: result_json(result), show, json=json, out=out, files=files)
+    if code := assessment_in(result).decision.exit_code:
+        raise typer.Exit(code)
+
+
+@contextmanager
+def judgement_on_failure(session: orthocal.Session, *, json: bool) -> Iterator[None]:
+    """Print the judgement of the readings in place of a failure of the solver that it explains."""
+    try:
+        yield
+    except (SolverError, ClosureError) as failure:
+        try:
+            assessment = orthocal.check_session(session)
+        except OrthocalError:
+            raise failure from None
+        if not assessment.decision.exit_code:
+            raise
+        put_note(f"orthocal: {failure}")
+        deliver_judged(assessment, json=json)
 
 
 def write_results(directory: Path, files: Mapping[str, Content]) -> None:
     """Write the files of a result, all or none, and name them on stderr."""
-    from orthocal.io.files import write_files
-
     write_files(directory, files)
     put_note(f"Wrote {' and '.join(str(directory / name) for name in files)}")
 

@@ -6,11 +6,11 @@ import io
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from orthocal.cli.options import app
+from orthocal.cli.options import command
 from orthocal.cli.printing import put_out
 from orthocal.errors import OrthocalError, SessionError
 from orthocal.runtime.interrupts import INTERRUPTED, raised_interrupt
@@ -27,22 +27,17 @@ LONGEST_LINE = 10_000
 """Characters of a line that are read at a time; a reading has ten."""
 
 
-@app.command()
-def record(
-    session: Annotated[
-        Path,
-        typer.Argument(
-            metavar="SESSION",
-            help="session.yaml of a plan, with an empty readings.csv or none, or the directory "
-            "that contains it.",
-        ),
-    ],
-) -> None:
+@command()
+def record(session: Path) -> None:
     """Record readings one at a time, with warnings of mistakes.
 
     The position of stand and machine is printed for each reading. Every reading is on disk before
     the next one is asked for. An interrupted recording continues at the first missing reading.
     From a pipe each line counts as typed. Warnings are those of `check` for the readings so far.
+
+    Args:
+        session (SESSION): session.yaml of a plan, with an empty readings.csv or none, or the
+            directory that contains it.
     """
     from orthocal.measurement.recording import open_recording
 

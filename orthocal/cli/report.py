@@ -3,30 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
-from typer import Option
-
-from orthocal.cli.options import CalibrationPath, app
+import orthocal
+from orthocal.cli.options import CalibrationPath, command
 from orthocal.cli.printing import put_note
+from orthocal.io.files import is_folder, require_writable_file
 
 
-@app.command()
-def report(
-    calibration: CalibrationPath,
-    out: Annotated[
-        Path | None,
-        Option(help="Page, or existing directory; default: report.html beside the calibration."),
-    ] = None,
-) -> None:
-    """Write the report of a calibration as a page."""
-    from orthocal.calibration.file import load_calibration
-    from orthocal.io.files import is_folder, require_writable_file
-    from orthocal.output.report.page import write_report
+@command()
+def report(calibration: CalibrationPath, out: Path | None = None) -> None:
+    """Write the report of a calibration as a page.
 
-    result = load_calibration(calibration)
+    Args:
+        out: Page, or existing directory; default: report.html beside the calibration.
+    """
+    result = orthocal.load_calibration(calibration)
     target = out or (Path() if result.path is None else result.path.parent)
     if is_folder(target):
         target = target / "report.html"
     require_writable_file(target, kinds=(".html", ".htm"))
-    put_note(f"Wrote {write_report(result, target)}")
+    put_note(f"Wrote {orthocal.write_report(result, target)}")

@@ -2,30 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
-
-from typer import Option
-
+import orthocal
 from orthocal.cli.files import require_new_files
-from orthocal.cli.options import Force, OptionalOutDirectory, PlanPath, app, read_numbers
+from orthocal.cli.options import Force, OptionalOutDirectory, PlanPath, command, read_numbers
 from orthocal.cli.printing import put_note
 from orthocal.errors import OrthocalError
-
-if TYPE_CHECKING:
-    from orthocal.session.session import Session
+from orthocal.io.files import is_folder, write_files
 
 
-@app.command()
+@command()
 def sheet(
     session: PlanPath,
-    feed: Annotated[float, Option(metavar="MM/MIN", help="Feed between postures.")] = 600.0,
-    approach_feed: Annotated[
-        float, Option(metavar="MM/MIN", help="Feed over the last millimetres to a posture.")
-    ] = 120.0,
-    shift_mm: Annotated[
-        str,
-        Option(metavar="X,Y,Z", help="Machine coordinates (G53) of the origin of the world, mm."),
-    ] = "0,0,0",
+    feed: float = 600.0,
+    approach_feed: float = 120.0,
+    shift_mm: str = "0,0,0",
     out: OptionalOutDirectory = None,
     force: Force = False,
 ) -> None:
@@ -33,9 +23,12 @@ def sheet(
 
     The programs pause in the alignment posture of each setup and at each reading. Without --out
     the files are written beside the session.
+
+    Args:
+        feed (MM/MIN): Feed between postures.
+        approach_feed (MM/MIN): Feed over the last millimetres to a posture.
+        shift_mm (X,Y,Z): Machine coordinates (G53) of the origin of the world, mm.
     """
-    from orthocal.io.files import is_folder, write_files
-    from orthocal.measurement.files.session_file import load_plan
     from orthocal.measurement.motion.motion_program import ProgramOptions
     from orthocal.output.sheet.page import sheet_files
 
@@ -43,7 +36,7 @@ def sheet(
     options = ProgramOptions(feed=feed, approach_feed=approach_feed, shift_mm=(x, y, z))
     directory = out or (session if is_folder(session) else session.parent)
     require_new_files(directory, ())
-    files = sheet_files(load_plan(session), options=options)
+    files = sheet_files(orthocal.load_plan(session), options=options)
     require_new_files(directory, files, force=force)
     write_files(directory, files)
     programs = len(files) - 1
@@ -51,7 +44,7 @@ def sheet(
     put_note(f"Wrote {directory / 'sheet.html'} to print{more}")
 
 
-def sheet_or_problem(session: Session) -> tuple[dict[str, str], str]:
+def sheet_or_problem(session: orthocal.Session) -> tuple[dict[str, str], str]:
     """Files of the measuring sheet, or no files and the reason."""
     from orthocal.output.sheet.page import sheet_files
 

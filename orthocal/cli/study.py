@@ -5,12 +5,12 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Option
 
+import orthocal
 from orthocal.cli.options import (
     LARGEST_MM,
     AllRows,
@@ -28,21 +28,22 @@ from orthocal.cli.options import (
     Tolerances,
     Workers,
     app,
+    command,
+    load_robot_or_session,
     make_group,
     read_numbers,
+    read_tolerances,
     read_workspace,
     require_between,
     split_globs,
 )
 from orthocal.cli.printing import deliver, put_note
 from orthocal.errors import ParameterError
+from orthocal.io.files import Content, exists, require_writable
 from orthocal.units import MM
 
 if TYPE_CHECKING:
-    from orthocal.robot.model import Robot
-    from orthocal.session.session import Session
     from orthocal.study.runner import Progress
-    from orthocal.study.study import Study
 
 studies = make_group("Simulate many machines, or resample readings.")
 app.add_typer(studies, name="study")
@@ -53,6 +54,8 @@ FILES = ("study.json", "results.parquet", "study.svg")
 PROGRESS_STEP = 0.1
 """Share of a study between two lines of progress."""
 
+Count = Annotated[int, Option(min=2, max=1_000_000)]
+Size = Annotated[int, Option(min=1, max=10_000)]
 Dask = Annotated[
     str | None, Option(metavar="ADDRESS", help="Run on a Dask cluster; address of its scheduler.")
 ]
@@ -68,21 +71,13 @@ LegMm = Annotated[
 ]
 
 
-@studies.command()
+@command(studies)
 def accuracy(
     plan: PlanPath,
     model: Model = None,
     free: Free = None,
-    machines: Annotated[
-        int, Option(min=2, max=1_000_000, metavar="N", help="Number of machines.")
-    ] = 1000,
-    draw: Annotated[
-        list[str] | None,
-        Option(
-            metavar="MODEL|GLOBS",
-            help="Errors that are random, within their tolerances; default: all.",
-        ),
-    ] = None,
+    machines: Count = 1000,
+    draw: list[str] | None = None,
     error: Error = None,
     errors: Errors = None,
     tolerance: Tolerances = None,
@@ -98,31 +93,30 @@ def accuracy(
     """Predict the tool error of many machines after calibration.
 
     A stopped study is resumed from its directory; --force starts again.
+
+    Args:
+        machines (N): Number of machines.
+        draw (MODEL|GLOBS): Errors that are random, within their tolerances; default: all.
     """
-    from orthocal.estimation.choice import Choice
-    from orthocal.estimation.selection import read_tolerances
-    from orthocal.io.files import exists
-    from orthocal.measurement.files.session_file import load_plan
     from orthocal.observation.simulate import collect_errors
     from orthocal.robot.loading import packaged_robots
-    from orthocal.study.accuracy import build_accuracy_study
 
     if not exists(plan) and str(plan) in packaged_robots():
         raise ParameterError(
             f"is a robot; expected a session.yaml, which `orthocal plan {plan} --out ...` writes",
             where=str(plan),
         )
-    session = load_plan(plan)
+    session = orthocal.load_plan(plan)
     robot = session.robot
     fixed = {}
     if error or errors is not None:
         fixed = collect_errors(robot, file=errors, single=error or [])
-    tolerances = read_tolerances(tolerance or [], robot.parameters, where="--tolerance")
+    tolerances = read_tolerances(tolerance, robot)
     if half_side_mm is not None:
         read_workspace(f"{half_side_mm:g}", robot, where="--half-side-mm")
-    study = build_accuracy_study(
+    study = orthocal.build_accuracy_study(
         session,
-        Choice(model, free=split_globs(free), tolerances=tolerances),
+        orthocal.Choice(model, free=split_globs(free), tolerances=tolerances),
         drawn=_parameter_globs(draw, robot),
         fixed=fixed,
         machines=machines,
@@ -132,51 +126,19 @@ def accuracy(
     _run(study, out, workers, dask, json=json, all_rows=all_rows, force=force)
 
 
-@studies.command()
+@command(studies)
 def linearisation(
     subject: Subject = "orthoglide",
-    free: Annotated[
-        list[str] | None, Option(metavar="GLOBS", help="Errors that grow; default: offsets.")
-    ] = None,
-    largest_mm: Annotated[
-        float, Option(metavar="SIZE", help="Largest size of the errors, mm or mrad.")
-    ] = 50.0,
-    sizes: Annotated[
-        int, Option(min=1, max=10_000, metavar="N", help="Number of sizes, from 0.1 mm on.")
-    ] = 40,
-    directions: Annotated[
-        int,
-        Option(min=1, max=10_000, metavar="N", help="Number of random directions of the errors."),
-    ] = 25,
-    along: Annotated[
-        str | None, Option(metavar="A,B,...", help="One direction instead, such as 1,-0.6,0.3.")
-    ] = None,
-    max_mm: Annotated[
-        float | None,
-        Option(
-            metavar="MM",
-            help="Displacement of the paper's maximum postures; default: 60 mm, scaled with legs.",
-        ),
-    ] = None,
-    min_mm: Annotated[
-        float | None,
-        Option(
-            metavar="MM",
-            help="Displacement of its minimum postures; default: -100 mm, scaled with legs.",
-        ),
-    ] = None,
+    free: list[str] | None = None,
+    largest_mm: float = 50.0,
+    sizes: Size = 40,
+    directions: Size = 25,
+    along: str | None = None,
+    max_mm: float | None = None,
+    min_mm: float | None = None,
     leg_mm: LegMm = None,
-    sigma_mm: Annotated[
-        float | None,
-        Option(
-            metavar="MM",
-            help="Standard deviation of a reading, mm; default: 0.02, as in the paper.",
-        ),
-    ] = None,
-    resolution_mm: Annotated[
-        float | None,
-        Option(metavar="MM", help="Resolution of a reading, mm; default: 0.01, as in the paper."),
-    ] = None,
+    sigma_mm: float | None = None,
+    resolution_mm: float | None = None,
     seed: Seed = 0,
     workers: Workers = None,
     dask: Dask = None,
@@ -184,14 +146,22 @@ def linearisation(
     json: Json = False,
     force: Force = False,
 ) -> None:
-    """Compare linearised with exact identification as errors grow."""
-    from orthocal.builder.machine_file import Dimensions
-    from orthocal.planning.first_plan import PAPER_GAUGE, Displacements
-    from orthocal.robot.model import Robot
-    from orthocal.session.session import Gauge
-    from orthocal.study.linearisation import build_linearisation_study
+    """Compare linearised with exact identification as errors grow.
 
-    scale = leg_mm * MM / Dimensions().leg if leg_mm is not None and leg_mm > 0.0 else 1.0
+    Args:
+        free (GLOBS): Errors that grow; default: offsets.
+        largest_mm (SIZE): Largest size of the errors, mm or mrad.
+        sizes (N): Number of sizes, from 0.1 mm on.
+        directions (N): Number of random directions of the errors.
+        along (A,B,...): One direction instead, such as 1,-0.6,0.3.
+        max_mm (MM): Displacement of the paper's maximum postures; default: 60 mm, scaled with legs.
+        min_mm (MM): Displacement of its minimum postures; default: -100 mm, scaled with legs.
+        sigma_mm (MM): Standard deviation of a reading, mm; default: 0.02, as in the paper.
+        resolution_mm (MM): Resolution of a reading, mm; default: 0.01, as in the paper.
+    """
+    from orthocal.planning.first_plan import PAPER_GAUGE, Displacements
+
+    scale = _scale_of(leg_mm) if leg_mm is not None and leg_mm > 0.0 else 1.0
     usual = Displacements()
     maximum = scale * usual.maximum / MM if max_mm is None else max_mm
     minimum = scale * usual.minimum / MM if min_mm is None else min_mm
@@ -201,17 +171,17 @@ def linearisation(
     for name, value in (("--sigma-mm", sigma_mm), ("--resolution-mm", resolution_mm)):
         if value is not None:
             require_between(value, 0.0, 1e3, name)
-    with _robot_or_session(subject, leg_mm) as source:
-        gauge = PAPER_GAUGE if isinstance(source, Robot) else source.gauge
-        study = build_linearisation_study(
-            source,
+    with _source(subject, leg_mm) as (session, robot):
+        gauge = PAPER_GAUGE if session is None else session.gauge
+        study = orthocal.build_linearisation_study(
+            session or robot,
             free=split_globs(free) or ("*.offset",),
             largest=largest_mm,
             count=sizes,
             directions=directions,
             along=None if along is None else read_numbers(along, "--along"),
             displacements=Displacements(maximum * MM, minimum * MM),
-            gauge=Gauge(
+            gauge=orthocal.Gauge(
                 gauge.sigma if sigma_mm is None else sigma_mm * MM,
                 gauge.resolution if resolution_mm is None else resolution_mm * MM,
                 None,
@@ -221,34 +191,24 @@ def linearisation(
     _run(study, out, workers, dask, json=json, all_rows=False, force=force)
 
 
-@studies.command()
+@command(studies)
 def sensitivity(
     subject: Subject = "orthoglide",
-    free: Annotated[
-        list[str] | None,
-        Option(
-            metavar="MODEL|GLOBS", help="Errors; default: all that change a reading or the tool."
-        ),
-    ] = None,
-    at: Annotated[
-        list[str] | None,
-        Option(
-            metavar="X,Y,Z",
-            help="Tool position, mm, at which every setup is read. Can be repeated.",
-        ),
-    ] = None,
+    free: list[str] | None = None,
+    at: list[str] | None = None,
     leg_mm: LegMm = None,
     out: OptionalOutDirectory = None,
     json: Json = False,
     all_rows: AllRows = False,
     force: Force = False,
 ) -> None:
-    """Print how each error changes readings and tool position."""
-    from orthocal.robot.model import Robot
-    from orthocal.study.sensitivity import build_sensitivity_study
+    """Print how each error changes readings and tool position.
 
-    with _robot_or_session(subject, leg_mm) as source:
-        robot = source if isinstance(source, Robot) else source.robot
+    Args:
+        free (MODEL|GLOBS): Errors; default: all that change a reading or the tool.
+        at (X,Y,Z): Tool position, mm, at which every setup is read. Can be repeated.
+    """
+    with _source(subject, leg_mm) as (session, robot):
         count = 0 if robot.tcp is None else len(robot.tcp.coordinates)
         points = []
         for text in at or []:
@@ -258,23 +218,19 @@ def sensitivity(
                     f"'{text}' has {len(point)} numbers; expected {count}", where="--at"
                 )
             points.append([v * MM for v in point])
-        study = build_sensitivity_study(
-            source, _parameter_globs(free, robot), points=points or None
+        study = orthocal.build_sensitivity_study(
+            session or robot, _parameter_globs(free, robot), points=points or None
         )
     _run(study, out, 1, None, json=json, all_rows=all_rows, force=force)
 
 
-@studies.command()
+@command(studies)
 def bootstrap(
     session: SessionPath,
     model: Model = None,
     free: Free = None,
-    by: Annotated[
-        str, Option(metavar="residuals|cycles", help="Resample residuals or cycles of setups.")
-    ] = "residuals",
-    draws: Annotated[
-        int, Option(min=2, max=1_000_000, metavar="N", help="Number of draws.")
-    ] = 1000,
+    by: str = "residuals",
+    draws: Count = 1000,
     tolerance: Tolerances = None,
     seed: Seed = 0,
     workers: Workers = None,
@@ -284,19 +240,19 @@ def bootstrap(
     all_rows: AllRows = False,
     force: Force = False,
 ) -> None:
-    """Estimate the scatter of errors by resampling a session."""
-    from orthocal.estimation.choice import Choice
-    from orthocal.estimation.selection import read_tolerances
-    from orthocal.measurement.files.session_file import load_session
-    from orthocal.study.bootstrap import build_bootstrap_study
+    """Estimate the scatter of errors by resampling a session.
 
+    Args:
+        by (residuals|cycles): Resample residuals or cycles of setups.
+        draws (N): Number of draws.
+    """
     if by not in ("residuals", "cycles"):
         raise ParameterError(f"found '{by}'; expected residuals or cycles", where="--by")
-    measured = load_session(session)
-    tolerances = read_tolerances(tolerance or [], measured.robot.parameters, where="--tolerance")
-    study = build_bootstrap_study(
+    measured = orthocal.load_session(session)
+    tolerances = read_tolerances(tolerance, measured.robot)
+    study = orthocal.build_bootstrap_study(
         measured,
-        Choice(model, free=split_globs(free), tolerances=tolerances),
+        orthocal.Choice(model, free=split_globs(free), tolerances=tolerances),
         by="cycles" if by == "cycles" else "residuals",
         draws=draws,
         seed=seed,
@@ -305,7 +261,7 @@ def bootstrap(
 
 
 def _run(
-    study: Study,
+    study: orthocal.Study,
     out: Path | None,
     workers: int | None,
     dask: str | None,
@@ -315,7 +271,6 @@ def _run(
     force: bool,
 ) -> None:
     """Run a study, print its report and write its files."""
-    from orthocal.io.files import Content, require_writable
     from orthocal.output.text.layout import print_rich
     from orthocal.output.text.study import render_report, report_study, study_json
     from orthocal.runtime.interrupts import message_at_interrupt
@@ -342,11 +297,16 @@ def _run(
     with worker_budget(1 if dask is not None else count):
         report = report_study(table, all_rows=all_rows)
         document = study_json(table, report)
-        show = partial(print_rich, render_report(report))
-        deliver(lambda: document, show, json=json, out=out, files=files)
+        deliver(
+            lambda: document,
+            lambda: print_rich(render_report(report)),
+            json=json,
+            out=out,
+            files=files,
+        )
 
 
-def _progress_lines(study: Study) -> Callable[[Progress], None] | None:
+def _progress_lines(study: orthocal.Study) -> Callable[[Progress], None] | None:
     """Function that prints a line on stderr after each tenth of a study of several tasks."""
     if len(study.task_sizes) < 2:
         return None
@@ -375,33 +335,30 @@ def _duration(seconds: float) -> str:
 
 
 @contextmanager
-def _robot_or_session(subject: str, leg_mm: float | None) -> Iterator[Robot | Session]:
-    """The session to study, or the robot, with another leg length if there is one."""
-    from orthocal.builder.build import make_robot
-    from orthocal.builder.machine_file import Dimensions
-    from orthocal.output.text.subject import load_subject
-    from orthocal.robot.model import Robot
-    from orthocal.session.session import Session
-
-    source = load_subject(subject)
-    if not isinstance(source, Robot | Session):
-        raise ParameterError("is a calibration; expected a robot or a session", where=subject)
+def _source(
+    subject: str, leg_mm: float | None
+) -> Iterator[tuple[orthocal.Session | None, orthocal.Robot]]:
+    """The session to study, if there is one, and the robot, with another leg length if stated."""
+    session, robot = load_robot_or_session(subject)
     if leg_mm is None:
-        yield source
+        yield session, robot
         return
-    if not isinstance(source, Robot) or source.name != "orthoglide":
+    if session is not None or robot.name != "orthoglide":
         raise ParameterError("applies to the robot orthoglide alone", where="--leg-mm")
-    usual, leg = Dimensions(), leg_mm * MM
-    scale = leg / usual.leg
-    dimensions = Dimensions(leg, scale * usual.lower, scale * usual.upper)
+    usual, scale = orthocal.Dimensions(), _scale_of(leg_mm)
+    dimensions = orthocal.Dimensions(leg_mm * MM, scale * usual.lower, scale * usual.upper)
     problem = dimensions.find_problem()
     if problem:
         raise ParameterError(problem[1], where="--leg-mm")
     with tempfile.TemporaryDirectory() as directory:
-        yield make_robot(dimensions, Path(directory) / "orthoglide")
+        yield None, orthocal.make_robot(dimensions, Path(directory) / "orthoglide")
 
 
-def _parameter_globs(texts: list[str] | None, robot: Robot) -> tuple[str, ...] | None:
+def _scale_of(leg_mm: float) -> float:
+    return leg_mm * MM / orthocal.Dimensions().leg
+
+
+def _parameter_globs(texts: list[str] | None, robot: orthocal.Robot) -> tuple[str, ...] | None:
     """Globs of error parameters; the name of a model selects those of the model."""
     models = robot.parameters.models
     globs = split_globs(texts)

@@ -121,9 +121,15 @@ def result_json(result: Calibration | Validation | Comparison | Assessment) -> s
     if isinstance(result, Calibration):
         from orthocal.calibration.file import calibration_document
 
-        document, assessment = calibration_document(result), assessment_of(result)
-    elif isinstance(result, Assessment):
-        document, assessment = {}, result
+        document = calibration_document(result)
     else:
-        document, assessment = json.loads(result.to_json()), result.assessment
-    return json.dumps(document | assessment.to_document(), indent=1, allow_nan=False) + "\n"
+        document = {} if isinstance(result, Assessment) else json.loads(result.to_json())
+    document |= assessment_in(result).to_document()
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
+def assessment_in(result: Calibration | Validation | Comparison | Assessment) -> Assessment:
+    """The assessment of readings that a result contains."""
+    if isinstance(result, Calibration):
+        return assessment_of(result)
+    return result if isinstance(result, Assessment) else result.assessment
