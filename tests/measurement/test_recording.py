@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from orthocal import load_session
-from orthocal.cli import record as command
+from orthocal.cli import record, recording
 from orthocal.errors import OrthocalError, OutputError, SessionError
 from orthocal.io.tables.numerals import parse_typed_reading
 from orthocal.measurement import recording as module
@@ -311,7 +311,7 @@ def talk(folder, lines, said):
     sys.stdin = os.fdopen(0, "r", encoding="utf-8", closefd=False)
     sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
     with ending_at_interrupt():
-        command.record(folder)
+        record.record(folder)
 
 
 KEPT = re.compile(r"Recorded: row \d+, (\S+) (\S+?)(?:, cycle (\d+))?: (-?[0-9.]+) mm\n")
@@ -320,9 +320,15 @@ KEPT = re.compile(r"Recorded: row \d+, (\S+) (\S+?)(?:, cycle (\d+))?: (-?[0-9.]
 def test_killed_many_times_no_accepted_reading_is_lost(tmp_path, monkeypatch):
     """Killed while lines come in as fast as they are taken, among them corrections and repeats."""
     monkeypatch.setenv("COLUMNS", "100")
+<<<<<<< HEAD
     folder = make_plan(tmp_path / "session", cycles=60)  # more than are read before all ends
     monkeypatch.setattr(command._Dialogue, "_is_doubtful", lambda *_: False)
     monkeypatch.setattr(command._Dialogue, "_judge", lambda *_: None)
+=======
+    folder = make_plan(tmp_path / "session", cycles=150)  # more than are read before all ends
+    monkeypatch.setattr(recording.Dialogue, "_is_doubtful", lambda *_: False)
+    monkeypatch.setattr(recording.Dialogue, "_judge", lambda *_: None)
+>>>>>>> 42c6241 (The dialogue of record is a module that its command loads; its commands are in one table)
     robot = load_plan(folder).robot
     monkeypatch.setattr(session_file, "load_robot", lambda *_, **__: robot)
     rng = np.random.default_rng(0)

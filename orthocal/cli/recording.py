@@ -1,0 +1,340 @@
+"""Dialogue in which readings are recorded."""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+
+import numpy as np
+
+from orthocal.assessment.judgement import find_warnings, is_doubtful, judge_session
+from orthocal.calibration.assessment_record import Finding
+from orthocal.cli.printing import put_out
+from orthocal.errors import OrthocalError, SessionError
+from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.io.tables.numerals import parse_typed_reading
+from orthocal.measurement.recording import Recording
+from orthocal.output.text.recording import COMMANDS, RecordingText, find_rows
+from orthocal.runtime.interrupts import raised_interrupt
+from orthocal.session.session import ReadingKey
+from orthocal.text import printable, shorten
+
+LONGEST_LINE = 10_000
+"""Characters of a line that are read at a time; a reading has ten."""
+
+
+class _EndOfDialogue(Exception):
+    """End of the input, or the command `quit`."""
+
+
+class Dialogue:
+    """Questions and answers about the rows of a recording."""
+
+    def __init__(self, recording: Recording, path: str) -> None:
+        self._recording = recording
+        self._path = path
+        self._text = RecordingText(recording)
+        self._warnings: tuple[Finding, ...] = ()
+        """Findings about the readings so far."""
+        self._can_judge = True
+        """Whether readings are judged: the robot can be calibrated."""
+        self._skipped: set[ReadingKey] = set()
+        self._shown: str | None = None
+        """Setup that was described last."""
+        self._last: int | None = None
+        """Index of the row that was read last."""
+        self._asked: int | None = None
+        """Index of the row that is asked for; None where all are read or skipped."""
+
+    def run(self) -> None:
+        """Ask for readings until none is missing and Enter is typed, or the input ends."""
+        self._say(self._text.introduction())
+        with raised_interrupt(), suppress(_EndOfDialogue):
+            self._judge()
+            self._ask_for_next()
+            while True:
+                self._answer(self._read_line())
+
+    def conclude(self) -> None:
+        """Print the missing rows and the next command."""
+        self._say("", self._text.conclusion(self._warnings, self._path))
+
+    def _ask_for(self, index: int | None) -> None:
+        """Ask for a row; None to ask for no more."""
+        self._asked = index
+        self._show()
+
+    def _ask_for_next(self) -> None:
+        self._ask_for(self._next)
+
+    @property
+    def _next(self) -> int | None:
+        """Index of the first row that is neither read nor skipped."""
+        return self._recording.next_empty(frozenset(self._skipped))
+
+    def _show(self) -> None:
+        index = self._asked
+        if index is None:
+            self._say("", self._text.state(self._warnings))
+            return
+        setup = self._recording.rows[index].setup
+        if setup != self._shown:
+            self._say("", self._text.setup(setup))
+            self._shown = setup
+        self._say("", self._text.row(index))
+
+    def _show_again(self) -> None:
+        self._shown = None
+        self._show()
+
+    def _read_line(self) -> str:
+        """The next line that is typed.
+
+        Raises:
+            _EndOfDialogue: At the end of the input.
+        """
+        prompt = "> "
+        if self._asked is not None:
+            row = self._recording.rows[self._asked]
+            prompt = printable(f"{row.setup} {row.posture} [mm]> ")
+            if len(prompt) > self._text.width // 2:
+                prompt = f"row {self._asked + 1} [mm]> "
+        if sys.stdin is None:
+            raise _EndOfDialogue
+        if isinstance(sys.stdin, io.TextIOWrapper) and sys.stdin.errors != "replace":
+            sys.stdin.reconfigure(errors="replace")  # invalid bytes are no number either
+        if sys.stdin.isatty() and sys.stdout.isatty():
+            with suppress(ImportError):
+                import readline  # noqa: F401 - lines can be edited
+            try:
+                return input(prompt)
+            except EOFError:
+                self._say("")
+                raise _EndOfDialogue from None
+        self._say(prompt.rstrip())
+        line = _read_piped_line()
+        if line and not line.endswith("\n"):
+            self._note(f"Not recorded: '{shorten(line)}', a line without an end.")
+        if not line.endswith("\n"):
+            raise _EndOfDialogue
+        return line
+
+    def _answer(self, line: str) -> None:
+        """Execute a line; errors are printed, and the question is repeated."""
+        word, *arguments = line.split() or [""]
+        try:
+            if not word:
+                self._keep()
+            elif word[0].isalpha() or word == "?":
+                self._command(word.lower(), arguments)
+            else:
+                index = self._require_row()
+                self._record(index, parse_typed_reading(line))
+        except SessionError as e:
+            self._note(f"Not recorded: {e}.")
+
+    def _keep(self) -> None:
+        """Keep the reading of the row that is asked for; end where none is."""
+        if self._asked is None:
+            raise _EndOfDialogue
+        if not self._recording.rows[self._asked].is_read:
+            raise SessionError("type the reading of the dial, or `skip`, or `help`")
+        self._ask_for_next()
+
+    def _record(self, index: int, value: float) -> None:
+        """Record a reading, compare it with its prediction, and judge the readings if necessary."""
+        recording = self._recording
+        corrected = recording.rows[index].is_read
+        recording.read(index, value)
+        row = recording.rows[index]
+        self._skipped.discard(row.key)
+        self._last = index
+        self._say(self._text.confirmation(index))
+        following = self._next
+        is_end_of_setup = following is None or recording.rows[following].setup != row.setup
+        if self._is_doubtful(index) or is_end_of_setup or corrected:
+            self._judge()
+        self._ask_for(following)
+
+    def _is_doubtful(self, index: int) -> bool:
+        """Print the prediction of a reading; whether the reading contradicts it.
+
+        Readings with a warning do not take part in the prediction.
+        """
+        if not self._can_judge:
+            return False
+        rows = self._recording.rows
+        doubted = {i for f in self._warnings for i in find_rows(f, rows)} - {index}
+        session = self._recording.measured(without=doubted)
+        position = sum(r.is_read and i not in doubted for i, r in enumerate(rows[:index]))
+        try:
+            mean, std = LinearModel(session).predict_row(session.values, position)
+        except (OrthocalError, np.linalg.LinAlgError) as e:
+            self._stop_judging(e)
+            return False
+        if prediction := self._text.prediction(mean, std):
+            self._say(prediction)
+        return is_doubtful(session, position, mean, std)
+
+    def _judge(self) -> None:
+        """Judge the readings so far; print new warnings and resolved ones.
+
+        A complete session is judged as by `check`, and its warnings are printed with its state.
+        """
+        recording = self._recording
+        if not self._can_judge or len(recording.missing) == len(recording.rows):
+            self._warnings = ()
+            return
+        try:
+            if recording.missing:
+                warnings = find_warnings(recording.measured())
+            else:
+                findings = judge_session(recording.measured()).findings
+                warnings = tuple(f for f in findings if f.severity != "note")
+        except (OrthocalError, np.linalg.LinAlgError) as e:
+            self._stop_judging(e)
+            return
+        new, resolved = _compare(self._warnings, warnings)
+        self._warnings = warnings
+        if recording.missing:
+            for finding in new:
+                self._say(self._text.warning(finding))
+        if resolved:
+            self._say(self._text.resolved(resolved))
+
+    def _stop_judging(self, error: Exception) -> None:
+        """Print once why readings cannot be judged; they are recorded all the same."""
+        self._can_judge = False
+        self._note(f"Readings are recorded without a check: {error}.")
+
+    def _command(self, word: str, arguments: list[str]) -> None:
+        """Execute a command.
+
+        Raises:
+            SessionError: If it is unknown, or cannot be executed now.
+        """
+        word = {"?": "help", "exit": "quit"}.get(word, word)
+        names = [name for name in COMMANDS if name.startswith(word)]
+        if len(names) != 1:
+            which = f" ({' or '.join(names)}?)" if names else ""
+            raise SessionError(f"'{shorten(word)}' is not a command{which}; `help` lists them")
+        name = names[0]
+        with_row = {"back": self._back, "again": self._again, "drop": self._drop}
+        if arguments and (name not in with_row or len(arguments) > 1):
+            raise SessionError(f"`{name}` has no argument '{shorten(arguments[0])}'")
+        if name in with_row:
+            with_row[name](self._parse_row(arguments[0]) if arguments else None)
+        elif name == "list":
+            self._say(self._text.list_rows())
+        elif name == "help":
+            self._say(self._text.list_commands())
+        elif name == "quit":
+            raise _EndOfDialogue
+        else:
+            {"skip": self._skip, "restart": self._restart, "show": self._show_again}[name]()
+
+    def _parse_row(self, text: str) -> int:
+        """Index of a row from its number."""
+        count = len(self._recording.rows)
+        if text.isascii() and text.isdigit() and len(text) < 7 and 1 <= int(text) <= count:
+            return int(text) - 1
+        raise SessionError(f"'{shorten(text)}' is not a row; expected 1 to {count}")
+
+    def _require_row(self) -> int:
+        if self._asked is None:
+            raise SessionError("no row is asked for; `back 3` goes to row 3")
+        return self._asked
+
+    def _back(self, index: int | None) -> None:
+        rows = self._recording.rows
+        if index is None:
+            index = (len(rows) if self._asked is None else self._asked) - 1
+        if index < 0:
+            raise SessionError("this is the first row")
+        setup = rows[index].setup
+        if self._last is not None and rows[self._last].setup != setup and rows[index].is_read:
+            self._note(
+                f"The stand has been moved since {setup} was read: correct only what was "
+                "mistyped. To read there again, `restart` the setup."
+            )
+        self._ask_for(index)
+
+    def _again(self, index: int | None) -> None:
+        rows = self._recording.rows
+        if index is None:
+            before = [i for i, r in enumerate(rows[: self._asked]) if r.is_read]
+            index = self._last if self._last is not None or not before else before[-1]
+        if index is None:
+            raise SessionError("nothing was read yet")
+        if not rows[index].is_read:
+            raise SessionError(f"row {index + 1} was not read yet")
+        index = self._recording.repeat(index)
+        if self._warnings:  # their lines have changed
+            self._judge()
+        self._ask_for(index)
+
+    def _skip(self) -> None:
+        index = self._require_row()
+        if not self._recording.rows[index].is_read:
+            self._skipped.add(self._recording.rows[index].key)
+            self._say(f"  Skipped: row {index + 1}")
+        self._ask_for_next()
+
+    def _drop(self, index: int | None) -> None:
+        index = self._require_row() if index is None else index
+        label = self._recording.rows[index].label_with_cycle
+        self._recording.drop(index)
+        if self._last is not None and self._last >= index:
+            self._last = None if self._last == index else self._last - 1
+        self._note(f"Deleted: row {index + 1}, {label}")
+        self._judge()
+        self._ask_for_next()
+
+    def _restart(self) -> None:
+        index = self._last if self._asked is None else self._asked
+        if index is None:
+            raise SessionError("nothing was read yet")
+        recording = self._recording
+        setup = recording.rows[index].setup
+        recording.empty(index)
+        self._skipped -= {r.key for r in recording.rows if r.setup == setup}
+        self._shown, self._last = None, None
+        self._note(f"Deleted: all readings of {setup}")
+        self._judge()
+        self._ask_for(next(i for i, r in enumerate(recording.rows) if r.setup == setup))
+
+    def _note(self, text: str) -> None:
+        """Print an indented paragraph."""
+        self._say(self._text.wrap(text, indent="  "))
+
+    def _say(self, *texts: str) -> None:
+        put_out("\n".join(texts))
+
+
+def _compare(
+    before: Sequence[Finding], after: Sequence[Finding]
+) -> tuple[list[Finding], list[Finding]]:
+    """New findings, and resolved ones, whose setups have no finding any more."""
+
+    def identify(finding: Finding) -> tuple[object, ...]:  # lines shift where rows are added
+        places = [(p.setup, p.posture) for p in finding.places[:1]]
+        return finding.kind, *places, finding.numbers.get("cycle")
+
+    known, present = ({identify(f) for f in findings} for findings in (before, after))
+    setups = {p.setup for f in after for p in f.places}
+    new = [f for f in after if identify(f) not in known]
+    gone = [f for f in before if identify(f) not in present]
+    return new, [f for f in gone if not setups & {p.setup for p in f.places}]
+
+
+def _read_piped_line() -> str:
+    """A line of the standard input without a terminal; empty at its end."""
+    line = sys.stdin.readline(LONGEST_LINE)
+    while line and not line.endswith("\n"):
+        more = sys.stdin.readline(LONGEST_LINE)
+        if not more:
+            break
+        line = line[:LONGEST_LINE] + ("\n" if more.endswith("\n") else "")
+    return line
