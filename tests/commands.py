@@ -12,14 +12,13 @@ import shlex
 import subprocess
 import sys
 from contextlib import chdir, redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from typing import NamedTuple
 from unittest.mock import patch
 
 from orthocal.cli import main
 
 
-@dataclass(frozen=True)
-class Done:
+class Done(NamedTuple):
     """What a command has printed, and how it ended."""
 
     returncode: int
@@ -40,7 +39,9 @@ def run_here(folder, act, *, argv=("orthocal",), typed=""):
                 code = e.code or 0
             for stream in (out, err):
                 stream.flush()
-    return Done(code, *(stream.buffer.getvalue().decode() for stream in (out, err)))
+    printed = [stream.buffer.getvalue().decode() for stream in (out, err)]
+    assert not any("Traceback" in text for text in printed)
+    return Done(code, *printed)
 
 
 def run_orthocal(folder, *words, typed=""):
@@ -65,3 +66,8 @@ def run_line(folder, line):
         return done
     (folder / target).write_text(done.stdout)
     return Done(done.returncode, "", done.stderr)
+
+
+def orthocal(*words, typed=""):
+    """`orthocal` with arguments, where the tests run."""
+    return run_orthocal(".", *words, typed=typed)

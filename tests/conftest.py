@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -69,6 +70,15 @@ def load_afresh(robot):
     """A robot as a new process loads it."""
     loading._build_robot.cache_clear()
     return load_robot(robot)
+
+
+@pytest.fixture(scope="module")
+def without_plots():
+    """Pages have marks in place of plots, which take seconds and have tests of their own."""
+    from orthocal.output.report.figure import Plot
+
+    with patch.object(Plot, "__call__", lambda plot, *_, **__: f'<svg id="{plot.name}"/>'):
+        yield
 
 
 @pytest.fixture(scope="session")

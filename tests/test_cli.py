@@ -12,43 +12,18 @@ import sys
 
 import numpy as np
 import pytest
+from commands import orthocal
 
 from orthocal import (
     __version__,
     check_session,
-    cli,
     load_calibration,
     load_session,
     write_session,
 )
 from orthocal.cli.run import PANELS, make_program
-from orthocal.output.report.figure import Plot
 
-
-def run(monkeypatch, capsys, *words):
-    """Run the command line here; returns exit code, stdout and stderr."""
-    monkeypatch.setattr(sys, "argv", ["orthocal", *map(str, words)])
-    code = 0
-    try:
-        cli.main()
-    except SystemExit as e:
-        code = e.code or 0
-    captured = capsys.readouterr()
-    assert "Traceback" not in captured.out + captured.err
-    return code, captured.out, captured.err
-
-
-@pytest.fixture(autouse=True)
-def plots(request, monkeypatch):
-    """Plots are drawn where a page is looked at, and in tests of their own; they take seconds."""
-    if request.function is test_calibrate_prints_and_writes:
-        return
-    monkeypatch.setattr(Plot, "__call__", lambda plot, *_, **__: f'<svg id="{plot.name}"/>')
-
-
-@pytest.fixture
-def orthocal(monkeypatch, capsys):
-    return lambda *words: run(monkeypatch, capsys, *words)
+pytestmark = pytest.mark.usefixtures("without_plots")
 
 
 @pytest.fixture(scope="module")
@@ -57,20 +32,20 @@ def experiment(root):
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    """Where the calibration of the experiment is written by the first who asks for it."""
-    return tmp_path_factory.mktemp("written") / "calibrated"
+def written(experiment, tmp_path_factory, without_plots):
+    """What `calibrate` writes of the experiment."""
+    folder = tmp_path_factory.mktemp("written") / "calibrated"
+    assert orthocal("calibrate", experiment, "--out", folder).returncode == 0
+    return folder
 
 
 @pytest.fixture
-def calibrated(orthocal, experiment, written, tmp_path):
-    """A folder with what `calibrate` writes of the experiment."""
-    if not written.exists():
-        assert orthocal("calibrate", experiment, "--out", written)[0] == 0
+def calibrated(written, tmp_path):
+    """A copy of it, to be changed."""
     return shutil.copytree(written, tmp_path / "calibrated")
 
 
-def test_calibrate_prints_and_writes(orthocal, experiment, tmp_path):
+def test_calibrate_prints_and_writes(experiment, tmp_path):
     code, out, err = orthocal("calibrate", experiment, "--out", tmp_path / "new/folder")
     assert code == 0
     assert load_calibration(tmp_path / "new/folder").assessment.decision.headline in out
@@ -82,7 +57,7 @@ def test_calibrate_prints_and_writes(orthocal, experiment, tmp_path):
     assert "Values to enter" in (folder / "report.html").read_text()
 
 
-def test_report_is_written_beside_its_calibration_or_where_asked(orthocal, calibrated, tmp_path):
+def test_report_is_written_beside_its_calibration_or_where_asked(calibrated, tmp_path):
     page = (calibrated / "report.html").read_bytes()
     (calibrated / "report.html").unlink()
     (tmp_path / "pages").mkdir()
@@ -96,7 +71,7 @@ def test_report_is_written_beside_its_calibration_or_where_asked(orthocal, calib
         assert target.read_bytes() == page
 
 
-def test_view_writes_a_page_of_anything(orthocal, calibrated, experiment, root, tmp_path):
+def test_view_writes_a_page_of_anything(calibrated, experiment, root, tmp_path):
     for subject, expected in (
         (calibrated, "Machine, calibrated"),
         (calibrated / "calibration.json", "Machine, calibrated"),
@@ -115,7 +90,7 @@ def test_view_writes_a_page_of_anything(orthocal, calibrated, experiment, root, 
     assert "true scale" in page.read_text(encoding="utf-8")
 
 
-def test_view_says_what_a_picture_needs(orthocal, monkeypatch, tmp_path):
+def test_view_says_what_a_picture_needs(monkeypatch, tmp_path):
     monkeypatch.setenv("ORTHOCAL_CHROMIUM", str(tmp_path / "none"))
     code, _, err = orthocal("view", "orthoglide", "--png", tmp_path / "a.png")
     assert code == 2
@@ -124,7 +99,7 @@ def test_view_says_what_a_picture_needs(orthocal, monkeypatch, tmp_path):
     assert not (tmp_path / "a.png").exists()
 
 
-def test_view_says_when_a_browser_takes_no_picture(orthocal, monkeypatch, tmp_path):
+def test_view_says_when_a_browser_takes_no_picture(monkeypatch, tmp_path):
     monkeypatch.setenv("ORTHOCAL_CHROMIUM", "false")
     code, _, err = orthocal("view", "orthoglide", "--png", tmp_path / "a.png")
     assert code == 2
@@ -132,7 +107,7 @@ def test_view_says_when_a_browser_takes_no_picture(orthocal, monkeypatch, tmp_pa
     assert list(tmp_path.iterdir()) == []
 
 
-def test_calibrate_prints_json_alone_on_stdout(orthocal, experiment):
+def test_calibrate_prints_json_alone_on_stdout(experiment):
     code, out, err = orthocal("calibrate", experiment, "--json", "--model", "lengths")
     assert code == 0
     assert err == ""
@@ -155,7 +130,7 @@ def turn_a_setup(root, folder):
     return folder
 
 
-def test_what_is_to_be_reviewed_exits_3_with_all_that_was_asked_for(orthocal, root, tmp_path):
+def test_what_is_to_be_reviewed_exits_3_with_all_that_was_asked_for(root, tmp_path):
     session = turn_a_setup(root, tmp_path / "turned")
     code, out, err = orthocal("calibrate", session, "--out", tmp_path / "out")
     assert code == 3
@@ -175,9 +150,7 @@ def test_what_is_to_be_reviewed_exits_3_with_all_that_was_asked_for(orthocal, ro
     assert "Parameters" in out
 
 
-def test_the_printed_json_holds_what_the_file_holds_and_the_decision(
-    orthocal, experiment, tmp_path
-):
+def test_the_printed_json_holds_what_the_file_holds_and_the_decision(experiment, tmp_path):
     code, out, _ = orthocal("calibrate", experiment, "--json", "--out", tmp_path)
     assert code == 0
     printed = json.loads(out)
@@ -190,7 +163,7 @@ def test_the_printed_json_holds_what_the_file_holds_and_the_decision(
     assert orthocal("report", tmp_path / "again.json", "--out", tmp_path)[0] == 0
 
 
-def test_details_and_all_print_the_rest(orthocal, experiment):
+def test_details_and_all_print_the_rest(experiment):
     _, short, _ = orthocal("calibrate", experiment)
     _, details, _ = orthocal("calibrate", experiment, "--details")
     _, everything, _ = orthocal("calibrate", experiment, "--all")
@@ -210,7 +183,7 @@ def test_only_the_command_that_is_called_is_made():
         assert len(program.registered_commands) + len(program.registered_groups) == len(names)
 
 
-def test_help_says_what_exit_code_3_means(orthocal):
+def test_help_says_what_exit_code_3_means():
     for command, words in (
         ("check", "check the readings"),
         ("calibrate", "review or reject"),
@@ -221,7 +194,7 @@ def test_help_says_what_exit_code_3_means(orthocal):
         assert words in text[text.index("3: ") :]
 
 
-def test_forward_and_inverse_undo_each_other(orthocal, calibrated, tmp_path):
+def test_forward_and_inverse_undo_each_other(calibrated, tmp_path):
     joints = tmp_path / "joints.csv"
     joints.write_text("x_slide_mm,y_slide_mm,z_slide_mm\n310.25,310.25,310.25\n330,290,300.5\n")
     code, out, _ = orthocal("forward", calibrated, joints)
@@ -240,7 +213,7 @@ def test_forward_and_inverse_undo_each_other(orthocal, calibrated, tmp_path):
     assert np.abs(back - [[310.25] * 3, [330, 290, 300.5]]).max() < 2e-5
 
 
-def test_compare_has_the_verdict_of_the_readings_as_exit_code(orthocal, experiment, root):
+def test_compare_has_the_verdict_of_the_readings_as_exit_code(experiment, root):
     repeat = experiment.parent / "experiment-3"
     code, out, err = orthocal("compare", experiment, "--repeat", repeat)
     assert (code, err) == (0, "")
@@ -255,7 +228,7 @@ def test_compare_has_the_verdict_of_the_readings_as_exit_code(orthocal, experime
     assert document["decision"]["verdict"] == "enter"
 
 
-def test_accuracy_over_a_cube_and_at_points(orthocal, calibrated, tmp_path):
+def test_accuracy_over_a_cube_and_at_points(calibrated, tmp_path):
     code, out, _ = orthocal("accuracy", calibrated, "--half-side-mm", 40)
     assert code == 0
     assert "Over the workspace ±40 mm" in out
@@ -272,7 +245,7 @@ def test_accuracy_over_a_cube_and_at_points(orthocal, calibrated, tmp_path):
     assert json.loads(out)["points"] == 2
 
 
-def test_what_is_free_known_and_bounded_by_option(orthocal, experiment, root):
+def test_what_is_free_known_and_bounded_by_option(experiment, root):
     code, out, _ = orthocal(
         "calibrate", root / "examples/sweep", "--json",
         "--model", "lengths", "--free", "x_coupler.rz,!z_leg.length",
@@ -294,7 +267,7 @@ def test_what_is_free_known_and_bounded_by_option(orthocal, experiment, root):
     assert found["z_slide.offset"]["value"] == 0.2e-3
 
 
-def test_base_parameters_and_hubers_loss_by_option(orthocal, root):
+def test_base_parameters_and_hubers_loss_by_option(root):
     code, out, _ = orthocal(
         "calibrate", root / "examples/raw-cycles", "--free", "*.offset,x_swivel.x", "--base",
         "--loss", "huber", "--details",
@@ -304,7 +277,7 @@ def test_base_parameters_and_hubers_loss_by_option(orthocal, root):
     assert "represents" in out
 
 
-def test_validate_holds_experiment_3_against_2(orthocal, calibrated, experiment):
+def test_validate_holds_experiment_3_against_2(calibrated, experiment):
     new = experiment.parent / "experiment-3"
     code, out, _ = orthocal("validate", calibrated, new)
     assert code == 0
@@ -314,7 +287,7 @@ def test_validate_holds_experiment_3_against_2(orthocal, calibrated, experiment)
     assert json.loads(out)["decision"]["verdict"] == "enter"
 
 
-def test_simulate_writes_a_session_that_calibrates_back(orthocal, root, tmp_path):
+def test_simulate_writes_a_session_that_calibrates_back(root, tmp_path):
     plan = root / "examples/raw-cycles/plan.yaml"
     words = ("simulate", plan, "--out", tmp_path / "s", "--exact")
     code, _, err = orthocal(
@@ -337,7 +310,7 @@ def test_simulate_writes_a_session_that_calibrates_back(orthocal, root, tmp_path
     assert "exists already; --force overwrites it" in err
 
 
-def test_simulate_draws_by_seed(orthocal, root, tmp_path):
+def test_simulate_draws_by_seed(root, tmp_path):
     plan = root / "examples/raw-cycles/plan.yaml"
     texts = []
     for folder, seed in (("a", 3), ("b", 3), ("c", 4)):
@@ -357,7 +330,7 @@ def test_simulate_draws_by_seed(orthocal, root, tmp_path):
     assert "z_leg.length_mm" in texts[0]
 
 
-def test_a_solve_that_does_not_converge_exits_1(orthocal, experiment, monkeypatch, tmp_path):
+def test_a_solve_that_does_not_converge_exits_1(experiment, monkeypatch, tmp_path):
     from orthocal.estimation.solvers import ipopt as nlp
 
     monkeypatch.setattr(nlp, "CONVERGED", frozenset())
@@ -370,7 +343,7 @@ def test_a_solve_that_does_not_converge_exits_1(orthocal, experiment, monkeypatc
 
 @pytest.mark.parametrize("command", ["calibrate", "compare"])
 def test_a_failing_solver_gives_way_to_the_judgement_of_the_readings(
-    orthocal, root, tmp_path, monkeypatch, command
+    root, tmp_path, monkeypatch, command
 ):
     from orthocal.estimation.solvers import ipopt as nlp
 
@@ -389,7 +362,7 @@ def test_a_failing_solver_gives_way_to_the_judgement_of_the_readings(
     assert (code, json.loads(out)["decision"]) == (3, decision.to_document())
 
 
-def test_a_bug_is_said_to_be_one(orthocal, experiment, monkeypatch):
+def test_a_bug_is_said_to_be_one(experiment, monkeypatch):
     from orthocal.assessment import assess
 
     def broken(*_, **__):
@@ -415,7 +388,7 @@ def commands_of(text):
     return panels
 
 
-def test_help_lists_the_commands_in_the_order_of_work(orthocal, monkeypatch):
+def test_help_lists_the_commands_in_the_order_of_work(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     code, out, _ = orthocal("--help")
     assert code == 0
@@ -430,7 +403,7 @@ def test_help_lists_the_commands_in_the_order_of_work(orthocal, monkeypatch):
     assert "Commands" in commands_of(orthocal("study", "--help")[1])
 
 
-def test_every_command_has_help(orthocal, monkeypatch):
+def test_every_command_has_help(monkeypatch):
     """Arguments and options have one sentence each, without what only its authors would say."""
     monkeypatch.setenv("COLUMNS", "80")
     names = [name for panel in PANELS.values() for name in panel if name != "study"]
@@ -445,7 +418,7 @@ def test_every_command_has_help(orthocal, monkeypatch):
             assert not re.search(r"\b(folder|told|stand|holds|by hand|own)\b", out), name
 
 
-def test_version(orthocal):
+def test_version():
     assert orthocal("--version")[1].strip() == __version__
 
 
@@ -456,7 +429,7 @@ def test_a_pipe_that_closes_early_is_no_error(root, experiment):
     assert done.stderr == ""
 
 
-def test_several_sessions_are_fitted_together(orthocal, root, tmp_path):
+def test_several_sessions_are_fitted_together(root, tmp_path):
     plan, truth = root / "examples/raw-cycles/plan.yaml", root / "examples/raw-cycles/machine.yaml"
     for seed, day in enumerate(("monday", "tuesday")):
         orthocal("simulate", plan, "--errors", truth, "--seed", seed, "--out", tmp_path / day)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 import os
 import pty
@@ -13,12 +11,12 @@ import subprocess
 import sys
 
 import pytest
+from commands import orthocal
 from lxml import etree
 
 from orthocal import load_plan, load_robot
 from orthocal.builder.build import remake_robot
 from orthocal.cli import dialogue as asking
-from orthocal.cli.run import main
 from orthocal.errors import ParameterError
 from orthocal.kinematics.workspace import find_workspace
 from orthocal.session.session import Purpose
@@ -40,24 +38,11 @@ def options(**changed):
     return [word for option, value in given.items() if value for word in (option, value)]
 
 
-def run(capsys, *words):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["orthocal", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-    out, err = capsys.readouterr()
-    return ended.value.code or 0, out, err
-
-
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A machine by options, with the paper's plan."""
     folder = tmp_path_factory.mktemp("new") / "mill"
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()):
-        patch.setattr(sys, "argv", ["orthocal", "new", str(folder), *options(), "--paper"])
-        with pytest.raises(SystemExit) as ended:
-            main()
-    assert not ended.value.code
+    assert orthocal("new", folder, *options(), "--paper").returncode == 0
     return folder
 
 
@@ -87,13 +72,13 @@ def test_a_new_directory_has_all_files(made):
     assert session.purpose == Purpose("full")
 
 
-def test_what_is_read_on_it_calibrates_it(made, capsys, tmp_path):
+def test_what_is_read_on_it_calibrates_it(made, tmp_path):
     """1.5 mm in one drive's zero come back, the controller counting down or not."""
     out = tmp_path / "try"
     error = ["--error", "y_slide.offset_mm=1.5", "--exact"]
-    code, _, err = run(capsys, "simulate", made / "first", "--out", out, *error)
+    code, _, err = orthocal("simulate", made / "first", "--out", out, *error)
     assert code == 0, err
-    code, text, _ = run(capsys, "calibrate", out, "--model", "offsets")
+    code, text, _ = orthocal("calibrate", out, "--model", "offsets")
     found = dict(re.findall(r"(?m)^  ([xyz])_slide +\+0\.000 +([-+]\d\.\d+)", text))
     assert {k: float(v) for k, v in found.items()} == pytest.approx(
         {"x": 0.0, "y": 1.5, "z": 0.0}, abs=0.002
@@ -101,10 +86,10 @@ def test_what_is_read_on_it_calibrates_it(made, capsys, tmp_path):
     assert code == 0
 
 
-def test_a_machine_is_made_again_after_a_change(copied, capsys):
+def test_a_machine_is_made_again_after_a_change(copied):
     file = copied / "machine.yaml"
     file.write_text(file.read_text().replace("leg_mm: 250", "leg_mm: 260"))
-    code, out, _ = run(capsys, "new", copied, "--again")
+    code, out, _ = orthocal("new", copied, "--again")
     assert code == 0
     assert f"Made {copied}/first/sheet.html and its programs again." in out
     # x_max: 60 mm out, and the other two legs lean: 260 − √(260² − 60²) = 7.0178
@@ -114,7 +99,7 @@ def test_a_machine_is_made_again_after_a_change(copied, capsys):
     assert load_plan(copied / "first").purpose == Purpose("full")
 
 
-def test_readings_are_not_overwritten(copied, capsys):
+def test_readings_are_not_overwritten(copied):
     file = copied / "first/readings.csv"
     head, *rows = file.read_text().splitlines()
     file.write_text("\n".join([head, *(f"{row}0.12" for row in rows)]) + "\n")
@@ -123,7 +108,7 @@ def test_readings_are_not_overwritten(copied, capsys):
         ["new", copied, *options(), "--paper"],
         ["plan", copied, "--out", copied / "first"],
     ):
-        code, _, err = run(capsys, *words, "--force")
+        code, _, err = orthocal(*words, "--force")
         assert (code, err) == (
             2,
             f"orthocal: {copied}/first/readings.csv: contains {len(rows)} readings, which "
@@ -132,16 +117,16 @@ def test_readings_are_not_overwritten(copied, capsys):
     assert {p: p.read_bytes() for p in copied.rglob("*") if p.is_file()} == before
 
 
-def test_the_workspace_is_written_and_a_plan_for_another_one_is_old(capsys, tmp_path):
+def test_the_workspace_is_written_and_a_plan_for_another_one_is_old(tmp_path):
     """Into machine.yaml and the robot's YAML; each of both changes makes the plan old."""
     mill = tmp_path / "mill"
     given = ["new", mill, *options(workspace_mm="40"), "--hours", "0.2"]
-    code, out, err = run(capsys, *given)
+    code, out, err = orthocal(*given)
     assert code == 0, err
     assert "workspace ±40 mm" in out
     assert find_workspace(load_robot(mill)).half_side == pytest.approx(0.04)
     assert json.loads((mill / "first/plan.json").read_text())["workspace_mm"] == [[-40, 40]] * 3
-    code, _, _ = run(capsys, "new", mill, "--again")
+    code, _, _ = orthocal("new", mill, "--again")
     assert code == 0
     file = mill / "machine.yaml"
     before = file.read_text()
@@ -151,29 +136,29 @@ def test_the_workspace_is_written_and_a_plan_for_another_one_is_old(capsys, tmp_
     ):
         assert old in before
         file.write_text(before.replace(old, new))
-        code, _, err = run(capsys, "new", mill, "--again")
+        code, _, err = orthocal("new", mill, "--again")
         assert code == 3
         assert f"{mill}/first: the plan is old ({changed} changed)" in err
     assert load_robot(mill).drives[0].lower == pytest.approx(0.09)
 
 
-def test_a_workspace_out_of_reach_is_refused_and_nothing_is_written(copied, capsys):
+def test_a_workspace_out_of_reach_is_refused_and_nothing_is_written(copied):
     file = copied / "machine.yaml"
     text = file.read_text()
     line = "# workspace_mm: [[-60, 60], [-60, 60], [-60, 60]]"
     assert line in text
     file.write_text(text.replace(line, "workspace_mm: [[-90, 90], [-90, 90], [-90, 90]]"))
     before = {p: p.read_bytes() for p in copied.rglob("*") if p.is_file()}
-    code, _, err = run(capsys, "new", copied, "--again")
+    code, _, err = orthocal("new", copied, "--again")
     assert code == 2
     assert err.startswith(f"orthocal: {file}: workspace_mm: the machine does not reach the workspa")
     assert "; it reaches ±" in err
     assert {p: p.read_bytes() for p in copied.rglob("*") if p.is_file()} == before
 
 
-def test_a_renamed_directory_is_named(copied, capsys):
+def test_a_renamed_directory_is_named(copied):
     renamed = copied.rename(copied.with_name("lathe"))
-    code, _, err = run(capsys, "new", renamed, "--again")
+    code, _, err = orthocal("new", renamed, "--again")
     assert (code, err) == (
         2,
         f"orthocal: {renamed}/lathe.yaml: there is no such file; there is {copied.name}.yaml: was "
@@ -181,30 +166,30 @@ def test_a_renamed_directory_is_named(copied, capsys):
     )
 
 
-def test_entries_of_joints_that_count_down_are_described(made, capsys, tmp_path):
+def test_entries_of_joints_that_count_down_are_described(made, tmp_path):
     words = ["--out", tmp_path / "try", "--error", "y_slide.offset_mm=1.5"]
-    code, _, err = run(capsys, "simulate", made / "first", *words)
+    code, _, err = orthocal("simulate", made / "first", *words)
     assert code == 0, err
-    _, text, _ = run(capsys, "calibrate", tmp_path / "try", "--model", "offsets")
+    _, text, _ = orthocal("calibrate", tmp_path / "try", "--model", "offsets")
     said = " ".join(text.split())
     assert "y_slide counts down in the controller: subtract the value there" in said
 
 
-def test_sheets_with_readings_stay_unchanged(copied, capsys):
+def test_sheets_with_readings_stay_unchanged(copied):
     csv = copied / "first/readings.csv"
     csv.write_text(csv.read_text().replace("yx,zero,1,", "yx,zero,1,0.12"))
     before = (copied / "first/sheet.html").read_text()
-    code, out, err = run(capsys, "new", copied, "--again")
+    code, out, err = orthocal("new", copied, "--again")
     assert code == 0
     assert f"orthocal: {copied}/first: has readings, which belong to the dimensions at" in err
     assert "sheet.html" not in out
     assert (copied / "first/sheet.html").read_text() == before
 
 
-def test_a_plan_out_of_reach_is_old(copied, capsys):
+def test_a_plan_out_of_reach_is_old(copied):
     file = copied / "machine.yaml"
     file.write_text(file.read_text().replace("[100, 320]", "[200, 320]"))
-    code, _, err = run(capsys, "new", copied, "--again")
+    code, _, err = orthocal("new", copied, "--again")
     assert code == 3
     assert "first/session.yaml: postures.x_min: " in err
     assert "first: the plan is old (the machine does not reach its postures); plan again" in err
@@ -236,23 +221,23 @@ def test_a_plan_out_of_reach_is_old(copied, capsys):
         ({"travel_mm": "245:300"}, "expected 10 mm to either side of the mechanical zero"),
     ],
 )
-def test_impossible_machines_are_refused(capsys, tmp_path, changed, message):
+def test_impossible_machines_are_refused(tmp_path, changed, message):
     given = ["new", tmp_path / "mill", "--paper", *options(**changed)]
-    code, out, err = run(capsys, *given)
+    code, out, err = orthocal(*given)
     assert (code, out) == (2, "")
     assert message in err
     assert len(err.splitlines()) == 1
     assert not (tmp_path / "mill").exists()
 
 
-def test_existing_files_are_not_overwritten(copied, capsys):
+def test_existing_files_are_not_overwritten(copied):
     before = (copied / "mill.urdf").read_text()
     given = ["new", copied, *options(leg_mm="260"), "--paper"]
-    code, _, err = run(capsys, *given)
+    code, _, err = orthocal(*given)
     assert code == 2
     assert err == f"orthocal: {copied}/machine.yaml: exists already; --force overwrites it\n"
     assert (copied / "mill.urdf").read_text() == before
-    code, _, _ = run(capsys, *given, "--force")
+    code, _, _ = orthocal(*given, "--force")
     assert code == 0
     assert load_robot(copied).drive_zero == pytest.approx([0.26] * 3)
 
@@ -266,8 +251,8 @@ def test_existing_files_are_not_overwritten(copied, capsys):
         (["mill", "--again", "--leg-mm", "260"], "--leg-mm: found with --again, which reads mach"),
     ],
 )
-def test_other_mistakes_are_refused(capsys, tmp_path, words, message):
-    code, _, err = run(capsys, "new", tmp_path / words[0], *words[1:])
+def test_other_mistakes_are_refused(tmp_path, words, message):
+    code, _, err = orthocal("new", tmp_path / words[0], *words[1:])
     assert code == 2
     assert message in err
 
@@ -344,9 +329,9 @@ def test_options_are_not_asked_for(monkeypatch):
 
 
 @pytest.mark.slow
-def test_without_paper_a_plan_is_chosen(capsys, tmp_path):
+def test_without_paper_a_plan_is_chosen(tmp_path):
     given = [*options(), "--tolerance", "*.offset_mm=4"]
-    code, out, err = run(capsys, "new", tmp_path / "mill", *given)
+    code, out, err = orthocal("new", tmp_path / "mill", *given)
     assert code == 0
     steps = [line.split()[1] for line in err.splitlines()]
     assert list(dict.fromkeys(steps)) == ["computing", "choosing", "start", "comparing", "drawing"]

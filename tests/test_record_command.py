@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import pty
 import re
@@ -15,10 +14,10 @@ import time
 
 import numpy as np
 import pytest
+from commands import orthocal
 from made_mistakes import sound_session
 
 from orthocal import check_session, load_session, write_session
-from orthocal.cli.run import main
 from orthocal.measurement.files.session_file import load_plan
 from orthocal.measurement.motion.motion import guide
 from orthocal.measurement.recording import SUFFIX, open_recording
@@ -49,16 +48,10 @@ def folder(tmp_path):
 
 
 @pytest.fixture
-def run(monkeypatch, capsys):
+def run(monkeypatch):
     def record(folder, *lines, columns=100):
         monkeypatch.setenv("COLUMNS", str(columns))
-        monkeypatch.setattr("sys.argv", ["orthocal", "record", str(folder)])
-        monkeypatch.setattr("sys.stdin", io.StringIO("".join(f"{line}\n" for line in lines)))
-        with pytest.raises(SystemExit) as ended:
-            main()
-        out, err = capsys.readouterr()
-        assert "Traceback" not in out + err
-        return ended.value.code or 0, out, err
+        return orthocal("record", folder, typed="".join(f"{line}\n" for line in lines))
 
     return record
 
@@ -390,12 +383,9 @@ def test_a_stand_that_was_elsewhere_is_recalled(folder, run):
     assert cells(folder)[0] == "0.20"
 
 
-def test_half_a_line_at_the_end_of_a_pipe_is_no_reading(folder, monkeypatch, capsys):
-    monkeypatch.setattr("sys.argv", ["orthocal", "record", str(folder)])
-    monkeypatch.setattr("sys.stdin", io.StringIO("0.1\n0.2"))
-    with pytest.raises(SystemExit):
-        main()
-    assert "Not recorded: '0.2', a line without an end." in capsys.readouterr().out
+def test_half_a_line_at_the_end_of_a_pipe_is_no_reading(folder):
+    done = orthocal("record", folder, typed="0.1\n0.2")
+    assert "Not recorded: '0.2', a line without an end." in done.stdout
     assert cells(folder)[:2] == ["0.10", ""]
 
 
@@ -506,8 +496,6 @@ def test_a_session_that_somebody_records_is_refused(folder, run):
     )
 
 
-def test_help_says_what_it_does(monkeypatch, capsys):
-    monkeypatch.setattr("sys.argv", ["orthocal", "record", "--help"])
-    with pytest.raises(SystemExit):
-        main()
-    assert "Every reading is on disk before the next" in " ".join(capsys.readouterr().out.split())
+def test_help_says_what_it_does():
+    text = " ".join(orthocal("record", "--help").stdout.split())
+    assert "Every reading is on disk before the next" in text
