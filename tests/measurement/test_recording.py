@@ -320,15 +320,9 @@ KEPT = re.compile(r"Recorded: row \d+, (\S+) (\S+?)(?:, cycle (\d+))?: (-?[0-9.]
 def test_killed_many_times_no_accepted_reading_is_lost(tmp_path, monkeypatch):
     """Killed while lines come in as fast as they are taken, among them corrections and repeats."""
     monkeypatch.setenv("COLUMNS", "100")
-<<<<<<< HEAD
     folder = make_plan(tmp_path / "session", cycles=60)  # more than are read before all ends
-    monkeypatch.setattr(command._Dialogue, "_is_doubtful", lambda *_: False)
-    monkeypatch.setattr(command._Dialogue, "_judge", lambda *_: None)
-=======
-    folder = make_plan(tmp_path / "session", cycles=150)  # more than are read before all ends
     monkeypatch.setattr(recording.Dialogue, "_is_doubtful", lambda *_: False)
     monkeypatch.setattr(recording.Dialogue, "_judge", lambda *_: None)
->>>>>>> 42c6241 (The dialogue of record is a module that its command loads; its commands are in one table)
     robot = load_plan(folder).robot
     monkeypatch.setattr(session_file, "load_robot", lambda *_, **__: robot)
     rng = np.random.default_rng(0)
