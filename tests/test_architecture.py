@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
+from graphlib import TopologicalSorter
 
 import pytest
 from conftest import ROOT
@@ -54,39 +56,35 @@ def stage(path):
     return path.relative_to(ROOT / "orthocal").with_suffix("").parts[0]
 
 
+@cache
+def parsed(path):
+    return ast.parse(path.read_text())
+
+
 def imported(path):
     """Names of the modules of this package that a module imports, wherever in it."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("orthocal"):
             yield node.module
         elif isinstance(node, ast.Import):
             yield from (a.name for a in node.names if a.name.startswith("orthocal"))
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_a_room_imports_what_it_may(path):
-    if path == ROOT / "orthocal/__init__.py":
-        return
-    own = stage(path)
-    allowed = {own, *ALLOWED[own].split()}
-    for module in imported(path):
-        parts = module.split(".")
-        assert len(parts) == 1 or parts[1] in allowed, f"{path.name} imports {module}"
+def test_a_room_imports_what_it_may():
+    refused = [
+        f"{path.relative_to(ROOT)} imports {module}"
+        for path in MODULES
+        if path != ROOT / "orthocal/__init__.py"
+        for module in imported(path)
+        if module != "orthocal"
+        and module.split(".")[1] not in (stage(path), *ALLOWED[stage(path)].split())
+    ]
+    assert refused == []
 
 
 def test_rooms_are_in_an_order():
     """No room may import another that may import it, however far around."""
-    done: set[str] = set()
-
-    def visit(room, way):
-        assert room not in way, f"circle: {' → '.join([*way, room])}"
-        if room not in done:
-            for other in ALLOWED[room].split():
-                visit(other, [*way, room])
-            done.add(room)
-
-    for room in ALLOWED:
-        visit(room, [])
+    TopologicalSorter({room: allowed.split() for room, allowed in ALLOWED.items()}).prepare()
     assert {stage(p) for p in MODULES if p.parent != ROOT / "orthocal"} <= set(ALLOWED)
 
 
@@ -96,25 +94,20 @@ def test_modules_within_a_stage_do_not_import_in_circles():
         for p in MODULES
         if p.name != "__init__.py"
     }
-    done: set[str] = set()
-
-    def visit(module, path):
-        assert module not in path, f"circle: {' → '.join([*path, module])}"
-        if module in graph and module not in done:
-            for other in graph[module]:
-                visit(other, [*path, module])
-            done.add(module)
-
-    for module in graph:
-        visit(module, [])
+    TopologicalSorter(graph).prepare()
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
-def test_nothing_prints_outside_the_edges(path):
-    if stage(path) in ("cli", "output"):
-        return
-    calls = [n.func for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call)]
-    assert not [f for f in calls if isinstance(f, ast.Name) and f.id == "print"]
+def test_nothing_prints_outside_the_edges():
+    printing = [
+        str(path.relative_to(ROOT))
+        for path in MODULES
+        if stage(path) not in ("cli", "output")
+        for node in ast.walk(parsed(path))
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id == "print"
+    ]
+    assert printing == []
 
 
 def test_everything_exported_is_there():

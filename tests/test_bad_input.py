@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 from commands import run_orthocal
+from folders import files_of
 
 from orthocal import calibrate, load_session
 from orthocal.calibration.file import calibration_json
@@ -24,6 +25,8 @@ from orthocal.calibration.file import calibration_json
 ROOT = Path(__file__).parents[1]
 DIFFERENCES = ROOT / "examples/table1/experiment-2"
 CYCLES = ROOT / "examples/raw-cycles"
+
+pytestmark = pytest.mark.usefixtures("without_plots")
 
 PROGRAM = "G21 G0 X0 Y0 Z0\nG1 X1 F100\n"
 ESCAPES = {r"\n": "\n", r"\t": "\t", r"\s": " "}
@@ -126,6 +129,8 @@ def bases(tmp_path_factory):
         shutil.copytree(ROOT / "robots/orthoglide", folder / base / "machine")
     shutil.copytree(folder / "differences", folder / "machine")
     spoil(folder / "machine/session.yaml", "robot: orthoglide -> robot: machine")
+    (folder / "planned").mkdir()
+    shutil.copy(CYCLES / "plan.yaml", folder / "planned/session.yaml")
     # the folder that the calibration names is no longer there
     made = shutil.copytree(folder / "machine", folder / "made")
     text = calibration_json(calibrate(load_session(made)))
@@ -151,10 +156,6 @@ def lay_out(bases, tmp_path):
 
 def arguments(command, folder):
     return [part.replace("{tmp}", str(folder)) for part in command.split()]
-
-
-def files_of(folder):
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def check_refused(case, done, folder):

@@ -16,6 +16,8 @@ from orthocal import calibrate, draw_scene, load_session
 from orthocal.errors import NotIdentifiableError
 from orthocal.session.session import Purpose
 
+pytestmark = pytest.mark.usefixtures("without_plots")
+
 SCRIPTS = sorted((ROOT / "examples").glob("[0-9]*.py"))
 
 
@@ -86,7 +88,7 @@ def test_the_python_of_a_page_runs(beside_examples, page):
 
 
 @pytest.fixture(scope="module")
-def run_page(beside_examples):
+def run_page(beside_examples, without_plots):
     """What each command of a page prints, run once, one after the other, as they stand."""
 
     @cache

@@ -310,8 +310,8 @@ def test_sound_sessions_raise_no_warning_that_check_does_not_repeat(root, run, t
         assert warned <= {f.kind for f in require_agreement(out, folder)}
 
 
-SOUND = {"workshop": 7, "raw-cycles": 3}
-"""Number of machines."""
+SOUND = {"workshop": 5, "raw-cycles": 2}
+"""Number of machines: a contradiction in 35 % of all sessions is seen with 95 % probability."""
 
 
 REPEATED = ("zero", "x_max", "zero", "x_max", "zero")
@@ -428,62 +428,6 @@ def test_a_terminal_can_be_left_by_ctrl_c(folder):
     assert cells(folder)[:2] == ["-0.12", ""]
     with open_recording(folder) as recording:
         assert recording.restored == 0
-
-
-def files_of(folder):
-    return {p: p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-
-
-BAD = {
-    "no session": (lambda f: (f / "session.yaml").unlink(), "/session.yaml: there is no such file"),
-    "no plan": (
-        lambda f: (f / "session.yaml").write_text(PLAN.replace("leg: x", "leg: w")),
-        "/session.yaml: setups.yx.leg: 'w' is not a leg of orthoglide; legs: x, y, z",
-    ),
-    "no table": (
-        lambda f: (f / "session.yaml").write_text(PLAN + "readings: readings.csv\n"),
-        "/readings.csv: there is no such file",
-    ),
-    "no reading": (
-        lambda f: (
-            (f / "session.yaml").write_text(PLAN + "readings: readings.csv\n"),
-            (f / "readings.csv").write_text("setup,posture,reading_mm\nyx,zero,a lot\n"),
-        ),
-        "/readings.csv:2: reading_mm is 'a lot'; expected a number",
-    ),
-    "other rows": (
-        lambda f: (f / "readings.csv").write_text("setup,posture,reading_mm\nyx,zero,0.1\n"),
-        "/readings.csv: holds other rows than session.yaml plans and would be overwritten; move it "
-        "away, or add `readings: readings.csv` to session.yaml",
-    ),
-    "a YAML that cannot be added to": (
-        lambda f: (f / "session.yaml").write_text(
-            "{robot: orthoglide, postures: {zero: {tcp_mm: [0, 0, 0]}}, "
-            "setups: {yx: {leg: x, direction: y, section: {fraction: 0.5}}}}\n"
-        ),
-        "/session.yaml: readings: is missing; add `readings: readings.csv` to it",
-    ),
-    "a folder for a journal": (
-        lambda f: (f / f"readings.csv{SUFFIX}").mkdir(),
-        "/readings.csv.journal: is a directory; expected a file",
-    ),
-    "a journal of something else": (
-        lambda f: (f / f"readings.csv{SUFFIX}").write_text("Dear diary\n"),
-        "/readings.csv.journal: is not the journal of a recording; move it away, and the readings "
-        "count as they are",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_what_cannot_be_recorded_is_refused_and_nothing_is_written(folder, run, name):
-    spoil, message = BAD[name]
-    spoil(folder)
-    before = files_of(folder)
-    code, out, err = run(folder, "0.1")
-    assert err == f"orthocal: {folder}{message}\n"
-    assert (code, out) == (2, "")
-    assert files_of(folder) == before
 
 
 def test_a_session_that_somebody_records_is_refused(folder, run):

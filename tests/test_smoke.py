@@ -27,6 +27,7 @@ def run(*words, cwd):
     done = run_orthocal(cwd, *words)
     assert done.returncode == 0, done.stderr
     assert "Warning" not in done.stderr
+    return done.stdout
 
 
 def test_main_job(root, workplace):
@@ -43,20 +44,22 @@ def test_main_job(root, workplace):
 def test_prepare_measure_calibrate_and_use(root, workplace):
     words = ["--leg-mm", 250, "--travel-mm", "100:325", "--attachment-mm", 30]
     words += ["--rods-apart-mm", 60, "--rod-radius-mm", 4, "--counts", "up,up,up"]
-    run("new", "mill", *words, "--at-zero-mm", 0, "--tolerance", "*.offset_mm=4", cwd=workplace)
+    words += ["--at-zero-mm", 0, "--tolerance", "*.offset_mm=4", "--hours", 0.3]
+    run("new", "mill", *words, cwd=workplace)
     assert (workplace / "mill/first/sheet.html").is_file()
     run("view", "mill", "--html", "mill.html", cwd=workplace)
     draw = ["--draw", "*", "--seed", 3]
     run("simulate", "mill/first", *draw, "--out", "readings", cwd=workplace)
     run("check", "readings", cwd=workplace)
-    run("calibrate", "readings", "--out", "calibrated", cwd=workplace)
+    text = run("calibrate", "readings", "--json", cwd=workplace)  # the main job draws the report
+    assert json.loads(text)["schema"]
+    calibrated = workplace / "calibrated.json"
+    calibrated.write_text(text, encoding="utf-8")
     run("compare", root / "examples/raw-cycles", cwd=workplace)
-    assert json.loads((workplace / "calibrated/calibration.json").read_text("utf-8"))["schema"]
-    run("accuracy", "calibrated", cwd=workplace)
-    out = ["--to", "linuxcnc", "--out", "linuxcnc"]
-    run("export", "calibrated", *out, cwd=workplace)
+    run("accuracy", calibrated, cwd=workplace)
+    run("export", calibrated, "--to", "linuxcnc", "--out", "linuxcnc", cwd=workplace)
     (workplace / "part.ngc").write_text("G21 G90\nG0 X0 Y0 Z0\nG1 X10 Y-10 F600\nM2\n")
-    run("correct", "calibrated", "part.ngc", "--out", "corrected.ngc", cwd=workplace)
+    run("correct", calibrated, "part.ngc", "--out", "corrected.ngc", cwd=workplace)
     assert (workplace / "corrected.ngc").is_file()
 
 

@@ -58,7 +58,7 @@ def left_at_tool(calibration, errors, send):
 
 
 @pytest.fixture(scope="module")
-def walked(tmp_path_factory):
+def walked(tmp_path_factory, without_plots):
     """The folder after two rounds, the machine's errors, both calibrations, and the last answer."""
     folder = tmp_path_factory.mktemp("walk")
     run(folder, "new", "mill", *SIZES.split(), "--tolerance", "*.offset_mm=4")
