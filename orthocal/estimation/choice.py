@@ -9,7 +9,7 @@ from typing import Any
 from orthocal.arguments import require_kind, require_names, require_numbers
 from orthocal.errors import ParameterError
 from orthocal.estimation.selection import Known, Selection, complete_model, select_parameters
-from orthocal.robot.parameters import ParameterSet
+from orthocal.robot.parameters import ParameterSet, errors_at
 from orthocal.session.session import Purpose, Session
 from orthocal.units import read_limit
 
@@ -120,10 +120,8 @@ def _in_words(purpose: Purpose) -> str:
 def _known(known: Mapping[str, Known], parameters: ParameterSet) -> dict[str, Known]:
     result: dict[str, Known] = {}
     for key, value in known.items():
-        try:
+        with errors_at("known"):
             name, factor = parameters.read_quantity(key, 1.0)
-        except ParameterError as e:
-            raise ParameterError(e.problem, where=e.where or "known") from None
         if name in result:
             raise ParameterError(f"'{name}' is given twice", where="known")
         if isinstance(value, tuple):
@@ -138,9 +136,7 @@ def _bounds(
 ) -> dict[str, tuple[float, float]]:
     result = {}
     for key, (low, high) in bounds.items():
-        try:
+        with errors_at("bounds"):
             glob, factor = parameters.read_glob(key)
-        except ParameterError as e:
-            raise ParameterError(e.problem, where=e.where or "bounds") from None
         result[glob] = (low * factor, high * factor)
     return result

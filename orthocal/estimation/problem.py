@@ -294,12 +294,15 @@ class CalibrationProblem:
         jacobian = linear.jacobian
         return linear.reading, jacobian if units == "prior_std" else jacobian / self.theta_scale
 
-    def linearisation(self, theta: ArrayLike, passive: Array) -> Linearisation:
+    def linearisation(
+        self, theta: ArrayLike, passive: Array, *, free: FreeParameters | None = None
+    ) -> Linearisation:
         """Readings to first order about parameters and passive coordinates near closed loops.
 
         Args:
             theta: Shape (n_free,), or (S, n_free) for a batch, [SI].
             passive: Shape (n_states, n_passive), with S in front for a batch, [m, rad].
+            free: Parameters by which to differentiate; the free ones by default.
 
         Raises:
             LinAlgError: If a posture is singular.
@@ -308,7 +311,7 @@ class CalibrationProblem:
             self.errors(theta),
             passive,
             self._nuisance(theta),
-            free=self._free_parameters,
+            free=free or self._free_parameters,
             noise=self.noise,
         )
 

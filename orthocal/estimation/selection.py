@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from orthocal.errors import ParameterError
 from orthocal.io.documents import parse_number
 from orthocal.io.fields import read_only
-from orthocal.robot.parameters import Parameter, ParameterSet, require_prior_std
+from orthocal.robot.parameters import Parameter, ParameterSet, errors_at, require_prior_std
 from orthocal.text import composed
 from orthocal.units import Unit, show_limit
 
@@ -121,12 +120,12 @@ def select_parameters(
     patterns: list[str] = []
     if base is not None:
         patterns += parameters.patterns(base)
-    with _named("free"):
+    with errors_at("free"):
         chosen = set(parameters.select([*patterns, *free]))
     held: dict[str, float] = {}
     priors: dict[str, tuple[float, float]] = {}
     for name, entry in (known or {}).items():
-        with _named("known"):
+        with errors_at("known"):
             parameter = parameters[name]
             _refuse_length(entry[0] if isinstance(entry, tuple) else entry, parameter)
             if isinstance(entry, tuple):
@@ -143,14 +142,14 @@ def select_parameters(
 
     stds = {n: parameters[n].prior_std for n in names}
     for glob, value in (prior_stds or {}).items():
-        with _named("tolerances"):
+        with errors_at("tolerances"):
             for name in _match_free(parameters, glob, names):
                 stds[name] = require_prior_std(value, parameters.defaults[name])
     stds.update({n: s for n, (_, s) in priors.items()})
     lower = np.array([_lowest(parameters[n]) for n in names])
     upper = np.full(len(names), np.inf)
     for glob, (low, high) in (bounds or {}).items():
-        with _named("bounds"):
+        with errors_at("bounds"):
             if not low < high:
                 raise ParameterError(f"those of '{glob}' leave nothing between them")
             for name in _match_free(parameters, glob, names):
@@ -183,11 +182,9 @@ def read_known(texts: Sequence[str], parameters: ParameterSet, *, where: str) ->
     for text in texts:
         key, text_of_value = _split(text, "NAME=VALUE or NAME=VALUE±TOLERANCE", where)
         value, sign, spread = text_of_value.replace("+/-", "±").replace("+-", "±").partition("±")
-        try:
-            number = _number(value, where, key)
+        number = _number(value, where, key)
+        with errors_at(where):
             name, _ = parameters.read_quantity(key, number)
-        except ParameterError as e:
-            raise ParameterError(e.problem, where=e.where or where) from None
         if name in names:
             raise ParameterError(f"'{name}' is given twice", where=where)
         names.add(name)
@@ -206,7 +203,8 @@ def read_tolerances(
     result = {}
     for text in texts:
         key, number = _split(text, "NAME=VALUE", where)
-        _check_glob(key, parameters, where)
+        with errors_at(where):
+            parameters.read_glob(key)
         result[key] = _number(number, where, key)
     return result
 
@@ -228,7 +226,8 @@ def read_bounds(
         low, colon, high = numbers.partition(":")
         if not colon:
             raise ParameterError(f"found '{text}'; expected {form}", where=where)
-        _check_glob(key, parameters, where)
+        with errors_at(where):
+            parameters.read_glob(key)
         if not (low.strip() or high.strip()):
             raise ParameterError(f"found '{text}'; expected {form}", where=where)
         result[key] = (
@@ -247,14 +246,6 @@ def _split(text: str, form: str, where: str) -> tuple[str, str]:
 
 def _number(text: str, where: str, name: str) -> float:
     return parse_number(text.strip(), where=where, name=name, error=ParameterError)
-
-
-def _check_glob(key: str, parameters: ParameterSet, where: str) -> None:
-    """Refuse a key without a unit, or with a wrong one."""
-    try:
-        parameters.read_glob(key)
-    except ParameterError as e:
-        raise ParameterError(e.problem, where=where) from None
 
 
 def _match_free(parameters: ParameterSet, glob: str, free: Sequence[str]) -> list[str]:
@@ -307,12 +298,3 @@ def _finite(value: float, name: str) -> float:
     if not math.isfinite(value):
         raise ParameterError(f"the known value of '{name}' is {value}; expected a finite number")
     return float(value)
-
-
-@contextmanager
-def _named(choice: str) -> Iterator[None]:
-    """Add the name of the argument to an error."""
-    try:
-        yield
-    except ParameterError as e:
-        raise ParameterError(e.problem, where=choice) from None

@@ -78,8 +78,7 @@ class RobotFunctions:
             robot.model, coordinates, joint_placements=joints, frame_placements=frames
         )
         self._first = {(m.index, m.of_frame): 6 * k for k, m in enumerate(moved)}
-        self._positions: dict[int, BatchFunction] = {}
-        self._poses: dict[int, BatchFunction] = {}
+        self._of_frames: dict[str, BatchFunction] = {}
 
     @property
     def symbols(self) -> list[ca.SX]:
@@ -166,23 +165,22 @@ class RobotFunctions:
 
     def position(self, frame: str) -> BatchFunction:
         """(actuated, passive, placements) to the position of a frame, [m]."""
-        index = self.robot.frame_id(frame)
-        if index not in self._positions:
-            self._positions[index] = self._batch(
-                f"frame_{index}", lambda: [self.tree.frame_pose(index).position]
-            )
-        return self._positions[index]
+        return self._of_frame("frame", frame, lambda pose: pose.position)
 
     def pose(self, frame: str) -> BatchFunction:
         """(actuated, passive, placements) to the pose of a frame, shape (4, 4), [1, m]."""
-        index = self.robot.frame_id(frame)
-        if index not in self._poses:
-            self._poses[index] = self._batch(f"pose_{index}", lambda: [self._homogeneous(index)])
-        return self._poses[index]
+        last = ca.SX([[0, 0, 0, 1]])
+        return self._of_frame(
+            "pose", frame, lambda pose: ca.blockcat([[pose.rotation, pose.position], [last]])
+        )
 
-    def _homogeneous(self, frame: int) -> ca.SX:
-        pose = self.tree.frame_pose(frame)
-        return ca.vertcat(ca.horzcat(pose.rotation, pose.position), ca.SX([[0, 0, 0, 1]]))
+    def _of_frame(self, kind: str, frame: str, express: Callable[[Pose], ca.SX]) -> BatchFunction:
+        index = self.robot.frame_id(frame)
+        name = f"{kind}_{index}"
+        if name not in self._of_frames:
+            pose = self.tree.frame_pose
+            self._of_frames[name] = self._batch(name, lambda: [express(pose(index))])
+        return self._of_frames[name]
 
     @cached_property
     def tool_jacobian(self) -> BatchFunction:

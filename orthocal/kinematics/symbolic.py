@@ -191,10 +191,8 @@ class SymbolicRobot:
         self.actuated = machine.actuated
         """Actual drive coordinates, shape (n_drives,), [m, rad]."""
         coordinates = ca.SX(robot.model.nv, 1)
-        for i, k in enumerate(robot.drive_index):
-            coordinates[int(k)] = self.actuated[i]
-        for i, k in enumerate(robot.passive_index):
-            coordinates[int(k)] = passive[i]
+        coordinates[robot.drive_index.tolist()] = self.actuated
+        coordinates[robot.passive_index.tolist()] = passive
         joints, frames = erroneous_placements(robot.model, machine.twists)
         self.tree = SymbolicTree(
             robot.model, coordinates, joint_placements=joints, frame_placements=frames

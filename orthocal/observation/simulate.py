@@ -20,6 +20,7 @@ from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import Observations, build_observations
 from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.robot.model import Robot
+from orthocal.robot.parameters import errors_at
 from orthocal.session.session import Reading, Session
 from orthocal.units import MM, to_mm
 
@@ -298,10 +299,8 @@ def read_errors(values: Mapping[str, float], robot: Robot, *, where: str) -> dic
     """
     errors: dict[str, float] = {}
     for key, value in values.items():
-        try:
+        with errors_at(where):
             name, si = robot.parameters.read_quantity(key, value)
-        except ParameterError as e:
-            raise ParameterError(e.problem, where=where) from None
         if name in errors:
             raise ParameterError(f"'{name}' is given twice", where=where)
         errors[name] = si

@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -296,10 +297,8 @@ class ParameterSet:
         require_numbers(given, argument="tolerances")
         result = {}
         for key, value in given.items():
-            try:
+            with errors_at("tolerances"):
                 glob, factor = self.read_glob(key)
-            except ParameterError as e:
-                raise ParameterError(e.problem, where=e.where or "tolerances") from None
             result[glob] = read_limit(value) * factor
         return result
 
@@ -450,3 +449,12 @@ def _suggest(name: str, names: Iterable[str]) -> str:
     """Hint with similar names, for messages."""
     close = difflib.get_close_matches(name, list(names), n=3, cutoff=0.5)
     return f"; did you mean {', '.join(close)}?" if close else ""
+
+
+@contextmanager
+def errors_at(where: str) -> Iterator[None]:
+    """Name the argument or key of parameter errors that name none."""
+    try:
+        yield
+    except ParameterError as e:
+        raise ParameterError(e.problem, where=e.where or where) from None

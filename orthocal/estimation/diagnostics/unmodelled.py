@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from orthocal.errors import ParameterError
 from orthocal.estimation.fit import Fit
-from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.selection import Selection
 from orthocal.estimation.weighting import SMALLEST_SIGMA
 from orthocal.io.documents import Number
 from orthocal.io.fields import CLOSED, Many, Matrix, Sizes, read_only
@@ -117,22 +115,16 @@ def error_jacobian(fit: Fit, names: Sequence[str]) -> Array:
     Returns:
         ∂h by one standard deviation of each, zeros eliminated, shape (n_entries, n_names), [m].
     """
-    problem = fit.problem
-    chosen = tuple(problem.robot.parameters[n] for n in names)
-    values = problem.split_errors(fit.solution.theta)
-    selection = Selection(
-        label="",
-        parameters=chosen,
-        prior=np.ones(len(names), dtype=bool),
-        mean=read_only(np.zeros(len(names))),
-        lower=read_only(np.full(len(names), -np.inf)),
-        upper=read_only(np.full(len(names), np.inf)),
-        fixed={n: v for n, v in values.items() if n not in names},
+    problem, parameters = fit.problem, fit.problem.robot.parameters
+    prior_stds = np.array([parameters[n].prior_std for n in names])
+    columns = problem.functions.errors.columns(names) * prior_stds
+    nuisance_scale = problem.theta_scale[problem.n_machine :]
+    linear = problem.linearisation(
+        fit.solution.theta,
+        fit.solution.passive,
+        free=problem.model.parametrise(columns, nuisance_scale),
     )
-    others = CalibrationProblem(problem.session, selection, noise=problem.noise)
-    at = np.append([values.get(n, 0.0) for n in names], fit.solution.theta[problem.n_machine :])
-    _, jacobian = others.linearise(at, fit.solution.passive)
-    return project_out_zeros(jacobian[:, : len(names)], problem.observations)
+    return project_out_zeros(linear.jacobian[:, : len(names)], problem.observations)
 
 
 def measure_unmodelled(fit: Fit, others: OtherErrors) -> tuple[Unmodelled, Array]:
