@@ -29,6 +29,9 @@ from orthocal.session.session import Session
 from orthocal.statistics.noise import KnownNoise, estimate_repeatability
 from orthocal.units import MM
 
+CRITERIA = ("rms", "chi_square", "dof", "aicc", "bic", "unseen_rms")
+"""Numbers of a score in the JSON document."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
@@ -286,12 +289,7 @@ def _result_document(result: ModelResult) -> dict[str, Any]:
         return {
             "estimates": dict(s.estimates),
             "residuals": [finite_or_none(v) for v in s.residuals.tolist()],
-            "rms": finite_or_none(s.rms),
-            "chi_square": finite_or_none(s.chi_square),
-            "dof": s.dof,
-            "aicc": finite_or_none(s.aicc),
-            "bic": finite_or_none(s.bic),
-            "unseen_rms": finite_or_none(s.unseen_rms),
+            **{name: finite_or_none(getattr(s, name)) for name in CRITERIA},
         }
 
     def size(s: ErrorSize | None) -> dict[str, float] | None:

@@ -48,30 +48,16 @@ class Chunk:
     """Index in the table to why the machine cannot be there."""
 
 
-def forward_rows(
-    calibration: Calibration, joints: ArrayLike, *, names: Sequence[str] | None = None
-) -> Iterator[Chunk]:
-    """Tool centre points of the calibrated machine.
+def forward_blocks(calibration: Calibration, blocks: Iterable[Block]) -> Iterator[Chunk]:
+    """Tool centre points of the calibrated machine, of rows as they come.
 
     Args:
         calibration: The calibration.
-        joints: Drive coordinates as the encoders give them, without any offset of the controller,
-            shape (K, n_drives), [m, rad].
-        names: What to call the rows in messages.
+        blocks: Names and drive coordinates of some rows as the encoders give them, without any
+            offset of the controller, shape (n, n_drives), [m, rad].
 
     Yields:
         Chunks of shape (n, 3), [m].
-    """
-    rows, _ = as_rows(joints, len(calibration.robot.drives), "drive coordinates")
-    yield from forward_blocks(calibration, _blocks(rows, names))
-
-
-def forward_blocks(calibration: Calibration, blocks: Iterable[Block]) -> Iterator[Chunk]:
-    """Tool centre points of the calibrated machine, as `forward_rows`, of rows as they come.
-
-    Args:
-        calibration: The calibration.
-        blocks: Names and drive coordinates of some rows, shape (n, n_drives), [m, rad].
     """
     robot = calibration.robot
     closure = LoopClosure(robot, fixed=calibration.errors)
@@ -83,29 +69,15 @@ def forward_blocks(calibration: Calibration, blocks: Iterable[Block]) -> Iterato
     yield from _by_chunks(evaluate, blocks)
 
 
-def inverse_rows(
-    calibration: Calibration, points: ArrayLike, *, names: Sequence[str] | None = None
-) -> Iterator[Chunk]:
-    """Drive coordinates that bring the calibrated machine's tool to given points.
-
-    Args:
-        calibration: The calibration.
-        points: Shape (K, n_drives), [m].
-        names: What to call the rows in messages.
-
-    Yields:
-        Chunks of shape (n, n_drives), as the encoders give them, [m, rad].
-    """
-    rows, _ = as_rows(points, len(calibration.robot.drives), "coordinates")
-    yield from inverse_blocks(calibration, _blocks(rows, names))
-
-
 def inverse_blocks(calibration: Calibration, blocks: Iterable[Block]) -> Iterator[Chunk]:
-    """Drive coordinates of the calibrated machine, as `inverse_rows`, of rows as they come.
+    """Drive coordinates that bring the calibrated machine's tool to points as they come.
 
     Args:
         calibration: The calibration.
         blocks: Names and coordinates of some points, shape (n, n_drives), [m].
+
+    Yields:
+        Chunks of shape (n, n_drives), as the encoders give them, [m, rad].
     """
     closure = LoopClosure(calibration.robot, fixed=calibration.errors)
 
@@ -158,11 +130,11 @@ def accuracy_rows(
             result[at, 6:] = np.sqrt(variance)
         return result
 
-    yield from _by_chunks(evaluate, _blocks(rows, names))
+    yield from _by_chunks(evaluate, row_blocks(rows, names))
 
 
-def _blocks(rows: Array, names: Sequence[str] | None) -> Iterator[Block]:
-    """Rows some at a time."""
+def row_blocks(rows: Array, names: Sequence[str] | None = None) -> Iterator[Block]:
+    """Rows some at a time, with what to call them in messages."""
     names = names or [f"row {i + 1}" for i in range(len(rows))]
     for first in range(0, len(rows), ROWS_AT_ONCE):
         part = slice(first, first + ROWS_AT_ONCE)

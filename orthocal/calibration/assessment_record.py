@@ -13,8 +13,8 @@ from typing import Any, Literal
 import numpy as np
 
 from orthocal.hypotheses.anomaly import AnomalyKind
-from orthocal.io.documents import Number, PositiveInSI
-from orthocal.io.fields import CLOSED, Many, NumberOrNaN, SizeOrNaN, finite_or_none
+from orthocal.io.documents import Number, PositiveInSI, write_plain
+from orthocal.io.fields import CLOSED, Many, NumberOrNaN, SizeOrNaN
 from orthocal.kinematics.workspace import describe_box
 from orthocal.units import InUnit, Unit
 
@@ -120,14 +120,7 @@ class Finding:
 
     def to_document(self) -> dict[str, Any]:
         """Plain data for JSON; null for what is unknown."""
-        return {
-            "kind": self.kind,
-            "severity": self.severity,
-            "text": self.text,
-            "action": self.action,
-            "numbers": {k: finite_or_none(v) for k, v in self.numbers.items()},
-            "places": [{k: getattr(p, k) for k in Place.__slots__} for p in self.places],
-        }
+        return write_plain(self, Finding)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,13 +148,7 @@ class Decision:
 
     def to_document(self) -> dict[str, Any]:
         """Plain data for JSON."""
-        return {
-            "verdict": self.verdict,
-            "headline": self.headline,
-            "reason": self.reason,
-            "action": self.action,
-            "exit_code": self.exit_code,
-        }
+        return {**write_plain(self, Decision), "exit_code": self.exit_code}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

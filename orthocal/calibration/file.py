@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -67,11 +67,12 @@ def load_calibration(path: str | Path) -> Calibration:
 
 def calibration_document(calibration: Calibration) -> dict[str, Any]:
     """A calibration as plain data: the content of calibration.json."""
+    derived = _derive(calibration)
     document = {"schema": SCHEMA, **write_plain(calibration, CalibrationRecord)}
-    for (key, index, name), value in _derive(calibration):
-        part: Any = document[key] if key else document
-        (part if index is None else part[index])[name] = value
-    return document
+    document["identifiability"] |= derived.pop("identifiability")
+    for row, more in zip(document["residuals"], derived.pop("residuals"), strict=True):
+        row |= more
+    return document | derived
 
 
 def calibration_json(calibration: Calibration) -> str:
@@ -118,7 +119,7 @@ def _read_document(
     """Calibration of a document, whose parts are checked against each other.
 
     Args:
-        data: The document; derived numbers are removed from it.
+        data: The document.
         file: Name of the file, for messages.
         path: The file, if the document was read from one.
         robot: The calibrated robot; by default the embedded one.
@@ -126,8 +127,11 @@ def _read_document(
     Raises:
         CalibrationFileError: Naming the key.
     """
-    derived = _take_derived(data)
-    record = validate(CalibrationRecord, data, where=file, error=CalibrationFileError)
+    plain = _without(data, (*_DERIVED, *BESIDE))
+    for key, names in _DERIVED_IN.items():
+        if isinstance(plain, dict) and key in plain:
+            plain[key] = _without(plain[key], names)
+    record = validate(CalibrationRecord, plain, where=file, error=CalibrationFileError)
     count = sum(p.free for p in record.parameters)
     if not count:
         raise CalibrationFileError("holds none that is free", where=f"{file}: parameters")
@@ -144,74 +148,63 @@ def _read_document(
         robot=robot,
         path=path,
     )
-    for place, value in _derive(calibration):
-        if place in derived:
-            _check_derived(place, derived[place], value, file)
+    _check_derived(data, _derive(calibration), file)
     return calibration
 
 
-_Place = tuple[str, int | None, str]
-"""Key in the document ("" for the document), index in a list, and name of a derived number."""
+_DERIVED = ("sigma", "dof", "rms_before", "rms_after", "largest_before", "largest_after")
+_DERIVED_IN = {"identifiability": ("condition", "observability"), "residuals": ("residual",)}
+"""Names of derived numbers in the document and in its parts."""
 
 
-def _derive(c: Calibration) -> Iterator[tuple[_Place, Any]]:
-    """Derived numbers of a record, with their places in the document."""
-    yield ("", None, "sigma"), finite_or_none(c.sigma)
-    yield ("", None, "dof"), finite_or_none(c.dof)
-    for name in ("rms_before", "rms_after", "largest_before", "largest_after"):
-        yield ("", None, name), getattr(c, name)
-    yield ("identifiability", None, "condition"), finite_or_none(c.identifiability.condition)
-    yield ("identifiability", None, "observability"), c.identifiability.observability
-    for i, row in enumerate(c.residuals):
-        yield ("residuals", i, "residual"), row.residual
+def _derive(c: Calibration) -> dict[str, Any]:
+    """Derived numbers of a record, at their places in the document."""
+    return {
+        **{name: finite_or_none(getattr(c, name)) for name in _DERIVED},
+        "identifiability": {
+            "condition": finite_or_none(c.identifiability.condition),
+            "observability": c.identifiability.observability,
+        },
+        "residuals": [{"residual": row.residual} for row in c.residuals],
+    }
 
 
-_FOLLOWING = {
-    "": ("sigma", "dof", "rms_before", "rms_after", "largest_before", "largest_after", *BESIDE),
-    "identifiability": ("condition", "observability"),
-    "residuals": ("residual",),
-}
-"""Names of derived numbers and of keys that are not read, by the key that contains them."""
-
-
-def _take_derived(data: Any) -> dict[_Place, Any]:  # noqa: ANN401 - any document
-    """Derived numbers of a document, which are removed from it."""
-    derived: dict[_Place, Any] = {}
-    for key, names in _FOLLOWING.items():
-        part = data.get(key) if key and isinstance(data, dict) else data
-        holders = enumerate(part) if isinstance(part, list) else [(None, part)]
-        for i, holder in holders:
-            if isinstance(holder, dict):
-                derived |= {(key, i, n): holder.pop(n) for n in names if n in holder}
-    return derived
+def _without(part: Any, names: Collection[str]) -> Any:  # noqa: ANN401 - any document
+    """A part of a document, or each part in a list, without some keys."""
+    if isinstance(part, list):
+        return [_without(p, names) for p in part]
+    return {k: v for k, v in part.items() if k not in names} if isinstance(part, dict) else part
 
 
 def _check_derived(
-    place: _Place,
-    stated: Any,  # noqa: ANN401 - any value of a document
-    value: float | dict[str, float] | None,
+    stated: Any,  # noqa: ANN401 - any document
+    expected: Any,  # noqa: ANN401 - a derived number, or parts with some
     file: str,
+    key: str = "",
 ) -> None:
-    """Refuse a stated number, or numbers by name, that differ from the recomputed ones."""
-    if isinstance(value, dict):
-        inner = stated if isinstance(stated, dict) else {}
-        for name, number in value.items():
-            where = (place[0], place[1], f"{place[2]}.{name}")
-            _check_derived(where, inner.get(name), number, file)
+    """Refuse stated numbers that differ from the recomputed ones; any may be left out."""
+    if isinstance(expected, dict):
+        parts = stated if isinstance(stated, dict) else dict.fromkeys(expected)
+        for name in [name for name in expected if name in parts]:
+            inner = f"{key}.{name}" if key else name
+            _check_derived(parts[name], expected[name], file, inner)
         return
-    if stated is None and value is None:
+    if isinstance(expected, list):
+        for i, pair in enumerate(zip(stated, expected, strict=True)):
+            _check_derived(*pair, file, f"{key}[{i}]")
         return
-    number = isinstance(stated, int | float) and not isinstance(stated, bool)
-    if number and value is not None and math.isclose(stated, value, rel_tol=FOLLOWS, abs_tol=1e-15):
-        return
-    key, index, name = place
-    at = "" if not key else f"{key}." if index is None else f"{key}[{index}]."
-    expected = "null" if value is None else f"{value:.9g}"
-    shown = "null" if stated is None else shorten(str(stated))
-    raise CalibrationFileError(
-        f"found {shown}; by what the file says otherwise it is {expected}",
-        where=f"{file}: {at}{name}",
-    )
+    is_number = isinstance(stated, int | float) and not isinstance(stated, bool)
+    if stated is None or expected is None:
+        agrees = stated is expected
+    else:
+        agrees = is_number and math.isclose(stated, expected, rel_tol=FOLLOWS, abs_tol=1e-15)
+    if not agrees:
+        shown = "null" if stated is None else shorten(str(stated))
+        wanted = "null" if expected is None else f"{expected:.9g}"
+        raise CalibrationFileError(
+            f"found {shown}; by what the file says otherwise it is {wanted}",
+            where=f"{file}: {key}",
+        )
 
 
 def _check_estimates(record: CalibrationRecord, file: str) -> None:
@@ -233,7 +226,7 @@ def _check_estimates(record: CalibrationRecord, file: str) -> None:
     ):
         for (i, p), size in zip(free, np.sqrt(np.abs(variance)).tolist(), strict=True):
             if math.isfinite(size):
-                _check_derived(("parameters", i, key), getattr(p, key), size, file)
+                _check_derived(getattr(p, key), size, file, f"parameters[{i}].{key}")
 
 
 def _require_covariance(matrix: Array, count: int, where: str) -> None:

@@ -12,7 +12,12 @@ import pytest
 from orthocal import assess_tool, calibrate, cli
 from orthocal.assessment import tool_tables as module
 from orthocal.assessment.tool_error import Workspace
-from orthocal.assessment.tool_tables import accuracy_rows, forward_rows, inverse_rows
+from orthocal.assessment.tool_tables import (
+    accuracy_rows,
+    forward_blocks,
+    inverse_blocks,
+    row_blocks,
+)
 from orthocal.calibration.file import write_calibration
 
 OUT_OF_REACH = [0.0, 0.0, 0.9]
@@ -34,6 +39,10 @@ def points():
     return np.random.default_rng(0).uniform(-0.05, 0.05, (20, 3))
 
 
+def inverse_rows(calibration, points, names=None):
+    return inverse_blocks(calibration, row_blocks(points, names))
+
+
 def joined(chunks):
     return np.concatenate([c.values for c in chunks])
 
@@ -43,7 +52,9 @@ def test_chunks_are_the_whole(calibration, points):
     assert [c.first for c in chunks] == [0, 7, 14]
     drives = joined(chunks)
     assert drives == pytest.approx(calibration.machine.inverse(points), abs=1e-12)
-    assert joined(forward_rows(calibration, drives)) == pytest.approx(points, abs=1e-12)
+    assert joined(forward_blocks(calibration, row_blocks(drives))) == pytest.approx(
+        points, abs=1e-12
+    )
     whole = assess_tool(calibration, Workspace.even(points))
     found = joined(accuracy_rows(calibration, points))
     assert whole.after is not None
@@ -71,7 +82,8 @@ def test_rows_that_cannot_be_reached_are_named_and_the_others_served(table, cali
 
 
 def test_joints_beyond_the_travel_are_refused_one_by_one(calibration):
-    chunks = list(forward_rows(calibration, [[0.31, 0.31, 0.31], [0.5, 0.31, 0.31]]))
+    rows = np.array([[0.31, 0.31, 0.31], [0.5, 0.31, 0.31]])
+    chunks = list(forward_blocks(calibration, row_blocks(rows)))
     assert np.isfinite(chunks[0].values[0]).all()
     assert chunks[0].refused[1].reason == "x_slide_mm is 500; the drive reaches from 120 to 390"
 
