@@ -137,6 +137,35 @@ class Family:
     known: bool = True
     """Whether the amounts of `shifts` are known."""
 
+    @classmethod
+    def of(cls, found: Sequence[Explanation], **parts: Any) -> Family:  # noqa: ANN401 - its fields
+        """Family of explanations that are at hand, each of them one way to happen."""
+        return cls(found.__getitem__, len(found), **{"size": len(found)} | parts)
+
+    @classmethod
+    def edited(
+        cls,
+        rows: Rows,
+        found: Sequence[Explanation],
+        changes: Sequence[Array],
+        *,
+        size: int | None = None,
+        log_volume: Array | None = None,
+    ) -> Family:
+        """Family of explanations that correct their rows by known amounts, [m]."""
+        edits = Patterns(sparse_rows([e.rows for e in found], changes, rows.count))
+        size = len(found) if size is None else size
+        return cls.of(found, size=size, edits=edits, log_volume=log_volume)
+
+    @classmethod
+    def with_effects(
+        cls, rows: Rows, found: Sequence[Explanation], shapes: Sequence[Array] | None = None
+    ) -> Family:
+        """Family of explanations whose rows are off by an unknown amount, times a shape."""
+        shapes = [np.ones(len(e.rows)) for e in found] if shapes is None else shapes
+        effects = Patterns(sparse_rows([e.rows for e in found], shapes, rows.count))
+        return cls.of(found, effects=effects)
+
 
 class Rows:
     """Rows of a session by setup, cycle and posture.
@@ -206,7 +235,9 @@ class Rows:
         return self.session.readings[row].postures
 
 
-def sparse_rows(rows: Sequence[Indices], values: Sequence[Array], count: int) -> Sparse:
+def sparse_rows(
+    rows: Sequence[Indices | Sequence[int]], values: Sequence[Array], count: int
+) -> Sparse:
     """Sparse matrix with given entries in each row, shape (len(rows), count)."""
     sizes = np.array([len(r) for r in rows], dtype=np.int64)
     columns = np.concatenate([*rows, np.empty(0, dtype=np.int64)]).astype(np.int64)
@@ -230,8 +261,3 @@ def row_products(one: Sparse, other: Sparse) -> Array:
     if isinstance(one, np.ndarray):
         return np.asarray(np.vecdot(one, other))
     return np.asarray(one.multiply(other).sum(axis=1)).ravel()
-
-
-def marks(rows: Sequence[Indices], count: int) -> Patterns:
-    """Patterns that are 1 on given rows."""
-    return Patterns(sparse_rows(rows, [np.ones(len(r)) for r in rows], count))

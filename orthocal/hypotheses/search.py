@@ -25,7 +25,7 @@ from orthocal.hypotheses.families.sessions import MOST_DRIVES, changes_between_s
 from orthocal.hypotheses.families.single_reading import wrong_readings
 from orthocal.hypotheses.families.swapped_rows import swapped_rows
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
-from orthocal.hypotheses.hypothesis import Family, Rows, marks, to_dense
+from orthocal.hypotheses.hypothesis import Family, Rows, sparse_rows, to_dense
 from orthocal.hypotheses.hypothesis_set import (
     HypothesisSet,
     Term,
@@ -529,4 +529,5 @@ def _prior(family: Family) -> Array:
 
 
 def _marks(groups: Sequence[NDArray[np.int64]], count: int) -> Array:
-    return to_dense(marks(groups, count).rows)
+    """One vector per group of rows that is 1 there, shape (len(groups), count)."""
+    return to_dense(sparse_rows(groups, [np.ones(len(g)) for g in groups], count))

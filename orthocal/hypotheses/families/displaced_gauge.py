@@ -8,12 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from orthocal.hypotheses.anomaly import Explanation, Scope
-from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, Tails, marks, sparse_rows
-
-Indices = NDArray[np.int64]
+from orthocal.hypotheses.anomaly import Explanation
+from orthocal.hypotheses.hypothesis import Family, Indices, Patterns, Rows, Tails, sparse_rows
 
 FEWEST = 4
 """Readings of a setup below which a tail or a drift is not distinguished from an outlier."""
@@ -62,48 +59,33 @@ def _displaced(rows: Rows) -> Family | None:
 
 def _cycle_apart(rows: Rows) -> Family | None:
     """An inner cycle; before the second and the last one the gauge was displaced for good."""
-    groups: list[Indices] = []
-    keys: list[tuple[str, int]] = []
+    found = []
     for (name, cycle), indices in rows.cycles.items():
         setup = rows.setups[name]
         inner = indices[0] != setup[0] and indices[-1] != setup[-1]
         if inner and indices.size > 1 and rows.single[indices].all():
-            groups.append(indices)
-            keys.append((name, cycle))
-    if not groups:
-        return None
-
-    def explain(h: int) -> Explanation:
-        name, cycle = keys[h]
-        indices = tuple(groups[h].tolist())
-        return Explanation("displaced gauge", "cycle", indices, names=(name,), cycle=cycle)
-
-    return Family(explain, len(groups), len(groups), effects=marks(groups, rows.count))
+            at = tuple(indices.tolist())
+            found.append(Explanation("displaced gauge", "cycle", at, names=(name,), cycle=cycle))
+    return Family.with_effects(rows, found) if found else None
 
 
 def _drift(rows: Rows) -> Family | None:
+    """Drift of each setup, and the same drift of all."""
     drifting = {
         name: indices
         for name, indices in rows.setups.items()
         if indices.size >= FEWEST and rows.single[indices].all()
     }
-    groups: list[tuple[tuple[str, ...], Indices]] = [
-        ((name,), indices) for name, indices in drifting.items()
+    found = [
+        Explanation("drift", "setup", tuple(indices.tolist()), (name,))
+        for name, indices in drifting.items()
     ]
     ramps = [np.linspace(0.0, 1.0, indices.size) for indices in drifting.values()]
-    if not groups:
-        return None
-    if len(groups) > 1:
-        groups.append((tuple(drifting), np.concatenate(list(drifting.values()))))
+    if len(found) > 1:
+        every = tuple(i for e in found for i in e.rows)
+        found.append(Explanation("drift", "session", every, tuple(drifting)))
         ramps.append(np.concatenate(ramps))
-
-    def explain(h: int) -> Explanation:
-        setups, indices = groups[h]
-        scope: Scope = "setup" if len(setups) == 1 else "session"
-        return Explanation("drift", scope, tuple(indices.tolist()), setups)
-
-    effects = Patterns(sparse_rows([indices for _, indices in groups], ramps, rows.count))
-    return Family(explain, len(groups), len(groups), effects=effects)
+    return Family.with_effects(rows, found, ramps) if found else None
 
 
 def _stuck(rows: Rows, sigma: float) -> Family | None:
@@ -119,13 +101,12 @@ def _stuck(rows: Rows, sigma: float) -> Family | None:
                 runs.append(run)
     if not runs:
         return None
-
-    def explain(h: int) -> Explanation:
-        setup = rows.session.readings[runs[h][0]].setup
-        return Explanation("stuck dial", "setup", tuple(runs[h].tolist()), names=(setup,))
-
+    setups = [rows.session.readings[run[0]].setup for run in runs]
+    found = [
+        Explanation("stuck dial", "setup", tuple(run.tolist()), names=(setup,))
+        for run, setup in zip(runs, setups, strict=True)
+    ]
     silent = [run[1 : MOST_STUCK + 1] for run in runs]
     steps = np.array([rows.gauge(int(run[0])).resolution or sigma for run in runs])
     volume = -np.log(steps) * [len(indices) for indices in silent]
-    size = rows.count * MOST_STUCK
-    return Family(explain, len(runs), size, log_volume=volume, silent=silent)
+    return Family.of(found, size=rows.count * MOST_STUCK, log_volume=volume, silent=silent)

@@ -8,12 +8,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthocal.hypotheses.anomaly import Explanation
-from orthocal.hypotheses.hypothesis import Family, Rows
-
-Indices = NDArray[np.int64]
+from orthocal.hypotheses.hypothesis import Family, Indices, Rows
 
 MOST = 12
 """Amounts of one setup or posture that are considered."""
@@ -32,21 +29,16 @@ def inconsistent_groups(rows: Rows) -> Iterator[Family]:
 def _setups(rows: Rows) -> Family | None:
     if not 2 < len(rows.setups) <= MOST_GROUPS:
         return None
-    names: list[str] = []
-    groups: list[list[Indices]] = []
+    found, groups = [], []
     for name, indices in rows.setups.items():
         amounts = [r for (setup, *_), r in rows.repeated.items() if setup == name]
         if rows.single[indices].all():  # the gauge zero is free
             amounts = amounts[1:]
         if 1 < len(amounts) <= MOST:
-            names.append(name)
+            at = tuple(indices.tolist())
+            found.append(Explanation("inconsistent setup", "setup", at, (name,)))
             groups.append(amounts)
-
-    def explain(h: int) -> Explanation:
-        indices = tuple(rows.setups[names[h]].tolist())
-        return Explanation("inconsistent setup", "setup", indices, (names[h],))
-
-    return Family(explain, len(groups), len(groups), groups=groups)
+    return Family.of(found, groups=groups)
 
 
 def _postures(rows: Rows) -> Family | None:
@@ -55,11 +47,11 @@ def _postures(rows: Rows) -> Family | None:
         by_label.setdefault(rows.posture(int(indices[0])), []).append(indices)
     if len(by_label) < 3:
         return None
-    found = {k: v for k, v in by_label.items() if 1 < len(v) <= MOST}
-    names, groups = list(found), list(found.values())
-
-    def explain(h: int) -> Explanation:
-        indices = tuple(np.concatenate(groups[h]).tolist())
-        return Explanation("inconsistent posture", "postures", indices, names=(names[h],))
-
-    return Family(explain, len(groups), len(groups), groups=groups)
+    groups = {k: v for k, v in by_label.items() if 1 < len(v) <= MOST}
+    found = [
+        Explanation(
+            "inconsistent posture", "postures", tuple(np.concatenate(g).tolist()), names=(label,)
+        )
+        for label, g in groups.items()
+    ]
+    return Family.of(found, groups=list(groups.values()))

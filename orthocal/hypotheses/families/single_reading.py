@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthocal.hypotheses.anomaly import AnomalyKind, Explanation, Scope
-from orthocal.hypotheses.families.unit_and_sign import DECIMAL_POINTS
-from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, marks, sparse_rows
-
-Indices = NDArray[np.int64]
+from orthocal.hypotheses.families.unit_and_sign import DECIMAL_POINTS, multiplied
+from orthocal.hypotheses.hypothesis import Family, Indices, Rows
 
 MISREAD = (1e-3, 0.5e-3, 0.2e-3, 0.1e-3)
 """Amounts by which a dial is misread: a turn, half a turn, a turn of a fine dial, a numbered mark,
@@ -39,57 +36,34 @@ def wrong_readings(rows: Rows) -> Iterator[Family]:
         yield _multiplied(rows, several, DECIMAL_POINTS, "decimal point")
 
 
-def explain_rows(
-    rows: Rows, indices: Indices, kind: AnomalyKind, *, factor: float | None = None
+def _explain(
+    rows: Rows,
+    indices: Indices,
+    kind: AnomalyKind,
+    *,
+    factor: float | None = None,
+    amount: float | None = None,
 ) -> Explanation:
     """Explanation that concerns one reading, or one posture in all cycles."""
     scope: Scope = "reading" if len(indices) == 1 else "posture"
     names = (rows.posture(int(indices[0])),)
-    return Explanation(kind, scope, tuple(indices.tolist()), names=names, factor=factor)
+    at = tuple(indices.tolist())
+    return Explanation(kind, scope, at, names=names, factor=factor, amount=amount)
 
 
 def _outliers(rows: Rows, groups: Sequence[Indices]) -> Family:
     kind: AnomalyKind = "outlier" if len(groups[0]) == 1 else "inconsistent posture"
-    return Family(
-        lambda h: explain_rows(rows, groups[h], kind),
-        len(groups),
-        len(groups),
-        effects=marks(groups, rows.count),
-    )
+    return Family.with_effects(rows, [_explain(rows, indices, kind) for indices in groups])
 
 
 def _multiplied(
     rows: Rows, groups: Sequence[Indices], factors: Sequence[float], kind: AnomalyKind
 ) -> Family:
-    tried = [(factor, indices) for factor in factors for indices in groups]
-    change = [(factor - 1.0) * rows.values[indices] for factor, indices in tried]
-    return Family(
-        lambda h: explain_rows(rows, tried[h][1], kind, factor=tried[h][0]),
-        len(tried),
-        len(tried),
-        Patterns(sparse_rows([indices for _, indices in tried], change, rows.count)),
-        log_volume=np.array([len(indices) * np.log(abs(factor)) for factor, indices in tried]),
-    )
+    tried = [_explain(rows, i, kind, factor=factor) for factor in factors for i in groups]
+    return multiplied(rows, tried)
 
 
 def _misread(rows: Rows, groups: Sequence[Indices]) -> Family:
-    steps = [sign * size for size in MISREAD for sign in (1.0, -1.0)]
-    tried = [(step, indices) for step in steps for indices in groups]
-    change = [np.full(len(indices), step) for step, indices in tried]
-
-    def explain(h: int) -> Explanation:
-        step, indices = tried[h]
-        return Explanation(
-            "misread dial",
-            "reading",
-            tuple(indices.tolist()),
-            names=(rows.posture(int(indices[0])),),
-            amount=-step,
-        )
-
-    return Family(
-        explain,
-        len(tried),
-        len(tried),
-        Patterns(sparse_rows([indices for _, indices in tried], change, rows.count)),
-    )
+    amounts = [sign * size for size in MISREAD for sign in (-1.0, 1.0)]
+    tried = [_explain(rows, i, "misread dial", amount=a) for a in amounts for i in groups]
+    return Family.edited(rows, tried, [np.array([-(e.amount or 0.0)]) for e in tried])

@@ -7,33 +7,18 @@ neighbours, and a family of more than `MOST` pairs is not considered at all.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import combinations, pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthocal.hypotheses.anomaly import Explanation, Scope
-from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, sparse_rows
-
-Indices = NDArray[np.int64]
+from orthocal.hypotheses.hypothesis import Family, Indices, Rows
 
 FAR_APART = 400
 """Rows of a session above which only neighbours in a setup are considered."""
 
 MOST = 60_000
 """Pairs of a family above which none is considered."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pair:
-    """Rows that may be swapped."""
-
-    scope: Scope
-    one: Indices
-    other: Indices
-    setups: tuple[str, ...] = ()
-    names: tuple[str, ...] = ()
 
 
 def swapped_rows(rows: Rows) -> Iterator[Family]:
@@ -51,27 +36,29 @@ def swapped_rows(rows: Rows) -> Iterator[Family]:
             yield _swapped(rows, pairs)
 
 
-def _swapped(rows: Rows, pairs: Sequence[_Pair]) -> Family:
-    both = [np.concatenate([p.one, p.other]) for p in pairs]
-    change = [
-        np.concatenate([rows.values[p.other] - rows.values[p.one]] * 2)
-        * np.repeat([1.0, -1.0], p.one.size)
-        for p in pairs
-    ]
-
-    def explain(h: int) -> Explanation:
-        p = pairs[h]
-        return Explanation("swapped rows", p.scope, tuple(both[h].tolist()), p.setups, p.names)
-
-    edits = Patterns(sparse_rows(both, change, rows.count))
-    return Family(explain, len(pairs), len(pairs), edits)
+def _swapped(rows: Rows, pairs: Sequence[Explanation]) -> Family:
+    both = [np.array(p.rows) for p in pairs]
+    change = [rows.values[np.roll(i, i.size // 2)] - rows.values[i] for i in both]
+    return Family.edited(rows, pairs, change)
 
 
-def _rows(one: int, other: int) -> _Pair:
-    return _Pair("reading", np.array([one]), np.array([other]))
+def _pair(
+    scope: Scope,
+    one: Indices,
+    other: Indices,
+    setups: tuple[str, ...] = (),
+    names: tuple[str, ...] = (),
+) -> Explanation:
+    """Rows that may be swapped."""
+    both = (*one.tolist(), *other.tolist())
+    return Explanation("swapped rows", scope, both, setups, names)
 
 
-def _of_setup(rows: Rows) -> list[_Pair]:
+def _rows(one: int, other: int) -> Explanation:
+    return Explanation("swapped rows", "reading", (int(one), int(other)))
+
+
+def _of_setup(rows: Rows) -> list[Explanation]:
     near = rows.count > FAR_APART
     return [
         _rows(i, j)
@@ -80,7 +67,7 @@ def _of_setup(rows: Rows) -> list[_Pair]:
     ]
 
 
-def _across_setups(rows: Rows) -> list[_Pair]:
+def _across_setups(rows: Rows) -> list[Explanation]:
     """Pairs of the same posture in two setups, as in a line of the sheet with slipped columns."""
     found: dict[tuple[str, int], list[int]] = {}
     for i, r in enumerate(rows.session.readings):
@@ -95,7 +82,7 @@ def _across_setups(rows: Rows) -> list[_Pair]:
     ]
 
 
-def _postures_of_setup(rows: Rows) -> list[_Pair]:
+def _postures_of_setup(rows: Rows) -> list[Explanation]:
     """Two postures of a setup, in all cycles."""
     by_setup: dict[str, list[Indices]] = {}
     for (setup, *_), indices in rows.repeated.items():
@@ -104,30 +91,30 @@ def _postures_of_setup(rows: Rows) -> list[_Pair]:
     if sum(len(groups) ** 2 for groups in by_setup.values()) > 2 * MOST:
         return []
     return [
-        _Pair("posture", a, b, names=(setup, rows.posture(int(a[0])), rows.posture(int(b[0]))))
+        _pair("posture", a, b, names=(setup, rows.posture(int(a[0])), rows.posture(int(b[0]))))
         for setup, groups in by_setup.items()
         for a, b in combinations(groups, 2)
         if len(a) == len(b)
     ]
 
 
-def _postures(rows: Rows) -> list[_Pair]:
+def _postures(rows: Rows) -> list[Explanation]:
     """Two postures in all setups that read both."""
     by_label: dict[str, dict[tuple[str, int], int]] = {}
     for i, r in enumerate(rows.session.readings):
         by_label.setdefault(rows.posture(i), {})[r.setup, r.cycle] = i
     if len(by_label) ** 2 > 2 * MOST or len(by_label) * rows.count > 100 * MOST:
         return []
-    found: list[_Pair] = []
+    found: list[Explanation] = []
     for a, b in combinations(by_label, 2):
         both = [k for k in by_label[a] if k in by_label[b]]
         if len({setup for setup, _ in both}) > 1:
             one, other = (np.array([by_label[x][k] for k in both]) for x in (a, b))
-            found.append(_Pair("postures", one, other, names=(a, b)))
+            found.append(_pair("postures", one, other, names=(a, b)))
     return found
 
 
-def _setups(rows: Rows) -> list[_Pair]:
+def _setups(rows: Rows) -> list[Explanation]:
     """Two setups of one session."""
     if len(rows.setups) ** 2 > 2 * MOST:
         return []
@@ -136,29 +123,29 @@ def _setups(rows: Rows) -> list[_Pair]:
         return setup.partition("/")[0] if rows.session.joined else ""
 
     return [
-        _Pair("setups", rows.setups[a], rows.setups[b], (a, b))
+        _pair("setups", rows.setups[a], rows.setups[b], (a, b))
         for a, b in combinations(rows.setups, 2)
         if rows.setups[a].size == rows.setups[b].size and session(a) == session(b)
     ]
 
 
-def _legs(rows: Rows) -> list[_Pair]:
+def _legs(rows: Rows) -> list[Explanation]:
     """All setups of two legs, in their order."""
     legs = {name: setups for (scope, name), setups in rows.groups.items() if scope == "leg"}
-    found: list[_Pair] = []
+    found: list[Explanation] = []
     for a, b in combinations(legs, 2):
         sizes = [[rows.setups[s].size for s in legs[x]] for x in (a, b)]
         if sizes[0] == sizes[1]:
             one, other = rows.of_setups(legs[a]), rows.of_setups(legs[b])
-            found.append(_Pair("legs", one, other, (*legs[a], *legs[b]), (a, b)))
+            found.append(_pair("legs", one, other, (*legs[a], *legs[b]), (a, b)))
     return found
 
 
-def _backwards(rows: Rows) -> list[_Pair]:
+def _backwards(rows: Rows) -> list[Explanation]:
     """The rows of a setup written from the last to the first."""
-    found: list[_Pair] = []
+    found: list[Explanation] = []
     for name, indices in rows.setups.items():
         half = indices.size // 2
         if half > 1:
-            found.append(_Pair("setup", indices[:half], indices[::-1][:half], (name,)))
+            found.append(_pair("setup", indices[:half], indices[::-1][:half], (name,)))
     return found

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.hypotheses.anomaly import AnomalyKind, Explanation, Scope
-from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, sparse_rows
+from orthocal.hypotheses.hypothesis import Family, Indices, Rows
 from orthocal.units import MM
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 UNITS = (25.4, 1.0 / 25.4, 1e3, 1e-3)
 """Factors that correct inches, mm taken for inches, m, and µm."""
@@ -39,28 +38,6 @@ MOST_PAIRED = 24
 """Setups above which pairs of them are not considered."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Group:
-    """Rows that may share a factor."""
-
-    scope: Scope
-    rows: Indices
-    setups: tuple[str, ...] = ()
-    names: tuple[str, ...] = ()
-    cycle: int | None = None
-
-    def explain(self, kind: AnomalyKind, factor: float) -> Explanation:
-        return Explanation(
-            kind,
-            self.scope,
-            tuple(self.rows.tolist()),
-            self.setups,
-            self.names,
-            cycle=self.cycle,
-            factor=factor,
-        )
-
-
 def wrong_units_and_signs(rows: Rows, sigma: float) -> Iterator[Family]:
     """Factors that groups of readings share.
 
@@ -69,13 +46,13 @@ def wrong_units_and_signs(rows: Rows, sigma: float) -> Iterator[Family]:
         sigma: Standard deviation of a reading, [m].
     """
     groups = _groups(rows)
-    yield _reversed(rows, groups)
+    yield multiplied(rows, groups)
     names = list(rows.setups)
     if 3 < len(names) <= MOST_PAIRED:
         pairs = combinations(names, 2)
-        yield _reversed(rows, [_Group("setups", rows.of_setups(p), p) for p in pairs])
+        yield multiplied(rows, [_reversed("setups", rows.of_setups(p), p) for p in pairs])
     groups += [
-        _Group("cycle", indices, names=(name,), cycle=cycle)
+        _reversed("cycle", indices, names=(name,), cycle=cycle)
         for (name, cycle), indices in rows.cycles.items()
         if len(indices) < len(rows.setups[name])
     ]
@@ -83,55 +60,67 @@ def wrong_units_and_signs(rows: Rows, sigma: float) -> Iterator[Family]:
     yield _scaled(rows, groups, "decimal point", DECIMAL_POINTS, sigma)
 
 
-def _groups(rows: Rows) -> list[_Group]:
+def multiplied(rows: Rows, found: Sequence[Explanation], *, size: int | None = None) -> Family:
+    """Readings that the factors of explanations correct.
+
+    Args:
+        rows: The rows.
+        found: The explanations.
+        size: Number of ways in which it could have happened; by default as many as explanations.
+    """
+    factors = np.array([e.factor for e in found], dtype=np.float64)
+    change = [(f - 1.0) * rows.values[list(e.rows)] for f, e in zip(factors, found, strict=True)]
+    dimensions = np.array([_dimensions(rows, e) for e in found])
+    volume = dimensions * np.log(np.abs(factors))
+    return Family.edited(rows, found, change, size=size, log_volume=volume)
+
+
+def _reversed(
+    scope: Scope,
+    indices: Indices,
+    setups: tuple[str, ...] = (),
+    names: tuple[str, ...] = (),
+    cycle: int | None = None,
+) -> Explanation:
+    at = tuple(indices.tolist())
+    return Explanation("reversed sign", scope, at, setups, names, cycle, factor=-1.0)
+
+
+def _groups(rows: Rows) -> list[Explanation]:
+    """Groups of readings that may share a factor, with their signs reversed."""
     every = tuple(rows.setups)
-    found = [_Group("session", np.arange(rows.count), every)]
+    found = [_reversed("session", np.arange(rows.count), every)]
     for (scope, name), setups in rows.groups.items():
         kind: Scope = "leg" if scope == "leg" else "gauge"
-        found.append(_Group(kind, rows.of_setups(setups), setups, (name,)))
+        found.append(_reversed(kind, rows.of_setups(setups), setups, (name,)))
     if len(every) > 1:
-        found += [_Group("setup", indices, (name,)) for name, indices in rows.setups.items()]
+        found += [_reversed("setup", indices, (name,)) for name, indices in rows.setups.items()]
     return found
-
-
-def _reversed(rows: Rows, groups: list[_Group]) -> Family:
-    change = [-2.0 * rows.values[g.rows] for g in groups]
-    edits = Patterns(sparse_rows([g.rows for g in groups], change, rows.count))
-    return Family(
-        lambda h: groups[h].explain("reversed sign", -1.0), len(groups), len(groups), edits
-    )
 
 
 def _scaled(
     rows: Rows,
-    groups: list[_Group],
+    groups: Sequence[Explanation],
     kind: AnomalyKind,
     factors: tuple[float, ...],
     sigma: float,
 ) -> Family:
-    steps = [_step(rows.values[g.rows]) for g in groups]
+    steps = [_step(rows.values[list(g.rows)]) for g in groups]
     tried = [
-        (factor, g)
+        replace(g, kind=kind, factor=factor)
         for factor in factors
         for g, step in zip(groups, steps, strict=True)
         if factor < 1.0 or FINEST * sigma <= factor * step <= COARSEST * sigma
     ]
-    change = [(factor - 1.0) * rows.values[g.rows] for factor, g in tried]
-    return Family(
-        lambda h: tried[h][1].explain(kind, tried[h][0]),
-        len(tried),
-        len(groups) * len(factors),
-        Patterns(sparse_rows([g.rows for _, g in tried], change, rows.count)),
-        log_volume=np.array([_dimensions(rows, g) * np.log(factor) for factor, g in tried]),
-    )
+    return multiplied(rows, tried, size=len(groups) * len(factors))
 
 
-def _dimensions(rows: Rows, group: _Group) -> int:
+def _dimensions(rows: Rows, group: Explanation) -> int:
     """Independent numbers in a group of rows: those of whole setups less their gauge zeros."""
     if not group.setups:
-        return group.rows.size
+        return len(group.rows)
     readings = rows.session.readings
-    return group.rows.size - len({readings[i].setup for i in group.rows if rows.single[i]})
+    return len(group.rows) - len({readings[i].setup for i in group.rows if rows.single[i]})
 
 
 def _step(values: Array) -> float:
