@@ -15,8 +15,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import Enum
 from itertools import product
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,12 +68,8 @@ POINTS_AT_ONCE = 2048
 Key = tuple[int, ...]
 """Number of halvings, and the indices of a box."""
 
-
-class Fallback(Enum):
-    """Treatment of a box without a polynomial."""
-
-    DIVIDED = "divided"
-    EXACT = "exact"
+Fallback = Literal["divided", "exact"]
+"""Treatment of a box without a polynomial."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,8 +141,9 @@ class CorrectionField:
         desired = np.array(points, dtype=np.float64)[:, axes]
         commanded, exact, refused = np.full(desired.shape, np.nan), list[int](), dict[int, str]()
         end = len(points)
-        for group, key in self._group_by_box(desired):
-            if exact and key not in self._boxes:  # making a box out of reach takes long
+        boxes = _group(_cells(desired, self._side))
+        for group, cell in sorted(boxes, key=lambda box: box[0][0]):
+            if exact and (0, *cell) not in self._boxes:  # making a box out of reach takes long
                 end = self._correct_exactly(desired, commanded, exact, refused)
             group = group[group < end]
             if group.size:
@@ -202,11 +199,6 @@ class CorrectionField:
         indices.clear()
         return end
 
-    def _group_by_box(self, desired: Array) -> list[tuple[Indices, Key]]:
-        """Points by undivided box, in the order of their first points."""
-        groups = _group(_cells(desired, self._side))
-        return sorted([(group, (0, *cell)) for group, cell in groups], key=lambda item: item[0][0])
-
     def _corrections(
         self, points: Array, indices: Indices, halvings: int, exact: list[int]
     ) -> Array:
@@ -216,7 +208,7 @@ class CorrectionField:
             box = self._box((halvings, *cell))
             if isinstance(box, _Box):
                 result[group] = box.correction(points[group])
-            elif box is Fallback.DIVIDED:
+            elif box == "divided":
                 result[group] = self._corrections(
                     points[group], indices[group], halvings + 1, exact
                 )
@@ -235,14 +227,14 @@ class CorrectionField:
         return self._boxes[key]
 
     def _make(self, key: Key) -> _Box | Fallback:
-        fallback = Fallback.DIVIDED if key[0] < MOST_DIVISIONS else Fallback.EXACT
+        fallback: Fallback = "divided" if key[0] < MOST_DIVISIONS else "exact"
         side = self._side / 2 ** key[0]
         middle = (np.array(key[1:]) + 0.5) * side
         half = np.full(middle.size, (0.5 + MARGIN) * side)
         nodes = middle + half * self._nodes
         corners = np.flatnonzero((np.abs(self._nodes) > 1.0 - 1e-12).all(axis=1))
         if self.exactly(middle[None])[1]:
-            return Fallback.EXACT if key[0] else fallback
+            return "exact" if key[0] else fallback
         if any(self.exactly(nodes[[i]])[1] for i in corners.tolist()):
             return fallback
         commanded, refused = self.exactly(nodes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -168,8 +169,7 @@ class ProgramCorrector:
 
 def _estimate(motion: Motion) -> float:
     """Estimated number of segments of a motion."""
-    a, b = motion.start, motion.end
-    length = abs(b[0] - a[0]) + abs(b[1] - a[1]) + abs(b[2] - a[2])
+    length = math.dist(motion.start, motion.end)
     if motion.arc is None:
         return 1.0 + length / LONGEST_SEGMENT
     return 1.0 + (length + 10.0 * abs(motion.arc.sweep) * motion.arc.radii[0]) / LONGEST_SEGMENT

@@ -13,7 +13,7 @@ from programs import distances, read_polyline
 
 from orthocal import ExportError, calibrate, draw_errors, write_calibration
 from orthocal.assessment.controller_entries import entered_offsets
-from orthocal.export.correction_field import CorrectionField, Fallback
+from orthocal.export.correction_field import CorrectionField
 from orthocal.gcode.interpreter import Interpreter
 from orthocal.gcode.program import ProgramCorrector
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
@@ -65,7 +65,7 @@ def test_line_that_leaves_the_workspace_is_refused_at_the_first_point(field):
 def test_first_point_out_of_reach_is_named_in_any_order(real):
     """With boxes of exact corrections, both before and after they are made."""
     field = CorrectionField(real, OFFSETS, within=WITHIN)
-    field._make = lambda key: Fallback.EXACT
+    field._make = lambda key: "exact"
     field.exactly = lambda p: (
         np.where(p > 0.1, np.nan, p + 1e-3),
         {int(i): f"{p[i][0]}" for i in np.flatnonzero((p > 0.1).any(axis=1))},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from datetime import datetime
 from pathlib import Path
 
@@ -158,18 +158,21 @@ def _find_leader(leaders: dict[str, str], name: str) -> str:
     return name
 
 
+def require_name(name: str, names: Collection[str], noun: str, *, where: str) -> None:
+    """Refuse a name that is not among those of a session.
+
+    Raises:
+        SessionError: With the names of the session.
+    """
+    if name not in names:
+        raise SessionError(f"'{name}' is not a {noun}; {noun}s: {', '.join(names)}", where=where)
+
+
 def _check_names(row: RawReading, plan: Session) -> None:
     """Refuse a setup or postures that the session does not have."""
-    if row.setup not in plan.setups:
-        raise SessionError(
-            f"'{row.setup}' is not a setup; setups: {', '.join(plan.setups)}", where=row.where
-        )
+    require_name(row.setup, plan.setups, "setup", where=row.where)
     for name in (row.posture, row.minus) if row.minus else (row.posture,):
-        if name not in plan.postures:
-            raise SessionError(
-                f"'{name}' is not a posture; postures: {', '.join(plan.postures)}",
-                where=row.where,
-            )
+        require_name(name, plan.postures, "posture", where=row.where)
     if row.minus == row.posture:
         raise SessionError(f"takes posture '{row.posture}' off itself", where=row.where)
 

@@ -150,6 +150,11 @@ class SessionKeys(_Keys):
     seed: Count | None = None
     """Seed of simulated readings."""
 
+    @property
+    def named_gauges(self) -> dict[str, GaugeKeys]:
+        """Gauges by name; that of a session with one may have the name ""."""
+        return self.gauges or {"": self.gauge or GaugeKeys()}
+
     @model_validator(mode="after")
     def _one_form_of_gauges(self) -> SessionKeys:
         if self.gauge is not None and self.gauges is not None:

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -22,7 +23,7 @@ from orthocal.io.files import (
     read_file,
     require_plain_name,
 )
-from orthocal.measurement.files.readings_checks import check_readings
+from orthocal.measurement.files.readings_checks import check_readings, require_name
 from orthocal.measurement.files.readings_file import read_rows
 from orthocal.measurement.files.schema import MOST_READINGS, CalibrationKeys, GaugeKeys, SessionKeys
 from orthocal.measurement.files.session_robot import (
@@ -234,7 +235,7 @@ _Setups = Mapping[str, tuple[SetupKeys, Sensor]]
 
 def _read_setups(file: Path, keys: SessionKeys) -> _Setups:
     """Keys and sensor of each setup."""
-    gauges = keys.gauges or {"": keys.gauge or GaugeKeys()}
+    gauges = keys.named_gauges
     only = next(iter(gauges.values())) if len(gauges) == 1 else GaugeKeys()
     setups = {}
     for name, data in keys.setups.items():
@@ -258,20 +259,15 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
     require_given_zero(robot, f"{file}: robot")
     purpose, robot = read_purpose(keys.calibration, robot, where=f"{file}: calibration")
     offsets = build_offsets(keys.controller, robot, f"{file}: controller")
-    gauges = _build_gauges(keys)
+    gauges = {name: g.to_gauge() for name, g in keys.named_gauges.items()}
     setups = {}
     for name, (setup, sensor) in read.items():
         where = f"{file}: setups.{name}"
         sensor.require_fit(robot, where=where)
-        if setup.aligned_at is not None and setup.aligned_at not in keys.postures:
-            raise SessionError(
-                f"'{setup.aligned_at}' is not a posture; postures: {', '.join(keys.postures)}",
-                where=f"{where}.aligned_at",
-            )
+        _check_postures(setup, keys.postures, where)
         gauge, zero = _gauge_of(setup, gauges, where), setup.zero or default_zero(sensor)
         setups[name] = Setup(name, sensor, gauge, zero=zero, aligned_at=setup.aligned_at)
     _check_shared(setups, str(file))
-    _check_planned_postures(file, keys, read)
     return Session(
         robot=robot,
         robot_reference=keys.robot,
@@ -283,8 +279,6 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
         readings=(),
         controller_offsets=offsets,
         path=file,
-        readings_path=None,
-        sha256="",
         purpose=purpose,
         seed=keys.seed,
     )
@@ -311,11 +305,6 @@ def _check_shared(setups: Mapping[str, Setup], file: str) -> None:
             )
 
 
-def _build_gauges(keys: SessionKeys) -> dict[str, Gauge]:
-    gauges = keys.gauges or {"": keys.gauge or GaugeKeys()}
-    return {name: g.to_gauge() for name, g in gauges.items()}
-
-
 def _gauge_of(setup: SetupKeys, gauges: Mapping[str, Gauge], where: str) -> str:
     """Name of a setup's gauge."""
     if setup.gauge is None:
@@ -334,16 +323,11 @@ def _gauge_of(setup: SetupKeys, gauges: Mapping[str, Gauge], where: str) -> str:
     return setup.gauge
 
 
-def _check_planned_postures(file: Path, keys: SessionKeys, read: _Setups) -> None:
-    for name, (setup, _) in read.items():
-        where = f"{file}: setups.{name}.postures"
-        seen: set[str] = set()
-        for posture in setup.postures or ():
-            if posture not in keys.postures:
-                raise SessionError(
-                    f"'{posture}' is not a posture; postures: {', '.join(keys.postures)}",
-                    where=where,
-                )
-            if posture in seen:
-                raise SessionError(f"'{posture}' stands twice", where=where)
-            seen.add(posture)
+def _check_postures(setup: SetupKeys, postures: Collection[str], where: str) -> None:
+    """Refuse postures of a setup that do not exist, or are planned twice."""
+    if setup.aligned_at is not None:
+        require_name(setup.aligned_at, postures, "posture", where=f"{where}.aligned_at")
+    for posture, count in Counter(setup.postures or ()).items():
+        require_name(posture, postures, "posture", where=f"{where}.postures")
+        if count > 1:
+            raise SessionError(f"'{posture}' stands twice", where=f"{where}.postures")
