@@ -39,19 +39,19 @@ class Polynomial:
         return int(self.exponents.sum(axis=1).max())
 
     def __call__(self, points: Array) -> Array:
-        """Values at points, shape (k, n), without limits: shape (k, n_values)."""
-        return _evaluate(self.tensor, (points - self.middle) / self.half)
+        """Values at points, shape (k, n), without limits: shape (k, n_values).
 
-    def derivative(self, points: Array) -> Array:
-        """Derivatives at points, shape (k, n): shape (k, n_values, n)."""
-        scaled = (points - self.middle) / self.half
-        columns = []
-        for k in range(self.middle.size):
-            tensor = np.moveaxis(self.tensor, k, 0)
-            powers = np.arange(1, len(tensor)).reshape(-1, *[1] * (tensor.ndim - 1))
-            lowered = np.moveaxis(powers * tensor[1:], 0, k)
-            columns.append(_evaluate(lowered, scaled) / self.half[k])
-        return np.stack(columns, axis=-1)
+        The sum of the terms is contracted along one coordinate after the other.
+        """
+        scaled, values = (points - self.middle) / self.half, self.tensor
+        for k in range(scaled.shape[1]):
+            powers = np.vander(scaled[:, k], self.tensor.shape[k], increasing=True)
+            if k == 0:
+                flat = powers @ values.reshape(len(values), -1)
+                values = flat.reshape(len(scaled), *values.shape[1:])
+            else:
+                values = np.einsum("ni,ni...->n...", powers, values)
+        return np.asarray(values)
 
 
 class PolynomialFit:
@@ -92,16 +92,3 @@ def total_degree(n: int, degree: int) -> Indices:
 def chebyshev_line(count: int) -> Array:
     """Chebyshev nodes of ±1 with both ends, shape (count,)."""
     return np.asarray(-np.cos(np.pi * np.arange(count) / (count - 1)))
-
-
-def _evaluate(tensor: Array, scaled: Array) -> Array:
-    """Sum of the terms, contracted along one coordinate after the other."""
-    values = tensor
-    for k in range(scaled.shape[1]):
-        powers = np.vander(scaled[:, k], tensor.shape[k], increasing=True)
-        if k == 0:
-            flat = powers @ values.reshape(len(values), -1)
-            values = flat.reshape(len(scaled), *values.shape[1:])
-        else:
-            values = np.einsum("ni,ni...->n...", powers, values)
-    return np.asarray(values)

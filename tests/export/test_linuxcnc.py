@@ -24,7 +24,7 @@ from linuxcnc import (
     require_linuxcnc,
     run_program,
 )
-from programs import distances as polyline_distances
+from programs import distances
 
 from orthocal import (
     ExportError,
@@ -210,8 +210,7 @@ def test_core_without_a_tool_equals_the_calibrated_machine(full, tmp_path):
     core = Core(tmp_path, write_core(full, approximation))
     points = np.random.default_rng(8).uniform(-0.06, 0.06, (10_000, 3))
     joints = drives_of(full, core.inverse(points / MM))
-    jacobian = approximation.inverse.derivative(points)
-    off = np.linalg.solve(jacobian, (joints - full.machine.inverse(points))[..., None])[..., 0]
+    off = full.machine.forward(joints) - points
     assert np.linalg.norm(off, axis=1).max() < approximation.achieved <= WITHIN
 
 
@@ -241,7 +240,7 @@ def test_correction_beyond_the_region_is_that_of_the_nearest_face(full, core):
     form = find_nominal_form(full.robot, np.zeros(3), np.full(3, 0.06))
     outside = np.array([[75.0, 10.0, -80.0], [-61.0, 0.0, 0.0], [0.0, 70.0, 20.0]])
     added = [
-        drives_of(full, core.inverse(p)) - form(p * MM)[0]
+        drives_of(full, core.inverse(p)) - form(p * MM)
         for p in (outside, np.clip(outside, -60.0, 60.0))
     ]
     assert np.abs(added[0] - added[1]).max() < 1e-12
@@ -469,10 +468,17 @@ def test_offsets_of_a_complete_model(full):
 # ---- LinuxCNC itself
 
 
-def from_circle(points, centre, radius):
-    """Distances from a circle in a plane of constant z."""
+def from_pieces(points, centre, radius, corners):
+    """Distances from a circle in a plane of constant z and from each line, [mm] to [m]."""
     across = np.hypot(points[:, 0] - centre[0], points[:, 1] - centre[1]) - radius
-    return np.hypot(across, points[:, 2] - centre[2])
+    lines = [distances(points, np.array(ends)) for ends in pairwise(corners)]
+    return np.array([np.hypot(across, points[:, 2] - centre[2]), *lines]) * MM
+
+
+def require_followed(pieces, within, counts):
+    """Every point is near one of the pieces, and each piece has points of its own."""
+    assert pieces.min(axis=0).max() < within
+    assert (np.count_nonzero(pieces < within, axis=1) > counts).all()
 
 
 def joints_at_switch(calibration, switch):
@@ -509,16 +515,12 @@ def test_linuxcnc_follows_a_path_with_the_exported_module(full, tmp_path):
         program, joints_of(full, old), lines=files["kinematics.ini"], module=tmp_path
     )
 
-    def distances(points):
-        lines = [polyline_distances(points, np.array(ends)) for ends in pairwise(corners)]
-        return np.array([from_circle(points, centre, radius), *lines]) * MM
-
-    pieces = distances(full.machine.forward(slides[::5] * MM) / MM)
-    assert pieces.min(axis=0).max() < PATH
-    assert (np.count_nonzero(pieces < PATH, axis=1) > [150, 100, 80]).all()
+    path = centre, radius, corners
+    real = full.machine.forward(slides[::5] * MM) / MM
+    require_followed(from_pieces(real, *path), PATH, [150, 100, 80])
     # the errors of the machine are large
     nominal = Machine(full.robot, {}).forward(slides[::5] * MM + ACTIVE) / MM
-    assert distances(nominal).min(axis=0).max() > 1.0 * MM
+    assert from_pieces(nominal, *path).min(axis=0).max() > 1.0 * MM
 
 
 FILTERED = 0.3
@@ -579,16 +581,11 @@ def test_linuxcnc_follows_a_path_with_a_filtered_program(root, mixed, full, filt
     tip = ToolTip(full, TOOL)
     points = tip.place(slides[::5] * MM) / MM - np.array(TOOL) / MM
 
-    def distances(points):
-        lines = [polyline_distances(points, np.array(ends)) for ends in pairwise(corners)]
-        return np.array([from_circle(points, centre, radius), *lines]) * MM
-
-    pieces = distances(points)
-    assert pieces.min(axis=0).max() < FILTERED * 1e-6 + PATH
-    assert (np.count_nonzero(pieces < FILTERED * 1e-6 + PATH, axis=1) > [150, 80, 60]).all()
+    path = centre, radius, corners
+    require_followed(from_pieces(points, *path), FILTERED * 1e-6 + PATH, [150, 80, 60])
     # without the filter the errors are large
     unfiltered = Machine(full.robot, {}).forward(slides[::5] * MM + ACTIVE) / MM
-    assert distances(unfiltered).min(axis=0).max() > 1.0 * MM
+    assert from_pieces(unfiltered, *path).min(axis=0).max() > 1.0 * MM
 
 
 def test_linuxcnc_window_shows_why_a_program_is_refused(filtered):
@@ -610,19 +607,14 @@ def test_linuxcnc_reaches_the_target_with_the_exported_home_offset(offsets):
     point = np.array([20.0, -15.0, 30.0]) * MM
     options = ExportOptions(home_offsets=tuple(old))
     entered = export_calibration(offsets, "linuxcnc", options=options)["joints.ini"]
-    reached = []
-    for lines in ("", entered):
-        drives = Machine(offsets.robot, {}).inverse(point)  # nominal kinematics
-        joints = [
-            float(d.to_joint(r)) / MM for d, r in zip(offsets.robot.drives, drives, strict=True)
-        ]
-        words = " ".join(f"{letter}{v:.7f}" for letter, v in zip("XYZ", joints, strict=True))
-        program = [f"G21 G90 G1 {words} F6000", "G4 P0.15"]
-        slides = run_program(program, joints_of(offsets, old), lines=lines)
-        reached.append(real.forward(slides[-1] * MM))
-    before, after = (np.linalg.norm(r - point) for r in reached)
-    assert after < ENTERED
-    assert before > 0.5 * MM
+    drives = Machine(offsets.robot, {}).inverse(point)  # nominal kinematics
+    joints = [float(d.to_joint(r)) / MM for d, r in zip(offsets.robot.drives, drives, strict=True)]
+    words = " ".join(f"{letter}{v:.7f}" for letter, v in zip("XYZ", joints, strict=True))
+    program = [f"G21 G90 G1 {words} F6000", "G4 P0.15"]
+    slides = run_program(program, joints_of(offsets, old), lines=entered)
+    assert np.linalg.norm(real.forward(slides[-1] * MM) - point) < ENTERED
+    # with the offsets that were active before, the error is large
+    assert np.linalg.norm(real.forward(drives - ACTIVE) - point) > 0.5 * MM
 
 
 def test_module_is_built_without_warnings(exported, tmp_path):

@@ -72,11 +72,7 @@ class CorrectedInverse:
     def __call__(self, points: Array) -> Array:
         """Drive coordinates, shape (k, n_drives), [m, rad], for points, shape (k, n), [m]."""
         clamped = np.clip(points, self.lower, self.upper)
-        return np.asarray(self.nominal(points)[0] + self.correction(clamped))
-
-    def derivative(self, points: Array) -> Array:
-        """∂q/∂p inside the region, shape (k, n_drives, n)."""
-        return np.asarray(self.nominal(points)[1] + self.correction.derivative(points))
+        return np.asarray(self.nominal(points) + self.correction(clamped))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,20 +157,18 @@ def approximate(
         reason = f"the machine does not reach {describe_box(box)} ({e.reason})"
         raise ExportError(f"{reason}; give a smaller --half-side-mm") from None
     form = find_nominal_form(robot, middle, half)
-    corrections = drives - form(middle + half * nodes)[0]
-    best = np.inf
+    corrections = drives - form(middle + half * nodes)
+    best = math.inf
     for degree in range(1, most + 1):
         fit = PolynomialFit(nodes, total_degree(n, degree))
         inverse = CorrectedInverse(form, fit(middle, half, corrections))
-        error = RESERVE * _estimate(inverse, checks, expected)
-        if error <= within:
-            error = RESERVE * _tip_error(tip, checks, inverse(checks), passive)
+        error = _tip_error(tip, checks, inverse(checks), start=passive)
+        error = math.inf if error is None else RESERVE * error
         best = min(best, error)
         if error <= within:
             nominal = None
             if not isinstance(form, Tangent):
-                active = calibration.active_offsets
-                nominal = _error_or_none(tip, checks, form(checks)[0] - active)
+                nominal = _tip_error(tip, checks, form(checks) - calibration.active_offsets)
             return Approximation(
                 inverse=inverse,
                 tool=tip.tool,
@@ -220,24 +214,15 @@ def _find_box(calibration: Calibration, half_side: float | None) -> Array:
     return tool.workspace.limits
 
 
-def _estimate(inverse: CorrectedInverse, points: Array, drives: Array) -> float:
-    """Largest error of the tip, to first order in the error of the drives, [m]."""
-    errors = (inverse(points) - drives)[..., None]
-    off = np.linalg.solve(inverse.derivative(points), errors)[..., 0]
-    return float(np.linalg.norm(off, axis=1).max())
-
-
-def _tip_error(tip: ToolTip, points: Array, drives: Array, start: Array | None) -> float:
-    """Largest distance of the tip from its target at drive coordinates, [m]."""
-    off = tip.place(drives, start=start) - tip.targets(points)
-    return float(np.linalg.norm(off, axis=1).max())
-
-
-def _error_or_none(tip: ToolTip, points: Array, drives: Array) -> float | None:
+def _tip_error(
+    tip: ToolTip, points: Array, drives: Array, *, start: Array | None = None
+) -> float | None:
+    """Largest distance of the tip from its target at drive coordinates, [m]; None out of reach."""
     try:
-        return _tip_error(tip, points, drives, None)
+        off = tip.place(drives, start=start) - tip.targets(points)
     except ClosureError:
         return None
+    return float(np.linalg.norm(off, axis=1).max())
 
 
 def _error_beyond(
@@ -252,7 +237,7 @@ def _error_beyond(
         return None
     if find_beyond_travel(calibration.robot, drives, [""] * len(drives)):
         return None
-    return _error_or_none(tip, points, drives)
+    return _tip_error(tip, points, drives)
 
 
 def _error_of_longer_tool(tip: ToolTip, drives: Array, passive: Array) -> float:

@@ -54,14 +54,14 @@ class SlidesWithRods:
     signs: Array
     """s, shape (n,)."""
 
-    def __call__(self, points: Array) -> tuple[Array, Array]:
-        """Drive coordinates, (k, n), [m], and their Jacobian, (k, n, n); NaN out of reach."""
+    def __call__(self, points: Array) -> Array:
+        """Drive coordinates, shape (k, n), [m]; NaN out of reach."""
         d = points[:, None, :] - self.anchors
         along = np.einsum("kij,ij->ki", d, self.axes)
         across = d - along[..., None] * self.axes
         with np.errstate(invalid="ignore"):
             root = self.signs * np.sqrt(self.lengths**2 - (across**2).sum(axis=-1))
-        return along + root, self.axes - across / root[..., None]
+        return np.asarray(along + root)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,10 +75,9 @@ class Tangent:
     jacobian: Array
     """Derivatives of the drive coordinates, shape (n, n), [1 or rad/m]."""
 
-    def __call__(self, points: Array) -> tuple[Array, Array]:
-        """Drive coordinates, (k, n), [m, rad], and their Jacobian, (k, n, n)."""
-        values = self.values + (points - self.middle) @ self.jacobian.T
-        return values, np.broadcast_to(self.jacobian, (len(points), *self.jacobian.shape))
+    def __call__(self, points: Array) -> Array:
+        """Drive coordinates, shape (k, n), [m, rad]."""
+        return np.asarray(self.values + (points - self.middle) @ self.jacobian.T)
 
 
 NominalForm = SlidesWithRods | Tangent
@@ -128,4 +127,4 @@ def _identify_slides(points: Array, drives: Array) -> SlidesWithRods | None:
         read_only(np.round(np.array(p), DECIMALS) + 0.0) for p in zip(*parts, strict=True)
     )
     slides = SlidesWithRods(axes, anchors, lengths, signs)
-    return slides if np.abs(slides(points)[0] - drives).max() < TOLERANCE else None
+    return slides if np.abs(slides(points) - drives).max() < TOLERANCE else None
