@@ -17,9 +17,9 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
-from orthocal.effects.protocol import Effect, EffectKeys, Placement, Symbols, placement_of
+from orthocal.effects.protocol import Effect, EffectKeys, Placement, Symbols
 from orthocal.io.documents import PositiveNumber
-from orthocal.robot.frames import hangs_on
+from orthocal.robot.frames import carriers
 from orthocal.robot.model import Robot, joint_axis
 from orthocal.robot.parameters import AXES, ElementaryError
 from orthocal.units import MM, MRAD, read_limit
@@ -60,7 +60,7 @@ class GeometryErrors(Effect):
         """Twists of placements; arguments as for `Effect.placements`."""
         twists: dict[Placement, ca.SX] = {}
         for e in self.errors:
-            twists.setdefault(placement_of(self.robot, e), ca.SX(6, 1))[e.axis] += errors[e.name]
+            twists.setdefault(self.robot.placement_of(e), ca.SX(6, 1))[e.axis] += errors[e.name]
         return twists
 
 
@@ -75,11 +75,8 @@ def _joint_errors(robot: Robot, keys: GeometryTolerances) -> Iterator[Elementary
 
 
 def _frame_errors(robot: Robot, keys: GeometryTolerances) -> Iterator[ElementaryError]:
-    frames = [f for c in robot.closures for f in (c.frame_a, c.frame_b)]
-    frames += [f for leg in robot.legs.values() for f in (leg.root, leg.tip)]
-    frames += [robot.tcp.frame] if robot.tcp else []
     parts = _ends_of_loops(robot)
-    for frame in dict.fromkeys(frames):
+    for frame in robot.frames:
         for axis in range(6):
             yield _error(frame, axis, keys, complete=frame in parts, of_frame=True)
 
@@ -107,10 +104,6 @@ def _ends_of_loops(robot: Robot) -> frozenset[str]:
     An error of a frame that carries the tool moves the tool alone: it says where on the platform
     that is. The ends of legs' lines are no parts.
     """
-    tool: set[int] = set()
-    current = None if robot.tcp is None else robot.frame_id(robot.tcp.frame)
-    while current is not None:
-        tool.add(current)
-        current = hangs_on(robot.model, current)
+    tool = set(carriers(robot.model, robot.frame_id(robot.tcp.frame))) if robot.tcp else set()
     ends = {frame for c in robot.closures for frame in (c.frame_a, c.frame_b)}
     return frozenset(frame for frame in ends if robot.frame_id(frame) not in tool)

@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from orthocal.effects.loading import robot_effects
 from orthocal.effects.protocol import NEUTRAL, Condition, Placement, Symbols, condition_size
-from orthocal.robot.frames import hangs_on
+from orthocal.robot.frames import carriers, hangs_on
 from orthocal.robot.model import Robot, Rod
 
 SAME_PLACE = 1e-6
@@ -117,15 +117,6 @@ def _body_of(robot: Robot, rod: Rod, share: Mapping[int, float]) -> int:
 
 def _used_frames(robot: Robot) -> set[int]:
     """Frames of closures, legs, rods and the tool, with the frames that carry them."""
-    names = [f for c in robot.closures for f in (c.frame_a, c.frame_b)]
-    names += [f for leg in robot.legs.values() for f in (leg.root, leg.tip)]
     rods = (rod for leg in robot.legs.values() for rod in leg.rods.values())
-    names += [f for rod in rods for f in (rod.root, rod.tip)]
-    names += [robot.tcp.frame] if robot.tcp else []
-    frames: set[int] = set()
-    for name in names:
-        frame: int | None = robot.frame_id(name)
-        while frame is not None:
-            frames.add(frame)
-            frame = hangs_on(robot.model, frame)
-    return frames
+    names = {*robot.frames, *(f for rod in rods for f in (rod.root, rod.tip))}
+    return {f for name in names for f in carriers(robot.model, robot.frame_id(name))}

@@ -22,12 +22,12 @@ How the effects that a machine may have beyond its geometry use the protocol:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Self
 
 import casadi as ca
 from pydantic import BaseModel, ConfigDict
 
+from orthocal.robot.frames import Placement as Placement
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import ElementaryError
 
@@ -46,22 +46,6 @@ NEUTRAL: dict[Condition, float] = {"approach": 0.0, "temperature": 20.0, "time":
 def condition_size(robot: Robot, name: Condition) -> int:
     """Numbers of a condition."""
     return len(robot.drives) if name == "approach" else 1
-
-
-@dataclass(frozen=True, slots=True)
-class Placement:
-    """Placement of a joint or frame in what carries it."""
-
-    index: int
-    """Index of the joint or frame in the robot's model."""
-    of_frame: bool
-
-
-def placement_of(robot: Robot, error: ElementaryError) -> Placement:
-    """The placement that an error of a joint or frame displaces."""
-    if error.of_frame:
-        return Placement(robot.frame_id(error.owner), True)
-    return Placement(int(robot.model.getJointId(error.owner)), False)
 
 
 class EffectKeys(BaseModel):

@@ -25,8 +25,8 @@ from orthocal.robot.model import (
     Robot,
     closure_row_units,
     closure_turns,
-    coordinate_joints,
     coordinate_limits,
+    coordinate_names,
     coordinate_units,
     require_commanded_tool,
     require_tcp,
@@ -104,8 +104,8 @@ class System:
         self.shortest = robot.closure_rows + n_tool != index.size
         self.units = coordinate_units(robot)[index]
         self.lower, self.upper = (limits[index] for limits in coordinate_limits(robot))
-        joints = coordinate_joints(robot.model)
-        self.names = tuple(str(robot.model.names[joints[k]]) for k in index.tolist())
+        names = coordinate_names(robot.model)
+        self.names = tuple(names[k] for k in index.tolist())
         self._row_units = np.append(closure_row_units(robot), np.ones(n_tool))
         self._turns = np.append(closure_turns(robot), np.zeros(n_tool, dtype=np.bool_))
 

@@ -22,7 +22,7 @@ from orthocal.kinematics.error_map import ErrorMap, error_map
 from orthocal.kinematics.function_cache import cached_function, cached_per_robot, function_key
 from orthocal.kinematics.se3 import log6_jacobian
 from orthocal.kinematics.symbolic import Pose, SymbolicTree, closure_residual
-from orthocal.robot.frames import hangs_on
+from orthocal.robot.frames import carriers
 from orthocal.robot.model import Closure, Robot, closure_row_units, joint_axis
 
 Array = NDArray[np.float64]
@@ -255,12 +255,10 @@ class RobotFunctions:
             (i, False): _MotionSource(self.tree.joint_base(i), i, self._first.get((i, False)))
             for i in self.tree.joints_to(frame)
         }
-        current: int | None = frame
-        while current is not None:
-            key = (current, True)
+        for carrier in carriers(self.robot.model, frame):
+            key = (carrier, True)
             if key in self._first:
-                sources[key] = _MotionSource(self.tree.frame_pose(current), None, self._first[key])
-            current = hangs_on(self.robot.model, current)
+                sources[key] = _MotionSource(self.tree.frame_pose(carrier), None, self._first[key])
         return sources
 
     def _place(self, joints: ca.SX, twists: ca.SX, source: _MotionSource, block: ca.SX) -> None:

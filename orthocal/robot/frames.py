@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
@@ -11,6 +12,15 @@ from numpy.typing import NDArray
 from orthocal.errors import RobotError
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Placement of a joint or frame in what carries it."""
+
+    index: int
+    """Index of the joint or frame in the robot's model."""
+    of_frame: bool
 
 
 def find_frame(model: pin.Model, name: str, *, where: str) -> int:
@@ -32,6 +42,14 @@ def hangs_on(model: pin.Model, frame: int) -> int | None:
     if f.type == pin.FrameType.JOINT or frame == parent:
         return None
     return parent if model.frames[parent].parentJoint == f.parentJoint else None
+
+
+def carriers(model: pin.Model, frame: int) -> Iterator[int]:
+    """The frame and those on the same joint whose errors move it, upwards."""
+    current: int | None = frame
+    while current is not None:
+        yield current
+        current = hangs_on(model, current)
 
 
 def place_frames(model: pin.Model, nominal: pin.Model, twists: Mapping[str, Array]) -> None:

@@ -9,6 +9,7 @@ from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -221,11 +222,6 @@ def _build_drive(model: pin.Model, motor: str, keys: RobotKeys, where: str) -> D
             f"the URDF has no moving joint '{motor}'; joints: {joints}", where=f"{where}: name_mot"
         )
     joint = model.joints[model.getJointId(motor)]
-    if joint.nv != 1:
-        raise RobotError(
-            f"'{motor}' has {joint.nv} degrees of freedom; a motor has one",
-            where=f"{where}: name_mot",
-        )
     unit: Unit = "rad" if np.any(joint_axis(model, joint.id)[3:]) else "m"
     here = f"{where}: orthocal.drives.{motor}"
     entry = keys.orthocal.drives.get(motor, DriveKeys())
@@ -338,8 +334,14 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
     pin.updateFramePlacements(model, data)
     for name, entry in keys.orthocal.legs.items():
         here = f"{where}: orthocal.legs.{name}"
-        root, tip = _ends(model, data, entry, here)
-        length = float(np.linalg.norm(tip - root))
+        line = _build_line(model, data, name, entry, here)
+        rods = {
+            rod: Rod(
+                **_build_line(model, data, rod, keys, f"{here}.rods.{rod}"),
+                radius=keys.radius_mm * MM,
+            )
+            for rod, keys in entry.rods.items()
+        }
         jacobian = pin.getFrameJacobian(
             model,
             data,
@@ -348,22 +350,20 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
         )[:3]
         moved = np.abs(jacobian[:, robot.passive_index]).max(initial=0.0)
         legs[name] = Leg(
-            name=name,
-            root=entry.root,
-            tip=entry.tip,
-            length=length,
-            axis=read_only(_snap_to_axes((tip - root) / length)),
-            reference_root=read_only(root),
+            **line,
+            axis=read_only(
+                _snap_to_axes((line["reference_tip"] - line["reference_root"]) / line["length"])
+            ),
             root_driven=bool(moved < 1e-9),
-            rods=_build_rods(model, data, entry, here),
+            rods=rods,
         )
     return legs
 
 
-def _ends(
-    model: pin.Model, data: pin.Data, entry: LegKeys | RodKeys, here: str
-) -> tuple[Array, Array]:
-    """Root and tip of a line in the reference posture, shape (3,) each, [m].
+def _build_line(
+    model: pin.Model, data: pin.Data, name: str, entry: LegKeys | RodKeys, here: str
+) -> dict[str, Any]:
+    """Fields of a leg or rod that describe its line in the reference posture.
 
     Raises:
         RobotError: If a frame does not exist, or the line is too long or has no length.
@@ -381,20 +381,11 @@ def _ends(
         raise RobotError(
             f"root '{entry.root}' and tip '{entry.tip}' are at the same place", where=here
         )
-    return root, tip
-
-
-def _build_rods(model: pin.Model, data: pin.Data, entry: LegKeys, here: str) -> dict[str, Rod]:
-    rods = {}
-    for name, rod in entry.rods.items():
-        root, tip = _ends(model, data, rod, f"{here}.rods.{name}")
-        rods[name] = Rod(
-            name=name,
-            root=rod.root,
-            tip=rod.tip,
-            radius=rod.radius_mm * MM,
-            length=float(np.linalg.norm(tip - root)),
-            reference_root=read_only(root),
-            reference_tip=read_only(tip),
-        )
-    return rods
+    return {
+        "name": name,
+        "root": entry.root,
+        "tip": entry.tip,
+        "length": length,
+        "reference_root": read_only(root),
+        "reference_tip": read_only(tip),
+    }

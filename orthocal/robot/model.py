@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import ClosureError, ParameterError, RobotError
 from orthocal.io.fields import read_only
-from orthocal.robot.closing import close_loops, describe_opening
-from orthocal.robot.frames import find_frame, place_frames
-from orthocal.robot.parameters import DeclaredErrors, ParameterSet
+from orthocal.robot.closing import Closing, close_loops, describe_opening
+from orthocal.robot.frames import Placement, find_frame, place_frames
+from orthocal.robot.parameters import DeclaredErrors, ElementaryError, ParameterSet
 from orthocal.units import InUnit, Unit
 
 Array = NDArray[np.float64]
@@ -70,28 +70,9 @@ class Closure:
     """Constrained rows, 0 to 5 for x, y, z, rx, ry, rz."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Rod:
-    """A round rod of a leg."""
-
-    name: str
-    root: str
-    """Frame on the rod's axis, at the drive's end."""
-    tip: str
-    """Frame on the rod's axis, at the platform's end."""
-    radius: float
-    """[m]."""
-    length: float
-    """Nominal distance from root to tip, [m]."""
-    reference_root: Array
-    """Root in the nominal reference posture, shape (3,), [m]."""
-    reference_tip: Array
-    """Tip in the nominal reference posture, shape (3,), [m]."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Leg:
-    """Leg: the line from root to tip, and its rods."""
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Line:
+    """Line of a leg, or axis of one of its rods, from root to tip."""
 
     name: str
     root: str
@@ -100,10 +81,26 @@ class Leg:
     """Frame at the platform's end."""
     length: float
     """Nominal distance from root to tip, [m]."""
-    axis: Array
-    """Unit vector from root to tip in the nominal reference posture, shape (3,)."""
     reference_root: Array
     """Root in the nominal reference posture, shape (3,), [m]."""
+    reference_tip: Array
+    """Tip in the nominal reference posture, shape (3,), [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Rod(Line):
+    """A round rod of a leg."""
+
+    radius: float
+    """[m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Leg(Line):
+    """Leg: the line from root to tip, and its rods."""
+
+    axis: Array
+    """Unit vector from root to tip in the nominal reference posture, shape (3,)."""
     root_driven: bool
     """True if no passive joint moves the root."""
     rods: Mapping[str, Rod]
@@ -195,6 +192,20 @@ class Robot:
         """
         return find_frame(self.model, name, where=str(self.yaml))
 
+    def placement_of(self, error: ElementaryError) -> Placement:
+        """The placement that an error of a joint or frame displaces."""
+        if error.of_frame:
+            return Placement(self.frame_id(error.owner), True)
+        return Placement(int(self.model.getJointId(error.owner)), False)
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Frames of closures, legs and tool, in this order."""
+        frames = [f for c in self.closures for f in (c.frame_a, c.frame_b)]
+        frames += [f for leg in self.legs.values() for f in (leg.root, leg.tip)]
+        frames += [self.tcp.frame] if self.tcp else []
+        return tuple(dict.fromkeys(frames))
+
     def configuration(self, coordinates: ArrayLike) -> Array:
         """Pinocchio's configuration of joint coordinates.
 
@@ -224,9 +235,7 @@ class Robot:
         full[..., self.passive_index] = p
         return full
 
-    def close_with_pinocchio(
-        self, drives: ArrayLike, start: ArrayLike, *, posture: str = "posture"
-    ) -> Array:
+    def close_with_pinocchio(self, drives: ArrayLike, start: ArrayLike) -> Array:
         """Solve the loop closures of one posture by damped least squares on Pinocchio's models.
 
         It needs a near start. Reference for `LoopClosure`, which closes batches of postures from
@@ -235,7 +244,6 @@ class Robot:
         Args:
             drives: Commanded drive coordinates, shape (n_drives,), [m, rad].
             start: Passive coordinates to start from, shape (n_passive,), [m, rad].
-            posture: Name of the posture, for messages.
 
         Returns:
             Shape (n_passive,), [m, rad].
@@ -243,28 +251,50 @@ class Robot:
         Raises:
             ClosureError: If the loops stay open.
         """
-        data = self.model.createData()
-
-        def evaluate(passive: Array) -> tuple[Array, Array]:
-            coordinates = self.joint_coordinates(drives, passive)
-            residual, jacobian = self.evaluate_constraints_at(coordinates, data=data)
-            return residual, jacobian[:, self.passive_index]
-
-        row_units = closure_row_units(self)
-        closing = close_loops(
-            evaluate,
-            start,
-            row_units=row_units,
-            units=coordinate_units(self)[self.passive_index],
-        )
+        coordinates = self.joint_coordinates(drives, start)
+        closing = self.close_coordinates(coordinates, self.passive_index, limited=False)
         if not closing.closed:
             opening = describe_opening(closing.residual, closure_turns(self))
             raise ClosureError(
                 f"does not close: open by {opening}",
-                posture=posture,
-                residual=float(np.abs(row_units * closing.residual).max()),
+                posture="posture",
+                residual=float(np.abs(closure_row_units(self) * closing.residual).max()),
             )
-        return closing.coordinates
+        return np.asarray(closing.coordinates[self.passive_index])
+
+    def close_coordinates(
+        self, start: Array, free: NDArray[np.int64], *, limited: bool = True
+    ) -> Closing:
+        """Close the loops by some of the joint coordinates, within their limits by default.
+
+        Args:
+            start: Joint coordinates to start from, shape (nv,), [m, rad].
+            free: Indices of the coordinates that may change.
+            limited: Whether these stay within their limits.
+
+        Returns:
+            All joint coordinates, and the residual.
+        """
+        lower, upper = coordinate_limits(self)
+        data = self.model.createData()
+
+        def complete(part: Array) -> Array:
+            coordinates = np.array(start)
+            coordinates[free] = part
+            return coordinates
+
+        def evaluate(part: Array) -> tuple[Array, Array]:
+            residual, jacobian = self.evaluate_constraints_at(complete(part), data=data)
+            return residual, jacobian[:, free]
+
+        closing = close_loops(
+            evaluate,
+            start[free],
+            row_units=closure_row_units(self),
+            units=coordinate_units(self)[free],
+            bounds=(lower[free], upper[free]) if limited else (-np.inf, np.inf),
+        )
+        return Closing(complete(closing.coordinates), closing.residual)
 
     def evaluate_constraints(self, drives: ArrayLike, passive: ArrayLike) -> tuple[Array, Array]:
         """Closure residual and its Jacobian by Pinocchio, constrained rows.
@@ -386,9 +416,9 @@ def require_commanded_tool(robot: Robot) -> tuple[int, ...]:
     return coordinates
 
 
-def coordinate_joints(model: pin.Model) -> list[int]:
-    """Index of the joint of each joint coordinate, shape (nv,)."""
-    return [i for i in range(1, model.njoints) for _ in range(model.joints[i].nv)]
+def coordinate_names(model: pin.Model) -> list[str]:
+    """Name of the joint of each joint coordinate, shape (nv,): each joint has one coordinate."""
+    return [str(name) for name in model.names][1:]
 
 
 def joint_axis(model: pin.Model, joint: int) -> Array:
@@ -412,15 +442,15 @@ def closure_row_units(robot: Robot) -> Array:
     return np.where(closure_turns(robot), robot.characteristic_length, 1.0)
 
 
+def coordinate_turns(model: pin.Model) -> NDArray[np.bool_]:
+    """Mask of the joint coordinates that are rotations, shape (nv,)."""
+    turns = [joint_axis(model, i)[3:].any() for i in range(1, model.njoints)]
+    return np.array(turns, dtype=np.bool_)
+
+
 def coordinate_units(robot: Robot) -> Array:
     """Metres per unit of each joint coordinate, shape (nv,), [1 or m/rad]."""
-    model, length = robot.model, robot.characteristic_length
-    units = np.ones(model.nv)
-    for i in range(1, model.njoints):
-        joint = model.joints[i]
-        if joint.nv == 1 and np.any(joint_axis(model, i)[3:]):
-            units[joint.idx_v] = length
-    return units
+    return np.where(coordinate_turns(robot.model), robot.characteristic_length, 1.0)
 
 
 def coordinate_limits(robot: Robot) -> tuple[Array, Array]:
@@ -428,18 +458,10 @@ def coordinate_limits(robot: Robot) -> tuple[Array, Array]:
     model = robot.model
     lower, upper = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
     for joint in list(model.joints)[1:]:
-        if joint.nq == joint.nv:
-            v = slice(joint.idx_v, joint.idx_v + joint.nv)
-            q = slice(joint.idx_q, joint.idx_q + joint.nq)
-            lower[v] = model.lowerPositionLimit[q]
-            upper[v] = model.upperPositionLimit[q]
+        if joint.nq == 1:
+            lower[joint.idx_v] = model.lowerPositionLimit[joint.idx_q]
+            upper[joint.idx_v] = model.upperPositionLimit[joint.idx_q]
     return lower, upper
-
-
-def joint_turns(model: pin.Model, joint: int) -> bool:
-    """True for a revolute joint, bounded or not."""
-    axis = joint_axis(model, joint) if model.joints[joint].nv == 1 else np.zeros(6)
-    return bool(np.any(axis[3:]) and not np.any(axis[:3]))
 
 
 def build_constraints(

@@ -14,13 +14,11 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from orthocal.errors import ClosureError
-from orthocal.robot.frames import hangs_on
-from orthocal.robot.model import Robot, coordinate_joints
+from orthocal.robot.frames import Placement, carriers
+from orthocal.robot.model import Robot
 from orthocal.robot.parameters import ElementaryError
 
 Array = NDArray[np.float64]
-Owner = tuple[int, bool]
-"""Index of a joint or of a frame, and True for a frame."""
 
 POSTURES = 4
 
@@ -43,8 +41,9 @@ def find_redundant_errors(robot: Robot, elementary: Sequence[ElementaryError]) -
     errors = [e for e in elementary if e.axis >= 0]
     if robot.tcp is None and not robot.legs:
         return frozenset()
-    owners = list(dict.fromkeys(_owner(robot, e) for e in errors))
-    columns = [6 * owners.index(_owner(robot, e)) + e.axis for e in errors]
+    placements = [robot.placement_of(e) for e in errors]
+    owners = list(dict.fromkeys(placements))
+    columns = [6 * owners.index(p) + e.axis for p, e in zip(placements, errors, strict=True)]
     observed = [] if robot.tcp is None else [robot.tcp.frame]
     for leg in robot.legs.values():
         for rod in leg.rods.values() or (leg,):
@@ -60,12 +59,6 @@ def find_redundant_errors(robot: Robot, elementary: Sequence[ElementaryError]) -
     for kind in (rotations, ~rotations):
         redundant |= kind & (effects <= SMALLEST_EFFECT * effects[kind].max(initial=0.0))
     return frozenset(e.name for e, r in zip(errors, redundant, strict=True) if r)
-
-
-def _owner(robot: Robot, error: ElementaryError) -> Owner:
-    model = robot.model
-    index = robot.frame_id(error.owner) if error.of_frame else model.getJointId(error.owner)
-    return int(index), error.of_frame
 
 
 def _random_postures(robot: Robot) -> Iterator[Array]:
@@ -91,32 +84,28 @@ def _random_postures(robot: Robot) -> Iterator[Array]:
 
 
 def _carried_masks(
-    robot: Robot, owners: Sequence[Owner], observed: Sequence[int]
+    robot: Robot, owners: Sequence[Placement], observed: Sequence[int]
 ) -> dict[int, Array]:
     """Frames of closures and observed frames, with a 0-1 mask of the motions that carry them.
 
     The motions are the six of each owner, then those of the passive coordinates.
     """
     model = robot.model
-    joints = np.array(coordinate_joints(model))[robot.passive_index].tolist()
     ends = [robot.frame_id(n) for c in robot.closures for n in (c.frame_a, c.frame_b)]
     masks = {}
     for frame in {*observed, *ends}:
         supports = model.supports[model.frames[frame].parentJoint]
-        carriers = {(int(joint), False) for joint in supports}
-        current: int | None = frame
-        while current is not None:
-            carriers.add((current, True))
-            current = hangs_on(model, current)
-        mask = np.repeat([owner in carriers for owner in owners], 6)
-        passive = [(joint, False) in carriers for joint in joints]
+        moving = {Placement(int(joint), False) for joint in supports}
+        moving |= {Placement(f, True) for f in carriers(model, frame)}
+        mask = np.repeat([owner in moving for owner in owners], 6)
+        passive = [Placement(k + 1, False) in moving for k in robot.passive_index.tolist()]
         masks[frame] = np.concatenate([mask, passive]).astype(np.float64)
     return masks
 
 
 def _sensitivity(
     robot: Robot,
-    owners: Sequence[Owner],
+    owners: Sequence[Placement],
     observed: Sequence[int],
     masks: Mapping[int, Array],
     coordinates: Array,
@@ -140,8 +129,10 @@ def _sensitivity(
     pin.computeJointJacobians(model, data, robot.configuration(coordinates))
     pin.updateFramePlacements(model, data)
     frames = [
-        data.oMf[i] if of_frame else data.oMi[model.parents[i]] * model.jointPlacements[i]
-        for i, of_frame in owners
+        data.oMf[p.index]
+        if p.of_frame
+        else data.oMi[model.parents[p.index]] * model.jointPlacements[p.index]
+        for p in owners
     ]
     twists = np.hstack(
         [*(f.toActionMatrix() for f in frames), data.J[:, robot.passive_index.tolist()]]

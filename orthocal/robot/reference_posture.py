@@ -15,15 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.errors import RobotError
 from orthocal.io.fields import read_only
-from orthocal.robot.closing import MAX_STEPS, Closing, close_loops, describe_opening
+from orthocal.robot.closing import MAX_STEPS, Closing, describe_opening
 from orthocal.robot.model import (
     Robot,
     closure_row_units,
     closure_turns,
-    coordinate_joints,
     coordinate_limits,
+    coordinate_names,
+    coordinate_turns,
     coordinate_units,
-    joint_turns,
 )
 
 Array = NDArray[np.float64]
@@ -102,7 +102,7 @@ def _search(robot: Robot, start: Array, movable: Indices) -> Array:
     attempts: list[Closing] = []
     for moving in (robot.passive_index, free) if movable.size else (free,):
         for trial in _starts(robot, start, moving):
-            closing = _close(robot, trial, moving)
+            closing = robot.close_coordinates(trial, moving)
             if closing.closed:
                 if moving is free and movable.size:
                     closing = _return_drives(robot, closing, movable, start)
@@ -122,11 +122,13 @@ def _find_joints_outside_limits(robot: Robot, start: Array, free: Indices) -> li
     lower, upper = coordinate_limits(robot)
     if not np.isfinite([lower[free], upper[free]]).any():
         return []
-    closings = (_close(robot, s, free, limited=False) for s in _starts(robot, start, free))
+    closings = (
+        robot.close_coordinates(s, free, limited=False) for s in _starts(robot, start, free)
+    )
     x = next((c.coordinates for c in closings if c.closed), np.clip(start, lower, upper))
     outside = np.flatnonzero((x < lower - LIMIT_TOLERANCE) | (x > upper + LIMIT_TOLERANCE))
-    joints = coordinate_joints(robot.model)
-    return list(dict.fromkeys(str(robot.model.names[joints[k]]) for k in outside.tolist()))
+    names = coordinate_names(robot.model)
+    return [names[k] for k in outside.tolist()]
 
 
 def _explain_open_loops(robot: Robot, best: Closing, drives_moved: bool, outside: list[str]) -> str:
@@ -159,35 +161,6 @@ def _starts(robot: Robot, start: Array, free: Indices) -> Iterator[Array]:
         yield start + spread * shift
 
 
-def _close(robot: Robot, start: Array, free: Indices, *, limited: bool = True) -> Closing:
-    """Close the loops by the free coordinates, within their limits by default.
-
-    Returns:
-        All joint coordinates, and the residual.
-    """
-    lower, upper = coordinate_limits(robot)
-    bounds = (lower[free], upper[free]) if limited else (-np.inf, np.inf)
-    data = robot.model.createData()
-
-    def complete(part: Array) -> Array:
-        coordinates = np.array(start)
-        coordinates[free] = part
-        return coordinates
-
-    def evaluate(part: Array) -> tuple[Array, Array]:
-        residual, jacobian = robot.evaluate_constraints_at(complete(part), data=data)
-        return residual, jacobian[:, free]
-
-    closing = close_loops(
-        evaluate,
-        start[free],
-        row_units=closure_row_units(robot),
-        units=coordinate_units(robot)[free],
-        bounds=bounds,
-    )
-    return Closing(complete(closing.coordinates), closing.residual)
-
-
 def _return_drives(robot: Robot, closing: Closing, movable: Indices, target: Array) -> Closing:
     """Move drives back towards their zeros with the loops closed.
 
@@ -216,7 +189,7 @@ def _return_drives(robot: Robot, closing: Closing, movable: Indices, target: Arr
         step *= factor * min(1.0, LARGEST_RETURN_STEP / max(float(np.abs(step).max()), 1e-300))
         trial = np.array(closing.coordinates)
         trial[free] += step * scales[free]
-        closed = _close(robot, trial, free)
+        closed = robot.close_coordinates(trial, free)
         after, before = (float(np.linalg.norm(missing(c))) for c in (closed, closing))
         if closed.closed and after < (1.0 - LEAST_GAIN) * before and is_regular(closed):
             closing, factor = closed, min(1.0, 2.0 * factor)
@@ -227,7 +200,7 @@ def _return_drives(robot: Robot, closing: Closing, movable: Indices, target: Arr
     trial = np.array(closing.coordinates)
     near = movable[np.abs(missing(closing)) < SNAP_DISTANCE]
     trial[near] = target[near]
-    closed = _close(robot, trial, np.setdiff1d(free, near))
+    closed = robot.close_coordinates(trial, np.setdiff1d(free, near))
     return closed if closed.closed and is_regular(closed) else closing
 
 
@@ -246,8 +219,7 @@ def _singular_values(robot: Robot, closing: Closing) -> Array:
 
 def _coordinate_scales(robot: Robot) -> Array:
     """Scale of each coordinate, shape (nv,): 1 rad or the characteristic length."""
-    units = coordinate_units(robot)
-    return np.where(units == 1.0, robot.characteristic_length, 1.0)
+    return np.where(coordinate_turns(robot.model), 1.0, robot.characteristic_length)
 
 
 def _null_space(matrix: Array) -> Array:
@@ -259,12 +231,7 @@ def _null_space(matrix: Array) -> Array:
 
 def _remove_full_turns(robot: Robot, coordinates: Array) -> Array:
     """Coordinates of unlimited passive joints reduced to ±π."""
-    lower, upper = coordinate_limits(robot)
-    reduced = np.array(coordinates)
-    for i in range(1, robot.model.njoints):
-        joint = robot.model.joints[i]
-        k = joint.idx_v
-        unlimited = joint.nv == 1 and lower[k] == -np.inf and upper[k] == np.inf
-        if unlimited and joint_turns(robot.model, i) and k in robot.passive_index:
-            reduced[k] -= 2.0 * np.pi * np.round(reduced[k] / (2.0 * np.pi))
-    return reduced
+    unlimited = np.isinf(coordinate_limits(robot)).all(axis=0) & coordinate_turns(robot.model)
+    unlimited[robot.drive_index] = False
+    turns = np.round(coordinates / (2.0 * np.pi))
+    return np.where(unlimited, coordinates - 2.0 * np.pi * turns, coordinates)
