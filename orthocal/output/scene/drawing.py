@@ -137,7 +137,7 @@ def _draw_robot(robot: Robot, posture: str | None) -> Scene:
         raise ParameterError("a robot has no postures; name a session", where="posture")
     drawing = MachineScene(robot, f"{robot.name}: the nominal machine")
     stops = _tour(robot)
-    timeline = plan_motion([s.drives for s in stops], count=_longest_tour(robot))
+    timeline = plan_motion([s.drives for s in stops], count=1 + 4 * len(robot.drives))
     poses = _follow(nominal_closure(robot), robot, timeline, drawing.frames, allow_free=True)
     drawing.draw_machine(MACHINE, "Machine", timeline, poses)
     drawing.draw_leg_lines(timeline, poses)
@@ -185,17 +185,12 @@ def _tour(robot: Robot) -> list[Stop]:
     return stops
 
 
-def _longest_tour(robot: Robot) -> int:
-    """Number of stops of a robot whose drives can all move."""
-    return 1 + 4 * len(robot.drives)
-
-
 def _find_reachable(robot: Robot, drive: int, move: float) -> Array | None:
     """Drive coordinates after a move, or a part of it, with loops that close on the way."""
     zero = robot.drive_zero
     for part in (1.0, 0.5, 0.25):
         target = zero + part * move * np.eye(len(zero))[drive]
-        timeline = plan_motion([zero, target, zero], count=_longest_tour(robot))
+        timeline = plan_motion([zero, target, zero], count=1 + 4 * len(zero))
         try:
             nominal_closure(robot).close(timeline.drives, allow_free=True)
         except ClosureError:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,83 +88,56 @@ def draw_readings(
         poses: Frame to poses as drawn, shape (F, 4, 4), [m].
         shown: Whether gauges and arrows are visible at first.
     """
-    scene = drawing.scene
+    scene, nodes = drawing.scene, _arrow_nodes(measured)
     setups = [measured.setups[name] for name in dict.fromkeys(r.setup for r in measured.rows)]
     contacts = {s.name: _find_contact(drawing, s, poses) for s in setups}
-    nodes = _arrow_nodes(measured)
     longest = max((abs(_deviation(r, node)) for node in nodes for r in measured.rows), default=0.0)
     if longest > NOTHING:
         scene.arrow_scale = round_scale(LONGEST_ARROW * drawing.size / longest)
     dial = DIAL * drawing.size * min(1.0, math.sqrt(MANY_GAUGES / max(len(setups), 1)))
-    animated = len(stops) > 1
     labelled = _labelled_setups(setups, measured, contacts)
-    points: list[Array] = []
-    for setup in setups:
+    for i, setup in enumerate(setups):
         contact = contacts[setup.name]
+        point = contact.points[0]
         rows = [next((r for r in s.rows if r.setup == setup.name), None) for s in stops]
         gauge = _draw_gauge(drawing, setup, contact, dial)
-        # gauges of other legs are not there: their contacts move sideways
-        present = np.array([s.place is None or s.place == setup.sensor.place for s in stops])
-        if not present.all():
-            scene.track(gauge, "visible", "bool", timeline.times[timeline.stops], present)
+        _hide_at_others(scene, gauge, setup, stops, timeline)
         # arrows of gauges with the same contact are beside each other
-        beside = sum(float(np.linalg.norm(contact.points[0] - p)) < dial for p in points)
-        points.append(contact.points[0])
-        arrows = _Arrows(setup.name, contact, dial, beside)
-        tips = _draw_arrows(drawing, arrows, nodes, rows, timeline)
+        others = (contacts[s.name].points[0] for s in setups[:i])
+        beside = sum(float(np.linalg.norm(point - other)) < dial for other in others)
+        aside = (FIRST_ARROW + NEXT_ARROW * beside) * dial * contact.along
+        tips = [point] * len(stops)
+        for node in nodes:
+            foot = point + (aside if node == AFTER else -aside)
+            lengths = [_deviation(row, node) * scene.arrow_scale for row in rows]
+            draw_arrow(
+                scene,
+                f"{node}/{node_name(setup.name)}",
+                pose_along(foot, contact.direction),
+                np.repeat(lengths, 2).tolist(),
+                width=arrow_width(dial),
+                colour=COLOURS[node],
+                times=timeline.rests,
+            )
+            ends = [foot + length * contact.direction for length in lengths]
+            drawing.lower_ground(min(float(end[2]) for end in ends))
+            tips = ends if node == BEFORE else tips
         texts = ["" if row is None else _label(row, measured) for row in rows]
-        if animated and setup.name not in labelled:  # the overview is the first and last stop
+        if len(stops) > 1 and setup.name not in labelled:  # the overview is the first and last stop
             texts = ["" if s is stops[0] else t for s, t in zip(stops, texts, strict=True)]
         rank = max(abs(r.before) for r in measured.rows if r.setup == setup.name)
         scene.labels.append(_label_gauge(gauge, contact, dial, texts, tips, rank))
     _explain(scene, nodes, shown)
-    overview = _overview(measured, shown)
-    captions = [
-        overview if animated and s is stops[0] else _caption(s, measured) for s in stops
-    ]  # the last stop may be the first again
-    write_steps(scene, stops, timeline, captions)
+    write_steps(scene, stops, timeline, _captions(measured, stops, shown))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Arrows:
-    """Place of the arrows at a gauge."""
-
-    setup: str
-    contact: Contact
-    dial: float
-    """Radius of the dial, [m]."""
-    beside: int
-    """Number of gauges with the same contact that are drawn already."""
-
-
-def _draw_arrows(
-    drawing: MachineScene,
-    arrows: _Arrows,
-    nodes: Sequence[str],
-    rows: Sequence[Deviation | None],
-    timeline: Timeline,
-) -> list[Array]:
-    """Draw the arrows at a gauge; return the tip of the first at every stop, shape (3,), [m]."""
-    scene, contact = drawing.scene, arrows.contact
-    distance = (FIRST_ARROW + NEXT_ARROW * arrows.beside) * arrows.dial
-    tips = [contact.points[0] for _ in rows]
-    for node in nodes:
-        foot = contact.points[0] + (distance if node == AFTER else -distance) * contact.along
-        lengths = [_deviation(row, node) * scene.arrow_scale for row in rows]
-        draw_arrow(
-            scene,
-            f"{node}/{node_name(arrows.setup)}",
-            pose_along(foot, contact.direction),
-            np.repeat(lengths, 2).tolist(),
-            width=arrow_width(arrows.dial),
-            colour=COLOURS[node],
-            times=timeline.rests,
-        )
-        ends = [foot + length * contact.direction for length in lengths]
-        drawing.lower_ground(min(float(end[2]) for end in ends))
-        if node == BEFORE:
-            tips = ends
-    return tips
+def _captions(measured: Measurement, stops: Sequence[Stop], shown: bool) -> list[str]:
+    overview = "Overview at the mechanical zero"
+    if shown:
+        planned = "places of the gauges" if measured.planned else "largest deviation at each gauge"
+        overview = f"{overview}: {planned}"
+    # the last stop may be the first again
+    return [overview if len(stops) > 1 and s is stops[0] else _caption(s, measured) for s in stops]
 
 
 def arrow_width(dial: float) -> float:
@@ -201,6 +173,15 @@ def _draw_gauge(drawing: MachineScene, setup: Setup, contact: Contact, dial: flo
         edge=None if tip is None or tip.edge is None else tip.width * tip.edge,
     )
     return node
+
+
+def _hide_at_others(
+    scene: Scene, gauge: str, setup: Setup, stops: Sequence[Stop], timeline: Timeline
+) -> None:
+    """Hide a gauge while another leg is measured: its contact moves sideways then."""
+    present = np.array([s.place is None or s.place == setup.sensor.place for s in stops])
+    if not present.all():
+        scene.track(gauge, "visible", "bool", timeline.times[timeline.stops], present)
 
 
 def _label_gauge(
@@ -269,21 +250,12 @@ def _label(row: Deviation, measured: Measurement) -> str:
     return f"{name} {_mm(row.before)}{after} mm\n{short_name(row.where, 2 * LONGEST_LABEL)}"
 
 
-def _overview(measured: Measurement, shown: bool) -> str:
-    if not shown:
-        return "Overview at the mechanical zero"
-    if measured.planned:
-        return "Overview at the mechanical zero: places of the gauges"
-    return "Overview at the mechanical zero: largest deviation at each gauge"
-
-
 def _caption(stop: Stop, measured: Measurement) -> str:
-    if not stop.rows and stop.subtracted_from:
+    if not stop.rows:
         place = "" if stop.place is None else f", {list_places([stop.place])}"
         minuends = ", ".join(stop.subtracted_from)
-        return f"{stop.name}{place}: subtracted from the readings at {minuends}"
-    if not stop.rows:
-        return f"{stop.name}: no reading"
+        subtracted = f"{stop.name}{place}: subtracted from the readings at {minuends}"
+        return subtracted if minuends else f"{stop.name}: no reading"
     places = list_places(measured.place(r) for r in stop.rows)
     readings = "; ".join(_label(r, measured).split("\n")[0] for r in stop.rows)
     return f"{stop.name}, {places}: {readings}"
