@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 from conftest import ROOT
@@ -35,3 +36,14 @@ def scene_of(name, model=None, **options):
 def report_of(name, model=None):
     """Report of the calibration of an example."""
     return build_report(calibrated(name, model))
+
+
+def rename_setups(session, names):
+    """The session with other names of its setups, each by its old name."""
+    return replace(
+        session,
+        setups={
+            names.get(n, n): replace(s, name=names.get(n, n)) for n, s in session.setups.items()
+        },
+        readings=tuple(replace(r, setup=names.get(r.setup, r.setup)) for r in session.readings),
+    )

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pinocchio as pin
 import pytest
+from commands import run_orthocal
 from linkages import (
     joint,
     write_ball_platform,
@@ -17,7 +16,6 @@ from linkages import (
 from tolerances import CLOSED, KINEMATICS
 
 from orthocal import draw_scene, load_robot
-from orthocal.cli import main
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.output.scene import drawing
 from orthocal.robot.reference_posture import count_free_motions
@@ -98,13 +96,10 @@ def test_only_the_wide_linkage_has_a_computed_zero(robots):
     assert [name for name, r in robots.items() if r.drives[0].zero_computed] == ["wide"]
 
 
-def test_view_writes_its_page(robots, tmp_path, monkeypatch, capsys):
-    folder, page = robots["balls"].urdf.parent, tmp_path / "page.html"
-    monkeypatch.setattr(sys, "argv", ["orthocal", "view", str(folder), "--html", str(page)])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    assert (stopped.value.code or 0) == 0, capsys.readouterr().err
-    assert "Mechanical zero" in page.read_text(encoding="utf-8")
+def test_view_writes_its_page(robots, tmp_path):
+    done = run_orthocal(tmp_path, "view", robots["balls"].urdf.parent, "--html", "page.html")
+    assert done.returncode == 0, done.stderr
+    assert "Mechanical zero" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
 def test_visuals_behind_a_ball_joint_are_drawn_on_their_links(tmp_path):

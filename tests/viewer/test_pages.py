@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from browser import SIZES, SMALL, open_browser, require_browser, visit
-from calibrated import EXPERIMENT_2, calibrated, report_of, scene_of, session_of
+from calibrated import EXPERIMENT_2, calibrated, rename_setups, report_of, scene_of, session_of
 from PIL import Image
 
 from orthocal import LiveScene, draw_scene
@@ -95,15 +93,9 @@ def seek(found, time):
 
 def test_setups_with_any_names_are_drawn(browser, raw_cycles, tmp_path):
     """The viewer keeps nodes in plain JavaScript objects, which have some keys already."""
-    odd = dict(zip(raw_cycles.setups, ("constructor", "__proto__", "<object>"), strict=False))
-    name_of = {name: odd.get(name, name) for name in raw_cycles.setups}
-    assert len(odd) == 3
-    session = replace(
-        raw_cycles,
-        setups={name_of[n]: replace(s, name=name_of[n]) for n, s in raw_cycles.setups.items()},
-        readings=tuple(replace(r, setup=name_of[r.setup]) for r in raw_cycles.readings),
-    )
-    path = draw_scene(session).save(tmp_path / "scene.html")
+    odd = dict(zip(("yx", "zx", "xy"), ("constructor", "__proto__", "<object>"), strict=True))
+    assert set(odd) < set(raw_cycles.setups)
+    path = draw_scene(rename_setups(raw_cycles, odd)).save(tmp_path / "scene.html")
     with visit(browser, path.as_uri(), size=SMALL) as found:
         found.wait_until_drawn()
         assert found.messages == []

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 import pytest
-from calibrated import EXPERIMENT_2, calibrated, scene_of, session_of
+from calibrated import EXPERIMENT_2, calibrated, rename_setups, scene_of, session_of
 from gauges import exact
 from tolerances import KINEMATICS
 
@@ -521,17 +521,6 @@ def test_loaded_calibration_makes_the_same_page(calibration, scene, tmp_path):
 
 def test_the_page_is_what_meshcats_own_interface_gives(scene):
     assert scene.visualizer.static_html() == scene.to_html()
-
-
-def rename_setups(session, names):
-    """The session with other names of its setups."""
-    return replace(
-        session,
-        setups={
-            names.get(n, n): replace(s, name=names.get(n, n)) for n, s in session.setups.items()
-        },
-        readings=tuple(replace(r, setup=names.get(r.setup, r.setup)) for r in session.readings),
-    )
 
 
 TAKEN = ("constructor", "__proto__", "toString", "hasOwnProperty", "<object>")

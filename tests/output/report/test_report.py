@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from calibrated import EXPERIMENT_2, calibrated, report_of
+from calibrated import EXPERIMENT_2, calibrated, rename_setups, report_of
 from rich.console import Group
 from rich.panel import Panel
 from rich.text import Text
@@ -171,18 +171,15 @@ def test_loaded_calibration_makes_the_same_report(calibration, page, tmp_path):
 
 
 def test_texts_from_files_are_escaped(raw_cycles):
+    renamed = rename_setups(raw_cycles, {name: f"{name}{EVIL}" for name in raw_cycles.setups})
     session = replace(
-        raw_cycles,
+        renamed,
         title=EVIL,
         source=EVIL,
-        setups={f"{n}{EVIL}": replace(s, name=f"{n}{EVIL}") for n, s in raw_cycles.setups.items()},
         postures={
             f"{n}{EVIL}": replace(p, name=f"{n}{EVIL}") for n, p in raw_cycles.postures.items()
         },
-        readings=tuple(
-            replace(r, setup=f"{r.setup}{EVIL}", posture=f"{r.posture}{EVIL}")
-            for r in raw_cycles.readings
-        ),
+        readings=tuple(replace(r, posture=f"{r.posture}{EVIL}") for r in renamed.readings),
     )
     found = calibrate(session)
     read = Reader(build_report(found))

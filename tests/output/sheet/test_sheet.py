@@ -7,18 +7,17 @@ from __future__ import annotations
 
 import re
 import shutil
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import run_orthocal
 from lxml import etree
 from machines import place
 
 from orthocal import load_plan
 from orthocal.builder.build import make_robot
 from orthocal.builder.machine_file import Counting, Dimensions
-from orthocal.cli.run import main
 from orthocal.output.sheet.page import sheet_files
 from orthocal.units import MM
 
@@ -276,26 +275,17 @@ def test_sheet_without_a_tool_has_joints_alone(root, tmp_path):
     assert [r[1:4] for r in cells][1] == ["out", "210.000", "195.000"]
 
 
-def run(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr(sys, "argv", ["orthocal", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    out, err = capsys.readouterr()
-    return ended.value.code or 0, out, err
-
-
-def test_the_command_writes_beside_the_session_or_elsewhere(monkeypatch, capsys, small, tmp_path):
-    session, out = small.path, tmp_path / "out"
-    code, _, err = run(monkeypatch, capsys, "sheet", session, "--out", out, "--shift-mm", "0,0,50")
-    assert code == 0
-    assert f"Wrote {out}/sheet.html to print and 4 programs" in err
+def test_the_command_writes_beside_the_session_or_elsewhere(small, tmp_path):
+    words, out = ("sheet", small.path, "--out", tmp_path / "out"), tmp_path / "out"
+    done = run_orthocal(tmp_path, *words, "--shift-mm", "0,0,50")
+    assert done.returncode == 0
+    assert f"Wrote {out}/sheet.html to print and 4 programs" in done.stderr
     assert "Z50.0000" in (out / "03-zx.ngc").read_text()
     assert "world origin at (0, 0, 50) mm" in (out / "sheet.html").read_text()
-    code, _, err = run(monkeypatch, capsys, "sheet", session, "--out", out)
-    assert code == 2
-    assert err == f"orthocal: {out}/sheet.html: exists already; --force overwrites it\n"
-    code, _, _ = run(monkeypatch, capsys, "sheet", session, "--out", out, "--force")
-    assert code == 0
+    done = run_orthocal(tmp_path, *words)
+    assert done.returncode == 2
+    assert done.stderr == f"orthocal: {out}/sheet.html: exists already; --force overwrites it\n"
+    assert run_orthocal(tmp_path, *words, "--force").returncode == 0
     assert "Z50" not in (out / "03-zx.ngc").read_text()
 
 
@@ -308,10 +298,9 @@ def test_the_command_writes_beside_the_session_or_elsewhere(monkeypatch, capsys,
         (["examples/workshop/plan.yaml", "--feed", "0"], "--feed: found 0; expected 1 to 20000"),
     ],
 )
-def test_bad_input_is_refused(monkeypatch, capsys, root, tmp_path, arguments, message):
-    arguments[0] = str(root / arguments[0])
-    code, out, err = run(monkeypatch, capsys, "sheet", *arguments, "--out", tmp_path / "out")
-    assert (code, out) == (2, "")
-    assert message in err
-    assert len(err.splitlines()) == 1
+def test_bad_input_is_refused(root, tmp_path, arguments, message):
+    done = run_orthocal(root, "sheet", *arguments, "--out", tmp_path / "out")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert message in done.stderr
+    assert len(done.stderr.splitlines()) == 1
     assert not (tmp_path / "out").exists()
