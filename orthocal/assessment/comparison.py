@@ -18,7 +18,7 @@ from orthocal.assessment.tool_error import ErrorSize
 from orthocal.assessment.words import comparison as words
 from orthocal.assessment.words.entries import SESSION_HEADLINES
 from orthocal.assessment.words.validation import describe_repetition
-from orthocal.calibration.assessment_record import Assessment, Decision, Finding, ToolErrorSummary
+from orthocal.calibration.assessment_record import Assessment, Decision, Finding, FindingKind
 from orthocal.calibration.refit import repeat_calibration
 from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.estimation.options import SolverOptions
@@ -27,7 +27,17 @@ from orthocal.io.fields import finite_or_none
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.session.session import Session
 from orthocal.statistics.noise import KnownNoise, estimate_repeatability
-from orthocal.units import MM
+
+NOISE_KINDS: tuple[FindingKind, ...] = (
+    "noise unknown",
+    "noise from residuals",
+    "noise as stated",
+    "model error",
+    "gauge overstated",
+    "fits",
+    "no redundancy",
+)
+"""Kinds of findings about the residuals of the recommended model."""
 
 CRITERIA = ("rms", "chi_square", "dof", "aicc", "bic", "unseen_rms")
 """Numbers of a score in the JSON document."""
@@ -53,10 +63,8 @@ class Comparison:
     recommendation: Recommendation
     judgement: Judgement
     """Of the readings, whatever the model is."""
-    tool: ToolErrorSummary | None
-    """Of the recommended model, as `calibrate` states it; None if it is unknown."""
-    tool_findings: tuple[Finding, ...]
-    """The same as findings."""
+    best_assessment: Assessment | None
+    """Of the recommended model's calibration, as `calibrate` states it; None without results."""
 
     def __getitem__(self, model: str) -> ModelResult:
         for result in self.results:
@@ -157,15 +165,13 @@ def compare_models(
         repeat_title=join_sessions(others).title if others else "",
         recommendation=recommendation,
         judgement=judgement,
-        tool=None,
-        tool_findings=(),
+        best_assessment=None,
     )
     if compared.best is None:
         return compared
     best = compared.best.calibration
     assessed = assess(best, session, judgement=judgement, recommendation=recommendation)
-    found = assessed.of_kind("tool error", "out of reach")
-    compared = replace(compared, tool=assessed.tool, tool_findings=found)
+    compared = replace(compared, best_assessment=assessed)
     if not others:
         return compared
     again = repeat_calibration(best, others)
@@ -198,13 +204,19 @@ def _assess(comparison: Comparison) -> Assessment:
     judged, best = comparison.judgement, comparison.best
     notes = words.describe_recommendation(comparison.recommendation)
     notes += [words.not_determined(u.model, u.reason) for u in comparison.undetermined]
-    if best is not None:
+    assessed, tool = comparison.best_assessment, None
+    if best is not None and assessed is not None:
         notes += _others(comparison, best)
-        notes += _residuals(comparison, best)
+        notes += assessed.of_kind(*NOISE_KINDS)
         if comparison.repetition is not None:
             title = comparison.repeat_title
             notes.append(describe_repetition(comparison.repetition, title=title))
-        notes += _tool(comparison, best)
+        tool = assessed.tool
+        notes += assessed.of_kind("tool error", "out of reach")
+        if tool is not None and not best.calibration.only_offsets:
+            notes.append(words.compensated(tool.compensated))
+        if best.linearisation_cost is not None:
+            notes.append(words.linearisation_cost(best.linearisation_cost.rms))
     findings = rank([*judged.findings, *notes])
     lead = next((f for f in findings if f.severity != "note"), notes[0])
     headline = SESSION_HEADLINES[judged.verdict]
@@ -212,7 +224,7 @@ def _assess(comparison: Comparison) -> Assessment:
         Decision(judged.verdict, headline, lead.text, lead.action),
         findings,
         (),
-        comparison.tool,
+        tool,
         judged.tolerance_scale,
     )
 
@@ -230,31 +242,6 @@ def _others(comparison: Comparison, best: ModelResult) -> list[Finding]:
         for r in comparison.results
         if r is not best
     ]
-
-
-def _residuals(comparison: Comparison, best: ModelResult) -> list[Finding]:
-    """Finding about the residuals of the recommended model: noise or not."""
-    calibration, noise = best.calibration, comparison.noise
-    exceeded = noise.is_exceeded(best.exact.chi_square, best.exact.dof)
-    if exceeded is None:
-        return [words.noise_unknown()] if noise.source == "unknown" else []
-    found, factor = calibration.noise.residual_sigma, calibration.row_factor
-    row = "a difference" if calibration.rows_are_differences else "a reading"
-    source = {"cycles": "from repeated readings", "gauge": "as stated for the gauge"}[noise.source]
-    sizes = f"σ {found * factor / MM:.3g} mm of {row}, noise {noise.sigma * factor / MM:.2g} mm"
-    if not exceeded:
-        return [words.residuals_are_noise(best.model, sizes, source)]
-    return [words.residuals_exceed_noise(best.model, sizes, source, found / noise.sigma)]
-
-
-def _tool(comparison: Comparison, best: ModelResult) -> list[Finding]:
-    """The expected tool error of the recommended model."""
-    found = list(comparison.tool_findings)
-    if comparison.tool is not None and not best.calibration.only_offsets:
-        found.append(words.compensated(comparison.tool.compensated))
-    if best.linearisation_cost is not None:
-        found.append(words.linearisation_cost(best.linearisation_cost.rms))
-    return found
 
 
 def _require_another(other: Session, sessions: Sequence[Session]) -> None:
@@ -278,10 +265,10 @@ def find_known_noise(session: Session) -> KnownNoise:
     problem = build_problem(session, free=["*.offset"])
     sigma, dof = estimate_repeatability(problem.values, problem.observations)
     if dof > 0 and sigma > 0.0:
-        return KnownNoise(sigma, "cycles", float(dof))
+        return KnownNoise(sigma, "cycles")
     if session.gauge.sigma is not None:
-        return KnownNoise(session.gauge.sigma, "gauge", math.inf)
-    return KnownNoise(math.nan, "unknown", 0.0)
+        return KnownNoise(session.gauge.sigma, "gauge")
+    return KnownNoise(math.nan, "unknown")
 
 
 def _result_document(result: ModelResult) -> dict[str, Any]:

@@ -97,22 +97,6 @@ class KnownNoise:
     sigma: float
     """Standard deviation of a reading, [m]; NaN if unknown."""
     source: Literal["cycles", "gauge", "unknown"]
-    dof: float
-
-    def is_exceeded(self, chi_square: float, dof: float) -> bool | None:
-        """Test for residuals larger than this noise.
-
-        Args:
-            chi_square: Σ r²/σ² of single readings, zeros eliminated, by this σ.
-            dof: Degrees of freedom of the residuals.
-
-        Returns:
-            None if the noise is unknown, or there are no residual degrees of freedom.
-        """
-        if not math.isfinite(self.sigma) or dof < LEAST_DOF:
-            return None
-        cycles_dof = 0.0 if math.isinf(self.dof) else self.dof
-        return chance_of_excess(chi_square, dof, cycles_dof=cycles_dof) < BY_CHANCE
 
 
 def estimate_repeatability(values: Array, observations: Observations) -> tuple[float, int]:

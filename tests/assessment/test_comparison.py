@@ -202,7 +202,7 @@ def test_readings_that_leave_an_offset_open_are_held_by_the_tolerances(raw_cycle
 def test_an_unstated_noise_is_unknown(experiment_2):
     session = experiment_2.with_gauge(replace(experiment_2.gauge, sigma=None))
     found = compare_models(session, models=["offsets"])
-    assert found.assessment.of_kind("noise unknown")
+    assert found.assessment.of_kind("noise from residuals")
     assert found.assessment.decision.exit_code == 0
     assert json.loads(found.to_json())["noise"] is None
 

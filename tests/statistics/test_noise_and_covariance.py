@@ -23,7 +23,7 @@ from orthocal.statistics.chance import (
     expanded_uncertainty,
 )
 from orthocal.statistics.information import Information, decompose, marginalise
-from orthocal.statistics.noise import KnownNoise, Noise, estimate_noise, estimate_repeatability
+from orthocal.statistics.noise import Noise, estimate_noise, estimate_repeatability
 
 TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
@@ -225,15 +225,12 @@ def test_an_information_without_readings_has_no_rank():
     assert not information.identifiable.any()
 
 
-def test_what_noise_explains_is_yes_no_or_unknown():
-    """Residuals of 12 degrees, 5 of them the cycles' own: an F test; or χ² of a given σ."""
+def test_the_chance_of_an_excess_over_cycles_is_an_f_test():
+    """Residuals of 12 degrees, 5 of them the cycles' own; or χ² of a given σ."""
     chi_square = 5 + 7 * 4.0  # beside the cycles' own 5: F(7, 5) at 4.0, χ² of 12 at 33
-    assert 0.01 < stats.f.sf(4.0, 7, 5) < 0.1
-    assert stats.chi2.sf(chi_square, 12) < 0.001
-    assert KnownNoise(1e-5, "cycles", 5.0).is_exceeded(chi_square, 12) is False
-    assert KnownNoise(1e-5, "gauge", np.inf).is_exceeded(chi_square, 12) is True
-    assert KnownNoise(np.nan, "unknown", 0.0).is_exceeded(chi_square, 12) is None
-    assert KnownNoise(1e-5, "gauge", np.inf).is_exceeded(0.0, 0.0) is None
+    expected = stats.f.sf(4.0, 7, 5)
+    assert chance_of_excess(chi_square, 12, cycles_dof=5.0) == pytest.approx(expected)
+    assert chance_of_excess(chi_square, 12) == pytest.approx(stats.chi2.sf(chi_square, 12))
 
 
 @pytest.mark.parametrize(

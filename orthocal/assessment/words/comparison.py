@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from orthocal.assessment.recommendation import Recommendation
-from orthocal.assessment.wording import lengths, mm, note, times
+from orthocal.assessment.wording import lengths, mm, note
 from orthocal.assessment.words.entries import describe_compensated
 from orthocal.calibration.assessment_record import Finding
 from orthocal.units import MM, UM
@@ -61,30 +61,6 @@ def not_recommended(model: str, evidence: float, unseen: float, best_unseen: flo
 def not_determined(model: str, reason: str) -> Finding:
     """A model that the readings do not determine."""
     return note("not determined", f"{model}: not determined. {reason}.")
-
-
-def noise_unknown() -> Finding:
-    """Nothing states the noise."""
-    return note(
-        "noise unknown",
-        "Whether the residuals are noise is unknown: nothing states the noise of the gauge.",
-        "Repeat readings in cycles, or state gauge.sigma_mm.",
-    )
-
-
-def residuals_are_noise(model: str, sizes: str, source: str) -> Finding:
-    """Residuals agree with the noise."""
-    return note("fits", f"The residuals of {model} are noise: {sizes} ({source}).")
-
-
-def residuals_exceed_noise(model: str, sizes: str, source: str, ratio: float) -> Finding:
-    """Residuals exceed the noise."""
-    return note(
-        "model error",
-        f"The residuals of {model} exceed the noise {times(ratio)}: {sizes} ({source}). The model "
-        "leaves out errors of the machine.",
-        ratio=ratio,
-    )
 
 
 def compensated(rms: float) -> Finding:
