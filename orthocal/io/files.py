@@ -129,15 +129,13 @@ def read_lines(
         yield pending
 
 
-def require_file(
-    path: Path, *, error: type[OrthocalError] = OrthocalError, largest: int = LARGEST_FILE
-) -> None:
+def require_file(path: Path, *, error: type[OrthocalError] = OrthocalError) -> None:
     """Check a file that other code will read, as `read_file` does.
 
     Raises:
         OrthocalError: Of kind `error`, as `read_file`.
     """
-    os.close(_open_regular(path, error, largest))
+    os.close(_open_regular(path, error, LARGEST_FILE))
 
 
 def _open_regular(path: Path, error: type[OrthocalError], largest: int | None = None) -> int:

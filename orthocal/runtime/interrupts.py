@@ -33,6 +33,16 @@ def _end(number: int, frame: FrameType | None) -> None:
 
 
 @contextmanager
+def _handled(handler: Handler) -> Iterator[None]:
+    """Handle Ctrl-C by a function inside the block."""
+    previous = signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+@contextmanager
 def message_at_interrupt(message: str) -> Iterator[None]:
     """Print a message if Ctrl-C ends the process inside the block."""
     token = _MESSAGE.set(message)
@@ -45,15 +55,12 @@ def message_at_interrupt(message: str) -> Iterator[None]:
 @contextmanager
 def ending_at_interrupt() -> Iterator[None]:
     """End the process at Ctrl-C, wherever it is: nothing is written, and nothing can swallow it."""
-    previous = signal.getsignal(signal.SIGINT)
-    if previous is not signal.default_int_handler or not _in_main_thread():
+    handler = signal.getsignal(signal.SIGINT)
+    if handler is not signal.default_int_handler or not _in_main_thread():
         yield
         return
-    signal.signal(signal.SIGINT, _end)
-    try:
+    with _handled(_end):
         yield
-    finally:
-        signal.signal(signal.SIGINT, previous)
 
 
 @contextmanager
@@ -65,11 +72,8 @@ def raised_interrupt() -> Iterator[None]:
     if signal.getsignal(signal.SIGINT) is not _end:
         yield
         return
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
+    with _handled(signal.default_int_handler):
         yield
-    finally:
-        signal.signal(signal.SIGINT, _end)
 
 
 @contextmanager
@@ -137,11 +141,8 @@ def _recorded_interrupts(*, pass_on: bool) -> Iterator[list[int]]:
         if pass_on:
             handler(number, frame)
 
-    signal.signal(signal.SIGINT, record)
-    try:
+    with _handled(record):
         yield received
-    finally:
-        signal.signal(signal.SIGINT, previous)
 
 
 def _in_main_thread() -> bool:

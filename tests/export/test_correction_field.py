@@ -185,9 +185,13 @@ def test_planar_robots_and_robots_without_a_tool(biglide, orthoglide):
         )
 
 
+@pytest.fixture(scope="module")
+def calibration(experiment_2):
+    return calibrate(experiment_2)
+
+
 @pytest.fixture
-def command(experiment_2, tmp_path):
-    calibration = calibrate(experiment_2)
+def command(calibration, tmp_path):
     write_calibration(calibration, tmp_path / "calibration.json")
 
     def run(text, *words, typed=""):

@@ -111,12 +111,12 @@ def millimetres(values: Iterable[float]) -> str:
     return ", ".join(f"{round(float(v) / MM, 6) + 0.0:g}" for v in values)
 
 
-def rounded_up(value: float, digits: int = 2) -> str:
-    """Number with few digits, rounded up."""
+def rounded_up(value: float) -> str:
+    """Number with two digits, rounded up."""
     if not math.isfinite(value) or value <= 0.0:
         return f"{value:g}"
-    decimals = digits - 1 - math.floor(math.log10(value))
-    return f"{math.ceil(value * 10.0**decimals) / 10.0**decimals:.{digits}g}"
+    decimals = 1 - math.floor(math.log10(value))
+    return f"{math.ceil(value * 10.0**decimals) / 10.0**decimals:.2g}"
 
 
 def approximate(

@@ -20,7 +20,7 @@ from orthocal.session.session import Conditions, Gauge, Purpose, Reading, Sessio
 from orthocal.units import MM, tidy, to_mm, trim_zeros
 
 
-def session_document(session: Session, *, readings: str = "readings.csv") -> dict[str, Any]:
+def session_document(session: Session) -> dict[str, Any]:
     """The session.yaml of a session, as plain data."""
     document: dict[str, Any] = {"robot": session.robot_reference}
     if session.title:
@@ -54,7 +54,7 @@ def session_document(session: Session, *, readings: str = "readings.csv") -> dic
         }
         for s in session.setups.values()
     }
-    document["readings"] = readings
+    document["readings"] = "readings.csv"
     return document
 
 
