@@ -60,7 +60,7 @@ def test_meaning_of_a_heading(text, expected):
 )
 def test_unit_of_an_assigned_column(heading, unit):
     columns = choose_columns(["setup", "posture", heading], {"reading": heading}, where="t")
-    assert columns.readings[0].unit == unit
+    assert columns.readings[2].unit == unit
     assert unit is None or unit in UNITS
 
 

@@ -245,7 +245,7 @@ def _clean_table(path: Path, content: bytes) -> tuple[Table, Columns] | None:
         return None
     strange = [
         *columns.extra,
-        *(r.index for r in columns.readings if r.unit != "mm" or r.cycle is not None),
+        *(i for i, h in columns.readings.items() if h.unit != "mm" or h.cycle is not None),
     ]
     if strange:
         name = " ".join(table.header[min(strange)].split())
@@ -260,7 +260,7 @@ def _clean_table(path: Path, content: bytes) -> tuple[Table, Columns] | None:
 def _table_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
     require_whole_cells(table, columns)
     (reading,) = columns.readings
-    numerals = [Numeral(row.cell(reading.index).text, row.line) for row in table.rows]
+    numerals = [Numeral(row.cell(reading).text, row.line) for row in table.rows]
     sign = decide_sign(numerals, house=is_house(table.header), ask=ASK, place=table.place).sign
     width = len(table.header)
     for row in table.rows:
@@ -273,7 +273,7 @@ def _table_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
             )
         cells = {
             COLUMN_OF_ROLE.get(role, role): composed(row.cell(index).text.strip())
-            for role, index in (*columns.single.items(), ("reading", reading.index))
+            for role, index in (*columns.single.items(), ("reading", reading))
         }
         for name in COLUMN_OF_ROLE.values():
             value = None if sign is None else parse_numeral(cells.get(name, ""), sign)
@@ -302,7 +302,7 @@ def require_whole_cells(table: Table, columns: Columns, *, sure: bool = False) -
     """
     if table.separator != "comma":
         return
-    readings = [r.index for r in columns.readings]
+    readings = list(columns.readings)
     texts = [row.cell(i).text for row in table.rows for i in readings]
     certain = sure or is_house(table.header) or any("." in t or "," in t for t in texts)
     pairs = {(i, i + 1) for i in readings} | {(i - 1, i) for i in readings if i}

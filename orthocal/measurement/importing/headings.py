@@ -94,18 +94,8 @@ class Heading:
 
     role: Role
     cycle: int | None = None
-    """Cycle of a column of readings beside others."""
+    """Cycle of all readings of a column; None if the rows give it."""
     unit: UnitName | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class ReadingColumn:
-    """A column of readings."""
-
-    index: int
-    cycle: int | None
-    """Cycle of all readings of the column; None if the rows give it."""
-    unit: UnitName | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +104,8 @@ class Columns:
 
     single: Mapping[Role, int]
     """Indices of the columns with a role in SINGLE, in that order."""
-    readings: tuple[ReadingColumn, ...]
+    readings: Mapping[int, Heading]
+    """Indices of the columns of readings, with their headings."""
     extra: tuple[int, ...]
     """Columns with a heading that has no role."""
 
@@ -282,22 +273,18 @@ def choose_columns(texts: Sequence[str], assigned: Mapping[str, str], *, where: 
                 f"no column has the role {role}; assign one by --column {role}=HEADING",
                 where=where,
             )
-    readings = [
-        ReadingColumn(i, h.cycle, h.unit)
-        for i, h in enumerate(headings)
-        if h is not None and h.role == "reading"
-    ]
+    readings = {i: h for i, h in enumerate(headings) if h is not None and h.role == "reading"}
     _check_readings(texts, readings, single.get("cycle"), where)
-    used = {r.index for r in readings} | set(single.values())
+    used = {*readings, *single.values()}
     return Columns(
         single=single,
-        readings=tuple(readings),
+        readings=readings,
         extra=tuple(i for i, text in enumerate(texts) if i not in used and text.strip()),
     )
 
 
 def _check_readings(
-    texts: Sequence[str], readings: Sequence[ReadingColumn], cycle: int | None, where: str
+    texts: Sequence[str], readings: Mapping[int, Heading], cycle: int | None, where: str
 ) -> None:
     """Refuse missing and ambiguous columns of readings."""
     if not readings:
@@ -305,25 +292,24 @@ def _check_readings(
             "no column has the role reading; assign one by --column reading=HEADING", where=where
         )
     by_cycle: dict[int, list[int]] = {}
-    for column in readings:
-        if column.cycle is None:
+    for index, heading in readings.items():
+        if heading.cycle is None:
             if len(readings) > 1:
-                places = [r.index for r in readings if r.cycle is None]
+                places = [i for i, h in readings.items() if h.cycle is None]
                 raise _several_columns(texts, places, "reading", where)
             continue
-        if column.cycle < 1:
+        if heading.cycle < 1:
             raise SessionError(
-                f"column '{shorten(texts[column.index])}' is cycle {column.cycle}; expected 1, 2, "
-                "3 ...",
+                f"column '{shorten(texts[index])}' is cycle {heading.cycle}; expected 1, 2, 3 ...",
                 where=where,
             )
-        by_cycle.setdefault(column.cycle, []).append(column.index)
+        by_cycle.setdefault(heading.cycle, []).append(index)
     for places in by_cycle.values():
         if len(places) > 1:
             raise _several_columns(texts, places, "reading", where)
     if by_cycle and cycle is not None:
         raise SessionError(
-            f"has cycles side by side ('{shorten(texts[readings[0].index])}' ...) and a column "
+            f"has cycles side by side ('{shorten(texts[min(readings)])}' ...) and a column "
             f"'{shorten(texts[cycle])}' as well; choose one by --column",
             where=where,
         )

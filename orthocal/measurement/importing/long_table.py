@@ -35,7 +35,6 @@ from orthocal.measurement.importing.headings import (
     SINGLE,
     UNITS,
     Columns,
-    ReadingColumn,
     Role,
     UnitName,
     parse_unit,
@@ -64,7 +63,7 @@ class Entry:
 
     row: RawReading
     """The row with names as written, without its reading."""
-    column: ReadingColumn
+    column: int
     number: str | None
     """Text of the number without its unit; None if the cell has no reading."""
     value: Decimal | None = None
@@ -140,7 +139,7 @@ def make_long_table(
             continue
         renamed |= {old: new for old, new in zip(written, meant, strict=True) if old != new}
         value = _parse_value(entry, sign.sign)
-        entry_unit = _choose_unit(entry, unit, table.header[entry.column.index])
+        entry_unit = _choose_unit(entry, unit, table.header[entry.column])
         units[entry_unit] = None
         unit_assumed |= entry.unit is None
         with localcontext(prec=2 * LONGEST_NUMBER):
@@ -160,9 +159,8 @@ def _read_entries(
     table: Table, columns: Columns, skipped: SkippedRows, fill: bool
 ) -> Iterator[Entry]:
     """Cells of the columns of readings, row by row."""
-    indices = [r.index for r in columns.readings]
     for column, top, _ in table.merged:
-        if column in indices:
+        if column in columns.readings:
             raise SessionError(
                 "is merged with cells below; expected one cell for each reading",
                 where=table.place(top, column),
@@ -179,7 +177,7 @@ def _read_entries(
         break
     for row in rows:
         names = {role: _name(row.cell(columns.single[role])) for role in NAMED}
-        filled_cells = [r for r in columns.readings if not _is_missing(row.cell(r.index))]
+        filled_cells = [i for i in columns.readings if not _is_missing(row.cell(i))]
         beyond = sum(not c.is_blank for c in row.cells[len(table.header) :])
         if beyond:
             skipped.append((row.line, f"{beyond} cells without a heading"))
@@ -195,15 +193,15 @@ def _read_entries(
                     where=table.place(row.line),
                 )
         cells = _read_optional_cells(row, columns) | {role: names[role] for role in NAMED}
-        for r in columns.readings:
-            where = table.place(row.line, r.index)
-            numbered = cells if r.cycle is None else {**cells, "cycle": str(r.cycle)}
-            entry = Entry(RawReading(where, row.line, **numbered), r, None)
-            if r not in filled_cells:
+        for i, heading in columns.readings.items():
+            where = table.place(row.line, i)
+            numbered = cells if heading.cycle is None else {**cells, "cycle": str(heading.cycle)}
+            entry = Entry(RawReading(where, row.line, **numbered), i, None)
+            if i not in filled_cells:
                 yield entry
                 continue
-            number, value, unit = _read_number(row.cell(r.index), where)
-            stated = r.unit or units_below.get(r.index)
+            number, value, unit = _read_number(row.cell(i), where)
+            stated = heading.unit or units_below.get(i)
             if unit and stated and unit != stated:
                 raise SessionError(
                     f"the reading is in {unit}, and its heading says {stated}", where=where
@@ -230,13 +228,13 @@ def _read_units_row(row: Row, columns: Columns) -> dict[int, UnitName]:
     if any(_name(row.cell(i)) for i in columns.keys):
         return {}
     units: dict[int, UnitName] = {}
-    for r in columns.readings:
-        text = tidy_text(row.cell(r.index).text).strip("[]()")
+    for i, heading in columns.readings.items():
+        text = tidy_text(row.cell(i).text).strip("[]()")
         unit = parse_unit(text)
-        if (text and unit is None) or (unit and r.unit and r.unit != unit):
+        if (text and unit is None) or (unit and heading.unit and heading.unit != unit):
             return {}
         if unit is not None:
-            units[r.index] = unit
+            units[i] = unit
     return units
 
 

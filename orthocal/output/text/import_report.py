@@ -89,8 +89,8 @@ def _columns_by_role(result: TableImport) -> list[tuple[str, str]]:
     columns, table = result.columns, result.table
     roles = [(role, _describe_column(table, index)) for role, index in columns.single.items()]
     readings = [
-        _describe_column(table, r.index) + (f" as cycle {r.cycle}" if r.cycle is not None else "")
-        for r in columns.readings
+        _describe_column(table, i) + (f" as cycle {h.cycle}" if h.cycle is not None else "")
+        for i, h in columns.readings.items()
     ]
     return [*roles, ("reading", ", ".join(readings))]
 
