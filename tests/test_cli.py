@@ -13,6 +13,7 @@ import sys
 import numpy as np
 import pytest
 from commands import orthocal
+from typer.main import get_command
 
 from orthocal import (
     __version__,
@@ -402,12 +403,15 @@ def test_help_lists_the_commands_in_the_order_of_work(monkeypatch):
 
 
 def test_every_command_has_help(monkeypatch):
-    """Arguments and options have one sentence each, without what only its authors would say."""
+    """Arguments and options have a sentence each, without what only its authors would say."""
     monkeypatch.setenv("COLUMNS", "80")
     names = [name for panel in PANELS.values() for name in panel if name != "study"]
     names += [f"study {name}" for name in commands_of(orthocal("study", "--help")[1])["Commands"]]
     assert len(names) == 22
+    program = get_command(make_program())
     for name in names:
+        made = program.commands["study"] if name.startswith("study ") else program
+        assert [p.name for p in made.commands[name.split()[-1]].params if not p.help] == []
         code, out, _ = orthocal(*name.split(), "--help")
         assert code == 0
         assert f"orthocal {name} " in out.splitlines()[0]
