@@ -19,9 +19,11 @@ from orthocal import (
     __version__,
     check_session,
     load_calibration,
+    load_plan,
     load_session,
     write_session,
 )
+from orthocal.assessment.controller_entries import entered_offsets
 from orthocal.cli.run import PANELS, make_program
 
 pytestmark = pytest.mark.usefixtures("without_plots")
@@ -117,36 +119,64 @@ def test_calibrate_prints_json_alone_on_stdout(experiment):
     assert len(document["parameters"]) == 6
 
 
-def turn_a_setup(root, folder):
-    """The example of three cycles with the readings of setup zx read with the wrong sign."""
-    folder.mkdir()
-    for name in ("session.yaml", "machine.yaml"):
-        (folder / name).write_text((root / "examples/raw-cycles" / name).read_text())
-    head, *rows = (root / "examples/raw-cycles/readings.csv").read_text().splitlines()
-    cells = [row.split(",") for row in rows]
-    for row in cells:
-        if row[0] == "zx":
-            row[-1] = f"{-float(row[-1]):.3f}"
-    (folder / "readings.csv").write_text("\n".join([head, *map(",".join, cells)]) + "\n")
-    return folder
+@pytest.fixture(scope="module")
+def turned(root, tmp_path_factory, without_plots):
+    """Directory of a calibration of readings with a reversed setup zx, and its answer."""
+    folder = tmp_path_factory.mktemp("turned")
+    session = load_session(root / "examples/raw-cycles")
+    signs = [-1.0 if r.setup == "zx" else 1.0 for r in session.readings]
+    write_session(session.with_values(session.values * signs), folder / "session")
+    words = ["calibrate", folder / "session", "--details", "--out", folder / "out"]
+    return folder / "out", orthocal(*words)
 
 
-def test_what_is_to_be_reviewed_exits_3_with_all_that_was_asked_for(root, tmp_path):
-    session = turn_a_setup(root, tmp_path / "turned")
-    code, out, err = orthocal("calibrate", session, "--details", "--out", tmp_path / "out")
+def test_what_is_to_be_reviewed_exits_3_with_all_that_was_asked_for(turned):
+    folder, (code, out, err) = turned
     assert code == 3
     assert err.startswith("Wrote ")
     assert "Parameters" in out
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"calibration.json", "report.html"}
-    decision = load_calibration(tmp_path / "out").assessment.decision
+    assert {p.name for p in folder.iterdir()} == {"calibration.json", "report.html"}
+    assessment = load_calibration(folder).assessment
+    decision = assessment.decision
     assert f"{decision.headline} {decision.reason}" in " ".join(out.split())
-    code, out, err = orthocal("calibrate", session, "--json")
-    assert (code, err) == (3, "")
-    document = json.loads(out)
-    assert document["decision"] == decision.to_document()
     assert (decision.verdict, decision.exit_code) == ("review", 3)
-    assert document["findings"][0]["kind"] == "reversed sign"
-    assert document["findings"][0]["places"][0]["setup"] == "zx"
+    assert assessment.findings[0].kind == "reversed sign"
+    assert assessment.findings[0].places[0].setup == "zx"
+
+
+def test_what_is_to_be_reviewed_is_not_measured_again(turned, tmp_path):
+    words = ["again", turned[0], "--out", tmp_path / "next"]
+    code, _, err = orthocal(*words)
+    assert code == 3
+    decision = load_calibration(turned[0]).assessment.decision
+    assert err.startswith(f"orthocal: {decision.headline} ")
+    assert not (tmp_path / "next").exists()
+    assert orthocal(*words, "--anyway").returncode == 0
+
+
+def test_again_is_the_same_session_with_offsets_active(calibrated, experiment, tmp_path):
+    out = tmp_path / "second"
+    code, text, err = orthocal("again", calibrated, "--out", out)
+    assert code == 0, err
+    first, second = load_plan(experiment), load_plan(out)
+    entered = entered_offsets(load_calibration(calibrated))
+    assert second.active_offsets == pytest.approx(entered, abs=0.6e-7)
+    assert second.active_offsets != pytest.approx(first.active_offsets, abs=1e-5)
+    assert [(r.setup, r.posture, r.minus, r.cycle) for r in second.readings] == [
+        (r.setup, r.posture, r.minus, r.cycle) for r in first.readings
+    ]
+    for name, posture in first.postures.items():  # commanded alike, so elsewhere in truth
+        assert second.postures[name].values.tolist() == posture.values.tolist()
+    rows = (out / "readings.csv").read_text().splitlines()
+    assert len(rows) == 1 + len(first.readings)
+    assert all(row.endswith(",") for row in rows[1:])
+    assert (second.title, second.source) == (first.title, "")
+    assert "x_slide -0.52" in text
+    assert f"orthocal validate {calibrated} {out}" in text
+    assert (out / "sheet.html").read_text().startswith("<!DOCTYPE html>")
+    code, _, err = orthocal("again", calibrated, "--out", out)
+    assert code == 2
+    assert err == f"orthocal: {out}/session.yaml: exists already; expected a new directory\n"
 
 
 def test_the_printed_json_holds_what_the_file_holds_and_the_decision(experiment, tmp_path):
@@ -431,23 +461,49 @@ def test_a_pipe_that_closes_early_is_no_error(root, experiment):
     assert done.stderr == ""
 
 
-def test_several_sessions_are_fitted_together(root, tmp_path):
+@pytest.fixture(scope="module")
+def days(root, tmp_path_factory, without_plots):
+    """Directory of the sessions of two days and of their calibration, and its answer."""
+    folder = tmp_path_factory.mktemp("days")
     plan, truth = root / "examples/raw-cycles/plan.yaml", root / "examples/raw-cycles/machine.yaml"
-    for seed, day in enumerate(("monday", "tuesday")):
-        orthocal("simulate", plan, "--errors", truth, "--seed", seed, "--out", tmp_path / day)
-    days = tmp_path / "monday", tmp_path / "tuesday"
-    code, out, _ = orthocal("calibrate", *days, "--details", "--out", tmp_path / "out")
+    sessions = folder / "monday", folder / "tuesday"
+    for seed, day in enumerate(sessions):
+        orthocal("simulate", plan, "--errors", truth, "--seed", seed, "--out", day)
+    return folder, orthocal("calibrate", *sessions, "--details", "--out", folder / "out")
+
+
+def test_several_sessions_are_fitted_together(days):
+    folder, (code, out, _) = days
     assert code == 0
     assert "108 readings in 14 postures, 12 setups on legs x, y, z" in out
-    lines = out.splitlines()
-    noise = {
-        day: next(line.split() for line in lines if f" {day} " in line)
-        for day in ("monday", "tuesday")
-    }
-    assert [row[1:3] for row in noise.values()] == [["54", "0.010"]] * 2
-    report = (tmp_path / "out/report.html").read_text()
+    for day in ("monday", "tuesday"):
+        row = next(line.split() for line in out.splitlines() if f" {day} " in line)
+        assert row[1:3] == ["54", "0.010"]
+    report = (folder / "out/report.html").read_text()
     assert "Gauges and sensors" in report
     assert report.count("monday/session.yaml") == 1
-    code, out, err = orthocal("calibrate", days[0], days[1], days[0])
+
+
+def test_readings_do_not_count_twice(days, tmp_path):
+    monday, tuesday = days[0] / "monday", days[0] / "tuesday"
+    code, out, err = orthocal("calibrate", monday, tuesday, monday)
     assert (code, out) == (2, "")
     assert "monday: is the same session as one before it; its readings would count twice" in err
+    copy = shutil.copytree(monday, tmp_path / "copy")
+    with (copy / "session.yaml").open("a") as stream:
+        stream.write("# Tuesday\n")
+    code, _, err = orthocal("calibrate", monday, copy)
+    assert code == 2
+    assert err == (
+        f"orthocal: {copy}/readings.csv: has the same readings as {monday}/session.yaml: a copy "
+        "that was not measured again?\n"
+    )
+
+
+def test_of_several_sessions_one_is_measured_again(days, tmp_path):
+    words = ["again", days[0] / "out", "--anyway", "--out", tmp_path / "next"]
+    code, _, err = orthocal(*words)
+    assert code == 2
+    assert "--session: is missing: the calibration is of several sessions" in err
+    code, _, err = orthocal(*words, "--session", days[0] / "tuesday")
+    assert code == 0, err
