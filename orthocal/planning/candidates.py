@@ -87,27 +87,13 @@ class CandidateSetup:
     shape (m, m)."""
     aligned: tuple[AlignedParameter, ...] = ()
 
-    def begun(self, first: int) -> CandidateSetup:
-        """The setup with its gauge aligned in the posture of one reading."""
-        if not self.aligned:
-            return self
-        jacobian = self.jacobian
+    def jacobian_of(self, chosen: Sequence[int]) -> Array:
+        """Jacobian of some readings, the gauge aligned in the first, (n_chosen, n_state)."""
+        rows = list(chosen)
+        jacobian = self.jacobian[rows]
         for a in self.aligned:
-            jacobian = jacobian + np.outer(a.sensitivity, a.jacobian[first])
-        return replace(self, jacobian=jacobian, aligned=())
-
-    def only(self, chosen: Sequence[int]) -> CandidateSetup:
-        """The setup with some of its readings."""
-        at = np.array(chosen)
-        square = np.ix_(at, at)
-        return CandidateSetup(
-            self.name,
-            self.rows[at],
-            self.jacobian[at],
-            self.covariance[square],
-            self.reachable[square],
-            tuple(AlignedParameter(a.sensitivity[at], a.jacobian[at]) for a in self.aligned),
-        )
+            jacobian = jacobian + np.outer(a.sensitivity[rows], a.jacobian[rows[0]])
+        return jacobian
 
 
 @dataclass(frozen=True, slots=True, eq=False)

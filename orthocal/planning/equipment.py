@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.errors import ClosureError, ParameterError, SessionError
+from orthocal.errors import ParameterError, SessionError
 from orthocal.io.documents import read_yaml, validate
 from orthocal.io.fields import read_only
 from orthocal.kinematics.function_cache import cached_per_robot
-from orthocal.kinematics.loop_closure import nominal_closure
+from orthocal.kinematics.loop_closure import Failures, nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.files.schema import GaugeKeys
 from orthocal.planning.expected_error import state_noise
@@ -172,17 +172,12 @@ def _reach(robot: Robot, middle: Array, coordinate: int, way: float) -> float:
 
 def reachable(robot: Robot, points: Array) -> NDArray[np.bool_]:
     """Mask of tool positions that the nominal machine reaches, shape (n,)."""
-    closure = nominal_closure(robot)
-    try:
-        drives = closure.inverse(points)
-    except ClosureError:
-        if len(points) == 1:
-            return np.array([False])
-        half = len(points) // 2
-        return np.concatenate([reachable(robot, points[:half]), reachable(robot, points[half:])])
-    lower = np.array([d.lower for d in robot.drives])
-    upper = np.array([d.upper for d in robot.drives])
-    return np.asarray(((drives >= lower) & (drives <= upper)).all(axis=1))
+    failures = Failures()
+    drives = nominal_closure(robot).inverse(points, failures=failures)
+    lower, upper = np.array([(d.lower, d.upper) for d in robot.drives]).T
+    reached = np.asarray(((drives >= lower) & (drives <= upper)).all(axis=1))
+    reached[list(failures)] = False
+    return reached
 
 
 def load_dial(path: str | Path, equipment: Equipment) -> Equipment:

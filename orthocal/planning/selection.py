@@ -210,9 +210,10 @@ class SetupSearch:
         for planned in setups:
             if len(planned.chosen) < FEWEST:
                 raise ValueError(f"found {len(planned.chosen)} readings; expected {FEWEST} or more")
-            setup = self.candidates.setups[planned.candidate].only(planned.chosen).begun(0)
-            spread = setup.covariance + self.candidates.sigma**2 * np.eye(len(setup.rows))
-            total += setup.jacobian.T @ np.linalg.solve(spread, setup.jacobian)
+            setup, rows = self.candidates.setups[planned.candidate], planned.chosen
+            jacobian, noise = setup.jacobian_of(rows), self.candidates.sigma**2
+            spread = setup.covariance[np.ix_(rows, rows)] + noise * np.eye(len(rows))
+            total += jacobian.T @ np.linalg.solve(spread, jacobian)
         return total
 
     def error_of(self, information: Array) -> float:

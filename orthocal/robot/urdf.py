@@ -111,12 +111,12 @@ def load_urdf(
     _validate_with_yourdfpy(str(etree.tostring(root, encoding="unicode")), path)
     retyped = retype_joints(root, joint_types or {}, where=declared_in)
     text = str(etree.tostring(root, encoding="unicode"))
-    with captured_stderr() as messages:
-        try:
+    try:
+        with captured_stderr() as messages:
             model = pin.buildModelFromXML(text)
-        except (ValueError, RuntimeError) as e:
-            reason = " ".join((messages() or str(e)).split())
-            raise RobotError(f"Pinocchio cannot load it: {reason}", where=str(path)) from None
+    except (ValueError, RuntimeError) as e:
+        reason = " ".join((messages[0] or str(e)).split())
+        raise RobotError(f"Pinocchio cannot load it: {reason}", where=str(path)) from None
     for name in (*unlimited, *retyped):
         if model.existJointName(name):
             place = model.joints[model.getJointId(name)].idx_q
@@ -411,30 +411,20 @@ def _ask_yourdfpy(text: str, path: Path) -> None:
 
 
 @contextmanager
-def captured_stderr() -> Iterator[Any]:
-    """Capture the error stream of C++ code; yields a function that returns its text."""
+def captured_stderr() -> Iterator[list[str]]:
+    """Capture the error stream of C++ code; the list that it yields holds the text afterwards."""
+    messages: list[str] = []
     with _sink() as sink:
         sys.stderr.flush()
         saved = os.dup(2)
         os.dup2(sink.fileno(), 2)
-        restored = False
-
-        def restore() -> None:
-            nonlocal restored
-            if not restored:
-                os.dup2(saved, 2)
-                os.close(saved)
-                restored = True
-
-        def messages() -> str:
-            restore()
-            sink.seek(0)
-            return sink.read().decode(errors="replace")
-
         try:
             yield messages
         finally:
-            restore()
+            os.dup2(saved, 2)
+            os.close(saved)
+            sink.seek(0)
+            messages.append(sink.read().decode(errors="replace"))
 
 
 def _sink() -> IO[bytes]:
