@@ -10,10 +10,10 @@ import sys
 from dataclasses import replace
 
 import pytest
+from commands import run_orthocal
 from processes import children_of, is_running, until
 
 from orthocal import MeasuringPlan, load_plan, plan_readings, summarize
-from orthocal.cli.run import main
 from orthocal.planning.equipment import Equipment
 from orthocal.runtime import worker_pool as cores
 from orthocal.runtime.interrupts import INTERRUPTED
@@ -28,21 +28,13 @@ direction_tolerance_mrad: 10
 """
 
 
-def run(monkeypatch, capsys, *words):
-    monkeypatch.setattr("sys.argv", ["orthocal", *map(str, words)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    out, err = capsys.readouterr()
-    return ended.value.code or 0, out, err
-
-
-def test_a_plan_is_written_ready_to_measure(monkeypatch, capsys, tmp_path):
+def test_a_plan_is_written_ready_to_measure(tmp_path):
     dial = tmp_path / "dial.yaml"
     dial.write_text(DIAL)
     out = tmp_path / "monday"
     entered = ["--tolerance", "*.offset_mm=1"]
     words = ["plan", "orthoglide", *QUICK, *entered, "--gauge", dial, "--out", out]
-    code, text, err = run(monkeypatch, capsys, *words)
+    code, text, err = run_orthocal(".", *words)
     assert code == 0
     assert "18 readings in 6 setups, about 72 min" in text
     assert len(text.splitlines()) <= 45
@@ -65,13 +57,13 @@ def test_a_plan_is_written_ready_to_measure(monkeypatch, capsys, tmp_path):
     assert document["readings"] + document["closing_readings"] == 24
     assert (out / "plan.svg").read_text().startswith('<?xml version="1.0"')
     # what is there is not written over
-    code, _, err = run(monkeypatch, capsys, *words)
+    code, _, err = run_orthocal(".", *words)
     assert code == 2
     assert f"orthocal: {out / 'session.yaml'}: exists already; --force overwrites it" in err
 
 
 @pytest.mark.parametrize("much", [["--setups", "3", "--out"], ["--hours", "0.5"]])
-def test_one_process_gives_the_plan_of_two(monkeypatch, capsys, tmp_path, much):
+def test_one_process_gives_the_plan_of_two(monkeypatch, tmp_path, much):
     monkeypatch.setattr(cores, "can_fork", lambda: True)
     found = []
     for workers in (1, 2):
@@ -79,17 +71,17 @@ def test_one_process_gives_the_plan_of_two(monkeypatch, capsys, tmp_path, much):
         words = ["plan", "orthoglide", *QUICK[:-1], 3, "--workers", workers, *much]
         if much[-1] == "--out":
             words.append(out)
-        code, text, err = run(monkeypatch, capsys, *words)
+        code, text, err = run_orthocal(".", *words)
         assert code == 0
         told = err.replace(str(out), "")
         found.append((text, told, {p.name: p.read_bytes() for p in out.glob("*")}))
     assert found[0] == found[1]
 
 
-def test_an_error_in_a_worker_process_is_reported(monkeypatch, capsys):
+def test_an_error_in_a_worker_process_is_reported(monkeypatch):
     monkeypatch.setattr(cores, "can_fork", lambda: True)
     words = ["orthoglide", *QUICK[:-1], 2, "--tolerance", "*.offset_mm=80", "--workers", 2]
-    code, out, err = run(monkeypatch, capsys, "plan", *words)
+    code, out, err = run_orthocal(".", "plan", *words)
     assert (code, out) == (2, "")
     last = err.splitlines()[-1]
     assert last.startswith("orthocal: plan: no setup can have 3 readings within the gauge's range")
@@ -115,17 +107,17 @@ def test_a_plan_that_is_stopped_leaves_no_process(tmp_path):
     assert not out.exists()
 
 
-def test_a_dial_without_a_tip_is_named(monkeypatch, capsys, tmp_path):
+def test_a_dial_without_a_tip_is_named(tmp_path):
     dial = tmp_path / "dial.yaml"
     dial.write_text("sigma_mm: 0.005\nrange_mm: [-5, 5]\n")
-    code, _, err = run(monkeypatch, capsys, "plan", "orthoglide", *QUICK, "--gauge", dial)
+    code, _, err = run_orthocal(".", "plan", "orthoglide", *QUICK, "--gauge", dial)
     assert code == 0
     assert f"orthocal: {dial} states no tip: the plan is for the line between the rods" in err
 
 
-def test_further_setups_of_a_session_are_planned(monkeypatch, capsys, root):
+def test_further_setups_of_a_session_are_planned(root):
     session = root / "examples/workshop"
-    code, text, _ = run(monkeypatch, capsys, "plan", session, "--add", 2, "--json", *QUICK)
+    code, text, _ = run_orthocal(".", "plan", session, "--add", 2, "--json", *QUICK)
     assert code == 0
     found = json.loads(text)
     assert found["setups"] == 2
@@ -231,8 +223,8 @@ def test_each_criterion_is_better_met_by_its_own_plan(orthoglide, for_the_headli
         ),
     ],
 )
-def test_invalid_options_are_refused(monkeypatch, capsys, words, message):
-    code, out, err = run(monkeypatch, capsys, "plan", *words)
+def test_invalid_options_are_refused(words, message):
+    code, out, err = run_orthocal(".", "plan", *words)
     assert (code, out) == (2, "")
     assert message in err.splitlines()[-1]
 
@@ -246,9 +238,9 @@ def test_invalid_options_are_refused(monkeypatch, capsys, words, message):
         ("- 1\n", "dial.yaml: "),
     ],
 )
-def test_an_invalid_dial_is_refused(monkeypatch, capsys, tmp_path, text, message):
+def test_an_invalid_dial_is_refused(tmp_path, text, message):
     dial = tmp_path / "dial.yaml"
     dial.write_text(text)
-    code, _, err = run(monkeypatch, capsys, "plan", "orthoglide", "--gauge", dial)
+    code, _, err = run_orthocal(".", "plan", "orthoglide", "--gauge", dial)
     assert code == 2
     assert message in err

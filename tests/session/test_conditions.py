@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 
 import numpy as np
 import pytest
+from commands import run_orthocal
 
 from orthocal import (
     Choice,
@@ -24,7 +24,6 @@ from orthocal import (
     write_session,
 )
 from orthocal.assessment.plausibility import find_scattered
-from orthocal.cli import main
 from orthocal.errors import CalibrationFileError, SessionError
 from orthocal.measurement.importing.import_readings import TableOptions
 from orthocal.measurement.joining import join_sessions, split_sessions
@@ -172,18 +171,16 @@ def test_joined_sessions_keep_them(session, tmp_path):
     assert session.select(session.readings[2:4]).readings[0].conditions == stated[2]
 
 
-def test_a_session_read_again_has_its_approaches_planned(tmp_path, root, monkeypatch, capsys):
+def test_a_session_read_again_has_its_approaches_planned(tmp_path, root):
     first = load_session(root / "examples/raw-cycles")
     stated = Conditions("ppp", 21.0, datetime(2025, 3, 14, tzinfo=UTC))
     readings = tuple(replace(r, conditions=stated) for r in first.readings)
     write_session(replace(first, readings=readings), tmp_path / "first")
     result = calibrate(load_session(tmp_path / "first"), "offsets", solver="variable-projection")
     write_calibration(result, tmp_path / "calibration.json")
-    words = ["again", tmp_path / "calibration.json", "--out", tmp_path / "second", "--anyway"]
-    monkeypatch.setattr(sys, "argv", ["orthocal", *map(str, words)])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    assert stopped.value.code == 0, capsys.readouterr().err
+    words = ["again", "calibration.json", "--out", "second", "--anyway"]
+    done = run_orthocal(tmp_path, *words)
+    assert done.returncode == 0, done.stderr
     lines = (tmp_path / "second/readings.csv").read_text().splitlines()
     assert lines[0] == "setup,posture,cycle,reading_mm,approach,temperature_C,time"
     assert all(line.endswith(",,ppp,,") for line in lines[1:])

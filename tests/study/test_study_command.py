@@ -9,19 +9,10 @@ import subprocess
 import sys
 
 import pytest
+from commands import run_orthocal
 from processes import children_of, is_running, until
 
-from orthocal.cli import main
-
 FILES = {"results.jsonl", "results.parquet", "study.json", "study.svg"}
-
-
-def run(monkeypatch, capsys, *words):
-    monkeypatch.setattr(sys, "argv", ["orthocal", "study", *map(str, words)])
-    with pytest.raises(SystemExit) as e:
-        main()
-    found = capsys.readouterr()
-    return e.value.code or 0, found.out, found.err
 
 
 QUICK = {
@@ -42,11 +33,10 @@ ANSWERS = {
 
 
 @pytest.mark.parametrize("kind", QUICK)
-def test_answer_and_files(monkeypatch, capsys, tmp_path, root, kind):
-    monkeypatch.chdir(root)
+def test_answer_and_files(tmp_path, root, kind):
     words = [kind, *QUICK[kind], "--out", tmp_path]
     words += [] if kind == "sensitivity" else ["--workers", 1]
-    code, out, err = run(monkeypatch, capsys, *words)
+    code, out, err = run_orthocal(root, "study", *words)
     assert code == 0
     assert ANSWERS[kind] in " ".join(out.split())
     assert out.startswith(ANSWERS[kind].split()[0])
@@ -61,27 +51,26 @@ def test_answer_and_files(monkeypatch, capsys, tmp_path, root, kind):
     assert picture.startswith('<?xml version="1.0"')
     assert "mathdefault" not in picture
     before = {f.name: f.read_bytes() for f in tmp_path.iterdir()}
-    code, again, _ = run(monkeypatch, capsys, *words)
+    code, again, _ = run_orthocal(root, "study", *words)
     assert (code, again) == (0, out)
     assert {f.name: f.read_bytes() for f in tmp_path.iterdir()} == before
 
 
-def test_json_output(monkeypatch, capsys, root):
-    monkeypatch.chdir(root)
+def test_json_output(root):
     words = ["sensitivity", "--at", "10,-20,30", "--leg-mm", "250", "--json"]
-    code, out, err = run(monkeypatch, capsys, *words)
+    code, out, err = run_orthocal(root, "study", *words)
     assert (code, err) == (0, "")
     document = json.loads(out)
     assert len(document["summary"]["parameters"]) == 129
     assert {r["posture"] for r in document["summary"]["rows"]} == {"point_1"}
 
 
-def test_leg_length(monkeypatch, capsys):
+def test_leg_length(root):
     found = []
     for leg in ("200", "310.25"):
         words = ["linearisation", "--leg-mm", leg, "--along", "1,-0.6,0.3", "--sizes", "1"]
         words += ["--largest-mm", "2", "--json"]  # displacements are as long as legs
-        code, out, _ = run(monkeypatch, capsys, *words)
+        code, out, _ = run_orthocal(root, "study", *words)
         assert code == 0
         found.append(json.loads(out)["summary"]["methods"][0]["error_mm"][0])
     assert found[0] > 1.2 * found[1]
@@ -145,22 +134,20 @@ def test_interrupt_ends_workers_and_names_the_way_to_resume(tmp_path, root, out)
         ),
     ],
 )
-def test_invalid_arguments(monkeypatch, capsys, root, words, message):
-    monkeypatch.chdir(root)
-    code, out, err = run(monkeypatch, capsys, *words)
+def test_invalid_arguments(root, words, message):
+    code, out, err = run_orthocal(root, "study", *words)
     assert (code, out) == (2, "")
     assert message in err
     assert len(err.splitlines()) == 1
 
 
-def test_directory_of_another_study(monkeypatch, capsys, tmp_path, root):
-    monkeypatch.chdir(root)
+def test_directory_of_another_study(tmp_path, root):
     out = ["--out", tmp_path]
-    assert run(monkeypatch, capsys, "sensitivity", "--free", "offsets", *out)[0] == 0
+    assert run_orthocal(root, "study", "sensitivity", "--free", "offsets", *out)[0] == 0
     before = {f.name: f.read_bytes() for f in tmp_path.iterdir()}
-    code, _, err = run(monkeypatch, capsys, "sensitivity", "--free", "lengths", *out)
+    code, _, err = run_orthocal(root, "study", "sensitivity", "--free", "lengths", *out)
     assert code == 2
     assert "results.jsonl: belongs to another study (different: parameters)" in err
     assert {f.name: f.read_bytes() for f in tmp_path.iterdir()} == before
-    code, _, _ = run(monkeypatch, capsys, "sensitivity", "--free", "lengths", *out, "--force")
+    code, _, _ = run_orthocal(root, "study", "sensitivity", "--free", "lengths", *out, "--force")
     assert code == 0
