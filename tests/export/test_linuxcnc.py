@@ -537,7 +537,7 @@ def filtered(root, full, tmp_path):
     tip = ",".join(f"{v / MM:g}" for v in TOOL)
     for old, new in {
         "/home/me/.venv/bin/orthocal": f"{sys.executable} -m orthocal",
-        "/home/me/out/two": f"{tmp_path} --anyway --offsets active --within {FILTERED}",
+        "/home/me/out/two": f"{tmp_path} --anyway --within {FILTERED}",
         "--tool 0,0,-50": f"--tool {tip}",
     }.items():
         assert old in ini
