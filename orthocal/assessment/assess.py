@@ -70,12 +70,13 @@ def calibrate(
         sessions: The session, or the path to one; or several, which are fitted together.
         choice: Which errors are free and what is known of them; or the name of a model. By default
             what the session states, otherwise the complete model with priors.
-        loss: Cost of a residual: `squares` (the default), `huber`, or one with its own width.
-        solver: `ipopt` on the complete program, the reference; `variable-projection`, the
-            same optimum in less time; `linearised`, as the paper; or one with its own settings.
+        loss: `squares` (the default), `huber` (pseudo-Huber), or a Loss with another width.
+        solver: `ipopt` on the complete program, the reference; `variable-projection`, the same
+            optimum in less time; `linearised`, one step about the active offsets; or
+            SolverOptions.
         profile: Names or globs of free parameters whose profile-likelihood intervals are wanted.
-        start: Free parameters to start from, shape (n_free,), [SI]; by default the linearised
-            solution.
+        start: Initial values of the free errors of the machine, shape (n_machine,), [SI]; by
+            default the linearised solution.
 
     Returns:
         The calibration with its assessment.
@@ -86,7 +87,7 @@ def calibrate(
         ClosureError: If the machine cannot reach a posture.
         ParameterError: If the model or a name is unknown.
         TypeError: If an argument is of another kind.
-        ValueError: If `start` does not have one number for each free parameter.
+        ValueError: If `start` does not have one number for each free error of the machine.
     """
     calibration, session = identify(
         sessions, choice, loss=loss, solver=solver, profile=profile, start=start

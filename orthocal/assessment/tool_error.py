@@ -66,12 +66,12 @@ class ErrorSizes:
     aligned: ErrorSize | None
     """With shift and rotation removed; None if there are too few points."""
     relative: ErrorSize
-    """With the common shift removed."""
+    """With the mean translation removed."""
     absolute: ErrorSize
 
     @property
     def headline(self) -> ErrorSize:
-        """The one that decides: aligned, where there are points enough."""
+        """The reported form: aligned, or relative where there are too few points."""
         return self.relative if self.aligned is None else self.aligned
 
 
@@ -98,11 +98,11 @@ class ToolAccuracy:
     jacobian: Array
     """∂p/∂θ at every point, shape (K, 3, n), [m per parameter unit]."""
     deviation: Array
-    """Where the calibrated machine's tool is now, less where it is commanded, (K, 3), [m]."""
+    """Actual minus commanded tool position with the active offsets, shape (K, 3), [m]."""
     error_after_offsets: Array
-    """The same with what is to be entered in a controller that is nominal otherwise."""
+    """The same with the offsets to enter, in a controller that corrects offsets only."""
     before: ToolUncertainty
-    """With all errors within their tolerances and nothing known."""
+    """Uncertainty from the priors alone."""
     after: ToolUncertainty | None
     """Uncertainty after the calibration; None if the noise is unknown."""
 
@@ -178,8 +178,8 @@ def assess_tool(
 ) -> ToolAccuracy:
     """Deviation and uncertainty of the tool position, before and after a calibration.
 
-    Errors that were not free are taken at their tolerances, together with what the estimate has
-    taken on of them: a calibration of offsets alone is only as good as legs and axes are.
+    Unmodelled errors contribute with their prior standard deviations, and with the bias that they
+    cause in the estimate. The tolerance scale is not applied.
 
     Args:
         calibration: The calibration.

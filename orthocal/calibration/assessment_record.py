@@ -98,7 +98,7 @@ class Place:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finding:
-    """Something that was recognised in readings or in a result."""
+    """Finding of the assessment, about readings or a result."""
 
     __pydantic_config__ = CLOSED
 
@@ -166,7 +166,7 @@ class ControllerEntry(InUnit):
     enter: Number
     """Offset to enter, [unit]; what to add to the present one if that is unknown."""
     std: SizeOrNaN
-    """Standard deviation of the value to enter, everything unknown included, [unit]."""
+    """Standard deviation of `enter` from noise, priors and unmodelled errors, [unit]."""
     std_scatter: SizeOrNaN
     """The part of it that is due to the noise of the readings, [unit]."""
     held: Literal["known", "lower bound", "upper bound"] | None
@@ -209,7 +209,7 @@ class ToolErrorSummary:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assessment:
-    """The judgement of a calibration: verdict, findings, what to enter, the tool error."""
+    """Assessment: verdict, findings, offsets to enter, tool error."""
 
     __pydantic_config__ = CLOSED
 
@@ -221,7 +221,8 @@ class Assessment:
     tool: ToolErrorSummary | None
     """None if the robot has no tool, or nothing determines the noise."""
     tolerance_scale: PositiveInSI
-    """Factor by which errors that were not identified exceed their tolerances; 1 if they do not."""
+    """Factor on the priors of unmodelled errors in the tool error; 1 if the readings are possible
+    within the tolerances."""
 
     @property
     def keeps_offsets(self) -> bool:

@@ -38,22 +38,22 @@ class Calibration(CalibrationRecord):
 
     @property
     def free(self) -> tuple[ParameterEstimate, ...]:
-        """Free parameters, in the order of the covariance."""
+        """Free errors of the machine, in the order of the covariance."""
         return tuple(p for p in self.parameters if p.free)
 
     @property
     def errors(self) -> dict[str, float]:
-        """Parameter name to exact estimate, [SI]."""
+        """Parameter name to estimate of the nonlinear model, [SI]."""
         return {p.name: p.value for p in self.parameters}
 
     @property
     def standard_deviations(self) -> Array:
-        """Standard deviations of the free parameters, everything unknown included, [SI]."""
+        """Standard deviations of `free` from noise, priors and unmodelled errors, [SI]."""
         return np.array([p.std for p in self.free])
 
     @property
     def correlation(self) -> Array:
-        """Correlation by noise and priors, shape (n_free, n_free); NaN at a bound.
+        """Correlation by noise and priors, shape (n_machine, n_machine); NaN at a bound.
 
         Parameters that the readings cannot separate have a correlation near ±1.
         """
@@ -73,7 +73,7 @@ class Calibration(CalibrationRecord):
 
     @property
     def spare_readings(self) -> int:
-        """Independent readings in excess of the parameters: they check the model."""
+        """Independent readings minus resolvable parameters: they check the model."""
         rank = len(self.free) if self.base else self.identifiability.structural_rank
         return self.identifiability.n_readings - rank
 
@@ -127,24 +127,26 @@ class Calibration(CalibrationRecord):
 
     @property
     def total_covariance(self) -> Array:
-        """Covariance of the free parameters, everything unknown included, (n_free, n_free), [SI].
+        """Total covariance of `free`, shape (n_machine, n_machine), [SI].
 
-        Scatter of the readings, priors, and errors of the machine that were not free.
+        From noise and priors (`model_covariance`) and from unmodelled errors with their stated
+        priors (`unmodelled.bias_covariance`), without the tolerance scale.
         """
         return np.asarray(self.model_covariance + self.unmodelled.bias_covariance)
 
     @property
     def expanded_uncertainties(self) -> Array:
-        """Expanded uncertainties (k = 2) of the free parameters, shape (n_free,), [SI].
+        """Expanded uncertainties of `free`, shape (n_machine,), [SI].
 
-        See `orthocal.statistics.chance.expanded_uncertainty`.
+        k = 2, but Student's 95 % factor for the part from noise where few degrees of freedom
+        determine it: U² = (t s)² + 4 (u² − s²) with u = `std` and s = `std_scatter`.
         """
         scatter = [p.std_scatter for p in self.free]
         return expanded_uncertainty(self.standard_deviations, scatter, dof=self.dof)
 
     @property
     def intervals(self) -> tuple[tuple[float, float], ...]:
-        """Free parameters ± their expanded uncertainties, [unit]."""
+        """Values of `free` ± their expanded uncertainties, [SI]."""
         half = self.expanded_uncertainties.tolist()
         return tuple((p.value - u, p.value + u) for p, u in zip(self.free, half, strict=True))
 
@@ -173,7 +175,7 @@ class Calibration(CalibrationRecord):
 
     @property
     def tolerance_scale(self) -> float:
-        """Factor by which errors that were not identified exceed their tolerances, as assessed."""
+        """Tolerance scale: factor on the priors of unmodelled errors in the expected tool error."""
         return 1.0 if self.assessment is None else self.assessment.tolerance_scale
 
     @property

@@ -47,12 +47,13 @@ def identify(
         sessions: The session, or the path to one; or several, which are fitted together.
         choice: Free errors and prior knowledge of them, or the name of a model; by default as the
             session states.
-        loss: Loss of a residual: `squares` (the default), `huber`, or a Loss with another width.
-        solver: `ipopt` on the whole program, the reference; `variable-projection`, the
-            same optimum sooner; `linearised`, as the paper; or one with its own settings.
+        loss: `squares` (the default), `huber` (pseudo-Huber), or a Loss with another width.
+        solver: `ipopt` on the complete program, the reference; `variable-projection`, the same
+            optimum in less time; `linearised`, one step about the active offsets; or
+            SolverOptions.
         profile: Names or globs of free parameters whose profile-likelihood intervals are wanted.
-        start: Free parameters to start from, shape (n_free,), [SI]; by default the linearised
-            solution.
+        start: Initial values of the free errors of the machine, shape (n_machine,), [SI]; by
+            default the linearised solution.
 
     Returns:
         The calibration, and the session (or the joined sessions) that it is of.
@@ -64,7 +65,7 @@ def identify(
         ParameterError: If the model or a name is unknown.
         SessionError: If a reading lacks a condition that the effect of a free parameter needs.
         TypeError: If an argument is of another kind.
-        ValueError: If there are not as many free parameters to start from as there are.
+        ValueError: If `start` does not have one number for each free error of the machine.
     """
     session = join_sessions(gather_sessions(sessions))
     require_names(profile, argument="profile")

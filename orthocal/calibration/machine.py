@@ -16,11 +16,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Machine:
-    """A robot with errors."""
+    """Kinematics of a robot with given error parameters."""
 
     robot: Robot
     errors: Mapping[str, float]
-    """Parameter to value, [SI]; others are 0."""
+    """Parameter to value, such as {"x_slide.offset": 1e-3}, [SI]; others are 0."""
 
     def forward(self, joints: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
         """Tool centre point.
@@ -28,7 +28,7 @@ class Machine:
         Args:
             joints: Drive coordinates as the encoders give them, without any offset of the
                 controller, shape (K, n_drives) or (n_drives,), [m, rad].
-            names: What to call the rows in messages.
+            names: Labels of the rows in error messages.
 
         Returns:
             Shape (K, 3) or (3,), [m].
@@ -47,8 +47,9 @@ class Machine:
         """Drive coordinates that bring the tool to given points.
 
         Args:
-            points: Shape (K, n_drives) or (n_drives,), [m].
-            names: What to call the rows in messages.
+            points: Coordinates that the drives control, shape (K, n_coordinates) or
+                (n_coordinates,), [m].
+            names: Labels of the rows in error messages.
 
         Returns:
             Drive coordinates as the encoders give them, shape (K, n_drives) or (n_drives,).

@@ -128,9 +128,9 @@ class SolverRecord:
     """All solutions until sigma had settled, [s]."""
     hessian: str
     loss: LossKind
-    """What residuals cost: their squares, or Huber's smooth loss."""
+    """Loss: squares, or the pseudo-Huber loss."""
     loss_width: PositiveInSI
-    """Where that turns from square to linear, [standard deviations]."""
+    """Residual at which the loss turns from square to linear, [standard deviations]."""
 
     @property
     def tells_linearisation(self) -> bool:
@@ -150,12 +150,12 @@ class ParameterEstimate(InUnit):
     name: str
     unit: Unit
     value: Number
-    """Exact estimate, [unit]."""
+    """Estimate of the nonlinear model, [unit]."""
     linear: Number
     """Linearised estimate, [unit]."""
     std: SizeOrNaN
-    """Standard deviation, [unit]: scatter of the readings, priors, mounting of the gauges, and
-    errors of the machine that were not identified. NaN if unknown."""
+    """Standard deviation from noise, priors (also of the mounting), and unmodelled errors with their
+    stated priors, [unit]. NaN if unknown."""
     std_scatter: SizeOrNaN
     """Part of `std` that is due to the noise of the readings, [unit]."""
     prior_std: PositiveInSI
@@ -174,7 +174,7 @@ class ParameterEstimate(InUnit):
     upper: Number | None
     """Upper bound, [unit]."""
     at_bound: Literal["lower", "upper"] | None
-    """Which bound holds it: it has no standard deviation then, and others hold with it there."""
+    """Bound that holds it. It then counts as fixed, with the standard deviation 0."""
     interval: tuple[Number, Number] | None
     """Profile-likelihood interval of 95 %, [unit], where it was asked for; widened by errors of the
     machine that were not free, at their tolerances."""
@@ -266,12 +266,12 @@ class CalibrationRecord:
     sensors: Many[ParameterEstimate]
     """Nuisance parameters of the sensors."""
     model_covariance: Matrix
-    """Covariance of the free parameters by noise and priors, as if the machine had no other
-    errors, shape (n_free, n_free), [SI]."""
+    """Covariance of the free errors of the machine by noise and priors, without unmodelled errors,
+    shape (n_machine, n_machine), [SI]."""
     noise_covariance: Matrix
-    """Part of it that is due to the noise of the readings, shape (n_free, n_free), [SI]."""
+    """Part of it that is due to the noise of the readings, shape (n_machine, n_machine), [SI]."""
     unmodelled: Unmodelled
-    """What errors that were not free do to the estimate."""
+    """Unmodelled errors and the bias that they cause."""
     identifiability: Identifiability
     """Resolvable directions and groups of inseparable parameters."""
     base: bool

@@ -17,8 +17,8 @@ Record = dict[str, str | float | int | bool | None]
 def parameter_table(calibration: Calibration) -> list[Record]:
     """A record for each parameter: free ones, held ones, then those of sensors.
 
-    `value`, `linearised`, `std` (everything unknown included), `std_scatter` (the part that is due
-    to noise), `low` and `high` (value ± expanded uncertainty) and `prior_std` are in `unit`.
+    `value`, `linearised`, `std` (from noise, priors and unmodelled errors), `std_scatter` (its part
+    from noise), `low` and `high` (value ± expanded uncertainty) and `prior_std` are in `unit`.
     """
     intervals = dict(
         zip((p.name for p in calibration.free), calibration.intervals, strict=True),

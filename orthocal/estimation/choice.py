@@ -24,8 +24,7 @@ class Choice:
     Args:
         model: A model of the robot's YAML: `offsets`, `lengths`, `full` or another; by default
             the one that the session states, otherwise the complete model.
-        free: Names or globs of further free parameters, or of all if no model is named; '!'
-            excludes.
+        free: Names or globs added to the model; without a model, the complete list. '!' excludes.
         prior: Use priors; by default True, unless only offsets are free.
         known: Name with its unit to a known value, which is then held, or to a value and its
             tolerance, a limit of ±2 standard deviations, which then act as prior.

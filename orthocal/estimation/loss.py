@@ -1,7 +1,8 @@
-"""Loss functions: squares, or Huber's loss for outliers.
+"""Loss functions: squares, or the pseudo-Huber loss for outliers.
 
-A residual r, in standard deviations, costs ρ(r). Beside squares, ρ = r²/2, there is a smooth form
-of Huber's loss (Hartley and Zisserman, Multiple View Geometry, 2004, A6.8)
+A residual r, in standard deviations, contributes ρ(r) to the objective, without a further factor.
+For squares ρ = r²/2. `huber` is the pseudo-Huber loss (Hartley and Zisserman, Multiple View
+Geometry, 2004, A6.8)
 
     ρ(r) = k² (√(1 + (r/k)²) − 1)
 
@@ -28,7 +29,7 @@ LossKind = Literal["squares", "huber"]
 Values = TypeVar("Values", Array, ca.SX)
 
 HUBER_WIDTH = 1.345
-"""k at which the estimate is 95 % as precise as by squares where all residuals are normal."""
+"""k at which the estimate is about 95 % as efficient as by squares if all residuals are normal."""
 
 MOST_STEPS = 100
 SETTLED = 1e-11
@@ -37,7 +38,7 @@ SETTLED = 1e-11
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """Cost of a residual."""
+    """Loss function of standardised residuals: `squares` or `huber`, the pseudo-Huber loss."""
 
     kind: LossKind = "squares"
     width: float = HUBER_WIDTH

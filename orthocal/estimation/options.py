@@ -43,7 +43,7 @@ class SolverOptions:
     print_level: int = 0
     """Ipopt's own printing, 0 (none) to 12."""
     loss: Loss = SQUARES
-    """Cost of a residual."""
+    """Loss function of standardised residuals."""
     ipopt: Mapping[str, OptionValue] = field(default_factory=dict)
     """Further options of Ipopt, by its own names, such as {"mu_strategy": "adaptive"}; they replace
     those that orthocal sets. Other solvers ignore them."""

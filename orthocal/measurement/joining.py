@@ -36,8 +36,8 @@ def gather_sessions(given: Given | Sequence[Given]) -> list[Session]:
 def join_sessions(sessions: Sequence[Session]) -> Session:
     """One session of all readings of several on the same robot.
 
-    Setups, postures and gauges are named after their session. What the controller corrects is
-    that of the last session: it is what the next offsets come on top of.
+    Setups, postures and gauges are named after their session. The active offsets are those of the
+    last session.
 
     Args:
         sessions: In the order in which they were measured, joined ones among them or not; a single

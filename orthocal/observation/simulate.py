@@ -98,7 +98,7 @@ def simulate_session(
         errors: Parameter name to value, [SI]; absent ones are 0.
         seed: Seed of noise and gauge zeros.
         sigma: Standard deviation of a reading, [m]; the plan's gauge by default.
-        exact: No noise, no rounding to the gauge's resolution; dials show 0 where they begin.
+        exact: No noise, no mounting errors and no rounding; the first reading of each setup is 0.
 
     Raises:
         SessionError: If the noise is not stated, or a reading does not exist or leaves the gauge's
@@ -168,7 +168,7 @@ def show_readings(
         entries: Exact readings, gauge zeros at 0, shape (n_entries,), [m].
         rng: Draws zeros and noise.
         sigma: Standard deviation of a reading, [m]; the plan's gauge by default.
-        exact: No noise, no rounding to the gauge's resolution; dials show 0 where they begin.
+        exact: No noise, no mounting errors and no rounding; the first reading of each setup is 0.
 
     Returns:
         Shape (n_entries,), [m], and setup to the zero of its gauge, [m].

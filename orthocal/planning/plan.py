@@ -135,7 +135,7 @@ def plan_readings(
     Args:
         robot: The robot.
         choice: Parameters to identify, or the name of a model; by default those of the measured
-            session, or `MODEL`. The plan's session states it.
+            session, or "full". The plan's session states it.
         setups: Number of setups; by default 6, or as many as `hours` allow.
         readings: Number of readings, at least 2 per setup; by default 3 per setup, or as many as
             `hours` allow. The first posture of each setup is read again at its end in addition.
@@ -143,7 +143,8 @@ def plan_readings(
         equipment: Available gauge, tip and region.
         measured: Existing readings, which the plan complements.
         workspace: Region over which the tool error is computed; by default the robot's.
-        criterion: Criterion to minimise.
+        criterion: Criterion to minimise: "aligned", "relative", "absolute", "worst", "A", "D" or
+            "E"; see `planning.expected_error.Criterion`.
         seed: Seed of the random starts; the plan depends on nothing else that is random.
         starts: Number of starts of the search; by default 3, or more for few candidates.
         reference: Name of the robot in the session; by default its own.

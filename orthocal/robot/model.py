@@ -238,8 +238,8 @@ class Robot:
     def close_with_pinocchio(self, drives: ArrayLike, start: ArrayLike) -> Array:
         """Solve the loop closures of one posture by damped least squares on Pinocchio's models.
 
-        It needs a near start. Reference for `LoopClosure`, which closes batches of postures from
-        the reference posture.
+        `start` must be near a solution. Reference for `LoopClosure`, which closes batches of
+        postures from the reference posture.
 
         Args:
             drives: Commanded drive coordinates, shape (n_drives,), [m, rad].

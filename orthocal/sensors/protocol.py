@@ -168,8 +168,8 @@ class Sensor(Protocol):
     def aligned_to(self, robot: Robot) -> Mapping[str, Sensor]:
         """Nuisance parameters that the operator aligns by eye, mapped to the virtual sensor.
 
-        Such a parameter is the deviation from the reading of the virtual sensor in the alignment
-        posture of the setup, relative to its reading on the nominal machine.
+        The parameter is measured from the actual position of the rod in the alignment posture. The
+        virtual sensor gives this position, relative to the nominal machine.
         """
 
     def expression(self, view: View, robot: Robot) -> ca.SX:

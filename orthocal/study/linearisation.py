@@ -75,7 +75,7 @@ class LinearisationStudy(Study):
     free: tuple[str, ...]
     """Names of the parameters that have errors and are identified."""
     sizes: tuple[float, ...]
-    """Largest error of each machine, [mm or mrad]."""
+    """Largest error component of each machine, [mm or mrad]."""
     directions: tuple[tuple[float, ...], ...]
     """Errors of machines divided by the largest of them."""
     displacements: Displacements | None
@@ -283,7 +283,7 @@ def build_linearisation_study(
         source: An Orthoglide-type robot, measured by the paper's plan; or a session of any robot,
             without the paper's equations.
         free: Names or globs of the errors that grow and are identified.
-        largest: Largest size, [mm or mrad].
+        largest: Largest size of a machine, [mm or mrad]: its largest error component.
         count: Number of sizes, in a geometric sequence from 0.1 mm on.
         directions: Number of random directions of the errors.
         along: One direction instead: a number for each error.

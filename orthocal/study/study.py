@@ -32,7 +32,7 @@ DIGITS = 9
 class Study(ABC):
     """A study; its fields are its arguments.
 
-    Two studies with equal documents produce the same table, byte by byte.
+    A study is determined by its record: equal records give equal tables, byte by byte.
     """
 
     kind: ClassVar[str]

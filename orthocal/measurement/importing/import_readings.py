@@ -40,7 +40,7 @@ Key = tuple[str, str, str, int]
 
 @dataclass(frozen=True, slots=True)
 class TableOptions:
-    """Options for what a table leaves open."""
+    """Options that resolve ambiguities of a table."""
 
     sheet: str | None = None
     """Worksheet of a workbook; by default the only one with readings."""
