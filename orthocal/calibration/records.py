@@ -154,8 +154,8 @@ class ParameterEstimate(InUnit):
     linear: Number
     """Linearised estimate, [unit]."""
     std: SizeOrNaN
-    """Standard deviation from noise, priors (also of the mounting), and unmodelled errors with their
-    stated priors, [unit]. NaN if unknown."""
+    """Standard deviation from noise, priors (also of the mounting), and unmodelled errors with
+    their stated priors, [unit]. NaN if unknown."""
     std_scatter: SizeOrNaN
     """Part of `std` that is due to the noise of the readings, [unit]."""
     prior_std: PositiveInSI
