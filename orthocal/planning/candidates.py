@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 
 from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import nominal_sensitivity
 from orthocal.observation.observations import build_observations
-from orthocal.planning.equipment import Equipment, choose_box, reachable
+from orthocal.planning.equipment import Equipment, choose_box, place_tool, reachable
 from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.direction import Direction
 from orthocal.sensors.leg_indicator import LegIndicator
@@ -265,9 +264,8 @@ def _add_postures(
     if len(points) < FEWEST:
         raise ParameterError("the machine reaches no posture in it", where="plan: box")
     names = [_name(p, robot, middle) for p in points]
-    drives = nominal_closure(robot).inverse(points)
-    for name, point, drive in zip(names, points, drives, strict=True):
-        postures.setdefault(name, Posture(name, "tcp_mm", point, drive))
+    for name, posture in place_tool(robot, names, points).items():
+        postures.setdefault(name, posture)
     return names
 
 

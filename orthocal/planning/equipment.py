@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from orthocal.sensors.direction import Direction
 from orthocal.sensors.leg_indicator import LegIndicator, Section
 from orthocal.sensors.mounting import USUAL, Mounting, MountingKeys
 from orthocal.sensors.tips import Tip
-from orthocal.session.session import Gauge, Session
+from orthocal.session.session import Gauge, Posture, Session
 
 Array = NDArray[np.float64]
 
@@ -178,6 +179,21 @@ def reachable(robot: Robot, points: Array) -> NDArray[np.bool_]:
     reached = np.asarray(((drives >= lower) & (drives <= upper)).all(axis=1))
     reached[list(failures)] = False
     return reached
+
+
+def place_tool(robot: Robot, names: Sequence[str], points: Array) -> dict[str, Posture]:
+    """Postures of the nominal machine with its tool at points, by name.
+
+    Args:
+        robot: The robot.
+        names: Names of the postures.
+        points: Coordinates of the tool, shape (n_postures, n_coordinates), [m].
+
+    Raises:
+        ClosureError: If a point cannot be reached; names the posture.
+    """
+    drives = nominal_closure(robot).inverse(points, names=names)
+    return {n: Posture(n, "tcp_mm", p, d) for n, p, d in zip(names, points, drives, strict=True)}
 
 
 def load_dial(path: str | Path, equipment: Equipment) -> Equipment:

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.errors import ParameterError, RobotError
-from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
-from orthocal.planning.equipment import Equipment, choose_box
+from orthocal.planning.equipment import Equipment, choose_box, place_tool
 from orthocal.robot.model import Robot
 from orthocal.sensors.mounting import EXACT
-from orthocal.session.session import Gauge, Posture, Reading, Session, Setup
+from orthocal.session.session import Gauge, Reading, Session, Setup
 from orthocal.units import MM
 
 Array = NDArray[np.float64]
@@ -143,15 +142,12 @@ def _read_legs(
             setups[setup] = Setup(setup, equipment.list_sensors(leg, "xyz"[k], 0.5)[0])
             readings += [Reading(setup, posture) for posture in ("zero", *extremes)]
             readings += [Reading(setup, "zero", cycle=2)] if closing else []
-    drives = nominal_closure(robot).inverse(np.array(list(points.values())), names=list(points))
     return Session(
         robot=robot,
         robot_reference=robot.name,
         title=title,
         gauges={"": equipment.gauge},
-        postures={
-            n: Posture(n, "tcp_mm", p, d) for (n, p), d in zip(points.items(), drives, strict=True)
-        },
+        postures=place_tool(robot, list(points), np.array(list(points.values()))),
         setups=setups,
         readings=tuple(readings),
     )

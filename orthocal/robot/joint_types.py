@@ -16,6 +16,9 @@ from lxml import etree
 
 from orthocal.errors import RobotError
 
+Element = Any
+"""Element of lxml, which has no types."""
+
 FIXED = "FIXED"
 
 JOINT_TYPES: dict[str, str] = {
@@ -28,12 +31,7 @@ JOINT_TYPES: dict[str, str] = {
 _AXES = {"X": "1 0 0", "Y": "0 1 0", "Z": "0 0 1"}
 
 
-def retype_joints(
-    root: Any,  # noqa: ANN401 - lxml has no types
-    types: Mapping[str, str],
-    *,
-    where: str,
-) -> list[str]:
+def retype_joints(root: Element, types: Mapping[str, str], *, where: str) -> list[str]:
     """Write declared joint types into a checked URDF.
 
     Args:
@@ -65,7 +63,7 @@ def retype_joints(
     return added
 
 
-def _split(root: Any, joint: Any, axes: str, *, where: str) -> list[str]:  # noqa: ANN401
+def _split(root: Element, joint: Element, axes: str, *, where: str) -> list[str]:
     """Replace a joint by revolute joints in series, one per axis; returns their names."""
     name = joint.get("name")
     new_names = [f"{name}_{axis}" for axis in axes]

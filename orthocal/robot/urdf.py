@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 import pinocchio as pin
@@ -21,7 +21,7 @@ from lxml import etree
 
 from orthocal.errors import RobotError
 from orthocal.io.documents import LARGEST_NUMBER, read_text
-from orthocal.robot.joint_types import retype_joints
+from orthocal.robot.joint_types import Element, retype_joints
 from orthocal.runtime import disk_cache as cache
 from orthocal.text import composed
 
@@ -125,7 +125,7 @@ def load_urdf(
     return model
 
 
-def _complete_limits(root: Any) -> list[str]:  # noqa: ANN401 - lxml has no types
+def _complete_limits(root: Element) -> list[str]:
     """Write URDF's default of 0 for absent bounds, which yourdfpy requires.
 
     Returns:
@@ -144,7 +144,7 @@ def _complete_limits(root: Any) -> list[str]:  # noqa: ANN401 - lxml has no type
     return unlimited
 
 
-def parse_urdf(path: Path, *, content: bytes | None = None) -> Any:  # noqa: ANN401 - lxml has no types
+def parse_urdf(path: Path, *, content: bytes | None = None) -> Element:
     """Root element of a URDF of limited size, without comments.
 
     Args:
@@ -193,12 +193,12 @@ def parse_urdf(path: Path, *, content: bytes | None = None) -> Any:  # noqa: ANN
     return root
 
 
-def _place(path: Path, element: Any) -> str:  # noqa: ANN401 - lxml has no types
+def _place(path: Path, element: Element) -> str:
     """File and line of an element, for messages."""
     return f"{path}:{element.sourceline}"
 
 
-def _check_elements(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has no types
+def _check_elements(root: Element, path: Path) -> None:
     """Refuse invalid elements that yourdfpy and urdfdom accept, or refuse without a message."""
     links = _check_names(root, path)
     parents: dict[str, str] = {}
@@ -220,7 +220,7 @@ def _check_elements(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has n
     _check_shapes(root, path)
 
 
-def _check_names(root: Any, path: Path) -> list[str]:  # noqa: ANN401 - lxml has no types
+def _check_names(root: Element, path: Path) -> list[str]:
     """Names of the links; names of links and of joints are unique."""
     names: dict[str, dict[str, int]] = {"link": {}, "joint": {}}
     for tag, lines in names.items():
@@ -240,7 +240,7 @@ def _check_names(root: Any, path: Path) -> list[str]:  # noqa: ANN401 - lxml has
     return list(names["link"])
 
 
-def _check_joint(joint: Any, path: Path) -> None:  # noqa: ANN401 - lxml has no types
+def _check_joint(joint: Element, path: Path) -> None:
     """Refuse a joint with an invalid type, axis or limit."""
     name, kind, where = joint.get("name"), joint.get("type"), _place(path, joint)
     if kind not in (*MOVING, "fixed"):
@@ -277,7 +277,7 @@ def _check_joint(joint: Any, path: Path) -> None:  # noqa: ANN401 - lxml has no 
         )
 
 
-def _check_ends(joint: Any, links: Sequence[str], path: Path) -> str:  # noqa: ANN401
+def _check_ends(joint: Element, links: Sequence[str], path: Path) -> str:
     """Name of a joint's child link; both links exist."""
     link: str | None = None
     for end in ("parent", "child"):
@@ -296,10 +296,7 @@ def _check_ends(joint: Any, links: Sequence[str], path: Path) -> str:  # noqa: A
 
 
 def _check_connected(
-    root: Any,  # noqa: ANN401 - lxml has no types
-    links: Sequence[str],
-    parents: Mapping[str, str],
-    path: Path,
+    root: Element, links: Sequence[str], parents: Mapping[str, str], path: Path
 ) -> None:
     """Require a single root link with all links connected to it.
 
@@ -330,7 +327,7 @@ def _check_connected(
         )
 
 
-def _check_shapes(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has no types
+def _check_shapes(root: Element, path: Path) -> None:
     """Require one shape with its attributes in every visual and collision; limit the visuals."""
     for element in root.iter("visual", "collision"):
         geometry = element.find("geometry")
@@ -350,7 +347,7 @@ def _check_shapes(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has no 
         raise RobotError(f"has {visuals} visuals; expected at most {MOST_VISUALS}", where=str(path))
 
 
-def _check_counts(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has no types
+def _check_counts(root: Element, path: Path) -> None:
     """Limit the number of joints."""
     joints = root.findall("joint")
     moving = [joint for joint in joints if joint.get("type") != "fixed"]
@@ -361,7 +358,7 @@ def _check_counts(root: Any, path: Path) -> None:  # noqa: ANN401 - lxml has no 
             )
 
 
-def _numbers(element: Any, key: str, count: int, where: str) -> list[float] | None:  # noqa: ANN401
+def _numbers(element: Element, key: str, count: int, where: str) -> list[float] | None:
     """Numbers of an attribute; None without it."""
     text = element.get(key)
     if text is None:

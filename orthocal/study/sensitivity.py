@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.estimation.problem import CalibrationProblem, build_problem
-from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.measurement.files.session_file import check_contacts
 from orthocal.observation.observations import drive_table
+from orthocal.planning.equipment import place_tool
 from orthocal.planning.first_plan import Displacements, build_paper_plan
 from orthocal.robot.model import Robot
-from orthocal.session.session import Gauge, Posture, Reading, Session
+from orthocal.session.session import Gauge, Reading, Session
 from orthocal.study.portable_session import PortableSession
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study
@@ -118,19 +118,12 @@ def build_sensitivity_study(
 def _at_points(session: Session, points: Array) -> Session:
     """The session with every setup read at every point of the tool."""
     names = [f"point_{i + 1}" for i in range(len(points))]
-    drives = nominal_closure(session.robot).inverse(points, names=names)
-    drives = drives - session.active_offsets
-    postures = {
-        n: Posture(n, "tcp_mm", p, d) for n, p, d in zip(names, points, drives, strict=True)
-    }
+    placed = place_tool(session.robot, names, points)
+    postures = {n: replace(p, drives=p.drives - session.active_offsets) for n, p in placed.items()}
     aligned_at = session.alignment_postures
     setups = {n: replace(s, aligned_at=aligned_at[n]) for n, s in session.setups.items()}
     alignment = {n: session.postures[n] for n in aligned_at.values()}
-    readings = tuple(
-        Reading(setup, posture, None, 1, 0.0, None)
-        for setup in session.setups
-        for posture in postures
-    )
+    readings = tuple(Reading(setup, posture) for setup in setups for posture in postures)
     postures = {**postures, **alignment}
     moved = replace(session, setups=setups, postures=postures, readings=readings)
     check_contacts(moved)
