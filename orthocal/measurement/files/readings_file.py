@@ -11,7 +11,7 @@ import io
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from decimal import Decimal
 from itertools import islice
 from pathlib import Path
@@ -60,6 +60,9 @@ COLUMNS = tuple(field.name for field in fields(RawReading))[2:]
 
 REQUIRED = ("setup", "posture", "reading_mm")
 OPTIONAL = tuple(name for name in COLUMNS if name not in REQUIRED)
+
+NUMBERS = ("reading_mm", "temperature_C")
+"""Columns of numbers that may have a decimal sign."""
 
 COLUMN_OF_ROLE = {"reading": "reading_mm", "temperature": "temperature_C"}
 """Roles of columns in other tables, where the column of a readings.csv has another name."""
@@ -198,7 +201,9 @@ def _plain_rows(path: Path, content: bytes) -> Iterator[RawReading]:
                 numerals.append(Numeral(row["reading_mm"], line))
         sign = _plain_sign(numerals, path)
     for line, cells in rows():
-        yield _with_house_numbers(RawReading(f"{path}:{line}", line, **cells), sign)
+        if sign is not None:
+            cells |= {name: _house_number(cells.get(name, ""), sign) for name in NUMBERS}
+        yield RawReading(f"{path}:{line}", line, **cells)
 
 
 ASK = "write it with a decimal point, or use `orthocal import --decimal comma|point`"
@@ -211,18 +216,8 @@ def _plain_sign(cells: Sequence[Numeral], path: Path) -> Sign | None:
     return decide_sign(cells, house=True, ask=ASK, place=lambda line: f"{path}:{line}").sign
 
 
-def _with_house_numbers(row: RawReading, sign: Sign | None) -> RawReading:
-    """A row with numbers in the form of a readings.csv; other text is left to be refused later."""
-    if sign is None:
-        return row
-    return replace(
-        row,
-        reading_mm=_house_number(row.reading_mm, sign),
-        temperature_C=_house_number(row.temperature_C, sign),
-    )
-
-
 def _house_number(text: str, sign: Sign) -> str:
+    """A number in the form of a readings.csv; other text is left to be refused later."""
     if sign == "point":
         return plain_minus(text)
     value = parse_numeral(text, sign)
@@ -275,7 +270,7 @@ def _table_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
             COLUMN_OF_ROLE.get(role, role): composed(row.cell(index).text.strip())
             for role, index in (*columns.single.items(), ("reading", reading))
         }
-        for name in COLUMN_OF_ROLE.values():
+        for name in NUMBERS:
             value = None if sign is None else parse_numeral(cells.get(name, ""), sign)
             if value is not None:
                 cells[name] = mm_text(value)
