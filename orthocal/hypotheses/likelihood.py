@@ -100,35 +100,21 @@ class Likelihood:
         """Products of dense vectors, zeros projected out, shape (h, n_entries), [m]."""
         return Products(vectors @ self.directions.T, (vectors**2).sum(axis=1))
 
-    def information(self, effects: Products) -> Array:
-        """Inverse variance of the amount of each effect, shape (h,), [1/m²].
-
-        With errors at their tolerances and the stated noise.
-        """
-        perpendicular = np.maximum(effects.square - (effects.along**2).sum(axis=1), 0.0)
-        noise = self.sigma**2
-        return np.asarray(
-            effects.along**2 @ (1.0 / (self.variances + noise)) + perpendicular / noise
-        )
-
-    def estimate_amount(self, deviation: Array, effect: Array) -> tuple[float, float]:
-        """Amount of an effect without prior, errors at their tolerances, noise as stated.
+    def estimate_amounts(self, deviation: Array, effects: Array) -> tuple[Array, Array]:
+        """Amount of each effect by itself, without prior; tolerances and noise as stated.
 
         Args:
             deviation: Readings less predictions, shape (n_entries,), zeros projected out, [m].
-            effect: Effect per unit, shape (n_entries,), zeros projected out.
+            effects: Effects per unit, shape (h, n_entries), zeros projected out.
 
         Returns:
-            The amount and its standard deviation; 0 and infinity if the entries do not show it.
+            The amounts and their standard deviations, shape (h,); 0 and infinity if the entries do
+            not show an effect.
         """
-        products = self.products(np.array([effect, deviation]))
-        information = float(self.information(products)[0])
-        if not information > 0.0:
-            return 0.0, np.inf
-        along, noise = products.along, self.sigma**2
-        perpendicular = effect @ deviation - along[0] @ along[1]
-        slope = along[0] @ (along[1] / (self.variances + noise)) + perpendicular / noise
-        return float(slope) / information, information**-0.5
+        (gram,), (slope,) = self._gram(deviation, effects, np.ones(1), np.ones(1))
+        information = np.maximum(np.diag(gram), 0.0)
+        shown = np.where(information > 0.0, information, np.inf)
+        return slope / shown, np.where(information > 0.0, shown**-0.5, np.inf)
 
     def score(
         self, deviations: Products, effects: Products | None = None, cross: Array | None = None
@@ -222,9 +208,15 @@ class Likelihood:
             np.sqrt(np.diag(np.linalg.inv(gram[best]))),
         )
 
-    def _gram(self, deviation: Array, vectors: Array) -> tuple[Array, Array]:
+    def _gram(
+        self,
+        deviation: Array,
+        vectors: Array,
+        tolerance_scales: Array = TOLERANCE_SCALES,
+        noise_scales: Array = NOISE_SCALES,
+    ) -> tuple[Array, Array]:
         """W V⁻¹ Wᵀ, shape (g, k, k), and W V⁻¹ d, shape (g, k), for all pairs (e, s)."""
-        inverse_noise, inverse = (1.0 / v for v in self.grid())
+        inverse_noise, inverse = (1.0 / v for v in self.grid(tolerance_scales, noise_scales))
         along, components = self.directions @ deviation, vectors @ self.directions.T
         perpendicular = vectors - components @ self.directions
         gram = np.einsum("kr,rg,lr->gkl", components, inverse, components)

@@ -242,8 +242,10 @@ class LinearModel:
         """
         entries, effect = self.entries(np.array([rows, np.arange(rows.size) == row]))
         about = self._approach(entries, effect)
-        amount, std = about.likelihood.estimate_amount(entries - about.expected, effect)
-        return (math.nan if math.isinf(std) else float(rows[row]) - amount), std
+        (amount,), (std,) = about.likelihood.estimate_amounts(
+            entries - about.expected, effect[None]
+        )
+        return (math.nan if math.isinf(std) else float(rows[row] - amount)), float(std)
 
     def _approach(self, entries: Array, effect: Array) -> Linearisation:
         """Linearise about the most likely machine, beside an effect of unknown amount.
@@ -258,7 +260,7 @@ class LinearModel:
         about = self.linearise(np.zeros(self.problem.n_free), (), None, slopes=False)
         for _ in range(MOST_STEPS):
             deviation = entries - about.expected
-            amount, _ = about.likelihood.estimate_amount(deviation, effect)
+            (amount,), _ = about.likelihood.estimate_amounts(deviation, effect[None])
             errors = about.errors_for(deviation - amount * effect)
             if not np.abs(errors - about.theta).max(initial=0.0) > SETTLED:
                 break

@@ -146,7 +146,9 @@ def test_an_amount_without_prior_is_that_of_weighted_least_squares(case):
     jacobian, likelihood, deviations, effects = case
     inverse = np.linalg.inv(jacobian @ jacobian.T + SIGMA**2 * np.eye(N))
     information = effects[0] @ inverse @ effects[0]
-    amount, std = likelihood.estimate_amount(deviations[0], effects[0])
+    (amount, none), (std, unknown) = likelihood.estimate_amounts(
+        deviations[0], np.array([effects[0], np.zeros(N)])
+    )
     assert amount == pytest.approx(effects[0] @ inverse @ deviations[0] / information)
     assert std == pytest.approx(information**-0.5)
-    assert likelihood.estimate_amount(deviations[0], np.zeros(N)) == (0.0, np.inf)
+    assert (none, unknown) == (0.0, np.inf)

@@ -49,23 +49,23 @@ def _wrong_offsets(model: LinearModel) -> Family | None:
     if not tried or len(place) < len(drives):
         return None
 
-    def explain(h: int) -> Explanation:
-        kind, k, moved, c = tried[h]
-        return Explanation(
+    found = [
+        Explanation(
             kind,
             "session",
             drives=tuple(drives[i] for i in moved),
             offsets=tuple(c.tolist()),
             sessions=(labels[k],),
         )
-
+        for kind, k, moved, c in tried
+    ]
     shifts = []
     for _, k, _, c in tried:
         direction = np.zeros(scale.size)
         for i, name in enumerate(drives):
             direction[place[name]] = (active[k, i] - c[i]) / scale[place[name]]
         shifts.append(MachineShift(np.arange(len(labels)) == k, direction))
-    return Family(explain, len(tried), len(tried), shifts=shifts)
+    return Family.of(found, shifts=shifts)
 
 
 def enter_wrongly(
@@ -144,23 +144,22 @@ def _steps(
     place: dict[str, int],
 ) -> Family:
     labels, active = model.labels, model.active
-    tried = [(k, name, d) for k in range(1, len(labels)) for name, d in directions]
-
-    def explain(h: int) -> Explanation:
-        k, name, _ = tried[h]
-        drive = drive_of.get(place.get(name, -1))
-        entered = drive is not None and bool(np.abs(active[k] - active[k - 1]).max() > ROUNDING)
-        return Explanation(
-            "offset of one drive" if entered else "machine changed",
-            "session",
-            drives=() if drive is None else (drive,),
-            parameters=(name,),
-            sessions=(labels[k],),
-        )
-
-    sessions = np.arange(len(labels))
-    shifts = [MachineShift(sessions >= k, d) for k, _, d in tried]
-    return Family(explain, len(tried), len(tried), shifts=shifts, known=False)
+    found, shifts = [], []
+    for k in range(1, len(labels)):
+        entered = bool(np.abs(active[k] - active[k - 1]).max() > ROUNDING)
+        for name, direction in directions:
+            drive = drive_of.get(place.get(name, -1))
+            found.append(
+                Explanation(
+                    "offset of one drive" if entered and drive else "machine changed",
+                    "session",
+                    drives=() if drive is None else (drive,),
+                    parameters=(name,),
+                    sessions=(labels[k],),
+                )
+            )
+            shifts.append(MachineShift(np.arange(len(labels)) >= k, direction))
+    return Family.of(found, shifts=shifts, known=False)
 
 
 def detectable_changes(session: Session) -> dict[str, float]:
@@ -187,7 +186,6 @@ def detectable_changes(session: Session) -> dict[str, float]:
         direction[i] = 1.0 / problem.theta_scale[i]
         shifts = [MachineShift(sessions >= k, direction) for k in sessions[1:]]
         effects = np.array([model.shift_entries(about, s) for s in shifts])
-        information = about.likelihood.information(about.likelihood.products(effects))
-        least = float(information.min())
-        sizes[drive] = DETECTED / np.sqrt(least) if least > 0.0 else np.inf
+        _, stds = about.likelihood.estimate_amounts(np.zeros_like(about.expected), effects)
+        sizes[drive] = DETECTED * float(stds.max())
     return sizes
