@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ from orthocal.io.documents import read_json, validate, write_plain
 from orthocal.io.fields import finite_or_none
 from orthocal.io.files import exists, is_folder, write_file
 from orthocal.robot.model import Robot
-from orthocal.statistics.identifiability import Identifiability
 from orthocal.text import shorten
 
 Array = NDArray[np.float64]
@@ -132,14 +131,9 @@ def _read_document(
         if isinstance(plain, dict) and key in plain:
             plain[key] = _without(plain[key], names)
     record = validate(CalibrationRecord, plain, where=file, error=CalibrationFileError)
-    count = sum(p.free for p in record.parameters)
-    if not count:
-        raise CalibrationFileError("holds none that is free", where=f"{file}: parameters")
-    for key in ("model_covariance", "noise_covariance"):
-        _require_covariance(getattr(record, key), count, f"{file}: {key}")
-    _check_unmodelled(record, file)
+    for key, problem in _find_contradictions(record):
+        raise CalibrationFileError(problem, where=f"{file}: {key}")
     _check_estimates(record, file)
-    _check_singular_values(record.identifiability, file)
     if robot is None:
         robot = load_recorded_robot(record.robot_record, file=file)
     require_consistent(record, robot, file=file)
@@ -208,71 +202,56 @@ def _check_derived(
 
 
 def _check_estimates(record: CalibrationRecord, file: str) -> None:
-    """Refuse parameters whose standard deviations contradict the covariances."""
-    free = [(i, p) for i, p in enumerate(record.parameters) if p.free]
-    names = [p.name for p in record.parameters]
-    for i, name in enumerate(names):
-        if name in names[:i]:
-            raise CalibrationFileError(
-                f"'{name}' stands twice", where=f"{file}: parameters[{i}].name"
-            )
+    """Refuse standard deviations that contradict the covariances."""
     variances = {
-        key: np.diag(getattr(record, key)) for key in ("model_covariance", "noise_covariance")
+        "std": np.diag(record.model_covariance + record.unmodelled.bias_covariance),
+        "std_scatter": np.diag(record.noise_covariance),
     }
-    bias = np.diag(record.unmodelled.bias_covariance)
-    for key, variance in (
-        ("std", variances["model_covariance"] + bias),
-        ("std_scatter", variances["noise_covariance"]),
-    ):
+    free = [(i, p) for i, p in enumerate(record.parameters) if p.free]
+    for key, variance in variances.items():
         for (i, p), size in zip(free, np.sqrt(np.abs(variance)).tolist(), strict=True):
             if math.isfinite(size):
                 _check_derived(getattr(p, key), size, file, f"parameters[{i}].{key}")
 
 
-def _require_covariance(matrix: Array, count: int, where: str) -> None:
-    """Refuse a matrix that is not a covariance of the free parameters."""
-    if matrix.shape != (count, count):
-        raise CalibrationFileError(
-            f"expected {count} × {count} numbers, as free parameters", where=where
-        )
+def _find_contradictions(record: CalibrationRecord) -> Iterator[tuple[str, str]]:
+    """Keys that contradict other parts of a record, each with the problem."""
+    count = sum(p.free for p in record.parameters)
+    if not count:
+        yield "parameters", "holds none that is free"
+    for key in ("model_covariance", "noise_covariance"):
+        matrix = getattr(record, key)
+        if matrix.shape != (count, count):
+            yield key, f"expected {count} × {count} numbers, as free parameters"
+        if not _is_covariance(matrix):
+            yield (
+                key,
+                "is not a covariance: expected symmetric numbers without negative variances",
+            )
+    unmodelled, others = record.unmodelled, len(record.unmodelled.names)
+    if unmodelled.prior_stds.shape != (others,):
+        size = unmodelled.prior_stds.size
+        yield "unmodelled.prior_stds", f"has {size} numbers; expected {others}, as names"
+    if unmodelled.leakage.shape != (count, others):
+        expected = f"expected {count} × {others} numbers, free parameters by names"
+        yield "unmodelled.leakage", expected
+    names = [p.name for p in record.parameters]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            yield f"parameters[{i}].name", f"'{name}' stands twice"
+    values, rank = record.identifiability.singular_values, record.identifiability.rank
+    if not values.size or values.min() < 0.0 or (np.diff(values) > 0.0).any():
+        yield "identifiability.singular_values", "expected positive numbers, the largest first"
+    if rank > len(values) or (rank and values[rank - 1] <= 0.0):
+        above = (values > 0.0).sum()
+        yield "identifiability.rank", f"found {rank}; only {above} singular values are above 0"
+
+
+def _is_covariance(matrix: Array) -> bool:
+    """False for finite numbers that are not symmetric, or that are variances below 0."""
     if not np.isfinite(matrix).all():
-        return
-    scale = float(np.abs(matrix).max())
+        return True
     std = np.sqrt(np.abs(np.diag(matrix)))
     unit = matrix / np.outer(*(np.where(std > 0.0, std, 1.0),) * 2)
-    symmetric = np.abs(matrix - matrix.T).max() <= FOLLOWS * scale
-    if not symmetric or np.linalg.eigvalsh(unit).min() < -1e-6:
-        raise CalibrationFileError(
-            "is not a covariance: expected symmetric numbers without negative variances",
-            where=where,
-        )
-
-
-def _check_singular_values(identifiability: Identifiability, file: str) -> None:
-    """Refuse negative or unsorted singular values, and a rank above their number."""
-    values, rank = identifiability.singular_values, identifiability.rank
-    if not values.size or values.min() < 0.0 or (np.diff(values) > 0.0).any():
-        raise CalibrationFileError(
-            "expected positive numbers, the largest first",
-            where=f"{file}: identifiability.singular_values",
-        )
-    if rank > len(values) or (rank and values[rank - 1] <= 0.0):
-        raise CalibrationFileError(
-            f"found {rank}; only {(values > 0.0).sum()} singular values are above 0",
-            where=f"{file}: identifiability.rank",
-        )
-
-
-def _check_unmodelled(record: CalibrationRecord, file: str) -> None:
-    unmodelled, n_free = record.unmodelled, len(record.model_covariance)
-    count = len(unmodelled.names)
-    if unmodelled.prior_stds.shape != (count,):
-        raise CalibrationFileError(
-            f"has {unmodelled.prior_stds.size} numbers; expected {count}, as names",
-            where=f"{file}: unmodelled.prior_stds",
-        )
-    if unmodelled.leakage.shape != (n_free, count):
-        raise CalibrationFileError(
-            f"expected {n_free} × {count} numbers, free parameters by names",
-            where=f"{file}: unmodelled.leakage",
-        )
+    symmetric = np.abs(matrix - matrix.T).max() <= FOLLOWS * np.abs(matrix).max()
+    return bool(symmetric and np.linalg.eigvalsh(unit).min() >= -1e-6)

@@ -182,9 +182,18 @@ def require_consistent(record: CalibrationRecord, robot: Robot, *, file: str) ->
     Raises:
         CalibrationFileError: Naming the key.
     """
-    _require_parameters(record, robot, file)
-    _require_postures(record, robot, file)
-    _require_names(record, file)
+    for i, p in enumerate(record.parameters):
+        with _named(f"{file}: parameters[{i}].name"):
+            unit = robot.parameters[p.name].unit
+        if p.unit != unit:
+            raise CalibrationFileError(
+                f"found '{p.unit}'; {p.name} is in {unit}", where=f"{file}: parameters[{i}].unit"
+            )
+    for i, name in enumerate(record.unmodelled.names):
+        with _named(f"{file}: unmodelled.names[{i}]"):
+            robot.parameters[name]
+    for key, problem in (*_wrong_counts(record, robot), *_unknown_names(record)):
+        raise CalibrationFileError(problem, where=f"{file}: {key}")
     for i, setup in enumerate(record.setups):
         with _named(f"{file}: setups[{i}].reads"):
             setup.sensor.require_fit(robot, where=f"{file}: setups[{i}].reads")
@@ -204,44 +213,25 @@ def _named(where: str) -> Iterator[None]:
         raise CalibrationFileError(e.problem, where=e.where or where) from None
 
 
-def _require_parameters(record: CalibrationRecord, robot: Robot, file: str) -> None:
-    for i, p in enumerate(record.parameters):
-        with _named(f"{file}: parameters[{i}].name"):
-            unit = robot.parameters[p.name].unit
-        if p.unit != unit:
-            raise CalibrationFileError(
-                f"found '{p.unit}'; {p.name} is in {unit}", where=f"{file}: parameters[{i}].unit"
-            )
-    for i, name in enumerate(record.unmodelled.names):
-        with _named(f"{file}: unmodelled.names[{i}]"):
-            robot.parameters[name]
+def _wrong_counts(record: CalibrationRecord, robot: Robot) -> Iterator[tuple[str, str]]:
+    """Keys of coordinates and offsets that are not as many as the robot has, with the problem."""
+    passive = robot.passive_index.size
+    for i, p in enumerate(record.postures):
+        for key, values in (("values", p.values), ("drives", p.drives)):
+            if len(values) != len(robot.drives):
+                expected = f"expected {len(robot.drives)}, one a drive"
+                yield f"postures[{i}].{key}", f"has {len(values)} numbers; {expected}"
+        if len(p.passive) != passive:
+            expected = f"expected {passive}, one a passive joint"
+            yield f"postures[{i}].passive", f"has {len(p.passive)} numbers; {expected}"
+    offsets, names = record.session.controller_offsets, [d.name for d in robot.drives]
+    if offsets is not None and len(offsets) != len(names):
+        expected = f"expected {len(names)}, one a drive: {', '.join(names)}"
+        yield "session.controller_offsets", f"has {len(offsets)} numbers; {expected}"
 
 
-def _require_postures(record: CalibrationRecord, robot: Robot, file: str) -> None:
-    """Refuse postures and offsets with another number of coordinates than the robot has."""
-    drives, passive = len(robot.drives), robot.passive_index.size
-    counts = [
-        (f"postures[{i}].{key}", len(values), count, kind)
-        for i, p in enumerate(record.postures)
-        for key, values, count, kind in (
-            ("values", p.values, drives, "drive"),
-            ("drives", p.drives, drives, "drive"),
-            ("passive", p.passive, passive, "passive joint"),
-        )
-    ]
-    if record.session.controller_offsets is not None:
-        names = f"drive: {', '.join(d.name for d in robot.drives)}"
-        offsets = len(record.session.controller_offsets)
-        counts.append(("session.controller_offsets", offsets, drives, names))
-    for key, length, count, kind in counts:
-        if length != count:
-            raise CalibrationFileError(
-                f"has {length} numbers; expected {count}, one a {kind}", where=f"{file}: {key}"
-            )
-
-
-def _require_names(record: CalibrationRecord, file: str) -> None:
-    """Refuse names of setups and postures that the file does not have."""
+def _unknown_names(record: CalibrationRecord) -> Iterator[tuple[str, str]]:
+    """Keys with names of setups and postures that the file does not have, with the problem."""
     postures, setups = {p.name for p in record.postures}, {s.name for s in record.setups}
     names = [
         (f"setups[{i}].aligned_at", s.aligned_at, "postures", postures)
@@ -255,6 +245,4 @@ def _require_names(record: CalibrationRecord, file: str) -> None:
         ]
     for key, name, kind, existing in names:
         if name not in existing:
-            raise CalibrationFileError(
-                f"'{name}' is not among the file's {kind}", where=f"{file}: {key}"
-            )
+            yield key, f"'{name}' is not among the file's {kind}"
