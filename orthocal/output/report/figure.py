@@ -92,42 +92,6 @@ def house_style() -> Iterator[None]:
         yield
 
 
-def render_figure(name: str, label: str, draw: Callable[[], Figure]) -> str:
-    """A figure as an inline `<svg>` that scales with its page.
-
-    Args:
-        name: Name of the plot, with which its ids begin.
-        label: Description for those who do not see the figure.
-        draw: Function that draws the figure.
-    """
-    stream = io.BytesIO()
-    with house_style(), warnings.catch_warnings():
-        # the text is drawn with the fonts of the reader
-        warnings.filterwarnings("ignore", message="Glyph .* missing from")
-        figure = draw()
-        nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
-        layout = figure.get_layout_engine()
-        if layout is not None:  # otherwise savefig would draw twice
-            layout.execute(figure)
-            figure.set_layout_engine(None)
-        figure.savefig(stream, format="svg", metadata=nothing)
-    parser = etree.XMLParser(resolve_entities=False, huge_tree=True)
-    root = etree.fromstring(stream.getvalue(), parser)
-    _name_ids(root, f"{name}-{hashlib.sha256(stream.getvalue()).hexdigest()[:8]}-")
-    for styles in root.findall(f".//{_SVG}style"):  # they would apply to the whole page
-        styles.getparent().remove(styles)
-    for key in ("width", "height", "version"):
-        root.attrib.pop(key, None)
-    width = figure.get_figwidth() * 100.0
-    root.set("style", f"width:{width:.0f}px;max-width:100%;height:auto;stroke-linejoin:round")
-    root.set("role", "img")
-    root.set("aria-label", label)
-    title = etree.Element(f"{_SVG}title")
-    title.text = label
-    root.insert(0, title)
-    return str(etree.tostring(root, encoding="unicode"))
-
-
 @dataclass(frozen=True)
 class Plot(Generic[P]):
     """A plot: called, it gives an inline `<svg>`, or "" if it has nothing to show."""
@@ -141,15 +105,44 @@ class Plot(Generic[P]):
             return self.draw(*args, **kwargs)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> str:
-        """Draw and render the plot."""
-        figure = self.figure(*args, **kwargs)
-        if figure is None:
-            return ""
-        return render_figure(self.name, str(figure.get_label()), lambda: figure)
+        """Draw the plot as an inline `<svg>` that scales with its page."""
+        stream = io.BytesIO()
+        with house_style(), warnings.catch_warnings():
+            # the text is drawn with the fonts of the reader
+            warnings.filterwarnings("ignore", message="Glyph .* missing from")
+            figure = self.draw(*args, **kwargs)
+            if figure is None:
+                return ""
+            layout = figure.get_layout_engine()
+            if layout is not None:  # otherwise savefig would draw twice
+                layout.execute(figure)
+                figure.set_layout_engine(None)
+            nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+            figure.savefig(stream, format="svg", metadata=nothing)
+        return _make_inline(stream.getvalue(), figure, self.name)
 
     def document(self, *args: P.args, **kwargs: P.kwargs) -> str:
         """The plot as an SVG file."""
         return f'<?xml version="1.0" encoding="utf-8"?>\n{self(*args, **kwargs)}\n'
+
+
+def _make_inline(svg: bytes, figure: Figure, name: str) -> str:
+    """An SVG file of a figure as an element of a page, with ids of its own."""
+    label = str(figure.get_label())
+    root = etree.fromstring(svg, etree.XMLParser(resolve_entities=False, huge_tree=True))
+    _name_ids(root, f"{name}-{hashlib.sha256(svg).hexdigest()[:8]}-")
+    for styles in root.findall(f".//{_SVG}style"):  # they would apply to the whole page
+        styles.getparent().remove(styles)
+    for key in ("width", "height", "version"):
+        root.attrib.pop(key, None)
+    width = figure.get_figwidth() * 100.0
+    root.set("style", f"width:{width:.0f}px;max-width:100%;height:auto;stroke-linejoin:round")
+    root.set("role", "img")
+    root.set("aria-label", label)
+    title = etree.Element(f"{_SVG}title")
+    title.text = label
+    root.insert(0, title)
+    return str(etree.tostring(root, encoding="unicode"))
 
 
 def plot(name: str) -> Callable[[Callable[P, Figure | None]], Plot[P]]:

@@ -106,25 +106,21 @@ def _draw_tool_map(calibration: Calibration, accuracy: ToolAccuracy, which: Fiel
     tcp = calibration.robot.tcp
     world = tuple(range(len(lines))) if tcp is None else tcp.coordinates
     grid = _error_parts(calibration, accuracy, which).reshape(*(line.size for line in lines), -1)
-    cuts = [_cut(grid, plane) for plane in planes]
-    between = [
-        _interpolate([lines[k] for k in plane], cut)
-        for plane, cut in zip(planes, cuts, strict=True)
-    ]
-    fine = [
-        _refine([lines[k] for k in plane], at) for plane, at in zip(planes, between, strict=True)
-    ]
-    levels = _choose_levels(np.concatenate([size.reshape(-1) for *_, size in fine]))
+    maps = []
+    for plane in planes:
+        sides = [lines[k] for k in plane]
+        between = _interpolate(sides, _cut(grid, plane))
+        maps.append((plane, sides, between, *_refine(sides, between)))
+    levels = _choose_levels(np.concatenate([size.reshape(-1) for *_, size in maps]))
     figure = open_figure(3.0 if len(planes) > 1 else 5.0, TITLES[which], legend=False)
     panels = np.atleast_1d(figure.subplots(1, len(planes)))
-    for axes, plane, at, (x, y, size) in zip(panels, planes, between, fine, strict=True):
+    for axes, (plane, sides, between, x, y, size) in zip(panels, maps, strict=True):
         axes.set(aspect="equal", title=_describe_cut(lines, plane, world))
         axes.set_xlabel(f"{'xyz'[world[plane[0]]]} [mm]")
         axes.set_ylabel(f"{'xyz'[world[plane[1]]]} [mm]", labelpad=0.0)
         taken = np.zeros((0, 2))
         if which != "uncertainty":
-            sides = [lines[k] for k in plane]
-            taken = _draw_arrows(axes, sides, at, [world[k] for k in plane], levels)
+            taken = _draw_arrows(axes, sides, between, [world[k] for k in plane], levels)
         _draw_size(axes, x, y, size, levels, taken)
     label = "size of the tool error [µm]; arrows: its part in the plane"
     if which == "uncertainty":

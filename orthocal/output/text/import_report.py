@@ -15,6 +15,14 @@ from orthocal.measurement.importing.import_readings import TableImport
 UNIT_SYMBOLS = {"um": "µm"}
 """Symbols of units that have another symbol than their name."""
 
+CHANGES = {
+    "filled": "filled in",
+    "added": "added",
+    "replaced": "replaced",
+    "unchanged": "unchanged",
+}
+"""Numbers of rows that an import states, in words."""
+
 MOST_NAMES = 6
 """Maximum number of replaced names in the text."""
 
@@ -112,16 +120,7 @@ def _format_rows(lines: Iterable[int]) -> str:
 
 def _describe_changes(result: TableImport) -> str:
     """Changes of the session's readings.csv."""
-    parts = [
-        f"{number} {words}"
-        for number, words in (
-            (result.filled, "filled in"),
-            (result.added, "added"),
-            (result.replaced, "replaced"),
-            (result.unchanged, "unchanged"),
-        )
-        if number
-    ]
+    parts = [f"{n} {words}" for name, words in CHANGES.items() if (n := getattr(result, name))]
     empty = f"; {counted(result.empty, 'row')} still without a reading" if result.empty else ""
     return f"{result.readings_path}: {', '.join(parts)}{empty}"
 
@@ -154,11 +153,7 @@ def format_import_json(result: TableImport, *, written: bool) -> str:
             for row in long_table.rows
         ],
         "session": str(result.session),
-        "filled": result.filled,
-        "added": result.added,
-        "replaced": result.replaced,
-        "unchanged": result.unchanged,
-        "empty": result.empty,
+        **{name: getattr(result, name) for name in (*CHANGES, "empty")},
         "written": str(result.readings_path) if written else None,
     }
     return json.dumps(document, indent=1, allow_nan=False) + "\n"

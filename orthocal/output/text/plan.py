@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -126,22 +127,12 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
         }
 
     def alternative(a: Alternative) -> dict[str, Any]:
-        return {
-            "name": a.name,
-            "setups": a.setups,
-            "readings": a.readings,
-            "minutes": a.minutes,
-            "in_range": a.expected is not None,
-            **sizes(a.expected),
-        }
+        names = ("name", "setups", "readings", "minutes")
+        known = {name: getattr(a, name) for name in names}
+        return {**known, "in_range": a.expected is not None, **sizes(a.expected)}
 
     def stage(s: Stage) -> dict[str, float]:
-        return {
-            "setups": s.setups,
-            "readings": s.readings,
-            "minutes": s.minutes,
-            "error": s.error / _unit(plan),
-        }
+        return {**asdict(s), "error": s.error / _unit(plan)}
 
     read, closing = _counts(plan)
     box = plan.forecast.workspace.box
