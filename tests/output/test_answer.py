@@ -59,10 +59,21 @@ class Answers(dict):
     def __init__(self, directory):
         super().__init__()
         self.directory, self.cycles = directory, session_of("raw-cycles")
+        self._complete = {}
 
     def __missing__(self, name):
         self[name] = calibrated(name, EXAMPLES[name]) if name in EXAMPLES else OTHERS[name](self)
         return self[name]
+
+    def complete(self, name):
+        """All that is printed about a calibration, in words; its tool errors take time."""
+        if name not in self._complete:
+            self._complete[name] = words_of(self[name], all_rows=True)
+        return self._complete[name]
+
+
+def words_of(calibration, **options):
+    return " ".join(summarize(calibration, **options).split())
 
 
 def reversed_sign(session, setup):
@@ -111,10 +122,6 @@ def test_an_answer_is_short_and_in_plain_words(answers, name):
         assert "\n\n\n" not in text
 
 
-def words_of(calibration, **options):
-    return " ".join(summarize(calibration, **options).split())
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_the_subject_comes_first_then_the_decision_and_then_the_rest(answers, name):
     calibration = answers[name]
@@ -147,7 +154,7 @@ def test_nothing_grave_is_kept_back(answers, name):
     order = {"reject": 0, "review": 1, "note": 2}
     ranks = [order[f.severity] for f in found.findings]
     assert ranks == sorted(ranks)
-    details = words_of(answers[name], all_rows=True)
+    details = answers.complete(name)
     assert all(" ".join(f.text.split()) in details for f in found.findings)
 
 
@@ -193,7 +200,7 @@ def test_one_tool_error_in_one_sentence_everywhere(answers, name):
     assert stated.numbers["entered_um"] == pytest.approx(found.tool.entered * 1e6)
     assert words_of(calibration).count(sentence) == 1
     # the answer, the section of the tool and the findings
-    assert words_of(calibration, details=True).count(sentence) == 3
+    assert answers.complete(name).count(sentence) == 3
     assert ("corrects all errors: " in words_of(calibration)) == (not calibration.only_offsets)
 
 
