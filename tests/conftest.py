@@ -11,10 +11,11 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
+from gauges import exact
 
 # as the command line does it: threads of small matrices get in each other's way
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-from orthocal import load_robot, load_session
+from orthocal import load_plan, load_robot, load_session
 from orthocal.robot import loading
 from orthocal.robot.model import Robot
 from orthocal.session.session import Session
@@ -109,3 +110,9 @@ def experiment_2() -> Session:
 @pytest.fixture(scope="session")
 def raw_cycles() -> Session:
     return load_session(ROOT / "examples/raw-cycles")
+
+
+@pytest.fixture(scope="session")
+def exact_plan() -> Session:
+    """Lines read in zero, maximum and minimum postures, by gauges whose mounting is known."""
+    return exact(load_plan(ROOT / "examples/raw-cycles/plan.yaml"))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from gauges import exact
+from models import TRUTH
 from scipy.optimize import lsq_linear
 from tolerances import SAME_OPTIMUM
 
-from orthocal import Choice, SolverOptions, calibrate, load_plan, simulate_session
+from orthocal import Choice, SolverOptions, calibrate, simulate_session
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.linear import linearise_at_reference
 from orthocal.estimation.loss import Loss
@@ -18,20 +18,13 @@ from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.statistics.information import decompose
 from orthocal.statistics.zeros import project_out_zeros
 
-TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
-
 LINEAR = 0.02e-3
 """[m] Exact against linearised offsets, at offsets of a millimetre."""
 
 
 @pytest.fixture(scope="module")
-def plan(root):
-    return exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
-
-
-@pytest.fixture(scope="module")
-def session(plan):
-    return simulate_session(plan, TRUTH, seed=11).session
+def session(exact_plan):
+    return simulate_session(exact_plan, TRUTH, seed=11).session
 
 
 def test_a_bound_holds_a_parameter_and_the_others_make_up_for_it(session):
@@ -99,10 +92,10 @@ def test_a_known_value_with_its_tolerance_is_weighed_with_the_readings(session):
     assert fit.covariance()[i, i] == pytest.approx(1.0 / precision, rel=1e-3)
 
 
-def test_the_robust_covariance_is_that_of_many_simulated_calibrations(plan):
+def test_the_robust_covariance_is_that_of_many_simulated_calibrations(exact_plan):
     """Huber's loss on normal noise: whitened errors are standard normal."""
     sigma = 20e-6
-    problem = build_problem(plan, model="offsets")
+    problem = build_problem(exact_plan, model="offsets")
     options = SolverOptions(loss=Loss("huber"))
     entries = problem.predict(np.array(list(TRUTH.values())))
     rng, white, loss = np.random.default_rng(0), [], Loss("huber")
@@ -125,20 +118,20 @@ def test_the_robust_covariance_is_that_of_many_simulated_calibrations(plan):
     assert np.mean(np.square(white)) == pytest.approx(1.0, abs=0.15)
 
 
-def test_nothing_moved_is_explained(plan):
-    still = calibrate(simulate_session(plan, {}, exact=True).session)
+def test_nothing_moved_is_explained(exact_plan):
+    still = calibrate(simulate_session(exact_plan, {}, exact=True).session)
     (found,) = still.assessment.of_kind("nothing moved")
     assert found.numbers["before_rms_mm"] == pytest.approx(0.0, abs=1e-9)
-    assert not calibrate(plan_with_truth(plan)).assessment.of_kind("nothing moved")
+    assert not calibrate(plan_with_truth(exact_plan)).assessment.of_kind("nothing moved")
 
 
-def plan_with_truth(plan):
-    return simulate_session(plan, TRUTH, seed=0).session
+def plan_with_truth(exact_plan):
+    return simulate_session(exact_plan, TRUTH, seed=0).session
 
 
-def test_nothing_to_move_is_explained(plan):
+def test_nothing_to_move_is_explained(exact_plan):
     """The platform's own placement is seen by no reading of leg x alone."""
-    result = calibrate(plan_with_truth(plan), Choice(free=["frame.tcp.*"]))
+    result = calibrate(plan_with_truth(exact_plan), Choice(free=["frame.tcp.*"]))
     (found,) = result.assessment.of_kind("nothing moved")
     assert {p.parameter for p in found.places} == {p.name for p in result.free}
     assert set(result.identifiability.unseen) == {p.name for p in result.free}

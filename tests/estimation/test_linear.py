@@ -102,13 +102,10 @@ def test_the_closed_loop_model_agrees_to_first_order_with_equation_8(experiment_
     assert np.abs(theta - expected).max() < 1e-13
 
 
-def test_twelve_generalised_rows_are_raw_readings_with_their_zeros(root):
+def test_twelve_generalised_rows_are_raw_readings_with_their_zeros(exact_plan):
     """Raw readings of zero, max and min, zeros eliminated, are equation (8) with its covariance."""
-    from orthocal import load_plan
-
-    plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
     rng = np.random.default_rng(0)
-    session = plan.with_values(1e-3 * rng.normal(size=len(plan.readings)))
+    session = exact_plan.with_values(1e-3 * rng.normal(size=len(exact_plan.readings)))
     problem = build_problem(session, model="offsets")
     theta = linearise_at_reference(problem).solve(sigma=1e-5)
     means = {}

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from gauges import exact
+from models import TRUTH
 
 from orthocal import calibrate, load_plan, simulate_session
 from orthocal.calibration.refit import restore_session
@@ -18,13 +18,12 @@ from orthocal.estimation.solvers.batch import BatchProgram
 from orthocal.measurement.files.session_file import load_session
 from orthocal.measurement.files.write_session import write_session
 
-TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 SIGMA = 5e-6
 
 
 @pytest.fixture(params=[(), ("yx",), None], ids=["free", "one known", "all known"])
-def session(request, root):
-    plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
+def session(request, exact_plan):
+    plan = exact_plan
     known = plan.setups if request.param is None else request.param
     setups = {n: replace(s, zero="known" if n in known else "free") for n, s in plan.setups.items()}
     return simulate_session(replace(plan, setups=setups), TRUTH, sigma=SIGMA, seed=2).session
@@ -54,9 +53,9 @@ def test_solvers_agree_and_keep_known_zeros_at_0(session, loss):
     assert np.abs(found["variable-projection"].theta - truth).max() < 50e-6
 
 
-def test_an_absolute_reading_is_one_more_equation(root):
+def test_an_absolute_reading_is_one_more_equation(exact_plan):
     """One posture alone determines nothing with free zeros, the offsets with known ones."""
-    plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
+    plan = exact_plan
     readings = tuple(r for r in plan.readings if r.posture == "x_max")
     setups = {n: replace(s, zero="known") for n, s in plan.setups.items()}
     free = build_problem(replace(plan, readings=readings), model="offsets")

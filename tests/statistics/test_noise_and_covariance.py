@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gauges import exact
+from models import TRUTH
 from scipy import stats
 from tolerances import KINEMATICS
 
@@ -24,8 +25,6 @@ from orthocal.statistics.chance import (
 )
 from orthocal.statistics.information import Information, decompose, marginalise
 from orthocal.statistics.noise import Noise, estimate_noise, estimate_repeatability
-
-TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
 
 def observations(setup, posture, zero):

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gauges import exact
+from models import TRUTH
 
 from orthocal import (
     SolverOptions,
     calibrate,
     check_session,
-    load_plan,
     load_session,
     simulate_session,
 )
@@ -23,8 +23,6 @@ from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.session.session import Gauge, Session
-
-TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
 FIRST_ORDER = 0.02
 """[1] Formula to first order against a new exact solution: readings bend by a few per mille of the
@@ -47,10 +45,14 @@ def differences_of(session: Session) -> Session:
 
 
 @pytest.fixture(scope="module")
-def readings(root):
-    plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
-    rows = tuple(r for r in plan.readings if r.cycle == 1)
-    session = simulate_session(replace(plan, readings=rows), TRUTH, seed=5).session
+def single_cycle(exact_plan):
+    rows = tuple(r for r in exact_plan.readings if r.cycle == 1)
+    return replace(exact_plan, readings=rows)
+
+
+@pytest.fixture(scope="module")
+def readings(single_cycle):
+    session = simulate_session(single_cycle, TRUTH, seed=5).session
     return session.with_gauge(Gauge(None, None, None))  # the residuals alone tell the noise
 
 
@@ -96,11 +98,9 @@ def test_studentised_residuals_are_those_of_a_regression_with_an_extra_column(re
 
 
 @pytest.mark.parametrize("form", ["readings", "differences"])
-def test_studentised_residuals_of_noise_are_students(root, form):
+def test_studentised_residuals_of_noise_are_students(single_cycle, form):
     """Over many sessions: a variance of dof/(dof − 2), and rarely anything suspicious."""
-    plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
-    rows = tuple(r for r in plan.readings if r.cycle == 1)
-    plan = replace(plan, readings=rows).with_gauge(replace(plan.gauge, resolution=None))
+    plan = single_cycle.with_gauge(replace(single_cycle.gauge, resolution=None))
     values, alarms = [], 0
     solver = SolverOptions(solver="variable-projection")
     for seed in range(30):

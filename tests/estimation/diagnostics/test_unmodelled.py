@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from drawn_machines import DrawnMachines
-from gauges import exact
 from models import JOINTS
 
-from orthocal import Choice, calibrate, load_plan, simulate_session
+from orthocal import Choice, calibrate, simulate_session
 from orthocal.assessment.judgement import RARE
 from orthocal.calibration import build_record as recording
 from orthocal.estimation.diagnostics.unmodelled import (
@@ -24,16 +23,11 @@ from orthocal.statistics.distributions import chi_square_tail
 from orthocal.statistics.zeros import project_out_zeros
 
 
-@pytest.fixture(scope="module")
-def plan(root):
-    return exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
-
-
 @pytest.mark.parametrize("name", ["x_slide.rz", "x_swivel.x", "y_coupler.x", "z_bar_b.z"])
 @pytest.mark.parametrize("model", ["offsets", "lengths"])
-def test_an_unmodelled_error_moves_the_estimate_by_its_leakage(plan, name, model):
+def test_an_unmodelled_error_moves_the_estimate_by_its_leakage(exact_plan, name, model):
     """Perfect readings of a machine with one small error, calibrated without it."""
-    probe = simulate_session(plan, {}, exact=True).session
+    probe = simulate_session(exact_plan, {}, exact=True).session
     fit = fit_problem(build_problem(probe, model=model))
     found, _ = measure_unmodelled(fit, find_other_errors(fit))
     if name not in found.names:
@@ -41,18 +35,20 @@ def test_an_unmodelled_error_moves_the_estimate_by_its_leakage(plan, name, model
         return
     column = found.leakage[:, found.names.index(name)]
     size = 1e-6
-    problem = build_problem(simulate_session(plan, {name: size}, exact=True).session, model=model)
+    problem = build_problem(
+        simulate_session(exact_plan, {name: size}, exact=True).session, model=model
+    )
     sigma = fit_problem(build_problem(probe, model=model)).sigma
     moved = NonlinearProgram(problem).solve(sigma=sigma).theta / size
     assert moved == pytest.approx(column, abs=2e-3 * max(1.0, np.abs(column).max()))
 
 
 @pytest.fixture(scope="module")
-def machines(plan):
+def machines(exact_plan):
     """Offsets and residuals found on 1,000 machines with all other errors, perfect readings."""
-    offsets = build_problem(plan, model="offsets")
-    errors = [n for n in machine_errors(plan.robot) if not n.endswith(".offset")]
-    others = build_problem(plan, free=errors)
+    offsets = build_problem(exact_plan, model="offsets")
+    errors = [n for n in machine_errors(exact_plan.robot) if not n.endswith(".offset")]
+    others = build_problem(exact_plan, free=errors)
     rng = np.random.default_rng(0)
     drawn = rng.normal(size=(1000, others.n_free)) * others.theta_scale
     values, _, reached = others.simulate(drawn)
@@ -65,8 +61,8 @@ def machines(plan):
 
 
 @pytest.fixture(scope="module")
-def result(plan):
-    return calibrate(simulate_session(plan, {}, exact=True).session)
+def result(exact_plan):
+    return calibrate(simulate_session(exact_plan, {}, exact=True).session)
 
 
 def test_residuals_of_machines_with_all_errors_are_as_large_as_foretold(result, machines):
@@ -105,19 +101,19 @@ def test_a_machine_has_all_errors_of_its_parts(orthoglide, biglide):
     assert not any(n.startswith("frame.x_tip") for n in machine_errors(biglide))
 
 
-def test_the_full_model_leaves_nothing_out(plan):
-    session = simulate_session(plan, {"x_slide.offset": 1e-3}, seed=1).session
+def test_the_full_model_leaves_nothing_out(exact_plan):
+    session = simulate_session(exact_plan, {"x_slide.offset": 1e-3}, seed=1).session
     assert calibrate(session, "full").unmodelled.names == ()
-    free = plan.robot.parameters.select(JOINTS)
+    free = exact_plan.robot.parameters.select(JOINTS)
     found = calibrate(session, Choice(free=JOINTS, prior=True)).unmodelled
-    assert set(found.names) == set(machine_errors(plan.robot)) - set(free)
+    assert set(found.names) == set(machine_errors(exact_plan.robot)) - set(free)
     assert found.leakage.shape == (126, len(found.names))
     assert len(found.names) == 3 * 4 + 12 + 3  # ends of rods, feet, scales
 
 
-def test_with_a_sum_free_its_parts_may_still_differ(plan):
+def test_with_a_sum_free_its_parts_may_still_differ(exact_plan):
     """A leg's length is told by its coupler; the second rod may be longer than the first."""
-    session = simulate_session(plan, {"x_slide.offset": 1e-3}, seed=1).session
+    session = simulate_session(exact_plan, {"x_slide.offset": 1e-3}, seed=1).session
     found = calibrate(session, "lengths").unmodelled
     assert "x_coupler.x" not in found.names
     assert "frame.x_rod_b_tip.x" in found.names
@@ -125,12 +121,14 @@ def test_with_a_sum_free_its_parts_may_still_differ(plan):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["offsets", "lengths"])
-def test_intervals_hold_what_they_say_with_all_errors_at_their_tolerances(plan, model, monkeypatch):
+def test_intervals_hold_what_they_say_with_all_errors_at_their_tolerances(
+    exact_plan, model, monkeypatch
+):
     """100 sessions: what scatter alone would promise is missed by far, all together is not.
 
     Of 300 intervals of three offsets 95 % have a standard error of 1.3 %.
     """
-    machines = DrawnMachines(plan, model=model)
+    machines = DrawnMachines(exact_plan, model=model)
     # they hardly change from machine to machine, and take longest to find
     monkeypatch.setattr(recording, "find_other_errors", lambda *_, **__: machines.others)
     known = machines.machine.free

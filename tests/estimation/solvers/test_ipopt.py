@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from derivatives import central_differences
 from gauges import exact
+from models import TRUTH
 from scipy.optimize import least_squares
 from tolerances import DERIVATIVE, SAME_OPTIMUM, TRUTH_BACK
 
@@ -21,17 +22,11 @@ from orthocal.statistics.zeros import project_out_zeros
 
 HUBER = Loss("huber")
 LOSSES = [SQUARES, HUBER]
-TRUTH = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
 
 
 @pytest.fixture(scope="module")
-def plan(root):
-    return exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
-
-
-@pytest.fixture(scope="module")
-def perfect(plan):
-    return simulate_session(plan, TRUTH, exact=True).session
+def perfect(exact_plan):
+    return simulate_session(exact_plan, TRUTH, exact=True).session
 
 
 def point(program, problem, size, seed=0):
@@ -126,8 +121,8 @@ def test_perfect_data_give_the_truth_back_from_any_start(perfect, hessian):
     ("model", "loss"),
     [("offsets", SQUARES), ("offsets", HUBER), ("lengths", HUBER), ("full", SQUARES)],
 )
-def test_both_hessians_reach_the_same_optimum(plan, model, loss):
-    session = simulate_session(plan, TRUTH, seed=3).session
+def test_both_hessians_reach_the_same_optimum(exact_plan, model, loss):
+    session = simulate_session(exact_plan, TRUTH, seed=3).session
     problem = build_problem(session, model=model)
     start = linearise_at_reference(problem).solve(sigma=1e-5)  # whence fits start by themselves
     found = [
@@ -142,9 +137,9 @@ def test_both_hessians_reach_the_same_optimum(plan, model, loss):
 
 
 @pytest.mark.parametrize("model", ["offsets", "lengths"])
-def test_another_solver_finds_the_same(plan, model):
+def test_another_solver_finds_the_same(exact_plan, model):
     """SciPy's least squares on the reduced problem, loops closed by Newton at every step."""
-    session = simulate_session(plan, TRUTH, seed=4).session
+    session = simulate_session(exact_plan, TRUTH, seed=4).session
     problem = build_problem(session, model=model)
     solution = NonlinearProgram(problem).solve(sigma=1e-5)
 
@@ -160,8 +155,8 @@ def test_another_solver_finds_the_same(plan, model):
     assert other.cost == pytest.approx(solution.objective, rel=1e-9)
 
 
-def test_new_readings_do_not_rebuild(plan):
-    first, second = (simulate_session(plan, TRUTH, seed=s).session for s in (5, 6))
+def test_new_readings_do_not_rebuild(exact_plan):
+    first, second = (simulate_session(exact_plan, TRUTH, seed=s).session for s in (5, 6))
     program = NonlinearProgram(build_problem(first, model="offsets"))
     again = program.solve(sigma=1e-5, values=build_problem(second, model="offsets").values)
     fresh = NonlinearProgram(build_problem(second, model="offsets")).solve(sigma=1e-5)
@@ -182,8 +177,8 @@ def test_where_gauss_newton_does_not_converge_the_exact_hessian_does(root):
     assert np.abs(slope).max() < DERIVATIVE * np.abs(pulls).sum(axis=0).max()
 
 
-def test_not_converged_is_an_error_and_never_a_result(plan):
-    session = simulate_session(plan, TRUTH, seed=7).session
+def test_not_converged_is_an_error_and_never_a_result(exact_plan):
+    session = simulate_session(exact_plan, TRUTH, seed=7).session
     program = NonlinearProgram(
         build_problem(session, model="offsets"), options=SolverOptions(max_iterations=1)
     )
