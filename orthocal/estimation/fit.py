@@ -309,7 +309,8 @@ def _linearised_sigma(
     problem = program.problem
     sigma = stated_sigma(problem.session.gauge, repeatability)
     stated = sigma
-    use_stated = problem.session.gauge.sigma is not None and _few_are_free(linearisation, sigma)
+    few_are_free = _residual_dof(problem, linearisation.information, sigma) < SMALL_DOF
+    use_stated = problem.session.gauge.sigma is not None and few_are_free
     for i in range(MAX_SIGMA_ROUNDS if _matters(program) else 0):
         change = (linearisation.solve(sigma=sigma) - problem.reference) / problem.theta_scale
         residual = linearisation.residual - linearisation.jacobian @ change
@@ -324,14 +325,16 @@ def _linearised_sigma(
     return (stated, sigma) if use_stated else (sigma, sigma)
 
 
-def _few_are_free(linearisation: Linearisation, sigma: float) -> bool:
-    """True if the parameters use nearly all degrees of freedom of the readings."""
-    problem = linearisation.problem
-    o = problem.observations
-    used = linearisation.information.effective_parameters(
-        sigma=sigma, precision=problem.prior_precision
-    )
-    return o.size - o.n_free_zeros - used < SMALL_DOF
+def _residual_dof(
+    problem: CalibrationProblem,
+    information: Information,
+    sigma: float,
+    held: NDArray[np.bool_] | None = None,
+) -> float:
+    """Readings less free zeros and effective parameters."""
+    o, precision = problem.observations, problem.prior_precision
+    used = information.effective_parameters(sigma=sigma, precision=precision, held=held)
+    return o.size - o.n_free_zeros - used
 
 
 def require_determined(problem: CalibrationProblem, information: Information) -> None:
@@ -370,10 +373,7 @@ def _noise(
 ) -> Noise:
     """Noise from residuals with zeros eliminated, shape (n_entries,), [m]."""
     problem, loss = program.problem, program.options.loss
-    used = information.effective_parameters(
-        sigma=sigma, precision=problem.prior_precision, held=held
-    )
-    dof = problem.observations.size - problem.observations.n_free_zeros - used
+    dof = _residual_dof(problem, information, sigma, held)
     return estimate_noise(
         # a wrong reading in repeated cycles would increase the noise of all
         repeatability=(math.nan, 0) if loss.robust and dof > 1.0 else repeatability,

@@ -131,12 +131,10 @@ class RobotFunctions:
         """(actuated, passive, placements) to g, ∂g by actuated and passive; the tool likewise."""
 
         def outputs() -> list[ca.SX]:
-            rows = [self.wrench_row(frame, force=ca.SX(np.eye(3)[i]))[0] for i in range(3)]
+            tool, joints, _ = self._tool()
             g, _ = self._closure_derivatives
-            tool = self.tree.frame_pose(frame).position
-            return [self.closure, *self.split(g), tool, *self.split(ca.vertcat(*rows))]
+            return [self.closure, *self.split(g), tool, *self.split(joints)]
 
-        frame = self._tool_frame()
         return self._batch("closure_and_tool", outputs, matrices=(1, 2, 4, 5))
 
     @cached_property
@@ -187,65 +185,65 @@ class RobotFunctions:
         """(actuated, passive, placements) to the tool and ∂ by actuated, passive and twists."""
 
         def outputs() -> list[ca.SX]:
-            rows = [self.wrench_row(frame, force=ca.SX(np.eye(3)[i])) for i in range(3)]
-            joints = self.split(ca.vertcat(*(j for j, _ in rows)))
-            twists = ca.vertcat(*(t for _, t in rows))
-            return [self.tree.frame_pose(frame).position, *joints, twists]
+            tool, joints, twists = self._tool()
+            return [tool, *self.split(joints), twists]
 
-        frame = self._tool_frame()
         return self._batch("tool_jacobian", outputs, matrices=(1, 2, 3))
 
-    def _tool_frame(self) -> int:
-        """Index of the tool's frame."""
-        return self.robot.frame_id("" if self.robot.tcp is None else self.robot.tcp.frame)
+    def _tool(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Position of the tool, and its derivatives by joint coordinates and twists."""
+        frame = self.robot.frame_id("" if self.robot.tcp is None else self.robot.tcp.frame)
+        return self.tree.frame_pose(frame).position, *self.wrench_rows(frame, ca.SX.eye(3))
 
-    def wrench_row(
-        self, frame: int, *, force: ca.SX, moment: ca.SX | None = None
+    def wrench_rows(
+        self, frame: int, forces: ca.SX, moments: ca.SX | None = None
     ) -> tuple[ca.SX, ca.SX]:
         """Derivatives of f · p + m · φ of a frame, p its position, φ its rotation in the world.
 
         Args:
             frame: Index of the frame.
-            force: f, shape (3,).
-            moment: m, shape (3,); none by default.
+            forces: f of each row, shape (n, 3).
+            moments: m of each row, shape (n, 3); none by default.
 
         Returns:
-            By the joint coordinates, shape (1, nv), and by the twists of the moved placements,
-            shape (1, n_twists).
+            By the joint coordinates, shape (n, nv), and by the twists of the moved placements,
+            shape (n, n_twists).
         """
-        position = self.tree.frame_pose(frame).position
-        joints, twists = ca.SX(1, self.robot.model.nv), ca.SX(1, self.n_twists)
-        for source in self._sources(frame).values():
-            to_source = source.pose.rotation.T
-            torque = ca.cross(position - source.pose.position, force)
-            if moment is not None:
-                torque += moment
-            block = ca.vertcat(to_source @ force, to_source @ torque).T
-            self._place(joints, twists, source, block)
-        return joints, twists
+        sources = [(1.0, source) for source in self._sources(frame).values()]
+        return self._rows(sources, self.tree.frame_pose(frame).position, forces, moments)
 
     def _closure_blocks(self, closure: Closure) -> tuple[ca.SX, ca.SX]:
         """∂g of one closure: its rows are forces and moments on frame b, in the world."""
         a, b = self.robot.frame_id(closure.frame_a), self.robot.frame_id(closure.frame_b)
         pose_a, pose_b = self.tree.frame_pose(a), self.tree.frame_pose(b)
-        rows = list(closure.rows)
+        rows, moments = list(closure.rows), None
         if closure.kind == "3d":
-            forces, moments = pose_a.rotation[:, rows].T, ca.SX(len(rows), 3)
+            forces = pose_a.rotation[:, rows].T
         else:
             relative = pose_a.relative(pose_b)
             outer = log6_jacobian(relative.rotation, relative.position)[rows, :]
             forces, moments = outer[:, :3] @ pose_b.rotation.T, outer[:, 3:] @ pose_b.rotation.T
-        joints = ca.SX(len(rows), self.robot.model.nv)
-        twists = ca.SX(len(rows), self.n_twists)
-        sources_a, sources_b = self._sources(a), self._sources(b)
-        for key in (*sources_b, *sources_a):
-            if key in sources_a and key in sources_b:
-                continue  # moves both alike
-            sign, source = (1.0, sources_b[key]) if key in sources_b else (-1.0, sources_a[key])
-            arm = pose_b.position - source.pose.position
-            torque = moments - forces @ ca.skew(arm)
+        of_a, of_b = self._sources(a), self._sources(b)  # a common one moves both alike
+        sources = [(1.0, source) for key, source in of_b.items() if key not in of_a]
+        sources += [(-1.0, source) for key, source in of_a.items() if key not in of_b]
+        return self._rows(sources, pose_b.position, forces, moments)
+
+    def _rows(
+        self,
+        sources: Sequence[tuple[float, _MotionSource]],
+        position: ca.SX,
+        forces: ca.SX,
+        moments: ca.SX | None,
+    ) -> tuple[ca.SX, ca.SX]:
+        """Effect of unit twists in the frames of sources on rows of forces at a position."""
+        n = forces.size1()
+        joints, twists = ca.SX(n, self.robot.model.nv), ca.SX(n, self.n_twists)
+        for sign, source in sources:
+            torques = -forces @ ca.skew(position - source.pose.position)
+            if moments is not None:
+                torques += moments
             to_source = sign * source.pose.rotation
-            block = ca.horzcat(forces @ to_source, torque @ to_source)
+            block = ca.horzcat(forces @ to_source, torques @ to_source)
             self._place(joints, twists, source, block)
         return joints, twists
 

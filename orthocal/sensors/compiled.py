@@ -171,7 +171,7 @@ def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
     by_zero, by_twists = ca.SX(1, n_d), ca.SX(1, here.n_twists)
     for i, (machine, frame) in enumerate(trees):
         force, moment = values[1 + 2 * i], values[2 + 2 * i]
-        joints, twists = machine.wrench_row(frame, force=force, moment=moment)
+        joints, twists = machine.wrench_rows(frame, force.T, moment.T)
         actuated, passive = machine.split(joints)
         by_twists += twists
         if machine is there:

@@ -65,7 +65,7 @@ def test_derivatives_equal_those_of_the_expressions(request, name, size):
     geometry = errors.geometry(at)
     where = geometry.drives(d)[None], q[None], geometry.placements
     residual, g_a, g_q, g_t = _derivatives(functions, *where)
-    joints, twists = functions.wrench_row(frame, force=ca.SX(row))
+    joints, twists = functions.wrench_rows(frame, ca.SX(row).T)
     actuated, rest = functions.split(joints)
     of_frame = ca.Function("row", functions.symbols, [actuated, rest, twists])
     p_a, p_q, p_t = (np.asarray(v.full()) for v in of_frame(*(w.reshape(-1) for w in where)))
