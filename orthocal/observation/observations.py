@@ -15,7 +15,7 @@ from orthocal.effects.protocol import NEUTRAL, Condition, condition_size
 from orthocal.errors import SessionError
 from orthocal.kinematics.error_map import error_map
 from orthocal.robot.model import Robot
-from orthocal.session.session import Conditions, Session
+from orthocal.session.session import Conditions, Reading, Session
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -167,27 +167,26 @@ def build_observations(session: Session) -> Observations:
     nodes: dict[tuple[str, int, str], int] = {}
     plus, minus = [], []
     groups = _difference_groups(session)
-    for reading in session.readings:
-        setup = setups[reading.setup]
-        if reading.minus is None:
-            zero = zeros.setdefault((reading.setup,), len(zeros))
-            plus.append(len(entries))
+
+    def add(reading: Reading, posture: str, zero: tuple[str] | tuple[str, int, str]) -> int:
+        number = zeros.setdefault(zero, len(zeros))
+        entries.append((setups[reading.setup], postures[posture], number))
+        conditions.append(reading.conditions if reading.minus is None else None)
+        return len(entries) - 1
+
+    def find(reading: Reading, posture: str) -> int:
+        node = (reading.setup, reading.cycle, posture)
+        if node not in nodes:
+            nodes[node] = add(reading, posture, (reading.setup, reading.cycle, groups[node]))
+        return nodes[node]
+
+    for r in session.readings:
+        if r.minus is None:
+            plus.append(add(r, r.posture, (r.setup,)))
             minus.append(-1)
-            entries.append((setup, postures[reading.posture], zero))
-            conditions.append(reading.conditions)
-            continue
-        ends = []
-        for posture in (reading.posture, reading.minus):
-            node = (reading.setup, reading.cycle, posture)
-            if node not in nodes:
-                key = (reading.setup, reading.cycle, groups[node])
-                nodes[node] = len(entries)
-                zero = zeros.setdefault(key, len(zeros))
-                entries.append((setup, postures[posture], zero))
-                conditions.append(None)
-            ends.append(nodes[node])
-        plus.append(ends[0])
-        minus.append(ends[1])
+        else:
+            plus.append(find(r, r.posture))
+            minus.append(find(r, r.minus))
     table = np.array(entries, dtype=np.int64).reshape(-1, 3)
     values = _condition_values(session.robot, conditions, table[:, 0])
     states, state = _find_states(session, table[:, 1], values)

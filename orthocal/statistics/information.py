@@ -5,6 +5,7 @@ All quantities are in scaled parameters θ̂ = θ/(prior std), with gauge zeros 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -230,11 +231,9 @@ def require_identifiable(
     lost = tuple(n for n, size in zip(names, (null**2).sum(axis=0), strict=True) if size > 1e-12)
     if lost:
         information = take_for_known(information, len(names))
-        named = ", ".join(lost[:MOST_NAMED])
-        more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
         raise NotIdentifiableError(
-            f"the readings do not determine {named}{more}: {information.rank} of {len(names)} free "
-            f"parameters are identifiable. {_advise_lost(information, names, null)} Or use "
+            f"the readings do not determine {_list_some(lost)}: {information.rank} of "
+            f"{len(names)} free parameters are identifiable. {_advise_lost(information, names, null)} Or use "
             "tolerances as a prior (--prior), or identify base parameters (--base)",
             parameters=lost,
             where=where,
@@ -247,10 +246,9 @@ def _advise_lost(information: Information, names: tuple[str, ...], null: Array) 
     unread = sizes <= RANK_THRESHOLD * max(float(sizes.max(initial=0.0)), 1e-300)
     words = []
     if unread.any():
-        listed = [n for n, out in zip(names, unread, strict=True) if out]
-        more = f" and {len(listed) - MOST_NAMED} more" if len(listed) > MOST_NAMED else ""
+        unread_names = [n for n, out in zip(names, unread, strict=True) if out]
         words.append(
-            f"No reading depends on {', '.join(listed[:MOST_NAMED])}{more}: read the legs that are "
+            f"No reading depends on {_list_some(unread_names)}: read the legs that are "
             "missing, in postures along their own axes."
         )
     # each row of the reduced echelon form is one unobservable change of the others
@@ -259,13 +257,14 @@ def _advise_lost(information: Information, names: tuple[str, ...], null: Array) 
     for row in null_rows[:MOST_LOST]:
         order = np.argsort(-np.round(np.abs(row), 9), kind="stable")
         terms = [i for i in order if abs(row[i]) > 1e-6]
-        ways = ", ".join(
-            f"{seen[i]} {'up' if row[i] * row[terms[0]] > 0 else 'down'}"
-            for i in terms[:MOST_NAMED]
-        )
-        others = f" and {len(terms) - MOST_NAMED} more" if len(terms) > MOST_NAMED else ""
-        words.append(f"No reading depends on this combined change: {ways}{others}.")
+        ways = [f"{seen[i]} {'up' if row[i] * row[terms[0]] > 0 else 'down'}" for i in terms]
+        words.append(f"No reading depends on this combined change: {_list_some(ways)}.")
     return " ".join(words)
+
+
+def _list_some(items: Sequence[str]) -> str:
+    more = f" and {len(items) - MOST_NAMED} more" if len(items) > MOST_NAMED else ""
+    return ", ".join(items[:MOST_NAMED]) + more
 
 
 def _reduce(rows: Array) -> Array:

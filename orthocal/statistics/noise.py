@@ -175,8 +175,10 @@ def estimate_noise(
         source = "residuals" if misfit else "cycles"
     elif enough:
         provisional = residual_dof < FEW_DOF and floor > 0.0 and gauge_sigma is not None
-        by_chance = provisional and not _exceeds(residual_square, residual_dof, floor)
-        source = "gauge" if by_chance else "residuals"
+        excess = not provisional or (
+            chance_of_excess(residual_square / floor**2, residual_dof) < BY_CHANCE
+        )
+        source = "residuals" if excess else "gauge"
     else:
         source = "gauge" if gauge_sigma is not None else "unknown"
     sigma, dof = {
@@ -190,8 +192,3 @@ def estimate_noise(
     return Noise(
         sigma, dof, source, cycles_sigma, cycles_dof, residual_sigma, max(residual_dof, 0.0)
     )
-
-
-def _exceeds(square: float, dof: float, sigma: float) -> bool:
-    """Test for residuals larger than noise with standard deviation [m]."""
-    return chance_of_excess(square / sigma**2, dof) < BY_CHANCE

@@ -66,16 +66,14 @@ class BatchProgram:
         """Solve for each set of readings.
 
         Args:
-            values: Readings as entries, shape (S, n_entries), [m of the first gauge], or rows of
-                the session, shape (S, n_rows), where these are differences, [m].
+            values: Readings as single ones, shape (S, n_entries), [m of the first gauge].
             sigma: Standard deviation of one reading, [m].
 
         Raises:
-            ValueError: If the number of readings does not fit.
             SolverError: If a set does not converge, not even alone.
             ClosureError: If the machine cannot reach a posture with the start values.
         """
-        problem, y = self.problem, self._entries(values)
+        problem, y = self.problem, np.asarray(values, dtype=np.float64)
         shared = _Shared(problem, self.options, sigma)
         n_sets, n = len(y), problem.n_free
         solution = BatchSolution(
@@ -96,15 +94,6 @@ class BatchProgram:
             solution.theta[i], solution.zeros[i] = one.theta, one.zeros
             solution.objective[i], solution.at_bound[i] = one.objective, one.at_bound
         return solution
-
-    def _entries(self, values: ArrayLike) -> Array:
-        o = self.problem.observations
-        rows = np.atleast_2d(np.asarray(values, dtype=np.float64))
-        if rows.ndim == 2 and rows.shape[1] == o.size:
-            return rows
-        if rows.ndim == 2 and rows.shape[1] == o.plus.size:
-            return np.array([o.values(row) for row in rows]) / self.problem.noise
-        raise ValueError(f"found the shape {rows.shape}; expected (n_sets, {o.size})")
 
     def _solve_part(self, shared: _Shared, y: Array, solution: BatchSolution, part: slice) -> None:
         """Gauss-Newton steps for some sets; fills their part of the solution."""

@@ -125,14 +125,3 @@ def test_a_set_far_from_the_others_is_solved_as_well(root):
     values[7] = problem.predict(np.full(3, 2.0) * problem.theta_scale)
     found = BatchProgram(problem).solve(values, sigma=SIGMA)
     assert np.abs(found.theta[7] / problem.theta_scale - 2.0).max() < AGREED
-
-
-def test_rows_of_the_session_are_readings_too(root):
-    session = exact(load_session(root / "examples/table1/experiment-2"))
-    problem = build_problem(session, model="offsets")
-    rows = np.tile(session.values, (3, 1))
-    found = BatchProgram(problem).solve(rows, sigma=SIGMA)
-    alone = VariableProjection(problem).solve(sigma=SIGMA)
-    assert np.abs(found.theta - alone.theta).max() < 1e-12
-    with pytest.raises(ValueError, match="expected"):
-        BatchProgram(problem).solve(rows[:, 1:], sigma=SIGMA)
