@@ -231,10 +231,11 @@ def require_identifiable(
     lost = tuple(n for n, size in zip(names, (null**2).sum(axis=0), strict=True) if size > 1e-12)
     if lost:
         information = take_for_known(information, len(names))
+        advice = _advise_lost(information, names, null)
         raise NotIdentifiableError(
             f"the readings do not determine {_list_some(lost)}: {information.rank} of "
-            f"{len(names)} free parameters are identifiable. {_advise_lost(information, names, null)} Or use "
-            "tolerances as a prior (--prior), or identify base parameters (--base)",
+            f"{len(names)} free parameters are identifiable. {advice} Or use tolerances as a prior "
+            "(--prior), or identify base parameters (--base)",
             parameters=lost,
             where=where,
         )
