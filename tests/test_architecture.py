@@ -13,11 +13,12 @@ from conftest import ROOT
 
 import orthocal
 
-BASE = "text arguments errors units runtime io"
+BASE = "arrays text arguments errors units runtime io"
 MACHINE = f"{BASE} robot effects kinematics sensors session observation measurement"
 ESTIMATE = f"{MACHINE} statistics estimation"
 
 ALLOWED = {
+    "arrays": "",
     "text": "",
     "units": "",
     "arguments": "",

@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthocal.arrays import Array, Mask
 from orthocal.errors import ClosureError, SolverError
 from orthocal.estimation.linear import Linearisation, linearise_at_reference
 from orthocal.estimation.loss import Loss
@@ -34,8 +35,6 @@ from orthocal.statistics.information import (
 )
 from orthocal.statistics.noise import Noise, estimate_noise, estimate_repeatability
 from orthocal.statistics.zeros import project_out_zeros
-
-Array = NDArray[np.float64]
 
 SIGMA_SETTLED = 0.03
 """Relative change of sigma below which no further solution is needed: with a prior it changes no
@@ -113,7 +112,7 @@ class Fit:
         return o.size - o.n_free_zeros - repeated
 
     @property
-    def held(self) -> NDArray[np.bool_]:
+    def held(self) -> Mask:
         """Mask of the parameters at a bound, shape (n_free,)."""
         return np.asarray(self.solution.at_bound != 0)
 
@@ -247,7 +246,7 @@ def _weigh(
     jacobian: Array,
     information: Information,
     sigma: float,
-    held: NDArray[np.bool_],
+    held: Mask,
 ) -> Array:
     """Noise of each entry relative to the first gauge, from the residuals, (n_entries,)."""
     covariance = information.covariance(sigma=sigma, precision=problem.prior_precision, held=held)
@@ -329,7 +328,7 @@ def _residual_dof(
     problem: CalibrationProblem,
     information: Information,
     sigma: float,
-    held: NDArray[np.bool_] | None = None,
+    held: Mask | None = None,
 ) -> float:
     """Readings less free zeros and effective parameters."""
     o, precision = problem.observations, problem.prior_precision
@@ -369,7 +368,7 @@ def _noise(
     sigma: float,
     repeatability: tuple[float, int],
     *,
-    held: NDArray[np.bool_] | None = None,
+    held: Mask | None = None,
 ) -> Noise:
     """Noise from residuals with zeros eliminated, shape (n_entries,), [m]."""
     problem, loss = program.problem, program.options.loss
@@ -405,7 +404,7 @@ def find_gauge_covariance(
     information: Information,
     *,
     sigma: float,
-    held: NDArray[np.bool_] | None = None,
+    held: Mask | None = None,
 ) -> Array:
     """Part of the covariance of the machine's parameters that is due to mounting errors.
 

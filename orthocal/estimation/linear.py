@@ -6,15 +6,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthocal.arrays import Array, Mask
 from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.orthoglide import displacement_angle
 from orthocal.statistics.information import RANK_THRESHOLD, Information, decompose
 from orthocal.statistics.zeros import project_out_zeros
-
-Array = NDArray[np.float64]
 
 TWELVE_ROWS = tuple(
     f"{row}{sign}"
@@ -149,7 +148,7 @@ class Linearisation:
     """dh/dθ̂, gauge zeros eliminated, shape (n_entries, n_free), [m per prior std]."""
     information: Information
 
-    def solve(self, *, sigma: float, use: NDArray[np.bool_] | None = None) -> Array:
+    def solve(self, *, sigma: float, use: Mask | None = None) -> Array:
         """First-order solution: generalised least squares with the problem's prior and bounds.
 
         Args:

@@ -19,12 +19,10 @@ from typing import Literal, TypeVar
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Indices
 from orthocal.errors import OrthocalError
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 LossKind = Literal["squares", "huber"]
 Values = TypeVar("Values", Array, ca.SX)
 

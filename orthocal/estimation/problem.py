@@ -14,8 +14,9 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthocal.arrays import Array, Mask
 from orthocal.errors import ClosureError, RobotError
 from orthocal.estimation.selection import Known, Selection, select_parameters
 from orthocal.kinematics.function_cache import cached_per_robot
@@ -27,9 +28,6 @@ from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.robot.model import Robot, closure_row_units, coordinate_units
 from orthocal.robot.parameters import AXES
 from orthocal.session.session import Session
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 LENGTH_SCALE = 1e-3
 """Scale of closures, passive motions and gauge zeros, [m]."""
@@ -183,7 +181,7 @@ class CalibrationProblem:
             failures=failures,
         )
 
-    def simulate(self, theta: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def simulate(self, theta: Array) -> tuple[Array, Array, Mask]:
         """Readings of a batch of machines.
 
         Args:

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Mask
 from orthocal.errors import ParameterError
 from orthocal.io.documents import parse_number
 from orthocal.io.fields import read_only
@@ -16,7 +16,6 @@ from orthocal.robot.parameters import Parameter, ParameterSet, errors_at, requir
 from orthocal.text import composed
 from orthocal.units import Unit, show_limit
 
-Array = NDArray[np.float64]
 Known = float | tuple[float, float]
 
 COMPLETE_MODELS = ("full", "complete")
@@ -43,7 +42,7 @@ class Selection:
     """Model and the patterns added to it."""
     parameters: tuple[Parameter, ...]
     """Free parameters, with the priors of this selection."""
-    prior: NDArray[np.bool_]
+    prior: Mask
     """Mask of the parameters with a prior, shape (n_free,)."""
     mean: Array
     """Mean of each prior, shape (n_free,), [SI]."""

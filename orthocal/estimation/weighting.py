@@ -12,14 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Mask
 from orthocal.observation.observations import Observations
 from orthocal.session.session import Gauge, Session
 from orthocal.statistics.noise import estimate_noise, estimate_repeatability, noise_floor
 from orthocal.statistics.zeros import project_out_zeros
-
-Array = NDArray[np.float64]
 
 DEFAULT_SIGMA = 10e-6
 """Standard deviation of a reading assumed at first if none is stated, [m]."""
@@ -37,7 +35,7 @@ class GaugeReadings:
 
     name: str
     gauge: Gauge
-    entries: NDArray[np.bool_]
+    entries: Mask
     """Shape (n_entries,)."""
 
 

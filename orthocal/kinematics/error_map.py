@@ -21,15 +21,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthocal.arrays import Array, Mask
 from orthocal.effects.machine import express_machine
 from orthocal.effects.protocol import NEUTRAL, Condition, condition_size
 from orthocal.kinematics.backend.batch_function import BatchFunction
 from orthocal.kinematics.se3 import exp6, right_jacobian
 from orthocal.kinematics.symbolic import Pose, nominal_placement
 from orthocal.robot.model import Robot
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -295,7 +293,7 @@ class ErrorMap:
         at = np.asarray(errors, dtype=np.float64)
         return self._twists.columns(at, columns, self._conditions(command))
 
-    def twists_moved_by(self, columns: Array) -> NDArray[np.bool_]:
+    def twists_moved_by(self, columns: Array) -> Mask:
         """Mask of the twists that parameters change, shape (6 n_moved,).
 
         Args:
@@ -361,7 +359,7 @@ class _Twists:
             return result
         return np.asarray(result + self._evaluate(errors, conditions)[1] @ columns[self._varying])
 
-    def moved_by(self, errors: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def moved_by(self, errors: Mask) -> Mask:
         """Mask of the twists that some errors change."""
         result = np.zeros(self._n, dtype=np.bool_)
         result[self._rows[errors[self._columns]]] = True

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.arguments import require_kind
+from orthocal.arrays import Array, Indices, Mask
 from orthocal.errors import ClosureError
 from orthocal.kinematics.error_map import MachineGeometry
 from orthocal.kinematics.function_cache import cached_per_robot
@@ -33,8 +34,6 @@ from orthocal.robot.model import (
 )
 from orthocal.units import DRIVE_UNITS
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Evaluate = Callable[[Array, Array, MachineGeometry], tuple[Array, Array]]
 Failures = dict[int, ClosureError]
 """Index of a posture to the reason why it cannot be reached. In a batch of machines, posture k of
@@ -130,7 +129,7 @@ class System:
             steps[usable] = -(inverse @ residuals[usable][..., None])[..., 0]
         return steps
 
-    def regular_step(self, residuals: Array, jacobians: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def regular_step(self, residuals: Array, jacobians: Array) -> tuple[Array, Mask]:
         """Newton steps, and a mask of the Jacobians that are certainly not singular.
 
         The ratio of singular values is at least 1/(|A| |A⁻¹|) by Frobenius' norm, with the inverse
@@ -343,7 +342,7 @@ class _Path:
 
     def _newton(
         self, points: NDArray[np.intp], start: Array, p: Array
-    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+    ) -> tuple[Array, Array, Mask]:
         """Damped Newton's method of some points at once.
 
         Returns:

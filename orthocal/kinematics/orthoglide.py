@@ -10,12 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthocal.arrays import Array
 from orthocal.errors import UnreachableError
 from orthocal.units import MM
-
-Array = NDArray[np.float64]
 
 
 def constraint_residual(

@@ -15,8 +15,8 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Indices
 from orthocal.kinematics.backend.batch_function import BatchFunction
 from orthocal.kinematics.error_map import ErrorMap, error_map
 from orthocal.kinematics.function_cache import cached_function, cached_per_robot, function_key
@@ -24,9 +24,6 @@ from orthocal.kinematics.se3 import log6_jacobian
 from orthocal.kinematics.symbolic import Pose, SymbolicTree, closure_residual
 from orthocal.robot.frames import carriers
 from orthocal.robot.model import Closure, Robot, closure_row_units, joint_axis
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,7 +143,7 @@ class RobotFunctions:
         return self._batch("closure_jacobian", self._jacobian_outputs, matrices=(1, 2), sparse=(3,))
 
     @cached_property
-    def twist_pattern(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def twist_pattern(self) -> tuple[Indices, Indices]:
         """Rows and columns of the nonzeros of ∂g by twists, column by column."""
         return self.closure_jacobian.pattern("y3")
 

@@ -17,9 +17,9 @@ from typing import Any, NamedTuple, TypeAlias, overload
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from orthocal.arrays import Array
+
 Operand: TypeAlias = Any
 """A NumPy array or a CasADi expression."""
 

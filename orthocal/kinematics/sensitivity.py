@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthocal.arrays import Array
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import robot_functions
 from orthocal.robot.model import Robot, require_tcp
-
-Array = NDArray[np.float64]
 
 
 class ToolSensitivity:

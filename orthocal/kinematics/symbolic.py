@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.effects.machine import express_machine
 from orthocal.effects.protocol import Condition, Placement
 from orthocal.errors import RobotError
@@ -73,7 +73,7 @@ def joint_motion(model: pin.Model, joint: int, coordinates: ca.SX) -> Pose:
     return screw_motion(joint_axis(model, joint), coordinates)
 
 
-def screw_motion(axis: NDArray[np.float64], angle: ca.SX) -> Pose:
+def screw_motion(axis: Array, angle: ca.SX) -> Pose:
     """exp6(S q) for a constant S = (v, ω) with |ω| = 1 or ω = 0, shape (6,)."""
     v, w = np.array(axis[:3]), np.array(axis[3:])
     if not np.any(w):

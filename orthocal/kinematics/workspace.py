@@ -13,8 +13,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthocal.arrays import Array
 from orthocal.errors import ClosureError, RobotError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.function_cache import cached_per_robot
@@ -22,8 +23,6 @@ from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.robot.model import Robot, require_commanded_tool
 from orthocal.units import MM
-
-Array = NDArray[np.float64]
 
 LARGEST_HALF_SIDE = 0.06
 """Half the side of the default cube, [m]; less where the machine does not reach it."""

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from orthocal.arrays import Array
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.robot_functions import reference_poses, robot_functions
 from orthocal.observation.observations import drive_table
 from orthocal.sensors.protocol import Contact
 from orthocal.session.session import Session
-
-Array = NDArray[np.float64]
 
 
 def locate_contacts(session: Session) -> dict[str, tuple[list[str], Contact]]:

@@ -17,12 +17,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Mask
 from orthocal.observation.sensor_groups import NuisanceParameters
 from orthocal.session.session import Posture, Reading, Session, Setup
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +37,7 @@ class ManualAlignment:
         return np.asarray(errors @ self.sensitivity.T + self.start)
 
     @property
-    def aligned(self) -> NDArray[np.bool_]:
+    def aligned(self) -> Mask:
         """Mask of the nuisance parameters that are aligned by eye, shape (n_nuisance,)."""
         return np.asarray(self.sensitivity.any(axis=1))
 

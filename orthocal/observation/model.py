@@ -20,8 +20,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthocal.arrays import Array, Indices
 from orthocal.kinematics.error_map import ErrorMap, MachineGeometry
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import RobotFunctions, robot_functions
@@ -34,9 +35,6 @@ from orthocal.observation.sensor_groups import (
     nuisance_parameters,
 )
 from orthocal.session.session import Session
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 MAX_POSTURES, MAX_READINGS = 64, 640
 """Postures and readings of one block: its Jacobians stay in the processor's cache."""

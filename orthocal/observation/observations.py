@@ -8,18 +8,14 @@ from datetime import datetime
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Indices, Mask
 from orthocal.effects.loading import robot_effects
 from orthocal.effects.protocol import NEUTRAL, Condition, condition_size
 from orthocal.errors import SessionError
 from orthocal.kinematics.error_map import error_map
 from orthocal.robot.model import Robot
 from orthocal.session.session import Conditions, Reading, Session
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-
 
 APPROACH = {"p": 1.0, "n": -1.0, "u": 0.0}
 """Letter of an approach to the direction of the drive's last motion."""
@@ -70,7 +66,7 @@ class Observations:
     """Setup of each zero."""
     zero_real: tuple[bool, ...]
     """True for the zero of a gauge, False for one that replaces differences."""
-    zero_known: NDArray[np.bool_]
+    zero_known: Mask
     """Mask of the zeros that are known to be 0, shape (n_zeros,)."""
     plus: Indices
     """Entry of each row of the session, shape (n_rows,)."""
@@ -94,7 +90,7 @@ class Observations:
         """Number of entries."""
         return self.setup.size
 
-    def only(self, chosen: NDArray[np.bool_]) -> Observations:
+    def only(self, chosen: Mask) -> Observations:
         """Some of the entries, without rows."""
         none = np.empty(0, dtype=np.int64)
         return replace(

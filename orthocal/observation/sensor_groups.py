@@ -6,17 +6,14 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Indices
 from orthocal.effects.loading import reading_effects
 from orthocal.observation.observations import Observations
 from orthocal.robot.parameters import Parameter
 from orthocal.sensors.compiled import CompiledReading, compile_reading
 from orthocal.sensors.protocol import NuisanceParameter
 from orthocal.session.session import Session, Setup
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,10 +10,10 @@ from typing import Annotated
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from orthocal.arguments import require_kind, require_names, require_numbers, require_seed
+from orthocal.arrays import Array
 from orthocal.errors import ParameterError, SessionError
 from orthocal.io.documents import Number, parse_number, read_yaml, validate
 from orthocal.observation.model import predict_readings
@@ -23,8 +23,6 @@ from orthocal.robot.model import Robot
 from orthocal.robot.parameters import errors_at
 from orthocal.session.session import Reading, Session
 from orthocal.units import MM, to_mm
-
-Array = NDArray[np.float64]
 
 LARGEST_ZERO = 0.2e-3
 """Limit of the uniform distribution of a dial's first reading in a setup, [m]."""

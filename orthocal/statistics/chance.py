@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthocal.arrays import Array
 from orthocal.statistics.distributions import chi_square_tail, f_tail, normal_quantile, t_quantile
 
 BY_CHANCE = 0.01
@@ -50,9 +51,7 @@ def coverage_factor(dof: float) -> float:
     return max(COVERAGE, factor) if math.isfinite(factor) else math.nan
 
 
-def expanded_uncertainty(
-    std: ArrayLike, std_scatter: ArrayLike, *, dof: float
-) -> NDArray[np.float64]:
+def expanded_uncertainty(std: ArrayLike, std_scatter: ArrayLike, *, dof: float) -> Array:
     """Expanded uncertainty U of estimates, of any shape, in their unit.
 
     U² = (k_ν s)² + k² (u² − s²), k = 2, with Student's factor k_ν for the part s that is due to

@@ -12,15 +12,13 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, PlainSerializer
 
+from orthocal.arrays import Array
 from orthocal.io.documents import Count, Number
 from orthocal.io.fields import CLOSED, Many, Vector
 from orthocal.robot.parameters import Parameter
 from orthocal.statistics.information import RANK_THRESHOLD, Information
-
-Array = NDArray[np.float64]
 
 NEGLIGIBLE = 1e-9
 """Coefficients of a combination below this, in prior std, are rounding."""

@@ -9,13 +9,11 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Mask
 from orthocal.errors import NotIdentifiableError
 from orthocal.observation.observations import Observations
 from orthocal.statistics.zeros import project_out_zeros
-
-Array = NDArray[np.float64]
 
 RANK_THRESHOLD = 1e-10
 """Singular values below this part of the largest count as zero."""
@@ -65,12 +63,12 @@ class Information:
         return int((self.singular_values > RANK_THRESHOLD * largest).sum()) if largest > 0 else 0
 
     @property
-    def identifiable(self) -> NDArray[np.bool_]:
+    def identifiable(self) -> Mask:
         """Mask of the parameters that the readings alone determine, shape (n_free,)."""
         null = self.directions[self.rank :]
         return np.asarray(np.sqrt((null**2).sum(axis=0)) < 1e-6)
 
-    def determined(self, *, sigma: float) -> NDArray[np.bool_]:
+    def determined(self, *, sigma: float) -> Mask:
         """Mask of the parameters with a standard deviation below the prior one without prior.
 
         Args:
@@ -88,7 +86,7 @@ class Information:
         return np.asarray(((self.directions**2).T @ variance < 1.0) & self.identifiable)
 
     def effective_parameters(
-        self, *, sigma: float, precision: Array, held: NDArray[np.bool_] | None = None
+        self, *, sigma: float, precision: Array, held: Mask | None = None
     ) -> float:
         """Effective number of parameters, n − tr(P cov): the rank without a prior.
 
@@ -108,7 +106,7 @@ class Information:
         *,
         sigma: float,
         precision: Array,
-        held: NDArray[np.bool_] | None = None,
+        held: Mask | None = None,
         loss: tuple[float, float] = (1.0, 1.0),
     ) -> Array:
         """Covariance of θ̂, (Jᵀ J/σ² + P)⁻¹, shape (n_free, n_free).
@@ -140,7 +138,7 @@ class Information:
         *,
         sigma: float,
         precision: Array,
-        held: NDArray[np.bool_] | None = None,
+        held: Mask | None = None,
         loss: tuple[float, float] = (1.0, 1.0),
     ) -> Array:
         """Part of `covariance` that is due to noise, b A⁻¹ Jᵀ J A⁻¹/σ², shape (n_free, n_free).

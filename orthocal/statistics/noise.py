@@ -10,14 +10,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.io.documents import Count
 from orthocal.io.fields import CLOSED, Size, SizeOrInf, SizeOrNaN
 from orthocal.observation.observations import Observations
 from orthocal.statistics.chance import BY_CHANCE, chance_of_excess
-
-Array = NDArray[np.float64]
 
 FEW_DOF = 5.0
 """Degrees of freedom below which residuals replace the stated noise only if they are significant:

@@ -7,11 +7,9 @@ the mean over their zero.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.observation.observations import Observations
-
-Array = NDArray[np.float64]
 
 
 def project_out_zeros(

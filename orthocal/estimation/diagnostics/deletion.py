@@ -21,8 +21,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Indices
 from orthocal.errors import NotIdentifiableError
 from orthocal.estimation.fit import Fit, require_determined
 from orthocal.estimation.weighting import SMALLEST_SIGMA
@@ -30,8 +30,6 @@ from orthocal.observation.observations import Observations
 from orthocal.statistics.chance import confidence_factor
 from orthocal.statistics.information import Information, decompose
 from orthocal.statistics.zeros import project_out_zeros
-
-Array = NDArray[np.float64]
 
 MIN_REDUNDANCY = 1e-9
 """Redundancy of a row, relative to its weight, below which no other row predicts it."""
@@ -58,13 +56,13 @@ class Diagnostics:
     influence: Array
     """Largest change of an error of the machine when the row is deleted, in its standard
     deviations."""
-    influenced: NDArray[np.int64]
+    influenced: Indices
     """Index of that parameter."""
     critical: float
     """Studentised residual above which a row is an outlier."""
 
     @property
-    def suspicious(self) -> NDArray[np.int64]:
+    def suspicious(self) -> Indices:
         """Outliers, the largest first."""
         size = np.nan_to_num(np.abs(self.studentised))
         rows = np.flatnonzero(size > self.critical)
@@ -135,7 +133,7 @@ def _weighted_information(fit: Fit) -> Information:
     return Information(np.sqrt(fit.weights)[:, None] * centred)
 
 
-def _inverse_covariance(o: Observations, group: NDArray[np.int64]) -> Array | None:
+def _inverse_covariance(o: Observations, group: Indices) -> Array | None:
     """Inverse covariance of differences that share postures, for readings of variance 1.
 
     None for single readings, which share only their gauge zero.

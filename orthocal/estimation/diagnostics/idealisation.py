@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import build_problem
 from orthocal.robot.model import Robot
@@ -15,8 +15,6 @@ from orthocal.sensors.protocol import Sensor
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Session
 from orthocal.statistics.zeros import project_out_zeros
-
-Array = NDArray[np.float64]
 
 MOST_READINGS = 60
 """Largest number of readings that are compared, spread over the session."""

@@ -14,8 +14,8 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import ParameterError
 from orthocal.estimation.fit import Fit
 from orthocal.estimation.weighting import SMALLEST_SIGMA
@@ -24,8 +24,6 @@ from orthocal.io.fields import CLOSED, Many, Matrix, Sizes, read_only
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.robot.model import Robot
 from orthocal.statistics.zeros import project_out_zeros
-
-Array = NDArray[np.float64]
 
 WHOLE_MODEL = "full"
 """Model that lists the errors of joint placements that a machine has."""

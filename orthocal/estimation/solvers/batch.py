@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthocal.arrays import Array, Mask
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.variable_projection import VariableProjection, are_settled
-
-Array = NDArray[np.float64]
 
 MAX_STEPS = 30
 
@@ -42,7 +41,7 @@ class BatchSolution:
     """Shape (S,)."""
     at_bound: NDArray[np.int8]
     """As of a `Solution`, shape (S, n_free)."""
-    alone: NDArray[np.bool_]
+    alone: Mask
     """Mask of the sets that were solved one by one, shape (S,)."""
 
 
@@ -190,9 +189,7 @@ class _Shared:
             steps = np.linalg.pinv(normal, rcond=1e-13, hermitian=True) @ gradient[..., None]
         return np.asarray(steps[..., 0])
 
-    def evaluate(
-        self, y: Array, theta: Array, reading: Array
-    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def evaluate(self, y: Array, theta: Array, reading: Array) -> tuple[Array, Array, Mask]:
         """Zeros, objective, and a mask of the sets that are finite and within the bounds."""
         _, zeros, cost = self.residual((y - reading) / self.sigma)
         objective = cost + 0.5 * (self._precision * (theta - self._mean) ** 2).sum(axis=1)

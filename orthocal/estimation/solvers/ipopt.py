@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import OrthocalError, SolverError
 from orthocal.estimation.options import OptionValue, SolverOptions
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
@@ -27,9 +28,6 @@ from orthocal.estimation.solvers.program import (
     scaled_bounds,
 )
 from orthocal.runtime.interrupts import noticed_interrupt
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 FINEST_WEIGHT = 5e-6
 """Least standard deviation by which readings are weighted, [m]. The prior is scaled down with them:

@@ -13,16 +13,13 @@ from functools import partial
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Indices
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import Hessian
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.estimation.solvers.symbolic_problem import ReadingExpressions, SymbolicProblem
 from orthocal.kinematics.function_cache import cached_function
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 class SparseSum:

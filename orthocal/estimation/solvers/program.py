@@ -11,10 +11,9 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthocal.arrays import Array
 from orthocal.estimation.options import Hessian, SolverKind, SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
-
-Array = NDArray[np.float64]
 
 LEFT_OUT = 1e-9
 """Weight of excluded readings: negligible, but their gauge zeros stay determined."""

@@ -9,15 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import SolverError
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.program import Solution, SolverInput, scaled_bounds
 from orthocal.observation.model import Linearisation
-
-Array = NDArray[np.float64]
 
 SETTLED_WITHIN = 1e-11
 """Last step of a subproblem with a robust loss, [prior std]."""

@@ -12,16 +12,14 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Indices
 from orthocal.estimation.problem import LENGTH_SCALE, CalibrationProblem
 from orthocal.kinematics.error_map import SymbolicErrorMap
 from orthocal.kinematics.symbolic import SymbolicRobot
 from orthocal.observation.sensor_groups import SensorGroup
 from orthocal.robot.model import closure_row_units
 from orthocal.sensors.compiled import express_reading
-
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

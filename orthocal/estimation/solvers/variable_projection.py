@@ -10,15 +10,13 @@ objective decreases. The optimum is that of the complete program, which Ipopt so
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Mask
 from orthocal.errors import ClosureError, SolverError
 from orthocal.estimation.problem import LENGTH_SCALE
 from orthocal.estimation.solvers.program import Program, Solution, SolverInput, no_convergence
 from orthocal.estimation.solvers.subproblem import State, Task
 from orthocal.observation.model import Linearisation
-
-Array = NDArray[np.float64]
 
 SETTLED = 1e-8
 """Estimated next step at which the solver has converged, extrapolated from the ratio of the last
@@ -132,7 +130,7 @@ class VariableProjection(Program):
         )
 
 
-def are_settled(sizes: Array) -> NDArray[np.bool_]:
+def are_settled(sizes: Array) -> Mask:
     """Mask of the solutions whose next step is negligible, extrapolated from the last three.
 
     Args:

@@ -9,12 +9,11 @@ from typing import Literal
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthocal.arrays import Array, Indices
 from orthocal.kinematics.backend import llvm
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Backend = Literal["casadi", "llvm"]
 
 BLOCK_SIZES = (32, 8, 1)

@@ -20,10 +20,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Indices
 from orthocal.runtime import disk_cache
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 LANES = 16
 """Points for which an instruction is executed at once."""
