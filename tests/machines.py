@@ -18,7 +18,14 @@ def place(machine, drives, frame, *, start=None):
     return np.array(data.oMf[machine.frame_id(frame)].translation)
 
 
-@lru_cache(maxsize=64)
+def frames(machine, drives):
+    """Positions of all frames by name, loops closed by Pinocchio, [m]."""
+    start = machine.reference_passive
+    data = _closed(machine, tuple(np.ravel(drives).tolist()), tuple(np.ravel(start).tolist()))
+    return {f.name: np.array(data.oMf[i].translation) for i, f in enumerate(machine.model.frames)}
+
+
+@lru_cache(maxsize=256)
 def _closed(machine, drives, start):
     """Placements of all frames of a machine, closed once for all that are asked for."""
     passive = machine.close_with_pinocchio(drives, start)

@@ -66,13 +66,18 @@ def sound_readings(folder):
     return [f"{v / MM:.2f}" for v in sound_session(load_plan(folder), 0, entered=False).values]
 
 
+def blank(example, folder):
+    """A copy of a session without its readings, and what was typed for them."""
+    shutil.copytree(example, folder)
+    header, *rows = (example / "readings.csv").read_text().splitlines()
+    empty = [f"{row.rpartition(',')[0]}," for row in rows]
+    (folder / "readings.csv").write_text("\n".join([header, *empty]) + "\n")
+    return [row.rpartition(",")[2] for row in rows]
+
+
 def test_the_examples_readings_typed_over_a_pipe_calibrate_as_they_do(root, run, tmp_path):
-    example = root / "examples/raw-cycles"
-    folder = shutil.copytree(example, tmp_path / "typed")
-    rows = (example / "readings.csv").read_text().splitlines()
-    blank = [row.rpartition(",")[0] + "," for row in rows[1:]]
-    (folder / "readings.csv").write_text("\n".join([rows[0], *blank]) + "\n")
-    typed = [row.rpartition(",")[2].replace(".", ",").replace("-", "−") for row in rows[1:]]
+    example, folder = root / "examples/raw-cycles", tmp_path / "typed"
+    typed = [v.replace(".", ",").replace("-", "−") for v in blank(example, folder)]
     code, out, err = run(folder, *typed)
     assert (code, err) == (0, "")
     assert "All readings are recorded.\nEnter ends; `back` corrects.\n" in out
@@ -204,15 +209,6 @@ def test_what_can_be_typed_on_a_narrow_terminal(folder, run, name):
 
 WARNING = re.compile(r"^! ([^(:]+)(?: \((rows? [^)]*)\))?:(?= |$)", re.MULTILINE)
 """Kind of a warning, and its rows."""
-
-
-def blank(example, folder):
-    """A copy of a session without its readings, and what was typed for them."""
-    shutil.copytree(example, folder)
-    header, *rows = (example / "readings.csv").read_text().splitlines()
-    empty = [f"{row.rpartition(',')[0]}," for row in rows]
-    (folder / "readings.csv").write_text("\n".join([header, *empty]) + "\n")
-    return [row.rpartition(",")[2] for row in rows]
 
 
 def reviewed(folder):

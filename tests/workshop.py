@@ -7,10 +7,9 @@ none: nothing here is a formula of orthocal's.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
-import pinocchio as pin
+from machines import frames
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
@@ -52,9 +51,9 @@ class Workshop:
     def __init__(self, session, errors):
         self.session = session
         self.machine = session.robot.with_errors(errors)
-        self.frames = [_place(self.machine, p.drives) for p in session.postures.values()]
+        self.frames = [frames(self.machine, p.drives) for p in session.postures.values()]
         self.zero_drives = session.robot.drive_zero - session.active_offsets
-        self.at_zero = _place(self.machine, self.zero_drives)
+        self.at_zero = frames(self.machine, self.zero_drives)
 
     def beside(self, setup):
         """How far the rod lies beside its drawing where the setup begins, across leg and plunger.
@@ -68,9 +67,9 @@ class Workshop:
         commanded, active = self.session.postures[first].drives, self.session.active_offsets
         found = []
         for machine, more in ((self.machine, 0.0), (robot, active)):  # as it is, and as drawn
-            places = _place(machine, commanded + more)
+            places = frames(machine, commanded + more)
             root, way = places[rod.root], places[rod.tip] - places[rod.root]
-            zero = _place(machine, self.zero_drives + more)[leg.root]
+            zero = frames(machine, self.zero_drives + more)[leg.root]
             plane = leg.axis @ zero + sensor.section.value * leg.length
             share = (plane - leg.axis @ root) / (leg.axis @ way)
             found.append(side @ (root + share * way))
@@ -91,28 +90,13 @@ class Workshop:
         assert sensor.section.form == "fraction"
         along = axis @ self.at_zero[leg.root] + sensor.section.value * leg.length
         start = (along + crooked.section) * axis + drawn + crooked.lateral * side
-        frames = self.frames[list(self.session.postures).index(posture)]
-        root, end = frames[rod.root], frames[rod.tip]
+        places = self.frames[list(self.session.postures).index(posture)]
+        root, end = places[rod.root], places[rod.tip]
         touching = rod.radius + sensor.tip.radius
         ball = sensor.tip.form == "ball"
         distance = _to_axis(root, end) if ball else _between(root, end, edge)
         h = _touch(lambda h: distance(start + h * plunger), touching)
         return (1.0 + crooked.scale) * h + crooked.zero
-
-
-def _place(machine, drives):
-    """Positions of all frames, loops closed by Pinocchio."""
-    return _place_once(machine, tuple(drives.tolist()))
-
-
-@lru_cache(maxsize=256)
-def _place_once(machine, coordinates):
-    drives = np.array(coordinates)
-    passive = machine.close_with_pinocchio(drives, machine.reference_passive)
-    data = machine.model.createData()
-    q = machine.configuration(machine.joint_coordinates(drives, passive))
-    pin.framesForwardKinematics(machine.model, data, q)
-    return {f.name: np.array(data.oMf[i].translation) for i, f in enumerate(machine.model.frames)}
 
 
 def _across(sensor, leg):
