@@ -196,14 +196,9 @@ Workers = Annotated[
     int | None,
     Option(min=1, max=1024, metavar="N", help="Number of processes; default: all cores."),
 ]
-OutDirectory = Annotated[
-    Path,
-    Option("--out", metavar="DIRECTORY", help="Directory for the results; created if necessary."),
-]
-OptionalOutDirectory = Annotated[
-    Path | None,
-    Option("--out", metavar="DIRECTORY", help="Directory for the results; created if necessary."),
-]
+_OUT = Option("--out", metavar="DIRECTORY", help="Directory for the results; created if necessary.")
+OutDirectory = Annotated[Path, _OUT]
+OptionalOutDirectory = Annotated[Path | None, _OUT]
 Json = Annotated[bool, Option("--json", help="Print the result as JSON.")]
 Details = Annotated[
     bool, Option("--details", help="Print the complete result, not the short answer.")
