@@ -88,19 +88,13 @@ def find_homes(
         )
     changes = {e.drive: e.change for e in find_entries(calibration)}
     active = calibration.session.controller_offsets
-    return tuple(
-        JointHome(
-            drive=d.name,
-            unit=d.unit,
-            direction=d.direction,
-            change=d.direction * changes.get(d.name, 0.0),
-            old=None if old is None else old[i],
-            limits=None
-            if active is None
-            else (
-                d.joint_limits[0] + d.direction * active[i],
-                d.joint_limits[1] + d.direction * active[i],
-            ),
-        )
-        for i, d in enumerate(drives)
-    )
+    homes = []
+    for i, d in enumerate(drives):
+        limits = None
+        if active is not None:
+            lowest, highest = np.array(d.joint_limits) + d.direction * active[i]
+            limits = float(lowest), float(highest)
+        change = d.direction * changes.get(d.name, 0.0)
+        home = None if old is None else old[i]
+        homes.append(JointHome(d.name, d.unit, d.direction, change, home, limits))
+    return tuple(homes)
