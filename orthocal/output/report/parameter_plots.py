@@ -38,6 +38,12 @@ FEW_PARAMETERS = 12
 NEGLIGIBLE = 0.1
 """Negligible error of the linearised solution, [σ]."""
 
+MOST_ESTIMATES = 30
+"""Largest number of parameters whose estimates are shown."""
+
+MOST_CORRELATED = 40
+"""Largest number of parameters in the correlation matrix."""
+
 MOST_SHIFTS = 20
 """Largest number of parameters whose linearised solution is shown."""
 
@@ -77,15 +83,13 @@ def plot_linearised(calibration: Calibration) -> Figure | None:
 
 
 @plot("parameters")
-def plot_parameters(calibration: Calibration, *, most: int = 30) -> Figure:
+def plot_parameters(calibration: Calibration) -> Figure:
     """Estimates with 95 % intervals, and the share of the prior that the readings removed.
 
-    Args:
-        calibration: The calibration.
-        most: Largest number of parameters: offsets, then those that the readings determine best.
+    Of many parameters the offsets are shown, then those that the readings determine best.
     """
     free = calibration.free
-    rows = sorted(free, key=_importance)[:most]
+    rows = sorted(free, key=_importance)[:MOST_ESTIMATES]
     title = "Estimates with 95 % intervals"
     if len(rows) < len(free):
         title += f": {len(rows)} of {len(free)}, offsets, then the best determined"
@@ -131,19 +135,17 @@ def _draw_shares(axes: Axes, rows: Sequence[ParameterEstimate]) -> None:
 
 
 @plot("correlations")
-def plot_correlations(calibration: Calibration, *, most: int = 40) -> Figure | None:
+def plot_correlations(calibration: Calibration) -> Figure | None:
     """Correlation matrix of the estimates; nothing for fewer than two parameters.
 
-    Args:
-        calibration: The calibration.
-        most: Largest number of parameters: those with the strongest correlations.
+    Of many parameters those with the strongest correlations are shown.
     """
     matrix = calibration.correlation
     finite = np.flatnonzero(np.isfinite(np.diag(matrix)))
     if finite.size < 2:
         return None
     size = np.abs(matrix[np.ix_(finite, finite)] - np.eye(finite.size))
-    chosen = np.sort(finite[np.argsort(-size.max(axis=1), kind="stable")[:most]])
+    chosen = np.sort(finite[np.argsort(-size.max(axis=1), kind="stable")[:MOST_CORRELATED]])
     names = [short_name(calibration.free[i].name, LONGEST_IN_MATRIX) for i in chosen]
     title = "Correlations of the estimates"
     if chosen.size < finite.size:

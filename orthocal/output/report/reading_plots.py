@@ -40,20 +40,18 @@ _deviation, _residual, _unseen = map(attrgetter, ("deviation", "residual", "unse
 SMALLEST_LENGTH = 1e-9
 """Smallest length on a logarithmic axis, [m]."""
 
+MOST_ROWS = 40
+"""Largest number of readings or setups that are shown."""
+
 MOST_POINTS = 500
 """Largest number of points in a quantile plot; the outermost points are always shown."""
 
 
 @plot("residuals")
-def plot_residuals(calibration: Calibration, *, most: int = 40) -> Figure:
-    """Deviations of the readings before and after calibration, the worst first.
-
-    Args:
-        calibration: The calibration.
-        most: Largest number of readings that are shown.
-    """
+def plot_residuals(calibration: Calibration) -> Figure:
+    """Deviations of the readings before and after calibration, the worst first."""
     residuals = calibration.residuals
-    rows = sorted(residuals, key=lambda r: -max(abs(r.deviation), abs(r.residual)))[:most]
+    rows = sorted(residuals, key=lambda r: -max(abs(r.deviation), abs(r.residual)))[:MOST_ROWS]
     title = "Readings before and after calibration, the worst first"
     if len(rows) < len(residuals):
         title = f"Readings before and after calibration: the {len(rows)} worst of {len(residuals)}"
@@ -74,15 +72,10 @@ def plot_residuals(calibration: Calibration, *, most: int = 40) -> Figure:
 
 
 @plot("setups")
-def plot_setups(calibration: Calibration, *, most: int = 40) -> Figure:
-    """Root mean square of every setup before, after, and predicted from all other setups.
-
-    Args:
-        calibration: The calibration.
-        most: Largest number of setups that are shown.
-    """
+def plot_setups(calibration: Calibration) -> Figure:
+    """Root mean square of every setup before, after, and predicted from all other setups."""
     groups = rows_by_setup(calibration.residuals)
-    names = sorted(groups, key=lambda n: -root_mean_square(map(_residual, groups[n])))[:most]
+    names = sorted(groups, key=lambda n: -root_mean_square(map(_residual, groups[n])))[:MOST_ROWS]
     title = "Residuals per setup, the worst first"
     if len(names) < len(groups):
         title = f"Residuals per setup: the {len(names)} worst of {len(groups)}"

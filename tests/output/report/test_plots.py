@@ -264,10 +264,10 @@ def test_of_many_readings_the_largest_are_shown_and_that_is_said(sweep):
     assert "Readings before and after calibration: the 40 worst of 162" in texts(
         reading_plots.plot_residuals(sweep)
     )
-    figure = reading_plots.plot_residuals.figure(sweep, most=7)
-    assert title(figure).endswith("the 7 worst of 162")
+    figure = reading_plots.plot_residuals.figure(sweep)
+    assert title(figure).endswith("the 40 worst of 162")
     x, _ = line(figure.axes[0], "before")
-    rows = sorted(sweep.residuals, key=worst)[:7]
+    rows = sorted(sweep.residuals, key=worst)[:40]
     np.testing.assert_allclose(x, [r.deviation * 1e3 for r in rows], atol=UNIT)
 
 
@@ -275,9 +275,9 @@ def test_a_reading_that_the_calibration_spoils_is_among_the_worst(table1):
     best = min(table1.residuals, key=lambda r: abs(r.deviation))
     spoilt = replace(best, predicted=best.measured - 3e-3)
     rows = tuple(spoilt if r is best else r for r in table1.residuals)
-    figure = reading_plots.plot_residuals.figure(replace(table1, residuals=rows), most=1)
+    figure = reading_plots.plot_residuals.figure(replace(table1, residuals=rows))
     x, _ = line(figure.axes[0], "after")
-    np.testing.assert_allclose(x, [3.0], atol=UNIT)
+    np.testing.assert_allclose(x[0], 3.0, atol=UNIT)
 
 
 def test_plots_of_many_readings_stay_small(many):
@@ -334,8 +334,9 @@ def test_setups_that_no_other_predicts_have_no_such_marker(table1, unknown):
     assert labels == ["before", "after"]
 
 
-def test_the_worst_of_many_setups_are_shown(sweep):
-    figure = reading_plots.plot_setups.figure(sweep, most=5)
+def test_the_worst_of_many_setups_are_shown(sweep, monkeypatch):
+    monkeypatch.setattr(reading_plots, "MOST_ROWS", 5)
+    figure = reading_plots.plot_setups.figure(sweep)
     assert title(figure).endswith("the 5 worst of 18")
     assert len(row_names(figure.axes[0])) == 5
 
@@ -500,9 +501,7 @@ def test_the_band_of_a_parameter_is_where_its_prior_was(sweep):
     known = replace(sweep.parameters[0], mean=0.01, prior_std=0.005, std=0.004)
     without = replace(sweep.parameters[1], prior=False)
     parameters = (known, without, *sweep.parameters[2:])
-    axes = parameter_plots.plot_parameters.figure(
-        replace(sweep, parameters=parameters), most=30
-    ).axes[0]
+    axes = parameter_plots.plot_parameters.figure(replace(sweep, parameters=parameters)).axes[0]
     (band,) = axes.containers
     bars = {round(b.get_y() + 0.5): (b.get_x(), b.get_width()) for b in band}
     names = row_names(axes)
@@ -555,8 +554,9 @@ def test_numbers_have_the_signs_that_axes_have():
     ]
 
 
-def test_of_many_parameters_those_with_the_strongest_correlations_are_shown(sweep):
-    figure = parameter_plots.plot_correlations.figure(sweep, most=10)
+def test_of_many_parameters_those_with_the_strongest_correlations_are_shown(sweep, monkeypatch):
+    monkeypatch.setattr(parameter_plots, "MOST_CORRELATED", 10)
+    figure = parameter_plots.plot_correlations.figure(sweep)
     assert title(figure).endswith("the 10 of 129 parameters with the strongest")
     axes = figure.axes[0]
     names = [axes.get_xticklabels()[0].get_text(), *row_names(axes)]
