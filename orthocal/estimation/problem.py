@@ -36,15 +36,26 @@ LENGTH_SCALE = 1e-3
 class CalibrationProblem:
     """Readings of a session and the parameters to estimate from them.
 
-    The free parameters are errors of the machine, then nuisance parameters of the sensors. Entries
-    are weighted by their noise: they are in "metres of the first gauge", in which every reading has
-    the same standard deviation.
+    The free parameters are errors of the machine, then nuisance parameters of the sensors. An entry
+    is one reading; a difference has two. Entries are scaled by the ratio of their noise to that of
+    the first gauge ("metres of the first gauge"), so that all have equal standard deviations. With
+    one gauge they are in metres.
 
     Args:
         session: The session, or several joined ones.
         selection: The free errors of the machine and their priors.
         noise: Standard deviation of each entry's readings, as a multiple of the first gauge's,
             shape (n_entries,); 1 by default.
+
+    Attributes:
+        free: Names of the free parameters, which are the columns of the Jacobian.
+        fixed: Name to value of parameters that are known, [SI].
+        observations: Setup, posture and zero of each entry.
+        noise: The argument.
+        theta_scale: Prior standard deviations of the free parameters, shape (n_free,), [SI].
+        prior_precision: 1 for a free parameter with a prior, otherwise 0, shape (n_free,),
+            [1 per prior std²].
+        prior_mean: Means of the priors, shape (n_free,), [SI].
 
     Raises:
         RobotError: If closure rows of the robot depend on each other.
@@ -94,12 +105,12 @@ class CalibrationProblem:
 
     @property
     def n_machine(self) -> int:
-        """Number of free parameters that are errors of the machine: the first ones."""
+        """Number of free errors of the machine, which are the first free parameters."""
         return len(self.machine_selection.parameters)
 
     @property
     def n_free(self) -> int:
-        """Number of free parameters."""
+        """Number of free parameters, nuisance parameters included."""
         return len(self.free)
 
     @property
@@ -131,7 +142,7 @@ class CalibrationProblem:
 
     @cached_property
     def values(self) -> Array:
-        """Readings as single ones, shape (n_entries,), [m of the first gauge]."""
+        """Readings of the entries, shape (n_entries,), [m of the first gauge]."""
         return self.observations.values(self.session.values) / self.noise
 
     @cached_property
@@ -153,7 +164,7 @@ class CalibrationProblem:
         start: Array | None = None,
         failures: Failures | None = None,
     ) -> Array:
-        """Passive coordinates of every posture.
+        """Passive coordinates of every posture, with its loops closed.
 
         Args:
             theta: Shape (n_free,), or (S, n_free) for a batch, [SI]; or those of the machine.

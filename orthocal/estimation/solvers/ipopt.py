@@ -59,15 +59,15 @@ class Expressions:
     """x: θ̂, gauge zeros, the passive coordinates of every posture and the values of manually
     aligned nuisance parameters, scaled."""
     parameters: ca.MX
-    """p: readings, their weights and noise."""
+    """p: readings, weights and noise of the entries, then σ and scales of prior and loss."""
     objective: ca.MX
-    """Σ ρ(r/σ) plus the prior's share."""
+    """Σ ρ(r/σ) + ½ (θ − mean)ᵀ P⁻¹ (θ − mean), times (σ/5 µm)² where σ is below 5 µm."""
     constraints: ca.MX
     """0 where all loops are closed and aligned nuisance parameters have their values."""
     errors: dict[str, ca.MX]
     """Free parameter to its value, [SI]: errors of the machine, then nuisance parameters."""
     nuisance: dict[str, ca.MX]
-    """Nuisance parameter to its deviation from the manual alignment, [SI]."""
+    """Those of `errors` that are nuisance parameters: deviations from the manual alignment, [SI]."""
     zeros: ca.MX
     """Gauge zeros, shape (n_zeros,), [m of the first gauge]."""
     readings: ca.MX
@@ -266,7 +266,7 @@ class NonlinearProgram(Program):
         left_out: ArrayLike | None = None,
         widening: float = 1.0,
     ) -> Array:
-        """The program's parameters p: readings, weights, noise, σ, the prior's scale, the width.
+        """Values of the parameters p of `expressions()`.
 
         Args:
             sigma: Standard deviation of one reading, [m].
