@@ -28,7 +28,12 @@ solver = ca.nlpsol(
     {"ipopt": {"print_level": 0, "sb": "yes"}, "print_time": False},
 )
 sigma = orthocal.calibrate(session, choice).noise.sigma
-found = solver(x0=program.begin(sigma=sigma), p=program.pack(sigma=sigma), lbg=0.0, ubg=0.0)
+found = solver(
+    x0=program.initial_variables(sigma=sigma),
+    p=program.parameter_values(sigma=sigma),
+    lbg=0.0,
+    ubg=0.0,
+)
 own = (found["x"].full()[: problem.n_free, 0] * problem.theta_scale)[: problem.n_machine]
 
 free = orthocal.calibrate(session, choice)

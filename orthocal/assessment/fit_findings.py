@@ -33,7 +33,7 @@ def find_fit_findings(calibration: Calibration) -> list[Finding]:
 
 def _redundancy(calibration: Calibration) -> list[Finding]:
     """Finding about the readings that check the model."""
-    if calibration.spare_readings > 0:
+    if calibration.redundancy > 0:
         return []
     return [words.no_redundancy(calibration.identifiability.n_readings, len(calibration.free))]
 
@@ -52,7 +52,7 @@ def _residuals(calibration: Calibration) -> list[Finding]:
     if noise.source == "unknown":
         return [words.noise_unknown()]
     if noise.source == "gauge":
-        if calibration.spare_readings > 0:
+        if calibration.redundancy > 0:
             return [words.fits_stated_noise(noise.sigma)]
         return [words.noise_as_stated(noise.sigma)]
     if noise.source == "cycles":

@@ -193,7 +193,7 @@ def _predict_unseen(fit: Fit, linearisation: Linearisation, method: Method) -> A
                     sigma=fit.sigma,
                     start=fit.solution.theta,
                     start_passive=fit.solution.passive,
-                    left_out=np.flatnonzero(out),
+                    excluded=np.flatnonzero(out),
                 ).theta
             else:
                 theta = linearisation.solve(sigma=fit.sigma, use=~out)
@@ -210,4 +210,4 @@ def _linearisation_cost(fit: Fit, tool: ToolAccuracy) -> ErrorSize:
     change = np.zeros(len(tool.names))
     n = fit.problem.n_machine
     change[:n] = (fit.linear - fit.solution.theta)[:n]
-    return tool.measure(tool.jacobian @ change).headline
+    return tool.measure(tool.jacobian @ change).reported

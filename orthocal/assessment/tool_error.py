@@ -70,7 +70,7 @@ class ErrorSizes:
     absolute: ErrorSize
 
     @property
-    def headline(self) -> ErrorSize:
+    def reported(self) -> ErrorSize:
         """The reported form: aligned, or relative where there are too few points."""
         return self.relative if self.aligned is None else self.aligned
 
@@ -280,9 +280,9 @@ def summarise_tool(
     return ToolErrorSummary(
         box=tuple((float(low), float(high)) for low, high in accuracy.workspace.limits),
         coordinates=accuracy.workspace.letters,
-        now=math.hypot(now.headline.rms, known.headline.rms),
-        entered=math.hypot(entered.headline.rms, known.headline.rms),
-        compensated=known.headline.rms,
+        now=math.hypot(now.reported.rms, known.reported.rms),
+        entered=math.hypot(entered.reported.rms, known.reported.rms),
+        compensated=known.reported.rms,
         now_absolute=math.hypot(now.absolute.rms, known.absolute.rms),
         entered_absolute=math.hypot(entered.absolute.rms, known.absolute.rms),
     )

@@ -72,7 +72,7 @@ class Calibration(CalibrationRecord):
         return tuple(sorted(pairs, key=lambda p: -abs(p[2])))
 
     @property
-    def spare_readings(self) -> int:
+    def redundancy(self) -> int:
         """Independent readings minus resolvable parameters: they check the model."""
         rank = len(self.free) if self.base else self.identifiability.structural_rank
         return self.identifiability.n_readings - rank

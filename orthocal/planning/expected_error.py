@@ -82,9 +82,9 @@ class Expected:
         return self.tool.sizes
 
     @property
-    def headline(self) -> ErrorSize:
-        """Tool error in the form that decides."""
-        return self.tool.sizes.headline
+    def reported(self) -> ErrorSize:
+        """Tool error in the reported form."""
+        return self.tool.sizes.reported
 
 
 class ToolForecast:

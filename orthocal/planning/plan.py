@@ -258,7 +258,7 @@ def _scale(
 
     def rms(found: Expected) -> float:
         sizes = found.sizes
-        size = {"aligned": sizes.headline, "relative": sizes.relative, "absolute": sizes.absolute}
+        size = {"aligned": sizes.reported, "relative": sizes.relative, "absolute": sizes.absolute}
         return size[criterion].rms
 
     remainder = math.sqrt(max(rms(nominal) ** 2 - stage.error**2, 0.0))

@@ -128,7 +128,7 @@ def test_sizes_solved_by_hand():
     assert found.sizes.relative.rms == pytest.approx(2.0)
     assert found.sizes.relative.percentile_95 == pytest.approx(2.0 * 1.96, rel=0.05)
     assert found.sizes.aligned is None  # a rigid motion leaves nothing of two points
-    assert found.sizes.headline is found.sizes.relative
+    assert found.sizes.reported is found.sizes.relative
     assert found.covariance[1, 0, 0] == pytest.approx(36.0)
 
 

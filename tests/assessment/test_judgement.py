@@ -234,8 +234,8 @@ def test_two_gauges_are_each_held_to_their_own_resolution(workshop):
 def test_the_tool_error_is_that_of_the_accuracy(workshop):
     calibration = calibrate(workshop, solver="variable-projection")
     tool, accuracy = calibration.assessment.tool, assess_tool(calibration)
-    known = accuracy.after.sizes.headline.rms
-    left = accuracy.measure(accuracy.error_after_offsets).headline.rms
+    known = accuracy.after.sizes.reported.rms
+    left = accuracy.measure(accuracy.error_after_offsets).reported.rms
     assert tool.entered == pytest.approx(math.hypot(left, known), rel=1e-9)
     assert tool.compensated == pytest.approx(known, rel=1e-9)
     assert tool.region == "±60 mm"

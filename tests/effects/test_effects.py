@@ -358,7 +358,7 @@ def test_the_tool_follows_its_derivatives_and_comes_back(plan):
 def test_the_program_has_exact_derivatives(problem, hessian):
     program = NonlinearProgram(problem, options=SolverOptions(hessian=hessian))
     f, theta = program.functions(), point(problem)
-    x, p = program.begin(theta, sigma=1e-4), program.pack(sigma=1e-4)
+    x, p = program.initial_variables(theta, sigma=1e-4), program.parameter_values(sigma=1e-4)
     rng = np.random.default_rng(4)
     along = rng.normal(size=(x.size, 6))
     along /= np.linalg.norm(along, axis=0)

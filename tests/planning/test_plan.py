@@ -82,10 +82,10 @@ def test_the_error_of_the_search_is_the_posterior_of_the_session(planned):
         readings=tuple(r for r in planned.session.readings if r.cycle == 1),
     )
     forecast = planned.forecast
-    whole, again = (forecast.about_nominal(s).headline.rms for s in (first, planned.session))
-    factor = planned.curve[0].error / planned.known.headline.rms
+    whole, again = (forecast.about_nominal(s).reported.rms for s in (first, planned.session))
+    factor = planned.curve[0].error / planned.known.reported.rms
     assert planned.stage.error / factor == pytest.approx(whole, rel=1e-4)
-    assert planned.stage.error == pytest.approx(planned.expected.headline.rms)
+    assert planned.stage.error == pytest.approx(planned.expected.reported.rms)
     assert again < whole  # each first posture is read again
     errors = [s.error for s in planned.curve]
     assert errors == sorted(errors, reverse=True)
@@ -96,7 +96,7 @@ def test_a_plan_is_better_than_usual_ones_at_equal_cost(planned):
     assert names == ["the paper's", "even"]
     for usual in planned.compared:
         assert usual.minutes == pytest.approx(planned.minutes)
-        assert planned.expected.headline.rms < usual.expected.headline.rms
+        assert planned.expected.reported.rms < usual.expected.reported.rms
 
 
 def simulate_tool_error(plan, workspace, *, machines):
@@ -134,7 +134,7 @@ def simulate_tool_error(plan, workspace, *, machines):
 
 def test_calibrated_machines_have_the_expected_tool_error(planned):
     found = simulate_tool_error(planned, planned.forecast.workspace, machines=100)
-    assert found == pytest.approx(planned.expected.headline.rms, rel=0.05)
+    assert found == pytest.approx(planned.expected.reported.rms, rel=0.05)
 
 
 def test_the_expected_tool_error_is_for_the_stated_workspace(tmp_path):
@@ -147,8 +147,8 @@ def test_the_expected_tool_error_is_for_the_stated_workspace(tmp_path):
     assert plan.forecast.workspace.half_side == pytest.approx(0.08)
     small = ToolForecast(robot, plan.forecast.selection, cube(robot, half_side=0.06))
     true = simulate_tool_error(plan, plan.forecast.workspace, machines=60)
-    assert true == pytest.approx(plan.expected.headline.rms, rel=0.1)
-    assert true > 1.2 * small.after(plan.session).headline.rms
+    assert true == pytest.approx(plan.expected.reported.rms, rel=0.1)
+    assert true > 1.2 * small.after(plan.session).reported.rms
 
 
 def test_readings_of_machines_at_tolerance_stay_in_the_gauges_range(planned):
@@ -218,13 +218,13 @@ def test_further_setups_combine_with_the_measured_session(orthoglide, root):
         orthoglide, choice, setups=2, measured=measured, equipment=equipment, starts=1
     )
     forecast = plan.forecast
-    assert plan.known.headline.rms == pytest.approx(forecast.after(measured).headline.rms)
-    assert plan.expected.headline.rms < plan.known.headline.rms
+    assert plan.known.reported.rms == pytest.approx(forecast.after(measured).reported.rms)
+    assert plan.expected.reported.rms < plan.known.reported.rms
     # the curve begins with what is known: readings of the session, with the same dial
     whole = join_sessions([measured, plan.session])
     first = replace(whole, readings=tuple(r for r in whole.readings if r.cycle == 1))
-    factor = plan.stage.error / forecast.about_nominal(first).headline.rms
-    known = forecast.about_nominal(measured).headline.rms
+    factor = plan.stage.error / forecast.about_nominal(first).reported.rms
+    known = forecast.about_nominal(measured).reported.rms
     assert plan.curve[0].error == pytest.approx(factor * known, rel=1e-3)
     assert set(plan.session.setups).isdisjoint(measured.setups)
 
@@ -282,7 +282,7 @@ def test_the_default_workspace_keeps_clear_of_the_end_of_the_reach(tmp_path, leg
     assert (drives >= sizes.lower).all()
     assert (drives <= sizes.upper).all()
     forecast = ToolForecast(robot, Choice("full").select(robot.parameters))
-    assert forecast.before.headline.largest < 0.5 * space.half_side
+    assert forecast.before.reported.largest < 0.5 * space.half_side
 
 
 def make_search(robot, equipment):

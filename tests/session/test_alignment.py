@@ -53,8 +53,8 @@ def test_the_order_of_rows_changes_no_estimate(how, workshop, calibration):
     np.testing.assert_allclose(
         tools[1].error_after_offsets, tools[0].error_after_offsets, atol=1e-12
     )
-    assert tools[1].after.sizes.headline.rms == pytest.approx(
-        tools[0].after.sizes.headline.rms, rel=1e-9
+    assert tools[1].after.sizes.reported.rms == pytest.approx(
+        tools[0].after.sizes.reported.rms, rel=1e-9
     )
 
 

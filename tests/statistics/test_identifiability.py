@@ -225,5 +225,5 @@ def test_the_base_parameters_of_table_1_are_the_three_offsets(experiment_2):
         assert a.value == pytest.approx(b.value, abs=1e-9)
     known = [np.diag(c.model_covariance) for c in (base, offsets)]
     assert known[0] == pytest.approx(known[1], rel=1e-6)
-    assert base.spare_readings == 3
-    assert calibrate(experiment_2, "full").spare_readings == 0
+    assert base.redundancy == 3
+    assert calibrate(experiment_2, "full").redundancy == 0

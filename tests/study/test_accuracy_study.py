@@ -44,7 +44,7 @@ def test_tool_error_agrees_with_the_covariance(workshop, model):
     """All errors are random, all or offsets are identified, gauges have mounting errors."""
     result = summary(build_accuracy_study(workshop, Choice(model, tolerances=NEAR), machines=300))
     assert result.machines > 290
-    assert abs(result.after - result.predicted.headline.rms) < 3.0 * result.standard_error
+    assert abs(result.after - result.predicted.reported.rms) < 3.0 * result.standard_error
     assert result.standard_error < 0.05 * result.after
     for e in result.parameters:
         assert abs(e.rms - e.predicted) < 4.5 * e.standard_error + 0.02 * e.predicted

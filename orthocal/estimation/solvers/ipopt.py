@@ -67,7 +67,7 @@ class Expressions:
     errors: dict[str, ca.MX]
     """Free parameter to its value, [SI]: errors of the machine, then nuisance parameters."""
     nuisance: dict[str, ca.MX]
-    """Those of `errors` that are nuisance parameters: deviations from the manual alignment, [SI]."""
+    """Those of `errors` that are nuisance parameters, each from its manual alignment, [SI]."""
     zeros: ca.MX
     """Gauge zeros, shape (n_zeros,), [m of the first gauge]."""
     readings: ca.MX
@@ -132,8 +132,8 @@ class NonlinearProgram(Program):
             return program._run(readings)
         step = readings
         try:
-            for widening in WIDENINGS:  # nearly squares first, then the requested width
-                solution = program._run(step, widening)
+            for width_factor in WIDENINGS:  # nearly squares first, then the requested width
+                solution = program._run(step, width_factor)
                 step = replace(step, start=solution.theta, start_passive=solution.passive)
         except SolverError:
             if exact:
@@ -141,7 +141,7 @@ class NonlinearProgram(Program):
             return program._run(readings)
         return solution
 
-    def _run(self, readings: SolverInput, widening: float = 1.0) -> Solution:
+    def _run(self, readings: SolverInput, width_factor: float = 1.0) -> Solution:
         """One run of Ipopt, with a multiple of the width of a robust loss."""
         problem, sigma, held = self.problem, readings.sigma, readings.held
         lower, upper = self._bounds(held)
@@ -150,14 +150,14 @@ class NonlinearProgram(Program):
             lower[: self._n_theta] * problem.theta_scale,
             upper[: self._n_theta] * problem.theta_scale,
         )
-        x0 = self.begin(
+        x0 = self.initial_variables(
             theta,
             sigma=sigma,
             values=readings.values,
             passive=readings.start_passive,
-            widening=widening,
+            width_factor=width_factor,
         )
-        p = self._pack(sigma, readings.values, readings.weights, widening)
+        p = self._pack(sigma, readings.values, readings.weights, width_factor)
         with noticed_interrupt():
             answer = self._solver(x0=x0, p=p, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
         stats = self._solver.stats()
@@ -186,14 +186,14 @@ class NonlinearProgram(Program):
             at_bound=_at_bound(x[: self._n_theta], multipliers, lower, upper, held),
         )
 
-    def begin(
+    def initial_variables(
         self,
         theta: ArrayLike | None = None,
         *,
         sigma: float,
         values: Array | None = None,
         passive: Array | None = None,
-        widening: float = 1.0,
+        width_factor: float = 1.0,
     ) -> Array:
         """The program's variables x with closed loops and optimal zeros, for free parameters.
 
@@ -202,7 +202,7 @@ class NonlinearProgram(Program):
             sigma: Standard deviation of one reading, [m].
             values: Readings as single ones, shape (n_entries,), [m]; the session's by default.
             passive: Passive coordinates to start closing the loops from.
-            widening: Factor on the width of a robust loss.
+            width_factor: Factor on the width of a robust loss.
 
         Raises:
             ClosureError: If the machine cannot reach a posture.
@@ -212,7 +212,7 @@ class NonlinearProgram(Program):
         closed = problem.close(at, start=passive)
         y = problem.values if values is None else values
         residual = (y - problem.predict(at, closed)) / sigma
-        wide = replace(loss, width=loss.width * widening)
+        wide = replace(loss, width=loss.width * width_factor)
         aligned = problem.model.alignment.aligned
         zeros = sigma * wide.centres(residual, o.zero, o.n_zeros, weights=np.ones(o.size))
         zeros[o.zero_known] = 0.0
@@ -229,7 +229,7 @@ class NonlinearProgram(Program):
     def expressions(self) -> Expressions:
         """The program as CasADi expressions, for additional terms and constraints.
 
-        `begin` and `pack` give values of its variables and parameters.
+        `initial_variables` and `parameter_values` give values of its variables and parameters.
         """
         problem, o, nlp = self.problem, self.problem.observations, self._functions["nlp"]
         x, p = ca.MX.sym("x", nlp.size1_in(0)), ca.MX.sym("p", nlp.size1_in(1))
@@ -258,28 +258,28 @@ class NonlinearProgram(Program):
             },
         )
 
-    def pack(
+    def parameter_values(
         self,
         *,
         sigma: float,
         values: Array | None = None,
-        left_out: ArrayLike | None = None,
-        widening: float = 1.0,
+        excluded: ArrayLike | None = None,
+        width_factor: float = 1.0,
     ) -> Array:
         """Values of the parameters p of `expressions()`.
 
         Args:
             sigma: Standard deviation of one reading, [m].
             values: Readings as single ones, shape (n_entries,), [m]; the session's by default.
-            left_out: Entries not to be used, as indices.
-            widening: Factor on the width of a robust loss.
+            excluded: Entries not to be used, as indices.
+            width_factor: Factor on the width of a robust loss.
         """
         y = self.problem.values if values is None else values
-        return self._pack(sigma, y, self._weights(left_out), widening)
+        return self._pack(sigma, y, self._weights(excluded), width_factor)
 
-    def _pack(self, sigma: float, values: Array, weights: Array, widening: float) -> Array:
+    def _pack(self, sigma: float, values: Array, weights: Array, width_factor: float) -> Array:
         weighted, scale = _weighting(sigma)
-        width = self.options.loss.width * widening * sigma / weighted
+        width = self.options.loss.width * width_factor * sigma / weighted
         return np.concatenate([values, weights, self.problem.noise, [weighted, scale, width]])
 
     def functions(self) -> dict[str, ca.Function]:

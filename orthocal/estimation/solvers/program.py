@@ -89,7 +89,7 @@ class Program(ABC):
         values: ArrayLike | None = None,
         start: ArrayLike | None = None,
         start_passive: Array | None = None,
-        left_out: ArrayLike | None = None,
+        excluded: ArrayLike | None = None,
         held: Mapping[int, float] | None = None,
     ) -> Solution:
         """Solve for one set of readings.
@@ -100,7 +100,7 @@ class Program(ABC):
                 session's by default.
             start: Free parameters to start from, shape (n_free,), [SI]; the reference by default.
             start_passive: Passive coordinates to start closing the loops from.
-            left_out: Indices of the entries to exclude.
+            excluded: Indices of the entries to exclude.
             held: Index of a free parameter to the value it is held at, [SI].
 
         Raises:
@@ -112,18 +112,18 @@ class Program(ABC):
             SolverInput(
                 sigma=sigma,
                 values=np.asarray(problem.values if values is None else values, dtype=np.float64),
-                weights=self._weights(left_out),
+                weights=self._weights(excluded),
                 start=np.array(problem.reference if start is None else start, dtype=np.float64),
                 start_passive=start_passive,
                 held=held or {},
             )
         )
 
-    def _weights(self, left_out: ArrayLike | None) -> Array:
+    def _weights(self, excluded: ArrayLike | None) -> Array:
         """Weights of the entries, shape (n_entries,): 1, or `LEFT_OUT` for excluded ones."""
         weights = np.ones(self.problem.observations.size)
-        if left_out is not None:
-            weights[np.asarray(left_out, dtype=np.int64)] = LEFT_OUT
+        if excluded is not None:
+            weights[np.asarray(excluded, dtype=np.int64)] = LEFT_OUT
         return weights
 
     @abstractmethod

@@ -184,7 +184,7 @@ def plot_plan(plan: MeasuringPlan, unit: float) -> Figure:
     if plan.criterion == "aligned":
         for marker, colour, other in zip("o^", (BEFORE, UNSEEN), plan.compared, strict=False):
             if other.expected is not None:
-                errors.append(other.expected.headline.rms / unit)
+                errors.append(other.expected.reported.rms / unit)
                 look: Look = {"color": colour, "label": other.name}
                 axes.plot(other.minutes / HOUR, errors[-1], marker, **look)
     if plan.enough is not None:

@@ -58,7 +58,7 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
     now_largest, entered_largest = (_largest(d) for d in (now, entered))
     # RMS in space, as in all tables; axes of an ellipsoid are shorter
     after, excess = assess_remaining(calibration, accuracy), calibration.tolerance_scale
-    spread = 0.0 if after is None else after.sizes.headline.largest
+    spread = 0.0 if after is None else after.sizes.reported.largest
     largest = max(now_largest, entered_largest, spread)
     if largest < VANISHING:
         return ""

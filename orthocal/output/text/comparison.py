@@ -69,7 +69,7 @@ def _scores(comparison: Comparison) -> RenderableType:
                 *(fits if checked else ("–",) * len(fits)),
                 f"{evidence:+.1f}" if first and math.isfinite(evidence) else "",
                 plain(score.unseen_rms / MM, 4),
-                "" if after is None or first else um(after.sizes.headline.rms),
+                "" if after is None or first else um(after.sizes.reported.rms),
             )
             rows.append(row)
     for u in comparison.undetermined:

@@ -93,7 +93,7 @@ def first_round_words(plan: MeasuringPlan) -> str:
     """Expected error before offsets are entered, and the readings that are impossible then."""
     first = plan.first_round
     texts = []
-    if first.headline.rms >= 1.1 * plan.expected.headline.rms:
+    if first.reported.rms >= 1.1 * plan.expected.reported.rms:
         texts.append(f"In the first round, before offsets are entered: {show_um(first)} µm.")
     if first.lost > SOME_LOST:
         texts.append(
@@ -123,7 +123,7 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
             "aligned_um": None if a is None else a.rms / UM,
             "relative_um": e.sizes.relative.rms / UM,
             "absolute_um": e.sizes.absolute.rms / UM,
-            "worst_um": e.headline.largest / UM,
+            "worst_um": e.reported.largest / UM,
         }
 
     def alternative(a: Alternative) -> dict[str, Any]:
@@ -176,7 +176,7 @@ def draw_plan(plan: MeasuringPlan) -> str:
 
 def show_um(expected: Expected) -> str:
     """Expected tool error, [µm]."""
-    value = expected.headline.rms / UM
+    value = expected.reported.rms / UM
     return plain(value, 0 if value >= 20.0 else 1)
 
 
@@ -231,8 +231,8 @@ def _alternatives(plan: MeasuringPlan, closing: int) -> RenderableType:
 
 def _helps(plan: MeasuringPlan) -> list[str]:
     """Other gauges that reduce the error, the best first."""
-    mine = plan.expected.headline.rms
-    sizes = {a.name: a.expected.headline.rms for a in plan.helps if a.expected is not None}
+    mine = plan.expected.reported.rms
+    sizes = {a.name: a.expected.reported.rms for a in plan.helps if a.expected is not None}
     names = sorted(sizes, key=sizes.__getitem__)
     better = [n for n in names if sizes[n] < (1.0 - NOTICEABLE) * mine]
     texts = [

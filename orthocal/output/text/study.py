@@ -128,7 +128,7 @@ def _accuracy(table: StudyTable, all_rows: bool) -> StudyReport:
     predicted = dict.fromkeys(("aligned_um", "shift_out_um", "absolute_um"), math.nan)
     if s.predicted is not None:
         sizes = s.predicted.sizes
-        values = (s.predicted.headline.rms, sizes.relative.rms, sizes.absolute.rms)
+        values = (s.predicted.reported.rms, sizes.relative.rms, sizes.absolute.rms)
         predicted = {name: v / UM for name, v in zip(predicted, values, strict=True)}
     parameters = _parameters(s.parameters, ("rms", "standard_error", "predicted"))
     for row, e in zip(parameters, s.parameters, strict=True):

@@ -133,7 +133,7 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
     """Identifiable combinations of parameters, and inseparable parameters."""
     spectrum, base = calibration.identifiability, calibration.base
     count = spectrum.singular_values.size
-    spare = calibration.spare_readings
+    spare = calibration.redundancy
     threshold = f"{spectrum.threshold / UM:.3g} µm per prior standard deviation"
     if base:
         lines = [

@@ -38,7 +38,7 @@ def point(program, problem, size, seed=0):
     passive = np.tile(problem.robot.reference_passive, problem.n_states)
     scale = np.tile(problem.passive_scale, problem.n_states)
     x[n - passive.size :] += passive / scale + 5.0 * rng.normal(size=passive.size)
-    return x, program.pack(sigma=2e-4, left_out=[1, 4])
+    return x, program.parameter_values(sigma=2e-4, excluded=[1, 4])
 
 
 @pytest.mark.parametrize("size", [0.0, 1.5])
@@ -99,7 +99,7 @@ def test_the_gauss_newton_hessian_is_the_exact_one_without_curvature(perfect):
     matrices = []
     for hessian in ("exact", "gauss-newton"):
         program = NonlinearProgram(problem, options=SolverOptions(hessian=hessian))
-        f, p = program.functions(), program.pack(sigma=1e-5)
+        f, p = program.functions(), program.parameter_values(sigma=1e-5)
         lam = np.zeros(f["nlp"].size1_out(1))
         matrices.append(np.asarray(f["hess_lag"](x, p, 1.0, lam).full()))
     scale = np.abs(matrices[0]).max()
@@ -210,7 +210,7 @@ def test_expressions_are_the_observation_model(root):
     program, sigma = NonlinearProgram(problem), 1e-5
     e = program.expressions()
     theta = 0.3 * problem.theta_scale * np.random.default_rng(0).normal(size=problem.n_free)
-    x, p = program.begin(theta, sigma=sigma), program.pack(sigma=sigma)
+    x, p = program.initial_variables(theta, sigma=sigma), program.parameter_values(sigma=sigma)
     o, n = problem.observations, problem.n_machine
 
     def value(expression):
