@@ -37,6 +37,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import openpyxl
 import yaml
 from lxml import etree
@@ -58,8 +59,7 @@ from orthocal.assessment.controller_entries import entered_offsets, find_entries
 from orthocal.assessment.tool_tables import (
     accuracy_rows,
     forward_blocks,
-    forward_rows,
-    inverse_rows,
+    inverse_blocks,
 )
 from orthocal.builder.build import remake_robot
 from orthocal.builder.machine_file import read_machine
@@ -604,8 +604,8 @@ def use_calibration(folder: Path, rng: random.Random, deep: bool) -> None:
         again = load_calibration(write_calibration(calibration, folder / "out.json"))
         assert calibration_document(again) == calibration_document(calibration)
         summarize(calibration, details=True)
-        list(forward_rows(calibration, [[0.2, 0.2]]))
-        list(inverse_rows(calibration, [[0.0, 0.0]]))
+        list(forward_blocks(calibration, [(["row 1"], np.array([[0.2, 0.2]]))]))
+        list(inverse_blocks(calibration, [(["row 1"], np.array([[0.0, 0.0]]))]))
         for chunk in accuracy_rows(calibration, [[0.0, 0.0]]):
             format_points(chunk.values)
         if rng.random() < 0.1:
@@ -629,7 +629,7 @@ def use_points(folder: Path, rng: random.Random, deep: bool) -> None:
     calibration = load_calibration(folder)
     names, rows = read_points(folder / "points.csv", calibration.robot)
     if deep:
-        list(inverse_rows(calibration, rows, names=names))
+        list(inverse_blocks(calibration, [(names, rows)]))
         list(accuracy_rows(calibration, rows, names=names))
 
 
