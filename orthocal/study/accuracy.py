@@ -39,7 +39,6 @@ from orthocal.planning.expected_error import (
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import Parameter, ParameterSet
 from orthocal.session.session import Session
-from orthocal.study.portable_session import PortableSession
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study, columns_in_edge_units, prepare_once
 from orthocal.units import UM
@@ -85,7 +84,7 @@ class AccuracyStudy(Study):
 
     def prepare(self) -> _Prepared:
         """Problems of the identified and of all errors, and the workspace."""
-        session = self.session.unpack()
+        session = self.session
         robot = session.robot
         problem = weigh_readings(CalibrationProblem(session, self.choice.select(robot.parameters)))
         workspace = gauss_box(robot, self.box)
@@ -345,7 +344,7 @@ def build_accuracy_study(
             )
     box = find_workspace(robot).limits if half_side is None else cube_limits(robot, half_side)
     return AccuracyStudy(
-        session=PortableSession.of(session.with_values(np.zeros(len(session.readings)))),
+        session=session.with_values(np.zeros(len(session.readings))),
         choice=chosen,
         drawn={n: stated.get(n, parameters[n].prior_std) for n in names},
         fixed=fixed,
@@ -466,7 +465,7 @@ def summarise_accuracy(study: AccuracyStudy, table: StudyTable) -> AccuracySumma
     except (ClosureError, np.linalg.LinAlgError):
         predicted = None
     errors = []
-    selection = study.choice.select(study.session.unpack().robot.parameters)
+    selection = study.choice.select(study.session.robot.parameters)
     for i, p in enumerate(selection.parameters):
         values = column(f"error.{p.name}_{p.edge_unit}") / p.edge_factor
         rms, standard_error = _root_mean_square(values)

@@ -23,7 +23,6 @@ from orthocal.estimation.weighting import leverages
 from orthocal.observation.observations import Observations
 from orthocal.robot.parameters import Parameter
 from orthocal.session.session import Session
-from orthocal.study.portable_session import PortableSession
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study, columns_in_edge_units, prepare_once
 
@@ -54,7 +53,7 @@ class BootstrapStudy(Study):
 
     def prepare(self) -> _Prepared:
         """Fit of the session, and the data to draw from."""
-        session = self.session.unpack()
+        session = self.session
         problem = CalibrationProblem(session, self.choice.select(session.robot.parameters))
         fit = fit_problem(problem, options=SolverOptions(solver="variable-projection"))
         return _Prepared(
@@ -125,7 +124,7 @@ def build_bootstrap_study(
         SessionError: If there is nothing to resample.
         NotIdentifiableError, SolverError, ClosureError: As `calibrate`.
     """
-    study = BootstrapStudy(PortableSession.of(session), choose(choice, session), by, draws, seed)
+    study = BootstrapStudy(session, choose(choice, session), by, draws, seed)
     prepare_once(study)  # refuses a session that cannot be resampled
     return study
 

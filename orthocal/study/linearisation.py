@@ -33,7 +33,6 @@ from orthocal.sensors.mounting import EXACT
 from orthocal.session.session import Gauge, Session
 from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
-from orthocal.study.portable_session import PortableSession
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study, prepare_once
 from orthocal.units import MM
@@ -92,7 +91,7 @@ class LinearisationStudy(Study):
 
     def prepare(self) -> _Prepared:
         """The problem, its linearisation, and the paper's equations."""
-        problem = build_problem(self.session.unpack(), free=self.free, prior=False)
+        problem = build_problem(self.session, free=self.free, prior=False)
         if problem.n_free > problem.n_machine:
             raise ParameterError(
                 f"{problem.free[problem.n_machine]} is a nuisance parameter; this study requires "
@@ -329,7 +328,7 @@ def build_linearisation_study(
     }
     session = replace(session, setups=setups).with_values(np.zeros(len(session.readings)))
     return LinearisationStudy(
-        session=PortableSession.of(session),
+        session=session,
         free=tuple(names),
         sizes=tuple(float(f"{v:.4g}") for v in sizes),
         directions=tuple(tuple(v.tolist()) for v in unit),

@@ -222,13 +222,18 @@ def _run_on_dask(study: Study, tasks: Sequence[int], address: str) -> Iterator[T
             where="--dask",
         ) from None
     with client:
-        shared = client.scatter(study, broadcast=False, hash=False)
+        # a result that the scheduler computes again if the worker that holds it is lost
+        shared = client.submit(_return_study, study, pure=False, retries=DASK_RETRIES)
         numbered = [shared] * len(tasks), list(tasks)
         futures = client.map(
             _run_numbered, *numbered, pure=False, retries=DASK_RETRIES, batch_size=1000
         )
         for future in as_completed(futures, loop=client.loop):
             yield future.result()
+
+
+def _return_study(study: Study) -> Study:
+    return study
 
 
 def _run_numbered(study: Study, task: int) -> TaskResult:

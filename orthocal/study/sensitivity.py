@@ -21,7 +21,6 @@ from orthocal.planning.equipment import place_tool
 from orthocal.planning.first_plan import Displacements, build_paper_plan
 from orthocal.robot.model import Robot
 from orthocal.session.session import Gauge, Reading, Session
-from orthocal.study.portable_session import PortableSession
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study
 from orthocal.units import MM, UM
@@ -48,7 +47,7 @@ class SensitivityStudy(Study):
 
     def prepare(self) -> CalibrationProblem:
         """The readings, with all parameters free."""
-        return build_problem(self.session.unpack(), free=self.parameters, prior=True)
+        return build_problem(self.session, free=self.parameters, prior=True)
 
     def run(self, prepared: CalibrationProblem, task: int) -> Columns:
         """A row for each parameter of each reading and tool coordinate."""
@@ -112,7 +111,7 @@ def build_sensitivity_study(
     parameters = session.robot.parameters
     names = parameters.select(free if free is not None else parameters.patterns("full"))
     session = session.with_values(np.zeros(len(session.readings)))
-    return SensitivityStudy(PortableSession.of(session), tuple(names))
+    return SensitivityStudy(session, tuple(names))
 
 
 def _at_points(session: Session, points: Array) -> Session:

@@ -7,18 +7,21 @@ import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from operator import attrgetter
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from orthocal import __version__
+from orthocal.effects.loading import load_robot_content
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.study.portable_session import PortableSession
+from orthocal.measurement.files.write_session import session_document
+from orthocal.robot.model import Robot
+from orthocal.session.session import Session
 
 Cell = float | int | str | bool | None
 Columns = Mapping[str, Sequence[Cell]]
@@ -40,7 +43,8 @@ class Study(ABC):
     """Plural noun for the cases of the study, such as machines."""
     cases_per_task: ClassVar[int] = 250
 
-    session: PortableSession
+    session: Session
+    """Session of a nominal robot. A worker on any machine builds it from the robot's files."""
 
     @property
     @abstractmethod
@@ -71,7 +75,8 @@ class Study(ABC):
         """Everything that the table depends on, as plain data: session, fields and version."""
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         del fields["session"]
-        document = {"kind": self.kind, "orthocal": __version__, **self.session.record, **fields}
+        document = {"kind": self.kind, "orthocal": __version__}
+        document |= {**_session_record(self.session), **fields}
         plain: dict[str, Any] = json.loads(json.dumps(document, default=attrgetter("document")))
         return plain
 
@@ -81,11 +86,36 @@ class Study(ABC):
         text = json.dumps(self.document, sort_keys=True, allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()
 
+    def __getstate__(self) -> dict[str, Any]:
+        robot, nothing = self.session.robot, cast(Robot, None)
+        files = robot.name, dict(robot.content), robot.folder, dict(robot.parameters.stated)
+        session = replace(self.session, robot=nothing, parts=())
+        return {**self.__dict__, "session": session, "files": files}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        name, content, folder, tolerances = state.pop("files")
+        robot = load_robot_content(name, content, folder=folder).with_tolerances(tolerances)
+        self.__dict__.update(state, session=replace(state["session"], robot=robot))
+
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Study) and self.digest == other.digest
 
     def __hash__(self) -> int:
         return hash(self.digest)
+
+
+def _session_record(session: Session) -> dict[str, Any]:
+    """A session as plain data, without the locations of its files."""
+    rows = "\n".join(
+        f"{r.setup},{r.posture},{r.minus or ''},{r.cycle},{r.value!r}"
+        + (f",{r.conditions}" if r.conditions else "")
+        for r in session.readings
+    )
+    return {
+        "robot": {"name": session.robot.name, "sha256": session.robot.sha256},
+        "session": {**session_document(session), "robot": session.robot.name},
+        "readings": hashlib.sha256(rows.encode()).hexdigest(),
+    }
 
 
 def run_task(study: Study, task: int) -> dict[str, list[Cell]]:

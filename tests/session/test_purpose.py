@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from orthocal.measurement.files.session_file import load_session
 from orthocal.measurement.files.write_session import write_session
 from orthocal.measurement.joining import join_sessions
 from orthocal.session.session import Purpose
-from orthocal.study.portable_session import PortableSession
+from orthocal.study.sensitivity import build_sensitivity_study
 
 TOLERANCES = {"*_fork.rx_mrad": 6.0, "*_swivel.rx_mrad": 4.0, "*.offset_mm": 0.8}
 FORK = "x_fork.rx"
@@ -122,7 +123,7 @@ def test_one_machine_has_one_tolerance(raw_cycles, stated, tmp_path):
 
 
 def test_a_worker_gets_them(stated):
-    there = PortableSession.of(stated).unpack()
+    there = pickle.loads(pickle.dumps(build_sensitivity_study(stated))).session
     assert there.purpose == stated.purpose
     assert there.robot.parameters[FORK].prior_std == pytest.approx(3e-3)
 

@@ -217,4 +217,4 @@ def test_noise_and_resolution_of_the_gauge(orthoglide):
     study = build_linearisation_study(orthoglide, gauge=Gauge(1e-6, 2e-6, None))
     assert study.resolution == 2e-6
     assert study.sigma == pytest.approx(np.hypot(1e-6, 2e-6 / np.sqrt(12)))
-    assert exact(study.session.unpack()).setups.keys() == study.session.unpack().setups.keys()
+    assert exact(study.session).setups.keys() == study.session.setups.keys()

@@ -6,6 +6,7 @@ import fcntl
 import json
 import multiprocessing
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -331,11 +332,13 @@ def test_workers_end_with_their_parent(root, tmp_path):
     until(lambda: not any(is_running(p) for p in children))
 
 
-def _forget_robots():
-    """Empty the caches of robots, as in the process of a worker."""
+def sent(study):
+    """The study in the process of a worker, which has loaded no robot."""
+    data = pickle.dumps(study)
     robot_loading._build_robot.cache_clear()
     loading._add_parameters.cache_clear()
     prepare_once.cache_clear()
+    return pickle.loads(data)
 
 
 def test_a_robot_whose_directory_is_gone(orthoglide, tmp_path):
@@ -348,13 +351,11 @@ def test_a_robot_whose_directory_is_gone(orthoglide, tmp_path):
     expected = run_study(study).columns
     for file in (tmp_path / "mine").iterdir():
         file.write_text("something else")
-    _forget_robots()
-    assert run_study(study).columns == expected
+    assert run_study(sent(study)).columns == expected
     for file in (tmp_path / "mine").iterdir():
         file.unlink()
     (tmp_path / "mine").rmdir()
-    _forget_robots()
-    assert run_study(study).columns == expected
+    assert run_study(sent(study)).columns == expected
     own = build_linearisation_study(orthoglide, sizes=[1.0], along=[1, -0.6, 0.3])
     assert run_study(own).columns["six"] != expected["six"]
     assert json.dumps(study.document) != json.dumps(own.document)

@@ -44,7 +44,7 @@ def test_derivatives_agree_with_central_differences(orthoglide):
     point = [0.02, -0.03, 0.04]
     study = build_sensitivity_study(orthoglide, names, points=[point])
     found = summarise_sensitivity(study, run_study(study))
-    posture = study.session.unpack().postures["point_1"]
+    posture = study.session.postures["point_1"]
     assert set(found.parameters) == set(names)
     for i, name in enumerate(found.parameters):
         parameter = orthoglide.parameters[name]
