@@ -16,6 +16,7 @@ from orthocal.errors import OrthocalError
 from orthocal.estimation.fit import Fit, fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem, build_problem
+from orthocal.hypotheses.hypothesis import Rows
 from orthocal.measurement.joining import split_sessions
 from orthocal.robot.model import Robot
 from orthocal.session.session import Gauge, Session
@@ -210,16 +211,16 @@ def _scattered(session: Session, gauge: str) -> Finding | None:
     if known.sigma is None:
         return None
     sigma = noise_floor(known.sigma, known.resolution)
-    places: dict[tuple[object, ...], list[int]] = {}
-    for i, r in enumerate(session.readings):
-        if session.setups[r.setup].gauge == gauge:
-            places.setdefault(r.place, []).append(i)
-    repeated = [rows for rows in places.values() if len(rows) > 1]
+    repeated = [
+        rows
+        for (setup, *_), rows in Rows(session).repeated.items()
+        if len(rows) > 1 and session.setups[setup].gauge == gauge
+    ]
     if not repeated:
         return None
     values = session.values
 
-    def scatter(rows: list[int]) -> float:
+    def scatter(rows: NDArray[np.int64]) -> float:
         single = 2.0 if session.readings[rows[0]].minus else 1.0
         return float(((values[rows] - values[rows].mean()) ** 2).sum()) / single
 

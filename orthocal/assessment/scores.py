@@ -30,7 +30,6 @@ Method = Literal["linearised", "exact"]
 class Score:
     """Score of one model, identified in one way."""
 
-    model: str
     method: Method
     estimates: Mapping[str, float]
     """Parameter name to estimate, [SI]."""
@@ -162,7 +161,6 @@ def _score(fit: Fit, linearisation: Linearisation, method: Method, noise: float)
     mean_square = max(square / count, SMALLEST_SIGMA**2)
     misfit = math.nan if math.isnan(square) else count * math.log(mean_square)
     return Score(
-        model=problem.selection.label,
         method=method,
         estimates=dict(zip(problem.machine_selection.names, theta.tolist(), strict=False)),
         residuals=rows,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from orthocal.session.session import Gauge, Session
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Key = TypeVar("Key")
 Sparse: TypeAlias = Any
 """A scipy.sparse.csr_array, which has no type stubs; an ordinary array for few columns."""
 
@@ -182,31 +183,20 @@ class Rows:
         self.single = np.array([r.minus is None for r in session.readings], dtype=bool)
         """Whether a row is a reading as shown, not a difference."""
 
-    def _by(self, key: Callable[[int], object]) -> dict[object, Indices]:
-        found: dict[object, list[int]] = {}
-        for i in range(self.count):
-            found.setdefault(key(i), []).append(i)
-        return {k: np.array(rows) for k, rows in found.items()}
-
     @cached_property
     def setups(self) -> dict[str, Indices]:
         """Rows of each setup, in the order of the file."""
-        readings = self.session.readings
-        return {str(k): v for k, v in self._by(lambda i: readings[i].setup).items()}
+        return group_rows(r.setup for r in self.session.readings)
 
     @cached_property
     def cycles(self) -> dict[tuple[str, int], Indices]:
         """Rows of each setup and cycle, in the order of the file."""
-        readings = self.session.readings
-        found = self._by(lambda i: (readings[i].setup, readings[i].cycle))
-        return {k: v for k, v in found.items() if isinstance(k, tuple)}
+        return group_rows((r.setup, r.cycle) for r in self.session.readings)
 
     @cached_property
     def repeated(self) -> dict[tuple[str, str, str | None, str | None], Indices]:
         """Rows of each setup, posture (or difference) and approach, in all cycles."""
-        readings = self.session.readings
-        found = self._by(lambda i: readings[i].place)
-        return {k: v for k, v in found.items() if isinstance(k, tuple)}
+        return group_rows(r.place for r in self.session.readings)
 
     @cached_property
     def groups(self) -> dict[tuple[str, str], tuple[str, ...]]:
@@ -233,6 +223,14 @@ class Rows:
     def posture(self, row: int) -> str:
         """Posture of a row, or the difference of two."""
         return self.session.readings[row].postures
+
+
+def group_rows(keys: Iterable[Key]) -> dict[Key, Indices]:
+    """Rows of each key, in their order; the keys are those of all rows."""
+    found: dict[Key, list[int]] = {}
+    for i, key in enumerate(keys):
+        found.setdefault(key, []).append(i)
+    return {key: np.array(rows) for key, rows in found.items()}
 
 
 def sparse_rows(

@@ -249,16 +249,13 @@ def build_likelihood(
         The likelihood; errors of the machine per principal direction, shape (n_free, r); and the
         singular values, shape (r,), [m].
     """
-    n, p = jacobian.shape
-    if n > 2 * p:  # principal directions of a tall matrix by its triangular factor
-        q, triangle = np.linalg.qr(jacobian)
-        left_vectors, sizes, errors = np.linalg.svd(triangle, full_matrices=False)
-        significant = sizes > LEAST * max(float(sizes.max(initial=0.0)), sigma)
-        directions = (q @ left_vectors[:, significant]).T
-    else:
-        left_vectors, sizes, errors = np.linalg.svd(jacobian, full_matrices=False)
-        significant = sizes > LEAST * max(float(sizes.max(initial=0.0)), sigma)
-        directions = left_vectors[:, significant].T
+    basis, factor = None, jacobian
+    if len(jacobian) > 2 * jacobian.shape[1]:  # of a tall matrix by its triangular factor
+        basis, factor = np.linalg.qr(jacobian)
+    vectors, sizes, errors = np.linalg.svd(factor, full_matrices=False)
+    significant = sizes > LEAST * max(float(sizes.max(initial=0.0)), sigma)
+    vectors = vectors[:, significant]
+    directions = (vectors if basis is None else basis @ vectors).T
     scale = -0.5 * (np.log(TOLERANCE_SCALES) / TOLERANCE_SCALE_SPREAD) ** 2
     noise = noise_weights(stated=stated)
     weights = np.repeat(scale - log_of_sum(scale), NOISE_SCALES.size)

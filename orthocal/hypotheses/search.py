@@ -365,11 +365,6 @@ class _Search:
         added, cross = model.products(effects, about, deviation)
         if edits is not None:
             inner = model.inner(edits, effects)
-        else:
-            products = Products(
-                np.broadcast_to(base.along, added.along.shape),
-                np.broadcast_to(base.square, added.square.shape),
-            )
         return about.likelihood.score(products, added, cross + inner)
 
     def _score_shifts(self, state: HypothesisSet, family: Family) -> Array:
@@ -381,8 +376,8 @@ class _Search:
         prior_stds = np.array([np.abs(s.direction).max() for s in family.shifts])[:, None]
         seen = size > LEAST_EFFECT * self.model.sigma * prior_stds
         vectors = np.where(seen, vectors, 0.0) / np.where(seen, size, 1.0)
-        base = likelihood.products(np.broadcast_to(state.remaining, vectors.shape))
-        return likelihood.score(base, likelihood.products(vectors), vectors @ state.remaining)
+        base, cross = likelihood.products(state.remaining[None]), vectors @ state.remaining
+        return likelihood.score(base, likelihood.products(vectors), cross)
 
     def _term(self, family: Family, h: int, rows: Rows) -> Term:
         prior = float(_prior(family)[h])

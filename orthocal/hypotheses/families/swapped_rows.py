@@ -12,7 +12,7 @@ from itertools import combinations, pairwise
 import numpy as np
 
 from orthocal.hypotheses.anomaly import Explanation, Scope
-from orthocal.hypotheses.hypothesis import Family, Indices, Rows
+from orthocal.hypotheses.hypothesis import Family, Indices, Rows, group_rows
 
 FAR_APART = 400
 """Rows of a session above which only neighbours in a setup are considered."""
@@ -69,9 +69,7 @@ def _of_setup(rows: Rows) -> list[Explanation]:
 
 def _across_setups(rows: Rows) -> list[Explanation]:
     """Pairs of the same posture in two setups, as in a line of the sheet with slipped columns."""
-    found: dict[tuple[str, int], list[int]] = {}
-    for i, r in enumerate(rows.session.readings):
-        found.setdefault((r.postures, r.cycle), []).append(i)
+    found = group_rows((r.postures, r.cycle) for r in rows.session.readings)
     if sum(len(indices) ** 2 for indices in found.values()) > 2 * MOST:
         return []
     return [
