@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-import sys
+import tracemalloc
 
 import numpy as np
 import pytest
+from commands import run_orthocal
 
-from orthocal import assess_tool, calibrate, cli
+from orthocal import assess_tool, calibrate
 from orthocal.assessment import tool_tables as module
 from orthocal.assessment.tool_error import Workspace
 from orthocal.assessment.tool_tables import (
@@ -89,21 +90,14 @@ def test_joints_beyond_the_travel_are_refused_one_by_one(calibration):
 
 
 @pytest.fixture
-def orthocal(monkeypatch, capsys, tmp_path, calibration):
+def orthocal(tmp_path, calibration):
     write_calibration(calibration, tmp_path / "calibration.json")
 
-    def run(command, text):
+    def run(command, text, *options):
         (tmp_path / "table.csv").write_text(text)
-        words = ["orthocal", command, str(tmp_path), str(tmp_path / "table.csv")]
-        monkeypatch.setattr(sys, "argv", words)
-        with pytest.raises(SystemExit) as stopped:
-            cli.main()
-        out, err = capsys.readouterr()
-        return (
-            stopped.value.code,
-            list(csv.reader(io.StringIO(out))),
-            err.replace(str(tmp_path), ""),
-        )
+        done = run_orthocal(tmp_path, command, tmp_path, tmp_path / "table.csv", *options)
+        table = list(csv.reader(io.StringIO(done.stdout)))
+        return done.returncode, table, done.stderr.replace(str(tmp_path), "")
 
     return run
 
@@ -139,8 +133,6 @@ def test_rows_before_the_first_that_is_served_are_named_too(orthocal):
 
 def test_memory_does_not_grow_with_the_table(calibration, monkeypatch):
     """What is held is a chunk and the rows themselves."""
-    import tracemalloc
-
     monkeypatch.setattr(module, "ROWS_AT_ONCE", 100)
     points = np.random.default_rng(0).uniform(-0.05, 0.05, (1000, 3))
     peaks = []
@@ -153,12 +145,7 @@ def test_memory_does_not_grow_with_the_table(calibration, monkeypatch):
     assert peaks[1] < 1.5 * peaks[0]
 
 
-def test_json_of_too_many_points_says_so(monkeypatch, capsys, tmp_path, calibration):
-    write_calibration(calibration, tmp_path / "calibration.json")
-    table = tmp_path / "table.csv"
-    table.write_text("x_mm,y_mm,z_mm\n" + "0,0,0\n" * 5001)
-    monkeypatch.setattr(sys, "argv", ["orthocal", "accuracy", str(tmp_path), str(table), "--json"])
-    with pytest.raises(SystemExit) as stopped:
-        cli.main()
-    assert stopped.value.code == 2
-    assert "contains 5001 points; expected at most 5000 with --json" in capsys.readouterr().err
+def test_json_of_too_many_points_says_so(orthocal):
+    code, _, err = orthocal("accuracy", "x_mm,y_mm,z_mm\n" + "0,0,0\n" * 5001, "--json")
+    assert code == 2
+    assert "contains 5001 points; expected at most 5000 with --json" in err

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import io
-import sys
 import tracemalloc
 
 import numpy as np
 import pytest
+from commands import run_orthocal
 
-from orthocal import calibrate, cli
+from orthocal import calibrate
 from orthocal.calibration.file import write_calibration
 from orthocal.cli import printing
 from orthocal.errors import SessionError
@@ -27,16 +27,12 @@ def folder(experiment_2, tmp_path_factory):
 
 
 @pytest.fixture
-def orthocal(monkeypatch, capsys, folder):
+def orthocal(monkeypatch, folder):
     monkeypatch.setattr(table, "BLOCK_ROWS", 4)
 
     def run(command, text, *, path="-"):
-        stream = io.TextIOWrapper(io.BytesIO(text.encode()))
-        monkeypatch.setattr(sys, "stdin", stream)
-        monkeypatch.setattr(sys, "argv", ["orthocal", command, str(folder), str(path)])
-        with pytest.raises(SystemExit) as stopped:
-            cli.main()
-        return (stopped.value.code, *capsys.readouterr())
+        done = run_orthocal(folder, command, folder, path, typed=text)
+        return done.returncode, done.stdout, done.stderr
 
     return run
 
