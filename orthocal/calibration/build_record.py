@@ -129,11 +129,7 @@ def _solver_record(fit: Fit) -> SolverRecord:
 def _posture_records(fit: Fit) -> tuple[PostureRecord, ...]:
     states, postures = fit.problem.states, fit.problem.session.postures.values()
     return tuple(
-        PostureRecord(
-            p.name,
-            p.form,
-            *(tuple(v.tolist()) for v in (p.values, p.drives, fit.solution.passive[i])),
-        )
+        PostureRecord(p.name, p.form, p.values, p.drives, read_only(fit.solution.passive[i]))
         for i, p in zip(states.first_of_posture, postures, strict=True)
     )
 

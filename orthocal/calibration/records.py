@@ -14,11 +14,11 @@ from orthocal.estimation.diagnostics.unmodelled import Unmodelled
 from orthocal.estimation.loss import LossKind
 from orthocal.estimation.options import SolverKind
 from orthocal.io.documents import Count, Number, PositiveInSI, PositiveNumber
-from orthocal.io.fields import CLOSED, Many, Matrix, SizeOrInf, SizeOrNaN
+from orthocal.io.fields import CLOSED, Many, Matrix, SizeOrInf, SizeOrNaN, Vector
 from orthocal.robot.files import MOST_FILES, is_inner_path
 from orthocal.sensors.protocol import GaugeZero, Sensor
 from orthocal.sensors.registry import RECORDED
-from orthocal.session.session import PostureForm, Purpose
+from orthocal.session.session import Posture, Purpose
 from orthocal.statistics.identifiability import Identifiability
 from orthocal.statistics.noise import Noise
 from orthocal.text import shorten
@@ -188,18 +188,14 @@ class ParameterEstimate(InUnit):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PostureRecord:
+class PostureRecord(Posture):
     """A posture of the session."""
 
     __pydantic_config__ = CLOSED
 
-    name: str
-    form: PostureForm
-    values: Many[Number]
-    """Commanded coordinates of the tool or the drives, by `form`, [m, rad]."""
-    drives: Many[Number]
-    """Commanded drive coordinates without the controller's offsets, [m, rad]."""
-    passive: Many[Number]
+    values: Vector
+    drives: Vector
+    passive: Vector
     """Passive coordinates of the calibrated machine, [m, rad]."""
 
 

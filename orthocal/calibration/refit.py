@@ -20,7 +20,7 @@ from orthocal.estimation.selection import Selection
 from orthocal.estimation.weighting import SMALLEST_SIGMA
 from orthocal.io.fields import read_only
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
-from orthocal.session.session import Gauge, Posture, Reading, Session, Setup
+from orthocal.session.session import Gauge, Reading, Session, Setup
 from orthocal.statistics.information import decompose
 
 Array = NDArray[np.float64]
@@ -99,10 +99,7 @@ def restore_session(calibration: Calibration) -> Session:
         title=record.title,
         source=record.source,
         gauges={g.name: Gauge(g.sigma, g.resolution, g.range) for g in calibration.gauges},
-        postures={
-            p.name: Posture(p.name, p.form, np.array(p.values), np.array(p.drives))
-            for p in calibration.postures
-        },
+        postures={p.name: p for p in calibration.postures},
         setups={
             s.name: Setup(
                 s.name,
