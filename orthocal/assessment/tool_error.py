@@ -36,7 +36,7 @@ from orthocal.robot.model import require_commanded_tool
 Array = NDArray[np.float64]
 
 MOST_POINTS = 5_000
-"""Points that are assessed together; each takes 40 kB. `rows.accuracy_rows` takes any number."""
+"""Points that are assessed together; each takes 40 kB. `accuracy_rows` takes any number."""
 
 DRAWS = 500
 """Errors drawn to find how large 95 % of the position errors are at most."""
