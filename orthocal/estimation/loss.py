@@ -36,11 +36,15 @@ SETTLED = 1e-11
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """Loss function of standardised residuals: `squares` or `huber`, the pseudo-Huber loss."""
+    """Loss function of standardised residuals.
+
+    Args:
+        kind: `squares` or `huber`, the pseudo-Huber loss.
+        width: k, [standard deviations]; not used for squares.
+    """
 
     kind: LossKind = "squares"
     width: float = HUBER_WIDTH
-    """k, [standard deviations]; not used for squares."""
 
     def __post_init__(self) -> None:
         if self.kind not in ("squares", "huber"):

@@ -27,26 +27,31 @@ MOST_ITERATIONS = 10**6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolverOptions:
-    """Choice and options of a solver."""
+    """Choice and options of a solver.
+
+    Args:
+        solver: `ipopt`, `variable-projection` or `linearised`.
+        hessian: Ipopt's Hessian of the Lagrangian: exact, or without the curvature of readings and
+            closures. Where the latter does not converge the exact one is tried.
+        tolerance: Ipopt's `tol` on the gradient of the scaled problem, in prior standard deviations
+            where only the prior holds a parameter, and far less where readings do.
+            Readings of 0.3 m known to 5 µm leave rounding errors of up to 1e-7 in it.
+        closure_tolerance: Ipopt's largest scaled closure residual: units of 1 mm.
+        max_iterations: Ipopt's `max_iter`; also of variable projection.
+        print_level: Ipopt's own printing, 0 (none) to 12.
+        loss: Loss function of standardised residuals.
+        ipopt: Further options of Ipopt, by its own names, such as {"mu_strategy": "adaptive"}; they
+            replace those that orthocal sets. Other solvers ignore them.
+    """
 
     solver: SolverKind = "ipopt"
     hessian: Hessian = "gauss-newton"
-    """Ipopt's Hessian of the Lagrangian: exact, or without the curvature of readings and closures.
-    Where the latter does not converge the exact one is tried."""
     tolerance: float = 1e-6
-    """Ipopt's `tol` on the gradient of the scaled problem, in units of θ̂ (one tolerance) where
-    only the prior holds a parameter, and far less where readings do. Readings of 0.3 m known to
-    5 µm leave rounding errors of up to 1e-7 in it."""
     closure_tolerance: float = 1e-9
-    """Ipopt's largest scaled closure residual: units of 1 mm."""
     max_iterations: int = 200
     print_level: int = 0
-    """Ipopt's own printing, 0 (none) to 12."""
     loss: Loss = SQUARES
-    """Loss function of standardised residuals."""
     ipopt: Mapping[str, OptionValue] = field(default_factory=dict)
-    """Further options of Ipopt, by its own names, such as {"mu_strategy": "adaptive"}; they replace
-    those that orthocal sets. Other solvers ignore them."""
 
     def __post_init__(self) -> None:
         require_kind(self.loss, Loss, expected="Loss(...)")

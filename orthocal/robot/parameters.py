@@ -40,25 +40,30 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 @dataclass(frozen=True, slots=True)
 class ElementaryError:
-    """One parameter of an effect."""
+    """One parameter of an effect.
+
+    Args:
+        name: Name of the parameter, such as x_slide.offset.
+        kind: "offset" or "scale" of a drive, "translation" or "rotation" of a placement; for other
+            effects the name of the effect.
+        owner: Name of the drive, joint or frame; of the leg, rod or setup for other effects.
+        unit: SI unit: m, rad, 1, 1/K or m/s.
+        prior_std: Standard deviation before the calibration, [unit].
+        of_frame: True if the owner is a frame, False if it is a joint.
+        axis: Component of the twist of a placement, 0 to 5; -1 for errors of other kinds.
+        complete: True if it is part of the complete model, unless it is redundant.
+        positive: True for a value of at least 0 with a half-normal prior.
+    """
 
     name: str
     kind: str
-    """"offset" or "scale" of a drive, "translation" or "rotation" of a placement; for other
-    effects the name of the effect."""
     owner: str
-    """Name of the drive, joint or frame; of the leg, rod or setup for other effects."""
     unit: Unit
     prior_std: float
-    """Standard deviation before the calibration, [unit]."""
     of_frame: bool = False
-    """True if the owner is a frame, False if it is a joint."""
     axis: int = -1
-    """Component of the twist of a placement, 0 to 5; -1 for errors of other kinds."""
     complete: bool = False
-    """True if it is part of the complete model, unless it is redundant."""
     positive: bool = False
-    """True for a value of at least 0 with a half-normal prior."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -49,44 +49,57 @@ class Purpose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gauge:
-    """The indicator."""
+    """The indicator.
+
+    Args:
+        sigma: Standard deviation of one reading, [m].
+        resolution: Step of the display, [m].
+        range: Lowest and highest reading, [m].
+    """
 
     sigma: float | None = None
-    """Standard deviation of one reading, [m]."""
     resolution: float | None = None
-    """[m]."""
     range: tuple[float, float] | None = None
-    """Lowest and highest reading, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posture:
-    """A commanded machine position."""
+    """A commanded machine position.
+
+    Args:
+        name: Name in the session.
+        form: Key in session.yaml: tcp_mm, joints_mm or joints_deg. The values are in SI units.
+        values: Commanded coordinates of the tool or the drives, by `form`, [m] or [rad].
+        drives: Commanded drive coordinates ρ minus the active offsets, [m, rad].
+    """
 
     name: str
     form: PostureForm
     values: Array
-    """Commanded coordinates of the tool or the drives, by `form`, [m] or [rad]."""
     drives: Array
-    """Commanded drive coordinates ρ with the controller's offsets taken off, [m, rad]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setup:
-    """A sensor mounted at one place, with one gauge zero."""
+    """A sensor mounted at one place, with one gauge zero.
+
+    Args:
+        name: Name in the session.
+        sensor: Sensor, with the part of the machine that it measures.
+        gauge: Name of what shows its readings, among the session's gauges.
+        active: Offsets active in the controller during this setup, shape (n_drives,), [m, rad]; by
+            default those of the session.
+        aligned_at: Posture in which the operator aligned the gauge; None for the rule of
+            `Session.alignment_postures`.
+        zero: Gauge zero: estimated from the setup's readings, or known to be 0 (absolute readings).
+    """
 
     name: str
     sensor: Sensor
     gauge: str = ""
-    """Name of what shows its readings, among the session's gauges."""
     active: Array | None = None
-    """Offsets active in the controller during this setup, shape (n_drives,), [m, rad]; by default
-    those of the session."""
     aligned_at: str | None = None
-    """Posture in which the operator aligned the gauge; None for the rule of
-    `Session.alignment_postures`."""
     zero: GaugeZero = "free"
-    """Gauge zero: estimated from the setup's readings, or known to be 0 (absolute readings)."""
 
 
 CycleNumber = Annotated[int, Field(ge=1, lt=10**9)]
@@ -94,17 +107,20 @@ CycleNumber = Annotated[int, Field(ge=1, lt=10**9)]
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """Conditions under which a reading was taken, as stated."""
+    """Conditions under which a reading was taken, as stated.
+
+    Args:
+        approach: A letter for each drive in the robot's order: p if its coordinate grew in its last
+            motion, n if it fell, u if unknown.
+        temperature: Temperature of the machine, [°C].
+        time: Time of the reading, with or without time zone.
+    """
 
     __pydantic_config__ = CLOSED
 
     approach: Annotated[str, Field(pattern="^[pnu]+$")] | None = None
-    """A letter for each drive in the robot's order: p if its coordinate grew in its last motion, n
-    if it fell, u if unknown."""
     temperature: Annotated[Number | None, Field(alias="temperature_C")] = None
-    """[°C]."""
     time: datetime | None = None
-    """With or without time zone."""
 
 
 ReadingKey = (
@@ -116,21 +132,28 @@ known."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """Reading of the indicator in a posture, or its difference between two."""
+    """Reading of the indicator in a posture, or its difference between two.
+
+    Args:
+        setup: Name of the setup.
+        posture: Name of the posture.
+        minus: Posture whose reading is subtracted; None for a reading as shown.
+        cycle: Number of the repetition.
+        value: Value, [m]; NaN in a recording before it is read.
+        line: Line in the CSV, for messages.
+        file: The CSV; that of the session where not given.
+        conditions: Conditions of a reading as shown; None for a difference, or where nothing is
+            stated.
+    """
 
     setup: str
     posture: str
     minus: str | None = None
-    """Posture whose reading was taken off; None for a reading as shown."""
     cycle: int = 1
     value: float = 0.0
-    """[m]; NaN in a recording before it is read."""
     line: int | None = None
-    """Line in the CSV, for messages."""
     file: Path | None = None
-    """The CSV; that of the session where not given."""
     conditions: Conditions | None = None
-    """Of a reading as shown; None for a difference, or where nothing is stated."""
 
     @property
     def approach(self) -> str | None:
