@@ -66,7 +66,7 @@ def chance_of_deviations(calibration: Calibration, fit: Fit) -> float:
     )
     variances, directions = np.linalg.eigh(covariance)
     root = directions * np.sqrt(np.maximum(variances, 0.0))
-    theta = np.append([p.value for p in calibration.free], problem.prior_mean[n:] * scale[n:])
+    theta = np.append([p.value for p in calibration.free], problem.prior_mean[n:])
     deviation = project_out_zeros(problem.values - problem.predict(theta), o)
     white = whiten(deviation, project_out_zeros(fit.jacobian, o) @ root, sigma=sigma)
     square = float(white @ white)
