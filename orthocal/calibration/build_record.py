@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from orthocal import __version__
 from orthocal.calibration.calibration import Calibration
-from orthocal.calibration.file import require_loadable
+from orthocal.calibration.file import absurd_result
 from orthocal.calibration.recorded_robot import record_robot
 from orthocal.calibration.records import (
     GaugeRecord,
@@ -38,6 +38,7 @@ from orthocal.estimation.fit import Fit
 from orthocal.estimation.linear import Linearisation, linearise_at_reference
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.weighting import split_by_gauge
+from orthocal.io.documents import LARGEST_NUMBER
 from orthocal.io.fields import finite_or_none, read_only
 from orthocal.session.session import Session
 from orthocal.statistics.chance import confidence_factor
@@ -85,8 +86,9 @@ def assemble_calibration(
         std_scatter=np.sqrt(np.diag(noise_covariance)),
         intervals=_widen(fit, unmodelled, intervals or {}),
     )
+    _require_possible(estimates, fit.iterations)
     diagnostics = diagnose_readings(fit)
-    calibration = Calibration(
+    return Calibration(
         robot_record=record_robot(session),
         session=_session_record(session),
         model=problem.selection.label,
@@ -109,8 +111,17 @@ def assemble_calibration(
         versions=_versions(),
         robot=session.robot,
     )
-    require_loadable(calibration)
-    return calibration
+
+
+def _require_possible(estimates: Sequence[ParameterEstimate], iterations: int) -> None:
+    """Refuse estimates that no machine has.
+
+    Raises:
+        SolverError: Naming the first such parameter.
+    """
+    for p in estimates:
+        if not max(abs(p.value), abs(p.linear)) <= LARGEST_NUMBER:
+            raise absurd_result(f"{p.name} is {p.value:.3g} {p.unit}", iterations)
 
 
 def _solver_record(fit: Fit) -> SolverRecord:

@@ -75,7 +75,12 @@ def calibration_document(calibration: Calibration) -> dict[str, Any]:
 
 
 def calibration_json(calibration: Calibration) -> str:
-    """A calibration as the text of calibration.json."""
+    """A calibration as the text of calibration.json.
+
+    Raises:
+        SolverError: If it could not be loaded again, naming the impossible number.
+    """
+    _require_loadable(calibration)
     return json.dumps(calibration_document(calibration), indent=1, allow_nan=False) + "\n"
 
 
@@ -89,23 +94,24 @@ def write_calibration(calibration: Calibration, path: str | Path) -> Path:
     return Path(path)
 
 
-def require_loadable(calibration: Calibration) -> None:
-    """Refuse a result that could not be loaded from its file.
-
-    Raises:
-        SolverError: Naming the impossible number.
-    """
+def _require_loadable(calibration: Calibration) -> None:
+    """Refuse a result that could not be loaded from its file."""
     try:
         _read_document(
             calibration_document(calibration), "calibration.json", robot=calibration.robot
         )
     except CalibrationFileError as e:
-        raise SolverError(
-            f"the result makes no sense ({e}); look for readings, a σ, tolerances or bounds that "
-            "cannot be",
-            status="absurd result",
-            iterations=calibration.solver.iterations,
-        ) from None
+        raise absurd_result(str(e), calibration.solver.iterations) from None
+
+
+def absurd_result(problem: str, iterations: int) -> SolverError:
+    """Error for a result with impossible numbers."""
+    return SolverError(
+        f"the result makes no sense ({problem}); look for readings, a σ, tolerances or bounds that "
+        "cannot be",
+        status="absurd result",
+        iterations=iterations,
+    )
 
 
 def _read_document(

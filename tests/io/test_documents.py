@@ -192,7 +192,7 @@ def test_the_smallest_values_of_a_session_are_read_again(root, tmp_path):
     assert calibration_document(found) == calibration_document(calibration)
 
 
-def test_an_implausible_result_is_refused_before_it_is_written(raw_cycles, monkeypatch):
+def test_an_implausible_estimate_is_refused(raw_cycles, monkeypatch):
     module = sys.modules["orthocal.calibration.build_record"]
     original = module._estimates
 
@@ -200,7 +200,13 @@ def test_an_implausible_result_is_refused_before_it_is_written(raw_cycles, monke
         return tuple(replace(p, value=2.6e15) for p in original(*args, **kwargs))
 
     monkeypatch.setattr(module, "_estimates", absurd)
-    with pytest.raises(
-        SolverError, match=r"the result makes no sense \(calibration.json: parameters\[0\]"
-    ):
+    with pytest.raises(SolverError, match=r"the result makes no sense \(x_slide.offset is 2.6e"):
         calibrate(raw_cycles)
+
+
+def test_a_result_that_could_not_be_loaded_is_not_written(experiment_2, tmp_path):
+    result = calibrate(experiment_2)
+    absurd = replace(result, model_covariance=1e12 * result.model_covariance)
+    with pytest.raises(SolverError, match=r"the result makes no sense \(calibration.json: "):
+        write_calibration(absurd, tmp_path / "calibration.json")
+    assert not list(tmp_path.iterdir())
