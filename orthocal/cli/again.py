@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,7 +46,7 @@ def again(
         "A plan: enter these offsets, then run `orthocal record .` in this directory, or fill in\n"
         "readings.csv. Compare the readings with the calibration by `orthocal validate`."
     )
-    sheet, problem = sheet_or_problem(new)
+    sheet, problem = sheet_or_problem(new, calibration=os.path.relpath(calibration, out))
     if problem:
         put_note(problem)
     orthocal.write_session(new, out, comment=comment, extra=sheet, blank=True)

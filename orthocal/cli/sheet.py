@@ -26,7 +26,7 @@ def sheet(
 
     Args:
         feed (MM/MIN): Feed between postures.
-        approach_feed (MM/MIN): Feed over the last millimetres to a posture.
+        approach_feed (MM/MIN): Feed over the last 2 mm to a posture.
         shift_mm (X,Y,Z): Machine coordinates (G53) of the origin of the world, mm.
     """
     from orthocal.measurement.motion.motion_program import ProgramOptions
@@ -44,11 +44,13 @@ def sheet(
     put_note(f"Wrote {directory / 'sheet.html'} to print{more}")
 
 
-def sheet_or_problem(session: orthocal.Session) -> tuple[dict[str, str], str]:
+def sheet_or_problem(
+    session: orthocal.Session, *, calibration: str = "CALIBRATION"
+) -> tuple[dict[str, str], str]:
     """Files of the measuring sheet, or no files and the reason."""
     from orthocal.output.sheet.page import sheet_files
 
     try:
-        return sheet_files(session), ""
+        return sheet_files(session, calibration=calibration), ""
     except OrthocalError as e:
         return {}, f"orthocal: no measuring sheet: {e}"

@@ -68,7 +68,7 @@ def read_program(text, robot):
     position: dict[str, float] = {}
     points, pauses, joints = [], [], None
     for line in text.splitlines():
-        message = re.search(r"joints ([-0-9. ]+);", line)
+        message = re.search(r"joints ([-0-9. ]+)\)", line)
         joints = [float(v) for v in message[1].split()] if message else joints
         code = re.sub(r"\([^)]*\)", "", line).strip()
         assert code.startswith("G53 G1 ") or not re.search("[XYZ]", code)
@@ -94,7 +94,8 @@ def test_program_pauses_in_the_alignment_posture_and_at_each_reading(small, moti
         )
         for (at, _), point in zip(pauses, expected, strict=True):
             assert at == pytest.approx(point / MM, abs=ROUNDED)
-        assert text.splitlines()[-1] == "M2"
+        assert "(Before start: gauge removed, machine at its mechanical zero)" in text
+        assert text.endswith("remove the gauge, then jog the machine to its mechanical zero)\nM2\n")
         assert max(len(line) for line in text.splitlines()) < 255
         assert text.isascii()
 
@@ -111,8 +112,8 @@ def test_gauge_is_aligned_at_the_first_pause(small, aligned_at, separate):
     assert (motion.alignment is not None) == separate
     before_first_pause, between, *_ = write_program(session, motion).split("\nM0\n")
     assert "mount the gauge, centre its ball on the rod" in before_first_pause
-    assert ("set the gauge zero, then read" in before_first_pause) == (not separate)
-    assert ("set the gauge zero, then read" in between) == separate
+    assert ("set the dial to 0, then read" in before_first_pause) == (not separate)
+    assert ("set the dial to 0, then read" in between) == separate
     if motion.alignment is not None:
         assert (motion.alignment.posture, motion.alignment.line) == (aligned_at, None)
         assert motion.alignment.lift == ""
@@ -168,6 +169,9 @@ def test_motion_ends_in_the_first_posture(motions, raw_cycles):
     # zero, max, min three times over, and back
     assert [s.posture for s in cycles.stops[-2:]] == ["x_min", "zero"]
     assert [s.line for s in cycles.stops] == [*range(2, 11), None]
+    assert [s.line for s in cycles.stops if s.repeats == 2] == [5, 8, None]
+    text = write_program(raw_cycles, cycles)
+    assert text.count("the dial must show the reading of line 2 again") == 3
 
 
 def test_a_difference_stops_in_both_postures(experiment_2):
@@ -203,7 +207,7 @@ def test_plunger_is_lifted_where_the_dial_would_leave_its_range(small):
     assert lifts[0] == ""
     assert "the dial would go" in lifts[1]
     text = write_program(small, motion)
-    assert "hold the plunger up on the way to line 3" in text
+    assert "hold the plunger up on the way to reading line 3" in text
 
 
 def test_path_that_leaves_the_travel_passes_through_the_mechanical_zero(small):

@@ -24,7 +24,7 @@ from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations, drive_table
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import Contact
-from orthocal.session.session import Posture, Reading, Session
+from orthocal.session.session import Gauge, Posture, Reading, Session
 from orthocal.units import DEG, MM
 
 Array = NDArray[np.float64]
@@ -99,6 +99,8 @@ class Stop:
     one, or return to the first posture."""
     line: int | None
     """Line of readings.csv; None for the alignment and the return."""
+    repeats: int | None
+    """Line of the setup's first reading, if this stop reads the first posture again."""
     cycle: int
     drives: Array
     """Nominal drive coordinates, shape (n_drives,), [m, rad]."""
@@ -132,6 +134,13 @@ class SetupMotion:
     """Stop in the alignment posture; None if that is the first posture of `stops`."""
     stops: tuple[Stop, ...]
     """Postures to read, and the first of them again."""
+
+    def closing(self, stop: Stop) -> str:
+        """What the dial shows if nothing moved, at a stop in the first posture again."""
+        if stop.repeats is None:
+            return ""
+        first = "0" if self.stops[0].role == "subtracted" else f"the reading of line {stop.repeats}"
+        return f"the dial must show {first} again"
 
 
 class _Path(NamedTuple):
@@ -167,6 +176,30 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
         alignment = stops.pop(0) if stops[0].role == "alignment" else None
         motions.append(SetupMotion(setup, number, len(rows), side, alignment, tuple(stops)))
     return tuple(motions)
+
+
+def approach_length(robot: Robot) -> str:
+    """Length of an approach with its unit."""
+    if any(d.unit == "m" for d in robot.drives):
+        return f"{APPROACH / MM:g} mm"
+    return f"{APPROACH_TURN / DEG:g}°"
+
+
+def dial_zero(gauge: Gauge) -> str:
+    """Reading in the middle of a gauge's range, to which its dial is set, in mm."""
+    low, high = gauge.range or (0.0, 0.0)
+    return f"{0.5 * (low + high) / MM + 0.0:g}"
+
+
+def set_dial(gauge: Gauge) -> str:
+    """Instruction for setting the gauge zero."""
+    travel = ""
+    if gauge.range is not None:
+        travel = f", about {0.5 * (gauge.range[1] - gauge.range[0]) / MM:g} mm"
+    return (
+        f"Press the plunger in to half of its travel{travel}. Then turn the bezel until the dial "
+        f"shows {dial_zero(gauge)}."
+    )
 
 
 def shown_joints(robot: Robot, drives: ArrayLike) -> Array:
@@ -212,7 +245,9 @@ def _find_approaches(session: Session, alignment: set[str]) -> tuple[int, dict[s
             ends = list(closure.forward(nominal, names=names)[:, coordinates])
             starts = list(closure.tcp(drives, passive)[:, coordinates])
         columns = zip(names, nominal, drives, ends, starts, strict=True)
-        return side, {name: Stop(name, "reading", None, 1, *parts) for name, *parts in columns}
+        return side, {
+            name: Stop(name, "reading", None, None, 1, *parts) for name, *parts in columns
+        }
     raise SessionError(
         f"can be approached neither from below nor from above by {APPROACH / MM:g} mm: "
         f"{refused[0].reason}",
@@ -224,15 +259,18 @@ def _list_stops(
     rows: Sequence[tuple[int, Reading]], aligned_at: str, stop_at: Mapping[str, Stop]
 ) -> list[Stop]:
     """Alignment of the gauge, stops in the order of the rows, and the first posture again."""
-    first = rows[0][1].minus or rows[0][1].posture
+    first_line, row = rows[0]
+    first = row.minus or row.posture
     stops = [] if aligned_at == first else [replace(stop_at[aligned_at], role="alignment")]
     for line, r in rows:
         if r.minus is not None:
             subtracted = replace(stop_at[r.minus], role="subtracted", line=line, cycle=r.cycle)
             stops.append(subtracted)
-        stops.append(replace(stop_at[r.posture], line=line, cycle=r.cycle))
+        again = r.minus is None and r.posture == first and line != first_line
+        repeats = first_line if again else None
+        stops.append(replace(stop_at[r.posture], line=line, repeats=repeats, cycle=r.cycle))
     if stops[-1].posture != first:
-        stops.append(replace(stop_at[first], role="return"))
+        stops.append(replace(stop_at[first], role="return", repeats=first_line))
     return stops
 
 

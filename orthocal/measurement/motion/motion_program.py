@@ -1,7 +1,7 @@
 """G-code programs that move the machine through a setup and pause (M0) where the operator acts.
 
-The first pause is in the alignment posture, where the gauge is mounted and aligned. Then there is
-one for each reading.
+A program starts at the mechanical zero, without a gauge. The first pause is in the alignment
+posture, where the gauge is mounted and aligned. Then there is one for each reading.
 
 Every motion is in machine coordinates (G53), so that work offsets (G54 to G59.3), G92 and a
 coordinate rotation have no effect. Coordinates are those of nominal kinematics; comments list the
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from orthocal.errors import ParameterError
 from orthocal.kinematics.workspace import tool_at_zero
-from orthocal.measurement.motion.motion import Role, SetupMotion, Stop, shown_joints
+from orthocal.measurement.motion.motion import SetupMotion, Stop, dial_zero, shown_joints
 from orthocal.robot.model import Robot
 from orthocal.sensors.leg_indicator import BallIndicator
 from orthocal.session.session import Session
@@ -41,20 +41,12 @@ FASTEST = 20_000.0
 LARGEST_SHIFT = 1e5
 """Largest coordinate of the machine's origin, [mm]."""
 
-ACTIONS: dict[Role, str] = {
-    "alignment": "",
-    "reading": "read",
-    "subtracted": "set the dial to 0",
-    "return": "first posture again: the dial must show its first reading",
-}
-"""Instructions to the operator at a stop."""
-
 PREAMBLE = (
-    "(Start at the mechanical zero, with no gauge mounted)",
+    "(Before start: gauge removed, machine at its mechanical zero)",
     "(Every motion is in machine coordinates: G53 G1 in G90)",
     "(Work offsets G54 to G59.3, G92 and rotation have no effect; G49 cancels the tool length)",
     "(Requires a controller that runs G53 with G1 at the programmed feed)",
-    "(Cancel scaling and mirroring before. First run: no gauge, slow override)",
+    "(Cancel scaling and mirroring first. Run once without gauge at low feed override)",
     "G21 G90 G94 G40 G49",
 )
 
@@ -107,46 +99,57 @@ def write_program(
             "the drives do not command the tool: there are no coordinates for a program",
             where=str(robot.yaml),
         )
-    shift = ", ".join(f"{v:g}" for v in options.shift_mm)
     name, setup = (comment_safe(text, LONGEST_NAME) for text in (robot.name, motion.setup))
+    of_setup = session.setups[motion.setup]
     lines = [
         f"(orthocal: {name}, setup {setup}, {motion.number} of {motion.count})",
-        f"({comment_safe(session.setups[motion.setup].sensor.describe(), 120)})",
-        f"(Coordinates: nominal kinematics, machine = world + {shift} mm)",
+        f"({comment_safe(of_setup.sensor.describe(), 120)})",
+        f"(Machine coordinates, mm; tool at the mechanical zero: "
+        f"{_words(robot, tool_at_zero(robot), options)})",
         *PREAMBLE,
         f"F{options.feed:g}",
     ]
-    ball = isinstance(session.setups[motion.setup].sensor, BallIndicator)
+    sensor, gauge = of_setup.sensor, session.gauges[of_setup.gauge]
+    ball = isinstance(sensor, BallIndicator)
     mount = f"mount the gauge, {'centre its ball on the rod' if ball else 'align it'}"
     stops = motion.stops if motion.alignment is None else (motion.alignment, *motion.stops)
     for i, stop in enumerate(stops):
-        zero = "set the gauge zero" if stop is motion.stops[0] and stop.role == "reading" else ""
-        actions = (mount if i == 0 else "", zero, ACTIONS[stop.role])
+        zero = "0" if stop.role == "subtracted" else ""
+        if stop is motion.stops[0] and stop.role == "reading":
+            zero = dial_zero(gauge)
+        actions = (
+            mount if i == 0 else "",
+            f"set the dial to {zero}" if zero else "",
+            "read" if stop.role == "reading" else "",
+        )
         instruction = ", then ".join(action for action in actions if action)
-        lines += [f"(to {_label(stop)})", *_moves(robot, stop, options)]
-        lines.append(f"(MSG, {_label(stop)}; joints {_joints(robot, stop)}; {instruction})")
+        instruction = "; ".join(text for text in (instruction, motion.closing(stop)) if text)
+        lines += [f"({_label(stop)}; joints {_joints(robot, stop)})", *_moves(robot, stop, options)]
+        lines.append(f"(MSG, {_label(stop)}: {instruction})")
         if i + 1 < len(stops) and stops[i + 1].lift:
             lines.append(f"(MSG, hold the plunger up on the way to {_label(stops[i + 1])})")
         if stop.role != "return":
             lines.append("M0")
+    lines.append("(MSG, end: remove the gauge, then jog the machine to its mechanical zero)")
     return "\n".join([*lines, "M2", ""])
 
 
 def _moves(robot: Robot, stop: Stop, options: ProgramOptions) -> list[str]:
     """Motion to the start of the approach, and the approach."""
-    coordinates = () if robot.tcp is None else robot.tcp.coordinates
     targets: list[tuple[Array | None, float]] = []
     if stop.via_zero:
         targets.append((tool_at_zero(robot), options.feed))
     targets += [(stop.approach_point, options.feed), (stop.point, options.approach_feed)]
-    lines = []
-    for point, feed in targets:
-        words = " ".join(
-            f"{LETTERS[c]}{format_fixed(v + options.shift_mm[c], DECIMALS)}"
-            for c, v in zip(coordinates, np.asarray(point) / MM, strict=True)
-        )
-        lines.append(f"G53 G1 {words} F{feed:g}")
-    return lines
+    return [f"G53 G1 {_words(robot, point, options)} F{feed:g}" for point, feed in targets]
+
+
+def _words(robot: Robot, point: Array | None, options: ProgramOptions) -> str:
+    """Coordinates of a point in machine coordinates."""
+    coordinates = () if robot.tcp is None else robot.tcp.coordinates
+    return " ".join(
+        f"{LETTERS[c]}{format_fixed(v + options.shift_mm[c], DECIMALS)}"
+        for c, v in zip(coordinates, np.asarray(point) / MM, strict=True)
+    )
 
 
 def _joints(robot: Robot, stop: Stop) -> str:
@@ -157,6 +160,7 @@ def _joints(robot: Robot, stop: Stop) -> str:
 
 def _label(stop: Stop) -> str:
     """Line of readings.csv and posture of a stop."""
-    kind = "alignment posture" if stop.role == "alignment" else "posture"
     name = comment_safe(stop.posture, LONGEST_NAME)
-    return f"{kind} {name}" if stop.line is None else f"line {stop.line}: {name}"
+    if stop.line is not None:
+        return f"reading line {stop.line}, posture {name}"
+    return f"{'alignment' if stop.role == 'alignment' else 'first'} posture {name}"

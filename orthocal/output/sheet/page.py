@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from importlib import resources
 
 import numpy as np
@@ -13,7 +14,9 @@ from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.measurement.motion.motion import (
     SetupMotion,
     Stop,
+    approach_length,
     plan_motion,
+    set_dial,
     shown_joints,
     with_alignment,
 )
@@ -37,16 +40,26 @@ Array = NDArray[np.float64]
 SHEET = "sheet.html"
 """Name of the sheet's file."""
 
+END = (
+    "Compare the readings of the first posture with each other. If they differ by more than two "
+    "steps of the dial, repeat this setup: the gauge or the machine was displaced. Then remove the "
+    "gauge and jog the machine to its mechanical zero."
+)
+"""What to do after the readings of a setup."""
+
 VISIBLE = 5e-5
 """Smallest distance that the sheet mentions and smallest deflection that a dial shows, [m]."""
 
 
-def sheet_files(session: Session, *, options: ProgramOptions | None = None) -> dict[str, str]:
+def sheet_files(
+    session: Session, *, options: ProgramOptions | None = None, calibration: str = "CALIBRATION"
+) -> dict[str, str]:
     """The sheet of a plan and one program per setup, as a mapping of file name to text.
 
     Args:
         session: The plan, or a session.
         options: Feeds and shift of the programs.
+        calibration: Path of the calibration whose offsets are active, from the sheet's directory.
 
     Raises:
         SessionError: If the machine cannot go through the plan.
@@ -68,7 +81,8 @@ def sheet_files(session: Session, *, options: ProgramOptions | None = None) -> d
     title = f"Measuring sheet: {session.robot.name}, {session.title}"
     style = (resources.files("orthocal.output.sheet") / "sheet.css").read_text(encoding="utf-8")
     front = _front(session, motions, options, with_programs=bool(programs))
-    body = "\n".join([front, "".join(setups), _afterwards()])
+    following = f"validate {shlex.quote(calibration)}" if _is_corrected(session) else "calibrate"
+    body = "\n".join([front, "".join(setups), _afterwards(f"orthocal {following} .")])
     return {SHEET: page(title, style, body), **programs}
 
 
@@ -101,24 +115,22 @@ def _front(
         measured = session.setups[m.setup].sensor.describe()
         program = (program_name(m),) if with_programs else ()
         rows.append((str(m.number), m.setup, measured, count, *program))
-    active = session.controller_offsets
-    shifted = "" if active is None or not any(active) else ", shifted by the active offsets"
+    normal = "" if _is_corrected(session) else "A few mm are normal: the calibration finds them. "
     checks = [
         "Warm the machine up. Home it once. Do not home it again until all readings are taken.",
         "Move the machine to its mechanical zero: each leg parallel to its axis, by eye. The "
-        f"controller must show about {_joint_list(robot, robot.drive_zero)}. An error of a few mm "
-        "is normal: the calibration finds it. If a number is quite different, correct the robot's "
-        f"files first. Travel of the joints: {'; '.join(_travel(robot))}{shifted}.",
-        "Move each slider by hand a little outwards, away from the middle. Its number must "
-        f"{_count_outwards(robot)}.",
+        f"controller must show about {_joint_list(robot, robot.drive_zero)}. {normal}If a number "
+        "differs by more than 10 mm, a dimension or the direction of counting is wrong: correct it "
+        "in machine.yaml (`orthocal new DIRECTORY --again`) or in the robot's YAML. Travel of the "
+        f"joints: {'; '.join(_travel(session))}.",
+        f"Jog each slide a little outwards. Its number must {_count_outwards(robot)}.",
         _active_offsets(session),
         "Check each rod and each hinge for play by hand. The calibration does not remove play.",
     ]
     rules = [
-        "Approach every posture from the same side: the last millimetres go towards "
+        f"Approach every posture from the same side: the last {approach_length(robot)} go towards "
         f"{_approach(robot, motions[0].side)}. The programs do this. Do the same if you jog.",
-        "Keep the tip on its rod from the first reading of a setup to the last. Lift the plunger "
-        "only where the sheet says so.",
+        "Keep the tip on its rod from the first reading of a setup to the last.",
         "After you have set the gauge zero, do not touch the bezel, the stand or the arm of the "
         "gauge. If the gauge was bumped, start that setup again.",
         "Write down what the dial shows, with its sign. Estimate the last digit. If you took no "
@@ -150,8 +162,9 @@ def _programs(options: ProgramOptions | None) -> str:
         f"Programs: G-code in mm, in machine coordinates (G53){origin}. Work offsets, G92 and "
         "rotation have no effect on them. They cancel the tool length (G49) and stop (M0) in the "
         "alignment posture and at each reading: press cycle start to continue. Run the first "
-        "program without a gauge and with a slow override. Keep the machine clear: every program "
-        "starts from the mechanical zero."
+        "program without a gauge and with a slow override. Before you start a program, remove the "
+        "gauge and jog the machine to its mechanical zero: its first motion goes straight to the "
+        "first posture, and nothing may be in its way."
     )
 
 
@@ -171,7 +184,7 @@ def _setup(
         f"{paragraph(f'{measured}.{program}', kind='lead')}"
         f'<div class="pictures">{pictures}</div>'
         f"{_numbered(_steps(session, motion, gauge))}"
-        f"{_warnings(session, motion, gauge)}{_boxes(session, motion)}</section>"
+        f"{_warnings(session, motion, gauge)}{_boxes(session, motion)}{paragraph(END)}</section>"
     )
 
 
@@ -180,15 +193,17 @@ def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[
     first = motion.stops[0]
     side = name_direction(gauge.contact.direction)
     opposite = name_direction(-gauge.contact.direction)
-    place = ", ".join(_number(v / MM, 1) for v in gauge.point)
+    place = " ".join(
+        f"{letter}{_number(v / MM, 1)}" for letter, v in zip("XYZ", gauge.point, strict=True)
+    )
     contact = ""
     if gauge.rod is not None and gauge.leg is not None:
         target = f"rod {gauge.rod.name} of leg {gauge.leg.name}"
         reach = gauge.hinge_distances / MM
         contact = (
             f"Its {name_tip(gauge.tip)} touches {_across(gauge)}, {reach[gauge.aligned]:.1f} mm "
-            f"from the hinge at the drive ({reach.min():.0f} to {reach.max():.0f} mm as the leg "
-            "moves). "
+            f"from the hinge on the slide ({reach.min():.0f} to {reach.max():.0f} mm during the "
+            "setup). "
         )
         if gauge.tip is not None and gauge.tip.edge is None:
             contact += "Align the ball by eye: half a millimetre is good enough. "
@@ -205,7 +220,7 @@ def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[
     return [
         f"{align}, {gauge.alignment}: {_joint_list(session.robot, gauge.drives)}.",
         f"Mount the gauge on the base, on the {side} side of {target}. Point its plunger to "
-        f"{opposite}. {contact}Contact in world coordinates: ({place}) mm.",
+        f"{opposite}. {contact}Contact point, from the tool's mechanical zero: {place} mm.",
         f"Push the plunger in by hand, towards {side}. The dial must grow. If it falls, write "
         "every reading of this setup with reversed sign.",
         *go,
@@ -218,26 +233,19 @@ def _across(gauge: GaugePosition) -> str:
     """Lateral position of the tip on the rod in the alignment posture."""
     offset = float(np.linalg.norm(gauge.lateral_offset))
     if offset <= VISIBLE:
-        return "the middle of the rod"
+        return "the rod on its centre line"
     return (
-        f"the rod {offset / MM:.1f} mm off its middle, towards "
+        f"the rod {offset / MM:.1f} mm off its centre line, towards "
         f"{name_direction(gauge.lateral_offset, cosine=ABOUT_ALONG)}"
     )
 
 
 def _gauge_zero(gauge: Gauge, first: Stop) -> str:
     """Instruction for setting the gauge zero."""
-    how = "Set the dial to the middle of its range."
-    if gauge.range is not None:
-        low, high = (v / MM for v in gauge.range)
-        how = (
-            f"Push the gauge in by half its travel ({0.5 * (high - low):g} mm). Turn the bezel "
-            f"until the dial shows {0.5 * (low + high):g}."
-        )
     again = " Set it again where the table says so." * (first.role == "subtracted")
     return (
-        f"{how} This is the gauge zero: set it here only.{again} Tap the stand. The hand must come "
-        "back."
+        f"{set_dial(gauge)} This is the gauge zero: set it here only.{again} Tap the stand. The "
+        "hand must come back."
     )
 
 
@@ -291,7 +299,7 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
             cells.append((_number(stop.expected / MM, 2, sign=True), "number"))
         body = "".join(f'<td class="{kind}">{escape(text)}</td>' for text, kind in cells)
         box = "<td>set to 0</td>" if stop.role == "subtracted" else '<td class="box"></td>'
-        remark = "same as first?" if stop.role == "return" else ""
+        remark = escape(motion.closing(stop))
         rows.append(f'<tr>{body}{box}<td class="note">{remark}</td></tr>')
     return (
         f'<table class="boxes"><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
@@ -299,7 +307,7 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
 
 
 def _posture(stop: Stop) -> str:
-    if stop.role == "return":
+    if stop.repeats is not None:
         return f"{stop.posture}, again"
     if stop.cycle == 1 or stop.role == "subtracted":
         return stop.posture
@@ -310,18 +318,16 @@ def _name(stop: Stop) -> str:
     return stop.posture if stop.line is None else f"line {stop.line}"
 
 
-def _afterwards() -> str:
+def _afterwards(command: str) -> str:
     steps = [
-        "Compare the last reading of each setup with its first. They must agree within the "
-        "scatter of the dial. If not, the gauge or the machine was displaced: repeat that setup.",
         "Enter the readings with `orthocal record`, which checks each one at once. Or type them "
         "into readings.csv, column reading_mm, in the order of its lines, and delete the lines "
-        "without a reading. `orthocal import` reads a spreadsheet.",
+        "without a reading: an empty field is refused. `orthocal import` reads a spreadsheet.",
         "Run:",
     ]
     return (
         f"<section class='last'>{heading('Afterwards')}{_numbered(steps)}"
-        "<p><code>orthocal calibrate .</code></p></section>"
+        f"<p><code>{escape(command)}</code></p></section>"
     )
 
 
@@ -363,7 +369,7 @@ def _active_offsets(session: Session) -> str:
 
 
 def _count_outwards(robot: Robot) -> str:
-    """Direction in which the joint numbers change if the sliders move outwards."""
+    """Direction in which the joint numbers change if the slides move outwards."""
     verbs = {1: "grow", -1: "fall"}
     if len({d.direction for d in robot.drives}) == 1:
         return verbs[robot.drives[0].direction]
@@ -380,12 +386,17 @@ def _approach(robot: Robot, side: int) -> str:
     )
 
 
-def _travel(robot: Robot) -> list[str]:
-    """Limits of the joints."""
+def _is_corrected(session: Session) -> bool:
+    """Whether the controller has offsets of a calibration."""
+    return session.controller_offsets is not None and bool(np.any(session.controller_offsets))
+
+
+def _travel(session: Session) -> list[str]:
+    """Limits of the joints, with the active offsets."""
     texts = []
-    for drive in robot.drives:
+    for drive, active in zip(session.robot.drives, session.active_offsets, strict=True):
         unit, size = DRIVE_UNITS[drive.unit]
-        low, high = (v / size for v in drive.joint_limits)
+        low, high = ((v + drive.direction * active) / size for v in drive.joint_limits)
         if np.isfinite([low, high]).all():
             texts.append(f"{drive.name} {_number(low, 1)} to {_number(high, 1)} {unit}")
     return texts or ["no limits"]

@@ -12,6 +12,7 @@ from rich.padding import Padding
 from rich.text import Text
 
 from orthocal.kinematics.workspace import find_workspace
+from orthocal.measurement.motion.motion import APPROACH
 from orthocal.output.text.accuracy import describe_remaining
 from orthocal.output.text.layout import bullets, counted, plain, section, table_of
 from orthocal.planning.cost_curve import ENOUGH, HOUR, Stage
@@ -50,7 +51,7 @@ MOST_LISTED = 24
 HOW = (
     "In each setup mount the gauge so that it touches at `section`. Go to the first posture and "
     "set the dial to the middle of its range there.",
-    "Approach every posture from the same side, from a millimetre before it.",
+    f"Approach every posture from the same side: the last {APPROACH / MM:g} mm in one direction.",
     "Read the first posture again at the end of the setup (cycle 2). This reveals drift.",
 )
 

@@ -114,12 +114,10 @@ def test_stated_contact_is_on_the_rod(small, page):
     robot, drives = small.robot, small.robot.drive_zero
     root, tip = (place(robot, drives, f) for f in ("x_bar_a", "x_coupler"))
     expected = 0.5 * (root + tip) + np.array([0.0, 0.004, 0.0])
-    found = re.search(r"Contact in world coordinates: \(([-\d., ]+)\) mm", text)
-    assert [float(v) for v in found[1].split(",")] == pytest.approx(
-        expected / MM, abs=ROUNDED_PLACE
-    )
+    found = re.search(r"mechanical zero: X([-\d.]+) Y([-\d.]+) Z([-\d.]+) mm", text)
+    assert [float(v) for v in found.groups()] == pytest.approx(expected / MM, abs=ROUNDED_PLACE)
     assert "on the +y side of rod a of leg x. Point its plunger to -y." in text
-    assert "ball of 3 mm diameter touches the middle of the rod, 125.0 mm from" in text
+    assert "ball of 3 mm diameter touches the rod on its centre line, 125.0 mm from" in text
 
 
 def test_lateral_offset_in_the_alignment_posture_is_stated(small):
@@ -137,7 +135,7 @@ def test_lateral_offset_in_the_alignment_posture_is_stated(small):
     across /= np.linalg.norm(across)
     # the plunger's line, through the rod as it was in the zero, from the rod's axis now
     aside = float((np.array([at_zero[0] - 0.125, 0.0, at_zero[2]]) - axis) @ across) / MM
-    found = re.search(r"touches the rod (\d+\.\d) mm off its middle, towards", text)
+    found = re.search(r"touches the rod (\d+\.\d) mm off its centre line, towards", text)
     assert float(found[1]) == pytest.approx(abs(aside), abs=ROUNDED_PLACE)
     assert abs(aside) > 1.0
 
@@ -165,10 +163,10 @@ def test_steps_say_how_to_mount_and_set_the_gauge(page):
     ball, blade, line, pin = (words(s) for s in sections(page))
     for text in (ball, blade, line, pin):
         assert "The dial must grow. If it falls, write every reading" in text
-        assert "half its travel (5 mm). Turn the bezel until the dial shows 0." in text
+        assert "half of its travel, about 5 mm. Then turn the bezel until the dial shows 0." in text
     assert "blade 20 mm wide" in blade
     assert "on the -x side of rod b of leg y. Point its plunger to +x." in blade
-    assert "Its tip touches the line between the rods. Contact in world coordinates: (155.0" in line
+    assert "Its tip touches the line between the rods. Contact point" in line
     assert "pin of 4 mm diameter, 60 mm wide" in pin
     # the leg moves sideways by more than the range of this dial
     assert "Even a perfect machine shows -32.7 mm in line 6" in blade
@@ -191,13 +189,17 @@ def test_front_page_states_zero_travel_and_approach(page):
     assert "`" not in text
 
 
-def test_active_offsets_shift_the_stated_travel(small):
-    """Home switches may be off by a few mm: that is not a fault of the robot's files."""
-    for active in ([0.0] * 3, [1e-3, 0.0, 0.0]):
-        text = sheet_files(small.with_controller(np.array(active)))["sheet.html"]
-        assert "An error of a few mm is normal" in text
-        (travel,) = re.findall(r"Travel of the joints: [^<]*", text)
-        assert ("shifted by the active offsets" in travel) == any(active)
+def test_sheet_after_a_calibration_has_shifted_travel_and_ends_with_validation(small):
+    for active in ([0.0] * 3, [1e-3, 2e-3, 0.0]):
+        session = small.with_controller(np.array(active))
+        text = sheet_files(session, calibration="../one")["sheet.html"].replace("−", "-")
+        assert ("A few mm are normal" in text) == (not any(active))
+        limits = (
+            "-149.0 to 71.0 mm; y_slide -67.0 to 153.0 mm",
+            "-150.0 to 70.0 mm; y_slide -65.0",
+        )
+        assert limits[not any(active)] in text
+        assert ("<code>orthocal validate ../one .</code>" in text) == any(active)
 
 
 def test_names_from_files_are_texts(files, page):
