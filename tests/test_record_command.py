@@ -103,11 +103,11 @@ def test_what_is_shown_of_a_setup_and_a_posture(folder, run):
     for words in (
         "Monday: 6 readings in 2 setups on orthoglide; none is recorded yet.",
         "Setup yx, 1 of 2: 3 readings Read: leg x, y, fraction 0.5, ball on rod a",
-        "Stand: on the +y side, so that the tip touches at (195.1, 5.5, 40.0) mm in zero.",
-        "Push the plunger in: the dial has to grow",
+        "Stand: on the +y side, so that the tip touches at (195.1, 5.5, 40.0) mm in zero, 155.1 mm",
+        "Push the plunger in: the dial must grow. If it falls, type every reading of this setup",
         "Dial: -5 to 5 mm, resolution 0.01 mm",
-        "Go to zero, align the gauge and set the dial to about 0 mm, the middle of its range,",
-        "1 of 6 (line 2 of the table): yx zero",
+        "Go to zero and align the gauge. Press the plunger in to half of its travel, about 5 mm.",
+        "Line 2: yx zero (6 of 6 missing)",
         "joints x_slide 310.250 mm, y_slide 310.250 mm, z_slide 310.250 mm",
         "tool x 0.000, y 0.000, z 0.000 mm",
         "6 of 6 readings are missing: yx all and zx all.",
@@ -147,34 +147,34 @@ def test_tools_of_postures_that_are_given_by_joints(tmp_path):
 TURNS = {
     "nothing": (["", "0.1"], ["0.10"], "Not recorded: type the reading of the dial, or `skip`"),
     "back": (["0.1", "back", "0,2"], ["0.20"], "Recorded: 0.10 mm; Enter keeps it."),
-    "back and keep": (["0.1", "b", ""], ["0.10"], "2 of 6 (line 3 of the table): yx x_max"),
+    "back and keep": (["0.1", "b", ""], ["0.10"], "Line 3: yx x_max (5 of 6 missing)"),
     "back to a row": (
-        ["0.1", "0.2", "back 1", "0.3"],
+        ["0.1", "0.2", "back 2", "0.3"],
         ["0.30", "0.20"],
-        "1 of 6 (line 2 of the table): yx zero",
+        "Line 2: yx zero (4 of 6 missing)",
     ),
-    "back beyond": (["back"], [], "Not recorded: this is the first row."),
-    "back to none": (["back 7"], [], "Not recorded: '7' is not a row; expected 1 to 6."),
-    "back to a word": (["back to"], [], "Not recorded: 'to' is not a row; expected 1 to 6."),
+    "back beyond": (["back"], [], "Not recorded: this is the first line."),
+    "back to none": (["back 1"], [], "Not recorded: '1' is not a line; expected 2 to 7."),
+    "back to a word": (["back to"], [], "Not recorded: 'to' is not a line; expected 2 to 7."),
     "again": (
         ["0.1", "again", "0.11"],
         ["0.10", "0.11"],
-        "2 of 7 (line 3 of the table): yx zero, cycle 2",
+        "Line 3: yx zero, cycle 2 (6 of 7 missing)",
     ),
-    "again of a row": (["0.1", "0.2", "again 1", "0.11"], ["0.10", "0.11", "0.20"], "cycle 2"),
+    "again of a row": (["0.1", "0.2", "again 2", "0.11"], ["0.10", "0.11", "0.20"], "cycle 2"),
     "again of nothing": (["again"], [], "Not recorded: nothing was read yet."),
-    "again of an empty row": (["again 2"], [], "Not recorded: row 2 was not read yet."),
-    "skip": (["skip", "0.2"], ["", "0.20"], "Skipped: row 1"),
-    "drop": (["0.1", "drop", "0.3"], ["0.10", "0.30"], "Deleted: row 2, yx x_max"),
-    "drop a row": (["0.1", "drop 1", "0.3"], ["0.30"], "Deleted: row 1, yx zero"),
+    "again of an empty row": (["again 3"], [], "Not recorded: line 3 was not read yet."),
+    "skip": (["skip", "0.2"], ["", "0.20"], "Skipped: line 2"),
+    "drop": (["0.1", "drop", "0.3"], ["0.10", "0.30"], "Deleted: line 3, yx x_max"),
+    "drop a row": (["0.1", "drop 2", "0.3"], ["0.30"], "Deleted: line 2, yx zero"),
     "restart": (["0.1", "0.2", "restart", "0.3"], ["0.30"], "Deleted: all readings of yx"),
-    "list": (["0.1", "list"], ["0.10"], "2 yx x_max: not read"),
+    "list": (["0.1", "list"], ["0.10"], "3 yx x_max: not read"),
     "show": (["show"], [], "Setup yx, 1 of 2"),
-    "help": (["help"], [], "again: read the last row once more, as another cycle"),
+    "help": (["help"], [], "again: read the last line once more, as another cycle"),
     "?": (["?"], [], "Ctrl-D and Ctrl-C end, too."),
     "quit": (["quit", "0.1"], [], "6 of 6 readings are missing"),
     "exit": (["exit", "0.1"], [], "6 of 6 readings are missing"),
-    "q": (["0.1", "Q", "0.2"], ["0.10"], "5 of 6 readings are missing: yx rows 2 to 3 and zx all"),
+    "q": (["0.1", "Q", "0.2"], ["0.10"], "5 of 6 readings are missing: yx lines 3 to 4 and zx all"),
     "two of them": (
         ["s"],
         [],
@@ -187,7 +187,7 @@ TURNS = {
     "resolution": (
         ["0.123"],
         ["0.123"],
-        "! Finer than the gauge (row 1): 1 of 1 readings have more digits",
+        "! Finer than the gauge (line 2): 1 of 1 readings have more digits",
     ),
     "no text": (["\ufffd\x1b[2J"], [], r"is neither a number nor a command"),
 }
@@ -207,8 +207,8 @@ def test_what_can_be_typed_on_a_narrow_terminal(folder, run, name):
     assert command == f"  orthocal record {folder}"  # to be copied
 
 
-WARNING = re.compile(r"^! ([^(:]+)(?: \((rows? [^)]*)\))?:(?= |$)", re.MULTILINE)
-"""Kind of a warning, and its rows."""
+WARNING = re.compile(r"^! ([^(:]+)(?: \((lines? [^)]*)\))?:(?= |$)", re.MULTILINE)
+"""Kind of a warning, and its lines."""
 
 
 def reviewed(folder):
@@ -245,8 +245,9 @@ def test_a_mistake_is_named_at_once_and_by_check(root, run, tmp_path, spoil):
     spoil(values, row)
     _, out, err = run(folder, *values)
     assert err == ""
-    at_once = out.partition(f"Recorded: row {row + 1},")[2].partition("Recorded: row")[0]
-    assert WARNING.search(at_once)
+    at_once = out.partition(f"Recorded: line {row + 2},")[2].partition("Recorded: line")[0]
+    assert f"Line {row + 2} differs by" in " ".join(at_once.split())
+    assert WARNING.search(at_once)[2].startswith((f"line {row + 2}", f"lines {row + 2}"))
     (finding, *_) = require_agreement(out, folder)
     assert row + 2 in [p.line for p in finding.places]
     assert out.endswith(f"Next: correct or repeat these readings,\n  orthocal record {folder}\n")
@@ -261,7 +262,7 @@ def test_a_reversed_setup_is_named_while_it_is_read_and_by_check(root, run, tmp_
             reverse_sign(values, row)
     _, out, _ = run(folder, *values)
     first = next(iter(WARNING.finditer(out)))
-    assert out.count("Recorded: row", 0, first.start()) <= setups.index("yz")
+    assert out.count("Recorded: line", 0, first.start()) <= setups.index("yz")
     (finding,) = require_agreement(out, folder)
     assert (finding.kind, [p.setup for p in finding.places]) == ("reversed sign", ["xz"])
 
@@ -335,10 +336,10 @@ def test_a_gauge_is_aligned_in_its_own_posture(folder, run):
     text = PLAN.replace("yx: {leg: x,", "yx: {leg: x, aligned_at: x_min,")
     (folder / "session.yaml").write_text(text)
     _, out, _ = run(folder)
-    words = " ".join(out.partition("1 of 6")[0].split())
+    words = " ".join(out.partition("Line 2:")[0].split())
     # rod a stays parallel to x, and the section where it is in the reference posture
-    assert "the tip touches at (195.1, 5.5, 40.0) mm in x_min." in words
-    assert "Go to x_min, align the gauge" in words
+    assert "the tip touches at (195.1, 5.5, 40.0) mm in x_min, 55.1 mm from the hinge" in words
+    assert "Go to x_min and align the gauge. Then go to zero." in words
     assert "x_min: joints x_slide 210.250 mm" in words
 
 
@@ -362,11 +363,11 @@ def test_what_comes_next_goes_by_what_the_session_says(folder, run):
 def test_at_the_end_the_last_reading_can_be_corrected(folder, run):
     _, out, _ = run(folder, *["0.1"] * 6, "0.3", "back", "0.2", "", "0.9")
     assert cells(folder) == [*["0.10"] * 5, "0.20"]
-    assert "no row is asked for; `back 3` goes to row 3" in " ".join(out.split())
+    assert "no line is asked for; `back 7` goes to line 7" in " ".join(out.split())
 
 
 def test_a_stand_that_was_elsewhere_is_recalled(folder, run):
-    _, out, _ = run(folder, *["0.1"] * 4, "back 1", "0.2")
+    _, out, _ = run(folder, *["0.1"] * 4, "back 2", "0.2")
     assert "The stand has been moved since yx was read" in " ".join(out.split())
     assert cells(folder)[0] == "0.20"
 

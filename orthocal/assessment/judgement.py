@@ -124,7 +124,18 @@ def is_doubtful(session: Session, row: int, mean: float, std: float) -> bool:
     """
     gauge = session.gauges[session.setups[session.readings[row].setup].gauge]
     value = session.values[row]
-    return bool(abs(value - mean) > LARGEST_DEVIATION * std or are_finer(value, gauge))
+    return is_far(value, mean, std) or bool(are_finer(value, gauge))
+
+
+def is_far(value: float, mean: float, std: float) -> bool:
+    """True if a reading contradicts its prediction by the others.
+
+    Args:
+        value: Reading, [m].
+        mean: Its prediction, [m]; NaN without one.
+        std: Its standard deviation, [m].
+    """
+    return bool(abs(value - mean) > LARGEST_DEVIATION * std)
 
 
 def _find_mistakes(session: Session) -> list[Finding]:

@@ -100,7 +100,7 @@ class Dialogue:
             row = self._recording.rows[self._asked]
             prompt = printable(f"{row.setup} {row.posture} [mm]> ")
             if len(prompt) > self._text.width // 2:
-                prompt = f"row {self._asked + 1} [mm]> "
+                prompt = f"line {row.line} [mm]> "
         if sys.stdin is None:
             raise _EndOfDialogue
         if isinstance(sys.stdin, io.TextIOWrapper) and sys.stdin.errors != "replace":
@@ -155,7 +155,7 @@ class Dialogue:
         following = self._next
         is_end_of_setup = following is None or recording.rows[following].setup != row.setup
         if self._is_doubtful(index) or is_end_of_setup or corrected:
-            self._judge()
+            self._judge(last=index)
         self._ask_for(following)
 
     def _is_doubtful(self, index: int) -> bool:
@@ -174,14 +174,17 @@ class Dialogue:
         except (OrthocalError, np.linalg.LinAlgError) as e:
             self._stop_judging(e)
             return False
-        if prediction := self._text.prediction(mean, std):
+        if prediction := self._text.prediction(index, mean, std):
             self._say(prediction)
         return is_doubtful(session, position, mean, std)
 
-    def _judge(self) -> None:
+    def _judge(self, *, last: int | None = None) -> None:
         """Judge the readings so far; print new warnings and resolved ones.
 
         A complete session is judged as by `check`, and its warnings are printed with its state.
+
+        Args:
+            last: Index of the row that was just read.
         """
         recording = self._recording
         if not self._can_judge or len(recording.missing) == len(recording.rows):
@@ -200,7 +203,7 @@ class Dialogue:
         self._warnings = warnings
         if recording.missing:
             for finding in new:
-                self._say(self._text.warning(finding))
+                self._say(self._text.warning(finding, last=last))
         if resolved:
             self._say(self._text.resolved(resolved))
 
@@ -236,15 +239,15 @@ class Dialogue:
             {"skip": self._skip, "restart": self._restart, "show": self._show_again}[name]()
 
     def _parse_row(self, text: str) -> int:
-        """Index of a row from its number."""
-        count = len(self._recording.rows)
-        if text.isascii() and text.isdigit() and len(text) < 7 and 1 <= int(text) <= count:
-            return int(text) - 1
-        raise SessionError(f"'{shorten(text)}' is not a row; expected 1 to {count}")
+        """Index of a row from its line."""
+        lines = [str(row.line) for row in self._recording.rows]
+        if text in lines:
+            return lines.index(text)
+        raise SessionError(f"'{shorten(text)}' is not a line; expected {lines[0]} to {lines[-1]}")
 
     def _require_row(self) -> int:
         if self._asked is None:
-            raise SessionError("no row is asked for; `back 3` goes to row 3")
+            raise SessionError("no line is asked for; `back 7` goes to line 7")
         return self._asked
 
     def _back(self, index: int | None) -> None:
@@ -252,7 +255,7 @@ class Dialogue:
         if index is None:
             index = (len(rows) if self._asked is None else self._asked) - 1
         if index < 0:
-            raise SessionError("this is the first row")
+            raise SessionError("this is the first line")
         setup = rows[index].setup
         if self._last is not None and rows[self._last].setup != setup and rows[index].is_read:
             self._note(
@@ -269,8 +272,12 @@ class Dialogue:
         if index is None:
             raise SessionError("nothing was read yet")
         if not rows[index].is_read:
-            raise SessionError(f"row {index + 1} was not read yet")
+            raise SessionError(f"line {rows[index].line} was not read yet")
         index = self._recording.repeat(index)
+        self._note(
+            f"Added: line {self._recording.rows[index].line}. The lines after it are now one "
+            "further down than on the sheet."
+        )
         if self._warnings:  # their lines have changed
             self._judge()
         self._ask_for(index)
@@ -279,16 +286,19 @@ class Dialogue:
         index = self._require_row()
         if not self._recording.rows[index].is_read:
             self._skipped.add(self._recording.rows[index].key)
-            self._say(f"  Skipped: row {index + 1}")
+            self._say(f"  Skipped: line {self._recording.rows[index].line}")
         self._ask_for_next()
 
     def _drop(self, index: int | None) -> None:
         index = self._require_row() if index is None else index
-        label = self._recording.rows[index].label_with_cycle
+        row = self._recording.rows[index]
         self._recording.drop(index)
         if self._last is not None and self._last >= index:
             self._last = None if self._last == index else self._last - 1
-        self._note(f"Deleted: row {index + 1}, {label}")
+        self._note(
+            f"Deleted: line {row.line}, {row.label_with_cycle}. The lines after it are now one "
+            "further up than on the sheet."
+        )
         self._judge()
         self._ask_for_next()
 

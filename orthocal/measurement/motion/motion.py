@@ -49,6 +49,8 @@ class Guidance:
 
     joints: dict[str, Array]
     """Posture to the joint coordinates that the controller displays, [m, rad]."""
+    passive: dict[str, Array]
+    """Posture to the passive coordinates, [m, rad]."""
     tool: dict[str, Array]
     """Posture to the tool centre point, shape (3,), [m]; empty for a robot without a tool."""
     contacts: dict[str, tuple[list[str], Contact]]
@@ -70,13 +72,14 @@ def guide(session: Session) -> Guidance:
     """
     robot = session.robot
     commanded = drive_table(session) + session.active_offsets
+    closure = nominal_closure(robot)
+    passive = closure.close(commanded, names=list(session.postures))
     tool: dict[str, Array] = {}
     if robot.tcp is not None:
-        closure = nominal_closure(robot)
-        passive = closure.close(commanded, names=list(session.postures))
         tool = dict(zip(session.postures, closure.tcp(commanded, passive), strict=True))
     return Guidance(
         joints=dict(zip(session.postures, shown_joints(robot, commanded), strict=True)),
+        passive=dict(zip(session.postures, passive, strict=True)),
         tool=tool,
         contacts=locate_contacts(with_alignment(session)),
         aligned_at=session.alignment_postures,

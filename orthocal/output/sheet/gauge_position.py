@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.measurement.motion.motion import SetupMotion
+from orthocal.measurement.motion.motion import Guidance, SetupMotion
 from orthocal.robot.model import Leg, Robot, Rod
 from orthocal.sensors.protocol import Contact, TouchingTip
 from orthocal.session.session import Session, Setup
@@ -78,8 +78,7 @@ class GaugePosition:
 def find_gauge_position(
     session: Session,
     motion: SetupMotion,
-    contacts: Mapping[str, tuple[list[str], Contact]],
-    passive: Mapping[str, Array],
+    guidance: Guidance,
     links: tuple[str, ...],
 ) -> GaugePosition:
     """Position of the gauge of one setup.
@@ -87,34 +86,29 @@ def find_gauge_position(
     Args:
         session: The plan.
         motion: The motion through the setup.
-        contacts: Setup to its postures and its contact in them (`locate_contacts`).
-        passive: Posture to passive coordinates of the nominal machine, [m, rad].
+        guidance: Guidance for the plan.
         links: Frames whose poses are needed.
     """
     robot, setup = session.robot, session.setups[motion.setup]
     leg, rod = _find_touched(robot, setup)
-    names, contact = contacts[motion.setup]
+    names, contact = guidance.contacts[motion.setup]
     alignment = session.alignment_postures[motion.setup]
     aligned = names.index(alignment)
     drives = np.array([session.postures[n].drives + session.active_offsets for n in names])
-    q = np.array([passive[n] for n in names])
+    q = np.array([guidance.passive[n] for n in names])
     rods = [] if leg is None else list(leg.rods.values())
     ends = [frame for r in rods for frame in (r.root, r.tip)]
     ends += [] if leg is None else [leg.root, leg.tip]
     wanted = tuple(dict.fromkeys([*links, *ends]))
     poses = place_frames(robot, drives[aligned][None], q[aligned][None], wanted)
-    hinge_distances, lateral_offset = np.full(len(names), np.nan), np.zeros(3)
+    distances, lateral_offset = np.full(len(names), np.nan), np.zeros(3)
     if rod is not None:
-        frames = place_frames(robot, drives, q, (rod.root, rod.tip))
-        roots, tips = (frames[f][:, :3, 3] for f in (rod.root, rod.tip))
-        axes = (tips - roots) / np.linalg.norm(tips - roots, axis=1)[:, None]
-        hinge_distances = np.einsum("ki,ki->k", contact.points - roots, axes)
-        normals = contact.points - roots - hinge_distances[:, None] * axes
+        distances, normals, axes = _locate_on_rod(robot, rod, drives, q, contact)
         lateral_offset = _find_lateral_offset(rod, contact, normals[aligned], axes[aligned])
     tool_path = np.zeros((0, 3))
     if robot.tcp is not None:
         way = np.array([s.drives for s in motion.stops])
-        on_way = np.array([passive[s.posture] for s in motion.stops])
+        on_way = np.array([guidance.passive[s.posture] for s in motion.stops])
         tool = robot.tcp.frame
         tool_path = place_frames(robot, way, on_way, (tool,))[tool][:, :3, 3]
     return GaugePosition(
@@ -127,9 +121,40 @@ def find_gauge_position(
         drives=drives[aligned],
         aligned=aligned,
         tool_path=tool_path,
-        hinge_distances=hinge_distances,
+        hinge_distances=distances,
         lateral_offset=lateral_offset,
     )
+
+
+def hinge_distances(session: Session, setup: str, guidance: Guidance) -> dict[str, float]:
+    """Posture to the distance of a gauge's contact from the rod's hinge on the slide, [m].
+
+    It is empty for a gauge that touches no rod.
+    """
+    _, rod = _find_touched(session.robot, session.setups[setup])
+    if rod is None:
+        return {}
+    names, contact = guidance.contacts[setup]
+    drives = np.array([session.postures[n].drives + session.active_offsets for n in names])
+    q = np.array([guidance.passive[n] for n in names])
+    distances, _, _ = _locate_on_rod(session.robot, rod, drives, q, contact)
+    return dict(zip(names, distances.tolist(), strict=True))
+
+
+def _locate_on_rod(
+    robot: Robot, rod: Rod, drives: Array, passive: Array, contact: Contact
+) -> tuple[Array, Array, Array]:
+    """Contact points relative to a rod, in K postures.
+
+    Returns:
+        Distances from the rod's hinge at the drive along its axis, shape (K,), [m]; vectors from
+        the axis to the points, shape (K, 3), [m]; unit vectors along the rod, shape (K, 3).
+    """
+    frames = place_frames(robot, drives, passive, (rod.root, rod.tip))
+    roots, tips = (frames[f][:, :3, 3] for f in (rod.root, rod.tip))
+    axes = (tips - roots) / np.linalg.norm(tips - roots, axis=1)[:, None]
+    distances = np.einsum("ki,ki->k", contact.points - roots, axes)
+    return distances, contact.points - roots - distances[:, None] * axes, axes
 
 
 def _find_lateral_offset(rod: Rod, contact: Contact, normal: Array, axis: Array) -> Array:

@@ -10,18 +10,16 @@ from numpy.typing import NDArray
 
 from orthocal.assessment.wording import name_direction
 from orthocal.io.html import escape, heading, page, paragraph, prose, table
-from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.measurement.motion.motion import (
     SetupMotion,
     Stop,
     approach_length,
+    guide,
     plan_motion,
     set_dial,
     shown_joints,
-    with_alignment,
 )
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
-from orthocal.observation.contacts import locate_contacts
 from orthocal.output.sheet.gauge_position import (
     ABOUT_ALONG,
     GaugePosition,
@@ -72,10 +70,10 @@ def sheet_files(
         programs = {program_name(m): write_program(session, m, options) for m in motions}
     visuals = load_visuals(session.robot)
     links = tuple(dict.fromkeys(v.link for v in visuals))
-    contacts, passive = locate_contacts(with_alignment(session)), _close_loops(session)
+    guidance = guide(session)
     setups = []
     for motion in motions:
-        gauge = find_gauge_position(session, motion, contacts, passive, links)
+        gauge = find_gauge_position(session, motion, guidance, links)
         pictures = draw_machine(session.robot, visuals, gauge) + draw_section(gauge)
         setups.append(_setup(session, motion, gauge, pictures, with_program=bool(programs)))
     title = f"Measuring sheet: {session.robot.name}, {session.title}"
@@ -84,14 +82,6 @@ def sheet_files(
     following = f"validate {shlex.quote(calibration)}" if _is_corrected(session) else "calibrate"
     body = "\n".join([front, "".join(setups), _afterwards(f"orthocal {following} .")])
     return {SHEET: page(title, style, body), **programs}
-
-
-def _close_loops(session: Session) -> dict[str, Array]:
-    """Posture to passive coordinates of the nominal machine, [m, rad]."""
-    names = list(session.postures)
-    drives = np.array([session.postures[n].drives + session.active_offsets for n in names])
-    passive = nominal_closure(session.robot).close(drives, names=names)
-    return dict(zip(names, passive, strict=True))
 
 
 def _front(

@@ -8,10 +8,12 @@ import shutil
 import textwrap
 from collections.abc import Sequence
 
+from orthocal.assessment.judgement import is_far
 from orthocal.assessment.wording import counted, joined, mm, name_direction, runs
 from orthocal.calibration.assessment_record import Finding
-from orthocal.measurement.motion.motion import guide
+from orthocal.measurement.motion.motion import approach_length, guide, set_dial
 from orthocal.measurement.recording import Recording
+from orthocal.output.sheet.gauge_position import hinge_distances
 from orthocal.session.session import Reading, Session, Setup
 from orthocal.text import printable
 from orthocal.units import DRIVE_UNITS, MM, format_fixed, to_mm, trim_zeros
@@ -23,12 +25,12 @@ GLUE = "\u00a0"
 """Space at which no line ends."""
 
 COMMANDS = {
-    "back": "correct the row above; `back 3` row 3",
-    "again": "read the last row once more, as another cycle; `again 3` row 3",
-    "skip": "leave this row empty for now",
-    "drop": "delete this row from the session; `drop 3` row 3",
+    "back": "correct the line above; `back 7` line 7",
+    "again": "read the last line once more, as another cycle; `again 7` line 7",
+    "skip": "leave this line empty for now",
+    "drop": "delete this line from the session; `drop 7` line 7",
     "restart": "delete the readings of this setup and read it again, if stand or dial moved",
-    "list": "all rows and their readings",
+    "list": "all lines and their readings",
     "show": "this setup and posture once more",
     "help": "this list",
     "quit": "end; all readings are kept, and the same command continues",
@@ -89,9 +91,12 @@ class RecordingText:
             )
         parts.append(
             "Type the reading of the dial in mm. It is on disk before the next question. `help` "
-            "lists the commands."
+            "lists the commands. Lines are those of the sheet and of readings.csv."
         )
-        parts.append("Approach every posture from the same side, from a millimetre before it.")
+        parts.append(
+            "Approach every posture from the same side: the last "
+            f"{approach_length(session.robot)} in one direction."
+        )
         return "\n".join(self.wrap(part) for part in parts)
 
     def setup(self, name: str) -> str:
@@ -100,7 +105,8 @@ class RecordingText:
         setup = session.setups[name]
         names = list(dict.fromkeys(r.setup for r in rows))
         of_setup = [r for r in rows if r.setup == name]
-        aligned = self._guidance.aligned_at[name]
+        aligned, first = self._guidance.aligned_at[name], of_setup[0].minus or of_setup[0].posture
+        go = "" if aligned == first else f"Then go to {first}. "
         title = (
             f"Setup {name}, {names.index(name) + 1} of {len(names)}: "
             f"{counted(len(of_setup), 'reading')}"
@@ -113,16 +119,17 @@ class RecordingText:
             )
         else:
             parts.append(
-                f"Go to {aligned}, align the gauge and set the dial to {_middle(session, setup)} "
-                "there. From then on touch neither stand nor dial until the setup is complete."
+                f"Go to {aligned} and align the gauge. {go}"
+                f"{set_dial(session.gauges[setup.gauge])} From then on touch neither stand nor "
+                "dial until the setup is complete."
             )
         if all(r.minus is not None for r in of_setup):
             parts.append(
-                "Each row is a difference: the reading in its first posture minus that in its "
+                "Each line is a difference: the reading in its first posture minus that in its "
                 "second."
             )
         lines = [self.wrap(title), *(self.wrap(part, indent="  ") for part in parts if part)]
-        if aligned != (of_setup[0].minus or of_setup[0].posture):
+        if aligned != first:
             lines.append(self._coordinates(aligned, f"{aligned}: "))
         return "\n".join(lines)
 
@@ -131,17 +138,23 @@ class RecordingText:
         aligned = guidance.aligned_at[setup]
         at = ", ".join(f"{format_fixed(v / MM, 1)}" for v in guidance.touched(setup, aligned))
         side = name_direction(guidance.contacts[setup][1].direction)
+        distances = hinge_distances(self._session, setup, guidance)
+        from_hinge = ""
+        if distances:
+            from_hinge = f", {distances[aligned] / MM:.1f} mm from the hinge on the slide"
         return (
-            f"Stand: on the {side} side, so that the tip touches at ({at}) mm in {aligned}. Push "
-            f"the plunger in: the dial has to grow, as it does where the machine moves to {side}."
+            f"Stand: on the {side} side, so that the tip touches at ({at}) mm in {aligned}"
+            f"{from_hinge}. Push the plunger in: the dial must grow. If it falls, type every "
+            "reading of this setup with reversed sign."
         )
 
     def row(self, index: int) -> str:
         """Next reading, and the posture of the machine for it."""
         rows = self._recording.rows
         row = rows[index]
-        place = f"{index + 1} of {len(rows)} (line {row.line} of the table)"
-        lines = [self.wrap(f"{place}: {row.label_with_cycle}")]
+        missing = len(self._recording.missing)
+        left = f" ({missing} of {len(rows)} missing)" if missing else ""
+        lines = [self.wrap(f"Line {row.line}: {row.label_with_cycle}{left}")]
         for posture in (row.posture, *([row.minus] if row.minus else [])):
             name = f"{posture}: " if row.minus else ""
             lines.append(self._coordinates(posture, name))
@@ -166,25 +179,41 @@ class RecordingText:
     def confirmation(self, index: int) -> str:
         """Confirmation that a reading is on disk."""
         row = self._recording.rows[index]
-        text = f"Recorded: row {index + 1}, {row.label_with_cycle}: {show_mm(row.value)} mm"
+        text = f"Recorded: line {row.line}, {row.label_with_cycle}: {show_mm(row.value)} mm"
         return self.wrap(text, indent="  ")
 
-    def prediction(self, mean: float, std: float) -> str:
+    def prediction(self, index: int, mean: float, std: float) -> str:
         """Prediction of a reading by the others, with its expanded uncertainty (k = 2).
 
         Args:
+            index: Index of the row.
             mean: Predicted reading, [m].
             std: Its standard deviation, [m]; infinite without a prediction.
         """
         if math.isinf(std):
             return ""
+        row = self._recording.rows[index]
         text = f"The other readings predict {format_fixed(mean / MM, 3)} ± {mm(2.0 * std)} mm."
+        if is_far(row.value, mean, std):
+            text += f" Line {row.line} differs by {mm(abs(row.value - mean))} mm: check the dial."
         return self.wrap(text, indent="  ")
 
-    def warning(self, finding: Finding) -> str:
-        """A finding about the readings so far, in the words of `check`."""
-        indices = find_rows(finding, self._recording.rows)
-        where = f" ({_spans([i + 1 for i in indices])})" if indices else ""
+    def warning(self, finding: Finding, *, last: int | None = None) -> str:
+        """A finding about the readings so far, in the words of `check`.
+
+        Args:
+            finding: The finding.
+            last: Index of the row that was read last; it is named first.
+        """
+        rows = self._recording.rows
+        indices = find_rows(finding, rows)
+        first = [i for i in indices if i == last]
+        parts = [[rows[i].line or 0 for i in part] for part in (first, indices) if part]
+        if first and len(indices) > 1:
+            parts[1].remove(parts[0][0])
+            where = f" ({_spans(parts[0])}; or {_spans(parts[1])})"
+        else:
+            where = f" ({_spans(parts[-1])})" if parts else ""
         kind = finding.kind.capitalize()
         return self.wrap(f"{kind}{where}: {finding.words}", indent="  ", first="! ")
 
@@ -199,14 +228,14 @@ class RecordingText:
     def list_rows(self) -> str:
         """All rows and their readings."""
         rows = self._recording.rows
-        last = len(str(len(rows)))
+        last = len(str(rows[-1].line))
         return "\n".join(
             self.wrap(
-                f"{i + 1:>{last}}  {r.label_with_cycle}: ".replace("  ", GLUE * 2)
+                f"{r.line:>{last}}  {r.label_with_cycle}: ".replace("  ", GLUE * 2)
                 + (f"{show_mm(r.value)}{GLUE}mm" if r.is_read else "not read"),
                 indent=" " * (last + 2),
             )
-            for i, r in enumerate(rows)
+            for r in rows
         )
 
     def list_commands(self) -> str:
@@ -242,7 +271,7 @@ class RecordingText:
         if recording.missing:
             parts = []
             for setup in dict.fromkeys(rows[i].setup for i in recording.missing):
-                numbers = [i + 1 for i in recording.missing if rows[i].setup == setup]
+                numbers = [rows[i].line or 0 for i in recording.missing if rows[i].setup == setup]
                 every = len(numbers) == sum(r.setup == setup for r in rows)
                 parts.append(f"{setup} {'all' if every else _spans(numbers)}")
             count = len(recording.missing)
@@ -288,13 +317,6 @@ def _gauge(session: Session, setup: Setup) -> str:
     return f"Dial{name}: {', '.join(facts)}" if facts or name else ""
 
 
-def _middle(session: Session, setup: Setup) -> str:
-    limits = session.gauges[setup.gauge].range
-    if limits is None:
-        return "the middle of its range"
-    return f"about {0.5 * (limits[0] + limits[1]) / MM + 0.0:g} mm, the middle of its range,"
-
-
 def find_rows(finding: Finding, rows: Sequence[Reading]) -> list[int]:
     """Indices of the rows with a reading that a finding names, by line or by setup."""
     lines = {p.line for p in finding.places if p.line is not None}
@@ -304,6 +326,6 @@ def find_rows(finding: Finding, rows: Sequence[Reading]) -> list[int]:
 
 
 def _spans(numbers: Sequence[int]) -> str:
-    """Numbers of rows in words: rows 3, 5 to 8."""
+    """Numbers of lines in words: lines 3, 5 to 8."""
     words = [str(a) if a == b else f"{a} to {b}" for a, b in runs(numbers)]
-    return f"{'row' if len(numbers) == 1 else 'rows'} {', '.join(words)}"
+    return f"{'line' if len(numbers) == 1 else 'lines'} {', '.join(words)}"
