@@ -1,4 +1,7 @@
-"""Findings about a fit: what its residuals, noise and parameters show. They only inform."""
+"""Findings about a fit: what its residuals, noise and parameters show.
+
+They are notes, except that an offset at a stated bound is to be reviewed.
+"""
 
 from __future__ import annotations
 

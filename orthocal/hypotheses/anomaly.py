@@ -63,7 +63,7 @@ class Explanation:
     cycle: int | None = None
     """The cycle, where one alone is concerned."""
     factor: float | None = None
-    """Factor that corrects the readings (wrong unit, decimal point, reversed sign)."""
+    """Factor that corrects the readings."""
     amount: float | None = None
     """Amount by which the rows are too large, [m] (misread dial, outlier, displaced gauge; for a
     drift of the last row against the first); of `machine changed` the change, [SI]."""
