@@ -137,14 +137,20 @@ class _Search:
         """Forward selection, backward elimination and their result.
 
         A unit or a decimal point of many readings explains several gross errors a little: where one
-        is found, single readings are tried by themselves as well.
+        is found, single readings are tried by themselves as well. No correction is proposed that
+        leaves more than the readings as written and that no machine shows.
         """
         state, near = self._select(grouped=True)
         if any(t.explanation.factor and len(t.explanation.rows) > 1 for t in state.terms):
             other = self._select(grouped=False)
-            if other[0].log_posterior > state.log_posterior + NEARLY:
+            if other[0].log_posterior > state.log_posterior + NEARLY or self._worsens(state):
                 state, near = other
-        return self._result(state, near)
+        return self._result(*((self.sound, []) if self._worsens(state) else (state, near)))
+
+    def _worsens(self, state: HypothesisSet) -> bool:
+        """True if the corrected readings are further from any machine than those as written."""
+        before, after = (self.model.rms(s.remaining, s.about) for s in (self.sound, state))
+        return after > before and not self.is_plausible(state)
 
     def _select(
         self, *, grouped: bool
@@ -253,7 +259,7 @@ class _Search:
             ranked = plausible
         if ranked[0].log_posterior < state.log_posterior + CLEARLY:
             return None, []
-        near = [s for s in ranked if s.log_posterior > ranked[0].log_posterior - NEARLY]
+        near = _nearly_as_likely(ranked, plausible)
         simplest = min(near, key=lambda s: s.size)
         if is_same_place(simplest, near[0]):
             simplest = near[0]
@@ -493,6 +499,22 @@ class _Search:
             state.score.tolerance_scale,
             state.score.noise_scale,
         )
+
+
+def _nearly_as_likely(
+    ranked: list[HypothesisSet], plausible: list[HypothesisSet]
+) -> list[HypothesisSet]:
+    """The most likely sets; of a pair also single hypotheses, if they are not clearly less likely.
+
+    The second anomaly of a pair needs the evidence that it would need after the first.
+    """
+    best = ranked[0].log_posterior
+    near = [s for s in ranked if s.log_posterior > best - NEARLY]
+    alone = [s for s in plausible if len(s.terms) < len(ranked[0].terms)]
+    if alone and alone[0].log_posterior > best - CLEARLY:
+        level = alone[0].log_posterior - NEARLY
+        near += [s for s in alone if s.log_posterior > level and s not in near]
+    return near
 
 
 def _families(model: LinearModel, rows: Rows, *, grouped: bool = True) -> Iterator[Family]:
