@@ -40,7 +40,6 @@ from orthocal.calibration.assessment_record import (
     Finding,
     FindingKind,
     Place,
-    first_of,
 )
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
@@ -192,11 +191,13 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
     if not math.isnan(excess):
         confirmed = lead.severity == "note" and not changes
         confirmed = None if confirmed and judgement.verdict != "enter" else confirmed
-    keep = wrongly_entered or (confirmed is not False and lead.kind != "further change")
+    further = [] if lead.kind != "as predicted" else _find_further_change(refit)
+    keep = wrongly_entered or (confirmed is not False and not further)
     entries = find_entries(calibration) if keep else assessment_of(refit).entries
     repetition = measure_repetition(calibration, refit)
     stated = all(one.controller_offsets is not None for one in given)
     notes = [
+        *further,
         *([] if wrongly_entered else assessment_of(refit).of_kind(*ENTRY_KINDS)),
         words.describe_repetition(repetition, new=_is_expected(excess) is False),
         *([] if stated else [words.controller_assumed()]),
@@ -292,7 +293,7 @@ def _agreement(refit: Calibration, excess: float, expected: float, *, explained:
         expected: RMS of the deviations as predicted, [m].
         explained: Whether a change between the sessions explains the deviations.
     """
-    achieved, judged = refit.rms_before, assessment_of(refit)
+    achieved = refit.rms_before
     numbers = {
         "expected_rms_mm": expected / MM,
         "achieved_rms_mm": achieved / MM,
@@ -312,11 +313,15 @@ def _agreement(refit: Calibration, excess: float, expected: float, *, explained:
             numbers=numbers,
             place=Place(line=worst.line, setup=worst.setup, posture=worst.postures),
         )
+    return words.as_predicted(achieved, expected, numbers)
+
+
+def _find_further_change(refit: Calibration) -> list[Finding]:
+    """Finding about offsets that a calibration from the new readings changes."""
+    judged = assessment_of(refit)
     if judged.keeps_offsets:
-        return words.as_predicted(achieved, expected, numbers)
-    changed = first_of(judged.findings, "must change")
-    drives = [] if changed is None else [p.parameter or "" for p in changed.places]
-    return words.further_change(achieved, expected, drives, numbers)
+        return []
+    return [words.further_change([e for e in judged.entries if is_significant(refit, e)])]
 
 
 def _expect_largest(calibration: Calibration, expected_rms: float) -> float:

@@ -14,9 +14,6 @@ from orthocal.units import MM, UM
 
 Array = NDArray[np.float64]
 
-LARGEST_IN_UM = 0.1 * MM
-"""Lengths from which on a sentence is in mm, [m]."""
-
 ALONG_AXIS = 0.9999
 """Cosine above which a direction is named after an axis of the world."""
 
@@ -98,21 +95,29 @@ def runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
     return [(run[0], run[-1]) for run in found]
 
 
+def spans(numbers: Sequence[int], noun: str) -> str:
+    """Numbers as runs, such as lines 3, 5 to 8."""
+    words = [
+        str(a) if a == b else f"{a}{' to' if b > a + 1 else ','} {b}" for a, b in runs(numbers)
+    ]
+    return f"{noun if len(numbers) == 1 else f'{noun}s'} {', '.join(words)}"
+
+
 def count_of(value: int) -> str:
     """A number of things, below ten as a word."""
     words = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
     return words[value] if 0 <= value < len(words) else str(value)
 
 
-def lengths(*values: float) -> tuple[str, ...]:
-    """Lengths of one sentence in one unit, two or three significant digits: 0.12 mm, 17.8 µm.
+def tool_mm(value: float) -> str:
+    """A tool error in mm: two significant digits, at most three decimals.
 
     Args:
-        values: Lengths, [m].
+        value: Length, [m].
     """
-    if max(values) >= LARGEST_IN_UM:
-        return tuple(f"{v / MM:.2g} mm" if v / MM < 1.0 else f"{v / MM:.3g} mm" for v in values)
-    return tuple(f"{um(v)} µm" for v in values)
+    size = value / MM
+    digits = 1 - math.floor(math.log10(size)) if size > 0.0 else 3
+    return f"{size:.{min(max(digits, 0), 3)}f} mm"
 
 
 def axis_name(direction: Array, *, cosine: float = ALONG_AXIS) -> str:

@@ -15,8 +15,8 @@ from orthocal.errors import ParameterError
 
 FILES = ("session.yaml", "readings.csv", "sheet.html")
 
-DIGITS = 7
-"""Decimals of an offset, [m, rad]: offsets to enter are printed to 0.1 µm."""
+DIGITS = 6
+"""Decimals of an offset, [m, rad]: offsets to enter are printed to 1 µm, as by `calibrate`."""
 
 
 @command()
@@ -51,7 +51,7 @@ def again(
         put_note(problem)
     orthocal.write_session(new, out, comment=comment, extra=sheet, blank=True)
     offsets = ", ".join(
-        f"{d.name} {v * d.edge_factor:+.4f} {d.edge_unit}"
+        f"{d.name} {v * d.edge_factor:+.3f} {d.edge_unit}"
         for d, v in zip(new.robot.drives, new.active_offsets.tolist(), strict=True)
     )
     put_out(

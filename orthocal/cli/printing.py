@@ -81,7 +81,7 @@ def deliver_judged(
 
     def show() -> None:
         if isinstance(result, Assessment):
-            print_decision(result)
+            print_decision(result, **shown)
         else:
             print_summary(result, **shown)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from orthocal.assessment.wording import joined, lengths, note, plain, review, signed, um
+from orthocal.assessment.wording import joined, note, plain, review, signed, spans, um
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, Explanation
 from orthocal.session.session import Session
@@ -38,7 +38,8 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
         return _ambiguous(session, result, anomaly)
     first = session.readings[e.rows[0]]
     ways = [_text(session, c) for c in anomaly.causes] or [_text(session, e)]
-    text = f"{session.where(first)}: it looks as if {' or '.join(ways)}."
+    text = f"{_lines(session, e)}it looks as if {' or '.join(ways)}."
+    text = f"{text[0].upper()}{text[1:]}"
     numbers = _numbers(result, anomaly)
     if anomaly.expected is not None:
         text += (
@@ -51,17 +52,15 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
             "cycle": float(first.cycle),
         }
     action = "Read it again, or leave it out." if anomaly.causes else _remedy(session, e)
-    text = f"{text} {_odds(result, anomaly)}"
     return review(e.kind, text, action, _places(session, e), **numbers)
 
 
 def _ambiguous(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding:
     every = (anomaly.explanation, *anomaly.alternatives)
-    ways = "; ".join(_text(session, e) + _line(session, e) for e in every)
+    ways = ";\n".join(f"  {_lines(session, e)}{_text(session, e)}" for e in every)
     return review(
         "ambiguous",
-        f"The readings contradict each other as if one of these had happened: {ways}. "
-        f"{_odds(result, anomaly)}",
+        f"The readings contradict each other. One of these may have happened:\n{ways}.",
         "Look at these readings, and read again what may be wrong.",
         tuple(p for e in every for p in _places(session, e)[:1]),
         **_numbers(result, anomaly),
@@ -69,19 +68,19 @@ def _ambiguous(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding
 
 
 def _unexplained(session: Session, result: Anomalies) -> Finding:
-    before, after = lengths(result.rms_before, result.rms_after)
     what = "What was found above explains" if result.found else "No single change explains"
-    remains = f" ({before} RMS, {after} RMS once corrected)" if result.found else f" ({before} RMS)"
     which = "The sessions do" if session.joined else "The readings do"
     return review(
         "inconsistent readings",
-        f"{which} not fit one machine{remains}. {what} "
+        f"{which} not fit one machine. {what} "
         f"{'only a part' if result.found else 'it'}: several parts may have changed, or several "
         "readings are wrong.",
         "Calibrate the last session alone: the values to enter must belong to the machine as it "
         "is now."
         if session.joined
         else "Measure again.",
+        before_rms_um=result.rms_before / UM,
+        after_rms_um=result.rms_after / UM,
     )
 
 
@@ -146,18 +145,20 @@ def _numbers(result: Anomalies, anomaly: Anomaly) -> dict[str, float]:
     }
 
 
-def _odds(result: Anomalies, anomaly: Anomaly) -> str:
-    """Residuals before and after the correction, and the odds."""
-    odds = math.exp(min(anomaly.log_evidence, math.log(LARGEST_ODDS)))
-    number = f"{float(f'{odds:.3g}'):,.0f}"
-    if odds > 0.999 * LARGEST_ODDS:
-        number = f"more than {LARGEST_ODDS:,.0f}"
-    words = f"odds that something is wrong: {number} to 1."
-    stuck = anomaly.explanation.kind == "stuck dial"
-    if stuck or not math.isfinite(result.rms_before + result.rms_after):
-        return f"{words[0].upper()}{words[1:]}"
-    before, after = um(result.rms_before), um(result.rms_after)
-    return f"Residual {before} µm RMS as written, {after} µm once corrected; {words}"
+def describe_evidence(finding: Finding) -> str:
+    """Residuals before and after the correction of an anomaly, and the odds; "" without any."""
+    numbers = finding.numbers
+    parts = []
+    before, after = (numbers.get(f"{n}_rms_um", math.nan) * UM for n in ("before", "after"))
+    if math.isfinite(before + after) and finding.kind != "stuck dial":
+        parts.append(f"Residual {um(before)} µm RMS as written, {um(after)} µm once corrected.")
+    if "log_likelihood_ratio" in numbers:
+        odds = math.exp(min(numbers["log_likelihood_ratio"], math.log(LARGEST_ODDS)))
+        number = f"{float(f'{odds:.3g}'):,.0f}"
+        if odds > 0.999 * LARGEST_ODDS:
+            number = f"more than {LARGEST_ODDS:,.0f}"
+        parts.append(f"Odds that something is wrong: {number} to 1.")
+    return " ".join(parts)
 
 
 def _places(session: Session, e: Explanation) -> tuple[Place, ...]:
@@ -190,8 +191,13 @@ def _file_of(session: Session, label: str) -> str | None:
     return None if path is None else str(path)
 
 
-def _line(session: Session, e: Explanation) -> str:
-    return f" ({session.where(session.readings[e.rows[0]])})" if e.rows else ""
+def _lines(session: Session, e: Explanation) -> str:
+    """Lines of readings.csv that an explanation concerns, with a colon; "" if unknown."""
+    rows = [session.readings[i] for i in e.rows]
+    lines = sorted(r.line for r in rows if r.line is not None)
+    if not lines or len(lines) == len(session.readings):
+        return ""
+    return f"{spans(lines, 'line')}: "
 
 
 def _row(session: Session, i: int) -> str:
@@ -220,7 +226,11 @@ def _text(session: Session, e: Explanation) -> str:
             session, e, UNITS.get(e.factor or 0.0, "in mm and read as inches")
         ),
         "decimal point": lambda: _written(session, e, "with a misplaced decimal point"),
-        "reversed sign": lambda: f"the sign of {_subject(session, e)} is reversed",
+        "reversed sign": lambda: (
+            f"the sign of {_subject(session, e)} is reversed"
+            if e.scope in ("reading", "posture")
+            else f"the signs of {_subject(session, e)} are reversed"
+        ),
         "misread dial": lambda: (
             f"{_subject(session, e)} was read {abs(e.amount or 0.0) / MM:g} mm too "
             f"{'high' if (e.amount or 0.0) > 0 else 'low'}, by a turn or a mark of the dial"
@@ -232,7 +242,7 @@ def _text(session: Session, e: Explanation) -> str:
             else f"the machine was not in posture {e.names[0]} when that was read"
         ),
         "inconsistent setup": lambda: f"setup {e.setups[0]} is not the one that is described",
-        "swapped rows": lambda: f"{_swapped(session, e)} were swapped",
+        "swapped rows": lambda: _swapped(session, e),
         "row offset": lambda: _offset(session, e),
         "stuck dial": lambda: (
             f"the dial stuck in setup {e.names[0]}: from {_row(session, e.rows[0])} on it shows "
@@ -278,16 +288,18 @@ def _offset(session: Session, e: Explanation) -> str:
     first = _row(session, e.rows[0])
     if e.missing:
         return (
-            f"{first} was not read, and all later readings of setup {e.names[0]} are one row too "
-            "early"
+            f"{first} was not read, and all later readings of setup {e.names[0]} are one line "
+            "too early"
         )
     return (
         f"the reading before {first} was written twice, and all later readings of setup "
-        f"{e.names[0]} are one row too late"
+        f"{e.names[0]} are one line too late"
     )
 
 
 def _swapped(session: Session, e: Explanation) -> str:
+    if e.scope == "setup":
+        return f"the readings of setup {e.setups[0]} were written in reverse order"
     half = len(e.rows) // 2
     names = {
         "reading": lambda: (
@@ -297,9 +309,8 @@ def _swapped(session: Session, e: Explanation) -> str:
         "postures": lambda: f"the readings of postures {e.names[0]} and {e.names[1]} in all setups",
         "setups": lambda: f"the readings of setups {e.setups[0]} and {e.setups[1]}",
         "legs": lambda: f"the readings of legs {e.names[0]} and {e.names[1]}",
-        "setup": lambda: f"the rows of setup {e.setups[0]}, written in reverse order,",
     }
-    return names[e.scope]()
+    return f"{names[e.scope]()} were swapped"
 
 
 def _changed(session: Session, e: Explanation) -> str:
@@ -339,8 +350,8 @@ def _remedy(session: Session, e: Explanation) -> str:
         return f"If so, read cycle {e.cycle} again, or leave it out."
     if e.kind == "row offset":
         if e.missing:
-            return "If so, move them down by a row and read what is missing."
-        return "If so, move them up by a row and read the last one again."
+            return "If so, move them down by a line and read what is missing."
+        return "If so, move them up by a line and read the last one again."
     if e.kind == "inconsistent posture" and e.scope == "postures":
         return "Check its coordinates, and read it again."
     remedies = {

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 
 from orthocal.assessment.recommendation import Recommendation
-from orthocal.assessment.wording import lengths, mm, note
-from orthocal.assessment.words.entries import describe_compensated
+from orthocal.assessment.wording import mm, note, tool_mm
 from orthocal.calibration.assessment_record import Finding
 from orthocal.units import MM, UM
 
@@ -21,23 +20,22 @@ def describe_recommendation(found: Recommendation, *, chosen: str | None = None)
     evidence = found.of(found.model)
     if evidence > 0.0:
         reason = (
-            f"The readings support it strongly (ln evidence {evidence:+.0f} against the complete "
-            "model): errors beyond it are too small to be seen."
+            "The readings support it strongly against the complete model: errors beyond it are "
+            "too small to be seen."
         )
     else:
         reason = "It is the complete model, and the readings support no smaller one strongly."
     other = -found.of(chosen) + evidence if chosen is not None else math.nan
+    numbers = {"log_evidence": evidence}
     if math.isfinite(other) and chosen != found.model:
-        reason += f" ln evidence against {chosen}: {other:+.0f}."
-    findings = [
-        note("recommended", f"Recommended model: {found.model}. {reason}", log_evidence=evidence)
-    ]
+        numbers["log_evidence_against_chosen"] = other
+    findings = [note("recommended", f"Recommended model: {found.model}. {reason}", **numbers)]
     if found.tolerance_scale != 1.0:
         findings.append(
             note(
                 "tolerances differ",
-                f"The readings support tolerances of {found.tolerance_scale:.2g} times the stated "
-                f"ones strongly (ln evidence {found.scale_evidence:+.0f}).",
+                f"The readings strongly support tolerances of {found.tolerance_scale:.2g} times "
+                "the stated ones.",
                 "State other tolerances in the session or by --tolerance if that is plausible.",
                 tolerance_scale=found.tolerance_scale,
                 log_evidence=found.scale_evidence,
@@ -63,14 +61,10 @@ def not_determined(model: str, reason: str) -> Finding:
     return note("not determined", f"{model}: not determined. {reason}.")
 
 
-def compensated(rms: float) -> Finding:
-    """Expected tool error with a controller that corrects all errors."""
-    return note("tool error", describe_compensated(rms), compensated_um=rms / UM)
-
-
 def linearisation_cost(rms: float) -> Finding:
     """Tool error that linearisation costs."""
-    (size,) = lengths(rms)
     return note(
-        "linearisation error", f"Linearisation costs {size} RMS at the tool.", cost_um=rms / UM
+        "linearisation error",
+        f"Linearisation costs {tool_mm(rms)} RMS at the tool.",
+        cost_um=rms / UM,
     )

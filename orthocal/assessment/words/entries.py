@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from orthocal.assessment.wording import joined, lengths, named, note
+from orthocal.assessment.wording import joined, named, note, tool_mm
 from orthocal.calibration.assessment_record import Finding, ToolErrorSummary, Verdict
 from orthocal.units import UM
 
@@ -46,15 +46,15 @@ def no_offset() -> Finding:
 
 
 def no_change_needed(drives: Sequence[str], ratio: float, tool: ToolErrorSummary | None) -> Finding:
-    """Neither an offset nor the tool error differs significantly from its present value."""
+    """Neither an offset nor the tool error changes by more than its uncertainty."""
     numbers = {"largest_change_over_std": ratio}
     too = ""
     if tool is not None:
         numbers |= {"now_um": tool.now / UM, "entered_um": tool.entered / UM}
-        too = ", and entering them does not change the expected tool error significantly"
+        too = ", and the expected tool error would change by less than its uncertainty"
     return note(
         "no change needed",
-        f"No offset differs significantly from its present value{too}.",
+        f"No offset changes by more than its uncertainty{too}.",
         "",
         named(*drives),
         **numbers,
@@ -62,25 +62,32 @@ def no_change_needed(drives: Sequence[str], ratio: float, tool: ToolErrorSummary
 
 
 def must_change(drives: Sequence[str]) -> Finding:
-    """Offsets that differ significantly from their present value."""
+    """Offsets that change by more than their uncertainty."""
     return note(
         "must change",
-        f"Significantly different from the present value: {joined(drives)}.",
+        f"{_changes(drives)} by more than {_their(drives)} uncertainty.",
         "",
         named(*drives),
     )
 
 
 def not_significant(drives: Sequence[str]) -> Finding:
-    """Offsets that do not differ significantly from their present value."""
-    verb = "does" if len(drives) == 1 else "do"
-    noun = "its present value" if len(drives) == 1 else "their present values"
+    """Offsets that change by less than their uncertainty."""
     return note(
         "not significant",
-        f"{joined(drives)} {verb} not differ significantly from {noun}.",
+        f"{_changes(drives)} by less than {_their(drives)} uncertainty. Entering "
+        f"{'it' if len(drives) == 1 else 'them'} does no harm.",
         "",
         named(*drives),
     )
+
+
+def _changes(drives: Sequence[str]) -> str:
+    return f"{joined(drives)} {'changes' if len(drives) == 1 else 'change'}"
+
+
+def _their(drives: Sequence[str]) -> str:
+    return "its" if len(drives) == 1 else "their"
 
 
 def controller_not_stated(drives: Sequence[str]) -> Finding:
@@ -99,18 +106,22 @@ def describe_tool_error(tool: ToolErrorSummary, *, keep: bool = False) -> str:
         tool: The tool error.
         keep: Whether the offsets stay as they are.
     """
-    where = f"workspace {tool.region}, workpiece aligned on the machine"
     if keep:
-        (now,) = lengths(tool.now)
-        return f"Expected tool error with the present offsets: {now} RMS, {where}."
-    entered, now = lengths(tool.entered, tool.now)
-    return f"Expected tool error: {entered} RMS (now {now}), {where}."
+        return f"Expected tool error with the present offsets: {tool_mm(tool.now)} RMS."
+    return (
+        f"Expected tool error with these offsets: {tool_mm(tool.entered)} RMS "
+        f"(now {tool_mm(tool.now)})."
+    )
 
 
 def describe_compensated(rms: float) -> str:
     """The expected tool error with a controller that corrects all identified errors."""
-    (size,) = lengths(rms)
-    return f"With a controller that corrects all errors: {size} RMS."
+    return f"With all errors corrected: {tool_mm(rms)}."
+
+
+def describe_region(region: str) -> str:
+    """Region and alignment of the tool errors of an answer."""
+    return f"RMS over the workspace {region}, workpiece aligned on the machine."
 
 
 def tool_error(tool: ToolErrorSummary, *, keep: bool) -> Finding:

@@ -75,8 +75,9 @@ def model_error(
     """
     return note(
         "model error",
-        f"The residuals, σ = {mm(sigma * factor)} mm of {row}, are {times(sigma / reference)} "
-        f"{source} ({mm(reference * factor)} mm): leg, axis and mounting errors, not noise.",
+        f"After the fit, {row} still deviates by {mm(sigma * factor)} mm, "
+        f"{times(sigma / reference)} {source} ({mm(reference * factor)} mm). These are errors of "
+        "legs, axes and mounting, not noise.",
         "`orthocal compare` shows whether the readings support a larger model." if larger else "",
         sigma_mm=sigma / MM,
         noise_mm=reference / MM,
@@ -181,9 +182,9 @@ def line_assumed(size: float, setup: str, touches: str, sigma: float) -> Finding
     """Readings are modelled as of the line between the rods, which nothing touches."""
     return note(
         "line assumed",
-        f"The readings are modelled as of the line between the rods of a leg. Readings of a rod "
-        f"differ from that by about {mm(size)} mm (setup {setup}).",
-        f"State what is touched (`touches: {touches}`, and the gauge's `tip`).",
+        "orthocal assumes that the gauge reads the centre line between the two rods of a leg. On "
+        f"a rod the readings differ by about {mm(size)} mm (setup {setup}).",
+        f"If it touched a rod, state `touches: {touches}` and the gauge's `tip`.",
         (Place(setup=setup),),
         off_line_mm=size / MM,
         sigma_mm=sigma / MM,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from orthocal.assessment.wording import mm, note, reject, review
+from orthocal.assessment.wording import mm, note, reject, review, times
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.units import MM, UM
 
@@ -25,9 +25,9 @@ def beyond_tolerances(scale: float, limit: float) -> Finding:
     """Only many times the stated tolerances would explain the readings."""
     return reject(
         "beyond tolerances",
-        f"Only a machine with {scale:.1f} times the stated tolerances explains these readings. "
-        f"More than {limit:g} times is no machine in working order.",
-        "Check signs, rows and setups. If they are right, adjust the machine mechanically first.",
+        f"These readings need errors {times(scale)} the stated tolerances. Above {limit:g} times, "
+        "the readings are wrong or the machine is out of adjustment.",
+        "Check signs, lines and setups. If they are right, adjust the machine mechanically first.",
         tolerance_scale=scale,
     )
 
@@ -36,7 +36,7 @@ def above_tolerances(scale: float) -> Finding:
     """Errors of the machine exceed their tolerances by a plausible factor."""
     return note(
         "above tolerances",
-        f"The errors of this machine correspond to {scale:.1f} times the stated tolerances.",
+        f"The errors of this machine are about {times(scale)} the stated tolerances.",
         tolerance_scale=scale,
     )
 
@@ -74,8 +74,8 @@ def sigma_too_large(given: float, scatter: float) -> Finding:
     """The stated noise of the gauge is far above what its readings scatter by."""
     return review(
         "sigma too large",
-        f"The session states a noise of {given / MM:g} mm (gauge.sigma_mm). Its readings scatter "
-        f"by {scatter / MM:.2g} mm.",
+        f"The session states that a reading scatters by {given / MM:g} mm (gauge.sigma_mm). The "
+        f"readings scatter by {scatter / MM:.2g} mm.",
         "Make sure that gauge.sigma_mm is in mm.",
         given_mm=given / MM,
         scatter_mm=scatter / MM,

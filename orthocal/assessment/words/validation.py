@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from orthocal.assessment.predictive import FEWEST, Repetition
-from orthocal.assessment.wording import joined, mm, named, note, review
-from orthocal.calibration.assessment_record import Finding, Place
+from orthocal.assessment.wording import joined, mm, named, note, review, signed
+from orthocal.calibration.assessment_record import ControllerEntry, Finding, Place
 
 CONFIRMED = "The calibration is confirmed."
 NOT_CONFIRMED = "The calibration is not confirmed."
 UNKNOWN = "Whether the calibration is confirmed is unknown."
 
-AGAIN = "Calibrate again from this session."
+AGAIN = "To use this, calibrate from this session."
 
 
 def nothing_predicted(numbers: Mapping[str, float]) -> Finding:
@@ -64,27 +64,35 @@ def larger_than_predicted(
 
 def as_predicted(achieved: float, expected: float, numbers: Mapping[str, float]) -> Finding:
     """Deviations are as the calibration predicts."""
-    return note("as predicted", _agreement(achieved, expected), **numbers)
-
-
-def further_change(
-    achieved: float, expected: float, drives: Sequence[str], numbers: Mapping[str, float]
-) -> Finding:
-    """Deviations are as predicted, and the new readings improve what to enter significantly."""
-    what = f"the offsets of {joined(drives)}" if drives else "the expected tool error"
     return note(
-        "further change",
-        f"{_agreement(achieved, expected)} The new readings determine {what} better.",
-        AGAIN,
-        named(*drives),
+        "as predicted",
+        f"The new readings deviate from the predictions by {mm(achieved)} mm RMS, within their "
+        f"uncertainty ({mm(expected)} mm expected).",
         **numbers,
     )
 
 
-def _agreement(achieved: float, expected: float) -> str:
-    return (
-        f"The deviations of the new readings are {mm(achieved)} mm RMS, consistent with the "
-        f"predicted {mm(expected)} mm."
+def further_change(entries: Sequence[ControllerEntry]) -> Finding:
+    """The new readings improve what to enter by more than its uncertainty.
+
+    Args:
+        entries: Offsets that change by more than their uncertainty; none if only all of them
+            together change the tool error.
+    """
+    changes = [
+        f"{e.drive} from {signed(e.active * e.edge_factor)} to {signed(e.enter * e.edge_factor)} "
+        f"{e.edge_unit}"
+        for e in entries
+        if e.active is not None
+    ]
+    noun = "an offset" if len(changes) == 1 else "offsets"
+    return note(
+        "further change",
+        f"The new readings still improve {noun}: {joined(changes)}."
+        if changes
+        else "The new readings still improve the offsets together.",
+        AGAIN,
+        named(*(e.drive for e in entries)),
     )
 
 

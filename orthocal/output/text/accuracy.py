@@ -21,7 +21,7 @@ from orthocal.assessment.tool_error import (
     assess_tool,
     summarise_tool,
 )
-from orthocal.assessment.words.entries import describe_tool_error
+from orthocal.assessment.words.entries import describe_compensated, describe_tool_error
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
 from orthocal.output.text.layout import noted, print_rich, table_of, um
@@ -97,6 +97,8 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
         if summary is not None:
             keep = assessment_of(calibration).keeps_offsets
             notes.append(describe_tool_error(summary, keep=keep))
+            if not calibration.only_offsets:
+                notes.append(describe_compensated(summary.compensated))
         notes += describe_remaining(find_remaining_errors(calibration, accuracy, count=2))
     return noted(table_of(headers, cells), *notes)
 

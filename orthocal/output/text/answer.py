@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +14,8 @@ from rich.text import Text
 from orthocal.assessment.assess import assessment_of, expanded_uncertainty
 from orthocal.assessment.plausibility import describe_legs
 from orthocal.assessment.wording import joined
-from orthocal.assessment.words.entries import describe_compensated
+from orthocal.assessment.words.anomalies import describe_evidence
+from orthocal.assessment.words.entries import describe_compensated, describe_region
 from orthocal.calibration.assessment_record import (
     Assessment,
     ControllerEntry,
@@ -31,10 +33,12 @@ from orthocal.output.text.layout import (
     noted,
     plain,
     print_rich,
+    section,
     short_name,
     signed,
     table_of,
 )
+from orthocal.text import printable
 from orthocal.units import DRIVE_UNITS
 
 MOST_LISTED = 4
@@ -80,25 +84,38 @@ def render_answer(
         ]
     parts += _tool(calibration, assessment)
     parts.append(bullets([f.words for f in _listed(calibration, assessment)]))
-    parts.append(Text.assemble(("Next: ", "bold"), _next_step(assessment, saved)))
-    return Group(*parts)
+    return Group(*parts, render_next(*_next_step(assessment, saved)))
 
 
-def render_decision(assessment: Assessment) -> RenderableType:
-    """A decision about readings, all findings, and the next step."""
+def render_next(words: str, commands: Sequence[str] = ()) -> RenderableType:
+    """The next step, with commands on lines of their own that can be copied."""
+    lines = [Text(f"  {command}", no_wrap=True, overflow="ignore") for command in commands]
+    return Group(Text.assemble(("Next: ", "bold"), words), *lines)
+
+
+def render_decision(assessment: Assessment, *, details: bool = False) -> RenderableType:
+    """A decision about readings, all findings, and the next step.
+
+    Args:
+        assessment: The assessment.
+        details: Whether to list the evidence for each finding.
+    """
     decision = assessment.decision
     parts: list[RenderableType] = [_decision(decision)]
     further = [f.words for f in assessment.findings if f.text != decision.reason]
     if further:
         parts += [Text(), bullets(further)]
     if decision.action:
-        parts.append(Text.assemble(("Next: ", "bold"), decision.action))
+        parts.append(render_next(decision.action))
+    evidence = [e for f in assessment.findings if (e := describe_evidence(f))]
+    if details and evidence:
+        parts.append(section("Evidence", bullets(evidence)))
     return Group(*parts)
 
 
-def print_decision(assessment: Assessment) -> None:
+def print_decision(assessment: Assessment, *, details: bool = False) -> None:
     """Print a decision about readings: in colour on a terminal."""
-    print_rich(render_decision(assessment))
+    print_rich(render_decision(assessment, details=details))
 
 
 def _decision(decision: Decision) -> Text:
@@ -115,14 +132,8 @@ def _entry_notes(calibration: Calibration, assessment: Assessment) -> list[Rende
     if not down or assessment.of_kind("no change needed"):
         return []
     verb = "counts" if len(down) == 1 else "count"
-    return [
-        _indented(
-            Text(
-                f"{joined(down)} {verb} down in the controller: subtract the value there "
-                "instead of adding it (`orthocal export --to linuxcnc --offsets` writes the lines)."
-            )
-        )
-    ]
+    text = f"joint: change of the controller's joint, with its sign; {joined(down)} {verb} down."
+    return [_indented(Text(text))]
 
 
 def _tool(calibration: Calibration, assessment: Assessment) -> list[RenderableType]:
@@ -130,10 +141,17 @@ def _tool(calibration: Calibration, assessment: Assessment) -> list[RenderableTy
     if assessment.tool is None:
         unreached = assessment.of_kind("out of reach")
         return [Text(unreached[0].text if unreached else "The tool error is unknown.")]
-    lines: list[RenderableType] = [Text(f.text) for f in assessment.of_kind("tool error")]
-    if not calibration.only_offsets:
-        lines.append(Text(describe_compensated(assessment.tool.compensated)))
-    return lines
+    texts = [f.text for f in assessment.of_kind("tool error")]
+    return [Text(text) for text in (*texts, *describe_conditions(calibration))]
+
+
+def describe_conditions(calibration: Calibration) -> list[str]:
+    """Tool error with all errors corrected if they were estimated; the region of tool errors."""
+    tool = assessment_of(calibration).tool
+    if tool is None:
+        return []
+    compensated = [] if calibration.only_offsets else [describe_compensated(tool.compensated)]
+    return [*compensated, describe_region(tool.region)]
 
 
 def _listed(calibration: Calibration, assessment: Assessment) -> Sequence[Finding]:
@@ -150,14 +168,24 @@ def _listed(calibration: Calibration, assessment: Assessment) -> Sequence[Findin
     return listed[:MOST_LISTED]
 
 
-def _next_step(assessment: Assessment, saved: Path | None) -> str:
-    """The next command or action."""
+def _next_step(assessment: Assessment, saved: Path | None) -> tuple[str, tuple[str, ...]]:
+    """The next action, and the commands for it."""
     decision = assessment.decision
     if decision.verdict != "enter" or assessment.keeps_offsets:
-        return decision.action or "none."
+        return decision.action or "none.", ()
     if saved is None:
-        return "keep the result with --out DIRECTORY; then `orthocal again DIRECTORY`."
-    return f"orthocal again {saved} --out SESSION; measure; orthocal validate {saved} SESSION"
+        return "keep the result by adding `--out DIRECTORY` to this command.", ()
+    directory, new = (quote_path(p) for p in (saved, f"{saved}-again"))
+    return "enter the offsets, home the machine and measure again.", (
+        f"orthocal again {directory} --out {new}",
+        f"orthocal record {new}",
+        f"orthocal validate {directory} {new}",
+    )
+
+
+def quote_path(path: str | Path) -> str:
+    """A path as it can be typed in a shell."""
+    return printable(shlex.quote(str(path)))
 
 
 def _indented(part: RenderableType) -> RenderableType:
@@ -245,9 +273,9 @@ def render_values(calibration: Calibration) -> RenderableType:
     notes.append(EXPANDED)
     if not calibration.only_offsets:
         notes.append(
-            "The values to enter minimise the tool error in a controller that corrects nothing "
-            "else: they compensate a part of the other errors. The identified offsets belong to a "
-            "controller that corrects all errors (`orthocal inverse`)."
+            "enter: best value for a controller that corrects nothing else; it compensates a part "
+            "of the other errors. identified: offset of the slide, for a controller that corrects "
+            "all errors."
         )
     return noted(Group() if complete else table, *notes)
 
@@ -263,14 +291,18 @@ def entry_table(calibration: Calibration, *, identified: bool = False) -> Table:
     enter = "estimate" if assessment.of_kind("no change needed") else "enter"
     stated = any(e.active is not None for e in assessment.entries)
     columns = ["now", enter] if stated else ["add" if enter == "enter" else enter]
+    directions = {d.name: d.direction for d in calibration.robot.drives}
+    counts_down = enter == "enter" and any(directions[e.drive] < 0 for e in assessment.entries)
     rows = []
     for e in assessment.entries:
         factor = e.edge_factor
         now = [] if e.active is None else [signed(e.active * factor)]
+        joint = [signed(directions[e.drive] * e.change * factor)] if counts_down else []
         estimate = [signed(e.identified * factor)] if identified else []
         half = e.held or plain(expanded_uncertainty(calibration, e) * factor)
-        rows.append((e.drive, *now, signed(e.enter * factor), half, *estimate, e.edge_unit))
-    headers = ("drive", *columns, "±", *(["identified"] if identified else []), "unit")
+        rows.append((e.drive, *now, signed(e.enter * factor), half, *joint, *estimate, e.edge_unit))
+    further = [*(["joint"] if counts_down else []), *(["identified"] if identified else [])]
+    headers = ("drive", *columns, "±", *further, "unit")
     return table_of(headers, rows)
 
 
@@ -278,7 +310,7 @@ def _example(calibration: Calibration, entry: ControllerEntry) -> str:
     """Meaning of an offset, by the first drive at its mechanical zero."""
     drive = next(d for d in calibration.robot.drives if d.name == entry.drive)
     factor, unit = drive.edge_factor, drive.edge_unit
-    meaning = "Slider coordinate = encoder coordinate + offset"
+    meaning = "Slide coordinate = encoder coordinate + offset"
     if entry.active is None:
         return f"{meaning}. Add these values to the present offsets."
     at, actual = drive.zero * factor, (drive.zero + entry.identified) * factor
@@ -287,6 +319,6 @@ def _example(calibration: Calibration, entry: ControllerEntry) -> str:
         joint = float(drive.to_joint(drive.zero)) * factor
         shown = f" (the controller's joint shows {joint:.3f} {unit})"
     return (
-        f"{meaning}. With {drive.name}'s encoder at {at:.3f} {unit}{shown}, its slider is at "
+        f"{meaning}. With {drive.name}'s encoder at {at:.3f} {unit}{shown}, its slide is at "
         f"{actual:.3f} {unit}. Enter the complete offset in place of the present one."
     )

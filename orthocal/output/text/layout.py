@@ -115,7 +115,7 @@ def to_text(content: RenderableType, *, width: int = WIDTH) -> str:
     """
     stream = io.StringIO()
     console = Console(file=stream, width=width, no_color=True, highlight=False)
-    console.print(content)
+    console.print(Segments(console.render(content)), soft_wrap=True)
     lines = printable(stream.getvalue(), keep="\n").split("\n")
     return "\n".join(line.rstrip() for line in lines[:-1]) + "\n"
 
@@ -124,9 +124,7 @@ def print_rich(content: RenderableType) -> None:
     """Print rich renderables: in colour on a terminal, else as plain text."""
     if sys.stdout.isatty():
         console = Console(highlight=False)
-        segments = [
-            s for line in console.render_lines(content, pad=False) for s in (*line, NEW_LINE)
-        ]
+        segments = console.render(content)
         shown = (Segment(printable(s.text, keep="\n"), s.style, s.control) for s in segments)
         console.print(Segments(shown), end="", soft_wrap=True)
     else:

@@ -102,13 +102,13 @@ def render_calibration(
     sections: dict[str, RenderableType | None] = {
         "Method": render_method(calibration),
         "Parameters": tables.render_parameters(calibration, all_rows=all_rows),
-        "Identifiability": tables.render_identifiability(calibration, all_rows=all_rows),
         "Readings": tables.render_readings(calibration, all_rows=all_rows),
         "Residuals": tables.render_fit(calibration),
         "Gauges and sensors": tables.render_sensors(calibration),
         "Tool error": render_tool(calibration),
         "Findings": tables.render_findings(calibration),
         "Values to enter": render_values(calibration),
+        "For research": tables.render_identifiability(calibration, all_rows=all_rows),
     }
     return Group(answer, *(section(name, part) for name, part in sections.items() if part))
 

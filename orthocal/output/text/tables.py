@@ -10,6 +10,7 @@ from rich.text import Text
 
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.fit_findings import find_held, find_unresolved
+from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.fit import FEW_NAMES
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
@@ -179,7 +180,13 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
 def render_findings(calibration: Calibration) -> RenderableType:
     """All findings except those about identifiability, which `render_identifiability` lists."""
     findings = assessment_of(calibration).findings
-    return bullets([f.words for f in findings if f.kind not in ("inseparable", "below the noise")])
+    return bullets(
+        [
+            f"{f.words} {describe_evidence(f)}".strip()
+            for f in findings
+            if f.kind not in ("inseparable", "below the noise")
+        ]
+    )
 
 
 def render_readings(

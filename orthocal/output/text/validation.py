@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from rich.console import Group, RenderableType
+from rich.padding import Padding
 from rich.text import Text
 
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.validation import Validation
-from orthocal.output.text.answer import entry_table
+from orthocal.calibration.assessment_record import FindingKind
+from orthocal.output.text.answer import describe_conditions, entry_table, quote_path, render_next
 from orthocal.output.text.layout import (
     bullets,
     mm,
@@ -18,12 +22,21 @@ from orthocal.output.text.layout import (
 )
 from orthocal.units import MM
 
+DETAILS: tuple[FindingKind, ...] = ("must change", "not significant", "repetition unknown")
+"""Kinds of findings that are printed only with all readings."""
+
 
 def render_validation(validation: Validation, *, all_rows: bool = False) -> RenderableType:
     """A validation as rich renderables."""
     refit, judged = validation.refit, validation.assessment
     verdict = judged.decision.words
-    findings = [f.words for f in judged.findings if f.text not in judged.decision.reason]
+    findings = [
+        f.words
+        for f in judged.findings
+        if f.text not in judged.decision.reason and (all_rows or f.kind not in DETAILS)
+    ]
+    if judged.tool is not None and judged.of_kind("tool error"):
+        findings += describe_conditions(refit)
     parts = [
         Text("Validation of a calibration", style="bold"),
         Text(refit.session.title),
@@ -32,20 +45,24 @@ def render_validation(validation: Validation, *, all_rows: bool = False) -> Rend
     if validation.mistake is not None and validation.enter:
         rows = [(e.drive, signed(e.enter * e.edge_factor), e.edge_unit) for e in validation.enter]
         parts.append(section("Values to enter", table_of(("drive", "enter", "unit"), rows)))
+    if judged.of_kind("further change") and refit.session.path is not None:
+        session = quote_path(Path(refit.session.path).parent)
+        command = f"orthocal calibrate {session} --out {session}-calibration"
+        parts.append(Padding(render_next("to use the better offsets:", [command]), (0, 0, 0, 2)))
     rms = (validation.expected_rms, refit.rms_before, refit.rms_after)
     largest = (validation.expected_largest, refit.largest_before, refit.largest_after)
     deviations = table_of(
-        ("", "predicted", "measured", "after a refit"),
+        ("", "expected", "measured", "after a new fit"),
         [("RMS [mm]", *map(mm, rms)), ("largest [mm]", *map(mm, largest))],
     )
-    parts.append(section("Deviations with the calibrated offsets active", deviations))
+    parts.append(section("Measured less predicted", deviations))
     if assessment_of(refit).entries:
-        parts.append(section("Offsets of a refit", entry_table(refit)))
+        parts.append(section("Offsets from the new readings", entry_table(refit)))
     readings = residual_table(
         refit.residuals,
         {
-            "deviation [mm]": lambda r: signed(r.deviation / MM),
-            "after a refit [mm]": lambda r: signed(r.residual / MM),
+            "measured − predicted [mm]": lambda r: signed(r.deviation / MM),
+            "after a new fit [mm]": lambda r: signed(r.residual / MM),
         },
         all_rows=all_rows,
         key=lambda r: abs(r.deviation),
