@@ -63,8 +63,8 @@ class Comparison:
     recommendation: Recommendation
     judgement: Judgement
     """Of the readings, whatever the model is."""
-    best_assessment: Assessment | None
-    """Of the recommended model's calibration, as `calibrate` states it; None without results."""
+    assessments: tuple[Assessment, ...]
+    """Of the calibration of each result, as `calibrate` states it."""
 
     def __getitem__(self, model: str) -> ModelResult:
         for result in self.results:
@@ -165,15 +165,14 @@ def compare_models(
         repeat_title=join_sessions(others).title if others else "",
         recommendation=recommendation,
         judgement=judgement,
-        best_assessment=None,
+        assessments=tuple(
+            assess(r.calibration, session, judgement=judgement, recommendation=recommendation)
+            for r in results
+        ),
     )
-    if compared.best is None:
+    if compared.best is None or not others:
         return compared
     best = compared.best.calibration
-    assessed = assess(best, session, judgement=judgement, recommendation=recommendation)
-    compared = replace(compared, best_assessment=assessed)
-    if not others:
-        return compared
     again = repeat_calibration(best, others)
     return replace(compared, repetition=measure_repetition(best, again))
 
@@ -204,8 +203,9 @@ def _assess(comparison: Comparison) -> Assessment:
     judged, best = comparison.judgement, comparison.best
     notes = words.describe_recommendation(comparison.recommendation)
     notes += [words.not_determined(u.model, u.reason) for u in comparison.undetermined]
-    assessed, tool = comparison.best_assessment, None
-    if best is not None and assessed is not None:
+    tool = None
+    if best is not None:
+        assessed = comparison.assessments[comparison.results.index(best)]
         notes += _others(comparison, best)
         notes += assessed.of_kind(*NOISE_KINDS)
         if comparison.repetition is not None:
@@ -213,8 +213,6 @@ def _assess(comparison: Comparison) -> Assessment:
             notes.append(describe_repetition(comparison.repetition, title=title))
         tool = assessed.tool
         notes += assessed.of_kind("tool error", "out of reach")
-        if tool is not None and not best.calibration.only_offsets:
-            notes.append(words.compensated(tool.compensated))
         if best.linearisation_cost is not None:
             notes.append(words.linearisation_cost(best.linearisation_cost.rms))
     findings = rank([*judged.findings, *notes])

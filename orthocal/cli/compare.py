@@ -8,6 +8,7 @@ import orthocal
 from orthocal.cli.files import load_each_once
 from orthocal.cli.options import (
     AllRows,
+    Details,
     Json,
     SessionPaths,
     Tolerances,
@@ -25,6 +26,7 @@ def compare(
     repeat: list[Path] | None = None,
     tolerance: Tolerances = None,
     json: Json = False,
+    details: Details = False,
     all_rows: AllRows = False,
 ) -> None:
     """Compare models, and recommend the one that readings support.
@@ -43,4 +45,4 @@ def compare(
             tolerances=read_tolerances(tolerance, loaded[0].robot),
             repeat=load_each_once(repeat) if repeat else None,
         )
-    deliver_judged(comparison, json=json, all_rows=all_rows)
+    deliver_judged(comparison, json=json, details=details, all_rows=all_rows)

@@ -216,17 +216,14 @@ def _report(
 ) -> None:
     """Print the expected tool error, the files and the next commands."""
     from orthocal.output.text.layout import counted
-    from orthocal.output.text.plan import first_round_words, show_duration, show_um
+    from orthocal.output.text.plan import describe_expected, show_duration
 
     size = f"{counted(len(session.readings), 'reading')} in {counted(len(session.setups), 'setup')}"
     lines = [f"Plan: {size}."]
     if plan is not None:
         lines = [
             f"Plan: {size}, about {show_duration(plan.minutes)}.",
-            f"Expected tool error: {show_um(plan.expected)} µm (now {show_um(plan.known)} µm), "
-            f"{plan.forecast.workspace.words.removeprefix('the ')}, workpiece aligned on the "
-            "machine.",
-            first_round_words(plan),
+            *describe_expected(plan),
         ]
     programs = sum(name.endswith(".ngc") for name in files)
     lines += [
@@ -240,7 +237,7 @@ def _report(
         f"  orthocal record {folder / FIRST}",
         f"  orthocal calibrate {folder / FIRST}",
     ]
-    put_out("\n".join(line for line in lines if line))
+    put_out("\n".join(lines))
 
 
 def _make_again(folder: Path) -> None:

@@ -49,7 +49,6 @@ from orthocal.runtime.worker_pool import call_in_parallel, run_in_parallel, work
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.session.session import Posture, Purpose, Reading, Session, Setup
 from orthocal.statistics.zeros import project_out_zeros
-from orthocal.units import UM
 
 Array = NDArray[np.float64]
 
@@ -63,9 +62,6 @@ USUAL_SETUPS = 6
 
 SIMPLER = 3e-2
 """Relative increase of the error, in total, for tips on the crests of their rods."""
-
-REPORTED = 1e-3
-"""Relative improvement by a start that is reported."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,7 +173,11 @@ def plan_readings(
     counts = options[0] if len(options) == 1 else _choose_counts(search, seed, workers, options)
     say(f"choosing readings of {len(counts)} setups")
     planned = search.choose(
-        counts, seed=seed, starts=starts, workers=workers, report=_reporter(say, criterion)
+        counts,
+        seed=seed,
+        starts=starts,
+        workers=workers,
+        report=lambda start, _: say(f"search {start} finished"),
     )
     planned = _simplify(candidates, planned, search)
     plan = build_session(candidates, planned.setups, measured)
@@ -230,19 +230,6 @@ def _evaluate(
         equipment=comparison.equipment,
         candidates=len(comparison.candidates.session.readings),
     )
-
-
-def _reporter(say: Callable[[str], None], criterion: Criterion) -> Callable[[int, float], None]:
-    """Report of the starts that improve the plan."""
-    in_metres, least = criterion not in ("A", "D", "E"), math.inf
-
-    def report_start(start: int, error: float) -> None:
-        nonlocal least
-        if error < (1.0 - REPORTED) * least:
-            least = error
-            say(f"start {start}: " + (f"{error / UM:.4g} µm" if in_metres else f"{error:.4g}"))
-
-    return report_start
 
 
 def _scale(

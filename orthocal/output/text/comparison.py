@@ -6,9 +6,14 @@ import math
 from collections.abc import Sequence
 
 from rich.console import Group, RenderableType
+from rich.padding import Padding
 from rich.text import Text
 
 from orthocal.assessment.comparison import Comparison
+from orthocal.assessment.wording import tool_mm
+from orthocal.assessment.words.entries import describe_region
+from orthocal.calibration.assessment_record import FindingKind
+from orthocal.output.text.answer import STYLES
 from orthocal.output.text.layout import (
     EXPANDED,
     MANY_ROWS,
@@ -26,23 +31,64 @@ from orthocal.output.text.layout import (
 )
 from orthocal.units import MM
 
+MORE = "--details prints scores, estimates and residuals of each model."
 
-def render_comparison(comparison: Comparison, *, all_rows: bool = False) -> RenderableType:
-    """A comparison as rich renderables."""
-    c = comparison
-    parts = [
+RESEARCH: tuple[FindingKind, ...] = (
+    *("recommended", "not recommended", "tool error", "linearisation error"),
+    *("noise as stated", "repetition unknown"),
+)
+"""Kinds of findings that the short answer replaces, or that only the details list."""
+
+
+def render_comparison(
+    comparison: Comparison, *, details: bool = False, all_rows: bool = False
+) -> RenderableType:
+    """A comparison as rich renderables: the short answer, and on demand the details."""
+    c, assessed = comparison, comparison.assessment
+    (recommended,) = assessed.of_kind("recommended")
+    short = [f.words for f in assessed.findings if f.kind not in RESEARCH]
+    answer: list[RenderableType] = [
         Text("Comparison of models", style="bold"),
-        Text(c.title),
-        Text(
-            f"{counted(c.independent, 'independent reading')}; σ of a reading: "
-            f"{mm(c.noise.sigma)} mm, {NOISE_SOURCES[c.noise.source]}"
-        ),
-        section("Findings", bullets([f.words for f in c.assessment.findings])),
-        section("Models", _scores(c)),
+        *([Text(c.title)] if c.title else []),
+        Text(),
+        Text(assessed.decision.headline, style=STYLES[assessed.decision.verdict]),
+        Text(recommended.text),
+        Text(),
+        Padding(_tool_errors(c), (0, 0, 0, 2)),
+        bullets(short),
+    ]
+    if not (details or all_rows):
+        return Group(*answer, Text(MORE))
+    further = [f.words for f in assessed.findings if f.kind in RESEARCH and f != recommended]
+    noise = (
+        f"{counted(c.independent, 'independent reading')}; σ of a reading: "
+        f"{mm(c.noise.sigma)} mm, {NOISE_SOURCES[c.noise.source]}"
+    )
+    return Group(
+        *answer,
+        section("Further findings", bullets([noise, *further])),
+        section("Scores", _scores(c)),
         section("Estimates", _estimates(c, all_rows)),
         section("Residuals by model", _residuals(c, all_rows)),
-    ]
-    return Group(*parts)
+    )
+
+
+def _tool_errors(comparison: Comparison) -> RenderableType:
+    """Expected tool errors of each model, as `calibrate` states them for it."""
+    rows = []
+    for result, assessed in zip(comparison.results, comparison.assessments, strict=True):
+        tool, only = assessed.tool, result.calibration.only_offsets
+        if tool is None:
+            rows.append((result.model, "unknown", "", ""))
+            continue
+        corrected = "" if only else tool_mm(tool.compensated)
+        rows.append((result.model, tool_mm(tool.now), tool_mm(tool.entered), corrected))
+    rows += [(u.model, "not identifiable", "", "") for u in comparison.undetermined]
+    headers = ("model", "tool error now", "with its offsets", "all errors corrected")
+    regions = dict.fromkeys(
+        describe_region(a.tool.region) for a in comparison.assessments if a.tool
+    )
+    return noted(table_of(headers, rows), *regions)
 
 
 def _scores(comparison: Comparison) -> RenderableType:
@@ -76,12 +122,12 @@ def _scores(comparison: Comparison) -> RenderableType:
         rows.append((u.model, "", str(u.n_free), "", "not identifiable", *([""] * 7)))
     sizes = ("free", "effective", "RMS [mm]", "χ²", "dof", "AICc", "BIC", "ln evidence")
     return noted(
-        table_of(("model", "", *sizes, "CV [mm]", "tool [µm]"), rows, left=2),
+        table_of(("model", "", *sizes, "CV [mm]", "uncertainty [µm]"), rows, left=2),
         "–: no redundant reading checks this model",
         "effective: number of parameters that the readings determine",
         "AICc, BIC: lower is better; ln evidence (0: complete model): higher is better",
         "CV: cross-validation, RMS error of predicting each setup from all others",
-        "tool: RMS uncertainty after calibration, workpiece aligned on the machine",
+        "uncertainty: of the tool after calibration, RMS, workpiece aligned, stated tolerances",
     )
 
 

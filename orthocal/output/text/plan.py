@@ -11,6 +11,7 @@ from rich.console import Group, RenderableType
 from rich.padding import Padding
 from rich.text import Text
 
+from orthocal.assessment.wording import tool_mm
 from orthocal.kinematics.workspace import find_workspace
 from orthocal.measurement.motion.motion import APPROACH
 from orthocal.output.text.accuracy import describe_remaining
@@ -62,13 +63,6 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
     """Plan as rich renderables, its expected tool error first."""
     s, robot = plan.session, plan.session.robot
     read, closing = _counts(plan)
-    first = first_round_words(plan)
-    head = Text.assemble(
-        "Expected tool error: ",
-        (f"{show_um(plan.expected)} µm", "bold"),
-        f" (now {show_um(plan.known)} µm), {plan.forecast.workspace.words.removeprefix('the ')}, "
-        "workpiece aligned on the machine.",
-    )
     remaining = describe_remaining(plan.find_remaining()) if details else []
     parts: list[RenderableType] = [
         Text(
@@ -78,10 +72,9 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
             style="bold",
         ),
         Text(),
-        head,
-        *([Text(first)] if first else []),
+        *map(Text, describe_expected(plan)),
         Text(_when_enough(plan)),
-        section("At equal cost", _alternatives(plan, closing)),
+        section("Other plans in the same time", _alternatives(plan, closing)),
         section("Other gauges", bullets(_helps(plan))),
         *([section("Largest contributions", bullets(remaining))] if remaining else []),
         section("Setups", _setups(plan)),
@@ -90,18 +83,21 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
     return Group(*parts)
 
 
-def first_round_words(plan: MeasuringPlan) -> str:
-    """Expected error before offsets are entered, and the readings that are impossible then."""
-    first = plan.first_round
-    texts = []
-    if first.reported.rms >= 1.1 * plan.expected.reported.rms:
-        texts.append(f"In the first round, before offsets are entered: {show_um(first)} µm.")
+def describe_expected(plan: MeasuringPlan) -> list[str]:
+    """Expected tool error with its conditions, and the readings that are impossible at first."""
+    first, workspace = plan.first_round, plan.forecast.workspace
+    expected, before, now = (tool_mm(e.reported.rms) for e in (plan.expected, first, plan.known))
+    lines = [
+        f"Expected tool error with all errors corrected: {expected} after the second measurement "
+        f"(first: {before}; now {now}).",
+        f"RMS over {workspace.words}, workpiece aligned on the machine.",
+    ]
     if first.lost > SOME_LOST:
-        texts.append(
+        lines.append(
             f"With offsets within their tolerances the tip misses the rod in {first.lost:.0%} of "
             "the readings. Enter offsets from a few readings first, or use a blade."
         )
-    return " ".join(texts)
+    return lines
 
 
 def describe_basis(robot: Robot) -> dict[str, Any]:
@@ -217,16 +213,13 @@ def _when_enough(plan: MeasuringPlan) -> str:
 def _alternatives(plan: MeasuringPlan, closing: int) -> RenderableType:
     s = plan.session
     read = len(s.readings) - closing
-    this = Alternative("this one", len(s.setups), read, plan.minutes, plan.expected)
+    this = Alternative("this plan", len(s.setups), read, plan.minutes, plan.expected)
     rows = []
     for a in (this, *plan.compared):
-        absolute, error = "", OUT_OF_RANGE
-        if a.expected is not None:
-            absolute = plain(a.expected.sizes.absolute.rms / UM, 0)
-            error = show_um(a.expected)
+        error = OUT_OF_RANGE if a.expected is None else show_um(a.expected)
         count = f"{read} + {closing}" if a is this else str(a.readings)
-        rows.append((a.name, str(a.setups), count, show_duration(a.minutes), error, absolute))
-    headers = ("plan", "setups", "readings", "time", "tool error [µm]", "absolute [µm]")
+        rows.append((a.name, str(a.setups), count, show_duration(a.minutes), error))
+    headers = ("plan", "setups", "readings", "time", "tool error [µm]")
     return table_of(headers, rows)
 
 
@@ -246,7 +239,9 @@ def _helps(plan: MeasuringPlan) -> list[str]:
             if better
             else f"None ({'; '.join(names)}) gains {NOTICEABLE:.0%}"
         )
-        texts.append(f"{none}. Less needs another sensor, such as an indicator at the tool.")
+        texts.append(
+            f"{none}. A smaller tool error needs another sensor, such as an indicator at the tool."
+        )
     return texts
 
 

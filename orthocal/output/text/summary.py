@@ -32,7 +32,7 @@ def summarize(
 
     Args:
         result: The result.
-        details: Whether to describe a calibration completely; else the short answer.
+        details: Whether to describe a calibration, comparison or plan completely.
         all_rows: Whether to list every reading and parameter; includes the details.
         html: Whether to return HTML, as a notebook shows it.
     """
@@ -54,7 +54,7 @@ def render_result(
 
     Args:
         result: The result.
-        details: Whether to describe a calibration or a plan completely.
+        details: Whether to describe a calibration, comparison or plan completely.
         all_rows: Whether to list every reading and parameter.
         saved: Directory in which a calibration was written.
     """
@@ -79,7 +79,7 @@ def render_result(
     if isinstance(result, Comparison):
         from orthocal.output.text.comparison import render_comparison
 
-        return render_comparison(result, all_rows=all_rows)
+        return render_comparison(result, details=details, all_rows=all_rows)
     from orthocal.output.text.validation import render_validation
 
     return render_validation(result, all_rows=all_rows)
