@@ -130,9 +130,12 @@ def test_without_paper_a_plan_is_chosen(planned):
     mill, (code, out, err) = planned
     assert code == 0, err
     steps = [line.split()[1] for line in err.splitlines()]
-    assert list(dict.fromkeys(steps)) == ["computing", "choosing", "start", "comparing", "drawing"]
+    assert list(dict.fromkeys(steps)) == ["computing", "choosing", "search", "comparing", "drawing"]
     assert re.search(r"Plan: \d+ readings in \d setups?, about 1\d min\.", out)
-    assert re.search(r"Expected tool error: [\d.]+ µm \(now \d+ µm\), workspace ±40 mm, workp", out)
+    assert re.search(
+        r"all errors corrected: [\d.]+ mm after .*first: [\d.]+ mm; now [\d.]+ mm", out
+    )
+    assert "RMS over the workspace ±40 mm" in out
     first = mill / "first"
     names = {p.name for p in first.iterdir() if p.suffix != ".ngc"}
     assert names == {"session.yaml", "readings.csv", "sheet.html", "plan.json", "plan.svg"}
@@ -200,7 +203,9 @@ def test_entries_of_joints_that_count_down_are_described(made, tmp_path):
     assert code == 0, err
     _, text, _ = orthocal("calibrate", tmp_path / "try", "--model", "offsets")
     said = " ".join(text.split())
-    assert "y_slide counts down in the controller: subtract the value there" in said
+    assert "y_slide counts down." in said
+    row = next(line.split() for line in text.splitlines() if line.split()[:1] == ["y_slide"])
+    assert row[-2] == f"{-float(row[2]):+.3f}"  # the change of the joint
 
 
 def test_sheets_with_readings_stay_unchanged(copied):

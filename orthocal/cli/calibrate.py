@@ -69,7 +69,8 @@ def calibrate(
         from orthocal.calibration.file import calibration_json
         from orthocal.output.report.page import build_report
 
-        return dict(zip(FILES, (calibration_json(result), build_report(result)), strict=True))
+        texts = (calibration_json(result), build_report(result, saved=out))
+        return dict(zip(FILES, texts, strict=True))
 
     if out is not None:
         require_writable(out, FILES)

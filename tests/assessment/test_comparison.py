@@ -12,11 +12,13 @@ import pytest
 from orthocal import calibrate, load_session, summarize
 from orthocal.assessment.comparison import compare_models
 from orthocal.assessment.recommendation import STRONG
+from orthocal.assessment.wording import tool_mm
 from orthocal.errors import ParameterError
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.output.text.comparison import MORE
 from orthocal.statistics.zeros import project_out_zeros
 
 OFFSETS = {"*.offset_mm": 4.0}
@@ -106,6 +108,8 @@ def test_the_tool_error_is_that_of_calibrate(raw_cycles, cycles):
     (second,) = calibration.assessment.of_kind("tool error")
     assert first.text == second.text
     assert compared.assessment.tool.box == calibration.assessment.tool.box
+    row = next(line for line in summarize(compared).splitlines() if cycles.best.model in line)
+    assert tool_mm(calibration.assessment.tool.entered) in row
     for name in ("now", "entered", "compensated"):
         values = [getattr(a.tool, name) for a in (compared.assessment, calibration.assessment)]
         assert values[0] == pytest.approx(values[1], rel=1e-6)
@@ -228,16 +232,17 @@ def test_a_small_model_is_not_worse_off_for_having_no_prior(raw_cycles):
 
 
 def test_the_recommendation_stands_first_and_unchecked_models_have_no_criteria(table1):
-    text = summarize(table1)
-    assert text.index("Findings") < text.index("Models")
-    rows = text[text.index("Models") : text.index("Estimates")].splitlines()
+    text = summarize(table1, details=True)
+    assert text.index("Recommended model") < text.index("Scores")
+    rows = text[text.index("Scores") : text.index("Estimates")].splitlines()
     full = next(i for i, row in enumerate(rows) if row.strip().startswith("full"))
     assert rows[full].split()[4:9] == ["–"] * 5
     assert rows[full + 1].split()[1:6] == ["–"] * 5
 
 
 def test_the_summary_shows_all_that_was_promised(table1):
-    text = summarize(table1)
+    text = summarize(table1, details=True)
+    assert text.startswith(summarize(table1).removesuffix(f"{MORE}\n"))
     for words in ("linear", "exact", "χ²", "AICc", "BIC", "CV", "tool", "ln evidence"):
         assert words in text
     row = next(line for line in text.splitlines() if line.strip().startswith("x_slide.offset"))

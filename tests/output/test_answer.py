@@ -201,7 +201,9 @@ def test_one_tool_error_in_one_sentence_everywhere(answers, name):
     assert words_of(calibration).count(sentence) == 1
     # the answer, the section of the tool and the findings
     assert answers.complete(name).count(sentence) == 3
-    assert ("corrects all errors: " in words_of(calibration)) == (not calibration.only_offsets)
+    assert ("With all errors corrected: " in words_of(calibration)) == (
+        not calibration.only_offsets
+    )
 
 
 def test_offsets_that_need_no_change_are_left_as_they_are(answers):
@@ -244,8 +246,8 @@ def test_details_and_all_hold_the_answer_and_the_rest(answers):
         details = summarize(calibration, details=True)
         assert details.startswith(answer)
         for title in (
-            *("Method", "Parameters", "Identifiability", "Readings", "Residuals", "Tool error"),
-            *("Findings", "Values to enter"),
+            *("Method", "Parameters", "Readings", "Residuals", "Tool error"),
+            *("Findings", "Values to enter", "For research"),
         ):
             assert f"\n{title}\n" in details
             assert f"\n{title}\n" not in summarize(calibration)

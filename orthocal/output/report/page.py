@@ -58,9 +58,9 @@ MOST_NAMED = 9
 GLOSSARY = (
     "σ: standard deviation of one reading. It comes from repeated cycles, else from the residuals, "
     "else from the gauge as stated.",
-    "tolerance: limit of an error before the calibration (±2 prior standard deviations), from the "
+    "tolerance: limit of an error before the calibration; 19 of 20 errors are within it. From the "
     "robot's YAML or --tolerance.",
-    "resolved: share of the prior variance that the readings remove.",
+    "resolved: how much the readings improved a value: 0 % not at all, 100 % completely.",
     "before: measured less nominal with the active offsets. after: measured less calibrated. Both "
     "use the best gauge zeros.",
     "predicted: readings of a setup, predicted from all other setups.",
@@ -72,15 +72,19 @@ GLOSSARY = (
     "uncertainty before calibration: RMS uncertainty of the tool position with every error within "
     "its tolerance. After calibration: with the readings. worst point: the largest value in the "
     "workspace.",
-    "combination: a direction in parameter space. It is identifiable if a change by its prior "
-    "standard deviation changes the readings by more than their noise. Condition number and "
+    "combination: errors that the readings show only as a sum. It is identifiable if a change "
+    "within its tolerance changes the readings by more than their noise. Condition number and "
     "observability indices O1 to O5 are measures of identifiability.",
 )
 """Terms of the report."""
 
 
-def build_report(calibration: Calibration) -> str:
+def build_report(calibration: Calibration, *, saved: Path | None = None) -> str:
     """Report of a calibration as a self-contained HTML page.
+
+    Args:
+        calibration: The calibration.
+        saved: Directory of the calibration; by default the one that it was loaded from.
 
     Raises:
         OrthocalError: If the robot is missing or differs from the calibrated one.
@@ -88,18 +92,19 @@ def build_report(calibration: Calibration) -> str:
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     title = f"Calibration of {calibration.robot_record.name}: {calibration.session.title}"
     sensors = render_sensors(calibration)
+    if saved is None and calibration.path is not None:
+        saved = calibration.path.parent
     sections = [
-        ("verdict", "Verdict", _verdict(calibration)),
+        ("verdict", "Verdict", _verdict(calibration, saved)),
         ("tool", "Tool error", _tool(calibration)),
         ("fit", "Residuals", _fit(calibration)),
         ("residuals", "Readings", _readings(calibration)),
         ("parameters", "Parameters", _parameters(calibration)),
         *([("sensors", "Gauges and sensors", to_markup(sensors))] if sensors else []),
-        ("correlations", "Correlations", _correlations(calibration)),
-        ("identifiability", "Identifiability", _identifiability(calibration)),
+        ("scene", "Scene", _scene(calibration)),
         ("words", "Glossary", items(GLOSSARY)),
         ("provenance", "Provenance", _provenance(calibration)),
-        ("scene", "Scene", _scene(calibration)),
+        ("research", "For research", _research(calibration)),
     ]
     links = "".join(f'<a href="#{name}">{escape(words)}</a>' for name, words, _ in sections)
     body = "".join(
@@ -122,7 +127,7 @@ def write_report(calibration: Calibration, path: str | Path) -> Path:
     return Path(path)
 
 
-def _verdict(calibration: Calibration) -> str:
+def _verdict(calibration: Calibration, saved: Path | None) -> str:
     before, after = calibration.rms_before, calibration.rms_after
     change = f" ({after / before - 1.0:+.0%})" if before > 1e-8 else ""
     fit = (
@@ -131,7 +136,7 @@ def _verdict(calibration: Calibration) -> str:
         f"{mm(calibration.largest_after)} mm after."
     )
     return (
-        to_markup(render_answer(calibration, heading=False))
+        to_markup(render_answer(calibration, heading=False, saved=saved))
         + heading("Values to enter", level=3)
         + to_markup(render_values(calibration))
         + paragraph(fit)
@@ -183,12 +188,6 @@ def _fit(calibration: Calibration) -> str:
             "error of the model, single points far from the line indicate wrong readings.",
         )
     )
-    parts.append(
-        _figure(
-            plot_linearised(calibration),
-            "Exact solution less the solution of the linear equations, as in the paper.",
-        )
-    )
     return "".join(parts)
 
 
@@ -205,6 +204,20 @@ def _parameters(calibration: Calibration) -> str:
     few = len(calibration.free) <= 12
     return _figure(plot_parameters(calibration), "") + (
         listed if few else _details("All parameters", listed)
+    )
+
+
+def _research(calibration: Calibration) -> str:
+    linearised = _figure(
+        plot_linearised(calibration),
+        "Exact solution less the solution of the linear equations, as in the paper.",
+    )
+    return (
+        linearised
+        + heading("Correlations", level=3)
+        + _correlations(calibration)
+        + heading("Identifiability", level=3)
+        + _identifiability(calibration)
     )
 
 
