@@ -56,6 +56,8 @@ HOW = (
     "Read the first posture again at the end of the setup (cycle 2). This reveals drift.",
 )
 
+EVENLY = "evenly spaced"
+
 OUT_OF_RANGE = "beyond the dial's range"
 
 
@@ -202,11 +204,11 @@ def _when_enough(plan: MeasuringPlan) -> str:
         last = plan.curve[-1]
         return (
             f"Another hour gains more than {ENOUGH:.0%}, up to {counted(last.setups, 'setup')} "
-            f"({show_duration(last.minutes)}, {plain(last.error / UM, 1)} µm)."
+            f"({show_duration(last.minutes)}, {tool_mm(last.error)})."
         )
     return (
         f"Beyond {counted(enough.setups, 'setup')} ({show_duration(enough.minutes)}, "
-        f"{plain(enough.error / UM, 1)} µm) another hour gains less than {ENOUGH:.0%}."
+        f"{tool_mm(enough.error)}) another hour gains less than {ENOUGH:.0%}."
     )
 
 
@@ -218,7 +220,8 @@ def _alternatives(plan: MeasuringPlan, closing: int) -> RenderableType:
     for a in (this, *plan.compared):
         error = OUT_OF_RANGE if a.expected is None else show_um(a.expected)
         count = f"{read} + {closing}" if a is this else str(a.readings)
-        rows.append((a.name, str(a.setups), count, show_duration(a.minutes), error))
+        name = EVENLY if a.name == "even" else a.name
+        rows.append((name, str(a.setups), count, show_duration(a.minutes), error))
     headers = ("plan", "setups", "readings", "time", "tool error [µm]")
     return table_of(headers, rows)
 
@@ -229,10 +232,7 @@ def _helps(plan: MeasuringPlan) -> list[str]:
     sizes = {a.name: a.expected.reported.rms for a in plan.helps if a.expected is not None}
     names = sorted(sizes, key=sizes.__getitem__)
     better = [n for n in names if sizes[n] < (1.0 - NOTICEABLE) * mine]
-    texts = [
-        f"The same readings with {n}: {plain(sizes[n] / UM, 0 if sizes[n] >= 20 * UM else 1)} µm."
-        for n in better
-    ]
+    texts = [f"The same readings with {n}: {tool_mm(sizes[n])}." for n in better]
     if names and sizes[names[0]] > (1.0 - HELPFUL) * mine:
         none = (
             f"None of these gains {HELPFUL:.0%}"
