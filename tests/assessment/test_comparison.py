@@ -108,7 +108,8 @@ def test_the_tool_error_is_that_of_calibrate(raw_cycles, cycles):
     (second,) = calibration.assessment.of_kind("tool error")
     assert first.text == second.text
     assert compared.assessment.tool.box == calibration.assessment.tool.box
-    row = next(line for line in summarize(compared).splitlines() if cycles.best.model in line)
+    lines = summarize(compared).splitlines()
+    row = next(line for line in lines if line.split()[:1] == [cycles.best.model])
     assert tool_mm(calibration.assessment.tool.entered) in row
     for name in ("now", "entered", "compensated"):
         values = [getattr(a.tool, name) for a in (compared.assessment, calibration.assessment)]
