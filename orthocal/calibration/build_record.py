@@ -27,7 +27,11 @@ from orthocal.calibration.records import (
     Versions,
 )
 from orthocal.errors import ClosureError
-from orthocal.estimation.diagnostics.deletion import Diagnostics, diagnose_readings, predict_unseen
+from orthocal.estimation.diagnostics.deletion import (
+    Diagnostics,
+    cross_validate_setups,
+    diagnose_readings,
+)
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.diagnostics.unmodelled import (
     Unmodelled,
@@ -104,7 +108,7 @@ def assemble_calibration(
         noise=fit.noise,
         rows_are_differences=session.only_differences,
         residuals=_residual_rows(fit, diagnostics, nominal),
-        critical=diagnostics.critical,
+        critical=diagnostics.outlier_threshold,
         postures=_posture_records(fit),
         setups=_setup_records(fit),
         gauges=_gauge_records(fit),
@@ -293,7 +297,7 @@ def _residual_rows(
     except ClosureError:  # the linearised machine cannot be assembled
         by_linear = np.full(len(session.readings), np.nan)
     predicted = session.values - noise * o.rows(fit.residual)
-    unseen = noise * predict_unseen(fit)
+    unseen = noise * cross_validate_setups(fit)
     return tuple(
         ResidualRow(
             setup=r.setup,
@@ -307,8 +311,8 @@ def _residual_rows(
             line=r.line,
             file=None if r.file is None else str(r.file),
             studentised=float(diagnostics.studentised[i]),
-            influence=float(diagnostics.influence[i]),
-            influenced=problem.free[diagnostics.influenced[i]],
+            influence=float(diagnostics.max_dfbetas[i]),
+            influenced=problem.free[diagnostics.dfbetas_parameter[i]],
             unseen=float(unseen[i]),
             conditions=r.conditions,
         )

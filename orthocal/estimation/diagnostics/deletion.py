@@ -1,9 +1,9 @@
 """Deletion diagnostics: a reading or a setup against the prediction from all the others.
 
 Deleting a reading is equivalent to adding an unknown error to it. With y ~ (X θ, σ² S), X with a
-column for every gauge zero and the prior as P,
+column for every free gauge zero and the prior precision P⁻¹,
 
-    M = S⁻¹ − S⁻¹ X A⁻¹ Xᵀ S⁻¹,  A = Xᵀ S⁻¹ X + σ² P
+    M = S⁻¹ − S⁻¹ X A⁻¹ Xᵀ S⁻¹,  A = Xᵀ S⁻¹ X + σ² P⁻¹
 
 this error is estimated as γᵢ = (M y)ᵢ/Mᵢᵢ with variance σ²/Mᵢᵢ, and deleting the reading changes
 the estimate by −A⁻¹ Xᵀ S⁻¹ eᵢ γᵢ (Cook and Weisberg, Residuals and Influence, 1982, 2.2).
@@ -11,9 +11,10 @@ Differences of one setup and cycle share postures: S has a block for each group.
 
 Deleting a setup s changes the estimate, to first order about the solution, by
 
-    δ = −A₋ₛ⁻¹ Fₛᵀ rₛ/σ²,  A₋ₛ = FᵀF/σ² + P − FₛᵀFₛ/σ²
+    δ = −A₋ₛ⁻¹ Fₛᵀ rₛ/σ²,  A₋ₛ = FᵀF/σ² + P⁻¹ − FₛᵀFₛ/σ²
 
-with F the Jacobian and r the residuals, zeros eliminated. The setup is then missed by rₛ − Fₛ δ.
+with F the Jacobian and r the residuals, zeros eliminated. The prediction error of the
+setup is then rₛ − Fₛ δ.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ MIN_REMAINING_SQUARE = 1e-6
 OUTLIER_PROBABILITY = 0.01
 """Probability that a session without wrong readings has an outlier."""
 
-LARGEST_CRITICAL = 1e6
+LARGEST_THRESHOLD = 1e6
 """Studentised residual above which a threshold counts as infinite."""
 
 
@@ -51,78 +52,75 @@ class Diagnostics:
     studentised: Array
     """Studentised deleted residual, shape (n_rows,). Noise from residuals is estimated without the
     row. NaN if no other row predicts it."""
-    deleted: Array
-    """Deleted residual, [m]: measured minus predicted from the others."""
-    influence: Array
-    """Largest change of an error of the machine when the row is deleted, in its standard
-    deviations."""
-    influenced: Indices
-    """Index of that parameter."""
-    critical: float
+    max_dfbetas: Array
+    """Largest |DFBETAS| over the machine's parameters: change of the estimate when the row is
+    deleted, in standard deviations of the parameter, shape (n_rows,)."""
+    dfbetas_parameter: Indices
+    """Index in `problem.free` of the parameter with that change, shape (n_rows,)."""
+    outlier_threshold: float
     """Studentised residual above which a row is an outlier."""
-
-    @property
-    def suspicious(self) -> Indices:
-        """Outliers, the largest first."""
-        size = np.nan_to_num(np.abs(self.studentised))
-        rows = np.flatnonzero(size > self.critical)
-        return np.asarray(rows[np.argsort(-size[rows])])
 
 
 def diagnose_readings(fit: Fit) -> Diagnostics:
     """Deletion diagnostics of every reading, to first order about the solution."""
-    problem, o = fit.problem, fit.problem.observations
-    count, sigma = o.plus.size, fit.noise.sigma
+    problem, count = fit.problem, fit.problem.observations.plus.size
+    sigma, n = fit.noise.sigma, fit.problem.n_machine
     if not (np.isfinite(sigma) and sigma >= SMALLEST_SIGMA):
-        undefined, zeros = np.full(count, np.nan), np.zeros(count)
-        return Diagnostics(undefined, undefined, zeros, zeros.astype(np.int64), np.inf)
+        zeros = np.zeros(count)
+        return Diagnostics(np.full(count, np.nan), zeros, zeros.astype(np.int64), np.inf)
     inverse = _weighted_information(fit).covariance(
         sigma=sigma, precision=problem.prior_precision, held=fit.held
     )
-    jacobian, residual, weights = o.rows(fit.jacobian), o.rows(fit.residual), fit.weights[o.plus]
-    sensitivity, projected, diagonal = np.empty_like(jacobian), np.empty(count), np.empty(count)
-    for zero in range(o.n_zeros):
-        group = np.flatnonzero(o.zero[o.plus] == zero)
-        precision = _inverse_covariance(o, group)
-        if precision is None:
-            w = weights[group]
-            mean = (w @ jacobian[group]) / w.sum()
-            sensitivity[group] = jacobian[group] - mean
-            # the weight of a robust loss is not part of the residual
-            projected[group], diagonal[group] = residual[group], 1.0 - w / w.sum()
-        else:
-            sensitivity[group] = precision @ jacobian[group]
-            projected[group], diagonal[group] = precision @ residual[group], np.diag(precision)
-            weights[group] = 1.0
-    gain = sensitivity @ inverse / sigma**2
-    redundancy = diagonal - weights * (gain * sensitivity).sum(axis=1)
-    redundancy[redundancy < MIN_REDUNDANCY * diagonal] = np.nan
-    with np.errstate(divide="ignore", invalid="ignore"):
-        deleted = projected / redundancy
-        share = projected**2 / redundancy
-    spread, dof = _spread_without(fit, share)
-    n = problem.n_machine
+    weights, s_inv_x, m_y, s_inv_diagonal = _eliminate_zeros(fit)
+    gain = s_inv_x @ inverse / sigma**2
+    redundancy = s_inv_diagonal - weights * (gain * s_inv_x).sum(axis=1)
+    redundancy[redundancy < MIN_REDUNDANCY * s_inv_diagonal] = np.nan
     std = np.sqrt(np.diag(inverse))[:n]
     with np.errstate(divide="ignore", invalid="ignore"):
-        shifts = np.abs(gain[:, :n] * (weights * deleted)[:, None])
-        shifts /= np.where(std > 0.0, std, np.inf)
-    influenced = np.nan_to_num(shifts).argmax(axis=1)
+        deleted_residual = m_y / redundancy
+        spread, dof = _spread_without(fit, m_y**2 / redundancy)
+        dfbetas = np.abs(gain[:, :n] * (weights * deleted_residual)[:, None])
+        dfbetas = np.nan_to_num(dfbetas / np.where(std > 0.0, std, np.inf))
+    largest = dfbetas.argmax(axis=1)
     return Diagnostics(
-        studentised=deleted * np.sqrt(redundancy) / spread,
-        deleted=deleted,
-        influence=np.nan_to_num(shifts[np.arange(count), influenced]),
-        influenced=influenced,
-        critical=_critical(dof, count),
+        studentised=deleted_residual * np.sqrt(redundancy) / spread,
+        max_dfbetas=dfbetas[np.arange(count), largest],
+        dfbetas_parameter=largest,
+        outlier_threshold=_outlier_threshold(dof, count),
     )
 
 
-def _critical(dof: float, count: int) -> float:
-    """Studentised residual above which one of `count` readings is an outlier; infinite for none.
+def _eliminate_zeros(fit: Fit) -> tuple[Array, Array, Array, Array]:
+    """Robust weights of the rows, S⁻¹ X, M y and diag S⁻¹, gauge zeros eliminated.
 
-    With very few degrees of freedom the quantile of Student's distribution is about 1e28.
+    All but the weights are divided by the weight of the row.
+    """
+    o = fit.problem.observations
+    weights = fit.weights[o.plus]
+    s_inv_x = o.rows(project_out_zeros(fit.jacobian, o, weights=fit.weights))
+    m_y, s_inv_diagonal = o.rows(fit.residual), np.ones(o.plus.size)
+    jacobian = o.rows(fit.jacobian)
+    for zero in range(o.n_zeros):
+        group = np.flatnonzero(o.zero[o.plus] == zero)
+        precision = _inverse_covariance(o, group)
+        if precision is not None:
+            s_inv_x[group], m_y[group] = precision @ jacobian[group], precision @ m_y[group]
+            s_inv_diagonal[group] = np.diag(precision)
+            # robust weights belong to single readings: a row of two of them counts fully
+            weights[group] = 1.0
+        elif not o.zero_known[zero]:
+            s_inv_diagonal[group] -= weights[group] / weights[group].sum()
+    return weights, s_inv_x, m_y, s_inv_diagonal
+
+
+def _outlier_threshold(dof: float, count: int) -> float:
+    """Bonferroni threshold of the studentised residuals of `count` readings.
+
+    Infinite if no reading can be judged: with very few degrees of freedom the quantile of Student's
+    distribution is about 1e28.
     """
     factor = confidence_factor(dof, 1.0 - OUTLIER_PROBABILITY / count)
-    return factor if factor < LARGEST_CRITICAL else np.inf
+    return factor if factor < LARGEST_THRESHOLD else np.inf
 
 
 def _weighted_information(fit: Fit) -> Information:
@@ -149,7 +147,15 @@ def _inverse_covariance(o: Observations, group: Indices) -> Array | None:
 
 
 def _spread_without(fit: Fit, share: Array) -> tuple[Array, float]:
-    """Standard deviation of a reading without each row, and its degrees of freedom."""
+    """Standard deviation of a reading estimated without each row, and its degrees of freedom.
+
+    Args:
+        fit: The fit.
+        share: Part of each row in Σ r², shape (n_rows,), [m² of the first gauge].
+
+    Returns:
+        Standard deviations, shape (n_rows,), [m of the first gauge], and degrees of freedom.
+    """
     noise = fit.noise
     if noise.source != "residuals" or fit.loss.robust:
         return np.full(share.size, noise.sigma), noise.dof
@@ -161,12 +167,12 @@ def _spread_without(fit: Fit, share: Array) -> tuple[Array, float]:
     return np.sqrt(np.maximum(total - share, MIN_REMAINING_SQUARE * total) / dof), dof
 
 
-def predict_unseen(fit: Fit) -> Array:
-    """Errors of predicting the rows of every setup from all other setups.
+def cross_validate_setups(fit: Fit) -> Array:
+    """Leave-one-setup-out prediction errors of every row.
 
     Returns:
-        Measured minus predicted, each with its best gauge zeros, shape (n_rows,), [m]; NaN where
-        the other setups do not determine the parameters.
+        Measured minus predicted, each with its best gauge zeros, shape (n_rows,), [m of the first
+        gauge]; NaN where the other setups do not determine the parameters.
     """
     problem, o = fit.problem, fit.problem.observations
     errors = np.full(o.plus.size, np.nan)
@@ -175,7 +181,7 @@ def predict_unseen(fit: Fit) -> Array:
         return errors
     root = np.sqrt(fit.weights)[:, None]
     factor = root * project_out_zeros(fit.jacobian, o, weights=fit.weights)
-    pull = root[:, 0] * fit.residual / fit.sigma**2
+    weighted_residual = root[:, 0] * fit.residual / fit.sigma**2
     free = ~fit.held
     precision = np.diag(problem.prior_precision)[np.ix_(free, free)]
     for setup in setups:
@@ -190,9 +196,10 @@ def predict_unseen(fit: Fit) -> Array:
         others = factor[~deleted][:, free] / fit.sigma
         change = np.zeros(problem.n_free)
         change[free] = -np.linalg.solve(
-            others.T @ others + precision, factor[deleted][:, free].T @ pull[deleted]
+            others.T @ others + precision,
+            factor[deleted][:, free].T @ weighted_residual[deleted],
         )
-        missed = project_out_zeros(fit.residual - fit.jacobian @ change, o)
+        prediction_error = project_out_zeros(fit.residual - fit.jacobian @ change, o)
         rows = deleted[o.plus]
-        errors[rows] = o.rows(missed)[rows]
+        errors[rows] = o.rows(prediction_error)[rows]
     return errors

@@ -7,7 +7,7 @@ import pytest
 from gauges import exact
 
 from orthocal import calibrate, compare_models, load_session
-from orthocal.estimation.diagnostics.deletion import predict_unseen
+from orthocal.estimation.diagnostics.deletion import cross_validate_setups
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
@@ -49,6 +49,6 @@ def test_with_a_robust_loss_it_is_the_robust_fit_that_predicts(raw_cycles):
     """Where no residual is large Huber's loss is all but squares, and predicts as they do."""
     wide = SolverOptions(loss=Loss("huber", width=100.0))
     problem = build_problem(exact(raw_cycles), model="offsets")
-    robust = predict_unseen(fit_problem(problem, options=wide))
-    squares = predict_unseen(fit_problem(problem))
+    robust = cross_validate_setups(fit_problem(problem, options=wide))
+    squares = cross_validate_setups(fit_problem(problem))
     assert np.abs(robust - squares).max() < 1e-3 * np.abs(squares).max()
