@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -56,8 +57,8 @@ ARGUMENTS = [
     ({"bounds": {"x_slide.offset": 5}}, "expected a name and 2 numbers"),
     ({"bounds": {"x_slide.offset": (1, 2, 3)}}, "expected a name and 2 numbers"),
     ({"bounds": {"x_slide.offset": ("a", "b")}}, "expected a name and 2 numbers"),
-    ({"prior": "x"}, "found a str; expected True or False as prior or base"),
-    ({"base": "x"}, "found a str; expected True or False as prior or base"),
+    ({"prior": "x"}, "prior: found a str; expected True, False or None"),
+    ({"base": "x"}, "base: found a str; expected True or False"),
 ]
 """Of a choice."""
 
@@ -107,6 +108,30 @@ def test_a_choice_in_any_unit_is_the_same_choice(experiment_2):
         assert other == pytest.approx(found[0], rel=1e-9)
 
 
+def test_a_list_is_a_value_and_its_tolerance(orthoglide):
+    """JSON and YAML have no tuples."""
+    choices = [Choice(known={"y_slide.offset_mm": v}) for v in ((0.5, 0.1), [0.5, 0.1])]
+    found = [c.select(orthoglide.parameters) for c in choices]
+    assert np.array_equal(found[0].mean, found[1].mean)
+    assert np.array_equal(found[0].prior_stds, found[1].prior_stds)
+    with pytest.raises(ParameterError, match="give y_slide"):
+        replace(choices[1], base=True).select(orthoglide.parameters)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        ("known", (0.5, 500.0)),
+        ("tolerances", (1.0, 1000.0)),
+        ("bounds", ((-1.0, 1.0), (-5.0, 5.0))),
+    ],
+)
+def test_one_name_in_two_units_is_refused(orthoglide, kind, values):
+    stated = dict(zip(("x_slide.offset_mm", "x_slide.offset_um"), values, strict=True))
+    with pytest.raises(ParameterError, match=f"{kind}: 'x_slide.offset' is given twice"):
+        Choice(**{kind: stated}).select(orthoglide.parameters)
+
+
 @pytest.mark.parametrize(("arguments", "message"), OTHER_ARGUMENTS, ids=lambda v: str(v)[:40])
 def test_arguments_of_calibrate(arguments, message, experiment_2):
     with pytest.raises((TypeError, ValueError), match=re.escape(message)):
@@ -122,7 +147,9 @@ def test_arguments_of_calibrate(arguments, message, experiment_2):
         {"closure_tolerance": float("nan")},
         {"max_iterations": "a"},
         {"max_iterations": -1},
+        {"max_iterations": 2_000_000},
         {"print_level": 1.5},
+        {"print_level": 13},
         {"loss": "huber"},
     ],
     ids=str,

@@ -12,7 +12,7 @@ from orthocal.arguments import require_kind, require_names
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import NotIdentifiableError, ParameterError
-from orthocal.estimation.choice import Choice, choose
+from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.estimation.diagnostics.profile_likelihood import profile_interval
 from orthocal.estimation.fit import Fit, fit_problem
 from orthocal.estimation.linear import linearise_at_reference
@@ -69,7 +69,7 @@ def identify(
     """
     session = join_sessions(gather_sessions(sessions))
     require_names(profile, argument="profile")
-    chosen = choose(choice, session)
+    chosen = resolve_choice(choice, session)
     options = _solver_options(solver, loss)
     problem = CalibrationProblem(session, chosen.select(session.robot.parameters))
     require_conditions(session, problem.machine_selection.names)

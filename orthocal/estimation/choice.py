@@ -8,7 +8,14 @@ from typing import Any
 
 from orthocal.arguments import require_kind, require_names, require_numbers
 from orthocal.errors import ParameterError
-from orthocal.estimation.selection import Known, Selection, complete_model, select_parameters
+from orthocal.estimation.selection import (
+    KnownWithStd,
+    KnownWithTolerance,
+    Selection,
+    complete_model,
+    label_choice,
+    select_parameters,
+)
 from orthocal.robot.parameters import ParameterSet, errors_at
 from orthocal.session.session import Purpose, Session
 from orthocal.units import read_limit
@@ -26,8 +33,8 @@ class Choice:
             the one that the session states, otherwise the complete model.
         free: Names or globs added to the model; without a model, the complete list. '!' excludes.
         prior: Use priors; by default True, unless only offsets are free.
-        known: Name with its unit to a known value, which is then held, or to a value and its
-            tolerance, a limit of ±2 standard deviations, which then act as prior.
+        known: Name with its unit to a known value, which is then fixed, or to a value and its
+            tolerance, a limit of ±2 prior standard deviations, which then act as prior.
         tolerances: Name or glob with its unit to another tolerance than the robot's, a limit of
             ±2 prior standard deviations.
         bounds: Name or glob with its unit to lowest and highest value, ±inf for open.
@@ -35,13 +42,13 @@ class Choice:
             parameter remains free and represents the combination.
 
     Raises:
-        TypeError: If an argument is of another kind.
+        TypeError: If an argument has a wrong type.
     """
 
     model: str | None = None
     free: Sequence[str] = ()
     prior: bool | None = None
-    known: Mapping[str, Known] = field(default_factory=dict)
+    known: Mapping[str, KnownWithTolerance] = field(default_factory=dict)
     tolerances: Mapping[str, float] = field(default_factory=dict)
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     base: bool = False
@@ -52,8 +59,14 @@ class Choice:
         require_numbers(self.known, argument="known", counts=(1, 2))
         require_numbers(self.tolerances, argument="tolerances")
         require_numbers(self.bounds, argument="bounds", counts=(2,))
-        for value in (self.prior, self.base):
-            require_kind(value, (bool, type(None)), expected="True or False as prior or base")
+        if not isinstance(self.prior, bool | None):
+            kind = type(self.prior).__name__
+            raise TypeError(f"prior: found a {kind}; expected True, False or None")
+        if not isinstance(self.base, bool):
+            raise TypeError(f"base: found a {type(self.base).__name__}; expected True or False")
+        # JSON and YAML have lists
+        known = {k: tuple(v) if isinstance(v, list) else v for k, v in self.known.items()}
+        object.__setattr__(self, "known", known)
 
     @property
     def document(self) -> dict[str, Any]:
@@ -64,38 +77,39 @@ class Choice:
         """The free parameters among those of a robot, in SI.
 
         Raises:
-            ParameterError: If a name, unit, glob or model is unknown, or a number makes no sense.
+            ParameterError: If a name, unit, glob or model is unknown, one is stated twice, or a
+                known value, tolerance or bound is invalid.
         """
-        with_std = [key for key, value in self.known.items() if isinstance(value, tuple)]
-        if self.base and (self.prior or with_std):
+        as_prior = [key for key, value in self.known.items() if isinstance(value, tuple)]
+        if self.base and (self.prior or as_prior):
             raise ParameterError(
                 "base parameters are identified without any prior"
-                + (f"; give {', '.join(with_std)} as known without ±" if with_std else "")
+                + (f"; give {', '.join(as_prior)} as known without ±" if as_prior else "")
             )
         return select_parameters(
             parameters,
             model=self.model,
             free=self.free,
             prior=self.prior,
-            known=_known(self.known, parameters),
+            known=_known_in_si(self.known, parameters),
             prior_stds=parameters.read_tolerances(self.tolerances),
-            bounds=_bounds(self.bounds, parameters),
+            bounds=_bounds_in_si(self.bounds, parameters),
         )
 
 
-def choose(
-    choice: Choice | str | None, session: Session | None, *, usual: str | None = None
+def resolve_choice(
+    choice: Choice | str | None, session: Session | None, *, default_model: str | None = None
 ) -> Choice:
-    """Choice of the user, otherwise of the session, otherwise the usual model.
+    """Choice of the user, otherwise of the session, otherwise the default model.
 
     Args:
         choice: A choice, or the name of a model.
         session: The measured session, or several joined ones.
-        usual: The model if nothing is stated; by default the complete one.
+        default_model: The model if nothing is stated; by default the complete one.
 
     Raises:
         ParameterError: If nothing is chosen and the sessions state different models.
-        TypeError: If an argument is of another kind.
+        TypeError: If an argument has a wrong type.
     """
     require_kind(choice, (Choice, str, type(None)), expected="a Choice, or the name of a model")
     chosen = choice if isinstance(choice, Choice) else Choice(choice)
@@ -104,20 +118,21 @@ def choose(
     sessions = () if session is None else session.parts or (session,)
     purposes = {s.purpose: s for s in sessions if s.purpose is not None}
     if len(purposes) > 1:
-        said = "; ".join(f"{_in_words(p)} in {s.path or s.title}" for p, s in purposes.items())
+        said = "; ".join(
+            f"{label_choice(p.model, p.free)} in {s.path or s.title}" for p, s in purposes.items()
+        )
         raise ParameterError(f"sessions are for different models: {said}; say which", where="model")
-    if usual is None and session is not None:
-        usual = complete_model(session.robot.parameters)
-    purpose = next(iter(purposes), Purpose(usual))
+    if default_model is None and session is not None:
+        default_model = complete_model(session.robot.parameters)
+    purpose = next(iter(purposes), Purpose(default_model))
     return replace(chosen, model=purpose.model, free=purpose.free)
 
 
-def _in_words(purpose: Purpose) -> str:
-    return " ".join(([] if purpose.model is None else [purpose.model]) + list(purpose.free))
-
-
-def _known(known: Mapping[str, Known], parameters: ParameterSet) -> dict[str, Known]:
-    result: dict[str, Known] = {}
+def _known_in_si(
+    known: Mapping[str, KnownWithTolerance], parameters: ParameterSet
+) -> dict[str, KnownWithStd]:
+    """Name to known value, or to (value, prior standard deviation), [SI]."""
+    result: dict[str, KnownWithStd] = {}
     for key, value in known.items():
         with errors_at("known"):
             name, factor = parameters.read_quantity(key, 1.0)
@@ -130,12 +145,15 @@ def _known(known: Mapping[str, Known], parameters: ParameterSet) -> dict[str, Kn
     return result
 
 
-def _bounds(
+def _bounds_in_si(
     bounds: Mapping[str, tuple[float, float]], parameters: ParameterSet
 ) -> dict[str, tuple[float, float]]:
-    result = {}
+    """Name or glob to (lowest, highest value), [SI]."""
+    result: dict[str, tuple[float, float]] = {}
     for key, (low, high) in bounds.items():
         with errors_at("bounds"):
             glob, factor = parameters.read_glob(key)
+            if glob in result:
+                raise ParameterError(f"'{glob}' is given twice")
         result[glob] = (low * factor, high * factor)
     return result

@@ -1,7 +1,7 @@
 """Choice and options of a solver.
 
 - `ipopt`: the complete nonlinear program, with passive coordinates and gauge zeros as variables;
-  the reference.
+  the solver that the others are tested against.
 - `variable-projection`: the same optimum by variable projection, for repetition and large sessions.
 - `linearised`: one step with readings to first order about the active offsets, as in the paper.
 """
@@ -23,6 +23,10 @@ Hessian = Literal["gauss-newton", "exact"]
 OptionValue = float | int | str | bool
 
 MOST_ITERATIONS = 10**6
+"""Largest `max_iterations`."""
+
+MOST_PRINTING = 12
+"""Largest `print_level` of Ipopt."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,16 +36,23 @@ class SolverOptions:
     Args:
         solver: `ipopt`, `variable-projection` or `linearised`.
         hessian: Ipopt's Hessian of the Lagrangian: exact, or without the curvature of readings and
-            closures. Where the latter does not converge the exact one is tried.
-        tolerance: Ipopt's `tol` on the gradient of the scaled problem, in prior standard deviations
-            where only the prior holds a parameter, and far less where readings do.
-            Readings of 0.3 m known to 5 µm leave rounding errors of up to 1e-7 in it.
+            closures. If the latter does not converge, the exact one is tried, for sessions of up to
+            2000 readings.
+        tolerance: Ipopt's `tol`: largest optimality error, for parameters in prior standard
+            deviations. Multiplied by n/20 000 for n > 20 000 readings. Rounding errors of the
+            gradient are about 1e-7 for readings of 0.3 m known to 5 µm.
         closure_tolerance: Ipopt's largest scaled closure residual: units of 1 mm.
-        max_iterations: Ipopt's `max_iter`; also of variable projection.
+        max_iterations: Ipopt's `max_iter`; also of variable projection. Sets of readings that are
+            solved in a batch have at most 30 common iterations first.
         print_level: Ipopt's own printing, 0 (none) to 12.
         loss: Loss function of standardised residuals.
         ipopt: Further options of Ipopt, by its own names, such as {"mu_strategy": "adaptive"}; they
             replace those that orthocal sets. Other solvers ignore them.
+
+    Raises:
+        OrthocalError: If the solver is unknown.
+        TypeError: If the loss is not a `Loss`.
+        ValueError: If another option is invalid.
     """
 
     solver: SolverKind = "ipopt"
@@ -59,10 +70,10 @@ class SolverOptions:
             value = getattr(self, name)
             if not (isinstance(value, int | float) and 0.0 < value < math.inf):
                 raise ValueError(f"{name} is {value!r}; expected a number above 0")
-        for name in ("max_iterations", "print_level"):
+        for name, most in (("max_iterations", MOST_ITERATIONS), ("print_level", MOST_PRINTING)):
             value = getattr(self, name)
-            if not (isinstance(value, int) and 0 <= value <= MOST_ITERATIONS):
-                raise ValueError(f"{name} is {value!r}; expected a whole number of at least 0")
+            if not (isinstance(value, int) and 0 <= value <= most):
+                raise ValueError(f"{name} is {value!r}; expected a whole number from 0 to {most}")
         if not isinstance(self.ipopt, Mapping):
             raise ValueError(f"ipopt is {self.ipopt!r}; expected names and values of options")
         for key, option in self.ipopt.items():
@@ -77,5 +88,6 @@ class SolverOptions:
 def _require_one_of(
     value: object, names: tuple[str, ...], what: str, error: type[Exception]
 ) -> None:
+    """Check that an option has one of some names."""
     if value not in names:
         raise error(f"the {what} is {value!r}; expected one of {', '.join(names)}")

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array, Mask
 from orthocal.errors import ClosureError, RobotError
-from orthocal.estimation.selection import Known, Selection, select_parameters
+from orthocal.estimation.selection import KnownWithStd, Selection, select_parameters
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import Failures, LoopClosure
 from orthocal.kinematics.robot_functions import RobotFunctions
@@ -67,7 +67,7 @@ class CalibrationProblem:
         self.session = session
         self.robot = session.robot
         self.machine_selection = selection
-        selection = selection.with_known(nuisance_parameters(session).parameters)
+        selection = selection.with_nuisance(nuisance_parameters(session).parameters)
         self.selection = selection
         self.free = selection.names
         self.parameters = selection.parameters
@@ -363,7 +363,7 @@ def build_problem(
     model: str | None = None,
     free: Sequence[str] = (),
     prior: bool | None = None,
-    known: Mapping[str, Known] | None = None,
+    known: Mapping[str, KnownWithStd] | None = None,
     prior_stds: Mapping[str, float] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
 ) -> CalibrationProblem:

@@ -16,7 +16,11 @@ from orthocal.robot.parameters import Parameter, ParameterSet, errors_at, requir
 from orthocal.text import composed
 from orthocal.units import Unit, show_limit
 
-Known = float | tuple[float, float]
+KnownWithStd = float | tuple[float, float]
+"""Known value, or value and prior standard deviation, [SI]."""
+
+KnownWithTolerance = float | tuple[float, float]
+"""Known value, or value and tolerance (±2 prior standard deviations), in the unit of its key."""
 
 COMPLETE_MODELS = ("full", "complete")
 """Names of complete models, in order of preference."""
@@ -60,11 +64,11 @@ class Selection:
 
     @property
     def prior_stds(self) -> Array:
-        """One standard deviation of each free parameter, shape (n_free,), [SI]."""
+        """Prior standard deviation of each free parameter, shape (n_free,), [SI]."""
         return np.array([p.prior_std for p in self.parameters])
 
-    def with_known(self, parameters: Sequence[Parameter]) -> Selection:
-        """Selection with further parameters that have priors."""
+    def with_nuisance(self, parameters: Sequence[Parameter]) -> Selection:
+        """Selection with nuisance parameters appended, which have priors of mean 0."""
         n = len(parameters)
         return replace(
             self,
@@ -94,7 +98,7 @@ def select_parameters(
     model: str | None = None,
     free: Sequence[str] = (),
     prior: bool | None = None,
-    known: Mapping[str, Known] | None = None,
+    known: Mapping[str, KnownWithStd] | None = None,
     prior_stds: Mapping[str, float] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
 ) -> Selection:
@@ -106,7 +110,7 @@ def select_parameters(
             given.
         free: Names or globs of further free parameters; '!' excludes.
         prior: Use priors; by default True, unless only offsets are free.
-        known: Name to a known value, which is then held, or to a value and its standard
+        known: Name to a known value, which is then fixed, or to a value and its standard
             deviation, which then act as prior of a free parameter, [SI].
         prior_stds: Name or glob to another prior standard deviation than the robot's, [SI].
         bounds: Name or glob to lowest and highest value, ±inf for open, [SI].
@@ -121,7 +125,7 @@ def select_parameters(
         patterns += parameters.patterns(base)
     with errors_at("free"):
         chosen = set(parameters.select([*patterns, *free]))
-    held: dict[str, float] = {}
+    fixed: dict[str, float] = {}
     priors: dict[str, tuple[float, float]] = {}
     for name, entry in (known or {}).items():
         with errors_at("known"):
@@ -132,12 +136,12 @@ def select_parameters(
                 priors[name] = (_finite(entry[0], name), spread)
                 chosen.add(name)
             else:
-                held[name] = _finite(entry, name)
+                fixed[name] = _finite(entry, name)
                 chosen.discard(name)
     names = [n for n in parameters.names if n in chosen]
     if not names:
         raise ParameterError("no free parameters: there is nothing to identify")
-    _refuse_overlap(parameters, [*names, *(n for n, v in held.items() if v != 0.0)])
+    _refuse_overlap(parameters, [*names, *(n for n, v in fixed.items() if v != 0.0)])
 
     stds = {n: parameters[n].prior_std for n in names}
     for glob, value in (prior_stds or {}).items():
@@ -150,33 +154,35 @@ def select_parameters(
     for glob, (low, high) in (bounds or {}).items():
         with errors_at("bounds"):
             if not low < high:
-                raise ParameterError(f"those of '{glob}' leave nothing between them")
+                raise ParameterError(f"the lower bound of '{glob}' is not below the upper one")
             for name in _match_free(parameters, glob, names):
                 i = names.index(name)
                 lower[i], upper[i] = max(low, lower[i]), high
     only_offsets = all(parameters.are_offsets(n) for n in names if n not in priors)
     everywhere = not only_offsets if prior is None else prior
     return Selection(
-        label=_label(base, free),
+        label=label_choice(base, free),
         parameters=tuple(replace(parameters[n], prior_std=stds[n]) for n in names),
         prior=np.array([everywhere or n in priors for n in names]),
         mean=read_only([priors.get(n, (0.0, 0.0))[0] for n in names]),
         lower=read_only(lower),
         upper=read_only(upper),
-        fixed=held,
+        fixed=fixed,
     )
 
 
-def read_known(texts: Sequence[str], parameters: ParameterSet, *, where: str) -> dict[str, Known]:
+def read_known(
+    texts: Sequence[str], parameters: ParameterSet, *, where: str
+) -> dict[str, KnownWithTolerance]:
     """Known values from texts such as x_leg.length_mm=0.12 or x_leg.length_mm=0.12±0.02.
 
     Returns:
-        Key with its unit to a value, or to a value and its standard deviation, as in `Choice`.
+        Key with its unit to a value, or to a value and its tolerance, as in `Choice`.
 
     Raises:
         ParameterError: If a text does not fit.
     """
-    result: dict[str, Known] = {}
+    result: dict[str, KnownWithTolerance] = {}
     names: set[str] = set()
     for text in texts:
         key, text_of_value = _split(text, "NAME=VALUE or NAME=VALUE±TOLERANCE", where)
@@ -237,6 +243,7 @@ def read_bounds(
 
 
 def _split(text: str, form: str, where: str) -> tuple[str, str]:
+    """Key and value of a text such as KEY=VALUE."""
     key, equals, value = text.partition("=")
     if not equals:
         raise ParameterError(f"found '{text}'; expected {form}", where=where)
@@ -279,11 +286,13 @@ def _lowest(parameter: Parameter) -> float:
     return 0.0 if parameter.positive else -math.inf
 
 
-def _label(model: str | None, free: Sequence[str]) -> str:
+def label_choice(model: str | None, free: Sequence[str]) -> str:
+    """Model and the patterns added to it, as on the command line."""
     return " ".join([*([] if model is None else [model]), *free])
 
 
 def _refuse_length(value: float, parameter: Parameter) -> None:
+    """Refuse a known value that is a length or an angle of the machine instead of an error."""
     if abs(value) > LARGEST_KNOWN * parameter.prior_std:
         factor, unit = parameter.edge_factor, parameter.edge_unit
         limit = show_limit(parameter.prior_std) * factor

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from orthocal.assessment.remaining_errors import RemainingError, rank_errors
 from orthocal.errors import ParameterError
-from orthocal.estimation.choice import Choice, choose
+from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.workspace import Workspace
 from orthocal.measurement.joining import join_sessions
@@ -156,7 +156,7 @@ def plan_readings(
     equipment = equipment or Equipment()
     options = _list_counts(setups, readings, hours, equipment)
     measured = None if measured is None else state_noise(measured)
-    chosen = choose(choice, measured, usual=MODEL)
+    chosen = resolve_choice(choice, measured, default_model=MODEL)
     robot = (robot if measured is None else measured.robot).with_tolerances(chosen.tolerances)
     measured = None if measured is None else measured.with_tolerances(chosen.tolerances)
     forecast = ToolForecast(robot, chosen.select(robot.parameters), workspace)

@@ -297,13 +297,15 @@ class ParameterSet:
             given: Name or glob with its unit to a limit of ±2 prior standard deviations.
 
         Raises:
-            ParameterError: If a name or unit is unknown.
+            ParameterError: If a name or unit is unknown, or a glob is stated in two units.
         """
         require_numbers(given, argument="tolerances")
-        result = {}
+        result: dict[str, float] = {}
         for key, value in given.items():
             with errors_at("tolerances"):
                 glob, factor = self.read_glob(key)
+                if glob in result:
+                    raise ParameterError(f"'{glob}' is given twice")
             result[glob] = read_limit(value) * factor
         return result
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.errors import ClosureError, SessionError, SolverError
-from orthocal.estimation.choice import Choice, choose
+from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
@@ -323,7 +323,7 @@ def build_accuracy_study(
         SessionError: If the noise of a gauge is missing.
         RobotError: If the drives do not command the tool.
     """
-    chosen = choose(choice, session, usual="full")
+    chosen = resolve_choice(choice, session, default_model="full")
     robot = session.robot
     parameters = robot.parameters
     chosen.select(parameters)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.errors import SessionError
-from orthocal.estimation.choice import Choice, choose
+from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.estimation.fit import Fit, fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
@@ -124,7 +124,7 @@ def build_bootstrap_study(
         SessionError: If there is nothing to resample.
         NotIdentifiableError, SolverError, ClosureError: As `calibrate`.
     """
-    study = BootstrapStudy(session, choose(choice, session), by, draws, seed)
+    study = BootstrapStudy(session, resolve_choice(choice, session), by, draws, seed)
     prepare_once(study)  # refuses a session that cannot be resampled
     return study
 

@@ -85,7 +85,7 @@ def test_bounds_are_open_where_none_is_given(parameters):
         ({"prior_stds": {"x_leg.length": 1e-4}}, "matches no free parameter"),
         ({"prior_stds": {"*.offset": 1e-12}}, "is 2e-09 mm; expected at least 2e-06 mm"),
         ({"model": "full", "prior_stds": {"x_*": 1e-3}}, "matches parameters in m, ppm and rad"),
-        ({"bounds": {"*.offset": (1e-3, -1e-3)}}, "bounds: those of"),
+        ({"bounds": {"*.offset": (1e-3, -1e-3)}}, "bounds: the lower bound of"),
         ({"known": {"x_slid.offset": 0.0}}, "did you mean x_slide.offset"),
         ({"known": {"x_slide.offset": float("nan")}}, "expected a finite number"),
         (

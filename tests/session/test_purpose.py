@@ -11,7 +11,7 @@ import pytest
 from orthocal import Choice, ParameterError, SessionError, calibrate, load_calibration
 from orthocal.calibration.file import write_calibration
 from orthocal.calibration.refit import repeat_calibration, restore_session
-from orthocal.estimation.choice import choose
+from orthocal.estimation.choice import resolve_choice
 from orthocal.measurement.files.session_file import load_session
 from orthocal.measurement.files.write_session import write_session
 from orthocal.measurement.joining import join_sessions
@@ -67,11 +67,11 @@ def test_a_calibration_keeps_them(stated, tmp_path):
 
 def test_options_come_before_what_a_session_says(stated):
     parameters = stated.robot.parameters
-    assert choose("offsets", stated).model == "offsets"
-    assert choose(Choice(free=["*.offset"]), stated).model is None
-    only_known = choose(Choice(known={"x_leg.length_mm": 0.1}), stated)
+    assert resolve_choice("offsets", stated).model == "offsets"
+    assert resolve_choice(Choice(free=["*.offset"]), stated).model is None
+    only_known = resolve_choice(Choice(known={"x_leg.length_mm": 0.1}), stated)
     assert (only_known.model, dict(only_known.known)) == ("full", {"x_leg.length_mm": 0.1})
-    narrower = choose(Choice(tolerances={"x_fork.rx_mrad": 1.0}), stated).select(parameters)
+    narrower = resolve_choice(Choice(tolerances={"x_fork.rx_mrad": 1.0}), stated).select(parameters)
     sizes = {p.name: p.prior_std for p in narrower.parameters}
     assert sizes[FORK] == pytest.approx(0.5e-3)
     assert sizes["y_fork.rx"] == pytest.approx(3e-3)
@@ -79,11 +79,11 @@ def test_options_come_before_what_a_session_says(stated):
 
 def test_where_nothing_is_said(raw_cycles, stated):
     silent = replace(raw_cycles, purpose=None)
-    assert choose(None, raw_cycles).model == "offsets"  # as it states
-    assert choose(None, silent).model == "full"
-    assert choose(None, silent, usual="lengths").model == "lengths"
-    assert choose(None, None, usual="full").model == "full"
-    assert choose(None, stated, usual="lengths").model == "full"
+    assert resolve_choice(None, raw_cycles).model == "offsets"  # as it states
+    assert resolve_choice(None, silent).model == "full"
+    assert resolve_choice(None, silent, default_model="lengths").model == "lengths"
+    assert resolve_choice(None, None, default_model="full").model == "full"
+    assert resolve_choice(None, stated, default_model="lengths").model == "full"
 
 
 def test_globs_instead_of_a_model(raw_cycles, tmp_path):
@@ -102,14 +102,14 @@ def test_sessions_agree_or_are_asked(raw_cycles, stated, tmp_path):
     offsets = say(raw_cycles, tmp_path / "offsets", model="offsets")
     joined = join_sessions([stated, offsets])
     with pytest.raises(ParameterError) as e:
-        choose(None, joined)
+        resolve_choice(None, joined)
     assert str(e.value) == (
         f"model: sessions are for different models: full in {stated.path}; offsets in "
         f"{offsets.path}; say which"
     )
-    assert choose("full", joined).model == "full"
+    assert resolve_choice("full", joined).model == "full"
     silent = replace(raw_cycles, purpose=None)
-    assert choose(None, join_sessions([stated, silent])).model == "full"
+    assert resolve_choice(None, join_sessions([stated, silent])).model == "full"
 
 
 def test_one_machine_has_one_tolerance(raw_cycles, stated, tmp_path):
