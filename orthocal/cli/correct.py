@@ -14,6 +14,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated, BinaryIO
 
+import numpy as np
+from numpy.typing import NDArray
 from typer import Option
 
 import orthocal
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
     from orthocal.export.correction_field import CorrectionField
     from orthocal.gcode.path import Vector
     from orthocal.gcode.program import Summary
+
+Array = NDArray[np.float64]
 
 BLOCK = 2**16
 """Characters or bytes that are read or written together."""
@@ -59,9 +63,10 @@ def correct(
     The program is for a controller with nominal kinematics. Lines and arcs are divided into chords
     that stay near the corrected path. The feed along the path and all other words are preserved.
     With --tool the program may use one tool only. If a line cannot be corrected, its number and
-    the reason are reported, and nothing is written.
+    the reason are reported, and nothing is written. A note names the first line that leaves the
+    workspace.
 
-    Exit code 3: the verdict is not to enter the calibration.
+    Exit code 3: the verdict is not `enter`; the reason is printed.
 
     Args:
         program (PROGRAM): G-code file; - for standard input.
@@ -96,7 +101,8 @@ def correct(
     interpreter = Interpreter(
         file, axes=field.axes, offsets=zeros, start=position, one_tool=tip is not None
     )
-    corrector = ProgramCorrector(interpreter, field, within=tolerance)
+    region, words = _find_region(result)
+    corrector = ProgramCorrector(interpreter, field, within=tolerance, region=region)
     with tempfile.TemporaryFile() as spool:  # nothing is written before all lines are corrected
         with _frozen():
             texts = corrector.run(_lines(program, file))
@@ -115,6 +121,7 @@ def correct(
         _describe_controller(result, values, active=active),
         _describe_tool(tip, interpreter.tools.used),
         warning,
+        _describe_outside(corrector.summary, file, words),
         "" if zeros else "The program's coordinates are read as machine coordinates.",
     ]
     if corrector.summary.unit_assumed:
@@ -209,16 +216,41 @@ def _read_offsets(texts: list[str]) -> dict[str, Vector]:
 
 
 def _describe(summary: Summary, field: CorrectionField, within: float) -> str:
+    from orthocal.assessment.wording import counted, lengths
     from orthocal.gcode.program import ROUNDING
 
-    low, high = ((v - 1.0) * 100.0 for v in summary.stretch)
+    change = max(abs(v - 1.0) * 100.0 for v in summary.stretch)
     bound = summary.deviation + field.error + ROUNDING * within
+    (largest,) = lengths(summary.correction)
     return (
-        f"Corrected {summary.lines} lines: {summary.points} points, largest correction "
-        f"{summary.correction / UM:.3g} µm. The written path is within {bound / UM:.3g} µm of the "
-        f"corrected path (requested: {within / UM:g} µm): chords {summary.deviation / UM:.3g} µm, "
-        f"correction {field.error / UM:.2g} µm, rounding {ROUNDING * within / UM:.2g} µm. Feeds "
-        f"changed by {low:+.2f} to {high:+.2f} % to preserve the speed of the tool."
+        f"Corrected {counted(summary.motions, 'motion')}, written as "
+        f"{counted(summary.points, 'point')}. Largest correction: {largest}. The path is within "
+        f"{bound / UM:.2g} µm of the exact correction (limit {within / UM:g} µm). Feeds change by "
+        f"at most {change:.2f} %, so that the tool keeps its speed."
+    )
+
+
+def _find_region(result: orthocal.Calibration) -> tuple[Array | None, str]:
+    """Limits of x, y and z over which the correction was determined, shape (3, 2), [m]; words."""
+    from orthocal.assessment.assess import assessment_of
+    from orthocal.kinematics.workspace import tool_at_zero
+
+    tool = assessment_of(result).tool
+    if tool is None or result.robot.tcp is None:
+        return None, ""
+    region = np.tile([-np.inf, np.inf], (3, 1))
+    region[list(result.robot.tcp.coordinates)] = (
+        np.array(tool.box) + tool_at_zero(result.robot)[:, None]
+    )
+    return region, tool.region
+
+
+def _describe_outside(summary: Summary, file: str, region: str) -> str:
+    if summary.outside is None:
+        return ""
+    return (
+        f"{file}:{summary.outside}: leaves the workspace {region}, over which the correction was "
+        "determined. Beyond it the correction is less certain."
     )
 
 

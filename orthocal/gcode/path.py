@@ -40,6 +40,12 @@ LARGEST_RADIUS_TOLERANCE = 127e-6
 SMALLEST_RADIUS = 1e-7
 """Smallest radius of an arc, [m]."""
 
+ARC_PARTS = 64
+"""Parts of an arc at whose ends a region is checked."""
+
+BORDER = 1e-6
+"""Distance beyond a region that counts as inside, [m]: coordinates have three decimals."""
+
 SHORT_RADIUS = 5e-6
 """Largest shortfall of R against half the distance of the ends, for a half circle, [m]."""
 
@@ -110,6 +116,20 @@ class Paths:
     def largest_radii(self) -> Array:
         """Largest radius of each curve, 0 for lines, shape (n,), [m]."""
         return np.asarray(np.maximum(self.radius[:, 0], self.radius.sum(axis=1)))
+
+    def leave(self, region: Array) -> NDArray[np.bool_]:
+        """True for curves that end outside a box, or pass outside it on an arc, shape (n,).
+
+        Args:
+            region: Limits of x, y and z, shape (3, 2), [m].
+        """
+        parts = np.linspace(0.0, 1.0, ARC_PARTS + 1)[1:]
+        curves = np.arange(len(self.base))
+        arcs = np.flatnonzero(self.angle[:, 1])
+        of = np.concatenate([curves, np.repeat(arcs, len(parts))])
+        points = self.points(of, np.concatenate([np.ones(len(curves)), np.tile(parts, len(arcs))]))
+        beyond = (points < region[:, 0] - BORDER) | (points > region[:, 1] + BORDER)
+        return np.asarray(np.bincount(of, weights=beyond.any(axis=1), minlength=len(curves)) > 0.0)
 
     def points(self, of: Indices, t: Array) -> Array:
         """Points on the curves, shape (k, 3), [m].

@@ -6,6 +6,9 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 from orthocal.errors import GcodeError
 from orthocal.gcode.interpreter import Interpreter, Step
 from orthocal.gcode.lines import CONTROL, Line, split_line, split_point_line
@@ -13,6 +16,8 @@ from orthocal.gcode.path import Motion, Paths
 from orthocal.gcode.segmentation import LONGEST_SEGMENT, Correction, Refused, segment_motions
 from orthocal.gcode.writer import Writer
 from orthocal.units import UM
+
+Array = NDArray[np.float64]
 
 LINES_AT_ONCE = 2000
 """Largest number of lines in memory."""
@@ -35,7 +40,10 @@ class Summary:
     """Statistics of a corrected program."""
 
     lines: int = 0
+    motions: int = 0
     points: int = 0
+    outside: int | None = None
+    """First line with a motion that leaves the region."""
     deviation: float = 0.0
     """Largest distance of the corrected path from a chord, [m]."""
     correction: float = 0.0
@@ -55,13 +63,21 @@ class ProgramCorrector:
         interpreter: New interpreter of the program.
         correct: Correction of points.
         within: Largest distance of the written path from the corrected one, [m].
+        region: Limits of x, y and z beyond which the summary names a line, shape (3, 2), [m].
 
     Raises:
         GcodeError: If the error bound of the correction exceeds the tolerance.
     """
 
-    def __init__(self, interpreter: Interpreter, correct: Correction, *, within: float) -> None:
-        self._interpreter, self._correct = interpreter, correct
+    def __init__(
+        self,
+        interpreter: Interpreter,
+        correct: Correction,
+        *,
+        within: float,
+        region: Array | None = None,
+    ) -> None:
+        self._interpreter, self._correct, self._region = interpreter, correct, region
         self._file = interpreter.file
         self._writer = Writer(
             interpreter.axes, rounding=ROUNDING * within, start=interpreter.position
@@ -126,6 +142,10 @@ class ProgramCorrector:
         moving = [s for s in steps if isinstance(s, Step) and s.motion is not None]
         motions = [s.motion for s in moving if s.motion is not None]
         paths = Paths.of(motions)
+        if self.summary.outside is None and self._region is not None and moving:
+            leaving = np.flatnonzero(paths.leave(self._region))
+            if leaving.size:
+                self.summary.outside = moving[leaving[0]].line.number
         results = iter(segment_motions(paths, self._correct, tolerance=self._tolerance))
         summary, low, high = self.summary, *self.summary.stretch
         texts: list[str] = []
@@ -142,6 +162,7 @@ class ProgramCorrector:
                         f"the machine cannot make this motion: it {segments.reason}",
                         where=f"{self._file}:{step.line.number}",
                     )
+                summary.motions += 1
                 summary.points += len(segments.points)
                 summary.deviation = max(summary.deviation, segments.deviation)
                 summary.correction = max(summary.correction, segments.correction)

@@ -44,13 +44,30 @@ class Bent:
         return bend(points * 1e3) * 1e-3, refused
 
 
-def corrected(text, *, within=WITHIN, offsets=None, start=None, correct=None, one_tool=False):
+def corrected(
+    text, *, within=WITHIN, offsets=None, start=None, correct=None, one_tool=False, region=None
+):
     interpreter = Interpreter(
         "p.ngc", axes=(0, 1, 2), offsets=offsets or {}, start=start, one_tool=one_tool
     )
-    corrector = ProgramCorrector(interpreter, correct or Bent(), within=within)
+    corrector = ProgramCorrector(interpreter, correct or Bent(), within=within, region=region)
     lines = "".join(corrector.run(f"{line}\n" for line in text)).splitlines()
     return lines, corrector.summary
+
+
+@pytest.mark.parametrize(
+    ("last", "outside"),
+    [
+        ("G1 X60", None),
+        ("G1 X60.01", 4),
+        ("G2 X-30 Y0 I-30 F100", None),
+        ("G3 X-30 Y0 I-30 F100", 4),  # the upper half of the same circle
+    ],
+)
+def test_first_line_that_leaves_the_region_is_named(last, outside):
+    region = np.array([[-0.06, 0.06], [-0.06, 0.02], [-np.inf, np.inf]])
+    _, summary = corrected(["G21 G90", "G0 X0 Y0 Z-200", "G1 X30 F100", last], region=region)
+    assert (summary.outside, summary.motions) == (outside, 3)
 
 
 def check_program(program, lines, *, within, offset=(0.0, 0.0, 0.0)):
