@@ -23,7 +23,7 @@ from orthocal import (
     load_session,
     write_session,
 )
-from orthocal.assessment.controller_entries import entered_offsets
+from orthocal.assessment.controller_entries import offsets_to_enter
 from orthocal.cli.run import PANELS, make_program
 
 pytestmark = pytest.mark.usefixtures("without_plots")
@@ -158,8 +158,8 @@ def test_again_is_the_same_session_with_offsets_active(calibrated, experiment, t
     code, text, err = orthocal("again", calibrated, "--out", out)
     assert code == 0, err
     first, second = load_plan(experiment), load_plan(out)
-    entered = entered_offsets(load_calibration(calibrated))
-    assert second.active_offsets == pytest.approx(entered, abs=0.6e-6)
+    entered = offsets_to_enter(load_calibration(calibrated))
+    assert second.active_offsets == pytest.approx(entered, abs=1e-12)
     assert second.active_offsets != pytest.approx(first.active_offsets, abs=1e-5)
     assert [(r.setup, r.posture, r.minus, r.cycle) for r in second.readings] == [
         (r.setup, r.posture, r.minus, r.cycle) for r in first.readings

@@ -27,6 +27,9 @@ DECIDED = 1e-2
 """Ratio of the aligned to the absolute tool error of a direction of the offsets, below which the
 absolute error decides on it: such offsets little more than shift and turn the workspace."""
 
+ENTERED_DECIMALS = 6
+"""Decimals of an offset as it is entered, [m, rad]: 1 µm."""
+
 MOST_STEPS = 12
 
 SETTLED = 1e-10
@@ -54,6 +57,11 @@ def entered_offsets(
     for entry in find_entries(calibration) if entries is None else entries:
         offsets[names.index(entry.drive)] = entry.enter
     return offsets
+
+
+def offsets_to_enter(calibration: Calibration) -> Array:
+    """Offsets in the controller once they were entered as printed, shape (n_drives,), [m, rad]."""
+    return np.asarray(entered_offsets(calibration).round(ENTERED_DECIMALS) + 0.0)
 
 
 def compute_entries(

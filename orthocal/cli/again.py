@@ -15,9 +15,6 @@ from orthocal.errors import ParameterError
 
 FILES = ("session.yaml", "readings.csv", "sheet.html")
 
-DIGITS = 6
-"""Decimals of an offset, [m, rad]: offsets to enter are printed to 1 µm, as by `calibrate`."""
-
 
 @command()
 def again(
@@ -26,11 +23,11 @@ def again(
     session: Path | None = None,
     anyway: Anyway = False,
 ) -> None:
-    """Plan the same readings again, with the identified offsets.
+    """Plan the same readings again, with the offsets to enter.
 
     The directory receives session.yaml, an empty readings.csv and a measuring sheet.
 
-    Exit code 3: the verdict is not to enter the offsets; nothing is written.
+    Exit code 3: the verdict is not `enter`; the reason is printed, and nothing is written.
 
     Args:
         session (SESSION): Session with the setups and postures; default: that of the calibration.
@@ -54,17 +51,19 @@ def again(
         f"{d.name} {v * d.edge_factor:+.3f} {d.edge_unit}"
         for d, v in zip(new.robot.drives, new.active_offsets.tolist(), strict=True)
     )
+    down = [d.name for d in new.robot.drives if d.direction < 0]
+    sign = f" For joints that count down the sign changes: {', '.join(down)}." if down else ""
     put_out(
-        f"Enter these offsets, home, and measure again: {offsets}.\n"
+        f"Enter these offsets of the slides, home, and measure again: {offsets}.{sign}\n"
         f"  orthocal record {out}\n"
         f"  orthocal validate {calibration} {out}"
     )
-    put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, and a sheet")
+    put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, and sheet.html")
 
 
 def _plan_again(calibration: orthocal.Calibration, path: Path | None) -> orthocal.Session:
     """The rows of a session, with the offsets to enter as active offsets."""
-    from orthocal.assessment.controller_entries import entered_offsets
+    from orthocal.assessment.controller_entries import offsets_to_enter
     from orthocal.calibration.recorded_robot import require_calibrated_robot
 
     if path is not None:
@@ -77,6 +76,6 @@ def _plan_again(calibration: orthocal.Calibration, path: Path | None) -> orthoca
         )
     else:
         planned = orthocal.restore_session(calibration)
-    offsets = entered_offsets(calibration).round(DIGITS) + 0.0
     title = planned.title.removeprefix("Simulated: ")
-    return replace(planned.with_controller(offsets), title=title, source="", seed=None)
+    planned = planned.with_controller(offsets_to_enter(calibration))
+    return replace(planned, title=title, source="", seed=None)

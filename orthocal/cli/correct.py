@@ -78,7 +78,7 @@ def correct(
             first motion does not have X, Y and Z.
         out (FILE): File for the corrected program; default: standard output.
     """
-    from orthocal.assessment.controller_entries import entered_offsets
+    from orthocal.assessment.controller_entries import offsets_to_enter
     from orthocal.export.correction_field import CorrectionField
     from orthocal.export.formats import require_entering, warn_against_verdict
     from orthocal.gcode.interpreter import Interpreter
@@ -94,7 +94,7 @@ def correct(
         require_entering(result)
     warning = warn_against_verdict(result)
     active = offsets is Offsets.ACTIVE
-    values = result.active_offsets if active else entered_offsets(result)
+    values = result.active_offsets if active else offsets_to_enter(result)
     tolerance = within * UM
     field = CorrectionField(result, values, within=tolerance, tool=tip or (0.0, 0.0, 0.0))
     file = "standard input" if str(program) == "-" else str(program)
@@ -272,7 +272,7 @@ def _describe_controller(
     listed = []
     for drive, value in zip(result.robot.drives, values, strict=True):
         unit, size = DRIVE_UNITS[drive.unit]
-        listed.append(f"{drive.name} {format_fixed(float(value) / size, 4, sign=True)} {unit}")
+        listed.append(f"{drive.name} {format_fixed(float(value) / size, 3, sign=True)} {unit}")
     state = "active during the measurement" if active else "to enter"
     if result.session.controller_offsets is None:
         state += " (in addition to those that were active during the measurement)"

@@ -108,8 +108,10 @@ def judgement_on_failure(session: orthocal.Session, *, json: bool) -> Iterator[N
 
 def write_results(directory: Path, files: Mapping[str, Content]) -> None:
     """Write the files of a result, all or none, and name them on stderr."""
+    from orthocal.assessment.wording import joined
+
     write_files(directory, files)
-    put_note(f"Wrote {' and '.join(str(directory / name) for name in files)}")
+    put_note(f"Wrote {joined([str(directory / name) for name in files])}")
 
 
 MOST_HELD = 10_000

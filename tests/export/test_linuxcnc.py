@@ -36,7 +36,7 @@ from orthocal import (
     simulate_session,
     write_calibration,
 )
-from orthocal.assessment.controller_entries import entered_offsets
+from orthocal.assessment.controller_entries import offsets_to_enter
 from orthocal.calibration.machine import Machine
 from orthocal.export.linuxcnc.approximation import approximate, rounded_up
 from orthocal.export.linuxcnc.c_source import braced, write_core
@@ -62,7 +62,8 @@ PATH = 0.5e-6
 which smooths each point with its neighbours, and rounding by LinuxCNC."""
 
 ENTERED = 0.2e-6
-"""Tolerance of HOME_OFFSET, [m]: entered to 0.1 µm, homing repeats to 0.02 µm; three drives."""
+"""Tolerance of HOME_OFFSET, [m]: three drives home to 0.02 µm; their offsets are multiples of 1 µm,
+to which they are entered."""
 
 
 # ---- machines
@@ -396,11 +397,12 @@ def test_unknown_home_offsets_are_written_as_changes(offsets):
     files = export_calibration(offsets, "linuxcnc")
     assert list(files) == ["README.md", "joints.ini"]
     lines = files["joints.ini"]
-    assert "[JOINT_0]\n# x_slide, counts up: +0.8000 mm\n" in lines
-    assert "# HOME_OFFSET = present value +0.8000" in lines
-    assert "[JOINT_1]\n# y_slide, counts down: +0.7000 mm\n" in lines
-    assert "[JOINT_2]\n# z_slide, counts down: -0.3000 mm\n" in lines
-    assert "| JOINT_1 | y_slide | down | present value +0.7000 | +0.7000 |" in files["README.md"]
+    assert "[JOINT_0]\n# x_slide, counts up: +0.800 mm\n" in lines
+    assert "# HOME_OFFSET = present value +0.800\n# MIN_LIMIT = present value +0.800" in lines
+    assert not re.search(r"^(HOME_OFFSET|M.._LIMIT)", lines, re.M)
+    assert "[JOINT_1]\n# y_slide, counts down: +0.700 mm\n" in lines
+    assert "[JOINT_2]\n# z_slide, counts down: -0.300 mm\n" in lines
+    assert "| JOINT_1 | y_slide | down | present value +0.700 | +0.700 |" in files["README.md"]
     assert "offsets_mm: [1.2, -0.8, 0.5]" in files["README.md"]
 
 
@@ -409,12 +411,12 @@ def test_home_offsets_and_limits_are_ini_lines(offsets, tmp_path):
     words = ["export", file, "--to", "linuxcnc", "--out", "out"]
     assert run_orthocal(tmp_path, *words, "--home-offset", "350,300.5,-20").returncode == 0
     ini = enter_lines("[JOINT_1]\nHOME = 3\n", (tmp_path / "out/joints.ini").read_text())
-    assert "[JOINT_0]\nHOME_OFFSET = 350.8000\nMIN_LIMIT = 121.2000\nMAX_LIMIT = 391.2000" in ini
+    assert "[JOINT_0]\nHOME_OFFSET = 350.800\nMIN_LIMIT = 121.200\nMAX_LIMIT = 391.200" in ini
     # joint 620.5 - c: the limits swap
-    assert "[JOINT_1]\nHOME = 3\nHOME_OFFSET = 301.2000\nMIN_LIMIT = 231.3000\n" in ini
-    assert "[JOINT_2]\nHOME_OFFSET = -20.3000\n" in ini
+    assert "[JOINT_1]\nHOME = 3\nHOME_OFFSET = 301.200\nMIN_LIMIT = 231.300\n" in ini
+    assert "[JOINT_2]\nHOME_OFFSET = -20.300\n" in ini
     page = (tmp_path / "out/README.md").read_text()
-    assert "300.5000 → **301.2000**" in page
+    assert "300.500 → **301.200**" in page
 
 
 def test_module_files_state_tool_limits_and_error(full, exported):
@@ -430,7 +432,7 @@ def test_module_files_state_tool_limits_and_error(full, exported):
     assert "HOME_OFFSET =" not in exported["kinematics.ini"]
     assert "restore the old INI lines" in exported["README.md"]
     assert "[AXIS_Z]\nMIN_LIMIT = -60\nMAX_LIMIT = 60\n" in exported["kinematics.ini"]
-    assert "# x_slide\nTYPE = LINEAR\nMIN_LIMIT = 120.4000\n" in exported["kinematics.ini"]
+    assert "# x_slide\nTYPE = LINEAR\nMIN_LIMIT = 120.400\n" in exported["kinematics.ini"]
     stated = float(re.search(r"at most ([\d.]+) µm", exported["README.md"])[1])
     assert 0.0 < stated <= WITHIN * 1e6
 
@@ -440,8 +442,8 @@ def test_module_of_offsets_alone(offsets):
     options = ExportOptions(module=True, home_offsets=(0.35, 0.3, -0.02))
     files = export_calibration(offsets, "linuxcnc", options=options)
     assert "identified offsets only; a module was requested" in files["README.md"]
-    assert "(JOINT_0 350.0000, JOINT_1 300.0000, JOINT_2 -20.0000)" in files["README.md"]
-    assert "HOME_OFFSET = 300.0000\n" in files["kinematics.ini"]
+    assert "(JOINT_0 350.000, JOINT_1 300.000, JOINT_2 -20.000)" in files["README.md"]
+    assert "HOME_OFFSET = 300.000\n" in files["kinematics.ini"]
     assert "#define DEGREE 1\n" in files["orthocal_core.c"]
     assert "at most 0.001 µm" in files["README.md"]
 
@@ -456,7 +458,7 @@ def test_offsets_of_a_complete_model(full):
     lines = re.findall(r"^HOME_OFFSET = (\S+)", files["joints.ini"], re.M)
     changed = np.array(lines, dtype=float) * 1e-3 - old
     ways = np.array([d.direction for d in full.robot.drives])
-    assert changed == pytest.approx(ways * (entered_offsets(full) - full.active_offsets), abs=6e-8)
+    assert changed == pytest.approx(ways * (offsets_to_enter(full) - full.active_offsets), abs=1e-9)
     assert np.abs(changed - ways * (full.offsets - full.active_offsets)).max() > 1e-6
     with pytest.raises(ParameterError) as e:
         export_calibration(full, "linuxcnc", options=replace(options, within=1e-6))

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.assessment.controller_entries import find_entries
+from orthocal.assessment.controller_entries import find_entries, offsets_to_enter
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ParameterError
 from orthocal.units import DRIVE_UNITS, Unit, format_fixed
@@ -63,9 +63,10 @@ class JointHome:
         return "up" if self.direction > 0 else "down"
 
     def show(self, value: float, *, sign: bool = False) -> str:
-        """Value in the joint's unit, to 0.1 µm or 1e-6 degrees."""
+        """Value in the joint's unit: to 1 µm, to 0.1 µm where it has more, or to 1e-6 degrees."""
         unit, size = DRIVE_UNITS[self.unit]
-        return format_fixed(value / size, 4 if unit == "mm" else 6, sign=sign)
+        text = format_fixed(value / size, 4 if unit == "mm" else 6, sign=sign)
+        return text.removesuffix("0")
 
 
 def find_homes(
@@ -86,7 +87,8 @@ def find_homes(
         raise ParameterError(
             f"found {len(old)} values; expected {len(drives)}, of {names}", where="--home-offset"
         )
-    changes = {e.drive: e.change for e in find_entries(calibration)}
+    entered = {e.drive for e in find_entries(calibration)}
+    changes = offsets_to_enter(calibration) - calibration.active_offsets
     active = calibration.session.controller_offsets
     homes = []
     for i, d in enumerate(drives):
@@ -94,7 +96,7 @@ def find_homes(
         if active is not None:
             lowest, highest = np.array(d.joint_limits) + d.direction * active[i]
             limits = float(lowest), float(highest)
-        change = d.direction * changes.get(d.name, 0.0)
+        change = d.direction * float(changes[i]) if d.name in entered else 0.0
         home = None if old is None else old[i]
         homes.append(JointHome(d.name, d.unit, d.direction, change, home, limits))
     return tuple(homes)

@@ -6,7 +6,11 @@ import math
 from collections.abc import Sequence
 
 from orthocal.assessment.assess import expanded_uncertainty
-from orthocal.assessment.controller_entries import entered_offsets, find_entries
+from orthocal.assessment.controller_entries import (
+    ENTERED_DECIMALS,
+    find_entries,
+    offsets_to_enter,
+)
 from orthocal.calibration.calibration import Calibration
 from orthocal.export.linuxcnc.approximation import (
     BEYOND,
@@ -36,7 +40,7 @@ def write_home_lines(homes: Sequence[JointHome]) -> str:
             f"# {comment_safe(home.drive)}, counts {home.counting}: "
             f"{home.show(home.change, sign=True)} {home.joint_unit}",
             _line("HOME_OFFSET", home, home.new),
-            *_limit_lines(home, home.new_limits),
+            *_limit_lines(home, None if home.new is None else home.new_limits),
         ]
     return "\n".join(lines) + "\n"
 
@@ -99,7 +103,7 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str
             entered = f"present value {change}"
         else:
             entered = f"{home.show(home.old)} → **{home.show(home.new)}**"
-        of_drive = half.get(home.drive, math.nan)
+        of_drive = round(half.get(home.drive, math.nan), ENTERED_DECIMALS)
         uncertainty = "" if math.isnan(of_drive) else f"± {home.show(of_drive)}"
         cells = (
             f"JOINT_{i}",
@@ -112,7 +116,7 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str
         )
         rows.append(f"| {' | '.join(cells)} |")
     unit, size = DRIVE_UNITS[homes[0].unit]
-    active = ", ".join(f"{v / size:.6g}" for v in entered_offsets(calibration))
+    active = ", ".join(f"{v / size:.6g}" for v in offsets_to_enter(calibration))
     scope = "The calibration identified offsets of the drives only."
     if not calibration.only_offsets:
         scope = (
