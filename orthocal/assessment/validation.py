@@ -243,13 +243,13 @@ def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
             factor, unit = entry.edge_factor, entry.edge_unit
             where = f"{session.path or 'session'}: controller.offsets_{unit}"
             others.append(
-                f"{entry.drive} has {active * factor:g} {unit} where the calibration says to enter "
+                f"{entry.drive} has {active * factor:g} {unit} instead of "
                 f"{entry.enter * factor:.3f} {unit}"
             )
     if others:
         raise SessionError(
-            f"{'; '.join(others)}. A validation needs a session that was measured with what the "
-            "calibration says to enter",
+            f"{'; '.join(others)}. The session was not measured with the offsets to enter: enter "
+            "them, measure again, and validate that session",
             where=where,
         )
     return session

@@ -1,6 +1,6 @@
 """Robot files of an Orthoglide with given dimensions, made from the packaged ones.
 
-The dimensions are leg length, travel, attachment offset, the two rods of a leg, and the workspace.
+The dimensions are leg length, travel, hinges of the platform, rods of a leg, and workspace.
 Joints, loops, legs, error parameters and models are those of the packaged robot.
 """
 

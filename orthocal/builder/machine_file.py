@@ -66,8 +66,8 @@ class Dimensions:
         travel = f"travel from {in_mm(self.lower)} to {in_mm(self.upper)} mm"
         if not self.lower < leg < self.upper:
             return "travel", (
-                f"{travel}; expected the mechanical zero in it, which is at the leg's length, "
-                f"{in_mm(leg)} mm"
+                f"{travel} does not include {in_mm(leg)} mm, the leg length, where the mechanical "
+                "zero is; check both numbers"
             )
         if max(leg - self.lower, self.upper - leg) > STEEPEST * leg:
             return "travel", (
@@ -76,8 +76,8 @@ class Dimensions:
             )
         if not 0.0 <= self.attachment <= leg:
             return "attachment", (
-                f"an attachment offset of {in_mm(self.attachment)} mm; expected 0 to the leg's "
-                f"length, {in_mm(leg)} mm"
+                f"hinges {in_mm(self.attachment)} mm from the tool centre point; expected 0 to the "
+                f"leg length, {in_mm(leg)} mm"
             )
         if not self.rod_radius > 0.0 or not 2.0 * self.rod_radius < self.rods_apart <= leg:
             return "rod_radius" if 0.0 < self.rods_apart <= leg else "rods_apart", (
@@ -91,7 +91,7 @@ class Dimensions:
         """Dimensions in words, in mm."""
         return (
             f"legs of {in_mm(self.leg)} mm, travel {in_mm(self.lower)} to {in_mm(self.upper)} mm, "
-            f"attachment offset {in_mm(self.attachment)} mm, rods of radius "
+            f"hinges {in_mm(self.attachment)} mm from the tool centre point, rods of radius "
             f"{in_mm(self.rod_radius)} mm, {in_mm(self.rods_apart)} mm apart"
         )
 
@@ -198,10 +198,10 @@ def machine_text(dimensions: Dimensions, counting: tuple[Counting, ...]) -> str:
         "#   orthocal new . --again\n"
         "# From hinge to hinge of a rod.\n"
         f"leg_mm: {in_mm(dimensions.leg)}\n"
-        "# Coordinates of a slider: the leg length where the legs are parallel to their axes,\n"
+        "# Coordinates of a slide: the leg length where the legs are parallel to their axes,\n"
         "# more further out.\n"
         f"travel_mm: [{in_mm(dimensions.lower)}, {in_mm(dimensions.upper)}]\n"
-        "# From slider to hinge, and from hinge to tool.\n"
+        "# From the tool centre point to the hinges on the platform, along the axis.\n"
         f"attachment_mm: {in_mm(dimensions.attachment)}\n"
         "# The two rods of a leg, from axis to axis, and their radius.\n"
         f"rods_apart_mm: {in_mm(dimensions.rods_apart)}\n"
@@ -209,7 +209,7 @@ def machine_text(dimensions: Dimensions, counting: tuple[Counting, ...]) -> str:
         "# Limits of x, y and z relative to the mechanical zero, where the tool works. Without\n"
         "# them: the largest cube of at most ±60 mm that the machine reaches.\n"
         f"{stated}\n"
-        "# Joints of the controller: whether they count up or down as a slider moves outwards,\n"
+        "# Joints of the controller: whether they count up or down as a slide moves outwards,\n"
         "# and what they show where the legs are parallel to their axes (by default the leg\n"
         "# length).\n"
         f"joints:\n{joints}"

@@ -35,7 +35,7 @@ FOLLOWS = 1e-9
 BESIDE = ("schema", "decision", "findings")
 """Keys outside the record: the schema, and further keys of `calibrate --json`."""
 
-MAKE_ONE = "`orthocal calibrate SESSION --out FOLDER` makes one"
+MAKE_ONE = "`orthocal calibrate SESSION --out DIRECTORY` makes one"
 
 OTHER_KINDS = (".csv", ".html", ".urdf", ".yaml", ".yml")
 """Suffixes of files of other kinds."""

@@ -49,19 +49,21 @@ def calibrate(
 
     With --out the directory receives calibration.json and report.html.
 
-    Exit code 3: review or reject the readings, for the reason that is printed. All results are
-    written nevertheless, unless the solver fails.
+    Exit code 3: the verdict is not `enter`; the reason is printed. All results are written
+    nevertheless, unless the solver fails.
 
     Args:
         known (NAME=VALUE[±TOL]): Known error, fixed or with a tolerance as prior:
             x_leg.length_mm=0.12±0.02 (or +-).
-        prior: Use tolerances as priors; default: unless only offsets are identified.
-        bound (GLOB=LOW:HIGH): Bounds such as 'x_slide.offset_mm=-2:2', or of one side '=-2:'.
-        base: Identify base parameters without priors: one of several redundant parameters.
-        loss (squares|huber): Loss function of the residuals; huber reduces the weight of outliers.
-        solver (ipopt|variable-projection|linearised): Reference, variable projection (faster), or
-            first order as in the paper.
-        profile (GLOBS): Compute profile-likelihood intervals of these errors (slow).
+        prior: Use the tolerances in the fit; default: yes, except where only offsets are
+            identified.
+        bound (PATTERN=LOW:HIGH): Bounds such as 'x_slide.offset_mm=-2:2', or of one side '=-2:'.
+        base: For research: estimate one of several redundant errors, without tolerances.
+        loss (squares|huber): For research: loss function of the residuals; huber reduces the
+            weight of outliers.
+        solver (ipopt|variable-projection|linearised): For research: reference, variable projection
+            (faster), or first order as in the paper.
+        profile (PATTERNS): For research: profile-likelihood intervals of these errors (slow).
     """
     from orthocal.estimation.selection import read_bounds, read_known
 

@@ -31,11 +31,12 @@ def compare(
 ) -> None:
     """Compare models, and recommend the one that readings support.
 
-    Exit code 3: review or reject the readings; the verdict is that of `calibrate`.
+    Exit code 3: the verdict, that of `calibrate`, is not `enter`; the reason is printed.
 
     Args:
         models (MODELS): Models, separated by commas; default: all of the robot.
-        repeat (SESSION): Another session, to see which residuals repeat. Can be repeated.
+        repeat (SESSION): Another session, to see which residuals repeat. May be stated several
+            times.
     """
     loaded = load_each_once(sessions)
     with judgement_on_failure(orthocal.join_sessions(loaded), json=json):

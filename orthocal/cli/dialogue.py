@@ -35,17 +35,21 @@ LARGEST_OFFSET = 100.0
 
 QUESTIONS = {
     "--leg-mm": "Leg length, from hinge to hinge of a rod, mm",
-    "--travel-mm": "Travel of a slider, LEAST:LARGEST, mm. Count {leg} (the leg) where the legs "
+    "--travel-mm": "Travel of a slide, LEAST:LARGEST, mm. Count {leg} (the leg) where the legs "
     "are parallel to their axes, and more further out",
-    "--attachment-mm": "Attachment offset, from slider to hinge and from hinge to tool, mm",
+    "--attachment-mm": "Distance from the tool centre point to the hinges on the platform, mm",
     "--rods-apart-mm": "Distance of the two rods of a leg, from axis to axis, mm",
     "--rod-radius-mm": "Radius of a rod, mm",
-    "--counts": "Does the number of a joint go up or down as its slider moves outwards? up or "
+    "--counts": "Does the number of a joint go up or down as its slide moves outwards? up or "
     "down, for all or as x,y,z",
     "--at-zero-mm": "What does the controller show where the legs are parallel to their axes, mm? "
     "One number for all, or x,y,z",
 }
 """Options and the questions at the terminal that replace them; {leg} is the leg length in mm."""
+
+
+COUNTING = ("--counts", "--at-zero-mm")
+"""Options about the joints of the controller."""
 
 
 class Answers(NamedTuple):
@@ -67,10 +71,14 @@ def find_answers(options: Mapping[str, str | None]) -> Answers:
     """
     missing = [option for option in QUESTIONS if options[option] is None]
     if missing and not (sys.stdin is not None and sys.stdin.isatty()):
+        for option, text in options.items():
+            if text and option in COUNTING:
+                _read_counting(Answers().counting, option, text)
+            elif text:
+                _read_lengths(option, text)
         raise ParameterError(
-            f"{'are' if len(missing) > 1 else 'is'} missing; without a terminal every dimension "
-            "must be an option",
-            where=", ".join(missing),
+            f"missing options: {', '.join(missing)}; without a terminal every dimension must be an "
+            "option"
         )
     answers = Answers()
     for option, question in QUESTIONS.items():
@@ -88,25 +96,31 @@ def _add(answers: Answers, option: str, text: str) -> Answers:
     """
     if not text:
         raise ParameterError("found nothing; expected an answer", where=option)
-    if option in ("--counts", "--at-zero-mm"):
+    if option in COUNTING:
         return answers._replace(counting=_read_counting(answers.counting, option, text))
     name = option.strip("-").removesuffix("-mm").replace("-", "_")
-    lengths: dict[str, Any]
-    if name == "travel":
-        low, colon, high = text.partition(":")
-        if not colon:
-            raise ParameterError(
-                f"found '{text}'; expected LEAST:LARGEST, in mm, such as 100:320", where=option
-            )
-        lengths = {"lower": _length(low, option), "upper": _length(high, option)}
-    else:
-        lengths = {name: _length(text, option)}
-    dimensions = replace(answers.dimensions, **lengths)
+    dimensions = replace(answers.dimensions, **_read_lengths(option, text))
     problem = dimensions.find_problem()
     if problem and problem[0] == name:  # dimensions after it have no answers yet
         in_metres = name == "leg" and 0.0 < dimensions.leg < 0.005
         raise ParameterError(problem[1] + (": mm, not m" if in_metres else ""), where=option)
     return answers._replace(dimensions=dimensions)
+
+
+def _read_lengths(option: str, text: str) -> dict[str, Any]:
+    """Fields of `Dimensions` of an option, [m].
+
+    Raises:
+        ParameterError: If the option is malformed.
+    """
+    if option != "--travel-mm":
+        return {option.strip("-").removesuffix("-mm").replace("-", "_"): _length(text, option)}
+    low, colon, high = text.partition(":")
+    if not colon:
+        raise ParameterError(
+            f"found '{text}'; expected LEAST:LARGEST, in mm, such as 100:320", where=option
+        )
+    return {"lower": _length(low, option), "upper": _length(high, option)}
 
 
 def _read_counting(counting: tuple[Counting, ...], option: str, text: str) -> tuple[Counting, ...]:

@@ -37,15 +37,16 @@ def export(
 
     --half-side-mm and --tool apply to a module for LinuxCNC.
 
-    Exit code 3: the verdict is not to enter the calibration, or the machine does not reach the
-    requested region or tolerance. Nothing is written then.
+    Exit code 3: the verdict is not `enter`, or the machine does not reach the requested region or
+    tolerance. The reason is printed, and nothing is written.
 
     Args:
         to (FORMAT): yaml: parameters with their units; table: corrections of the tool over a grid;
             urdf: the calibrated machine as a robot directory; linuxcnc: HOME_OFFSET, or a
             kinematics module if the calibration identified more than offsets.
         module: linuxcnc: write a module, or HOME_OFFSET only; default: by what was identified.
-        within (UM): linuxcnc: largest error of a module at the tool, µm; default: 0.1.
+        within (UM): linuxcnc: largest error of a module itself at the tool, µm; default: 0.1. (In
+            `correct`: of the written path.)
         home_offset (VALUES): linuxcnc: HOME_OFFSET of each joint during the measurement, separated
             by commas, mm or degrees; without it the files contain changes only.
     """

@@ -54,17 +54,18 @@ def new(
 
     Missing dimensions are asked for at a terminal.
 
-    Exit code 3 with --again: a plan is old.
+    Exit code 3 with --again: an existing plan no longer fits the changed machine.
 
     Args:
         folder (DIRECTORY): Directory of the machine; it is created.
         leg_mm (MM): Length of a leg, from hinge to hinge of a rod.
-        travel_mm (LEAST:LARGEST): Travel of a slider; its coordinate is the leg length where the
+        travel_mm (LEAST:LARGEST): Travel of a slide; its coordinate is the leg length where the
             legs are parallel to their axes, and more further out.
-        attachment_mm (MM): Distance from slider to hinge, and from hinge to tool.
+        attachment_mm (MM): Distance from the tool centre point to the hinges on the platform, along
+            the axis.
         rods_apart_mm (MM): Distance of the axes of a leg's two rods.
         rod_radius_mm (MM): Radius of a rod.
-        counts (up|down[,...]): Direction in which a joint of the controller counts as its slider
+        counts (up|down[,...]): Direction in which a joint of the controller counts as its slide
             moves outwards: one for all, or x,y,z.
         at_zero_mm (MM[,...]): Coordinate that the controller shows where the legs are parallel to
             their axes: one for all, or x,y,z.

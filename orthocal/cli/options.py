@@ -133,16 +133,17 @@ Model = Annotated[
 Free = Annotated[
     list[str] | None,
     Option(
-        metavar="GLOBS",
-        help="Errors to identify by name or glob, with --model in addition to its errors; '!' "
-        "excludes: --model full --free '!*_fork.*'.",
+        metavar="PATTERNS",
+        help="Errors to identify, by name or pattern (* stands for any text), with --model in "
+        "addition to its errors; '!' excludes: --model full --free '!*_fork.*'.",
     ),
 ]
 Tolerances = Annotated[
     list[str] | None,
     Option(
-        metavar="GLOB=VALUE",
-        help="Tolerance (± limit) instead of the robot's, such as '*.offset_mm=4'.",
+        metavar="PATTERN=VALUE",
+        help="Tolerance (± limit) instead of the robot's, such as '*.offset_mm=4'; * stands for "
+        "any text.",
     ),
 ]
 Error = Annotated[
@@ -171,7 +172,8 @@ WorkspaceMm = Annotated[
         "--workspace-mm",
         metavar="HALF|LOW:HIGH,...",
         help="Workspace around the mechanical zero, mm: half the side of a cube, or a range "
-        "for each coordinate; default: that of the robot, else up to 60.",
+        "for each coordinate; default: that of the robot, else the largest cube that the machine "
+        "reaches, at most ±60 mm.",
     ),
 ]
 HalfSideMm = Annotated[
@@ -267,7 +269,9 @@ def read_numbers(text: str, option: str, names: Sequence[str] | None = None) -> 
     parts = text.split(",")
     names = names or ["part"] * len(parts)
     if len(parts) != len(names):
-        raise ParameterError(f"found '{text}'; expected {','.join(names)}", where=option)
+        raise ParameterError(
+            f"found '{text}'; expected {len(names)} numbers, {','.join(names)}", where=option
+        )
     return tuple(read_number(p, option, name) for p, name in zip(parts, names, strict=True))
 
 

@@ -76,18 +76,19 @@ def plan(
         readings (N): Number of readings in all setups; default: 3 per setup.
         add (N): Number of further setups for a session.
         touches (RODS): Rods that the gauge can touch, separated by commas.
-        sections (FRACTIONS): Sections as fractions of a leg's length from its root; default:
+        sections (FRACTIONS): Sections as fractions of a leg's length from its slide; default:
             0.25,0.5,0.75.
         box (LOW:HIGH,...): Region of the postures, mm: one range for all coordinates or one for
             each; default: up to 100 mm from the mechanical zero.
-        along (N): Number of positions along a leg's direction.
+        along (N): For research: number of positions along a leg's direction.
         across_mm (MM): Displacement across that direction, to either side.
         minutes_a_setup (MINUTES): Duration of a setup.
         minutes_a_reading (MINUTES): Duration of a reading.
-        criterion (aligned|relative|absolute|worst|A|D|E): Figure to minimise: RMS tool error after
-            aligning the workpiece, after shifting it, or absolute; worst tool error; or trace,
-            determinant or largest eigenvalue of the covariance.
-        starts (N): Number of starts of the search; default: 3 or more.
+        criterion (aligned|relative|absolute|worst|A|D|E): For research: figure to minimise.
+            RMS tool error after aligning the workpiece, after shifting it, or absolute; worst tool
+            error; or trace, determinant or largest eigenvalue of the covariance.
+        starts (N): For research: number of starts of the search; default: 20000 divided by the
+            number of candidate readings, at least 3 and at most 30.
     """
     from orthocal.kinematics.workspace import box_workspace, coordinate_letters
     from orthocal.output.text.plan import plan_json

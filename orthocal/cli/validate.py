@@ -19,10 +19,11 @@ def validate(
 ) -> None:
     """Compare new readings with the predictions of a calibration.
 
-    Exit code 0: the calibration is confirmed. 3: it is not, or review or reject the new readings.
+    Exit code 0: the calibration is confirmed. 3: it is not, or the new readings contradict each
+    other; the reason is printed.
 
     Args:
-        sessions (NEW_SESSION...): Measured with the identified offsets in the controller.
+        sessions (NEW_SESSION...): Measured with the entered offsets in the controller.
     """
     before, loaded = orthocal.load_calibration(calibration), load_each_once(sessions)
     with judgement_on_failure(orthocal.join_sessions(loaded), json=json):

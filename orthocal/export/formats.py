@@ -111,9 +111,7 @@ def export_calibration(
             of the format.
     """
     if to not in FORMATS:
-        raise ParameterError(
-            f"found '{to}'; expected one of {', '.join(FORMATS)}", where="the format"
-        )
+        raise ParameterError(f"found '{to}'; expected one of {', '.join(FORMATS)}", where="--to")
     if not anyway:
         require_entering(calibration)
     options = options or ExportOptions()

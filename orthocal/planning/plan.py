@@ -171,7 +171,7 @@ def plan_readings(
         forecast.weigh(criterion, len(candidates.state)),
     )
     counts = options[0] if len(options) == 1 else _choose_counts(search, seed, workers, options)
-    say(f"choosing readings of {len(counts)} setups")
+    say(f"choosing readings of {len(counts)} setup{'s' * (len(counts) > 1)}")
     planned = search.choose(
         counts,
         seed=seed,

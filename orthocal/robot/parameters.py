@@ -362,7 +362,8 @@ def split_unit(key: str) -> tuple[str, Unit, float]:
         if key.endswith(suffix):
             return key.removesuffix(suffix), unit, factor
     raise ParameterError(
-        f"'{key}' carries no unit; expected one of the suffixes {', '.join(UNIT_SUFFIXES)}"
+        f"'{key}' carries no unit; expected one of the suffixes {', '.join(UNIT_SUFFIXES)}, "
+        "for example '*.offset_mm'"
     )
 
 

@@ -337,7 +337,7 @@ def test_rounded_up():
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        (["--tool", "1,2"], 2, "--tool: found '1,2'; expected X,Y,Z"),
+        (["--tool", "1,2"], 2, "--tool: found '1,2'; expected 3 numbers, X,Y,Z"),
         (["--tool", "0,0,nan"], 2, "--tool: Z is 'nan'; expected a finite number"),
         (["--tool", "0,0,1e6"], 2, "--tool: found 0, 0, 1e+06 mm; expected"),
         (["--within", "0"], 2, "--within: found 0 µm; expected more than 0"),
@@ -346,7 +346,7 @@ def test_rounded_up():
         (
             ["--home-offset", "1;2;3"],
             2,
-            "--home-offset: found '1;2;3'; expected x_slide,y_slide,z_slide",
+            "--home-offset: found '1;2;3'; expected 3 numbers, x_slide,y_slide,z_slide",
         ),
         (
             ["--home-offset", "1,2,inf"],

@@ -19,6 +19,12 @@ from orthocal.units import MM
 LOWEST_C, HIGHEST_C = -50.0, 100.0
 """No machine is measured outside: it is another unit, [°C]."""
 
+IN_UM = "; for readings in µm use `orthocal import --unit um`"
+"""Remedy for readings in another unit."""
+
+FAR = 5.0
+"""Ratio of a reading to the range of the gauge above which its unit may be another."""
+
 
 def check_readings(
     rows: Iterable[RawReading], plan: Session, *, file: Path, partial: bool = False
@@ -44,8 +50,8 @@ def check_readings(
                     "nothing was read yet; `orthocal record` takes the readings", where=str(file)
                 )
             raise SessionError(
-                "reading_mm is empty; expected what the gauge showed, or no row where nothing was "
-                "read (`orthocal record` takes it, or drops the row)",
+                "reading_mm is empty; type the reading, or delete the line (`orthocal record` does "
+                "both)",
                 where=row.where,
             )
         checked.add(row, reading)
@@ -289,7 +295,7 @@ def check_range(value_mm: float, gauge: Gauge, difference: bool, where: str) -> 
     if abs(value_mm) > LARGEST_READING_MM:
         raise SessionError(
             f"reading_mm is {value_mm:g}; expected a number within ±{LARGEST_READING_MM:g}: no "
-            "indicator reaches further",
+            f"indicator reaches further{IN_UM}",
             where=where,
         )
     if gauge.range is None:
@@ -299,8 +305,9 @@ def check_range(value_mm: float, gauge: Gauge, difference: bool, where: str) -> 
         lowest, highest = lowest - highest, highest - lowest
     if value_mm < lowest - 1e-9 or value_mm > highest + 1e-9:
         kind = "a difference" if difference else "a reading"
+        hint = IN_UM if abs(value_mm) > FAR * max(-lowest, highest) else ""
         raise SessionError(
             f"reading_mm is {value_mm:g}; the gauge's range allows {kind} from "
-            f"{lowest:g} to {highest:g}",
+            f"{lowest:g} to {highest:g}{hint}",
             where=where,
         )

@@ -10,6 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
 
@@ -213,21 +214,34 @@ def _read_keys(path: Path) -> tuple[Path, bytes, SessionKeys]:
     if file.suffix.lower() in OTHER_KINDS:
         raise SessionError("is no session.yaml", where=str(file))
     if file is not path and not exists(file):
-        raise SessionError(f"there is no such file{_describe_content(path)}", where=str(file))
+        raise SessionError(_describe_content(path), where=str(path))
+    if not exists(file) and (near := get_close_matches(path.name, _names_in(path.parent), n=1)):
+        meant = path.with_name(near[0])
+        raise SessionError(
+            f"there is no such file or directory; did you mean {meant}?", where=str(path)
+        )
     content = read_file(file, error=SessionError)
     data = read_yaml(file, error=SessionError, content=content)
     return file, content, validate(SessionKeys, data, where=str(file), error=SessionError)
 
 
 def _describe_content(folder: Path) -> str:
-    """Calibration or sessions in a directory without a session, as the end of a message."""
+    """Problem of a directory without a session: a calibration, or sessions below it."""
     if exists(folder / "calibration.json"):
-        return "; the folder holds a calibration: name the session that it was made from"
+        return "is a calibration; name the session that it was made from"
     sessions = sorted(f.parent for f in islice(folder.glob(f"*/{SESSION}"), MOST_LOOKED_AT))
     if not sessions:
-        return ""
-    more = ", ..." if len(sessions) > MOST_NAMED else ""
-    return f"; sessions in it: {', '.join(map(str, sessions[:MOST_NAMED]))}{more}"
+        return f"is a directory without {SESSION}"
+    named = [str(s) for s in sessions[:MOST_NAMED]] + ["..."] * (len(sessions) > MOST_NAMED)
+    return f"is a directory without {SESSION}; sessions in it: {', '.join(named)}"
+
+
+def _names_in(folder: Path) -> list[str]:
+    """Names of files and directories in a directory; none if it cannot be read."""
+    try:
+        return [f.name for f in islice(folder.iterdir(), MOST_LOOKED_AT)]
+    except OSError:
+        return []
 
 
 _Setups = Mapping[str, tuple[SetupKeys, Sensor]]
