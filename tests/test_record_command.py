@@ -174,7 +174,7 @@ TURNS = {
     "?": (["?"], [], "Ctrl-D and Ctrl-C end, too."),
     "quit": (["quit", "0.1"], [], "6 of 6 readings are missing"),
     "exit": (["exit", "0.1"], [], "6 of 6 readings are missing"),
-    "q": (["0.1", "Q", "0.2"], ["0.10"], "5 of 6 readings are missing: yx lines 3 to 4 and zx all"),
+    "q": (["0.1", "Q", "0.2"], ["0.10"], "5 of 6 readings are missing: yx lines 3, 4 and zx all"),
     "two of them": (
         ["s"],
         [],

@@ -216,17 +216,16 @@ def _read_offsets(texts: list[str]) -> dict[str, Vector]:
 
 
 def _describe(summary: Summary, field: CorrectionField, within: float) -> str:
-    from orthocal.assessment.wording import counted, lengths
+    from orthocal.assessment.wording import counted, mm
     from orthocal.gcode.program import ROUNDING
 
     change = max(abs(v - 1.0) * 100.0 for v in summary.stretch)
     bound = summary.deviation + field.error + ROUNDING * within
-    (largest,) = lengths(summary.correction)
     return (
         f"Corrected {counted(summary.motions, 'motion')}, written as "
-        f"{counted(summary.points, 'point')}. Largest correction: {largest}. The path is within "
-        f"{bound / UM:.2g} µm of the exact correction (limit {within / UM:g} µm). Feeds change by "
-        f"at most {change:.2f} %, so that the tool keeps its speed."
+        f"{counted(summary.points, 'point')}. Largest correction: {mm(summary.correction)} mm. The "
+        f"path is within {bound / UM:.2g} µm of the exact correction (limit {within / UM:g} µm). "
+        f"Feeds change by at most {change:.2f} %, so that the tool keeps its speed."
     )
 
 

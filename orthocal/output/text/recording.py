@@ -9,7 +9,7 @@ import textwrap
 from collections.abc import Sequence
 
 from orthocal.assessment.judgement import is_far
-from orthocal.assessment.wording import counted, joined, mm, name_direction, runs
+from orthocal.assessment.wording import counted, joined, mm, name_direction, spans
 from orthocal.calibration.assessment_record import Finding
 from orthocal.measurement.motion.motion import approach_length, guide, set_dial
 from orthocal.measurement.recording import Recording
@@ -211,9 +211,9 @@ class RecordingText:
         parts = [[rows[i].line or 0 for i in part] for part in (first, indices) if part]
         if first and len(indices) > 1:
             parts[1].remove(parts[0][0])
-            where = f" ({_spans(parts[0])}; or {_spans(parts[1])})"
+            where = f" ({spans(parts[0], 'line')}; or {spans(parts[1], 'line')})"
         else:
-            where = f" ({_spans(parts[-1])})" if parts else ""
+            where = f" ({spans(parts[-1], 'line')})" if parts else ""
         kind = finding.kind.capitalize()
         return self.wrap(f"{kind}{where}: {finding.words}", indent="  ", first="! ")
 
@@ -273,7 +273,7 @@ class RecordingText:
             for setup in dict.fromkeys(rows[i].setup for i in recording.missing):
                 numbers = [rows[i].line or 0 for i in recording.missing if rows[i].setup == setup]
                 every = len(numbers) == sum(r.setup == setup for r in rows)
-                parts.append(f"{setup} {'all' if every else _spans(numbers)}")
+                parts.append(f"{setup} {'all' if every else spans(numbers, 'line')}")
             count = len(recording.missing)
             state = (
                 f"{count} of {counted(len(rows), 'reading')} {'is' if count == 1 else 'are'} "
@@ -323,9 +323,3 @@ def find_rows(finding: Finding, rows: Sequence[Reading]) -> list[int]:
     setups = {p.setup for p in finding.places if p.line is None}
     named = [row.line in lines or row.setup in setups for row in rows]
     return [i for i, row in enumerate(rows) if named[i] and row.is_read]
-
-
-def _spans(numbers: Sequence[int]) -> str:
-    """Numbers of lines in words: lines 3, 5 to 8."""
-    words = [str(a) if a == b else f"{a} to {b}" for a, b in runs(numbers)]
-    return f"{'line' if len(numbers) == 1 else 'lines'} {', '.join(words)}"
