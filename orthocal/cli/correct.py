@@ -14,8 +14,6 @@ from enum import StrEnum
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated, BinaryIO
 
-import numpy as np
-from numpy.typing import NDArray
 from typer import Option
 
 import orthocal
@@ -26,11 +24,14 @@ from orthocal.io.files import read_parts, require_writable_file, write_file
 from orthocal.units import DRIVE_UNITS, MM, UM, format_fixed
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from orthocal.export.correction_field import CorrectionField
     from orthocal.gcode.path import Vector
     from orthocal.gcode.program import Summary
 
-Array = NDArray[np.float64]
+    Array = NDArray[np.float64]
 
 BLOCK = 2**16
 """Characters or bytes that are read or written together."""
@@ -231,6 +232,8 @@ def _describe(summary: Summary, field: CorrectionField, within: float) -> str:
 
 def _find_region(result: orthocal.Calibration) -> tuple[Array | None, str]:
     """Limits of x, y and z over which the correction was determined, shape (3, 2), [m]; words."""
+    import numpy as np
+
     from orthocal.assessment.assess import assessment_of
     from orthocal.kinematics.workspace import tool_at_zero
 
