@@ -17,6 +17,7 @@ from orthocal.assessment.plausibility import (
     are_finer,
     find_finer,
     find_implausible,
+    find_overstated,
     find_scattered,
 )
 from orthocal.assessment.words import plausibility as words
@@ -139,7 +140,12 @@ def is_far(value: float, mean: float, std: float) -> bool:
 
 
 def _find_mistakes(session: Session) -> list[Finding]:
-    """Anomalies of a session; without any, gauges whose repeated readings scatter too much."""
+    """Anomalies of a session; without any, gauges whose repeated readings scatter too much.
+
+    Nothing is sought if the stated noise of a gauge, which all evidence rests on, is impossible.
+    """
+    if overstated := list(find_overstated(session)):
+        return overstated
     anomalies = describe_anomalies(session, find_anomalies(session))
     return anomalies or list(find_scattered(session))
 

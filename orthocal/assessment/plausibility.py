@@ -83,6 +83,13 @@ def find_scattered(session: Session) -> tuple[Finding, ...]:
     return tuple(f for f in found if f is not None)
 
 
+def find_overstated(session: Session) -> Iterator[Finding]:
+    """Gauges whose stated noise is many times their resolution: it is in another unit."""
+    for gauge in session.gauges.values():
+        if gauge.sigma and gauge.resolution and gauge.sigma > TOO_COARSE * gauge.resolution:
+            yield words.sigma_too_large(gauge.sigma, step=gauge.resolution)
+
+
 def find_finer(session: Session) -> Iterator[Finding]:
     """Gauges of which at least half of the readings lie between the steps."""
     for name, gauge in session.gauges.items():
@@ -162,7 +169,7 @@ def _coarse(session: Session, fit: Fit) -> Finding | None:
     dof = noise.cycles_dof if repeated else noise.residual_dof
     if dof < FEWEST or not COMPUTED < TOO_COARSE * scatter < given:
         return None  # readings without any scatter were computed
-    return words.sigma_too_large(given, scatter)
+    return words.sigma_too_large(given, scatter=scatter)
 
 
 def _near(session: Session) -> Finding | None:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -120,6 +121,14 @@ def test_a_setup_whose_readings_are_of_nothing_that_is_known_is_named_as_a_whole
     values = [r.value + huge.get(r.posture, 0.0) * (r.setup == "zx") for r in cycles.readings]
     (found,) = anomalies(cycles.with_values(values))
     assert (found.kind, [p.setup for p in found.places]) == ("inconsistent setup", ["zx"])
+
+
+def test_a_noise_in_a_wrong_unit_is_named_before_anything_else(cycles):
+    for sigma in (1e-3, 5e-3):
+        wrong = cycles.with_gauge(replace(cycles.gauge, sigma=sigma, resolution=1e-5))
+        assert [found.kind for found in anomalies(wrong)] == ["sigma too large"]
+    unknown = cycles.with_gauge(replace(cycles.gauge, sigma=5e-3, resolution=None))
+    assert [found.kind for found in anomalies(unknown)] == ["sigma too large"]
 
 
 def test_what_is_no_session_is_refused():

@@ -56,7 +56,7 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
 
 
 def _ambiguous(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding:
-    every = (anomaly.explanation, *anomaly.alternatives)
+    every = (*(anomaly.causes or (anomaly.explanation,)), *anomaly.alternatives)
     ways = ";\n".join(f"  {_lines(session, e)}{_text(session, e)}" for e in every)
     return review(
         "ambiguous",

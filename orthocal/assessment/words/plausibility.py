@@ -70,16 +70,28 @@ def residuals_too_small(left: float, rounding: float, step: float) -> Finding:
     )
 
 
-def sigma_too_large(given: float, scatter: float) -> Finding:
-    """The stated noise of the gauge is far above what its readings scatter by."""
+def sigma_too_large(given: float, *, scatter: float | None = None, step: float = 0.0) -> Finding:
+    """The stated noise of the gauge is far above its scatter, or above its steps.
+
+    Args:
+        given: Stated noise, [m].
+        scatter: Scatter of the readings, [m]; None to compare with the steps.
+        step: Resolution of the gauge, [m].
+    """
+    shown = (
+        f"The gauge's resolution is {step / MM:g} mm."
+        if scatter is None
+        else f"The readings scatter by {scatter / MM:.2g} mm."
+    )
+    other = step if scatter is None else scatter
     return review(
         "sigma too large",
-        f"The session states that a reading scatters by {given / MM:g} mm (gauge.sigma_mm). The "
-        f"readings scatter by {scatter / MM:.2g} mm.",
+        f"The session states that a reading scatters by {given / MM:g} mm (gauge.sigma_mm). "
+        f"{shown}",
         "Make sure that gauge.sigma_mm is in mm.",
         given_mm=given / MM,
-        scatter_mm=scatter / MM,
-        ratio=given / scatter,
+        **{"resolution_mm" if scatter is None else "scatter_mm": other / MM},
+        ratio=given / other,
     )
 
 

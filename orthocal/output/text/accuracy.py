@@ -111,8 +111,8 @@ def describe_remaining(errors: Iterable[RemainingError]) -> list[str]:
             f"{name} {read_limit(size):+.2f}" for name, size in error.parts[:MOST_PARTS]
         )
         if error.rms > UM:
-            combination = f"{parts} tolerances" if parts else "small errors"
-            lines.append(f"Contribution of {um(error.rms)} µm RMS: {combination}.")
+            which = f" from these errors together, in tolerances: {parts}" if parts else ""
+            lines.append(f"Remaining uncertainty of {um(error.rms)} µm RMS{which}.")
     return lines
 
 

@@ -95,6 +95,8 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
 def _parameter_notes(c: Calibration, *, omitted: int, by_noise: bool) -> list[str]:
     """Sentences under the table of the parameters."""
     notes = []
+    if not c.only_offsets and assessment_of(c).entries:
+        notes.append("Offsets are those of the slides; the values to enter differ (see there).")
     if omitted:
         notes.append(f"{omitted} more are resolved by less than half; --all lists them.")
     held = [p for p in c.parameters if not p.free]
@@ -105,7 +107,7 @@ def _parameter_notes(c: Calibration, *, omitted: int, by_noise: bool) -> list[st
     if by_noise:
         notes.append("± by noise: part of ± that is due to the noise of the readings")
     if c.prior:
-        notes.append("resolved: share of the prior variance that the readings remove")
+        notes.append("resolved: how much the readings improved a value; 100 %: completely")
     pairs = c.correlated(above=0.5)
     if pairs:
         listed = ", ".join(f"{a} with {b} {r:+.2f}" for a, b, r in pairs[:MOST_PAIRS])
