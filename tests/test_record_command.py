@@ -102,7 +102,7 @@ def test_what_is_shown_of_a_setup_and_a_posture(folder, run):
     # the middle of the leg is at 310.25 + 40 − 310.25/2 mm; rod a 40 mm above it, of 5.5 mm radius
     for words in (
         "Monday: 6 readings in 2 setups on orthoglide; none is recorded yet.",
-        "Setup yx, 1 of 2: 3 readings Read: leg x, y, fraction 0.5, ball on rod a",
+        "Setup yx, 1 of 2: 3 readings Read: leg x, gauge in y, at 0.5 of its length,",
         "Stand: on the +y side, so that the tip touches at (195.1, 5.5, 40.0) mm in zero, 155.1 mm",
         "Push the plunger in: the dial must grow. If it falls, type every reading of this setup",
         "Dial: -5 to 5 mm, resolution 0.01 mm",

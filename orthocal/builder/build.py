@@ -40,7 +40,7 @@ PATTERN = "orthoglide"
 AXES = "xyz"
 
 SLIDER = 0.03
-"""Distance from a leg's hinge on the slider to the centre of the drawn slider, less the attachment
+"""Distance from a leg's hinge on the slide to the centre of the drawn slide, less the attachment
 offset, [m]."""
 
 RAIL = 0.09

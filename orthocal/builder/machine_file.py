@@ -42,8 +42,8 @@ class Dimensions:
     upper: float = 0.39
     """Largest coordinate of a drive."""
     attachment: float = 0.04
-    """Distance from slider to hinge, and from hinge to tool. It does not change where the tool
-    is."""
+    """Distance from the tool centre point to the hinges on the platform, along the axis. The
+    slide's coordinate does not depend on it: it is the leg length in the mechanical zero."""
     rods_apart: float = 0.08
     """Distance of the axes of a leg's two rods."""
     rod_radius: float = 0.0055
@@ -101,7 +101,7 @@ class Counting:
     """Relation of a controller's joint to the drive's coordinate."""
 
     up: bool = True
-    """Whether it grows as the slider moves away from the intersection of the drive axes."""
+    """Whether it grows as the slide moves away from the intersection of the drive axes."""
     at_zero: float | None = None
     """Coordinate in the mechanical zero, [m]; None for the leg length, as in orthocal."""
 

@@ -139,6 +139,13 @@ class Section:
         """Keys for a session.yaml."""
         return {self.form: self.value if self.form == "fraction" else to_mm(self.value)}
 
+    def describe(self) -> str:
+        """The position in words."""
+        if self.form == "fraction":
+            return f"{self.value:g} of its length"
+        from_root = " from its hinge on the slide" if self.form == "from_root_mm" else ""
+        return f"{'' if from_root else 'coordinate '}{self.value / MM:g} mm{from_root}"
+
 
 @dataclass(frozen=True, slots=True)
 class LegIndicator:
@@ -253,10 +260,8 @@ class LegIndicator:
 
     def describe(self) -> str:
         """Leg, direction and section; rod and tip."""
-        form, place = self.section.form, self.section.value
-        section = form.removesuffix("_mm").replace("_", " ")
-        section += f" {place:g}" if form == "fraction" else f" {place / MM:g} mm"
-        words = f"leg {self.leg}, {direction_name(self.direction)}, {section}"
+        direction = direction_name(self.direction)
+        words = f"leg {self.leg}, gauge in {direction}, at {self.section.describe()}"
         if self.rod is not None:
             words += f", {self.tip.form} on rod {self.rod}"
         if any(self.beside):
