@@ -349,12 +349,12 @@ def _active_offsets(session: Session) -> str:
             f"into it: controller: {{{key}: [{', '.join('0' for _ in drives)}]}}."
         )
     active = ", ".join(
-        f"{d.name} {v / DRIVE_UNITS[d.unit][1]:g} {DRIVE_UNITS[d.unit][0]}"
+        f"{d.name} {_number(v / DRIVE_UNITS[d.unit][1], 3)} {DRIVE_UNITS[d.unit][0]}"
         for d, v in zip(drives, session.active_offsets, strict=True)
     )
     return (
-        f"Check that these offsets are active in the controller, as session.yaml states: {active}. "
-        "Do not change them until all readings are taken."
+        "Check that these offsets of the slides are active in the controller, as session.yaml "
+        f"states: {active}. Do not change them until all readings are taken."
     )
 
 
