@@ -214,8 +214,8 @@ def test_only_the_command_that_is_called_is_made():
 def test_help_says_what_exit_code_3_means():
     for command, words in (
         ("check", "check the readings"),
-        ("calibrate", "review or reject"),
-        ("compare", "review or reject"),
+        ("calibrate", "is not `enter`"),
+        ("compare", "is not `enter`"),
         ("validate", "it is not"),
     ):
         text = " ".join(orthocal(command, "--help")[1].split())
