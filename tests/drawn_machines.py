@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from orthocal.estimation.diagnostics.unmodelled import find_other_errors, machine_errors
+from orthocal.estimation.diagnostics.unmodelled import find_unmodelled_errors, machine_errors
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
@@ -26,7 +26,7 @@ class DrawnMachines:
         problem = build_problem(plan, model=model)
         # the same optimum as Ipopt's (`test_solvers`), in less time
         self.nominal = fit_problem(problem, options=SolverOptions(solver="variable-projection"))
-        self.problem, self.others = problem, find_other_errors(self.nominal)
+        self.problem, self.others = problem, find_unmodelled_errors(self.nominal)
 
     def draw(self, rng, *, level=1.0):
         """Errors of a machine, all but its offsets so many times their tolerances, [SI]."""

@@ -108,7 +108,7 @@ def test_covariance_at_the_tool():
 def test_singular_values_with_the_mounting_marginalised():
     calibration, fit = experiment()
     problem, n = fit.problem, fit.problem.n_machine
-    jacobian = without_zeros(problem, problem.linearise(problem.reference)[1])
+    jacobian = without_zeros(problem, problem.predict_and_jacobian(problem.active_theta)[1])
     mounting = jacobian[:, n:]
     values, vectors = np.linalg.eigh(
         np.eye(len(mounting)) + mounting @ mounting.T / calibration.noise.sigma**2
@@ -169,7 +169,9 @@ def by_offsets_and_lengths(name):
     session = orthocal.load_session(ROOT / "examples" / name)
     choice = orthocal.Choice("lengths").select(session.robot.parameters)
     problem = CalibrationProblem(session, choice)
-    return without_zeros(problem, problem.linearise(problem.reference, units="SI")[1])[:, :6]
+    return without_zeros(
+        problem, problem.predict_and_jacobian(problem.active_theta, units="SI")[1]
+    )[:, :6]
 
 
 def test_an_offset_with_an_equal_change_of_its_leg_length_is_weak():
@@ -206,6 +208,8 @@ def test_a_rigid_motion_of_the_machine_changes_no_reading():
         theta[problem.free.index(f"{drive.name}.offset")] = along @ twist
         for axis in np.flatnonzero(along == 0.0):
             theta[problem.free.index(f"{drive.name}.{AXES[axis]}")] = twist[axis]
-    jacobian = without_zeros(problem, problem.linearise(problem.reference, units="SI")[1])
+    jacobian = without_zeros(
+        problem, problem.predict_and_jacobian(problem.active_theta, units="SI")[1]
+    )
     assert np.abs(jacobian @ theta).max() < KINEMATICS
     assert (theta != 0.0).sum() == 18

@@ -24,7 +24,7 @@ from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import describe_anomalies, describe_no_change
 from orthocal.calibration.assessment_record import Finding, Severity, Verdict
 from orthocal.hypotheses.families.sessions import detectable_changes
-from orthocal.hypotheses.linear_model import Linearisation, LinearModel
+from orthocal.hypotheses.linear_model import LinearModel, ModelLinearisation
 from orthocal.hypotheses.search import find_anomalies
 from orthocal.measurement.joining import split_sessions
 from orthocal.session.session import Session
@@ -178,7 +178,7 @@ def find_tolerance_scale(session: Session) -> float:
 
 
 def _parts(
-    model: LinearModel, about: Linearisation, deviation: Array, noise: float
+    model: LinearModel, about: ModelLinearisation, deviation: Array, noise: float
 ) -> tuple[Array, Array, float, int]:
     """Independent parts of a deviation, offsets projected out.
 

@@ -134,10 +134,10 @@ def _by_fit(session: Session, problem: CalibrationProblem) -> Iterator[Finding |
 def _dimensions(session: Session, problem: CalibrationProblem) -> Finding | None:
     """Postures in which the nominal machine would have moved the gauge far more than it did."""
     o = problem.observations
-    values = problem.values * problem.noise
+    values = problem.values * problem.noise_ratio
     measured, deviation = (
         _rms(o.rows(project_out_zeros(v, o)))
-        for v in (values, values - problem.predict(problem.reference) * problem.noise)
+        for v in (values, values - problem.predict(problem.active_theta) * problem.noise_ratio)
     )
     if deviation < LEAST_UNSUITED or deviation < UNSUITED * measured:
         return None

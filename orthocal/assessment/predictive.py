@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.calibration.calibration import Calibration
-from orthocal.calibration.refit import restore_gauge_covariance
+from orthocal.calibration.refit import restore_mounting_covariance
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.fit import Fit
 from orthocal.measurement.joining import name_within
@@ -86,7 +86,7 @@ def expect_rms(calibration: Calibration, fit: Fit) -> float:
         fit: The same parameters fitted to the new session.
     """
     problem, n = fit.problem, fit.problem.n_machine
-    by_gauges = restore_gauge_covariance(calibration) + fit.gauge_covariance
+    by_gauges = restore_mounting_covariance(calibration) + fit.mounting_covariance
     slopes = project_out_zeros(fit.jacobian[:, :n] / problem.theta_scale[:n], problem.observations)
     square = max(float(np.trace(slopes @ by_gauges @ slopes.T)), 0.0)
     rows = problem.session.readings

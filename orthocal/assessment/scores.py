@@ -15,7 +15,7 @@ from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, NotIdentifiableError, RobotError, SolverError
 from orthocal.estimation.fit import Fit, fit_problem, require_determined
-from orthocal.estimation.linear import Linearisation
+from orthocal.estimation.linear import LinearProblem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.weighting import SMALLEST_SIGMA
@@ -145,9 +145,9 @@ def _effective(fit: Fit) -> float:
     )
 
 
-def _score(fit: Fit, linearisation: Linearisation, method: Method, noise: float) -> Score:
+def _score(fit: Fit, linearisation: LinearProblem, method: Method, noise: float) -> Score:
     problem, o = fit.problem, fit.problem.observations
-    theta = fit.linear if method == "linearised" else fit.solution.theta
+    theta = fit.linearised_theta if method == "linearised" else fit.solution.theta
     try:
         residual = project_out_zeros(problem.values - problem.predict(theta), o)
     except ClosureError:  # the linearised machine cannot be assembled
@@ -173,7 +173,7 @@ def _score(fit: Fit, linearisation: Linearisation, method: Method, noise: float)
     )
 
 
-def _predict_unseen(fit: Fit, linearisation: Linearisation, method: Method) -> Array:
+def _predict_unseen(fit: Fit, linearisation: LinearProblem, method: Method) -> Array:
     """Prediction errors of every setup from all the others, (n_rows,), [m]."""
     problem, o = fit.problem, fit.problem.observations
     errors = np.full(o.plus.size, np.nan)
@@ -207,5 +207,5 @@ def _linearisation_cost(fit: Fit, tool: ToolAccuracy) -> ErrorSize:
     """Tool distance between the linearised and the exact estimate, to first order."""
     change = np.zeros(len(tool.names))
     n = fit.problem.n_machine
-    change[:n] = (fit.linear - fit.solution.theta)[:n]
+    change[:n] = (fit.linearised_theta - fit.solution.theta)[:n]
     return tool.measure(tool.jacobian @ change).reported

@@ -34,12 +34,12 @@ from orthocal.estimation.diagnostics.deletion import (
 )
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.diagnostics.unmodelled import (
-    Unmodelled,
-    find_other_errors,
-    measure_unmodelled,
+    UnmodelledEffect,
+    find_unmodelled_errors,
+    propagate_unmodelled,
 )
 from orthocal.estimation.fit import Fit
-from orthocal.estimation.linear import Linearisation, linearise_at_reference
+from orthocal.estimation.linear import LinearProblem, linearise_problem
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.weighting import split_by_gauge
 from orthocal.io.documents import LARGEST_NUMBER
@@ -79,10 +79,10 @@ def assemble_calibration(
     session, n = problem.session, problem.n_machine
     covariance, noise_covariance = fit.covariance(), fit.noise_covariance()
     # a base parameter stands for all errors of its combination
-    others = find_other_errors(
+    others = find_unmodelled_errors(
         fit, represented=() if full_problem is None else full_problem.machine_selection.names
     )
-    unmodelled, taken_on = measure_unmodelled(fit, others)
+    unmodelled, taken_on = propagate_unmodelled(fit, others)
     bias = np.append(np.sqrt(np.diag(unmodelled.bias_covariance)), taken_on)
     estimates = _estimates(
         fit,
@@ -152,7 +152,7 @@ def _posture_records(fit: Fit) -> tuple[PostureRecord, ...]:
 def _identifiability(fit: Fit, full_problem: CalibrationProblem | None) -> Identifiability:
     """Identifiability of the free parameters; for base parameters with their combinations."""
 
-    def analyse(linearisation: Linearisation) -> Identifiability:
+    def analyse(linearisation: LinearProblem) -> Identifiability:
         machine = linearisation.problem.machine_selection.parameters
         return analyse_identifiability(
             marginalise(linearisation.information, len(machine), sigma=fit.sigma),
@@ -165,14 +165,16 @@ def _identifiability(fit: Fit, full_problem: CalibrationProblem | None) -> Ident
     solved = analyse(fit.linearisation)
     if full_problem is None:
         return solved
-    combinations = analyse(linearise_at_reference(full_problem.with_noise(fit.problem.noise)))
+    combinations = analyse(
+        linearise_problem(full_problem.with_noise_ratio(fit.problem.noise_ratio))
+    )
     return replace(
         combinations, singular_values=solved.singular_values, rank=solved.structural_rank
     )
 
 
 def _widen(
-    fit: Fit, unmodelled: Unmodelled, intervals: Mapping[str, tuple[float, float]]
+    fit: Fit, unmodelled: UnmodelledEffect, intervals: Mapping[str, tuple[float, float]]
 ) -> dict[str, tuple[float, float]]:
     """Profile-likelihood intervals, widened by the errors of the machine that were not free."""
     spread = confidence_factor(np.inf) * np.sqrt(np.diag(unmodelled.bias_covariance))
@@ -207,13 +209,13 @@ def _estimates(
             name=p.name,
             unit=p.unit,
             value=float(solution.theta[i]),
-            linear=float(fit.linear[i]),
+            linear=float(fit.linearised_theta[i]),
             std=float(std[i]),
             std_scatter=float(std_scatter[i]),
             prior_std=p.prior_std,
             free=True,
             identifiable=bool(determined[i]),
-            start=float(problem.reference[i]),
+            start=float(problem.active_theta[i]),
             prior=bool(selection.prior[i]),
             mean=float(problem.prior_mean[i]),
             lower=finite_or_none(selection.lower[i]),
@@ -280,20 +282,20 @@ def _residual_rows(
 ) -> tuple[ResidualRow, ...]:
     """Readings with the predictions of three machines, each with its best gauge zeros."""
     problem, o = fit.problem, fit.problem.observations
-    measured, session, noise = problem.values, problem.session, problem.noise[o.plus]
+    measured, session, noise = problem.values, problem.session, problem.noise_ratio[o.plus]
 
     def fitted(prediction: Array) -> Array:
-        residual = project_out_zeros(measured - prediction, o, weights=fit.weights)
+        residual = project_out_zeros(measured - prediction, o, weights=fit.robust_weights)
         return session.values - noise * o.rows(residual)
 
     n = problem.n_machine
     at_reference = nominal_theta is None
-    machine = problem.reference[:n] if nominal_theta is None else nominal_theta
+    machine = problem.active_theta[:n] if nominal_theta is None else nominal_theta
     theta = np.append(machine, fit.solution.theta[n:])  # the mounting of the gauges is the same
-    nominal = fitted(problem.predict(theta, problem.reference_passive if at_reference else None))
+    nominal = fitted(problem.predict(theta, problem.active_passive if at_reference else None))
     try:
-        closed = problem.close(fit.linear, start=fit.solution.passive)
-        by_linear = fitted(problem.predict(fit.linear, closed))
+        closed = problem.close(fit.linearised_theta, start=fit.solution.passive)
+        by_linear = fitted(problem.predict(fit.linearised_theta, closed))
     except ClosureError:  # the linearised machine cannot be assembled
         by_linear = np.full(len(session.readings), np.nan)
     predicted = session.values - noise * o.rows(fit.residual)
@@ -328,7 +330,7 @@ def _gauge_records(fit: Fit) -> tuple[GaugeRecord, ...]:
             sigma=g.gauge.sigma,
             resolution=g.gauge.resolution,
             range=g.gauge.range,
-            noise=fit.noise.sigma * float(problem.noise[g.entries][0]),
+            noise=fit.noise.sigma * float(problem.noise_ratio[g.entries][0]),
             readings=int(g.entries.sum()),
         )
         for g in split_by_gauge(problem.session, problem.observations)
@@ -338,7 +340,7 @@ def _gauge_records(fit: Fit) -> tuple[GaugeRecord, ...]:
 def _setup_records(fit: Fit) -> tuple[SetupRecord, ...]:
     o = fit.problem.observations
     noise = np.ones(o.n_zeros)
-    noise[o.zero] = fit.problem.noise
+    noise[o.zero] = fit.problem.noise_ratio
     zeros = {
         name: float(fit.solution.zeros[i] * noise[i])
         for i, (name, real) in enumerate(zip(o.zero_setup, o.zero_real, strict=True))

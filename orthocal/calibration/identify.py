@@ -15,11 +15,11 @@ from orthocal.errors import NotIdentifiableError, ParameterError
 from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.estimation.diagnostics.profile_likelihood import profile_interval
 from orthocal.estimation.fit import Fit, fit_problem
-from orthocal.estimation.linear import linearise_at_reference
+from orthocal.estimation.linear import linearise_problem
 from orthocal.estimation.loss import Loss, LossKind
 from orthocal.estimation.options import SolverKind, SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.weighting import stated_sigma
+from orthocal.estimation.weighting import initial_sigma
 from orthocal.kinematics.loop_closure import as_rows
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.observation.observations import require_conditions
@@ -105,9 +105,9 @@ def _fit_base(
 
     Their number depends on the noise, which depends on the residuals: iterated until both agree.
     """
-    information = linearise_at_reference(problem).information
+    information = linearise_problem(problem).information
     repeatability = estimate_repeatability(problem.values, problem.observations)
-    sigma = stated_sigma(problem.session.gauge, repeatability)
+    sigma = initial_sigma(problem.session.gauge, repeatability)
     leads: list[str] = []
     for _ in range(MAX_BASE_ROUNDS):
         factor = information.factor[:, : problem.n_machine]

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field
 
 from orthocal.calibration.assessment_record import Assessment
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
-from orthocal.estimation.diagnostics.unmodelled import Unmodelled
+from orthocal.estimation.diagnostics.unmodelled import UnmodelledEffect
 from orthocal.estimation.loss import LossKind
 from orthocal.estimation.options import SolverKind
 from orthocal.io.documents import Count, Number, PositiveInSI, PositiveNumber
@@ -266,7 +266,7 @@ class CalibrationRecord:
     shape (n_machine, n_machine), [SI]."""
     noise_covariance: Matrix
     """Part of it that is due to the noise of the readings, shape (n_machine, n_machine), [SI]."""
-    unmodelled: Unmodelled
+    unmodelled: UnmodelledEffect
     """Unmodelled errors and the bias that they cause."""
     identifiability: Identifiability
     """Resolvable directions and groups of inseparable parameters."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
-from orthocal.estimation.fit import Fit, find_gauge_covariance, fit_problem
+from orthocal.estimation.fit import Fit, find_mounting_covariance, fit_problem
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
@@ -50,8 +50,8 @@ def repeat_fit(calibration: Calibration, session: Session) -> Fit:
     return fit_problem(_repeat_problem(calibration, session), options=options)
 
 
-def restore_gauge_covariance(calibration: Calibration) -> Array:
-    """`find_gauge_covariance` of a calibration, from its record.
+def restore_mounting_covariance(calibration: Calibration) -> Array:
+    """`find_mounting_covariance` of a calibration, from its record.
 
     Shape (n_free, n_free), [SI]; zeros if the noise is unknown.
     """
@@ -60,14 +60,16 @@ def restore_gauge_covariance(calibration: Calibration) -> Array:
         return np.zeros((problem.n_machine, problem.n_machine))
     noise = {g.name: g.noise / calibration.noise.sigma for g in calibration.gauges}
     of_setup = np.array([noise[s.gauge] for s in problem.session.setups.values()])
-    problem = problem.with_noise(of_setup[problem.observations.setup])
+    problem = problem.with_noise_ratio(of_setup[problem.observations.setup])
     theta = np.array([p.value for p in (*calibration.free, *calibration.sensors)])
-    _, jacobian = problem.linearise(theta)
-    return find_gauge_covariance(
+    _, jacobian = problem.predict_and_jacobian(theta)
+    return find_mounting_covariance(
         problem,
         decompose(jacobian, problem.observations),
         sigma=max(calibration.noise.sigma, SMALLEST_SIGMA),
-        held=np.array([p.at_bound for p in (*calibration.free, *calibration.sensors)], dtype=bool),
+        at_bound=np.array(
+            [p.at_bound for p in (*calibration.free, *calibration.sensors)], dtype=bool
+        ),
     )
 
 

@@ -12,19 +12,19 @@ from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array, Mask
 from orthocal.errors import ClosureError, SolverError
-from orthocal.estimation.linear import Linearisation, linearise_at_reference
+from orthocal.estimation.linear import LinearProblem, linearise_problem
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.program import Program, Solution
+from orthocal.estimation.solvers.program import Program, Solution, advise
 from orthocal.estimation.weighting import (
     SMALLEST_SIGMA,
     GaugeReadings,
-    first_noise,
+    estimate_gauge_sigmas,
+    initial_noise_ratio,
+    initial_sigma,
     leverages,
     split_by_gauge,
-    stated_sigma,
-    weigh_gauges,
 )
 from orthocal.statistics.information import (
     Information,
@@ -41,12 +41,15 @@ SIGMA_SETTLED = 0.03
 parameter by more than a twentieth of its standard deviation."""
 
 MAX_SIGMA_ROUNDS = 8
+"""Largest number of solutions until sigma and the noise ratios settle. The last solution is
+returned if they do not, such as where sigma alternates between cycles and residuals."""
 
 SMALL_DOF = 20.0
-"""Residual degrees of freedom below which the first sigma is the stated one."""
+"""Residual degrees of freedom below which the initial sigma does not come from residuals."""
 
 MAX_LINEARISATION_RATIO = 10.0
-"""Residuals of the linearised problem over the stated sigma that nonlinearity never reaches."""
+"""RMS of the linearised residuals over the initial sigma above which the latter is rejected.
+Nonlinearity alone remains below."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,28 +64,25 @@ class Fit:
     """Time to solve until sigma converged, [s]."""
     iterations: int
     """Iterations of the solver in all solutions."""
-    linearisation: Linearisation
-    """Linearisation about the active offsets of the controller."""
-    linear: Array
+    linearisation: LinearProblem
+    """The problem to first order about the active offsets of the controller."""
+    linearised_theta: Array
     """Linearised solution, shape (n_free,), [SI]."""
     solution: Solution
     noise: Noise
     prediction: Array
-    """h at the solution, gauge zeros at 0, shape (n_entries,), [m]."""
+    """h at the solution, gauge zeros at 0, shape (n_entries,), [m of the first gauge]."""
     jacobian: Array
-    """dh/dθ̂ at the solution, shape (n_entries, n_free), [m per prior std]."""
+    """dh/dθ̂ at the solution, shape (n_entries, n_free), [m of the first gauge per prior std]."""
     information: Information
     """Information of that Jacobian."""
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of a reading in the weights of the solution, [m].
-
-        With several gauges, it belongs to the first.
-        """
+        """Standard deviation of a reading of the first gauge, [m]; assumed if it is unknown."""
         if math.isfinite(self.noise.sigma):
-            return max(self.noise.sigma, SMALLEST_SIGMA)
-        return stated_sigma(self.problem.session.gauge, (math.nan, 0))
+            return floored_sigma(self.noise)
+        return initial_sigma(self.problem.session.gauge, (math.nan, 0))
 
     @property
     def loss(self) -> Loss:
@@ -91,12 +91,12 @@ class Fit:
 
     @property
     def residual(self) -> Array:
-        """Readings less predictions and gauge zeros, shape (n_entries,), [m]."""
+        """Readings less predictions and gauge zeros, shape (n_entries,), [m of the first gauge]."""
         return _residual(self.program, self.solution, self.prediction)
 
     @property
-    def weights(self) -> Array:
-        """Weights of the squared residuals, shape (n_entries,): 1 without a robust loss."""
+    def robust_weights(self) -> Array:
+        """Robust weights ρ'(r)/r of the residuals, shape (n_entries,): 1 for squares."""
         return self.loss.weight(self.residual / self.sigma)
 
     @property
@@ -112,7 +112,7 @@ class Fit:
         return o.size - o.n_free_zeros - repeated
 
     @property
-    def held(self) -> Mask:
+    def at_bound(self) -> Mask:
         """Mask of the parameters at a bound, shape (n_free,)."""
         return np.asarray(self.solution.at_bound != 0)
 
@@ -121,14 +121,14 @@ class Fit:
 
         NaN where nothing determines the noise.
         """
-        return self._scaled(self.information.covariance)
+        return self._to_si(self.information.covariance)
 
     def noise_covariance(self) -> Array:
         """Part of `covariance` that is due to noise, shape (n_free, n_free), [SI]."""
-        return self._scaled(self.information.noise_covariance)
+        return self._to_si(self.information.noise_covariance)
 
-    def _scaled(self, covariance: Callable[..., Array]) -> Array:
-        """Covariance of the scaled parameters with the weights of this fit, in SI units."""
+    def _to_si(self, compute: Callable[..., Array]) -> Array:
+        """Covariance from `compute`, which returns that of θ̂, shape (n_free, n_free), [SI]."""
         scale = np.outer(self.problem.theta_scale, self.problem.theta_scale)
         if not math.isfinite(self.noise.sigma):
             return np.full_like(scale, np.nan)
@@ -137,18 +137,21 @@ class Fit:
             used = self.problem.observations.size - self.noise.residual_dof
             gain = self.loss.gain(self.residual / self.sigma, used=used)
             factors = (gain, self.loss.normal_square)
-        return scale * covariance(
+        return scale * compute(
             sigma=self.sigma,  # above 0, also for readings without scatter
             precision=self.problem.prior_precision,
-            held=self.held,
+            at_bound=self.at_bound,
             loss=factors,
         )
 
     @property
-    def gauge_covariance(self) -> Array:
-        """Part of the covariance that is due to mounting errors; see `find_gauge_covariance`."""
-        return find_gauge_covariance(
-            self.problem, self.information, sigma=self.sigma, held=self.held
+    def mounting_covariance(self) -> Array:
+        """Part of the covariance by mounting errors, shape (n_machine, n_machine), [SI].
+
+        Computed with squares, also for a robust loss; see `find_mounting_covariance`.
+        """
+        return find_mounting_covariance(
+            self.problem, self.information, sigma=self.sigma, at_bound=self.at_bound
         )
 
 
@@ -164,110 +167,142 @@ def fit_problem(
     Args:
         problem: The problem.
         options: Choice and options of the solver.
-        start: Free parameters to start from, shape (n_free,), [SI]; by default the linearised
-            solution.
+        start: Free parameters to start from, shape (n_free,), [SI]; with it no other start is
+            tried. By default the linearised solution, then the active offsets.
         program: Program of the same problem with other readings; it replaces `options`.
 
     Raises:
         NotIdentifiableError: If neither readings nor a prior determine a parameter.
+        SessionError: If a predicted reading is not finite at the active offsets.
+        OrthocalError: If the solver does not accept an option.
         SolverError: If the solver does not converge.
         ClosureError: If the machine cannot reach a posture.
     """
     began = time.perf_counter()
     groups = split_by_gauge(problem.session, problem.observations)
-    if len(groups) > 1 and (problem.noise == 1.0).all():
-        problem = problem.with_noise(first_noise(problem.session, problem.observations))
-    linearisation = linearise_at_reference(problem)
-    require_determined(problem, linearisation.information)
+    if len(groups) > 1 and (problem.noise_ratio == 1.0).all():
+        ratio = initial_noise_ratio(problem.session, problem.observations)
+        problem = problem.with_noise_ratio(ratio)
+    linear = linearise_problem(problem)
+    require_determined(problem, linear.information)
     repeatability = estimate_repeatability(problem.values, problem.observations)
-    if program is None:
-        program = build_program(problem, options)
-    else:
-        program = program.with_problem(problem)
+    program = build_program(problem, options) if program is None else program.with_problem(problem)
     built = time.perf_counter()
-    iterations = 0
-    sigma, larger = _linearised_sigma(program, linearisation, repeatability)
-    first = linearisation.solve(sigma=sigma) if start is None else np.asarray(start)
-    passive: Array | None = None
-    for _ in range(MAX_SIGMA_ROUNDS):
-        try:
-            solution = program.solve(sigma=sigma, start=first, start_passive=passive)
-        except ClosureError:
-            if start is not None or passive is not None:
-                raise
-            solution = program.solve(sigma=sigma)  # the linearised machine cannot reach a posture
-        except SolverError:
-            if start is not None or passive is not None or not larger > sigma:
-                raise
-            # the unmodelled errors may be too large for the stated sigma
-            sigma, first = larger, linearisation.solve(sigma=larger)
-            solution = program.solve(sigma=sigma, start=first)
-        iterations += solution.iterations
-        prediction, jacobian = problem.linearise(solution.theta, solution.passive)
-        information = decompose(jacobian, problem.observations)
-        residual = _residual(program, solution, prediction)
-        held = solution.at_bound != 0
-        noise = _noise(program, residual, information, sigma, repeatability, held=held)
-        estimated = max(noise.sigma, SMALLEST_SIGMA)
-        weights = problem.noise
-        if len(groups) > 1:
-            weights = _weigh(problem, groups, residual, jacobian, information, sigma, held)
-        balanced = bool(np.abs(weights / problem.noise - 1.0).max() < SIGMA_SETTLED)
-        if balanced and (not _matters(program) or _settled(estimated, sigma)):
+    solution, sigma = _solve_first(program, linear, repeatability, start)
+    iterations = solution.iterations
+    for remaining in reversed(range(MAX_SIGMA_ROUNDS)):
+        at = _evaluate(program, solution, sigma, repeatability)
+        ratio = _estimate_noise_ratio(problem, groups, at, sigma)
+        balanced = bool(np.abs(ratio / problem.noise_ratio - 1.0).max() < SIGMA_SETTLED)
+        settled = not _depends_on_sigma(program) or _settled(floored_sigma(at.noise), sigma)
+        if (balanced and settled) or not remaining:
             break
-        first, passive = solution.theta, solution.passive
         if balanced:
-            sigma = estimated
-            continue
-        problem = problem.with_noise(weights)
-        program, linearisation = program.with_problem(problem), linearise_at_reference(problem)
-    require_assembly(problem, solution, robust=program.options.loss.robust)
-    weight = max(noise.sigma, SMALLEST_SIGMA) if math.isfinite(noise.sigma) else sigma
+            sigma = floored_sigma(at.noise)
+        else:
+            problem = problem.with_noise_ratio(ratio)
+            program, linear = program.with_problem(problem), linearise_problem(problem)
+        start_theta, start_passive = solution.theta, solution.passive
+        solution = program.solve(sigma=sigma, start=start_theta, start_passive=start_passive)
+        iterations += solution.iterations
+    require_assembly(problem, solution, options=program.options)
+    final_sigma = floored_sigma(at.noise)
     return Fit(
         problem=problem,
         program=program,
         seconds_build=built - began,
         seconds_solve=time.perf_counter() - built,
         iterations=iterations,
-        linearisation=linearisation,
-        linear=linearisation.solve(sigma=weight),
+        linearisation=linear,
+        linearised_theta=linear.solve(sigma=final_sigma if math.isfinite(final_sigma) else sigma),
         solution=solution,
-        noise=noise,
-        prediction=prediction,
-        jacobian=jacobian,
-        information=information,
+        noise=at.noise,
+        prediction=at.prediction,
+        jacobian=at.jacobian,
+        information=at.information,
     )
 
 
-def _weigh(
-    problem: CalibrationProblem,
-    groups: Sequence[GaugeReadings],
-    residual: Array,
-    jacobian: Array,
-    information: Information,
-    sigma: float,
-    held: Mask,
+def _solve_first(
+    program: Program,
+    linear: LinearProblem,
+    repeatability: tuple[float, int],
+    start: ArrayLike | None,
+) -> tuple[Solution, float]:
+    """First solution and its sigma, [m]; without a start, others are tried if it fails."""
+    sigma, residual_sigma = _linearised_sigma(program, linear, repeatability)
+    if start is not None:
+        return program.solve(sigma=sigma, start=np.asarray(start)), sigma
+    try:
+        return program.solve(sigma=sigma, start=linear.solve(sigma=sigma)), sigma
+    except ClosureError:  # the linearised machine cannot reach a posture
+        return program.solve(sigma=sigma), sigma
+    except SolverError:
+        if not residual_sigma > sigma:
+            raise
+    # the unmodelled errors may be too large for the initial sigma
+    start = linear.solve(sigma=residual_sigma)
+    return program.solve(sigma=residual_sigma, start=start), residual_sigma
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Evaluation:
+    """A solution with its predictions; quantities as in `Fit`."""
+
+    prediction: Array
+    jacobian: Array
+    information: Information
+    residual: Array
+    at_bound: Mask
+    noise: Noise
+
+
+def _evaluate(
+    program: Program, solution: Solution, sigma: float, repeatability: tuple[float, int]
+) -> _Evaluation:
+    """Predictions, Jacobian, residuals and noise at a solution."""
+    problem, at_bound = program.problem, solution.at_bound != 0
+    prediction, jacobian = problem.predict_and_jacobian(solution.theta, solution.passive)
+    information = decompose(jacobian, problem.observations)
+    residual = _residual(program, solution, prediction)
+    noise = _noise(program, residual, information, sigma, repeatability, at_bound=at_bound)
+    return _Evaluation(prediction, jacobian, information, residual, at_bound, noise)
+
+
+def _estimate_noise_ratio(
+    problem: CalibrationProblem, groups: Sequence[GaugeReadings], at: _Evaluation, sigma: float
 ) -> Array:
     """Noise of each entry relative to the first gauge, from the residuals, (n_entries,)."""
-    covariance = information.covariance(sigma=sigma, precision=problem.prior_precision, held=held)
-    std = weigh_gauges(
+    if len(groups) < 2:
+        return problem.noise_ratio
+    covariance = at.information.covariance(
+        sigma=sigma, precision=problem.prior_precision, at_bound=at.at_bound
+    )
+    std = estimate_gauge_sigmas(
         groups,
         problem.observations,
-        residual=residual * problem.noise,
-        leverage=leverages(jacobian, problem.observations, covariance, sigma),
-        values=problem.values * problem.noise,
-        sigma=sigma * problem.noise,
+        residual=at.residual * problem.noise_ratio,
+        leverage=leverages(at.jacobian, problem.observations, covariance, sigma),
+        values=problem.values * problem.noise_ratio,
+        sigma=sigma * problem.noise_ratio,
     )
     return np.asarray(std / std[groups[0].entries][0])
 
 
-def require_assembly(problem: CalibrationProblem, solution: Solution, *, robust: bool) -> None:
+def floored_sigma(noise: Noise) -> float:
+    """Sigma of the noise, at least `SMALLEST_SIGMA`, [m]; NaN if unknown."""
+    return max(noise.sigma, SMALLEST_SIGMA) if math.isfinite(noise.sigma) else math.nan
+
+
+def require_assembly(
+    problem: CalibrationProblem, solution: Solution, *, options: SolverOptions
+) -> None:
     """Refuse a solution that cannot reach a posture: wrong readings can lead to impossible errors.
 
     Args:
         problem: The problem.
         solution: Its solution.
-        robust: True if the loss was robust.
+        options: Options of its solver.
 
     Raises:
         SolverError: Naming the posture that the machine cannot reach.
@@ -275,64 +310,63 @@ def require_assembly(problem: CalibrationProblem, solution: Solution, *, robust:
     try:
         problem.close(solution.theta, start=solution.passive)
     except ClosureError as e:
-        hint = "" if robust else "; with the loss 'huber' it may be named"
         raise SolverError(
-            f"the errors that fit these readings best are impossible: {e}. Look for a reading "
-            f"with a wrong sign or in a wrong row{hint}",
+            f"the errors that fit these readings best are impossible: {e}. {advise(options)}",
             status=solution.status,
             iterations=solution.iterations,
         ) from None
 
 
-def _matters(program: Program) -> bool:
+def _depends_on_sigma(program: Program) -> bool:
     """True if the estimate depends on sigma: with a prior or a robust loss."""
-    return program.problem.prior or program.options.loss.robust
+    return program.problem.has_prior or program.options.loss.robust
 
 
 def _settled(estimated: float, sigma: float) -> bool:
+    """True if an estimate of sigma agrees with the previous one, or is NaN: unknown."""
     return not math.isfinite(estimated) or abs(estimated / sigma - 1.0) < SIGMA_SETTLED
 
 
 def _linearised_sigma(
-    program: Program, linearisation: Linearisation, repeatability: tuple[float, int]
+    program: Program, linearisation: LinearProblem, repeatability: tuple[float, int]
 ) -> tuple[float, float]:
     """Sigma of the linearised problem, [m]: usually close enough for one exact solution.
 
-    With few residual degrees of freedom the stated sigma is used, unless the residuals exclude it:
-    otherwise nonlinearity would count as noise, which would allow larger residuals, and so on.
+    With few residual degrees of freedom the initial sigma is kept, unless the residuals reject it:
+    an estimate from them would count nonlinearity as noise, which would allow larger residuals.
 
     Returns:
-        Sigma to start with, and sigma from the residuals, which is larger if the first one is
-        stated.
+        Sigma to start with, and sigma from the linearised residuals. They differ only if the
+        initial one was kept because of few degrees of freedom.
     """
     problem = program.problem
-    sigma = stated_sigma(problem.session.gauge, repeatability)
-    stated = sigma
+    sigma = initial_sigma(problem.session.gauge, repeatability)
+    initial = sigma
     few_are_free = _residual_dof(problem, linearisation.information, sigma) < SMALL_DOF
-    use_stated = problem.session.gauge.sigma is not None and few_are_free
-    for i in range(MAX_SIGMA_ROUNDS if _matters(program) else 0):
-        change = (linearisation.solve(sigma=sigma) - problem.reference) / problem.theta_scale
+    keep_initial = problem.session.gauge.sigma is not None and few_are_free
+    for i in range(MAX_SIGMA_ROUNDS if _depends_on_sigma(program) else 0):
+        change = (linearisation.solve(sigma=sigma) - problem.active_theta) / problem.theta_scale
         residual = linearisation.residual - linearisation.jacobian @ change
         if i == 0:
-            excluded = residual @ residual > residual.size * (MAX_LINEARISATION_RATIO * sigma) ** 2
-            use_stated = use_stated and not excluded
+            rejected = residual @ residual > residual.size * (MAX_LINEARISATION_RATIO * sigma) ** 2
+            keep_initial = keep_initial and not rejected
         noise = _noise(program, residual, linearisation.information, sigma, repeatability)
-        estimated = max(noise.sigma, SMALLEST_SIGMA)
+        estimated = floored_sigma(noise)
         if _settled(estimated, sigma):
             break
         sigma = estimated
-    return (stated, sigma) if use_stated else (sigma, sigma)
+    return (initial, sigma) if keep_initial else (sigma, sigma)
 
 
 def _residual_dof(
     problem: CalibrationProblem,
     information: Information,
     sigma: float,
-    held: Mask | None = None,
+    at_bound: Mask | None = None,
 ) -> float:
     """Readings less free zeros and effective parameters."""
     o, precision = problem.observations, problem.prior_precision
-    used = information.effective_parameters(sigma=sigma, precision=precision, held=held)
+    used = information.effective_parameters(sigma=sigma, precision=precision, at_bound=at_bound)
     return o.size - o.n_free_zeros - used
 
 
@@ -353,7 +387,7 @@ def require_determined(problem: CalibrationProblem, information: Information) ->
 
 
 def _residual(program: Program, solution: Solution, prediction: Array) -> Array:
-    """Residuals with the optimal gauge zeros."""
+    """Residuals with the optimal gauge zeros, shape (n_entries,), [m of the first gauge]."""
     problem, o = program.problem, program.problem.observations
     deviation = problem.values - prediction
     if program.options.loss.robust:
@@ -368,11 +402,20 @@ def _noise(
     sigma: float,
     repeatability: tuple[float, int],
     *,
-    held: Mask | None = None,
+    at_bound: Mask | None = None,
 ) -> Noise:
-    """Noise from residuals with zeros eliminated, shape (n_entries,), [m]."""
+    """Noise of a reading from its residuals.
+
+    Args:
+        program: The program.
+        residual: Residuals, zeros eliminated, shape (n_entries,), [m of the first gauge].
+        information: Information of the readings.
+        sigma: Standard deviation of a reading in the present solution, [m].
+        repeatability: Scatter of the cycles and its degrees of freedom.
+        at_bound: Mask of the parameters at a bound, shape (n_free,).
+    """
     problem, loss = program.problem, program.options.loss
-    dof = _residual_dof(problem, information, sigma, held)
+    dof = _residual_dof(problem, information, sigma, at_bound)
     return estimate_noise(
         # a wrong reading in repeated cycles would increase the noise of all
         repeatability=(math.nan, 0) if loss.robust and dof > 1.0 else repeatability,
@@ -399,12 +442,12 @@ def build_program(problem: CalibrationProblem, options: SolverOptions | None = N
     return NonlinearProgram(problem, options=chosen)
 
 
-def find_gauge_covariance(
+def find_mounting_covariance(
     problem: CalibrationProblem,
     information: Information,
     *,
     sigma: float,
-    held: Mask | None = None,
+    at_bound: Mask | None = None,
 ) -> Array:
     """Part of the covariance of the machine's parameters that is due to mounting errors.
 
@@ -415,16 +458,16 @@ def find_gauge_covariance(
         problem: The problem.
         information: Information about all its parameters.
         sigma: Standard deviation of a reading, [m].
-        held: Mask of the parameters that a bound holds, shape (n_free,).
+        at_bound: Mask of the parameters that a bound holds, shape (n_free,).
 
     Returns:
         Shape (n_machine, n_machine), [SI].
     """
     n, precision = problem.n_machine, problem.prior_precision
-    held = np.zeros(problem.n_free, dtype=np.bool_) if held is None else held
-    total = information.covariance(sigma=sigma, precision=precision, held=held)
+    at_bound = np.zeros(problem.n_free, dtype=np.bool_) if at_bound is None else at_bound
+    total = information.covariance(sigma=sigma, precision=precision, at_bound=at_bound)
     without_mounting = take_for_known(information, n).covariance(
-        sigma=sigma, precision=precision[:n], held=held[:n]
+        sigma=sigma, precision=precision[:n], at_bound=at_bound[:n]
     )
     scale = problem.theta_scale[:n]
     return np.asarray((total[:n, :n] - without_mounting) * np.outer(scale, scale))

@@ -115,7 +115,7 @@ def solve_equation_8(
     """
     a = np.asarray(matrix, dtype=np.float64)
     y = np.asarray(differences, dtype=np.float64)
-    if np.linalg.matrix_rank(a, tol=RANK_THRESHOLD) < 3:
+    if np.linalg.matrix_rank(a, rtol=RANK_THRESHOLD) < 3:
         raise NotIdentifiableError(
             "the rows do not determine the three offsets", parameters=("x", "y", "z")
         )
@@ -138,7 +138,7 @@ def solve_equation_8(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Linearisation:
+class LinearProblem:
     """A problem to first order about the active offsets of the controller."""
 
     problem: CalibrationProblem
@@ -164,9 +164,9 @@ class Linearisation:
         if len(jacobian) > 2 * problem.n_free:  # the same normal equations from far fewer rows
             stacked = np.asarray(np.linalg.qr(np.column_stack([jacobian, residual]), mode="r"))
             jacobian, residual = stacked[:, :-1], stacked[:, -1]
-        reference = problem.reference / problem.theta_scale
+        reference = problem.active_theta / problem.theta_scale
         weight = np.sqrt(problem.prior_precision)
-        if problem.prior:
+        if problem.has_prior:
             expected = problem.prior_mean / problem.theta_scale
             jacobian = np.vstack([jacobian / sigma, np.diag(weight)])
             residual = np.concatenate([residual / sigma, weight * (expected - reference)])
@@ -182,16 +182,18 @@ class Linearisation:
         return np.asarray((reference + step) * problem.theta_scale)
 
 
-def linearise_at_reference(problem: CalibrationProblem) -> Linearisation:
+def linearise_problem(problem: CalibrationProblem) -> LinearProblem:
     """Linearise a problem about the active offsets of the controller.
 
     Raises:
         ClosureError: If the reference machine cannot reach a posture.
         SessionError: If a sensor has no reading in one.
     """
-    prediction, jacobian = problem.linearise(problem.reference, problem.reference_passive)
+    prediction, jacobian = problem.predict_and_jacobian(
+        problem.active_theta, problem.active_passive
+    )
     _require_numbers(problem, prediction, jacobian)
-    return Linearisation(
+    return LinearProblem(
         problem,
         project_out_zeros(problem.values - prediction, problem.observations),
         project_out_zeros(jacobian, problem.observations),

@@ -22,7 +22,7 @@ from orthocal.estimation.selection import KnownWithStd, Selection, select_parame
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import Failures, LoopClosure
 from orthocal.kinematics.robot_functions import RobotFunctions
-from orthocal.observation.model import FreeParameters, Linearisation, ObservationModel
+from orthocal.observation.model import FreeParameters, ObservationModel, ReadingLinearisation
 from orthocal.observation.observations import Observations, build_observations
 from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.robot.model import Robot, closure_row_units, coordinate_units
@@ -62,7 +62,7 @@ class CalibrationProblem:
     """
 
     def __init__(
-        self, session: Session, selection: Selection, *, noise: Array | None = None
+        self, session: Session, selection: Selection, *, noise_ratio: Array | None = None
     ) -> None:
         self.session = session
         self.robot = session.robot
@@ -74,7 +74,7 @@ class CalibrationProblem:
         self.fixed = dict(selection.fixed)
         _require_independent_rows(self.robot)
         self.observations: Observations = build_observations(session)
-        self.noise = np.ones(self.observations.size) if noise is None else noise
+        self.noise_ratio = np.ones(self.observations.size) if noise_ratio is None else noise_ratio
         self.states = self.observations.states
         self.theta_scale = selection.prior_stds
         self.prior_precision = selection.prior.astype(np.float64)
@@ -92,15 +92,16 @@ class CalibrationProblem:
         other.__dict__.pop("values", None)
         return other
 
-    def with_noise(self, noise: Array) -> CalibrationProblem:
-        """Problem with other standard deviations; nothing is built again.
+    def with_noise_ratio(self, noise_ratio: Array) -> CalibrationProblem:
+        """Problem with other noise ratios; nothing is built again.
 
         Args:
-            noise: Standard deviations relative to the first gauge, shape (n_entries,).
+            noise_ratio: As for `CalibrationProblem`.
         """
         other = copy.copy(self)
-        other.noise = noise
-        other.__dict__.pop("values", None)
+        other.noise_ratio = noise_ratio
+        for cached in ("values", "linearisation_at_active"):
+            other.__dict__.pop(cached, None)
         return other
 
     @property
@@ -114,7 +115,7 @@ class CalibrationProblem:
         return len(self.free)
 
     @property
-    def prior(self) -> bool:
+    def has_prior(self) -> bool:
         """True if any parameter has a prior."""
         return bool(self.prior_precision.any())
 
@@ -124,7 +125,7 @@ class CalibrationProblem:
         return self.states.posture.size
 
     @cached_property
-    def reference(self) -> Array:
+    def active_theta(self) -> Array:
         """Active offsets of the controller as parameters, shape (n_free,), [SI].
 
         The point of linearisation and the default start: nominal where the controller has no
@@ -143,7 +144,7 @@ class CalibrationProblem:
     @cached_property
     def values(self) -> Array:
         """Readings of the entries, shape (n_entries,), [m of the first gauge]."""
-        return self.observations.values(self.session.values) / self.noise
+        return self.observations.values(self.session.values) / self.noise_ratio
 
     @cached_property
     def zero_incidence(self) -> Array:
@@ -178,7 +179,7 @@ class CalibrationProblem:
         Raises:
             ClosureError: If a machine with these errors cannot reach a posture.
         """
-        begin = self._near_reference if start is None else start
+        begin = self._active_passive_or_none if start is None else start
         return self._close(theta, begin, failures)
 
     def _close(
@@ -211,36 +212,36 @@ class CalibrationProblem:
 
     def _first_order_passive(self, theta: Array) -> Array | None:
         """Passive coordinates of a batch to first order, to start from; None if that fails."""
-        if self._near_reference is None:
+        if self._active_passive_or_none is None:
             return None
         try:
-            linear = self.reference_linearisation
+            linear = self.linearisation_at_active
         except np.linalg.LinAlgError:
             return None
-        change = (theta - self.reference) / self.theta_scale
-        return np.asarray(self._near_reference + linear.follow(change))
+        change = (theta - self.active_theta) / self.theta_scale
+        return np.asarray(self._active_passive_or_none + linear.follow(change))
 
     @cached_property
-    def reference_linearisation(self) -> Linearisation:
+    def linearisation_at_active(self) -> ReadingLinearisation:
         """Readings to first order about the reference."""
-        return self.linearisation(self.reference, self.reference_passive)
+        return self.linearise(self.active_theta, self.active_passive)
 
     @cached_property
-    def _near_reference(self) -> Array | None:
+    def _active_passive_or_none(self) -> Array | None:
         """The reference, where it reaches all postures."""
         try:
-            return self.reference_passive
+            return self.active_passive
         except ClosureError:
             return None
 
     @cached_property
-    def reference_passive(self) -> Array:
+    def active_passive(self) -> Array:
         """Passive coordinates of every posture at the reference, (n_states, n_passive).
 
         Raises:
             ClosureError: If the reference machine cannot reach a posture.
         """
-        return self._close(self.reference, None)
+        return self._close(self.active_theta, None)
 
     def nuisance_values(self, theta: ArrayLike) -> Array:
         """Nuisance parameters with the manual alignment, shape (..., n_nuisance), [SI].
@@ -249,10 +250,10 @@ class CalibrationProblem:
             theta: Shape (..., n_free), [SI], or those of the machine.
         """
         deviations = np.asarray(theta, dtype=np.float64)[..., self.n_machine :]
-        aligned = self.model.alignment(self.errors(theta))
+        aligned = self.model.alignment(self.elementary_errors(theta))
         return aligned + deviations if deviations.size else aligned
 
-    def errors(self, theta: ArrayLike) -> Array:
+    def elementary_errors(self, theta: ArrayLike) -> Array:
         """Elementary errors of the machine, shape (..., n_errors) of (..., n_free), [SI]."""
         return self.closure.errors(self._of_machine(theta))
 
@@ -271,10 +272,12 @@ class CalibrationProblem:
             ClosureError: If a machine with these errors cannot reach a posture.
         """
         q = self.close(theta) if passive is None else passive
-        readings = self.model.predict(self.errors(theta), q, self._nuisance(theta))
-        return np.asarray(readings / self.noise)
+        readings = self.model.predict(
+            self.elementary_errors(theta), q, self._nuisance_deviations(theta)
+        )
+        return np.asarray(readings / self.noise_ratio)
 
-    def linearise(
+    def predict_and_jacobian(
         self,
         theta: ArrayLike,
         passive: Array | None = None,
@@ -299,13 +302,13 @@ class CalibrationProblem:
             ClosureError: If a machine with these errors cannot reach a posture.
         """
         q = self.close(theta) if passive is None else passive
-        linear = self.linearisation(theta, q)
+        linear = self.linearise(theta, q)
         jacobian = linear.jacobian
         return linear.reading, jacobian if units == "prior_std" else jacobian / self.theta_scale
 
-    def linearisation(
+    def linearise(
         self, theta: ArrayLike, passive: Array, *, free: FreeParameters | None = None
-    ) -> Linearisation:
+    ) -> ReadingLinearisation:
         """Readings to first order about parameters and passive coordinates near closed loops.
 
         Args:
@@ -317,14 +320,14 @@ class CalibrationProblem:
             LinAlgError: If a posture is singular.
         """
         return self.model.linearise(
-            self.errors(theta),
+            self.elementary_errors(theta),
             passive,
-            self._nuisance(theta),
+            self._nuisance_deviations(theta),
             free=free or self._free_parameters,
-            noise=self.noise,
+            noise_ratio=self.noise_ratio,
         )
 
-    def split_errors(self, theta: ArrayLike) -> dict[str, float]:
+    def error_values(self, theta: ArrayLike) -> dict[str, float]:
         """Errors of the machine, free and fixed: name to value, [SI]."""
         names, values = self.machine_selection.names, self._of_machine(theta).tolist()
         return {**self.fixed, **dict(zip(names, values, strict=True))}
@@ -332,7 +335,7 @@ class CalibrationProblem:
     def _of_machine(self, theta: ArrayLike) -> Array:
         return np.asarray(theta, dtype=np.float64)[..., : self.n_machine]
 
-    def _nuisance(self, theta: ArrayLike) -> Array | None:
+    def _nuisance_deviations(self, theta: ArrayLike) -> Array | None:
         deviations = np.asarray(theta, dtype=np.float64)[..., self.n_machine :]
         return deviations if deviations.size else None
 
@@ -348,10 +351,10 @@ class CalibrationProblem:
 
     @cached_property
     def _free_parameters(self) -> FreeParameters:
-        return self.model.parametrise(self.columns, self.theta_scale[self.n_machine :])
+        return self.model.parametrise(self.errors_per_theta, self.theta_scale[self.n_machine :])
 
     @cached_property
-    def columns(self) -> Array:
+    def errors_per_theta(self) -> Array:
         """Elementary errors of one prior std of each machine parameter, (n_errors, n_machine)."""
         selection = self.machine_selection
         return self.functions.errors.columns(selection.names) * selection.prior_stds

@@ -50,7 +50,7 @@ def split_by_gauge(session: Session, observations: Observations) -> tuple[GaugeR
     )
 
 
-def stated_sigma(gauge: Gauge, repeatability: tuple[float, int]) -> float:
+def initial_sigma(gauge: Gauge, repeatability: tuple[float, int]) -> float:
     """Standard deviation of a reading before the first solution, [m]."""
     cycles_sigma, cycles_dof = repeatability
     floor = noise_floor(gauge.sigma, gauge.resolution)
@@ -59,7 +59,7 @@ def stated_sigma(gauge: Gauge, repeatability: tuple[float, int]) -> float:
     return max(gauge.sigma or DEFAULT_SIGMA, floor)
 
 
-def first_noise(session: Session, observations: Observations) -> Array:
+def initial_noise_ratio(session: Session, observations: Observations) -> Array:
     """Noise of each entry relative to the first gauge, before the first solution, (n_entries,)."""
     groups = split_by_gauge(session, observations)
     result = np.ones(observations.size)
@@ -68,11 +68,11 @@ def first_noise(session: Session, observations: Observations) -> Array:
     values = observations.values(session.values)
     for g in groups:
         repeatability = _repeatability(values, observations, g)
-        result[g.entries] = stated_sigma(g.gauge, repeatability)
+        result[g.entries] = initial_sigma(g.gauge, repeatability)
     return np.asarray(result / result[groups[0].entries][0])
 
 
-def weigh_gauges(
+def estimate_gauge_sigmas(
     groups: Sequence[GaugeReadings],
     observations: Observations,
     *,

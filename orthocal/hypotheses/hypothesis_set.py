@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.hypotheses.hypothesis import MachineShift
 from orthocal.hypotheses.likelihood import Score
-from orthocal.hypotheses.linear_model import Linearisation
+from orthocal.hypotheses.linear_model import ModelLinearisation
 from orthocal.session.session import Session
 
 Array = NDArray[np.float64]
@@ -44,7 +44,7 @@ class HypothesisSet:
 
     terms: tuple[Term, ...]
     score: Score
-    about: Linearisation
+    about: ModelLinearisation
     remaining: Array
     """Deviation of the corrected entries, shape (n_entries,), [m]."""
     corrected: Array

@@ -14,7 +14,7 @@ from orthocal.errors import ClosureError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import select_parameters
-from orthocal.estimation.weighting import DEFAULT_SIGMA, first_noise
+from orthocal.estimation.weighting import DEFAULT_SIGMA, initial_noise_ratio
 from orthocal.hypotheses.hypothesis import (
     MOST_DENSE,
     MachineShift,
@@ -50,7 +50,7 @@ LEAST_SIGMA = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Linearisation:
+class ModelLinearisation:
     """Linearised model about one machine, gauge zeros projected out.
 
     With K sessions each may have a machine that differs by known errors (`shifts`).
@@ -100,7 +100,7 @@ class LinearModel:
         names = machine_errors(session.robot) if model is None else parameters.select_model(model)
         selection = select_parameters(parameters, free=names, prior=True)
         problem = CalibrationProblem(session, selection)
-        self.problem = problem.with_noise(first_noise(session, problem.observations))
+        self.problem = problem.with_noise_ratio(initial_noise_ratio(session, problem.observations))
         o = self.problem.observations
         self.stated = session.gauge.sigma is not None
         floor = noise_floor(session.gauge.sigma or DEFAULT_SIGMA, session.gauge.resolution)
@@ -141,9 +141,9 @@ class LinearModel:
             from scipy.sparse import csr_array
 
             return csr_array(
-                (1.0 / self.problem.noise[o.plus], (np.arange(n), o.plus)), (n, o.size)
+                (1.0 / self.problem.noise_ratio[o.plus], (np.arange(n), o.plus)), (n, o.size)
             )
-        blocks = np.array([o.values(row) / self.problem.noise for row in np.eye(n)])
+        blocks = np.array([o.values(row) / self.problem.noise_ratio for row in np.eye(n)])
         if n <= MOST_DENSE:
             return blocks
         from scipy.sparse import csr_array
@@ -165,7 +165,7 @@ class LinearModel:
 
     def linearise(
         self, theta: Array, shifts: Sequence[MachineShift], start: Array | None, *, slopes: bool
-    ) -> Linearisation:
+    ) -> ModelLinearisation:
         """Linearise the model.
 
         Args:
@@ -189,9 +189,9 @@ class LinearModel:
         machines, which = np.unique(each, axis=0, return_inverse=True)
         which = which.ravel()
         for m, shift in enumerate(machines):
-            at = problem.reference + (theta + shift) * problem.theta_scale
+            at = problem.active_theta + (theta + shift) * problem.theta_scale
             passive = problem.close(at, start=passive)
-            prediction, slope = problem.linearise(at, passive)
+            prediction, slope = problem.predict_and_jacobian(at, passive)
             if len(machines) == 1:
                 expected, jacobian = prediction, slope
             else:
@@ -201,7 +201,7 @@ class LinearModel:
         likelihood, vectors, sizes = build_likelihood(
             jacobian, sigma=self.sigma, dof=self.dof, stated=self.stated
         )
-        return Linearisation(
+        return ModelLinearisation(
             project_out_zeros(expected, o) - jacobian @ theta,
             jacobian if slopes else np.empty((o.size, 0)),
             likelihood,
@@ -211,7 +211,7 @@ class LinearModel:
             np.asarray(passive),
         )
 
-    def most_likely(self, rows: Array) -> Linearisation:
+    def most_likely(self, rows: Array) -> ModelLinearisation:
         """Linearise about the most likely machine, with the tolerances as prior.
 
         Args:
@@ -247,7 +247,7 @@ class LinearModel:
         )
         return (math.nan if math.isinf(std) else float(rows[row] - amount)), float(std)
 
-    def _approach(self, entries: Array, effect: Array) -> Linearisation:
+    def _approach(self, entries: Array, effect: Array) -> ModelLinearisation:
         """Linearise about the most likely machine, beside an effect of unknown amount.
 
         Gauss-Newton steps end when the errors change by less than SETTLED prior std, or before the
@@ -270,14 +270,14 @@ class LinearModel:
                 break
         return about
 
-    def shift_entries(self, about: Linearisation, shift: MachineShift) -> Array:
+    def shift_entries(self, about: ModelLinearisation, shift: MachineShift) -> Array:
         """Effect of a machine shift on the entries, zeros projected out, (n_entries,), [m]."""
         moved = np.asarray(about.slopes @ shift.direction)
         changed = np.where(shift.sessions[self.session_of_entry], moved, 0.0)
         return np.asarray(self.project(changed[None])[0])
 
     def products(
-        self, patterns: Patterns, about: Linearisation, deviation: Array
+        self, patterns: Patterns, about: ModelLinearisation, deviation: Array
     ) -> tuple[Products, Array]:
         """Products of patterns over the rows with the principal directions and a deviation.
 
@@ -329,7 +329,7 @@ class LinearModel:
         """True if all rows are single readings, so that the rows of a setup share one zero."""
         return bool((self.problem.observations.minus < 0).all())
 
-    def rms(self, deviation: Array, about: Linearisation) -> float:
+    def rms(self, deviation: Array, about: ModelLinearisation) -> float:
         """RMS residual of a machine within its tolerances, to first order, [m].
 
         Args:
@@ -338,7 +338,7 @@ class LinearModel:
         """
         errors = about.errors_for(deviation)
         along = about.sizes * (about.errors.T @ errors)
-        residuals = (deviation - along @ about.likelihood.directions) * self.problem.noise
+        residuals = (deviation - along @ about.likelihood.directions) * self.problem.noise_ratio
         return float(np.sqrt(np.mean(self.problem.observations.rows(residuals) ** 2)))
 
 

@@ -44,8 +44,8 @@ from orthocal.hypotheses.linear_model import (
     FURTHEST,
     MOST_ROUNDS,
     NEAR,
-    Linearisation,
     LinearModel,
+    ModelLinearisation,
 )
 from orthocal.hypotheses.pairs import Singles, find_pairs
 from orthocal.session.session import Session
@@ -172,7 +172,7 @@ class _Search:
                 break
         return state, near
 
-    def evaluate(self, terms: Sequence[Term], start: Linearisation) -> HypothesisSet:
+    def evaluate(self, terms: Sequence[Term], start: ModelLinearisation) -> HypothesisSet:
         """Score a set of hypotheses, linearised where it leads."""
         model = self.model
         rows = self.values + sum((t.change for t in terms if t.change is not None), 0.0)
@@ -216,7 +216,7 @@ class _Search:
         )
 
     def _vectors(
-        self, terms: Sequence[Term], about: Linearisation
+        self, terms: Sequence[Term], about: ModelLinearisation
     ) -> tuple[list[Array], Array | None, Array]:
         """Effects of each term on the entries, silent rows, and effects of unknown shifts."""
         model, groups, silent, steps = self.model, [], [], []

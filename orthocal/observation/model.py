@@ -240,9 +240,9 @@ class ObservationModel:
         nuisance: Array | None = None,
         *,
         free: FreeParameters,
-        noise: Array | None = None,
+        noise_ratio: Array | None = None,
         aligned: bool = True,
-    ) -> Linearisation:
+    ) -> ReadingLinearisation:
         """Readings to first order about machines and passive coordinates near closed loops.
 
         Args:
@@ -250,7 +250,7 @@ class ObservationModel:
             passive: As for `predict`; the loops need not be closed exactly.
             nuisance: As for `predict`.
             free: The free parameters.
-            noise: Divisor of each entry's reading, shape (n_entries,); 1 by default.
+            noise_ratio: Divisor of each entry's reading, shape (n_entries,); 1 by default.
             aligned: Add the manual alignment to the nuisance parameters.
 
         Raises:
@@ -258,15 +258,15 @@ class ObservationModel:
         """
         at, q, nu = self._batch(errors, passive, nuisance, aligned=aligned)
         alignment = self.alignment.sensitivity if aligned else np.zeros((nu.shape[1], at.shape[1]))
-        divisor = np.ones(self.observations.size) if noise is None else noise
-        return Linearisation(
+        divisor = np.ones(self.observations.size) if noise_ratio is None else noise_ratio
+        return ReadingLinearisation(
             self,
             at,
             q,
             nu,
             free=free,
             alignment=alignment,
-            noise=divisor,
+            noise_ratio=divisor,
             batch=errors.ndim > 1,
         )
 
@@ -344,7 +344,7 @@ class ObservationModel:
         return self.blocks(1)
 
 
-class Linearisation:
+class ReadingLinearisation:
     """Readings of a batch of machines to first order.
 
     Shapes are those of a batch of S machines; S is absent where one machine was linearised.
@@ -356,7 +356,7 @@ class Linearisation:
         nuisance: Nuisance parameters, shape (S, n_nuisance), [SI].
         free: The free parameters.
         alignment: Derivative of the nuisance parameters by errors, shape (n_nuisance, n_errors).
-        noise: Divisor of each entry's reading, shape (n_entries,).
+        noise_ratio: Divisor of each entry's reading, shape (n_entries,).
         batch: Keep the leading dimension of results.
 
     Attributes:
@@ -376,7 +376,7 @@ class Linearisation:
         *,
         free: FreeParameters,
         alignment: Array,
-        noise: Array,
+        noise_ratio: Array,
         batch: bool,
     ) -> None:
         self._model, self._free, self._batch = model, free, batch
@@ -417,9 +417,9 @@ class Linearisation:
         if aligned.size:
             jacobian[:, :, :n_machine] += by_nuisance[:, :, aligned] @ by_errors[aligned]
         by_nuisance *= free.nuisance_scale
-        if (noise != 1.0).any():
-            reading, opening = reading / noise, opening / noise
-            jacobian /= noise[:, None]
+        if (noise_ratio != 1.0).any():
+            reading, opening = reading / noise_ratio, opening / noise_ratio
+            jacobian /= noise_ratio[:, None]
         self.reading, self.opening = self._squeeze(reading), self._squeeze(opening)
         self.correction, self.jacobian = self._squeeze(correction), self._squeeze(jacobian)
 

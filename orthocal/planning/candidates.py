@@ -168,7 +168,7 @@ def measure_candidates(
         spare_range: As in `Equipment`.
     """
     sigma = noise_floor(session.gauge.sigma, session.gauge.resolution)
-    h, jacobian = problem.linearise(problem.reference)
+    h, jacobian = problem.predict_and_jacobian(problem.active_theta)
     n, o = problem.n_machine, problem.observations
     private = {f"setup.{name}" for name in session.setups}
     owners = [name.rpartition(".")[0] for name in problem.free]
@@ -217,7 +217,7 @@ def _list_aligned(
     for unknown, setups in aligned.items():
         readings = tuple(r for r in session.readings if r.setup in setups)
         views = replace(session, setups=setups, readings=readings)
-        jacobian = nominal_sensitivity(views) @ problem.columns
+        jacobian = nominal_sensitivity(views) @ problem.errors_per_theta
         setup_of = build_observations(views).setup
         for k, name in enumerate(setups):
             index = problem.free.index(f"setup.{name}.{unknown}")

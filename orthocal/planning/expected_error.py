@@ -197,7 +197,7 @@ class ToolForecast:
         problem = self.problem(session)
         others = self._jacobian_of_others(session)
         noise = noise_of(session)
-        covariance, _ = self._posterior(problem, others, problem.reference, noise)
+        covariance, _ = self._posterior(problem, others, problem.active_theta, noise)
         if covariance is None:
             raise ClosureError("cannot be read", posture="the planned ones")
         return self._expected(covariance)
@@ -210,7 +210,7 @@ class ToolForecast:
         own = dict(zip(self.others, self.prior_stds[n:].tolist(), strict=True))
         free = build_problem(session, free=self.others, prior=True, prior_stds=own)
         problem = weigh_readings(free)
-        _, slopes = problem.linearise(np.zeros(problem.n_free))
+        _, slopes = problem.predict_and_jacobian(np.zeros(problem.n_free))
         return slopes[:, : len(self.others)]
 
     def _draw(self, problem: CalibrationProblem, *, entered: bool) -> Iterator[Array]:
@@ -221,7 +221,7 @@ class ToolForecast:
             if entered:
                 drawn[offsets] *= ENTERED
             # parameters that are free without a prior are drawn, too
-            yield problem.reference + drawn
+            yield problem.active_theta + drawn
 
     def _posterior(
         self,
@@ -238,7 +238,7 @@ class ToolForecast:
         """
         o, n = problem.observations, problem.n_machine
         try:
-            _, jacobian = problem.linearise(theta, passive)
+            _, jacobian = problem.predict_and_jacobian(theta, passive)
         except ClosureError:
             return None, 1.0
         good = np.asarray(np.isfinite(jacobian).all(axis=1))
@@ -353,7 +353,7 @@ def weigh_readings(problem: CalibrationProblem) -> CalibrationProblem:
     for group in groups:
         own = noise_floor(group.gauge.sigma, group.gauge.resolution)
         noise[group.entries] = own / noise_of(session)
-    return problem.with_noise(noise)
+    return problem.with_noise_ratio(noise)
 
 
 def state_noise(session: Session) -> Session:

@@ -345,7 +345,7 @@ def _prior(candidates: Candidates, forecast: ToolForecast, measured: Session | N
 
 def _information(problem: CalibrationProblem, state: Sequence[str], measured: Session) -> Array:
     """Information of a session about the state, its other parameters marginalised."""
-    _, jacobian = problem.linearise(problem.reference)
+    _, jacobian = problem.predict_and_jacobian(problem.active_theta)
     jacobian = project_out_zeros(jacobian, problem.observations)
     information = jacobian.T @ jacobian / noise_of(measured) ** 2
     others = [i for i, name in enumerate(problem.free) if name not in state]

@@ -86,19 +86,19 @@ class Information:
         return np.asarray(((self.directions**2).T @ variance < 1.0) & self.identifiable)
 
     def effective_parameters(
-        self, *, sigma: float, precision: Array, held: Mask | None = None
+        self, *, sigma: float, precision: Array, at_bound: Mask | None = None
     ) -> float:
         """Effective number of parameters, n − tr(P cov): the rank without a prior.
 
         Args:
             sigma: Standard deviation of one reading, [m].
             precision: Diagonal of P: 1 or 0, shape (n_free,).
-            held: Mask of the parameters at a bound.
+            at_bound: Mask of the parameters at a bound.
         """
-        count = 0 if held is None else int(held.sum())
+        count = 0 if at_bound is None else int(at_bound.sum())
         if not precision.any():
             return float(self.rank - count)
-        covariance = self.covariance(sigma=sigma, precision=precision, held=held)
+        covariance = self.covariance(sigma=sigma, precision=precision, at_bound=at_bound)
         return float(len(precision) - count - precision @ np.diag(covariance))
 
     def covariance(
@@ -106,7 +106,7 @@ class Information:
         *,
         sigma: float,
         precision: Array,
-        held: Mask | None = None,
+        at_bound: Mask | None = None,
         loss: tuple[float, float] = (1.0, 1.0),
     ) -> Array:
         """Covariance of θ̂, (Jᵀ J/σ² + P)⁻¹, shape (n_free, n_free).
@@ -117,10 +117,10 @@ class Information:
         Args:
             sigma: Standard deviation of one reading, [m].
             precision: Diagonal of P: 1 or 0, shape (n_free,).
-            held: Mask of the parameters at a bound, which have no covariance.
+            at_bound: Mask of the parameters at a bound, which have no covariance.
             loss: a, mean of ρ'', and b, mean square of ρ', of the residuals; 1 for squares.
         """
-        free = np.ones(len(precision), dtype=bool) if held is None else ~held
+        free = np.ones(len(precision), dtype=bool) if at_bound is None else ~at_bound
         rows = self.factor[:, free] / sigma
         gain, noise = loss
         prior = np.diag(np.sqrt(precision[free]))
@@ -138,7 +138,7 @@ class Information:
         *,
         sigma: float,
         precision: Array,
-        held: Mask | None = None,
+        at_bound: Mask | None = None,
         loss: tuple[float, float] = (1.0, 1.0),
     ) -> Array:
         """Part of `covariance` that is due to noise, b A⁻¹ Jᵀ J A⁻¹/σ², shape (n_free, n_free).
@@ -146,12 +146,12 @@ class Information:
         Args:
             sigma: Standard deviation of one reading, [m].
             precision: Diagonal of P: 1 or 0, shape (n_free,).
-            held: Mask of the parameters at a bound, which have no covariance.
+            at_bound: Mask of the parameters at a bound, which have no covariance.
             loss: a, mean of ρ'', and b, mean square of ρ', of the residuals; 1 for squares.
         """
         gain, noise = loss
         inverse = self.covariance(
-            sigma=sigma / np.sqrt(gain), precision=precision, held=held
+            sigma=sigma / np.sqrt(gain), precision=precision, at_bound=at_bound
         )  # A⁻¹
         spread = np.sqrt(noise) * inverse @ self.factor.T / sigma
         return np.asarray(spread @ spread.T)

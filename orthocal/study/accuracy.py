@@ -21,7 +21,7 @@ from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
-from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.kinematics.loop_closure import Failures, LoopClosure
 from orthocal.kinematics.workspace import (
     Workspace,
@@ -95,8 +95,10 @@ class AccuracyStudy(Study):
         prepared = _Prepared(
             session=session,
             problem=problem,
-            truth=CalibrationProblem(session, _true_selection(self, robot), noise=problem.noise),
-            program=BatchProgram(problem),
+            truth=CalibrationProblem(
+                session, _true_selection(self, robot), noise_ratio=problem.noise_ratio
+            ),
+            program=BatchSolver(problem),
             workspace=workspace,
             drives=drives,
             passive=closure.close(drives),
@@ -177,7 +179,7 @@ class _Prepared:
     """Of the identified errors."""
     truth: CalibrationProblem
     """Of all errors that machines have."""
-    program: BatchProgram
+    program: BatchSolver
     workspace: Workspace
     drives: Array
     """Commanded for the points of the workspace, shape (K, n_drives), [m, rad]."""
@@ -201,15 +203,15 @@ class _Prepared:
         theta, o, truth = np.array(draws), self.problem.observations, self.truth
         predicted, _, closed = truth.simulate(theta * truth.theta_scale)
         status = np.where(closed, CALIBRATED, NOT_ASSEMBLED).astype(object)
-        entries = predicted * self.problem.noise
+        entries = predicted * self.problem.noise_ratio
         for i, rng in enumerate(generators):
             entries[i], _ = show_readings(self.session, o, entries[i], rng=rng)
         _set_reason(status, np.asarray(~np.isfinite(entries).all(axis=1)), NO_CONTACT)
         rows = np.array([o.rows(v) for v in entries])
         beyond = (rows < self.limits[0]) | (rows > self.limits[1])
         _set_reason(status, np.asarray(beyond.any(axis=1)), OUT_OF_RANGE)
-        errors = truth.closure.errors() + theta[:, : truth.n_machine] @ truth.columns.T
-        return _Measured(errors, entries / self.problem.noise, rows, status)
+        errors = truth.closure.errors() + theta[:, : truth.n_machine] @ truth.errors_per_theta.T
+        return _Measured(errors, entries / self.problem.noise_ratio, rows, status)
 
     def tool_errors(
         self, true: Array, theta: Array, status: NDArray[np.object_]
@@ -262,7 +264,7 @@ class _Prepared:
         except (SolverError, ClosureError):  # one by one, to find the machines that fail
             for i in range(len(values)):
                 try:
-                    program = BatchProgram(self.problem)
+                    program = BatchSolver(self.problem)
                     theta[i] = program.solve(values[i : i + 1], sigma=self.sigma).theta[0]
                 except (SolverError, ClosureError):
                     converged[i] = False
@@ -388,7 +390,7 @@ def _weighting_sigma(study: AccuracyStudy, p: _Prepared) -> float:
     """
     columns = p.problem.functions.errors.columns(p.problem.machine_selection.names)
     projector = columns @ np.linalg.pinv(columns)
-    if np.allclose(projector @ p.truth.columns, p.truth.columns, atol=1e-12):
+    if np.allclose(projector @ p.truth.errors_per_theta, p.truth.errors_per_theta, atol=1e-12):
         return p.sigma
     measured = p.measure(study, range(min(PILOT_MACHINES, study.machines)))
     options, sigmas = SolverOptions(solver="variable-projection"), []

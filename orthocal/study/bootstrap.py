@@ -18,7 +18,7 @@ from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.estimation.fit import Fit, fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.estimation.weighting import leverages
 from orthocal.observation.observations import Observations
 from orthocal.robot.parameters import Parameter
@@ -62,7 +62,7 @@ class BootstrapStudy(Study):
             fitted=fit.prediction,
             residuals=_rescaled_residuals(fit),
             cycles=find_cycles(session, problem.observations) if self.by == "cycles" else (),
-            program=BatchProgram(problem, options=fit.program.options),
+            program=BatchSolver(problem, options=fit.program.options),
         )
 
     def run(self, prepared: _Prepared, task: int) -> Columns:
@@ -88,7 +88,7 @@ class _Prepared:
     """Residuals rescaled to the size of the noise, with mean 0, [m of the first gauge]."""
     cycles: tuple[tuple[NDArray[np.int64], ...], ...]
     """Entries of each cycle of each setup, in the same order of postures."""
-    program: BatchProgram
+    program: BatchSolver
 
     def draw(self, rng: np.random.Generator, by: Resampled) -> Array:
         """Resampled readings of the session, shape (n_entries,), [m of the first gauge]."""
@@ -234,7 +234,7 @@ def _rescaled_residuals(fit: Fit) -> Array:
     """
     o = fit.problem.observations
     posterior = fit.information.covariance(
-        sigma=fit.sigma, precision=fit.problem.prior_precision, held=fit.held
+        sigma=fit.sigma, precision=fit.problem.prior_precision, at_bound=fit.at_bound
     )
     leverage = leverages(fit.jacobian, o, posterior, fit.sigma)
     share = 1.0 - leverage - 1.0 / np.bincount(o.zero, minlength=o.n_zeros)[o.zero]

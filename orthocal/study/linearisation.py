@@ -19,9 +19,9 @@ from orthocal.estimation.fit import require_determined
 from orthocal.estimation.linear import (
     SIX_ROWS,
     TWELVE_ROWS,
-    Linearisation,
+    LinearProblem,
     leg_parallelism_matrix,
-    linearise_at_reference,
+    linearise_problem,
     solve_equation_8,
     twelve_row_covariance,
 )
@@ -98,7 +98,7 @@ class LinearisationStudy(Study):
                 "exact sensors, which only indicators support",
                 where="sensors",
             )
-        linearisation = linearise_at_reference(problem)
+        linearisation = linearise_problem(problem)
         require_determined(problem, linearisation.information)
         matrices, differences = {}, np.zeros((0, problem.observations.size))
         if self.displacements is not None:
@@ -134,7 +134,7 @@ class _Prepared:
     """Data shared by all machines."""
 
     problem: CalibrationProblem
-    linearisation: Linearisation
+    linearisation: LinearProblem
     program: VariableProjection
     matrices: Mapping[int, Array]
     """The paper's matrices by their number of rows; empty for other plans."""
@@ -166,7 +166,7 @@ class _Prepared:
             error = np.abs(theta - errors).max(axis=1) / MM
             columns[name] = np.where(good, error, np.nan).tolist()
 
-        change = readings - problem.predict(problem.reference, problem.reference_passive)
+        change = readings - problem.predict(problem.active_theta, problem.active_passive)
         for name, differences, covariance in self.paper_methods():
             matrix = self.matrices[len(differences)]
             unit = np.eye(len(differences))  # the solver is linear: solve for each row once
@@ -231,7 +231,7 @@ class _Prepared:
         _, passive, closed = problem.simulate(theta)
         if not closed.any():
             return np.full_like(theta, np.nan), closed
-        predicted, jacobian = problem.linearise(theta[closed], passive[closed])
+        predicted, jacobian = problem.predict_and_jacobian(theta[closed], passive[closed])
         finite = np.isfinite(predicted).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
         predicted, jacobian = predicted[finite], jacobian[finite]
         alive = np.array(closed)

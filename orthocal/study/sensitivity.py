@@ -54,7 +54,7 @@ class SensitivityStudy(Study):
         problem, session, o = prepared, prepared.session, prepared.observations
         setups, postures = list(session.setups), list(session.postures)
         parameters = problem.machine_selection.parameters
-        jacobian = problem.linearise(problem.reference)[1][:, : len(parameters)]
+        jacobian = problem.predict_and_jacobian(problem.active_theta)[1][:, : len(parameters)]
         by_std: dict[tuple[str, str], Array] = {}
         read = {postures[i] for i in o.posture}
         if session.robot.tcp is not None:
@@ -66,7 +66,7 @@ class SensitivityStudy(Study):
                     by_std.update({(posture, axis): r for axis, r in zip(TOOL, rows, strict=True)})
         for i in range(o.size):
             key = postures[o.posture[i]], setups[o.setup[i]]
-            by_std.setdefault(key, jacobian[i] * problem.noise[i])
+            by_std.setdefault(key, jacobian[i] * problem.noise_ratio[i])
         scales = np.array([p.prior_std * p.edge_factor for p in parameters])
         n = len(by_std)
         return {

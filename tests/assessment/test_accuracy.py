@@ -261,7 +261,7 @@ def test_what_three_plans_are_worth(
     session = exact(load_plan(plans.write(tmp_path, plan())))
     own = dict(zip(tool.free, tolerances, strict=True))
     problem = build_problem(session, free=tool.free, prior_stds=own)
-    _, slopes = problem.linearise(np.zeros(problem.n_free))
+    _, slopes = problem.predict_and_jacobian(np.zeros(problem.n_free))
     information = decompose(slopes, problem.observations)
     scale = np.outer(tolerances, tolerances)
     precision = problem.prior_precision

@@ -54,7 +54,7 @@ def bound(plan, space, *, sigma, free):
     problem = build_problem(plan, free=names, prior=True, prior_stds=OFFSETS)
     n = problem.n_machine
     tool = ToolSensitivity(robot, free=problem.free[:n])(LoopClosure(robot).inverse(space.points))
-    _, slopes = problem.linearise(np.zeros(problem.n_free))
+    _, slopes = problem.predict_and_jacobian(np.zeros(problem.n_free))
     posterior = decompose(slopes, problem.observations).covariance(
         sigma=sigma, precision=problem.prior_precision
     )

@@ -56,7 +56,7 @@ def test_offsets_alone_are_entered_as_they_are(root):
 def test_offsets_are_chosen_by_least_error_at_the_tool(quarter):
     """No offsets nearby leave less; the gain is how the choice follows from the parameters."""
     machines = DrawnMachines(quarter)
-    errors = machines.machine.split_errors(machines.draw(np.random.default_rng(1)))
+    errors = machines.machine.error_values(machines.draw(np.random.default_rng(1)))
     result = calibrate(simulate_session(quarter, errors, seed=1).session, "full")
     tool = find_tool(result)
     space = tool.workspace
@@ -90,7 +90,7 @@ def test_what_is_promised_with_the_offsets_entered_is_kept(quarter):
     left = {"chosen": [], "identified": [], "offsets": [], "promised": []}
     for seed in range(10):
         drawn = machines.draw(np.random.default_rng(100 + seed))
-        errors = machines.machine.split_errors(drawn)
+        errors = machines.machine.error_values(drawn)
         session = simulate_session(quarter, errors, seed=seed).session
         (full, _), (alone, _) = (
             identify(session, m, solver="variable-projection") for m in ("full", "offsets")

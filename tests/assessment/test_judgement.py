@@ -256,7 +256,7 @@ def test_sound_machines_are_never_accused(plan, seed):
     drawn = machines.draw(np.random.default_rng(70 + seed))
     for scale in (1.0, 0.0):
         values = np.where(machines.is_offset, scale * drawn, drawn)
-        errors = machines.machine.split_errors(values)
+        errors = machines.machine.error_values(values)
         session = simulate_session(plan, errors, seed=seed).session
         found = check_session(session)
         assert [f.kind for f in found.findings if f.severity != "note"] == []

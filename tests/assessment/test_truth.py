@@ -14,7 +14,7 @@ from orthocal.assessment.tool_error import assess_tool, measure_uncertainty
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import cube
@@ -40,7 +40,7 @@ class Machines:
     def __init__(self, root, name):
         self.plan = exact(load_plan(session_folder(root, name) / "plan.yaml"))
         self.problem = build_problem(self.plan, free=JOINTS, prior=True, prior_stds=IN_SI)
-        self.batch = BatchProgram(self.problem)
+        self.batch = BatchSolver(self.problem)
         self.workspace = cube(self.plan.robot, points_a_side=5)
         closure = LoopClosure(self.plan.robot)
         self.drives = closure.inverse(self.workspace.points)
@@ -78,7 +78,7 @@ def test_the_tools_error_is_what_the_posterior_predicts(machines):
     m, problem = machines, machines.problem
     weights = m.workspace.weights
     jacobian = ToolSensitivity(m.plan.robot, free=problem.free)(m.drives)
-    _, slopes = problem.linearise(np.zeros(problem.n_free))
+    _, slopes = problem.predict_and_jacobian(np.zeros(problem.n_free))
     covariance = decompose(slopes, problem.observations).covariance(
         sigma=SIGMA, precision=problem.prior_precision
     ) * np.outer(problem.theta_scale, problem.theta_scale)
@@ -143,7 +143,7 @@ def test_the_covariance_of_the_full_model_is_that_of_300_calibrations(root):
     truths = rng.normal(size=(300, problem.n_free))
     solved = m.solve(truths * problem.theta_scale, rng)
     for truth, found in zip(truths, solved, strict=True):
-        _, slopes = problem.linearise(found)
+        _, slopes = problem.predict_and_jacobian(found)
         covariance = decompose(slopes, problem.observations).covariance(
             sigma=SIGMA, precision=problem.prior_precision
         )

@@ -83,7 +83,7 @@ def test_the_error_at_the_tool_is_what_is_predicted(root, name, offsets_mm, most
         errors = draw_errors(robot, names, seed=seed, tolerances=drawn)
         values = problem.observations.values(as_measured(plan, errors, rng))
         found = program.solve(sigma=SIGMA, values=values)
-        _, slopes = problem.linearise(found.theta, found.passive)
+        _, slopes = problem.predict_and_jacobian(found.theta, found.passive)
         covariance = decompose(slopes, problem.observations).covariance(
             sigma=SIGMA, precision=problem.prior_precision
         ) * np.outer(scale, scale)

@@ -18,7 +18,7 @@ from tolerances import KINEMATICS, SAME_OPTIMUM
 from orthocal import load_session
 from orthocal.estimation.choice import Choice
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.nlp import ProgramFunctions
 from orthocal.estimation.solvers.variable_projection import VariableProjection
@@ -257,7 +257,7 @@ def test_many_sets_at_once_are_faster_than_one_by_one(root, record):
     theta = 0.4 * np.random.default_rng(0).normal(size=(count, problem.n_free))
     values, _, reached = problem.simulate(theta * problem.theta_scale)
     assert reached.all()
-    batch = BatchProgram(problem)
+    batch = BatchSolver(problem)
     together = fastest(lambda: batch.solve(values, sigma=SIGMA)) / count
     program = VariableProjection(problem)
     alone = fastest(lambda: [program.solve(sigma=SIGMA, values=v) for v in values[:10]]) / 10
@@ -271,7 +271,7 @@ def test_many_sets_of_many_parameters_are_faster_at_once(session, record):
     theta = np.random.default_rng(0).normal(size=(count, problem.n_free))
     values, _, reached = problem.simulate(theta * problem.theta_scale)
     assert reached.all()
-    batch = BatchProgram(problem)
+    batch = BatchSolver(problem)
     together = fastest(lambda: batch.solve(values, sigma=SIGMA)) / count
     program = VariableProjection(problem)
     alone = fastest(lambda: [program.solve(sigma=SIGMA, values=v) for v in values[:10]]) / 10

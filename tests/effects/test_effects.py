@@ -31,7 +31,7 @@ from orthocal.effects.machine import stretch_rod
 from orthocal.errors import ParameterError, RobotError, SessionError
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.kinematics.error_map import error_map
@@ -297,7 +297,7 @@ def predictor(problem):
 
 def test_the_jacobian_is_that_of_the_readings(problem):
     theta, scale = point(problem), problem.theta_scale
-    _, jacobian = problem.linearise(theta)
+    _, jacobian = problem.predict_and_jacobian(theta)
     predict = predictor(problem)
     numeric = central_differences(lambda t: predict(t * scale), theta / scale, step=1e-3)
     size = np.maximum(np.abs(numeric).max(axis=0), 1e-9)
@@ -308,12 +308,12 @@ def test_the_jacobian_is_that_of_the_readings(problem):
 def test_batches_and_first_order_agree_with_the_jacobian(problem):
     thetas = np.array([point(problem, size) for size in (0.2, 0.6)])
     passive = problem.close(thetas)
-    readings, jacobians = problem.linearise(thetas, passive)
-    batch = problem.linearisation(thetas, passive)
+    readings, jacobians = problem.predict_and_jacobian(thetas, passive)
+    batch = problem.linearise(thetas, passive)
     rng = np.random.default_rng(5)
     change = 1e-4 * rng.normal(size=thetas.shape)
     for i, theta in enumerate(thetas):
-        alone, jacobian = problem.linearise(theta, passive[i])
+        alone, jacobian = problem.predict_and_jacobian(theta, passive[i])
         assert np.abs(jacobians[i] - jacobian).max() < KINEMATICS
         assert np.abs(readings[i] - problem.predict(theta, passive[i])).max() < KINEMATICS
         closed = problem.close(theta + change[i] * problem.theta_scale)
@@ -414,7 +414,7 @@ def test_all_solvers_identify_it_alike(simulated):
         assert other.objective == pytest.approx(found[0].objective, rel=1e-9)
     truth = {**TRUTH, **simulated.nuisance}
     expected = np.array([truth.get(n, 0.0) for n in problem.free])
-    _, jacobian = problem.linearise(found[0].theta)
+    _, jacobian = problem.predict_and_jacobian(found[0].theta)
     zeros = problem.zero_incidence
     centred = jacobian - zeros @ (np.linalg.pinv(zeros) @ jacobian)
     std = np.sqrt(np.diag(np.linalg.inv(centred.T @ centred / 0.2e-6**2 + np.eye(problem.n_free))))
@@ -428,7 +428,7 @@ def test_a_batch_is_solved_as_each_of_its_sets(simulated):
     problem = build_problem(simulated.session, free=FREE, prior=True)
     rng = np.random.default_rng(8)
     values = problem.values + 1e-6 * rng.normal(size=(3, problem.observations.size))
-    batch = BatchProgram(problem).solve(values, sigma=1e-6)
+    batch = BatchSolver(problem).solve(values, sigma=1e-6)
     for row, theta in zip(values, batch.theta, strict=True):
         alone = VariableProjection(problem).solve(sigma=1e-6, values=row)
         assert (np.abs(theta - alone.theta) / problem.theta_scale).max() < 1e-6

@@ -10,10 +10,10 @@ from tolerances import SAME_OPTIMUM
 
 from orthocal import Choice, SolverOptions, calibrate, simulate_session
 from orthocal.estimation.fit import fit_problem
-from orthocal.estimation.linear import linearise_at_reference
+from orthocal.estimation.linear import linearise_problem
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.statistics.information import decompose
 from orthocal.statistics.zeros import project_out_zeros
@@ -33,13 +33,13 @@ def test_a_bound_holds_a_parameter_and_the_others_make_up_for_it(session):
     fit = fit_problem(build_problem(session, bounds=bounds, model="offsets"))
     assert list(fit.solution.at_bound) == [1, 0, 0]
     assert fit.solution.theta[0] == pytest.approx(0.9e-3, abs=1e-8)
-    linear = linearise_at_reference(build_problem(session, model="offsets"))
+    linear = linearise_problem(build_problem(session, model="offsets"))
     low = np.array([-1e-3, -np.inf, -np.inf]) / 5e-3
     high = np.array([0.9e-3, np.inf, np.inf]) / 5e-3
     bounds = (low, high)
     expected = lsq_linear(linear.jacobian, linear.residual, bounds=bounds, tol=1e-15).x * 5e-3
     assert np.abs(fit.solution.theta - expected).max() < LINEAR
-    assert fit.linear == pytest.approx(expected, abs=1e-9)
+    assert fit.linearised_theta == pytest.approx(expected, abs=1e-9)
 
 
 def test_a_parameter_at_its_bound_has_no_deviation_and_others_hold_with_it_there(session):
@@ -100,10 +100,10 @@ def test_the_robust_covariance_is_that_of_many_simulated_calibrations(exact_plan
     entries = problem.predict(np.array(list(TRUTH.values())))
     rng, white, loss = np.random.default_rng(0), [], Loss("huber")
     truth, o = np.array(list(TRUTH.values())), problem.observations
-    _, jacobian = problem.linearise(truth)
+    _, jacobian = problem.predict_and_jacobian(truth)
     information = decompose(jacobian, o)
     measured = entries + sigma * rng.normal(size=(300, entries.size))
-    solved = BatchProgram(problem, options=options).solve(measured, sigma=sigma)
+    solved = BatchSolver(problem, options=options).solve(measured, sigma=sigma)
     predicted, _, _ = problem.simulate(solved.theta)
     for left, theta in zip(measured - predicted, solved.theta, strict=True):
         residual = project_out_zeros(left, o) / sigma

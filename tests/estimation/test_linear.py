@@ -12,7 +12,7 @@ from orthocal.estimation.linear import (
     SIX_ROWS,
     TWELVE_ROWS,
     leg_parallelism_matrix,
-    linearise_at_reference,
+    linearise_problem,
     solve_equation_8,
     twelve_row_covariance,
 )
@@ -85,6 +85,13 @@ def test_perfect_differences_give_the_offsets_back():
         assert fit.dof == 9
 
 
+def test_the_rank_of_the_rows_does_not_depend_on_their_unit():
+    matrix = leg_parallelism_matrix(**GEOMETRY, rows=6)
+    offsets = np.array([1e-3, -2e-3, 0.5e-3])
+    fit = solve_equation_8(1e-11 * matrix, 1e-11 * (matrix @ offsets))
+    assert fit.offsets == pytest.approx(offsets, rel=1e-9)
+
+
 def test_rows_of_one_leg_do_not_determine_three_offsets():
     with pytest.raises(NotIdentifiableError):
         solve_equation_8(leg_parallelism_matrix(**GEOMETRY, rows=6)[[2, 3]], np.zeros(2))
@@ -93,11 +100,11 @@ def test_rows_of_one_leg_do_not_determine_three_offsets():
 def test_the_closed_loop_model_agrees_to_first_order_with_equation_8(experiment_2):
     """Six differences of the URDF's model against the reduced system, rows and solution."""
     problem = build_problem(exact(experiment_2), model="offsets")
-    _, jacobian = problem.linearise(problem.reference)
+    _, jacobian = problem.predict_and_jacobian(problem.active_theta)
     slopes = problem.observations.rows(jacobian) / problem.theta_scale
     matrix = leg_parallelism_matrix(**GEOMETRY, rows=6)
     assert np.abs(slopes - matrix).max() < 1e-11
-    theta = linearise_at_reference(problem).solve(sigma=1e-5)
+    theta = linearise_problem(problem).solve(sigma=1e-5)
     expected = solve_equation_8(matrix, experiment_2.values).offsets
     assert np.abs(theta - expected).max() < 1e-13
 
@@ -107,7 +114,7 @@ def test_twelve_generalised_rows_are_raw_readings_with_their_zeros(exact_plan):
     rng = np.random.default_rng(0)
     session = exact_plan.with_values(1e-3 * rng.normal(size=len(exact_plan.readings)))
     problem = build_problem(session, model="offsets")
-    theta = linearise_at_reference(problem).solve(sigma=1e-5)
+    theta = linearise_problem(problem).solve(sigma=1e-5)
     means = {}
     for r in session.readings:
         means.setdefault((r.setup, r.posture), []).append(r.value)

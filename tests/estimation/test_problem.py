@@ -33,7 +33,7 @@ def test_the_implicit_jacobian_is_the_derivative(plan, free, size):
     """Of sums, frames and scales; `test_observation_model` has the complete model."""
     problem = build_problem(plan, free=free)
     at = size * np.random.default_rng(1).normal(size=problem.n_free)
-    _, jacobian = problem.linearise(at * problem.theta_scale)
+    _, jacobian = problem.predict_and_jacobian(at * problem.theta_scale)
     assert_derivative(
         jacobian * 1e3,
         lambda t: problem.predict(t * problem.theta_scale) * 1e3,
@@ -53,7 +53,7 @@ def test_known_values_are_held(plan):
 
 def test_what_the_controller_corrects_is_the_reference(exact_plan):
     active = replace(exact_plan, controller_offsets=np.array([1e-3, 2e-3, 3e-3]))
-    assert np.array_equal(build_problem(active, model="offsets").reference, [1e-3, 2e-3, 3e-3])
+    assert np.array_equal(build_problem(active, model="offsets").active_theta, [1e-3, 2e-3, 3e-3])
 
 
 def test_readings_depend_on_few_variables(plan):
@@ -90,3 +90,11 @@ def test_closure_rows_that_depend_on_others_are_named(root, tmp_path):
     )
     with pytest.raises(RobotError, match=r"closure rows depend on others: z of apex; leave them"):
         build_problem(load_plan(tmp_path / "plan.yaml"), model="offsets")
+
+
+def test_other_noise_ratios_are_in_the_linearisation(plan):
+    """Also if the first problem has already been linearised."""
+    problem = build_problem(plan, model="offsets")
+    jacobian = problem.linearisation_at_active.jacobian
+    other = problem.with_noise_ratio(np.full(problem.observations.size, 4.0))
+    assert np.allclose(other.linearisation_at_active.jacobian, jacobian / 4.0, rtol=1e-12)

@@ -60,9 +60,11 @@ def condition(session, row):
     others = np.delete(np.arange(len(session.readings)), row)
     theta = np.zeros(problem.n_free)
     for _ in range(MOST_STEPS):
-        reading, jacobian = problem.linearise(problem.reference + theta * problem.theta_scale)
-        jacobian = of_rows @ (jacobian * problem.noise[:, None])
-        mean = of_rows @ (reading * problem.noise) - jacobian @ theta
+        reading, jacobian = problem.predict_and_jacobian(
+            problem.active_theta + theta * problem.theta_scale
+        )
+        jacobian = of_rows @ (jacobian * problem.noise_ratio[:, None])
+        mean = of_rows @ (reading * problem.noise_ratio) - jacobian @ theta
         spread = of_rows @ np.hstack([zeros, np.diag(sigma)])
         covariance = jacobian @ jacobian.T + spread @ spread.T
         known = np.linalg.solve(covariance[np.ix_(others, others)], (session.values - mean)[others])
@@ -134,7 +136,7 @@ def draw_sessions(plan, count, seed):
     problem = build_problem(plan, free=machine_errors(plan.robot), prior=True)
     theta = np.random.default_rng(seed).normal(size=(count, problem.n_free))
     o = problem.observations
-    entries, _, closed = problem.simulate(problem.reference + theta * problem.theta_scale)
+    entries, _, closed = problem.simulate(problem.active_theta + theta * problem.theta_scale)
     limits = [limits_of(plan, r) for r in plan.readings]
     for k in np.flatnonzero(closed & np.isfinite(entries).all(axis=1)).tolist():
         rng = np.random.default_rng((seed, k))

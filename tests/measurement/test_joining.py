@@ -11,6 +11,7 @@ from gauges import exact
 from orthocal import SolverOptions, calibrate, load_calibration, load_plan, simulate_session
 from orthocal.calibration.file import calibration_document, write_calibration
 from orthocal.errors import SessionError
+from orthocal.estimation import fit as fit_module
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
@@ -139,7 +140,7 @@ def test_both_solvers_weigh_gauges_alike(root):
         simulate_session(plan, TRUTH, seed=i, sigma=s).session for i, s in enumerate((2e-5, 5e-6))
     ]
     problem = build_problem(join_sessions(pair), model="lengths")
-    problem = problem.with_noise(np.repeat([1.0, 0.25], problem.observations.size // 2))
+    problem = problem.with_noise_ratio(np.repeat([1.0, 0.25], problem.observations.size // 2))
     for loss in ("squares", "huber"):
         from orthocal.estimation.loss import Loss
 
@@ -177,3 +178,16 @@ def test_only_sessions_of_one_robot_are_joined(root):
     with pytest.raises(SessionError, match="no session"):
         join_sessions([])
     assert join_sessions(sessions) is sessions[0]
+
+
+def test_a_fit_is_of_one_problem_where_the_noise_does_not_settle(root, monkeypatch):
+    """The noise ratio of the last solution, not of one that nobody has solved."""
+    monkeypatch.setattr(fit_module, "MAX_SIGMA_ROUNDS", 1)
+    plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
+    plan = plan.with_gauge(replace(plan.gauge, sigma=None, resolution=None))
+    sessions = [simulate_session(plan, TRUTH, seed=s, sigma=s * 10e-6).session for s in (1, 4)]
+    once = [replace(s, readings=tuple(r for r in s.readings if r.cycle == 1)) for s in sessions]
+    fit = fit_problem(build_problem(join_sessions(once), model="offsets"))
+    prediction = fit.problem.predict(fit.solution.theta, fit.solution.passive)
+    assert fit.prediction == pytest.approx(prediction, rel=1e-12)
+    assert fit.program.problem is fit.problem

@@ -14,7 +14,7 @@ from orthocal.errors import SessionError
 from orthocal.estimation.fit import build_program, fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.measurement.files.session_file import load_session
 from orthocal.measurement.files.write_session import write_session
 
@@ -43,7 +43,7 @@ def test_solvers_agree_and_keep_known_zeros_at_0(session, loss):
         options = SolverOptions(solver=kind, loss=Loss(loss))
         found[kind] = build_program(problem, options).solve(sigma=SIGMA)
         assert (found[kind].zeros[known] == 0.0).all()
-    batch = BatchProgram(
+    batch = BatchSolver(
         problem, options=SolverOptions(solver="variable-projection", loss=Loss(loss))
     )
     together = batch.solve(problem.values[None], sigma=SIGMA)
@@ -64,7 +64,7 @@ def test_an_absolute_reading_is_one_more_equation(exact_plan):
 
     ranks = []
     for problem in (free, known):
-        _, jacobian = problem.linearise(problem.reference)
+        _, jacobian = problem.predict_and_jacobian(problem.active_theta)
         rows = project_out_zeros(jacobian, problem.observations)
         ranks.append(int(np.linalg.matrix_rank(rows, tol=1e-9)))
     assert ranks[0] == 0

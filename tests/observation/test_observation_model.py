@@ -43,7 +43,7 @@ def problem(request, root, tmp_path):
     else:
         registry.register_sensor(ToolCoordinate)
         (tmp_path / "plan.yaml").write_text(SEVERAL_SENSORS)
-        yield build_problem(load_plan(tmp_path / "plan.yaml"), model="full").with_noise(
+        yield build_problem(load_plan(tmp_path / "plan.yaml"), model="full").with_noise_ratio(
             np.random.default_rng(0).uniform(0.5, 2.0, 20)
         )
         registry.unregister_sensor(ToolCoordinate.kind)
@@ -61,13 +61,13 @@ def draw(problem, count=3, size=0.5):
 def test_a_batch_equals_its_machines_one_by_one(problem):
     theta, readings, passive, rng = draw(problem)
     near = passive + 1e-5 * rng.normal(size=passive.shape)
-    linear = problem.linearisation(theta, near)
+    linear = problem.linearise(theta, near)
     change = 1e-3 * rng.normal(size=theta.shape)
     follow = linear.follow(change)
     for i, own in enumerate(theta):
         assert np.abs(problem.close(own) - passive[i]).max() < 1e-12
         assert np.abs(problem.predict(own) - readings[i]).max() < 1e-12
-        alone = problem.linearisation(own, near[i])
+        alone = problem.linearise(own, near[i])
         assert np.abs(linear.reading[i] - alone.reading).max() < 1e-15
         assert np.abs(linear.opening[i] - alone.opening).max() < 1e-15
         scale = np.abs(alone.jacobian).max()
@@ -80,15 +80,15 @@ def test_simulation_and_problem_predict_the_same_readings(problem):
     own, n = theta[0], problem.n_machine
     errors = dict(zip(problem.free[:n], own[:n].tolist(), strict=True))
     nuisance = own[n:] if own.size > n else None
-    alone = predict_readings(problem.session, errors, nuisance=nuisance) / problem.noise
+    alone = predict_readings(problem.session, errors, nuisance=nuisance) / problem.noise_ratio
     assert np.abs(readings[0] - alone).max() < 1e-12
-    reading, _ = problem.linearise(own)
+    reading, _ = problem.predict_and_jacobian(own)
     assert np.abs(reading - alone).max() < 1e-12
 
 
 def test_the_jacobian_is_that_of_central_differences(problem):
     theta, _, passive, _ = draw(problem, count=1)
-    reading, jacobian = problem.linearise(theta, passive)
+    reading, jacobian = problem.predict_and_jacobian(theta, passive)
     assert_derivative(
         jacobian[0] * 1e3,
         lambda t: problem.predict(t * problem.theta_scale) * 1e3,
@@ -96,7 +96,7 @@ def test_the_jacobian_is_that_of_central_differences(problem):
         step=1e-3,
         tolerance=1e-6,  # steps of a thousandth of a tolerance, third order
     )
-    si_reading, si = problem.linearise(theta, passive, units="SI")
+    si_reading, si = problem.predict_and_jacobian(theta, passive, units="SI")
     assert np.array_equal(si_reading, reading)
     assert np.allclose(si * problem.theta_scale, jacobian, rtol=1e-14, atol=0.0)
 
@@ -105,7 +105,7 @@ def test_opening_and_follow_close_the_loops_to_first_order(problem):
     theta, _, passive, rng = draw(problem, count=1)
     for size in (1e-4, 1e-5):
         near = passive + size * rng.normal(size=passive.shape)
-        linear = problem.linearisation(theta, near)
+        linear = problem.linearise(theta, near)
         left = np.abs(near + linear.correction - passive).max()
         assert left < 100.0 * size**2
         predicted = linear.reading + linear.opening - problem.predict(theta, passive)

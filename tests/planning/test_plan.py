@@ -23,7 +23,7 @@ from orthocal import (
 from orthocal.builder.build import Dimensions, make_robot
 from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import cube, find_workspace
 from orthocal.measurement.files.write_session import write_session
@@ -119,7 +119,7 @@ def simulate_tool_error(plan, workspace, *, machines):
     values, _, reached = problem.simulate(theta)
     assert reached.all()
     values = values + sigma * rng.normal(size=values.shape)
-    found = BatchProgram(problem).solve(values, sigma=sigma).theta
+    found = BatchSolver(problem).solve(values, sigma=sigma).theta
     closure, columns = LoopClosure(robot), problem.functions.errors.columns(names)
     drives = closure.inverse(workspace.points)
 

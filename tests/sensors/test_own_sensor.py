@@ -161,7 +161,7 @@ def test_both_solvers_find_one_optimum(plan, model, hessian):
 def test_its_slope_is_central_differences(plan):
     problem = build_problem(simulate_session(plan, TRUTH, seed=1).session, model="lengths")
     theta = np.append(0.3 * problem.theta_scale[:-2], [1.5e-3, -1e-3])
-    _, jacobian = problem.linearise(theta)
+    _, jacobian = problem.predict_and_jacobian(theta)
     for i in (0, 4, problem.n_free - 2, problem.n_free - 1):
         step = np.zeros(problem.n_free)
         step[i] = 1e-2 * problem.theta_scale[i]

@@ -120,7 +120,7 @@ def jacobians(root):
     for name in ("sweep", "lines"):
         plan = exact(load_plan(session_folder(root, name) / "plan.yaml"))
         problem = build_problem(plan, free=JOINTS, prior=True)
-        _, jacobian = problem.linearise(np.zeros(problem.n_free))
+        _, jacobian = problem.predict_and_jacobian(np.zeros(problem.n_free))
         found[name] = problem, jacobian
     return found
 

@@ -14,7 +14,7 @@ from tolerances import KINEMATICS
 from orthocal import calibrate, load_plan
 from orthocal.errors import NotIdentifiableError
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import Observations, build_observations
 from orthocal.statistics.chance import (
@@ -164,7 +164,7 @@ def test_readings_of_one_leg_leave_an_offset_open(raw_cycles):
 
 def test_six_equations_have_the_closed_form_covariance(experiment_2):
     problem = build_problem(exact(experiment_2), model="offsets")
-    _, jacobian = problem.linearise(problem.reference)
+    _, jacobian = problem.predict_and_jacobian(problem.active_theta)
     information = decompose(jacobian, problem.observations)
     scale = np.outer(problem.theta_scale, problem.theta_scale)
     precision = problem.prior_precision
@@ -185,11 +185,11 @@ def test_predicted_covariance_is_that_of_many_simulated_calibrations(root, model
     entries, _, reached = problem.simulate(truths * problem.theta_scale)
     assert reached.all()
     measured = entries + sigma * rng.normal(size=entries.shape)
-    solved = BatchProgram(problem).solve(measured, sigma=sigma)
+    solved = BatchSolver(problem).solve(measured, sigma=sigma)
     _, found, reached = problem.simulate(solved.theta)
     assert reached.all()
     whitened = []
-    _, jacobians = problem.linearise(solved.theta, found)
+    _, jacobians = problem.predict_and_jacobian(solved.theta, found)
     for truth, theta, jacobian in zip(truths, solved.theta, jacobians, strict=True):
         covariance = decompose(jacobian, problem.observations).covariance(
             sigma=sigma, precision=problem.prior_precision

@@ -123,7 +123,7 @@ def test_batch_step_equals_single_gauss_newton_steps(study):
     from orthocal.statistics.zeros import project_out_zeros
 
     for y, at, step in zip(read, theta, found, strict=True):
-        reading, jacobian = problem.linearise(at)
+        reading, jacobian = problem.predict_and_jacobian(at)
         slopes = project_out_zeros(jacobian, problem.observations)
         left = project_out_zeros(y - reading, problem.observations)
         expected = at + np.linalg.lstsq(slopes, left)[0] * problem.theta_scale

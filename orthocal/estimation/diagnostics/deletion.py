@@ -69,7 +69,7 @@ def diagnose_readings(fit: Fit) -> Diagnostics:
         zeros = np.zeros(count)
         return Diagnostics(np.full(count, np.nan), zeros, zeros.astype(np.int64), np.inf)
     inverse = _weighted_information(fit).covariance(
-        sigma=sigma, precision=problem.prior_precision, held=fit.held
+        sigma=sigma, precision=problem.prior_precision, at_bound=fit.at_bound
     )
     weights, s_inv_x, m_y, s_inv_diagonal = _eliminate_zeros(fit)
     gain = s_inv_x @ inverse / sigma**2
@@ -96,8 +96,8 @@ def _eliminate_zeros(fit: Fit) -> tuple[Array, Array, Array, Array]:
     All but the weights are divided by the weight of the row.
     """
     o = fit.problem.observations
-    weights = fit.weights[o.plus]
-    s_inv_x = o.rows(project_out_zeros(fit.jacobian, o, weights=fit.weights))
+    weights = fit.robust_weights[o.plus]
+    s_inv_x = o.rows(project_out_zeros(fit.jacobian, o, weights=fit.robust_weights))
     m_y, s_inv_diagonal = o.rows(fit.residual), np.ones(o.plus.size)
     jacobian = o.rows(fit.jacobian)
     for zero in range(o.n_zeros):
@@ -127,8 +127,8 @@ def _weighted_information(fit: Fit) -> Information:
     """Information of the readings with the weights of a robust loss."""
     if not fit.loss.robust:
         return fit.information
-    centred = project_out_zeros(fit.jacobian, fit.problem.observations, weights=fit.weights)
-    return Information(np.sqrt(fit.weights)[:, None] * centred)
+    centred = project_out_zeros(fit.jacobian, fit.problem.observations, weights=fit.robust_weights)
+    return Information(np.sqrt(fit.robust_weights)[:, None] * centred)
 
 
 def _inverse_covariance(o: Observations, group: Indices) -> Array | None:
@@ -179,10 +179,10 @@ def cross_validate_setups(fit: Fit) -> Array:
     setups = np.unique(o.setup)
     if setups.size < 2:
         return errors
-    root = np.sqrt(fit.weights)[:, None]
-    factor = root * project_out_zeros(fit.jacobian, o, weights=fit.weights)
+    root = np.sqrt(fit.robust_weights)[:, None]
+    factor = root * project_out_zeros(fit.jacobian, o, weights=fit.robust_weights)
     weighted_residual = root[:, 0] * fit.residual / fit.sigma**2
-    free = ~fit.held
+    free = ~fit.at_bound
     precision = np.diag(problem.prior_precision)[np.ix_(free, free)]
     for setup in setups:
         deleted = o.setup == setup

@@ -66,7 +66,7 @@ def _first_order(session: Session) -> Array:
     Shape (n_readings, 1 + n_errors).
     """
     problem = build_problem(session, free=machine_errors(session.robot), prior=True)
-    h, jacobian = problem.linearise(np.zeros(problem.n_free))
+    h, jacobian = problem.predict_and_jacobian(np.zeros(problem.n_free))
     o = problem.observations
     columns = np.column_stack([h, jacobian[:, : problem.n_machine]])
     return np.asarray(o.rows(project_out_zeros(columns, o)))

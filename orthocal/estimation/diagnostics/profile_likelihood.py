@@ -65,7 +65,7 @@ def _find_end(fit: Fit, index: int, factor: float, side: float) -> float:
             sigma=sigma,
             start=best.theta,
             start_passive=best.passive,
-            held={index: centre + side * distance},
+            prescribed={index: centre + side * distance},
         )
         # a decrease is rounding
         return math.sqrt(max(2.0 * (solution.objective - base.objective), 0.0)) - factor

@@ -30,7 +30,7 @@ WHOLE_MODEL = "full"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Unmodelled:
+class UnmodelledEffect:
     """Unmodelled errors and their effect on an estimate."""
 
     __pydantic_config__ = CLOSED
@@ -53,7 +53,7 @@ class Unmodelled:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OtherErrors:
+class UnmodelledErrors:
     """Errors of the machine that a fit does not model, and their Jacobian."""
 
     names: tuple[str, ...]
@@ -83,7 +83,7 @@ def machine_errors(robot: Robot) -> tuple[str, ...]:
     return tuple(name for name in parameters.names if name in names)
 
 
-def find_other_errors(fit: Fit, *, represented: Collection[str] = ()) -> OtherErrors:
+def find_unmodelled_errors(fit: Fit, *, represented: Collection[str] = ()) -> UnmodelledErrors:
     """Errors of the machine that a fit does not model.
 
     Args:
@@ -102,9 +102,9 @@ def find_other_errors(fit: Fit, *, represented: Collection[str] = ()) -> OtherEr
     ]
     o = problem.observations
     if not names:
-        return OtherErrors((), read_only([]), read_only(np.zeros((o.size, 0))))
+        return UnmodelledErrors((), read_only([]), read_only(np.zeros((o.size, 0))))
     prior_stds = read_only([parameters[n].prior_std for n in names])
-    return OtherErrors(tuple(names), prior_stds, read_only(error_jacobian(fit, names)))
+    return UnmodelledErrors(tuple(names), prior_stds, read_only(error_jacobian(fit, names)))
 
 
 def error_jacobian(fit: Fit, names: Sequence[str]) -> Array:
@@ -117,7 +117,7 @@ def error_jacobian(fit: Fit, names: Sequence[str]) -> Array:
     prior_stds = np.array([parameters[n].prior_std for n in names])
     columns = problem.functions.errors.columns(names) * prior_stds
     nuisance_scale = problem.theta_scale[problem.n_machine :]
-    linear = problem.linearisation(
+    linear = problem.linearise(
         fit.solution.theta,
         fit.solution.passive,
         free=problem.model.parametrise(columns, nuisance_scale),
@@ -125,7 +125,7 @@ def error_jacobian(fit: Fit, names: Sequence[str]) -> Array:
     return project_out_zeros(linear.jacobian[:, : len(names)], problem.observations)
 
 
-def measure_unmodelled(fit: Fit, others: OtherErrors) -> tuple[Unmodelled, Array]:
+def propagate_unmodelled(fit: Fit, others: UnmodelledErrors) -> tuple[UnmodelledEffect, Array]:
     """Effect of errors that were not free on an estimate.
 
     Returns:
@@ -135,17 +135,17 @@ def measure_unmodelled(fit: Fit, others: OtherErrors) -> tuple[Unmodelled, Array
     problem = fit.problem
     n = problem.n_machine
     if not others.names:
-        none = Unmodelled((), read_only([]), read_only(np.zeros((n, 0))), 0.0, 0.0)
+        none = UnmodelledEffect((), read_only([]), read_only(np.zeros((n, 0))), 0.0, 0.0)
         return none, np.zeros(problem.n_free - n)
     o, sigma = problem.observations, max(fit.sigma, SMALLEST_SIGMA)
     jacobian = project_out_zeros(fit.jacobian, o)
     inverse = fit.information.covariance(
-        sigma=sigma, precision=problem.prior_precision, held=fit.held
+        sigma=sigma, precision=problem.prior_precision, at_bound=fit.at_bound
     )
     scaled = inverse @ (jacobian.T @ others.jacobian) / sigma**2
     residual = o.rows(others.jacobian - jacobian @ scaled)
     change = scaled * problem.theta_scale[:, None]
-    effect = Unmodelled(
+    effect = UnmodelledEffect(
         names=others.names,
         prior_stds=others.prior_stds,
         leakage=read_only((change / others.prior_stds)[:n]),

@@ -41,11 +41,11 @@ class BatchSolution:
     """Shape (S,)."""
     at_bound: NDArray[np.int8]
     """As of a `Solution`, shape (S, n_free)."""
-    alone: Mask
+    solved_alone: Mask
     """Mask of the sets that were solved one by one, shape (S,)."""
 
 
-class BatchProgram:
+class BatchSolver:
     """A calibration problem for many sets of readings.
 
     Each set is solved independently of the others.
@@ -88,7 +88,7 @@ class BatchProgram:
             part = slice(first, first + size)
             self._solve_part(shared, y[part], solution, part)
         program = VariableProjection(problem, options=self.options)
-        for i in np.flatnonzero(solution.alone).tolist():
+        for i in np.flatnonzero(solution.solved_alone).tolist():
             one = program.solve(sigma=sigma, values=y[i])
             solution.theta[i], solution.zeros[i] = one.theta, one.zeros
             solution.objective[i], solution.at_bound[i] = one.objective, one.at_bound
@@ -98,12 +98,12 @@ class BatchProgram:
         """Gauss-Newton steps for some sets; fills their part of the solution."""
         problem, sigma = self.problem, shared.sigma
         theta = shared.linearised_solutions(y)
-        passive = problem.reference_passive + shared.reference.follow(theta - shared.start)
+        passive = problem.active_passive + shared.reference.follow(theta - shared.start)
         active, converged = np.arange(len(y)), np.zeros(len(y), dtype=np.bool_)
         sizes, reading = np.full((3, len(y)), np.inf), np.empty_like(y)
         for _ in range(MAX_STEPS):
             try:
-                linear = problem.linearisation(theta[active] * problem.theta_scale, passive[active])
+                linear = problem.linearise(theta[active] * problem.theta_scale, passive[active])
             except np.linalg.LinAlgError:  # a singular posture: solve all of them one by one
                 break
             closed = linear.reading + linear.opening
@@ -121,7 +121,7 @@ class BatchProgram:
                 break
         zeros, objective, good = shared.evaluate(y, theta, reading)
         solution.theta[part], solution.zeros[part] = theta * problem.theta_scale, zeros
-        solution.objective[part], solution.alone[part] = objective, ~(good & converged)
+        solution.objective[part], solution.solved_alone[part] = objective, ~(good & converged)
 
 
 class _Shared:
@@ -133,11 +133,11 @@ class _Shared:
         self._low, self._high = problem.selection.lower / scale, problem.selection.upper / scale
         self._mean = problem.prior_mean / scale
         self._precision = problem.prior_precision
-        self.start = problem.reference / scale
+        self.start = problem.active_theta / scale
         self._counts = np.bincount(o.zero, minlength=o.n_zeros).astype(np.float64)
         self._incidence = problem.zero_incidence
         self._free_zeros = problem.zero_incidence * ~o.zero_known
-        self.reference = problem.reference_linearisation
+        self.reference = problem.linearisation_at_active
         self._jacobian = self._centre(self.reference.jacobian / sigma)
         normal = self._jacobian.T @ self._jacobian + np.diag(self._precision)
         self._inverse = np.linalg.pinv(normal, rcond=1e-13, hermitian=True)

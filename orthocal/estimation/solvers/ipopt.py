@@ -24,7 +24,7 @@ from orthocal.estimation.solvers.program import (
     Program,
     Solution,
     SolverInput,
-    no_convergence,
+    advise,
     scaled_bounds,
 )
 from orthocal.runtime.interrupts import noticed_interrupt
@@ -48,7 +48,7 @@ CONVERGED = frozenset({"Solve_Succeeded"})
 
 COMPLEMENTARITY = 1e-11
 """Largest product of a bound's multiplier and the distance to it, both scaled. A parameter closer
-to its bound than the square root of this counts as held: 16 nm for a tolerance of 5 mm."""
+to its bound than the square root of this counts as at it: 16 nm for a tolerance of 10 mm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,8 +143,8 @@ class NonlinearProgram(Program):
 
     def _run(self, readings: SolverInput, width_factor: float = 1.0) -> Solution:
         """One run of Ipopt, with a multiple of the width of a robust loss."""
-        problem, sigma, held = self.problem, readings.sigma, readings.held
-        lower, upper = self._bounds(held)
+        problem, sigma, prescribed = self.problem, readings.sigma, readings.prescribed
+        lower, upper = self._bounds(prescribed)
         theta = np.clip(
             readings.start,
             lower[: self._n_theta] * problem.theta_scale,
@@ -165,7 +165,7 @@ class NonlinearProgram(Program):
         if status not in CONVERGED:
             raise SolverError(
                 f"Ipopt did not converge: {status} after {iterations} iterations; "
-                f"{no_convergence(self.options)}",
+                f"there is no result. {advise(self.options)}",
                 status=status,
                 iterations=iterations,
             )
@@ -183,7 +183,7 @@ class NonlinearProgram(Program):
             iterations=iterations,
             hessian=self.options.hessian,
             closure=float(closures) * LENGTH_SCALE,
-            at_bound=_at_bound(x[: self._n_theta], multipliers, lower, upper, held),
+            at_bound=_at_bound(x[: self._n_theta], multipliers, lower, upper, prescribed),
         )
 
     def initial_variables(
@@ -208,7 +208,7 @@ class NonlinearProgram(Program):
             ClosureError: If the machine cannot reach a posture.
         """
         problem, o, loss = self.problem, self.problem.observations, self.options.loss
-        at = problem.reference if theta is None else np.asarray(theta, dtype=np.float64)
+        at = problem.active_theta if theta is None else np.asarray(theta, dtype=np.float64)
         closed = problem.close(at, start=passive)
         y = problem.values if values is None else values
         residual = (y - problem.predict(at, closed)) / sigma
@@ -280,7 +280,7 @@ class NonlinearProgram(Program):
     def _pack(self, sigma: float, values: Array, weights: Array, width_factor: float) -> Array:
         weighted, scale = _weighting(sigma)
         width = self.options.loss.width * width_factor * sigma / weighted
-        return np.concatenate([values, weights, self.problem.noise, [weighted, scale, width]])
+        return np.concatenate([values, weights, self.problem.noise_ratio, [weighted, scale, width]])
 
     def functions(self) -> dict[str, ca.Function]:
         """The program's functions of (x, p[, lam_f, lam_g]), for checks of their derivatives."""
@@ -327,13 +327,13 @@ class NonlinearProgram(Program):
             },
         )
 
-    def _bounds(self, held: Mapping[int, float]) -> tuple[Array, Array]:
+    def _bounds(self, prescribed: Mapping[int, float]) -> tuple[Array, Array]:
         """Bounds of all variables, scaled; a known zero is fixed at 0."""
         problem = self.problem
         k = problem.n_states * self._n_passive + int(problem.model.alignment.aligned.sum())
         limits = np.full(self._n_zeros + k, np.inf)
         limits[: self._n_zeros][problem.observations.zero_known] = 0.0
-        lower, upper = scaled_bounds(problem, held)
+        lower, upper = scaled_bounds(problem, prescribed)
         return np.concatenate([lower, -limits]), np.concatenate([upper, limits])
 
 
@@ -370,11 +370,11 @@ def _weighting(sigma: float) -> tuple[float, float]:
 
 
 def _at_bound(
-    theta: Array, multipliers: Array, lower: Array, upper: Array, held: Mapping[int, float]
+    theta: Array, multipliers: Array, lower: Array, upper: Array, prescribed: Mapping[int, float]
 ) -> NDArray[np.int8]:
     """Parameters held by a bound: its multiplier exceeds the distance to it."""
     result = np.zeros(theta.size, dtype=np.int8)
     result[-multipliers > np.abs(theta - lower[: theta.size])] = -1
     result[multipliers > np.abs(theta - upper[: theta.size])] = 1
-    result[list(held)] = 0
+    result[list(prescribed)] = 0
     return result

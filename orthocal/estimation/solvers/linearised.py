@@ -22,10 +22,10 @@ class LinearisedProgram(Program):
     def _solve(self, readings: SolverInput) -> Solution:
         problem = self.problem
         task = Task(problem, self.options.loss, readings)
-        reference = task.at(problem.reference / problem.theta_scale, readings.start_passive)
-        _, jacobian = problem.linearise(problem.reference, reference.passive)
+        reference = task.at(problem.active_theta / problem.theta_scale, readings.start_passive)
+        _, jacobian = problem.predict_and_jacobian(problem.active_theta, reference.passive)
         jacobian /= task.sigma
-        start = task.clip(problem.reference)
+        start = task.clip(problem.active_theta)
         first = task.moved(reference, jacobian, start - reference.theta)
         state = task.moved(first, jacobian, task.step(first, jacobian))
         state = replace(state, theta=state.theta.clip(task.low, task.high))

@@ -394,7 +394,7 @@ class ProgramFunctions:
         rows = np.arange(self._aligned.size)
         matrix = np.zeros((rows.size, int(self._value_of.max()) + 1))
         alignment = problem.model.alignment
-        matrix[:, :n] = (alignment.sensitivity @ problem.columns)[index] / scale[:, None]
+        matrix[:, :n] = (alignment.sensitivity @ problem.errors_per_theta)[index] / scale[:, None]
         matrix[rows, self._aligned] = 1.0
         matrix[rows, self._value_of[self._aligned]] = -1.0
         start = alignment(problem.closure.errors())[index] / scale

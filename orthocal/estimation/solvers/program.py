@@ -56,8 +56,8 @@ class SolverInput:
     """Free parameters to start from, shape (n_free,), [SI]."""
     start_passive: Array | None
     """Passive coordinates to start closing the loops from."""
-    held: Mapping[int, float]
-    """Index of a free parameter to the value it is held at, [SI]."""
+    prescribed: Mapping[int, float]
+    """Index of a free parameter to its prescribed value, [SI]."""
 
 
 class Program(ABC):
@@ -90,7 +90,7 @@ class Program(ABC):
         start: ArrayLike | None = None,
         start_passive: Array | None = None,
         excluded: ArrayLike | None = None,
-        held: Mapping[int, float] | None = None,
+        prescribed: Mapping[int, float] | None = None,
     ) -> Solution:
         """Solve for one set of readings.
 
@@ -101,7 +101,7 @@ class Program(ABC):
             start: Free parameters to start from, shape (n_free,), [SI]; the reference by default.
             start_passive: Passive coordinates to start closing the loops from.
             excluded: Indices of the entries to exclude.
-            held: Index of a free parameter to the value it is held at, [SI].
+            prescribed: Index of a free parameter to its prescribed value, [SI].
 
         Raises:
             SolverError: If it does not converge.
@@ -113,9 +113,9 @@ class Program(ABC):
                 sigma=sigma,
                 values=np.asarray(problem.values if values is None else values, dtype=np.float64),
                 weights=self._weights(excluded),
-                start=np.array(problem.reference if start is None else start, dtype=np.float64),
+                start=np.array(problem.active_theta if start is None else start, dtype=np.float64),
                 start_passive=start_passive,
-                held=held or {},
+                prescribed=prescribed or {},
             )
         )
 
@@ -131,18 +131,20 @@ class Program(ABC):
         """Solve for one set of readings."""
 
 
-def scaled_bounds(problem: CalibrationProblem, held: Mapping[int, float]) -> tuple[Array, Array]:
-    """Lower and upper bounds of θ̂, shape (n_free,), equal for held parameters."""
+def scaled_bounds(
+    problem: CalibrationProblem, prescribed: Mapping[int, float]
+) -> tuple[Array, Array]:
+    """Lower and upper bounds of θ̂, shape (n_free,), equal for prescribed parameters."""
     lower, upper = (
         b / problem.theta_scale for b in (problem.selection.lower, problem.selection.upper)
     )
-    for i, value in held.items():
+    for i, value in prescribed.items():
         lower[i] = upper[i] = value / problem.theta_scale[i]
     return lower, upper
 
 
-def no_convergence(options: SolverOptions) -> str:
-    """Advice after a solver did not converge."""
-    return "there is no result. Look for a reading with a wrong sign or in a wrong row first" + (
-        "" if options.loss.robust else "; with the loss 'huber' it may be named"
+def advise(options: SolverOptions) -> str:
+    """Advice after a solver did not converge, or converged to an impossible machine."""
+    return "Look for a reading with a wrong sign or in a wrong row" + (
+        "" if options.loss.robust else "; the robust loss ('huber') may show which one"
     )

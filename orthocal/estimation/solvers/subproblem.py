@@ -15,7 +15,7 @@ from orthocal.errors import SolverError
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.program import Solution, SolverInput, scaled_bounds
-from orthocal.observation.model import Linearisation
+from orthocal.observation.model import ReadingLinearisation
 
 SETTLED_WITHIN = 1e-11
 """Last step of a subproblem with a robust loss, [prior std]."""
@@ -59,7 +59,7 @@ class Task:
     def __init__(self, problem: CalibrationProblem, loss: Loss, readings: SolverInput) -> None:
         self.problem, self.loss, self.readings = problem, loss, readings
         self.sigma, self.weights = readings.sigma, readings.weights
-        self.low, self.high = scaled_bounds(problem, readings.held)
+        self.low, self.high = scaled_bounds(problem, readings.prescribed)
 
     def clip(self, theta: Array) -> Array:
         """θ̂ within the bounds, shape (n_free,) of free parameters in SI."""
@@ -80,7 +80,7 @@ class Task:
         at_bound = np.zeros(state.theta.size, dtype=np.int8)
         at_bound[(state.theta <= self.low) & (gradient > 0.0)] = -1
         at_bound[(state.theta >= self.high) & (gradient < 0.0)] = 1
-        at_bound[list(self.readings.held)] = 0
+        at_bound[list(self.readings.prescribed)] = 0
         return Solution(
             theta=state.theta * self.problem.theta_scale,
             zeros=state.zeros * self.sigma,
@@ -106,7 +106,7 @@ class Task:
             theta, closed, (self.readings.values - problem.predict(si, closed)) / self.sigma
         )
 
-    def begin(self) -> tuple[State, Linearisation]:
+    def begin(self) -> tuple[State, ReadingLinearisation]:
         """The problem at the start of a solver.
 
         Raises:
@@ -118,11 +118,11 @@ class Task:
             self.clip(self.readings.start),
             self.readings.start_passive,
         )
-        at_reference = np.array_equal(at * problem.theta_scale, problem.reference)
+        at_reference = np.array_equal(at * problem.theta_scale, problem.active_theta)
         if passive is None and at_reference:
-            passive = problem.reference_passive
+            passive = problem.active_passive
         else:
-            first = problem.reference_passive if passive is None else passive
+            first = problem.active_passive if passive is None else passive
             passive = problem.close(at * problem.theta_scale, start=first)
         linear = self.linearise(at, passive)
         if not np.isfinite(linear.jacobian).all():
@@ -134,11 +134,11 @@ class Task:
             )
         return self.near(at, passive, linear), linear
 
-    def linearise(self, theta: Array, passive: Array) -> Linearisation:
+    def linearise(self, theta: Array, passive: Array) -> ReadingLinearisation:
         """Readings to first order about some θ̂ and passive coordinates near closed loops."""
-        return self.problem.linearisation(theta * self.problem.theta_scale, passive)
+        return self.problem.linearise(theta * self.problem.theta_scale, passive)
 
-    def near(self, theta: Array, passive: Array, linear: Linearisation) -> State:
+    def near(self, theta: Array, passive: Array, linear: ReadingLinearisation) -> State:
         """The problem at some θ̂, with loops closed to first order."""
         predicted = linear.reading + linear.opening
         return self._state(theta, passive, (self.readings.values - predicted) / self.sigma)

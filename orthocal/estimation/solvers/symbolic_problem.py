@@ -61,7 +61,9 @@ class SymbolicProblem:
     def __init__(self, problem: CalibrationProblem) -> None:
         self.problem = problem
         self.error_map = SymbolicErrorMap(
-            problem.functions.errors, fixed=problem.closure.errors(), columns=problem.columns
+            problem.functions.errors,
+            fixed=problem.closure.errors(),
+            columns=problem.errors_per_theta,
         )
         n_command = problem.states.commands.shape[1]
         self.command = ca.SX.sym("command", n_command)

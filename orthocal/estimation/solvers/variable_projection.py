@@ -14,9 +14,9 @@ import numpy as np
 from orthocal.arrays import Array, Mask
 from orthocal.errors import ClosureError, SolverError
 from orthocal.estimation.problem import LENGTH_SCALE
-from orthocal.estimation.solvers.program import Program, Solution, SolverInput, no_convergence
+from orthocal.estimation.solvers.program import Program, Solution, SolverInput, advise
 from orthocal.estimation.solvers.subproblem import State, Task
-from orthocal.observation.model import Linearisation
+from orthocal.observation.model import ReadingLinearisation
 
 SETTLED = 1e-8
 """Estimated next step at which the solver has converged, extrapolated from the ratio of the last
@@ -50,7 +50,7 @@ class VariableProjection(Program):
         return task.solution(state, jacobian, passive=state.passive, iterations=iterations)
 
     def _descend(
-        self, task: Task, begin: tuple[State, Linearisation], *, follow: bool
+        self, task: Task, begin: tuple[State, ReadingLinearisation], *, follow: bool
     ) -> tuple[State, Array, int]:
         """Gauss-Newton iterations: the optimum, the last Jacobian and the number of iterations.
 
@@ -86,14 +86,14 @@ class VariableProjection(Program):
             linear = task.linearise(state.theta, state.passive)
         raise SolverError(
             f"did not converge: the step is still {sizes[0]:.2g} prior standard deviations "
-            f"after {most} iterations; {no_convergence(self.options)}",
+            f"after {most} iterations; there is no result. {advise(self.options)}",
             status="Maximum_Iterations_Exceeded",
             iterations=most,
         )
 
     def _follow(
-        self, task: Task, state: State, linear: Linearisation, step: Array
-    ) -> tuple[State, Linearisation] | None:
+        self, task: Task, state: State, linear: ReadingLinearisation, step: Array
+    ) -> tuple[State, ReadingLinearisation] | None:
         """A full step with passive joints that follow it; None if the loops open too far."""
         theta = np.clip(state.theta + step, task.low, task.high)
         passive = state.passive + linear.follow(theta - state.theta)
@@ -124,7 +124,8 @@ class VariableProjection(Program):
             if np.abs(part).max(initial=0.0) < SETTLED:
                 return state, np.zeros_like(step)
         raise SolverError(
-            f"did not converge: no step makes it better; {no_convergence(self.options)}",
+            "did not converge: no step makes it better; there is no result. "
+            f"{advise(self.options)}",
             status="Restoration_Failed",
             iterations=MOST_HALVINGS,
         )

@@ -212,9 +212,9 @@ def test_errors_that_make_no_machine_are_refused(readings):
     fit = fit_problem(build_problem(readings, model="offsets"))
     absurd = replace(fit.solution, theta=np.array([0.3, 0.0, 0.0]))
     with pytest.raises(SolverError, match="are impossible: posture 'zero' cannot be reached"):
-        require_assembly(fit.problem, absurd, robust=False)
+        require_assembly(fit.problem, absurd, options=SolverOptions())
     with pytest.raises(SolverError) as caught:
-        require_assembly(fit.problem, absurd, robust=True)
+        require_assembly(fit.problem, absurd, options=SolverOptions(loss=Loss("huber")))
     assert "huber" not in str(caught.value)
 
 

@@ -11,13 +11,13 @@ from orthocal import Choice, calibrate, simulate_session
 from orthocal.assessment.judgement import RARE
 from orthocal.calibration import build_record as recording
 from orthocal.estimation.diagnostics.unmodelled import (
-    find_other_errors,
+    find_unmodelled_errors,
     machine_errors,
-    measure_unmodelled,
+    propagate_unmodelled,
 )
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.statistics.distributions import chi_square_tail
 from orthocal.statistics.zeros import project_out_zeros
@@ -29,7 +29,7 @@ def test_an_unmodelled_error_moves_the_estimate_by_its_leakage(exact_plan, name,
     """Perfect readings of a machine with one small error, calibrated without it."""
     probe = simulate_session(exact_plan, {}, exact=True).session
     fit = fit_problem(build_problem(probe, model=model))
-    found, _ = measure_unmodelled(fit, find_other_errors(fit))
+    found, _ = propagate_unmodelled(fit, find_unmodelled_errors(fit))
     if name not in found.names:
         assert (model, name) == ("lengths", "y_coupler.x")  # the length of the leg has it
         return
@@ -53,7 +53,7 @@ def machines(exact_plan):
     drawn = rng.normal(size=(1000, others.n_free)) * others.theta_scale
     values, _, reached = others.simulate(drawn)
     assert reached.all()
-    theta = BatchProgram(offsets).solve(values, sigma=1e-5).theta
+    theta = BatchSolver(offsets).solve(values, sigma=1e-5).theta
     found, _, reached = offsets.simulate(theta)
     assert reached.all()
     left = [project_out_zeros(r, offsets.observations) for r in values - found]
@@ -130,7 +130,7 @@ def test_intervals_hold_what_they_say_with_all_errors_at_their_tolerances(
     """
     machines = DrawnMachines(exact_plan, model=model)
     # they hardly change from machine to machine, and take longest to find
-    monkeypatch.setattr(recording, "find_other_errors", lambda *_, **__: machines.others)
+    monkeypatch.setattr(recording, "find_unmodelled_errors", lambda *_, **__: machines.others)
     known = machines.machine.free
     free = [known.index(n) if n in known else -1 for n in machines.problem.free]
     hits, scatter_hits, count = 0, 0, 0

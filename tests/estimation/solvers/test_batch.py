@@ -10,7 +10,7 @@ from orthocal import load_session
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.batch import BatchProgram
+from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 
@@ -49,8 +49,8 @@ def test_each_set_has_the_optimum_that_it_has_alone(root, loss, given):
     problem = build_problem(session, model="offsets", **given)
     options = SolverOptions(loss=Loss(loss))
     values, _ = draw(problem)
-    found = BatchProgram(problem, options=options).solve(values, sigma=SIGMA)
-    assert "bounds" in given or not found.alone.any()
+    found = BatchSolver(problem, options=options).solve(values, sigma=SIGMA)
+    assert "bounds" in given or not found.solved_alone.any()
     # far beyond its bounds Ipopt does not find the optimum of a robust loss
     ipopts = 0 if "bounds" in given and loss == "huber" else 2
     for kind, few in ((VariableProjection, SHOWN), (NonlinearProgram, ipopts)):
@@ -76,8 +76,8 @@ def test_many_parameters_are_solved_at_once(sweep, loss):
     options = SolverOptions(loss=Loss(loss))
     values, _ = draw(sweep, spread=1.0)
     values[:, 3] += 40e-6  # an outlier in each set
-    found = BatchProgram(sweep, options=options).solve(values, sigma=SIGMA)
-    assert not found.alone.any()
+    found = BatchSolver(sweep, options=options).solve(values, sigma=SIGMA)
+    assert not found.solved_alone.any()
     program = VariableProjection(sweep, options=options)
     for i in (0, 3):
         alone = program.solve(sigma=SIGMA, values=values[i])
@@ -95,26 +95,26 @@ def test_a_bound_or_a_machine_far_off_is_solved_alone(root):
     problem = build_problem(session, model="full", bounds=bounds)
     values, truth = draw(problem)
     values[3] += 2e-3 * np.sin(np.arange(values.shape[1]))  # hardly a machine reads like this
-    found = BatchProgram(problem).solve(values, sigma=SIGMA)
+    found = BatchSolver(problem).solve(values, sigma=SIGMA)
     held = np.abs(truth[:, 0]) > 1.2e-3
     assert held.any()
-    assert found.alone[held].all()
-    assert not found.alone.all()
+    assert found.solved_alone[held].all()
+    assert not found.solved_alone.all()
     assert (found.at_bound[held, 0] != 0).all()
     program = VariableProjection(problem)
-    for i in (3, int(np.flatnonzero(held)[0]), int(np.flatnonzero(~found.alone)[0])):
+    for i in (3, int(np.flatnonzero(held)[0]), int(np.flatnonzero(~found.solved_alone)[0])):
         alone = program.solve(sigma=SIGMA, values=values[i])
         assert np.abs((alone.theta - found.theta[i]) / problem.theta_scale).max() < AGREED
 
 
 def test_a_set_is_solved_alike_beside_any_others(sweep):
     values, _ = draw(sweep, spread=0.5, sets=4)
-    together = BatchProgram(sweep).solve(values, sigma=SIGMA)
+    together = BatchSolver(sweep).solve(values, sigma=SIGMA)
     for i in range(4):
-        alone = BatchProgram(sweep).solve(values[i : i + 1], sigma=SIGMA)
+        alone = BatchSolver(sweep).solve(values[i : i + 1], sigma=SIGMA)
         apart = np.abs(alone.theta[0] - together.theta[i]) / sweep.theta_scale
         assert apart.max() < 1e-11  # sums of a product may be added in another order
-        assert not alone.alone.any()
+        assert not alone.solved_alone.any()
 
 
 def test_a_set_far_from_the_others_is_solved_as_well(root):
@@ -123,5 +123,5 @@ def test_a_set_far_from_the_others_is_solved_as_well(root):
     values, _ = draw(problem, spread=0.01, sets=60)
     values = np.tile(values, (8, 1))
     values[7] = problem.predict(np.full(3, 2.0) * problem.theta_scale)
-    found = BatchProgram(problem).solve(values, sigma=SIGMA)
+    found = BatchSolver(problem).solve(values, sigma=SIGMA)
     assert np.abs(found.theta[7] / problem.theta_scale - 2.0).max() < AGREED

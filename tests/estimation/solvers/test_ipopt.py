@@ -13,7 +13,7 @@ from tolerances import DERIVATIVE, SAME_OPTIMUM, TRUTH_BACK
 
 from orthocal import load_plan, load_session, simulate_session
 from orthocal.errors import OrthocalError, SolverError
-from orthocal.estimation.linear import linearise_at_reference
+from orthocal.estimation.linear import linearise_problem
 from orthocal.estimation.loss import SQUARES, Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import LENGTH_SCALE, build_problem
@@ -124,7 +124,7 @@ def test_perfect_data_give_the_truth_back_from_any_start(perfect, hessian):
 def test_both_hessians_reach_the_same_optimum(exact_plan, model, loss):
     session = simulate_session(exact_plan, TRUTH, seed=3).session
     problem = build_problem(session, model=model)
-    start = linearise_at_reference(problem).solve(sigma=1e-5)  # whence fits start by themselves
+    start = linearise_problem(problem).solve(sigma=1e-5)  # whence fits start by themselves
     found = [
         NonlinearProgram(problem, options=SolverOptions(hessian=h, loss=loss)).solve(
             sigma=1e-5, start=start
@@ -146,7 +146,7 @@ def test_another_solver_finds_the_same(exact_plan, model):
     def residuals(theta_hat):
         left = problem.values - problem.predict(theta_hat * problem.theta_scale)
         whitened = project_out_zeros(left, problem.observations) / 1e-5
-        return np.r_[whitened, theta_hat * problem.prior]
+        return np.r_[whitened, theta_hat * problem.has_prior]
 
     other = least_squares(
         residuals, np.zeros(problem.n_free), jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-12
@@ -168,12 +168,12 @@ def test_where_gauss_newton_does_not_converge_the_exact_hessian_does(root):
     session = load_session(root / "examples/table1/experiment-1-printed")
     problem = build_problem(session, model="full")
     program, sigma = NonlinearProgram(problem, options=SolverOptions(loss=HUBER)), 2e-5
-    solution = program.solve(sigma=sigma, start=linearise_at_reference(problem).solve(sigma=sigma))
+    solution = program.solve(sigma=sigma, start=linearise_problem(problem).solve(sigma=sigma))
     assert solution.hessian == "exact"
-    prediction, jacobian = problem.linearise(solution.theta, solution.passive)
+    prediction, jacobian = problem.predict_and_jacobian(solution.theta, solution.passive)
     residual = problem.values - prediction - solution.zeros[problem.observations.zero]
     pulls = -jacobian * HUBER.influence(residual / sigma)[:, None] / sigma
-    slope = pulls.sum(axis=0) + problem.prior * solution.theta / problem.theta_scale
+    slope = pulls.sum(axis=0) + problem.has_prior * solution.theta / problem.theta_scale
     assert np.abs(slope).max() < DERIVATIVE * np.abs(pulls).sum(axis=0).max()
 
 

@@ -16,7 +16,7 @@ from orthocal.estimation.fit import build_program
 from orthocal.estimation.linear import (
     SIX_ROWS,
     leg_parallelism_matrix,
-    linearise_at_reference,
+    linearise_problem,
     solve_equation_8,
 )
 from orthocal.estimation.loss import Loss
@@ -99,7 +99,7 @@ def test_the_linearised_solver_is_least_squares_about_what_the_controller_correc
     """As SciPy's bounded least squares on stacked rows has it."""
     problem = problem_of(example, model, choice)
     found = LinearisedProgram(problem).solve(sigma=20e-6)
-    expected = linearise_at_reference(problem).solve(sigma=20e-6)
+    expected = linearise_problem(problem).solve(sigma=20e-6)
     assert np.abs(found.theta - expected).max() < 1e-9 * problem.theta_scale.max()
     assert np.abs(problem.close(found.theta) - found.passive).max() < 1e-12
 
@@ -125,11 +125,11 @@ def test_the_linearised_solver_takes_a_robust_loss(root):
     options = SolverOptions(solver="linearised", loss=loss)
     found = LinearisedProgram(problem, options=options).solve(sigma=sigma)
     squares = LinearisedProgram(problem).solve(sigma=sigma)
-    prediction, jacobian = problem.linearise(problem.reference)
+    prediction, jacobian = problem.predict_and_jacobian(problem.active_theta)
     o, scale = problem.observations, problem.theta_scale
 
     def cost(theta, zeros):
-        left = problem.values - prediction - jacobian @ ((theta - problem.reference) / scale)
+        left = problem.values - prediction - jacobian @ ((theta - problem.active_theta) / scale)
         off = problem.prior_precision * (theta - problem.prior_mean) / scale
         return loss.value((left - zeros[o.zero]) / sigma).sum() + 0.5 * off @ off
 
