@@ -217,7 +217,7 @@ def test_command_line(command, tmp_path):
     assert "The program's coordinates are read as machine coordinates." in err
     code, out, err = command(PROGRAM, "--offsets", "active", "--work-offset-mm", "10,0,-5")
     assert code == 0
-    assert "active during the measurement: x_slide +0.0000 mm" in err
+    assert "active during the measurement: x_slide +0.000 mm" in err
     wanted = np.array([11.0, 2.0, -2.0]) * 1e-3
     machine = command.calibration
     expected = nominal_closure(machine.robot).forward(machine.machine.inverse(wanted))

@@ -105,7 +105,7 @@ def test_a_machine_is_made_again_from_its_sizes_in_one_place(tmp_path):
     ("old", "new", "message"),
     [
         ("leg_mm: 250", "leg_mm: 0.25", "machine.yaml: leg_mm: legs of 0.25 mm; expected 20 to"),
-        ("[100, 320]", "[100, 240]", "machine.yaml: travel_mm: travel from 100 to 240 mm; exp"),
+        ("[100, 320]", "[100, 240]", "machine.yaml: travel_mm: travel from 100 to 240 mm does not"),
         ("[100, 320]", "[100]", "machine.yaml: travel_mm"),
         ("leg_mm: 250", "leg_mm: long", "machine.yaml: leg_mm"),
         ("counts: down", "counts: left", "machine.yaml: joints.y_slide.counts"),
