@@ -142,7 +142,7 @@ CALIBRATE = f"calibrate {EXPERIMENT}"
         ("docs/results.md", "Calibration of orthoglide", f"{CALIBRATE} --out out/experiment-2"),
         ("docs/results.md", "Parameters\n", f"{CALIBRATE} --details"),
         ("docs/results.md", "Tool error\n", f"{CALIBRATE} --details"),
-        ("docs/results.md", "Findings\n", f"compare {EXPERIMENT}"),
+        ("docs/results.md", "Recommended model", f"compare {EXPERIMENT}"),
         (
             "docs/planning.md",
             "Expected tool error",
