@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -209,10 +210,11 @@ PROGRAM = "G21 G0 X1 Y2 Z3\r\nG1 X5 F100 (\xe9)\r\n"
 
 
 def test_command_line(command, tmp_path):
-    """Offsets alone need a correction only until they are entered."""
+    """Offsets alone need a correction only until they are entered, to 1 µm."""
     code, out, err = command(PROGRAM)
     assert code == 0
-    assert out.splitlines()[0] == "G21 G0 X1.0000 Y2.0000 Z3.0000"
+    found = re.fullmatch(r"G21 G0 X(\S+) Y(\S+) Z(\S+)", out.splitlines()[0])
+    assert [float(v) for v in found.groups()] == pytest.approx([1.0, 2.0, 3.0], abs=1e-3)
     assert "For a controller with the offsets to enter: x_slide -0.5" in err
     assert "The program's coordinates are read as machine coordinates." in err
     code, out, err = command(PROGRAM, "--offsets", "active", "--work-offset-mm", "10,0,-5")
