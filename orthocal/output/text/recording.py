@@ -215,7 +215,10 @@ class RecordingText:
         else:
             where = f" ({spans(parts[-1], 'line')})" if parts else ""
         kind = finding.kind.capitalize()
-        return self.wrap(f"{kind}{where}: {finding.words}", indent="  ", first="! ")
+        head, *causes = f"{kind}{where}: {finding.words}".split("\n")
+        lines = [self.wrap(head, indent="  ", first="! ")]
+        lines += [self.wrap(cause.strip(), indent="      ", first="    ") for cause in causes]
+        return "\n".join(lines)
 
     def resolved(self, findings: Sequence[Finding]) -> str:
         """Warnings that the readings no longer support."""
