@@ -1,4 +1,8 @@
-"""Linear identification: the paper's equation (8), and the linearised solution of any problem."""
+"""Linear identification: equation (8) of the paper, and the linearised solution of any problem.
+
+The paper is Pashkevich, Chablat and Wenger, Kinematic calibration of Orthoglide-type mechanisms,
+2006.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +25,9 @@ TWELVE_ROWS = tuple(
     for sign in "+-"
     for row in rows
 )
-"""Rows of equation (8): direction, leg, and + or − for maximum or minimum less zero posture.
+"""Rows of equation (8): direction, leg, and sign.
 
+"+" is the posture of the maximum minus that at zero, "-" that of the minimum minus that at zero.
 The last block is (Δx_z, Δz_x).
 """
 
@@ -38,7 +43,7 @@ def leg_parallelism_matrix(
     rows: Literal[6, 12] = 12,
     fraction_from_tcp: float = 0.5,
 ) -> Array:
-    """Coefficients of equation (8), readings by offsets.
+    """Jacobian of differences of readings by the drive offsets, equation (8).
 
         Δy_x = c Δρ_x + b Δρ_y,  b = sin α,  c = (1 − μ + sin α) tan α
 
@@ -48,9 +53,10 @@ def leg_parallelism_matrix(
         length: Leg length L, [m].
         displacement_max: Displacement of the tool in the maximum postures, [m].
         displacement_min: Displacement in the minimum postures, negative, [m].
-        rows: 12 for differences from the zero posture (order TWELVE_ROWS), 6 for maximum less
+        rows: 12 for differences from the mechanical zero (order TWELVE_ROWS), 6 for maximum less
             minimum (order SIX_ROWS).
-        fraction_from_tcp: μ, where the gauge touches the leg in the zero posture: 0 at the tool.
+        fraction_from_tcp: μ, where the gauge touches the leg in the mechanical zero: 0 at the
+            tip, 1 at the root of the leg.
 
     Returns:
         Shape (rows, 3), [m/m].
@@ -93,11 +99,12 @@ class LinearFit:
     """Δρ, shape (3,), [m]."""
     residuals: Array
     """y − A Δρ, shape (rows,), [m]."""
-    covariance: Array
-    """Covariance of the offsets for readings of the covariance given, shape (3, 3)."""
+    cofactor: Array
+    """(Aᵀ V⁻¹ A)⁻¹, shape (3, 3), [1]: times `sigma`² it is the covariance of the offsets."""
     sigma: float
-    """√(Σ r²/(rows − 3)) of a row, or for generalised least squares of a reading, [m]."""
+    """√(rᵀ V⁻¹ r/(rows − 3)), V = I for ordinary least squares, [m]; NaN for three rows."""
     dof: int
+    """Degrees of freedom: rows − 3."""
 
 
 def solve_equation_8(
@@ -108,7 +115,7 @@ def solve_equation_8(
     Args:
         matrix: From `leg_parallelism_matrix`, shape (rows, 3).
         differences: Measured differences, shape (rows,), [m].
-        covariance: Covariance of the rows up to a factor, shape (rows, rows).
+        covariance: V, covariance of the rows up to a factor, shape (rows, rows).
 
     Raises:
         NotIdentifiableError: If the rows do not determine the three offsets.
@@ -131,7 +138,7 @@ def solve_equation_8(
     return LinearFit(
         offsets=offsets,
         residuals=residuals,
-        covariance=inverse @ inverse.T,
+        cofactor=inverse @ inverse.T,
         sigma=float(np.sqrt(weighted @ weighted / dof)) if dof > 0 else float("nan"),
         dof=dof,
     )
@@ -143,13 +150,15 @@ class LinearProblem:
 
     problem: CalibrationProblem
     residual: Array
-    """y − h, gauge zeros eliminated, shape (n_entries,), [m]."""
+    """y − h, gauge zeros eliminated, shape (n_entries,), [m of the first gauge]."""
     jacobian: Array
-    """dh/dθ̂, gauge zeros eliminated, shape (n_entries, n_free), [m per prior std]."""
+    """dh/dθ̂, gauge zeros eliminated, shape (n_entries, n_free), [m of the first gauge per prior
+    std]."""
     information: Information
+    """Information of that Jacobian."""
 
     def solve(self, *, sigma: float, use: Mask | None = None) -> Array:
-        """First-order solution: generalised least squares with the problem's prior and bounds.
+        """First-order solution: least squares with the problem's prior and bounds.
 
         Args:
             sigma: Standard deviation of one reading, [m]; used only with a prior.
@@ -186,13 +195,13 @@ def linearise_problem(problem: CalibrationProblem) -> LinearProblem:
     """Linearise a problem about the active offsets of the controller.
 
     Raises:
-        ClosureError: If the reference machine cannot reach a posture.
-        SessionError: If a sensor has no reading in one.
+        ClosureError: If a posture cannot be reached with the active offsets.
+        SessionError: If a predicted reading or its derivative is not finite.
     """
     prediction, jacobian = problem.predict_and_jacobian(
         problem.active_theta, problem.active_passive
     )
-    _require_numbers(problem, prediction, jacobian)
+    _require_finite(problem, prediction, jacobian)
     return LinearProblem(
         problem,
         project_out_zeros(problem.values - prediction, problem.observations),
@@ -201,8 +210,8 @@ def linearise_problem(problem: CalibrationProblem) -> LinearProblem:
     )
 
 
-def _require_numbers(problem: CalibrationProblem, prediction: Array, jacobian: Array) -> None:
-    """Refuse predictions that are not finite: a tip touches nothing, or a sensor is wrong."""
+def _require_finite(problem: CalibrationProblem, prediction: Array, jacobian: Array) -> None:
+    """Refuse predictions that are not finite, such as of a tip that does not touch its rod."""
     bad = np.flatnonzero(~(np.isfinite(prediction) & np.isfinite(jacobian).all(axis=1)))
     if not bad.size:
         return
@@ -210,7 +219,7 @@ def _require_numbers(problem: CalibrationProblem, prediction: Array, jacobian: A
     setup = list(session.setups)[o.setup[bad[0]]]
     posture = list(session.postures)[o.posture[bad[0]]]
     raise SessionError(
-        f"the sensor shows nothing in posture '{posture}' on the machine as the controller knows "
-        "it, or what moves it has no derivative there",
+        f"the predicted reading in posture '{posture}' or its derivative is not finite, for the "
+        "nominal machine with the active offsets; check that the tip touches the rod there",
         where=f"{session.path or 'session'}: setups.{setup}",
     )

@@ -30,6 +30,8 @@ HUBER_WIDTH = 1.345
 """k at which the estimate is about 95 % as efficient as by squares if all residuals are normal."""
 
 MOST_STEPS = 100
+"""Largest number of steps of a search for a centre."""
+
 SETTLED = 1e-11
 """Last step of a search for a centre, [standard deviations]."""
 

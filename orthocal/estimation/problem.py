@@ -1,9 +1,10 @@
 """The calibration problem: free parameters with their priors, readings, and their prediction.
 
     min over θ, z, q_1..q_K   Σ ρ((y − h(q_k, θ) − z)/σ) + ½ Σ ((θ − mean)/prior std)²
-    s.t.                      g(q_k, θ) = 0 for every posture k
+    s.t.                      g(q_k, θ) = 0 for every state k,  lower ≤ θ ≤ upper
 
-θ holds errors of the machine and nuisance parameters of the sensors; a known gauge zero z is 0.
+A state is a posture under one set of conditions. θ holds errors of the machine and nuisance
+parameters of the sensors; a known gauge zero z is 0.
 """
 
 from __future__ import annotations
@@ -32,26 +33,37 @@ from orthocal.session.session import Session
 LENGTH_SCALE = 1e-3
 """Scale of closures, passive motions and gauge zeros, [m]."""
 
+ROW_RANK_TOLERANCE = 1e-8
+"""Singular value below which a row of the closures depends on others, [m per m or rad]."""
+
 
 class CalibrationProblem:
     """Readings of a session and the parameters to estimate from them.
 
-    The free parameters are errors of the machine, then nuisance parameters of the sensors. An entry
-    is one reading; a difference has two. Entries are scaled by the ratio of their noise to that of
-    the first gauge ("metres of the first gauge"), so that all have equal standard deviations. With
-    one gauge they are in metres.
+    The free parameters are errors of the machine, then nuisance parameters of the sensors, as
+    deviations from the manual alignment. An entry is a single reading; a difference has two.
+    Readings are divided by the ratio of their gauge's noise to that of the first gauge ("metres of
+    the first gauge"), so that all have equal standard deviations. With one gauge they are
+    in metres.
 
     Args:
         session: The session, or several joined ones.
         selection: The free errors of the machine and their priors.
-        noise: Standard deviation of each entry's readings, as a multiple of the first gauge's,
+        noise_ratio: Noise of each entry's gauge divided by that of the first gauge,
             shape (n_entries,); 1 by default.
 
     Attributes:
+        session: The session.
+        robot: Its robot.
+        machine_selection: The argument `selection`.
+        selection: It with the nuisance parameters appended.
+        parameters: Its free parameters.
+        states: Loop closures to solve.
+        passive_scale: One unit of each scaled passive coordinate, shape (n_passive,), [m, rad].
         free: Names of the free parameters, which are the columns of the Jacobian.
         fixed: Name to value of parameters that are known, [SI].
         observations: Setup, posture and zero of each entry.
-        noise: The argument.
+        noise_ratio: The argument.
         theta_scale: Prior standard deviations of the free parameters, shape (n_free,), [SI].
         prior_precision: 1 for a free parameter with a prior, otherwise 0, shape (n_free,),
             [1 per prior std²].
@@ -121,15 +133,14 @@ class CalibrationProblem:
 
     @property
     def n_states(self) -> int:
-        """Number of loop closures: postures, or postures under different conditions."""
+        """Number of states: postures, or postures under different conditions."""
         return self.states.posture.size
 
     @cached_property
     def active_theta(self) -> Array:
-        """Active offsets of the controller as parameters, shape (n_free,), [SI].
+        """Free parameters at the active offsets of the controller, shape (n_free,), [SI].
 
-        The point of linearisation and the default start: nominal where the controller has no
-        offsets.
+        All others are 0. Clipped to the bounds. The point of linearisation and the default start.
         """
         active = dict(
             zip(
@@ -165,13 +176,14 @@ class CalibrationProblem:
         start: Array | None = None,
         failures: Failures | None = None,
     ) -> Array:
-        """Passive coordinates of every posture, with its loops closed.
+        """Passive coordinates of every state, with its loops closed.
 
         Args:
-            theta: Shape (n_free,), or (S, n_free) for a batch, [SI]; or those of the machine.
-            start: Passive coordinates to start from; the reference by default.
-            failures: Filled with the postures that cannot be reached, which are NaN then (see
-                `LoopClosure.close`); by default the first of them raises.
+            theta: Shape (n_free,), or (S, n_free) for a batch, [SI]; n_machine values suffice.
+            start: Passive coordinates to start from; those at the active offsets by default.
+            failures: Filled with the flat indices s · n_states + k of states that cannot be
+                reached, which are NaN then (see `LoopClosure.close`); by default the first of them
+                raises.
 
         Returns:
             Shape (n_states, n_passive), with S in front for a batch, [m, rad].
@@ -223,12 +235,12 @@ class CalibrationProblem:
 
     @cached_property
     def linearisation_at_active(self) -> ReadingLinearisation:
-        """Readings to first order about the reference."""
+        """Readings to first order about the active offsets."""
         return self.linearise(self.active_theta, self.active_passive)
 
     @cached_property
     def _active_passive_or_none(self) -> Array | None:
-        """The reference, where it reaches all postures."""
+        """`active_passive`; None if a posture cannot be reached with the active offsets."""
         try:
             return self.active_passive
         except ClosureError:
@@ -236,18 +248,18 @@ class CalibrationProblem:
 
     @cached_property
     def active_passive(self) -> Array:
-        """Passive coordinates of every posture at the reference, (n_states, n_passive).
+        """Passive coordinates at the active offsets, shape (n_states, n_passive), [m, rad].
 
         Raises:
-            ClosureError: If the reference machine cannot reach a posture.
+            ClosureError: If a posture cannot be reached with the active offsets.
         """
         return self._close(self.active_theta, None)
 
     def nuisance_values(self, theta: ArrayLike) -> Array:
-        """Nuisance parameters with the manual alignment, shape (..., n_nuisance), [SI].
+        """Nuisance parameters: manual alignment plus deviations, shape (..., n_nuisance), [SI].
 
         Args:
-            theta: Shape (..., n_free), [SI], or those of the machine.
+            theta: Shape (..., n_free), [SI]; or (..., n_machine), with deviations of 0.
         """
         deviations = np.asarray(theta, dtype=np.float64)[..., self.n_machine :]
         aligned = self.model.alignment(self.elementary_errors(theta))
@@ -261,7 +273,8 @@ class CalibrationProblem:
         """Predicted readings h(q(θ), θ) of all entries, gauge zeros at 0.
 
         Args:
-            theta: Shape (n_free,), or (S, n_free) for a batch, [SI]; or those of the machine.
+            theta: Shape (n_free,), or (S, n_free) for a batch, [SI]; with n_machine values the
+                nuisance parameters have their values of the manual alignment.
             passive: Passive coordinates with closed loops at theta, with S in front for a batch;
                 solved here by default.
 
@@ -328,7 +341,7 @@ class CalibrationProblem:
         )
 
     def error_values(self, theta: ArrayLike) -> dict[str, float]:
-        """Errors of the machine, free and fixed: name to value, [SI]."""
+        """Name to value of the machine's error parameters, free and known, [SI]."""
         names, values = self.machine_selection.names, self._of_machine(theta).tolist()
         return {**self.fixed, **dict(zip(names, values, strict=True))}
 
@@ -346,7 +359,7 @@ class CalibrationProblem:
 
     @property
     def functions(self) -> RobotFunctions:
-        """The functions of the robot."""
+        """Compiled kinematics and their derivatives."""
         return self.model.functions
 
     @cached_property
@@ -355,7 +368,7 @@ class CalibrationProblem:
 
     @cached_property
     def errors_per_theta(self) -> Array:
-        """Elementary errors of one prior std of each machine parameter, (n_errors, n_machine)."""
+        """Elementary errors per unit of θ̂, shape (n_errors, n_machine), [SI]."""
         selection = self.machine_selection
         return self.functions.errors.columns(selection.names) * selection.prior_stds
 
@@ -385,7 +398,9 @@ def build_problem(
 
 @cached_per_robot(maxsize=8)
 def _require_independent_rows(robot: Robot) -> None:
-    """Refuse closures with dependent rows, which are inconsistent as constraints.
+    """Refuse closures with dependent rows.
+
+    They are redundant for the nominal machine and contradict each other for one with errors.
 
     Raises:
         RobotError: Naming the closures and the rows.
@@ -398,7 +413,7 @@ def _require_independent_rows(robot: Robot) -> None:
     dependent = []
     for name, row in zip(rows, by_passive, strict=True):
         trial = np.vstack([independent, row])
-        if np.linalg.matrix_rank(trial, tol=1e-8) == len(trial):
+        if np.linalg.matrix_rank(trial, tol=ROW_RANK_TOLERANCE) == len(trial):
             independent = trial
         else:
             dependent.append(name)

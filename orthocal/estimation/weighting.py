@@ -1,4 +1,4 @@
-"""Weights of the readings of several gauges by their noise.
+"""Noise ratios of the readings of several gauges.
 
 The noise of each gauge is estimated from its repeated cycles, otherwise from its residuals
 (variance components, Förstner, Ein Verfahren zur Schätzung von Varianz- und Kovarianzkomponenten,
@@ -36,7 +36,7 @@ class GaugeReadings:
     name: str
     gauge: Gauge
     entries: Mask
-    """Shape (n_entries,)."""
+    """Mask of its entries, shape (n_entries,)."""
 
 
 def split_by_gauge(session: Session, observations: Observations) -> tuple[GaugeReadings, ...]:
@@ -88,8 +88,8 @@ def estimate_gauge_sigmas(
         observations: Which setup, posture and zero each entry has.
         residual: Residuals, gauge zeros eliminated, shape (n_entries,), [m].
         leverage: Leverage of each entry, shape (n_entries,).
-        values: Readings as single ones, shape (n_entries,), [m].
-        sigma: Standard deviations in the present weights, shape (n_entries,), [m]; kept for gauges
+        values: Readings of the entries, shape (n_entries,), [m].
+        sigma: Standard deviations in the present solution, shape (n_entries,), [m]; kept for gauges
             with too few readings.
     """
     result = np.array(sigma)
@@ -122,10 +122,10 @@ def leverages(
     """Leverage of each entry, shape (n_entries,); the sum is the effective number of parameters.
 
     Args:
-        jacobian: dh/dθ̂, shape (n_entries, n_free), [m per prior std].
+        jacobian: dh/dθ̂, shape (n_entries, n_free), [m of the first gauge per prior std].
         observations: Which zero each entry has.
         covariance: Covariance of θ̂, shape (n_free, n_free).
-        sigma: Standard deviation of a reading, [m].
+        sigma: Standard deviation of a reading of the first gauge, [m].
     """
     centred = project_out_zeros(jacobian, observations)
     return np.asarray(((centred @ covariance) * centred).sum(axis=1) / sigma**2)

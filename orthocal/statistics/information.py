@@ -88,11 +88,11 @@ class Information:
     def effective_parameters(
         self, *, sigma: float, precision: Array, at_bound: Mask | None = None
     ) -> float:
-        """Effective number of parameters, n − tr(P cov): the rank without a prior.
+        """Effective number of parameters, n − tr(P⁻¹ cov): the rank without a prior.
 
         Args:
             sigma: Standard deviation of one reading, [m].
-            precision: Diagonal of P: 1 or 0, shape (n_free,).
+            precision: Diagonal of P⁻¹: 1 or 0, shape (n_free,).
             at_bound: Mask of the parameters at a bound.
         """
         count = 0 if at_bound is None else int(at_bound.sum())
@@ -109,14 +109,14 @@ class Information:
         at_bound: Mask | None = None,
         loss: tuple[float, float] = (1.0, 1.0),
     ) -> Array:
-        """Covariance of θ̂, (Jᵀ J/σ² + P)⁻¹, shape (n_free, n_free).
+        """Covariance of θ̂, (Jᵀ J/σ² + P⁻¹)⁻¹, shape (n_free, n_free).
 
-        With a robust loss it is A⁻¹ B A⁻¹, A = a Jᵀ J/σ² + P and B = b Jᵀ J/σ² + P (Huber, Robust
-        Statistics, 1981, section 7.6, with a prior).
+        With a robust loss it is A⁻¹ B A⁻¹, A = a Jᵀ J/σ² + P⁻¹ and B = b Jᵀ J/σ² + P⁻¹ (Huber,
+        Robust Statistics, 1981, section 7.6, with a prior).
 
         Args:
             sigma: Standard deviation of one reading, [m].
-            precision: Diagonal of P: 1 or 0, shape (n_free,).
+            precision: Diagonal of P⁻¹: 1 or 0, shape (n_free,).
             at_bound: Mask of the parameters at a bound, which have no covariance.
             loss: a, mean of ρ'', and b, mean square of ρ', of the residuals; 1 for squares.
         """
@@ -145,7 +145,7 @@ class Information:
 
         Args:
             sigma: Standard deviation of one reading, [m].
-            precision: Diagonal of P: 1 or 0, shape (n_free,).
+            precision: Diagonal of P⁻¹: 1 or 0, shape (n_free,).
             at_bound: Mask of the parameters at a bound, which have no covariance.
             loss: a, mean of ρ'', and b, mean square of ρ', of the residuals; 1 for squares.
         """

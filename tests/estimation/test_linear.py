@@ -48,9 +48,9 @@ def test_singular_values_of_the_six_equations():
 def test_standard_errors_of_the_six_equations(fraction_from_tcp, expected):
     matrix = leg_parallelism_matrix(**GEOMETRY, rows=6, fraction_from_tcp=fraction_from_tcp)
     fit = solve_equation_8(matrix, np.zeros(6))
-    assert np.abs(np.sqrt(np.diag(fit.covariance)) - expected).max() < 0.00006
+    assert np.abs(np.sqrt(np.diag(fit.cofactor)) - expected).max() < 0.00006
     if fraction_from_tcp == 0.5:
-        correlation = fit.covariance[0, 1] / fit.covariance[0, 0]
+        correlation = fit.cofactor[0, 1] / fit.cofactor[0, 0]
         assert abs(correlation + 0.25) < 0.005
 
 
@@ -67,7 +67,7 @@ def test_standard_errors_per_reading_of_the_three_ways():
         estimator = np.linalg.pinv(whiten @ matrix) @ whiten
         spread = estimator @ rows_covariance @ estimator.T
         if weighting is not None:
-            assert np.abs(spread - fit.covariance).max() < KINEMATICS
+            assert np.abs(spread - fit.cofactor).max() < KINEMATICS
         return np.sqrt(spread[0, 0])
 
     assert abs(per_reading(six, 2 * np.eye(6), None) - 1.984) < 0.0006

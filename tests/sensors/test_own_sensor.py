@@ -304,7 +304,5 @@ def test_a_sensor_that_shows_no_number_is_named_by_setup_and_posture(plan):
     }
     session = simulate_session(plan, TRUTH, seed=1).session
     session = replace(session, setups=broken)
-    with pytest.raises(
-        SessionError, match=r"setups\.tx: the sensor shows nothing in posture 'zero'"
-    ):
+    with pytest.raises(SessionError, match=r"setups\.tx: the predicted reading in posture 'zero'"):
         calibrate(session)

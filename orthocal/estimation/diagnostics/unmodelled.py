@@ -1,9 +1,9 @@
 """Effect of unmodelled errors of the machine on an estimate.
 
 Offsets fitted to a machine whose legs and axes have errors absorb some of these errors. To first
-order the estimate changes by L θᵤ for unmodelled errors θᵤ,
+order unmodelled errors θᵤ bias the estimate by B θᵤ,
 
-    L = A⁻¹ Jᵀ Jᵤ/σ²,  A = Jᵀ J/σ² + P
+    B = A⁻¹ Jᵀ Jᵤ/σ²,  A = Jᵀ J/σ² + P⁻¹
 
 so that the priors of θᵤ give a covariance that belongs to every stated uncertainty.
 """
@@ -16,17 +16,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.errors import ParameterError
 from orthocal.estimation.fit import Fit
-from orthocal.estimation.weighting import SMALLEST_SIGMA
 from orthocal.io.documents import Number
 from orthocal.io.fields import CLOSED, Many, Matrix, Sizes, read_only
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.robot.model import Robot
 from orthocal.statistics.zeros import project_out_zeros
 
-WHOLE_MODEL = "full"
-"""Model that lists the errors of joint placements that a machine has."""
+FULL_MODEL = "full"
+"""Model of all errors that are not redundant, which every loaded robot has."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,17 +35,22 @@ class UnmodelledEffect:
 
     names: Many[str]
     prior_stds: Sizes
-    """One standard deviation of each, shape (n_unmodelled,), [SI]."""
+    """Prior standard deviation of each, shape (n_unmodelled,), [SI]."""
     leakage: Matrix
-    """L: change of the free parameters, shape (n_free, n_unmodelled), [SI per SI]."""
+    """B: change of the machine's free parameters per unit of each unmodelled error, shape
+    (n_machine, n_unmodelled), [SI per SI]."""
     residual_rms: Number
-    """Residuals of the rows due to unmodelled errors alone, RMS, [m]."""
+    """Expected RMS of the rows' residuals due to unmodelled errors within their priors, [m of the
+    first gauge]."""
     residual_dof: Number
     """Effective degrees of freedom of these residuals (Satterthwaite, 1946)."""
 
     @property
     def bias_covariance(self) -> Array:
-        """Covariance of the parameters due to unmodelled errors, shape (n_free, n_free), [SI]."""
+        """Covariance of the machine's parameters due to unmodelled errors, [SI].
+
+        Shape (n_machine, n_machine).
+        """
         spread = self.leakage * self.prior_stds
         return np.asarray(spread @ spread.T)
 
@@ -58,23 +61,21 @@ class UnmodelledErrors:
 
     names: tuple[str, ...]
     prior_stds: Array
-    """One standard deviation of each, shape (n_others,), [SI]."""
+    """Prior standard deviation of each, shape (n_unmodelled,), [SI]."""
     jacobian: Array
-    """∂h by one standard deviation of each, zeros eliminated, shape (n_entries, n_others), [m]."""
+    """∂h/∂θ̂ᵤ: change of the readings by one prior standard deviation of each error, zeros
+    eliminated, shape (n_entries, n_unmodelled), [m of the first gauge]."""
 
 
 @cached_per_robot(maxsize=8)
 def machine_errors(robot: Robot) -> tuple[str, ...]:
     """Names of all errors that a machine has, in the robot's order.
 
-    These are all errors with an effect. If the robot lists a model `full`, errors of joint
-    placements that are not in this model are excluded.
+    These are the errors of the model `full` and, of the complete set, every drive scale and every
+    error of a closure frame.
     """
     parameters = robot.parameters
-    try:
-        names = set(parameters.select_model(WHOLE_MODEL))
-    except ParameterError:
-        names = set()
+    names = set(parameters.select_model(FULL_MODEL))
     names |= {
         e.name
         for e in (parameters.elementary[n] for n in parameters.complete)
@@ -88,11 +89,12 @@ def find_unmodelled_errors(fit: Fit, *, represented: Collection[str] = ()) -> Un
 
     Args:
         fit: The fit.
-        represented: Further parameters that the fit represents, as base parameters do.
+        represented: Names of parameters that a free base parameter stands for: they count as
+            modelled.
     """
     problem = fit.problem
     parameters = problem.robot.parameters
-    # a sum is represented by its first error: the others still differ from it
+    # a named sum counts as its first error: the others still differ from it
     free = problem.machine_selection.names
     modelled = {parameters[n].terms[0][0] for n in (*free, *problem.fixed, *represented)}
     names = [
@@ -110,8 +112,13 @@ def find_unmodelled_errors(fit: Fit, *, represented: Collection[str] = ()) -> Un
 def error_jacobian(fit: Fit, names: Sequence[str]) -> Array:
     """Jacobian of the readings by errors that are not free, at the solution of a fit.
 
+    Args:
+        fit: The fit.
+        names: Names of the errors.
+
     Returns:
-        ∂h by one standard deviation of each, zeros eliminated, shape (n_entries, n_names), [m].
+        ∂h/∂θ̂ᵤ per prior standard deviation of each, zeros eliminated, shape (n_entries, n_names),
+        [m of the first gauge].
     """
     problem, parameters = fit.problem, fit.problem.robot.parameters
     prior_stds = np.array([parameters[n].prior_std for n in names])
@@ -126,7 +133,7 @@ def error_jacobian(fit: Fit, names: Sequence[str]) -> Array:
 
 
 def propagate_unmodelled(fit: Fit, others: UnmodelledErrors) -> tuple[UnmodelledEffect, Array]:
-    """Effect of errors that were not free on an estimate.
+    """Effect of unmodelled errors on an estimate.
 
     Returns:
         Effect on the machine's parameters; and standard deviations of the effect on the nuisance
@@ -137,7 +144,7 @@ def propagate_unmodelled(fit: Fit, others: UnmodelledErrors) -> tuple[Unmodelled
     if not others.names:
         none = UnmodelledEffect((), read_only([]), read_only(np.zeros((n, 0))), 0.0, 0.0)
         return none, np.zeros(problem.n_free - n)
-    o, sigma = problem.observations, max(fit.sigma, SMALLEST_SIGMA)
+    o, sigma = problem.observations, fit.sigma
     jacobian = project_out_zeros(fit.jacobian, o)
     inverse = fit.information.covariance(
         sigma=sigma, precision=problem.prior_precision, at_bound=fit.at_bound
@@ -150,13 +157,13 @@ def propagate_unmodelled(fit: Fit, others: UnmodelledErrors) -> tuple[Unmodelled
         prior_stds=others.prior_stds,
         leakage=read_only((change / others.prior_stds)[:n]),
         residual_rms=float(np.sqrt((residual**2).sum() / len(residual))),
-        residual_dof=_independent_parts(residual),
+        residual_dof=_effective_dof(residual),
     )
     return effect, np.asarray(np.linalg.norm(change[n:], axis=1))
 
 
-def _independent_parts(matrix: Array) -> float:
-    """Degrees of freedom ν of |S t|², t standard normal: (tr SᵀS)²/tr (SᵀS)²."""
+def _effective_dof(matrix: Array) -> float:
+    """Effective degrees of freedom of |S t|², t standard normal: (tr SᵀS)²/tr (SᵀS)²."""
     square = matrix.T @ matrix
     total = float(np.trace(square)) ** 2
     return total / float((square**2).sum()) if total > 0.0 else 0.0

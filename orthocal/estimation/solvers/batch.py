@@ -1,4 +1,4 @@
-"""Batch solver: the optimum of each of many sets of readings of one plan.
+"""Batch solver: the optimum of each of many sets of readings of one problem.
 
 Gauss-Newton runs on all sets at once, from the linearised solutions, with the Jacobian of each set.
 Sets that do not converge or that reach a bound are solved one by one by variable projection, so
@@ -15,18 +15,20 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.arrays import Array, Mask
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.solvers.subproblem import RANK_TOLERANCE
 from orthocal.estimation.solvers.variable_projection import VariableProjection, are_settled
 
 MAX_STEPS = 30
+"""Largest number of common iterations."""
 
 MAX_STEP_SIZE = 100.0
 """Longer steps mark a set that is solved alone, [prior std]."""
 
-MAX_NUMBERS = 2**21
-"""Numbers in the Jacobians of the sets that are solved together."""
+MAX_JACOBIAN_NUMBERS = 2**21
+"""Largest number of numbers in the Jacobians of the sets that are solved together."""
 
-MAX_POSTURES = 4096
-"""Postures of the sets that are solved together."""
+MAX_BATCH_STATES = 4096
+"""Largest number of states of the sets that are solved together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,11 +38,11 @@ class BatchSolution:
     theta: Array
     """Free parameters, shape (S, n_free), [SI]."""
     zeros: Array
-    """Gauge zeros, shape (S, n_zeros), [m]."""
+    """Gauge zeros, shape (S, n_zeros), [m of the first gauge]."""
     objective: Array
-    """Shape (S,)."""
+    """Objectives as in `Solution`, shape (S,)."""
     at_bound: NDArray[np.int8]
-    """As of a `Solution`, shape (S, n_free)."""
+    """-1, 0 or 1 as in `Solution`, shape (S, n_free)."""
     solved_alone: Mask
     """Mask of the sets that were solved one by one, shape (S,)."""
 
@@ -52,7 +54,7 @@ class BatchSolver:
 
     Args:
         problem: The problem; the values of its own readings do not matter.
-        options: Iterations and loss.
+        options: Loss, and `max_iterations` of the sets that are solved one by one.
     """
 
     def __init__(
@@ -65,7 +67,7 @@ class BatchSolver:
         """Solve for each set of readings.
 
         Args:
-            values: Readings as single ones, shape (S, n_entries), [m of the first gauge].
+            values: Readings of the entries, shape (S, n_entries), [m of the first gauge].
             sigma: Standard deviation of one reading, [m].
 
         Raises:
@@ -73,7 +75,7 @@ class BatchSolver:
             ClosureError: If the machine cannot reach a posture with the start values.
         """
         problem, y = self.problem, np.asarray(values, dtype=np.float64)
-        shared = _Shared(problem, self.options, sigma)
+        shared = _BatchTask(problem, self.options, sigma)
         n_sets, n = len(y), problem.n_free
         solution = BatchSolution(
             np.empty((n_sets, n)),
@@ -83,7 +85,9 @@ class BatchSolver:
             np.zeros(n_sets, dtype=np.bool_),
         )
         numbers = max(problem.observations.size * n, 1)
-        size = max(1, min(MAX_NUMBERS // numbers, MAX_POSTURES // max(problem.n_states, 1)))
+        size = max(
+            1, min(MAX_JACOBIAN_NUMBERS // numbers, MAX_BATCH_STATES // max(problem.n_states, 1))
+        )
         for first in range(0, n_sets, size):
             part = slice(first, first + size)
             self._solve_part(shared, y[part], solution, part)
@@ -94,17 +98,19 @@ class BatchSolver:
             solution.objective[i], solution.at_bound[i] = one.objective, one.at_bound
         return solution
 
-    def _solve_part(self, shared: _Shared, y: Array, solution: BatchSolution, part: slice) -> None:
+    def _solve_part(
+        self, shared: _BatchTask, y: Array, solution: BatchSolution, part: slice
+    ) -> None:
         """Gauss-Newton steps for some sets; fills their part of the solution."""
         problem, sigma = self.problem, shared.sigma
         theta = shared.linearised_solutions(y)
-        passive = problem.active_passive + shared.reference.follow(theta - shared.start)
+        passive = problem.active_passive + shared.linear.follow(theta - shared.start)
         active, converged = np.arange(len(y)), np.zeros(len(y), dtype=np.bool_)
         sizes, reading = np.full((3, len(y)), np.inf), np.empty_like(y)
         for _ in range(MAX_STEPS):
             try:
                 linear = problem.linearise(theta[active] * problem.theta_scale, passive[active])
-            except np.linalg.LinAlgError:  # a singular posture: solve all of them one by one
+            except np.linalg.LinAlgError:  # a singular posture: active sets are solved one by one
                 break
             closed = linear.reading + linear.opening
             residual, _, _ = shared.residual((y[active] - closed) / sigma)
@@ -124,8 +130,12 @@ class BatchSolver:
         solution.objective[part], solution.solved_alone[part] = objective, ~(good & converged)
 
 
-class _Shared:
-    """Input that all sets share: linearisation at the reference, prior, bounds and loss."""
+class _BatchTask:
+    """`Task` for many sets at once.
+
+    The same formulas, vectorised over the sets; tests/estimation/solvers/test_batch.py compares
+    both.
+    """
 
     def __init__(self, problem: CalibrationProblem, options: SolverOptions, sigma: float) -> None:
         self.problem, self.loss, self.sigma = problem, options.loss, sigma
@@ -136,20 +146,20 @@ class _Shared:
         self.start = problem.active_theta / scale
         self._counts = np.bincount(o.zero, minlength=o.n_zeros).astype(np.float64)
         self._incidence = problem.zero_incidence
-        self._free_zeros = problem.zero_incidence * ~o.zero_known
-        self.reference = problem.linearisation_at_active
-        self._jacobian = self._centre(self.reference.jacobian / sigma)
+        self._free_incidence = problem.zero_incidence * ~o.zero_known
+        self.linear = problem.linearisation_at_active
+        self._jacobian = self._centre(self.linear.jacobian / sigma)
         normal = self._jacobian.T @ self._jacobian + np.diag(self._precision)
-        self._inverse = np.linalg.pinv(normal, rcond=1e-13, hermitian=True)
+        self._inverse = np.linalg.pinv(normal, rcond=RANK_TOLERANCE, hermitian=True)
 
     def linearised_solutions(self, y: Array) -> Array:
-        """Solutions to first order, by least squares, within the bounds, shape (S, n_free)."""
-        residual = self._centre(((y - self.reference.reading) / self.sigma).T).T
+        """First-order solutions, clipped to the bounds, to start from, shape (S, n_free)."""
+        residual = self._centre(((y - self.linear.reading) / self.sigma).T).T
         gradient = residual @ self._jacobian - self._precision * (self.start - self._mean)
         return np.asarray(np.clip(self.start + gradient @ self._inverse, self._low, self._high))
 
     def residual(self, deviation: Array) -> tuple[Array, Array, Array]:
-        """Residuals, zeros and costs of deviations, shape (S, n_entries), [σ]."""
+        """Residuals (S, n_entries) and zeros (S, n_zeros), [σ], and Σ ρ, (S,), of deviations."""
         n, o = len(deviation), self.problem.observations
         if self.loss.robust:
             group = (np.arange(n)[:, None] * o.n_zeros + o.zero).reshape(-1)
@@ -163,7 +173,7 @@ class _Shared:
         return residual, zeros, self.loss.value(residual).sum(axis=1)
 
     def step(self, theta: Array, residual: Array, jacobian: Array) -> Array:
-        """Gauss-Newton steps s = (JᵀWJ + P)⁻¹ (Jᵀρ' − P (θ̂ − mean)), shape (S, n_free).
+        """Gauss-Newton steps s = (JᵀWJ + P⁻¹)⁻¹ (Jᵀρ' − P⁻¹ (θ̂ − mean)), shape (S, n_free).
 
         W holds the weights ρ'(r)/r, J the rows minus the weighted mean of those with the same
         free zero.
@@ -180,17 +190,22 @@ class _Shared:
         if self.loss.robust:
             weights = self.loss.weight(residual)[..., None]
             weighted, sums = weights * rows, self._incidence.T @ weights
-        by_zero = self._free_zeros.T @ weighted
+        by_zero = self._free_incidence.T @ weighted
         normal = np.swapaxes(rows, 1, 2) @ weighted + np.diag(self._precision)
         normal -= np.swapaxes(by_zero, 1, 2) @ (by_zero / sums)
         try:
             steps = np.linalg.solve(normal, gradient[..., None])
         except np.linalg.LinAlgError:
-            steps = np.linalg.pinv(normal, rcond=1e-13, hermitian=True) @ gradient[..., None]
+            steps = (
+                np.linalg.pinv(normal, rcond=RANK_TOLERANCE, hermitian=True) @ gradient[..., None]
+            )
         return np.asarray(steps[..., 0])
 
     def evaluate(self, y: Array, theta: Array, reading: Array) -> tuple[Array, Array, Mask]:
-        """Zeros, objective, and a mask of the sets that are finite and within the bounds."""
+        """Zeros (S, n_zeros), [m of the first gauge], objective (S,), and a mask (S,).
+
+        The mask is True for sets that are finite and within the bounds.
+        """
         _, zeros, cost = self.residual((y - reading) / self.sigma)
         objective = cost + 0.5 * (self._precision * (theta - self._mean) ** 2).sum(axis=1)
         within = ((theta > self._low) & (theta < self._high)).all(axis=1)
@@ -198,5 +213,5 @@ class _Shared:
 
     def _centre(self, values: Array) -> Array:
         """Rows minus the mean of those with the same free zero, shape as given."""
-        means = self._free_zeros.T @ values / self._counts[:, None]
+        means = self._free_incidence.T @ values / self._counts[:, None]
         return np.asarray(values - means[self.problem.observations.zero])

@@ -1,7 +1,8 @@
 """The exact identification as one nonlinear program, solved by Ipopt.
 
-Its variables are θ̂, the gauge zeros ẑ and the passive coordinates q̂_k of every posture; the
-closures of every posture are constraints (see `nlp.py`).
+Its variables are θ̂, the gauge zeros ẑ, the passive coordinates q̂_k of every state and the values
+of manually aligned nuisance parameters. The closures of every state and these alignments are
+constraints (see `nlp.py`).
 """
 
 from __future__ import annotations
@@ -29,21 +30,21 @@ from orthocal.estimation.solvers.program import (
 )
 from orthocal.runtime.interrupts import noticed_interrupt
 
-FINEST_WEIGHT = 5e-6
+SMALLEST_WEIGHTING_SIGMA = 5e-6
 """Least standard deviation by which readings are weighted, [m]. The prior is scaled down with them:
 the optimum is the same, and rounding errors stay below the tolerance."""
 
-EXACT_READINGS = 20_000
+FULL_TOLERANCE_READINGS = 20_000
 """Readings from which the tolerance grows, like the rounding errors of their sum."""
 
-MOST_EXACT = 2_000
+MOST_READINGS_FOR_EXACT_HESSIAN = 2_000
 """Readings up to which the exact Hessian is tried if the other one does not converge."""
 
 WIDENINGS = (256.0, 64.0, 16.0, 4.0, 2.0, 1.0)
 """Widths of a robust loss as multiples of the requested one; each solution starts the next. Used
 when outliers are so large that the requested width does not converge at once."""
 
-CONVERGED = frozenset({"Solve_Succeeded"})
+CONVERGED = "Solve_Succeeded"
 """Status of Ipopt for a solution; any other is an error."""
 
 COMPLEMENTARITY = 1e-11
@@ -56,10 +57,10 @@ class Expressions:
     """A nonlinear program as CasADi expressions of its variables and parameters."""
 
     variables: ca.MX
-    """x: θ̂, gauge zeros, the passive coordinates of every posture and the values of manually
+    """x: θ̂, gauge zeros, the passive coordinates of every state and the values of manually
     aligned nuisance parameters, scaled."""
     parameters: ca.MX
-    """p: readings, weights and noise of the entries, then σ and scales of prior and loss."""
+    """p: readings, weights and noise ratios of the entries, then σ and scales of prior and loss."""
     objective: ca.MX
     """Σ ρ(r/σ) + ½ (θ − mean)ᵀ P⁻¹ (θ − mean), times (σ/5 µm)² where σ is below 5 µm."""
     constraints: ca.MX
@@ -76,9 +77,9 @@ class Expressions:
     residuals: ca.MX
     """Readings minus predicted ones, shape (n_entries,), [m of the first gauge]."""
     passive: dict[str, ca.MX]
-    """Posture to its passive coordinates q, shape (n_passive,), [m, rad]."""
+    """Name of each state to its passive coordinates q, shape (n_passive,), [m, rad]."""
     closures: dict[str, ca.MX]
-    """Posture to the residuals g of its loop closures, shape (closure_rows,), [m]."""
+    """Name of each state to the residuals g of its loop closures, shape (closure_rows,), [m]."""
 
 
 class NonlinearProgram(Program):
@@ -105,15 +106,18 @@ class NonlinearProgram(Program):
             problem, hessian=self.options.hessian, loss=self.options.loss
         )
         self._functions = self._builder.build()
-        self._solver = self._start_ipopt()
+        self._solver = self._build_solver()
 
     def with_problem(self, problem: CalibrationProblem) -> NonlinearProgram:
-        """The program for a `with_values` of its problem; nothing is built again."""
+        """The program for the same problem with other readings or noise ratios.
+
+        Its compiled functions are kept.
+        """
         other = super().with_problem(problem)
         other.__dict__.pop("_exact", None)
         return other
 
-    def _solve(self, readings: SolverInput) -> Solution:
+    def _solve(self, given: SolverInput) -> Solution:
         """Solve, if necessary with the exact Hessian and with a robust loss of decreasing width.
 
         Raises:
@@ -123,14 +127,16 @@ class NonlinearProgram(Program):
         """
         exact, robust = self.options.hessian == "exact", self.options.loss.robust
         try:
-            return self._run(readings)
+            return self._run(given)
         except SolverError:
-            if self.problem.observations.size > MOST_EXACT or (exact and not robust):
+            if self.problem.observations.size > MOST_READINGS_FOR_EXACT_HESSIAN or (
+                exact and not robust
+            ):
                 raise
         program = self if exact else self._exact
         if not robust:
-            return program._run(readings)
-        step = readings
+            return program._run(given)
+        step = given
         try:
             for width_factor in WIDENINGS:  # nearly squares first, then the requested width
                 solution = program._run(step, width_factor)
@@ -138,31 +144,31 @@ class NonlinearProgram(Program):
         except SolverError:
             if exact:
                 raise
-            return program._run(readings)
+            return program._run(given)
         return solution
 
-    def _run(self, readings: SolverInput, width_factor: float = 1.0) -> Solution:
+    def _run(self, given: SolverInput, width_factor: float = 1.0) -> Solution:
         """One run of Ipopt, with a multiple of the width of a robust loss."""
-        problem, sigma, prescribed = self.problem, readings.sigma, readings.prescribed
+        problem, sigma, prescribed = self.problem, given.sigma, given.prescribed
         lower, upper = self._bounds(prescribed)
         theta = np.clip(
-            readings.start,
+            given.start,
             lower[: self._n_theta] * problem.theta_scale,
             upper[: self._n_theta] * problem.theta_scale,
         )
         x0 = self.initial_variables(
             theta,
             sigma=sigma,
-            values=readings.values,
-            passive=readings.start_passive,
+            values=given.values,
+            passive=given.start_passive,
             width_factor=width_factor,
         )
-        p = self._pack(sigma, readings.values, readings.weights, width_factor)
+        p = self._pack(sigma, given.values, given.weights, width_factor)
         with noticed_interrupt():
             answer = self._solver(x0=x0, p=p, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
         stats = self._solver.stats()
         status, iterations = str(stats["return_status"]), int(stats["iter_count"])
-        if status not in CONVERGED:
+        if status != CONVERGED:
             raise SolverError(
                 f"Ipopt did not converge: {status} after {iterations} iterations; "
                 f"there is no result. {advise(self.options)}",
@@ -170,7 +176,9 @@ class NonlinearProgram(Program):
                 iterations=iterations,
             )
         x = np.asarray(answer["x"].full()).reshape(-1)
-        closures = np.abs(np.asarray(answer["g"].full())).max(initial=0.0)
+        # constraints of manually aligned parameters follow, in prior standard deviations
+        rows = problem.n_states * problem.robot.closure_rows
+        closures = np.abs(np.asarray(answer["g"].full())[:rows]).max(initial=0.0)
         multipliers = np.asarray(answer["lam_x"].full()).reshape(-1)[: self._n_theta]
         first = self._n_theta + self._n_zeros
         passive = slice(first, first + problem.n_states * self._n_passive)
@@ -198,10 +206,12 @@ class NonlinearProgram(Program):
         """The program's variables x with closed loops and optimal zeros, for free parameters.
 
         Args:
-            theta: Free parameters, shape (n_free,), [SI]; the reference by default.
+            theta: Free parameters, shape (n_free,), [SI]; the active offsets by default.
             sigma: Standard deviation of one reading, [m].
-            values: Readings as single ones, shape (n_entries,), [m]; the session's by default.
-            passive: Passive coordinates to start closing the loops from.
+            values: Readings of the entries, shape (n_entries,), [m of the first gauge]; the
+                session's by default.
+            passive: Passive coordinates to start closing the loops from, shape (n_states,
+                n_passive), [m, rad].
             width_factor: Factor on the width of a robust loss.
 
         Raises:
@@ -270,7 +280,8 @@ class NonlinearProgram(Program):
 
         Args:
             sigma: Standard deviation of one reading, [m].
-            values: Readings as single ones, shape (n_entries,), [m]; the session's by default.
+            values: Readings of the entries, shape (n_entries,), [m of the first gauge]; the
+                session's by default.
             excluded: Entries not to be used, as indices.
             width_factor: Factor on the width of a robust loss.
         """
@@ -278,6 +289,7 @@ class NonlinearProgram(Program):
         return self._pack(sigma, y, self._weights(excluded), width_factor)
 
     def _pack(self, sigma: float, values: Array, weights: Array, width_factor: float) -> Array:
+        """Values of p, shape (3 n_entries + 3,)."""
         weighted, scale = _weighting(sigma)
         width = self.options.loss.width * width_factor * sigma / weighted
         return np.concatenate([values, weights, self.problem.noise_ratio, [weighted, scale, width]])
@@ -291,7 +303,7 @@ class NonlinearProgram(Program):
         """Program with the exact Hessian: slower, but it converges in more cases."""
         return NonlinearProgram(self.problem, options=replace(self.options, hessian="exact"))
 
-    def _start_ipopt(self) -> ca.Function:
+    def _build_solver(self) -> ca.Function:
         """Ipopt with its functions and options.
 
         Raises:
@@ -299,7 +311,7 @@ class NonlinearProgram(Program):
         """
         entries = self.problem.observations.size
         ipopt: dict[str, Any] = {
-            "tol": self.options.tolerance * max(1.0, entries / EXACT_READINGS),
+            "tol": self.options.tolerance * max(1.0, entries / FULL_TOLERANCE_READINGS),
             "constr_viol_tol": self.options.closure_tolerance,
             "compl_inf_tol": COMPLEMENTARITY,
             "acceptable_iter": 0,
@@ -328,7 +340,7 @@ class NonlinearProgram(Program):
         )
 
     def _bounds(self, prescribed: Mapping[int, float]) -> tuple[Array, Array]:
-        """Bounds of all variables, scaled; a known zero is fixed at 0."""
+        """Scaled bounds of the variables, shape (n_variables,) each; a known zero is fixed at 0."""
         problem = self.problem
         k = problem.n_states * self._n_passive + int(problem.model.alignment.aligned.sum())
         limits = np.full(self._n_zeros + k, np.inf)
@@ -365,14 +377,17 @@ def _require_accepted(options: Mapping[str, OptionValue]) -> None:
 
 def _weighting(sigma: float) -> tuple[float, float]:
     """Standard deviation by which readings are weighted, and the scale of the objective."""
-    weighted = max(sigma, FINEST_WEIGHT)
+    weighted = max(sigma, SMALLEST_WEIGHTING_SIGMA)
     return weighted, (sigma / weighted) ** 2
 
 
 def _at_bound(
     theta: Array, multipliers: Array, lower: Array, upper: Array, prescribed: Mapping[int, float]
 ) -> NDArray[np.int8]:
-    """Parameters held by a bound: its multiplier exceeds the distance to it."""
+    """-1, 0 or 1 as in `Solution.at_bound`, shape (n_free,).
+
+    A parameter is at a bound if the bound's multiplier exceeds the parameter's distance from it.
+    """
     result = np.zeros(theta.size, dtype=np.int8)
     result[-multipliers > np.abs(theta - lower[: theta.size])] = -1
     result[multipliers > np.abs(theta - upper[: theta.size])] = 1

@@ -9,7 +9,7 @@ from orthocal.estimation.solvers.subproblem import Task
 
 
 class LinearisedProgram(Program):
-    """A calibration problem with readings to first order about the reference.
+    """A calibration problem with readings to first order about the active offsets.
 
     Its only option is the loss. The start does not matter.
 
@@ -19,16 +19,16 @@ class LinearisedProgram(Program):
 
     kind = "linearised"
 
-    def _solve(self, readings: SolverInput) -> Solution:
+    def _solve(self, given: SolverInput) -> Solution:
         problem = self.problem
-        task = Task(problem, self.options.loss, readings)
-        reference = task.at(problem.active_theta / problem.theta_scale, readings.start_passive)
-        _, jacobian = problem.predict_and_jacobian(problem.active_theta, reference.passive)
+        task = Task(problem, self.options.loss, given)
+        active = task.at(problem.active_theta / problem.theta_scale, given.start_passive)
+        _, jacobian = problem.predict_and_jacobian(problem.active_theta, active.passive)
         jacobian /= task.sigma
         start = task.clip(problem.active_theta)
-        first = task.moved(reference, jacobian, start - reference.theta)
+        first = task.moved(active, jacobian, start - active.theta)
         state = task.moved(first, jacobian, task.step(first, jacobian))
         state = replace(state, theta=state.theta.clip(task.low, task.high))
         theta = state.theta * problem.theta_scale
-        passive = problem.close(theta, start=reference.passive)
+        passive = problem.close(theta, start=active.passive)
         return task.solution(state, jacobian, passive=passive, iterations=1)

@@ -15,7 +15,7 @@ from orthocal.arrays import Array
 from orthocal.estimation.options import Hessian, SolverKind, SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 
-LEFT_OUT = 1e-9
+EXCLUDED_WEIGHT = 1e-9
 """Weight of excluded readings: negligible, but their gauge zeros stay determined."""
 
 
@@ -26,7 +26,7 @@ class Solution:
     theta: Array
     """Free parameters, shape (n_free,), [SI]."""
     zeros: Array
-    """Gauge zeros, shape (n_zeros,), [m]."""
+    """Gauge zeros, shape (n_zeros,), [m of the first gauge]."""
     passive: Array
     """Passive coordinates, shape (n_states, n_passive), [m, rad]."""
     objective: float
@@ -49,13 +49,13 @@ class SolverInput:
     sigma: float
     """Standard deviation of one reading, [m]."""
     values: Array
-    """Readings as single ones, shape (n_entries,), [m of the first gauge]."""
+    """Readings of the entries, shape (n_entries,), [m of the first gauge]."""
     weights: Array
-    """Weights of the entries, shape (n_entries,): 1, or `LEFT_OUT` for excluded ones."""
+    """Weights of the entries, shape (n_entries,): 1, or `EXCLUDED_WEIGHT` for excluded ones."""
     start: Array
     """Free parameters to start from, shape (n_free,), [SI]."""
     start_passive: Array | None
-    """Passive coordinates to start closing the loops from."""
+    """Passive coordinates to start closing the loops from, (n_states, n_passive), [m, rad]."""
     prescribed: Mapping[int, float]
     """Index of a free parameter to its prescribed value, [SI]."""
 
@@ -77,7 +77,10 @@ class Program(ABC):
         self.options = options or SolverOptions(solver=self.kind)
 
     def with_problem(self, problem: CalibrationProblem) -> Self:
-        """The program for a `with_values` of its problem; nothing is built again."""
+        """The program for the same problem with other readings or noise ratios.
+
+        Its compiled functions are kept.
+        """
         other = copy.copy(self)
         other.problem = problem
         return other
@@ -96,9 +99,10 @@ class Program(ABC):
 
         Args:
             sigma: Standard deviation of one reading, [m].
-            values: Readings as single ones, shape (n_entries,), [m of the first gauge]; the
+            values: Readings of the entries, shape (n_entries,), [m of the first gauge]; the
                 session's by default.
-            start: Free parameters to start from, shape (n_free,), [SI]; the reference by default.
+            start: Free parameters to start from, shape (n_free,), [SI]; the active offsets by
+                default.
             start_passive: Passive coordinates to start closing the loops from.
             excluded: Indices of the entries to exclude.
             prescribed: Index of a free parameter to its prescribed value, [SI].
@@ -120,14 +124,14 @@ class Program(ABC):
         )
 
     def _weights(self, excluded: ArrayLike | None) -> Array:
-        """Weights of the entries, shape (n_entries,): 1, or `LEFT_OUT` for excluded ones."""
+        """Weights of the entries, shape (n_entries,): 1, or `EXCLUDED_WEIGHT` for excluded ones."""
         weights = np.ones(self.problem.observations.size)
         if excluded is not None:
-            weights[np.asarray(excluded, dtype=np.int64)] = LEFT_OUT
+            weights[np.asarray(excluded, dtype=np.int64)] = EXCLUDED_WEIGHT
         return weights
 
     @abstractmethod
-    def _solve(self, readings: SolverInput) -> Solution:
+    def _solve(self, given: SolverInput) -> Solution:
         """Solve for one set of readings."""
 
 

@@ -21,24 +21,29 @@ SETTLED_WITHIN = 1e-11
 """Last step of a subproblem with a robust loss, [prior std]."""
 
 MOST_STEPS_WITHIN = 100
+"""Largest number of steps of a subproblem with a robust loss."""
+
+RANK_TOLERANCE = 1e-13
+"""Eigenvalues of the normal matrix below this part of the largest count as zero."""
 
 FEW = 50
 """Size of systems that NumPy solves faster than SciPy's triangular solver is imported."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class State:
+class Iterate:
     """The problem at some θ̂, or to first order near it."""
 
     theta: Array
     """θ̂, shape (n_free,)."""
     passive: Array
-    """Passive coordinates of every posture, not updated by first-order changes, [m, rad]."""
+    """Passive coordinates, not updated by first-order changes, (n_states, n_passive), [m, rad]."""
     deviation: Array
     """Readings minus predictions, with gauge zeros, shape (n_entries,), [σ]."""
     zeros: Array
-    """Shape (n_zeros,), [σ]."""
+    """Gauge zeros, shape (n_zeros,), [σ]."""
     objective: float
+    """Objective as in `Solution`."""
 
 
 class Task:
@@ -47,7 +52,7 @@ class Task:
     Args:
         problem: The problem.
         loss: Cost of a residual.
-        readings: The readings.
+        given: Readings, weights, start and prescribed values.
 
     Attributes:
         sigma: Standard deviation of one reading, [m].
@@ -56,17 +61,17 @@ class Task:
         high: Upper bounds of θ̂, shape (n_free,).
     """
 
-    def __init__(self, problem: CalibrationProblem, loss: Loss, readings: SolverInput) -> None:
-        self.problem, self.loss, self.readings = problem, loss, readings
-        self.sigma, self.weights = readings.sigma, readings.weights
-        self.low, self.high = scaled_bounds(problem, readings.prescribed)
+    def __init__(self, problem: CalibrationProblem, loss: Loss, given: SolverInput) -> None:
+        self.problem, self.loss, self.given = problem, loss, given
+        self.sigma, self.weights = given.sigma, given.weights
+        self.low, self.high = scaled_bounds(problem, given.prescribed)
 
     def clip(self, theta: Array) -> Array:
         """θ̂ within the bounds, shape (n_free,) of free parameters in SI."""
         return np.clip(theta / self.problem.theta_scale, self.low, self.high)
 
     def solution(
-        self, state: State, jacobian: Array, *, passive: Array, iterations: int
+        self, state: Iterate, jacobian: Array, *, passive: Array, iterations: int
     ) -> Solution:
         """Solution of the task.
 
@@ -80,7 +85,7 @@ class Task:
         at_bound = np.zeros(state.theta.size, dtype=np.int8)
         at_bound[(state.theta <= self.low) & (gradient > 0.0)] = -1
         at_bound[(state.theta >= self.high) & (gradient < 0.0)] = 1
-        at_bound[list(self.readings.prescribed)] = 0
+        at_bound[list(self.given.prescribed)] = 0
         return Solution(
             theta=state.theta * self.problem.theta_scale,
             zeros=state.zeros * self.sigma,
@@ -93,7 +98,7 @@ class Task:
             at_bound=at_bound,
         )
 
-    def at(self, theta: Array, passive: Array | None) -> State:
+    def at(self, theta: Array, passive: Array | None) -> Iterate:
         """The problem at some θ̂, shape (n_free,).
 
         Raises:
@@ -103,10 +108,10 @@ class Task:
         si = theta * problem.theta_scale
         closed = problem.close(si, start=passive)
         return self._state(
-            theta, closed, (self.readings.values - problem.predict(si, closed)) / self.sigma
+            theta, closed, (self.given.values - problem.predict(si, closed)) / self.sigma
         )
 
-    def begin(self) -> tuple[State, ReadingLinearisation]:
+    def begin(self) -> tuple[Iterate, ReadingLinearisation]:
         """The problem at the start of a solver.
 
         Raises:
@@ -115,11 +120,11 @@ class Task:
         """
         problem, at, passive = (
             self.problem,
-            self.clip(self.readings.start),
-            self.readings.start_passive,
+            self.clip(self.given.start),
+            self.given.start_passive,
         )
-        at_reference = np.array_equal(at * problem.theta_scale, problem.active_theta)
-        if passive is None and at_reference:
+        at_active = np.array_equal(at * problem.theta_scale, problem.active_theta)
+        if passive is None and at_active:
             passive = problem.active_passive
         else:
             first = problem.active_passive if passive is None else passive
@@ -138,16 +143,16 @@ class Task:
         """Readings to first order about some θ̂ and passive coordinates near closed loops."""
         return self.problem.linearise(theta * self.problem.theta_scale, passive)
 
-    def near(self, theta: Array, passive: Array, linear: ReadingLinearisation) -> State:
+    def near(self, theta: Array, passive: Array, linear: ReadingLinearisation) -> Iterate:
         """The problem at some θ̂, with loops closed to first order."""
         predicted = linear.reading + linear.opening
-        return self._state(theta, passive, (self.readings.values - predicted) / self.sigma)
+        return self._state(theta, passive, (self.given.values - predicted) / self.sigma)
 
-    def moved(self, state: State, jacobian: Array, change: Array) -> State:
+    def moved(self, state: Iterate, jacobian: Array, change: Array) -> Iterate:
         """The problem to first order at another θ̂; arguments as for `step`."""
         return self._state(state.theta + change, state.passive, state.deviation - jacobian @ change)
 
-    def step(self, state: State, jacobian: Array) -> Array:
+    def step(self, state: Iterate, jacobian: Array) -> Array:
         """Change of θ̂ that solves the problem with readings to first order, shape (n_free,).
 
         Least squares take one solve. A robust loss takes Newton's method with weights ρ''; where
@@ -173,25 +178,25 @@ class Task:
             at = trial
         return np.asarray(at.theta - state.theta)
 
-    def _change(self, at: State, jacobian: Array, weights: Array) -> Array:
+    def _change(self, at: Iterate, jacobian: Array, weights: Array) -> Array:
         """Newton step with weights of the entries, within the bounds, shape (n_free,)."""
         square = self._square(jacobian, weights)
         square[np.diag_indices_from(square)] += self.problem.prior_precision
         return self._solve(square, -self.gradient(at, jacobian), at.theta)
 
-    def gradient(self, state: State, jacobian: Array) -> Array:
+    def gradient(self, state: Iterate, jacobian: Array) -> Array:
         """Gradient of the objective by θ̂, shape (n_free,)."""
         residual = state.deviation - state.zeros[self.problem.observations.zero]
         prior = self.problem.prior_precision * self._off(state.theta)
         return np.asarray(prior - jacobian.T @ (self.weights * self.loss.influence(residual)))
 
-    def _state(self, theta: Array, passive: Array, deviation: Array) -> State:
+    def _state(self, theta: Array, passive: Array, deviation: Array) -> Iterate:
         o, off = self.problem.observations, self._off(theta)
         zeros = self.loss.centres(deviation, o.zero, o.n_zeros, weights=self.weights)
         zeros[o.zero_known] = 0.0
         prior = 0.5 * float(off @ (self.problem.prior_precision * off))
         cost = float(self.weights @ self.loss.value(deviation - zeros[o.zero]))
-        return State(theta, passive, deviation, zeros, cost + prior)
+        return Iterate(theta, passive, deviation, zeros, cost + prior)
 
     def _solve(self, square: Array, gradient: Array, theta: Array) -> Array:
         """Step s that minimises ½ sᵀ A s − bᵀ s within the bounds, shape (n_free,)."""
@@ -202,7 +207,7 @@ class Task:
             factor: Array = np.asarray(np.linalg.cholesky(scaled).T, dtype=np.float64)
         except np.linalg.LinAlgError:  # undetermined parameters: the smallest change
             values, vectors = np.linalg.eigh(scaled)
-            large = values > 1e-13 * values.max(initial=0.0)
+            large = values > RANK_TOLERANCE * values.max(initial=0.0)
             step = vectors[:, large] @ ((vectors[:, large].T @ target) / values[large])
         else:
             target = _solve_triangular(factor, target, transposed=True)

@@ -15,7 +15,7 @@ from orthocal.arrays import Array, Mask
 from orthocal.errors import ClosureError, SolverError
 from orthocal.estimation.problem import LENGTH_SCALE
 from orthocal.estimation.solvers.program import Program, Solution, SolverInput, advise
-from orthocal.estimation.solvers.subproblem import State, Task
+from orthocal.estimation.solvers.subproblem import Iterate, Task
 from orthocal.observation.model import ReadingLinearisation
 
 SETTLED = 1e-8
@@ -40,8 +40,8 @@ class VariableProjection(Program):
 
     kind = "variable-projection"
 
-    def _solve(self, readings: SolverInput) -> Solution:
-        task = Task(self.problem, self.options.loss, readings)
+    def _solve(self, given: SolverInput) -> Solution:
+        task = Task(self.problem, self.options.loss, given)
         start = task.begin()
         try:
             state, jacobian, iterations = self._descend(task, start, follow=True)
@@ -50,8 +50,8 @@ class VariableProjection(Program):
         return task.solution(state, jacobian, passive=state.passive, iterations=iterations)
 
     def _descend(
-        self, task: Task, begin: tuple[State, ReadingLinearisation], *, follow: bool
-    ) -> tuple[State, Array, int]:
+        self, task: Task, begin: tuple[Iterate, ReadingLinearisation], *, follow: bool
+    ) -> tuple[Iterate, Array, int]:
         """Gauss-Newton iterations: the optimum, the last Jacobian and the number of iterations.
 
         Args:
@@ -92,8 +92,8 @@ class VariableProjection(Program):
         )
 
     def _follow(
-        self, task: Task, state: State, linear: ReadingLinearisation, step: Array
-    ) -> tuple[State, ReadingLinearisation] | None:
+        self, task: Task, state: Iterate, linear: ReadingLinearisation, step: Array
+    ) -> tuple[Iterate, ReadingLinearisation] | None:
         """A full step with passive joints that follow it; None if the loops open too far."""
         theta = np.clip(state.theta + step, task.low, task.high)
         passive = state.passive + linear.follow(theta - state.theta)
@@ -107,7 +107,7 @@ class VariableProjection(Program):
         after = task.near(theta, passive, following)
         return (after, following) if after.objective <= _no_more_than(state) else None
 
-    def _move(self, task: Task, state: State, step: Array) -> tuple[State, Array]:
+    def _move(self, task: Task, state: Iterate, step: Array) -> tuple[Iterate, Array]:
         """Halve a step until the objective decreases, with closed loops.
 
         Raises:
@@ -143,5 +143,5 @@ def are_settled(sizes: Array) -> Mask:
         return np.asarray((sizes[0] <= SETTLED) | (sizes[0] * np.maximum(last, before) <= SETTLED))
 
 
-def _no_more_than(state: State) -> float:
+def _no_more_than(state: Iterate) -> float:
     return state.objective + ROUNDING * max(abs(state.objective), 1.0)
