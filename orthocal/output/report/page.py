@@ -94,6 +94,7 @@ def build_report(calibration: Calibration, *, saved: Path | None = None) -> str:
     sensors = render_sensors(calibration)
     if saved is None and calibration.path is not None:
         saved = calibration.path.parent
+    saved = saved and saved.resolve()
     sections = [
         ("verdict", "Verdict", _verdict(calibration, saved)),
         ("tool", "Tool error", _tool(calibration)),
