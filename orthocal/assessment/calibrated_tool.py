@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
@@ -15,8 +16,6 @@ from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace, find_workspace
 from orthocal.robot.model import Robot
-
-Array = NDArray[np.float64]
 
 LIMIT_SLACK = 1e-9
 """By which a drive may seem to be beyond its travel, [m, rad]."""

@@ -13,15 +13,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.assessment.calibrated_tool import CalibratedTool, error_covariance, find_tool
 from orthocal.calibration.assessment_record import ControllerEntry
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.io.fields import read_only
-
-Array = NDArray[np.float64]
 
 DECIDED = 1e-2
 """Ratio of the aligned to the absolute tool error of a direction of the offsets, below which the

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.assessment.plausibility import (
     are_finer,
     find_finer,
@@ -30,8 +30,6 @@ from orthocal.measurement.joining import split_sessions
 from orthocal.session.session import Session
 from orthocal.statistics.chance import chance_of_excess
 from orthocal.statistics.noise import estimate_repeatability
-
-Array = NDArray[np.float64]
 
 RARE = 1e-3
 """Share of the machines within their tolerances that are called worse."""

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from orthocal.arrays import Array
 from orthocal.assessment.wording import signed
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import MOST_PLACES, place_of
@@ -24,8 +25,6 @@ from orthocal.statistics.chance import chance_of_excess
 from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 from orthocal.units import MM
-
-Array = NDArray[np.float64]
 
 FINER = 1e-3
 """Part of a step of the gauge by which a reading may miss it: rounding of numbers."""

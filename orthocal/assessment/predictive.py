@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.refit import restore_mounting_covariance
@@ -28,8 +27,6 @@ from orthocal.session.session import known_approach
 from orthocal.statistics.distributions import beta_share, chi_square_tail, f_tail
 from orthocal.statistics.information import whiten
 from orthocal.statistics.zeros import project_out_zeros
-
-Array = NDArray[np.float64]
 
 FEWEST = 3
 """Rows below which residuals have no correlation."""

@@ -18,16 +18,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import OrthocalError
 from orthocal.estimation.selection import complete_model
 from orthocal.hypotheses.likelihood import NOISE_SCALES, log_of_sum, noise_weights
 from orthocal.hypotheses.linear_model import LinearModel
 from orthocal.measurement.joining import split_sessions
 from orthocal.session.session import Session
-
-Array = NDArray[np.float64]
 
 STRONG = 5.0
 """ln of the Bayes factor from which evidence is strong: 150 to 1 (Kass and Raftery, 1995)."""

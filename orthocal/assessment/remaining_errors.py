@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.assessment.calibrated_tool import error_covariance
 from orthocal.assessment.tool_error import ToolAccuracy
 from orthocal.calibration.calibration import Calibration
-
-Array = NDArray[np.float64]
 
 NOTABLE = 0.1
 """Prior standard deviations by which a parameter must be off to be named in a combination."""

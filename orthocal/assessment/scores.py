@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.assessment.tool_error import ErrorSize, ToolAccuracy, assess_tool
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
@@ -22,7 +22,6 @@ from orthocal.estimation.weighting import SMALLEST_SIGMA
 from orthocal.statistics.information import decompose, take_for_known
 from orthocal.statistics.zeros import project_out_zeros
 
-Array = NDArray[np.float64]
 Method = Literal["linearised", "exact"]
 
 

@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthocal.arguments import require_kind
+from orthocal.arrays import Array
 from orthocal.assessment.calibrated_tool import (
     CalibratedTool,
     error_covariance,
@@ -32,8 +32,6 @@ from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
 from orthocal.robot.model import require_commanded_tool
-
-Array = NDArray[np.float64]
 
 MOST_POINTS = 5_000
 """Points that are assessed together; each takes 40 kB. `accuracy_rows` takes any number."""

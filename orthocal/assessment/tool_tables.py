@@ -9,8 +9,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthocal.arrays import Array
 from orthocal.assessment.calibrated_tool import error_covariance
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
@@ -23,8 +24,6 @@ from orthocal.kinematics.loop_closure import (
     nominal_closure,
 )
 from orthocal.kinematics.sensitivity import ToolSensitivity
-
-Array = NDArray[np.float64]
 
 ROWS_AT_ONCE = 512
 """Rows of a chunk: a full model takes 20 kB a row while it is evaluated."""

@@ -7,12 +7,10 @@ from collections.abc import Sequence
 from itertools import groupby
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.calibration.assessment_record import Finding, FindingKind, Place
 from orthocal.units import MM, UM
-
-Array = NDArray[np.float64]
 
 ALONG_AXIS = 0.9999
 """Cosine above which a direction is named after an axis of the world."""

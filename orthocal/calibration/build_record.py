@@ -11,9 +11,9 @@ from importlib.metadata import version
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthocal import __version__
+from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.file import absurd_result
 from orthocal.calibration.recorded_robot import record_robot
@@ -52,8 +52,6 @@ from orthocal.statistics.identifiability import (
 )
 from orthocal.statistics.information import marginalise
 from orthocal.statistics.zeros import project_out_zeros
-
-Array = NDArray[np.float64]
 
 
 def assemble_calibration(

@@ -10,15 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.calibration.machine import Machine
 from orthocal.calibration.records import CalibrationRecord, ParameterEstimate
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow, root_mean_square
 from orthocal.robot.model import Robot
 from orthocal.statistics.chance import expanded_uncertainty
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.recorded_robot import load_recorded_robot, require_consistent
 from orthocal.calibration.records import CalibrationRecord
@@ -24,8 +24,6 @@ from orthocal.io.fields import finite_or_none
 from orthocal.io.files import exists, is_folder, write_file
 from orthocal.robot.model import Robot
 from orthocal.text import shorten
-
-Array = NDArray[np.float64]
 
 SCHEMA = "orthocal/calibration/7"
 

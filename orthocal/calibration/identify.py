@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from orthocal.arguments import require_kind, require_names
 from orthocal.calibration.build_record import assemble_calibration
@@ -26,8 +26,6 @@ from orthocal.observation.observations import require_conditions
 from orthocal.session.session import Session
 from orthocal.statistics.identifiability import find_base_parameters
 from orthocal.statistics.noise import estimate_repeatability
-
-Array = NDArray[np.float64]
 
 MAX_BASE_ROUNDS = 8
 

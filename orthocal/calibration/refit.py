@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
 from orthocal.estimation.fit import Fit, find_mounting_covariance, fit_problem
@@ -22,8 +22,6 @@ from orthocal.io.fields import read_only
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.session.session import Gauge, Reading, Session, Setup
 from orthocal.statistics.information import decompose
-
-Array = NDArray[np.float64]
 
 
 def repeat_calibration(calibration: Calibration, sessions: Given | Sequence[Given]) -> Calibration:

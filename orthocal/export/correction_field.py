@@ -19,16 +19,13 @@ from itertools import product
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Indices
 from orthocal.calibration.calibration import Calibration
 from orthocal.export.polynomial import Polynomial, PolynomialFit, chebyshev_line
 from orthocal.export.tool_tip import ToolTip
 from orthocal.kinematics.loop_closure import Failures, nominal_closure
 from orthocal.kinematics.workspace import grid_points
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 ERROR_PART = 0.1
 """Part of the tolerance for the error of the polynomials."""

@@ -10,15 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError, ParameterError
 from orthocal.kinematics.loop_closure import Failures, LoopClosure
 from orthocal.kinematics.robot_functions import reference_poses, robot_functions
 from orthocal.units import MM
-
-Array = NDArray[np.float64]
 
 TOLERANCE = 1e-12
 """Largest distance of a tip from its target, [m]."""

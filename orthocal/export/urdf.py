@@ -12,8 +12,8 @@ from xml.parsers import expat
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError
 from orthocal.robot.description import load_description
@@ -22,8 +22,6 @@ from orthocal.robot.model import Robot, joint_axis
 from orthocal.robot.urdf import load_urdf, parse_urdf
 from orthocal.text import composed
 from orthocal.units import PPM, tidy
-
-Array = NDArray[np.float64]
 
 TOLERANCE = 1e-9
 """Largest difference of a written placement from the calibrated machine, [m, rad]."""

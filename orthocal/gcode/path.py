@@ -14,10 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Indices
 from orthocal.errors import GcodeError
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Vector = tuple[float, float, float]
 
 PLANES: dict[int, tuple[int, int, int]] = {17: (0, 1, 2), 18: (2, 0, 1), 19: (1, 2, 0)}

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import GcodeError
 from orthocal.gcode.interpreter import Interpreter, Step
 from orthocal.gcode.lines import CONTROL, Line, split_line, split_point_line
@@ -16,8 +16,6 @@ from orthocal.gcode.path import Motion, Paths
 from orthocal.gcode.segmentation import LONGEST_SEGMENT, Correction, Refused, segment_motions
 from orthocal.gcode.writer import Writer
 from orthocal.units import UM
-
-Array = NDArray[np.float64]
 
 LINES_AT_ONCE = 2000
 """Largest number of lines in memory."""

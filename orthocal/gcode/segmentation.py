@@ -12,12 +12,9 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Indices
 from orthocal.gcode.path import Paths
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 LONGEST_SEGMENT = 10e-3
 """Largest length of a segment, [m]."""

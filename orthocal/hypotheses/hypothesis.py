@@ -10,11 +10,10 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Indices
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.session.session import Gauge, Session
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Key = TypeVar("Key")
 Sparse: TypeAlias = Any
 """A scipy.sparse.csr_array, which has no type stubs; an ordinary array for few columns."""

@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.hypotheses.hypothesis import MachineShift
 from orthocal.hypotheses.likelihood import Score
 from orthocal.hypotheses.linear_model import ModelLinearisation
 from orthocal.session.session import Session
-
-Array = NDArray[np.float64]
 
 MOST_ALTERNATIVES = 8
 """Alternatives of an anomaly that are listed."""

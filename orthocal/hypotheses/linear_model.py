@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Indices
 from orthocal.errors import ClosureError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import CalibrationProblem
@@ -26,9 +26,6 @@ from orthocal.hypotheses.likelihood import Likelihood, Products, build_likelihoo
 from orthocal.session.session import Session
 from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 MOST_ROUNDS = 2
 """Relinearisations per hypothesis."""

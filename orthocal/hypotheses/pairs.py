@@ -17,10 +17,8 @@ from functools import reduce
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Indices
 from orthocal.hypotheses.likelihood import AMOUNTS, NOISE_SCALES, Likelihood, log_of_sum
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 COARSE_TOLERANCES = (2, 3, 4, 5, 6)
 """Places in the grid of tolerance scales that all pairs are scored at."""

@@ -16,6 +16,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import ClosureError
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, AnomalyKind
 from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
@@ -49,8 +50,6 @@ from orthocal.hypotheses.linear_model import (
 )
 from orthocal.hypotheses.pairs import Singles, find_pairs
 from orthocal.session.session import Session
-
-Array = NDArray[np.float64]
 
 CLEARLY = 7.0
 """Logarithm of the Bayes factor from which on an anomaly is reported: by chance in at most one of

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import (
     ConfigDict,
     Field,
@@ -22,9 +22,9 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
+from orthocal.arrays import Array
 from orthocal.io.documents import Number
 
-Array = NDArray[np.float64]
 Item = TypeVar("Item")
 
 CLOSED = ConfigDict(extra="forbid")

@@ -13,6 +13,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Indices
 from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.workspace import tool_at_zero
@@ -27,9 +28,6 @@ from orthocal.sensors.tips import Tip
 from orthocal.session.session import Posture, Reading, Session, Setup
 from orthocal.statistics.noise import noise_floor
 from orthocal.units import MM
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 PLACES_ACROSS = 5
 """Number of positions across a leg's direction."""

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import ParameterError, SessionError
 from orthocal.io.documents import read_yaml, validate
 from orthocal.io.fields import read_only
@@ -26,8 +27,6 @@ from orthocal.sensors.leg_indicator import LegIndicator, Section
 from orthocal.sensors.mounting import USUAL, Mounting, MountingKeys
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Gauge, Posture, Session
-
-Array = NDArray[np.float64]
 
 REACH = 0.1
 """Largest default distance of the tool from the mechanical zero, along each coordinate, [m]."""

@@ -12,8 +12,8 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.assessment.tool_error import (
     ErrorSize,
     ErrorSizes,
@@ -38,8 +38,6 @@ from orthocal.session.session import Session
 from orthocal.statistics.information import Information
 from orthocal.statistics.noise import estimate_repeatability, noise_floor
 from orthocal.statistics.zeros import project_out_zeros
-
-Array = NDArray[np.float64]
 
 Criterion = Literal["aligned", "relative", "absolute", "worst", "A", "D", "E"]
 """Criterion of a plan: the RMS tool error in its three forms, the error at the worst point with

@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import ParameterError, RobotError
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.planning.equipment import Equipment, choose_box, place_tool
@@ -15,8 +15,6 @@ from orthocal.robot.model import Robot
 from orthocal.sensors.mounting import EXACT
 from orthocal.session.session import Gauge, Reading, Session, Setup
 from orthocal.units import MM
-
-Array = NDArray[np.float64]
 
 CLEAR = 0.02
 """Least distance of a tip from a hinge, [m]; less on legs shorter than five times that."""

@@ -10,8 +10,8 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.assessment.remaining_errors import RemainingError, rank_errors
 from orthocal.errors import ParameterError
 from orthocal.estimation.choice import Choice, resolve_choice
@@ -49,8 +49,6 @@ from orthocal.runtime.worker_pool import call_in_parallel, run_in_parallel, work
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.session.session import Posture, Purpose, Reading, Session, Setup
 from orthocal.statistics.zeros import project_out_zeros
-
-Array = NDArray[np.float64]
 
 MODEL = "full"
 """Model that a plan identifies by default: the complete machine with priors."""

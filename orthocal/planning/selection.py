@@ -14,16 +14,14 @@ from itertools import zip_longest
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from orthocal.arrays import Array
 from orthocal.errors import ParameterError
 from orthocal.planning.candidates import FEWEST, AlignedParameter, Candidates, CandidateSetup
 from orthocal.planning.information_gain import Pairs, SetupGain
 from orthocal.runtime.worker_pool import run_in_parallel
 from orthocal.units import MM
-
-Array = NDArray[np.float64]
 
 LEAST_IMPROVEMENT = 1e-3
 """Relative improvement by one round of exchanges that justifies another round."""

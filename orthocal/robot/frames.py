@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import RobotError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import ParameterError, RobotError
 from orthocal.io.fields import read_only
 from orthocal.io.files import content_withheld_outside, is_folder, read_file, require_plain_name
@@ -42,8 +43,6 @@ from orthocal.robot.parameters import AXES, DeclaredErrors, ParameterSet, split_
 from orthocal.robot.reference_posture import find_reference_posture
 from orthocal.robot.urdf import load_urdf
 from orthocal.units import DRIVE_UNITS, MM, Unit
-
-Array = NDArray[np.float64]
 
 LONGEST_LEG = 20.0
 """Largest length of a leg; a longer one is in mm, [m]."""

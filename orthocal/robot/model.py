@@ -10,14 +10,13 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import ClosureError, ParameterError, RobotError
 from orthocal.io.fields import read_only
 from orthocal.robot.closing import Closing, close_loops, describe_opening
 from orthocal.robot.frames import Placement, find_frame, place_frames
 from orthocal.robot.parameters import DeclaredErrors, ElementaryError, ParameterSet
 from orthocal.units import InUnit, Unit
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,14 +11,12 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import ClosureError
 from orthocal.robot.frames import Placement, carriers
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import ElementaryError
-
-Array = NDArray[np.float64]
 
 POSTURES = 4
 

@@ -11,8 +11,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthocal.arrays import Array, Indices
 from orthocal.errors import RobotError
 from orthocal.io.fields import read_only
 from orthocal.robot.closing import MAX_STEPS, Closing, describe_opening
@@ -25,9 +26,6 @@ from orthocal.robot.model import (
     coordinate_turns,
     coordinate_units,
 )
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 MAX_STARTS = 6
 """Starts of the search: the first from the YAML, the others at random around it, reproducibly."""

@@ -12,7 +12,6 @@ from functools import cached_property, lru_cache, partial
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from orthocal.effects.loading import reading_effects
 from orthocal.effects.protocol import NEUTRAL, Condition, condition_size
@@ -28,8 +27,6 @@ from orthocal.kinematics.robot_functions import RobotFunctions, robot_functions
 from orthocal.kinematics.symbolic import Pose
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import Frames, Sensor, View, sensor_conditions
-
-Array = NDArray[np.float64]
 
 INPUTS = ["actuated", "passive", "placements", "zero", "constants", "nuisance"]
 

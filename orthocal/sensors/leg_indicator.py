@@ -22,9 +22,9 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from orthocal.arrays import Array
 from orthocal.errors import SessionError
 from orthocal.io.documents import Name, Number
 from orthocal.robot.model import Leg, Robot
@@ -48,7 +48,6 @@ from orthocal.sensors.protocol import (
 from orthocal.sensors.tips import Tip, TipKeys, touch_by_ball, touch_by_blade
 from orthocal.units import MM, to_mm
 
-Array = NDArray[np.float64]
 Matrix = Any
 """Symbols or numbers of CasADi, or arrays."""
 

@@ -12,18 +12,14 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from orthocal.arrays import Array
 from orthocal.effects.protocol import Condition
 from orthocal.io.documents import Name
 from orthocal.kinematics.symbolic import Pose
 from orthocal.robot.model import Robot
 from orthocal.units import Unit
-
-Array = NDArray[np.float64]
-
 
 GaugeZero = Literal["free", "known"]
 """Gauge zero of a setup: estimated from its readings, or known to be 0, so that its readings are

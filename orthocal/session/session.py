@@ -14,18 +14,17 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from orthocal.arguments import require_array
+from orthocal.arrays import Array
 from orthocal.io.documents import Number
 from orthocal.io.fields import CLOSED, read_only
 from orthocal.io.html import paragraph, table
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import GaugeZero, Sensor
 from orthocal.units import MM
-
-Array = NDArray[np.float64]
 
 ALIKE = 9
 """Decimals to which distances of postures from the mechanical zero are compared, [m, rad]."""

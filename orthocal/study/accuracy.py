@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import ClosureError, SessionError, SolverError
 from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.estimation.fit import fit_problem
@@ -42,8 +43,6 @@ from orthocal.session.session import Session
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study, columns_in_edge_units, prepare_once
 from orthocal.units import UM
-
-Array = NDArray[np.float64]
 
 PREDICTED_MACHINES = 60
 """Machines over which the prediction is averaged: the Jacobian differs from machine to machine."""

@@ -13,6 +13,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import SessionError
 from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.estimation.fit import Fit, fit_problem
@@ -25,8 +26,6 @@ from orthocal.robot.parameters import Parameter
 from orthocal.session.session import Session
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study, columns_in_edge_units, prepare_once
-
-Array = NDArray[np.float64]
 
 Resampled = Literal["residuals", "cycles"]
 

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import ClosureError, ParameterError, SolverError
 from orthocal.estimation.fit import require_determined
 from orthocal.estimation.linear import (
@@ -37,7 +38,6 @@ from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study, prepare_once
 from orthocal.units import MM
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 IDENTIFIED = "identified"

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.measurement.files.session_file import check_contacts
@@ -24,8 +24,6 @@ from orthocal.session.session import Gauge, Reading, Session
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study
 from orthocal.units import MM, UM
-
-Array = NDArray[np.float64]
 
 TOOL = ("tool x", "tool y", "tool z")
 

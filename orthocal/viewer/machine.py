@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.robot.model import Robot
 from orthocal.units import MM
 from orthocal.viewer.motion import Timeline, place_frames
@@ -23,8 +23,6 @@ from orthocal.viewer.shapes import (
     to_triple,
 )
 from orthocal.viewer.visuals import load_visuals
-
-Array = NDArray[np.float64]
 
 GROUND = "Ground"
 AXES = "Axes x, y, z"

@@ -9,10 +9,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
+from orthocal.arrays import Array
 from orthocal.robot.model import Robot
 from orthocal.viewer.scene import FRAME_RATE
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,12 +24,11 @@ import umsgpack
 from meshcat.animation import Animation, AnimationClip, AnimationTrack
 from meshcat.geometry import Geometry, Material
 from meshcat.path import Path as NodePath
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.io.files import write_file
 from orthocal.text import printable
 
-Array = NDArray[np.float64]
 Point = tuple[float, float, float]
 Mark = Literal["solid", "ghost", "arrow", "line", "ball"]
 

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 
 import meshcat.geometry as g
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.viewer.scene import Label, Scene
 
-Array = NDArray[np.float64]
 Colour = tuple[float, float, float]
 
 AXIS_COLOURS: tuple[Colour, Colour, Colour] = (

@@ -12,16 +12,14 @@ import meshcat.geometry as g
 import numpy as np
 import pinocchio as pin
 from lxml import etree
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import RobotError
 from orthocal.io.files import exists, read_file, require_file
 from orthocal.robot.files import MESH_FORMATS, mesh_path, robot_directory
 from orthocal.robot.model import Robot
 from orthocal.robot.urdf import LARGEST_PLACE, captured_stderr, parse_urdf
 from orthocal.viewer.shapes import Colour, cylinder, pose_along
-
-Array = NDArray[np.float64]
 
 LARGEST_REPETITION = 10 * 2**20
 """Largest size of the repetitions of a mesh file, [bytes]."""

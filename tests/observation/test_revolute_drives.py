@@ -264,6 +264,6 @@ def test_somebody_who_records_is_shown_degrees_as_the_controller_has_them(root, 
     with open_recording(folder) as recording:
         shown = RecordingText(recording).row(1)
     assert shown.splitlines()[:2] == [
-        "2 of 18 (line 3 of the table): ya p-10",
+        "Line 3: ya p-10 (18 of 18 missing)",
         "  joints motor_a -6.000 deg, motor_b 0.000 deg",
     ]

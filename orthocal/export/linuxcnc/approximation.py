@@ -15,8 +15,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthocal.arrays import Array
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, ExportError
@@ -26,8 +27,6 @@ from orthocal.export.tool_tip import ToolTip
 from orthocal.kinematics.loop_closure import find_beyond_travel
 from orthocal.kinematics.workspace import cube_limits, describe_box, grid_points, tool_at_zero
 from orthocal.units import MM, UM
-
-Array = NDArray[np.float64]
 
 LETTERS = "XYZABC"
 """Coordinates of LinuxCNC in its order."""

@@ -11,8 +11,9 @@ from importlib.resources import files
 from string import Template
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
 from orthocal.export.linuxcnc.approximation import (
     LETTERS,
@@ -24,8 +25,6 @@ from orthocal.export.linuxcnc.nominal_form import NominalForm, Tangent
 from orthocal.robot.model import Drive
 from orthocal.text import comment_safe
 from orthocal.units import DRIVE_UNITS, MM, UM
-
-Array = NDArray[np.float64]
 
 LONGEST_LINE = 90
 

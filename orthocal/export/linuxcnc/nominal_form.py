@@ -19,14 +19,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.robot.model import Robot
-
-Array = NDArray[np.float64]
 
 TOLERANCE = 1e-9
 """Largest difference of the closed form from the model, [m]."""

@@ -9,8 +9,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from orthocal.arrays import Indices
 from orthocal.hypotheses.anomaly import Explanation
-from orthocal.hypotheses.hypothesis import Family, Indices, Patterns, Rows, Tails, sparse_rows
+from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, Tails, sparse_rows
 
 FEWEST = 4
 """Readings of a setup below which a tail or a drift is not distinguished from an outlier."""

@@ -9,8 +9,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from orthocal.arrays import Indices
 from orthocal.hypotheses.anomaly import Explanation
-from orthocal.hypotheses.hypothesis import Family, Indices, Rows
+from orthocal.hypotheses.hypothesis import Family, Rows
 
 MOST = 12
 """Amounts of one setup or posture that are considered."""

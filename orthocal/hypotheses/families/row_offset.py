@@ -6,13 +6,10 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Indices
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, Tails, sparse_rows
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 FEWEST = 3
 """Rows of a setup below which a row offset is a swap."""

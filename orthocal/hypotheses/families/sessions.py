@@ -9,14 +9,12 @@ from collections.abc import Iterator
 from itertools import combinations, permutations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.hypotheses.anomaly import AnomalyKind, Explanation
 from orthocal.hypotheses.hypothesis import Family, MachineShift
 from orthocal.hypotheses.linear_model import LinearModel
 from orthocal.session.session import Session
-
-Array = NDArray[np.float64]
 
 MOST_DRIVES = 6
 """Drives up to which all choices among them are considered."""

@@ -6,9 +6,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from orthocal.arrays import Indices
 from orthocal.hypotheses.anomaly import AnomalyKind, Explanation, Scope
 from orthocal.hypotheses.families.unit_and_sign import DECIMAL_POINTS, multiplied
-from orthocal.hypotheses.hypothesis import Family, Indices, Rows
+from orthocal.hypotheses.hypothesis import Family, Rows
 
 MISREAD = (1e-3, 0.5e-3, 0.2e-3, 0.1e-3)
 """Amounts by which a dial is misread: a turn, half a turn, a turn of a fine dial, a numbered mark,

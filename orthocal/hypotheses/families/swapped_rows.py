@@ -11,8 +11,9 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
+from orthocal.arrays import Indices
 from orthocal.hypotheses.anomaly import Explanation, Scope
-from orthocal.hypotheses.hypothesis import Family, Indices, Rows, group_rows
+from orthocal.hypotheses.hypothesis import Family, Rows, group_rows
 
 FAR_APART = 400
 """Rows of a session above which only neighbours in a setup are considered."""

@@ -7,13 +7,11 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array, Indices
 from orthocal.hypotheses.anomaly import AnomalyKind, Explanation, Scope
-from orthocal.hypotheses.hypothesis import Family, Indices, Rows
+from orthocal.hypotheses.hypothesis import Family, Rows
 from orthocal.units import MM
-
-Array = NDArray[np.float64]
 
 UNITS = (25.4, 1.0 / 25.4, 1e3, 1e-3)
 """Factors that correct inches, mm taken for inches, m, and µm."""

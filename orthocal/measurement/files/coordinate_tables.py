@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import SessionError
 from orthocal.io.documents import MOST_CSV_ROWS, csv_rows, parse_number
 from orthocal.io.files import read_lines
 from orthocal.robot.model import Robot
 from orthocal.units import DRIVE_UNITS, MM
-
-Array = NDArray[np.float64]
 
 Block = tuple[list[str], Array]
 """File and line of some rows, for messages, and their values, shape (k, n_columns), [SI]."""

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import ClosureError, SessionError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.loop_closure import nominal_closure
@@ -15,8 +15,6 @@ from orthocal.measurement.files.schema import OFFSET_KEYS, ControllerKeys, Postu
 from orthocal.robot.model import Robot
 from orthocal.session.session import Posture, PostureForm
 from orthocal.units import DRIVE_UNITS, MM
-
-Array = NDArray[np.float64]
 
 
 def require_given_zero(robot: Robot, where: str) -> None:

@@ -14,8 +14,9 @@ from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthocal.arrays import Array
 from orthocal.errors import ClosureError, SessionError
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
@@ -27,7 +28,6 @@ from orthocal.sensors.protocol import Contact
 from orthocal.session.session import Gauge, Posture, Reading, Session
 from orthocal.units import DEG, MM
 
-Array = NDArray[np.float64]
 Role = Literal["alignment", "reading", "subtracted", "return"]
 
 APPROACH = 2e-3

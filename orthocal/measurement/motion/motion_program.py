@@ -14,8 +14,8 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.errors import ParameterError
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.motion import SetupMotion, Stop, dial_zero, shown_joints
@@ -24,8 +24,6 @@ from orthocal.sensors.leg_indicator import BallIndicator
 from orthocal.session.session import Session
 from orthocal.text import comment_safe
 from orthocal.units import DRIVE_UNITS, MM, format_fixed
-
-Array = NDArray[np.float64]
 
 LETTERS = "XYZ"
 

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.output.report.figure import (
@@ -29,8 +30,6 @@ from orthocal.output.report.figure import (
 )
 from orthocal.output.text.layout import short_name, typeset
 from orthocal.units import MM, show_limit
-
-Array = NDArray[np.float64]
 
 FEW_PARAMETERS = 12
 """Number of parameters up to which units and correlations are printed as numbers."""

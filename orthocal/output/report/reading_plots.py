@@ -33,8 +33,6 @@ from orthocal.output.report.figure import (
 from orthocal.output.text.layout import short_name
 from orthocal.units import MM
 
-Array = NDArray[np.float64]
-
 _deviation, _residual, _unseen = map(attrgetter, ("deviation", "residual", "unseen"))
 
 SMALLEST_LENGTH = 1e-9

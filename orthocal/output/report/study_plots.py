@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter
-from numpy.typing import NDArray
 
 from orthocal.output.report.figure import (
     AFTER,
@@ -34,8 +33,6 @@ from orthocal.study.linearisation import LinearisationSummary
 from orthocal.study.runner import StudyTable
 from orthocal.study.sensitivity import SensitivitySummary
 from orthocal.units import UM
-
-Array = NDArray[np.float64]
 
 GREY = "#777777"
 

@@ -12,16 +12,15 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import RectBivariateSpline
 
+from orthocal.arrays import Array
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.assessment.tool_error import ToolAccuracy, assess_remaining
 from orthocal.calibration.calibration import Calibration
 from orthocal.output.report.figure import Plot, open_figure
 from orthocal.units import MM, UM
-
-Array = NDArray[np.float64]
 
 Field = Literal["now", "entered", "uncertainty"]
 

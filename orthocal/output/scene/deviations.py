@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ParameterError
 from orthocal.observation.model import predict_readings
@@ -16,8 +16,6 @@ from orthocal.observation.observations import build_observations
 from orthocal.robot.model import Robot
 from orthocal.session.session import Session, Setup
 from orthocal.statistics.zeros import project_out_zeros
-
-Array = NDArray[np.float64]
 
 Place = tuple[str, str]
 """Kind and name of the part of the machine that a sensor measures, such as ("leg", "x")."""

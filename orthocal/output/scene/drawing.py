@@ -13,8 +13,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, ParameterError
@@ -43,7 +43,6 @@ from orthocal.viewer.motion import (
 )
 from orthocal.viewer.scene import Scene, round_scale
 
-Array = NDArray[np.float64]
 Poses = Mapping[str, Array]
 """Frame to poses, shape (F, 4, 4), [m]."""
 

@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.kinematics.robot_functions import reference_poses
 from orthocal.output.scene.deviations import (
     Deviation,
@@ -32,8 +32,6 @@ from orthocal.viewer.shapes import (
     pose_along,
     to_triple,
 )
-
-Array = NDArray[np.float64]
 
 GAUGES = "Gauges"
 BEFORE = "Readings before"

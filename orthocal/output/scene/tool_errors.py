@@ -6,6 +6,7 @@ import meshcat.geometry as g
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.assessment.tool_error import ToolAccuracy, assess_remaining, assess_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
@@ -13,8 +14,6 @@ from orthocal.output.text.layout import um
 from orthocal.viewer.machine import MachineScene
 from orthocal.viewer.scene import LegendEntry, Scene, round_scale
 from orthocal.viewer.shapes import Colour, css, draw_arrow, material, pose_along
-
-Array = NDArray[np.float64]
 
 TOOL_NOW = "Tool error now"
 TOOL_ENTERED = "Tool error, offsets entered"

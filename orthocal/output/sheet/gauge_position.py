@@ -6,16 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.measurement.motion.motion import Guidance, SetupMotion
 from orthocal.robot.model import Leg, Robot, Rod
 from orthocal.sensors.protocol import Contact, TouchingTip
 from orthocal.session.session import Session, Setup
 from orthocal.units import MM
 from orthocal.viewer.motion import place_frames
-
-Array = NDArray[np.float64]
 
 ABOUT_ALONG = 0.97
 """Cosine above which the direction of a small offset is named after an axis of the world."""

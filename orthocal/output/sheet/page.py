@@ -6,8 +6,8 @@ import shlex
 from importlib import resources
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthocal.arrays import Array
 from orthocal.assessment.wording import name_direction
 from orthocal.io.html import escape, heading, page, paragraph, prose, table
 from orthocal.measurement.motion.motion import (
@@ -32,8 +32,6 @@ from orthocal.robot.model import Robot
 from orthocal.session.session import Gauge, Session
 from orthocal.units import DRIVE_UNITS, MM, format_fixed
 from orthocal.viewer.visuals import load_visuals
-
-Array = NDArray[np.float64]
 
 SHEET = "sheet.html"
 """Name of the sheet's file."""

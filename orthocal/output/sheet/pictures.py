@@ -14,9 +14,10 @@ from typing import NamedTuple
 
 import meshcat.geometry as g
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull, QhullError
 
+from orthocal.arrays import Array
 from orthocal.assessment.wording import axis_name, name_direction
 from orthocal.io.html import escape
 from orthocal.output.sheet.gauge_position import (
@@ -28,8 +29,6 @@ from orthocal.robot.model import Robot
 from orthocal.units import MM
 from orthocal.viewer.machine import VIEW
 from orthocal.viewer.visuals import Visual
-
-Array = NDArray[np.float64]
 
 BLUE, ORANGE, GREEN, GREY = "#0063a6", "#c55a00", "#007a4d", "#8a8f98"
 BLACK, DARK, TOUCHED = "#222", "#4d5661", "#9cc7e6"

@@ -6,11 +6,10 @@ import json
 from collections.abc import Iterable
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from rich.console import RenderableType
 from rich.text import Text
 
+from orthocal.arrays import Array
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.assessment.remaining_errors import RemainingError, find_remaining_errors
@@ -26,8 +25,6 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
 from orthocal.output.text.layout import noted, print_rich, table_of, um
 from orthocal.units import MM, UM, read_limit
-
-Array = NDArray[np.float64]
 
 POINT_COLUMNS = (
     *("x_mm", "y_mm", "z_mm"),
