@@ -35,6 +35,7 @@ UNITS = ("_mm", "_um", "_mrad", "_deg")
 
 PURE = {
     *("cycle", "finer", "ratio", "tolerance_scale", "log_likelihood_ratio", "log_evidence"),
+    "log_evidence_against_chosen",
     *("independent_readings", "parameters", "chance", "part_of_std", "readings"),
     *("largest_change_over_std",),
 }

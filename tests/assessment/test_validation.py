@@ -198,7 +198,7 @@ def test_each_of_several_sessions_must_have_the_offsets(plan):
     entered = [e.enter for e in find_entries(calibration)]
     right = simulate_session(with_offsets(plan, entered), TRUTH, seed=2).session
     other = simulate_session(with_offsets(plan, [0.0, 0.0, 0.0]), TRUTH, seed=3).session
-    with pytest.raises(SessionError, match="x_slide has 0 mm where the calibration says to enter"):
+    with pytest.raises(SessionError, match=r"x_slide has 0 mm instead of 1\.199 mm"):
         validate_calibration(calibration, [right, other])
 
 

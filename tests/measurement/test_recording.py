@@ -314,7 +314,7 @@ def talk(folder, lines, said):
         record.record(folder)
 
 
-KEPT = re.compile(r"Recorded: row \d+, (\S+) (\S+?)(?:, cycle (\d+))?: (-?[0-9.]+) mm\n")
+KEPT = re.compile(r"Recorded: line \d+, (\S+) (\S+?)(?:, cycle (\d+))?: (-?[0-9.]+) mm\n")
 
 
 def test_killed_many_times_no_accepted_reading_is_lost(tmp_path, monkeypatch):
@@ -343,7 +343,7 @@ def test_killed_many_times_no_accepted_reading_is_lost(tmp_path, monkeypatch):
                 text += ["back", f"{value / 100 - 0.01:.2f}"]
         os.write(lines_in, ("\n".join(text) + "\n").encode()[:60_000])
         answer = b""
-        while b"Recorded: row" not in answer:  # what comes before is the same every time
+        while b"Recorded: line" not in answer:  # what comes before is the same every time
             answer += os.read(said_out, 65536)
         time.sleep(float(rng.uniform(0.0, 0.05)))
         os.kill(child.pid, signal.SIGKILL)

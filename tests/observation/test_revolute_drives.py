@@ -150,9 +150,7 @@ def test_what_was_identified_is_validated(tmp_path, robot):
     assert predicted > 2.0 * found.rms_after
     assert achieved == pytest.approx(predicted, rel=0.2)
     wrong = load_plan(write_plan(tmp_path / "c", robot, "{offsets_deg: [0, 0]}"))
-    with pytest.raises(
-        SessionError, match=r"controller.*: motor_a has 0 mrad where the calibration"
-    ):
+    with pytest.raises(SessionError, match=r"controller.*: motor_a has 0 mrad instead of"):
         validate_calibration(found, simulate_session(wrong, OFFSETS, seed=3).session)
 
 

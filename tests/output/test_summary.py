@@ -114,7 +114,7 @@ def test_a_prior_marks_what_the_readings_leave_open():
     text = summarize(result, details=True)
     assert line(text, "x_leg.length").split()[4] == "0%"
     assert line(text, "x_slide.offset").split()[4] == "99%"
-    assert "resolved: share of the prior variance that the readings remove" in text
+    assert "resolved: how much the readings improved a value" in text
     assert "tolerances as prior" in text
 
 

@@ -174,7 +174,7 @@ def test_only_known_solvers_are_taken():
 
 def test_readings_left_out_and_parameters_held(root):
     problem = build_problem(load_session(root / "examples/raw-cycles"), model="lengths")
-    given = {"excluded": [3, 11], "held": {0: 0.4e-3}}
+    given = {"excluded": [3, 11], "prescribed": {0: 0.4e-3}}
     ours, ipopts = both(problem, loss="squares", sigma=10e-6, **given)
     assert np.abs((ours.theta - ipopts.theta) / problem.theta_scale).max() < AGREED
     assert ours.theta[0] == pytest.approx(0.4e-3, abs=1e-15)
