@@ -392,6 +392,7 @@ def test_a_terminal_can_be_left_by_ctrl_c(folder):
     child, terminal = pty.fork()
     if child == 0:
         os.environ.update(COLUMNS="60", TERM="dumb")
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # ignored if the tests run in the background
         os.execv(sys.executable, [sys.executable, "-m", "orthocal", "record", str(folder)])
     said = b""
 
