@@ -1,0 +1,65 @@
+"""Backlash of each drive: the slide stays behind by half of it, on the side that it comes from.
+
+    really at  ρ − (b/2) s
+
+with the backlash b ≥ 0 of the drive and s = +1 where its coordinate grew in its last motion, −1
+where it fell. Where the direction is unknown s is 0: the middle of both positions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import casadi as ca
+
+from orthocal.effects.protocol import Effect, EffectKeys, Symbols
+from orthocal.io.documents import PositiveNumber
+from orthocal.robot.model import Robot
+from orthocal.robot.parameters import ElementaryError
+from orthocal.units import MM, MRAD, read_limit
+
+
+class BacklashKeys(EffectKeys):
+    """Keys under `orthocal.effects.backlash`: largest backlash of a drive in working order."""
+
+    tolerance_mm: PositiveNumber = 0.04
+    tolerance_mrad: PositiveNumber = 0.2
+    """Of revolute drives."""
+
+
+@dataclass(frozen=True, eq=False)
+class Backlash(Effect):
+    """Backlash of each drive, half-normal."""
+
+    name = "backlash"
+    keys = BacklashKeys
+    conditions = ("approach",)
+
+    robot: Robot
+    errors: tuple[ElementaryError, ...]
+    """`<drive>.backlash`, [m, rad]."""
+
+    @classmethod
+    def from_keys(cls, keys: BacklashKeys, robot: Robot) -> Self:
+        """The effect of a robot; arguments as for `Effect.from_keys`."""
+        stds = {
+            "m": read_limit(keys.tolerance_mm) * MM,
+            "rad": read_limit(keys.tolerance_mrad) * MRAD,
+        }
+        errors = (
+            ElementaryError(
+                f"{d.name}.backlash", "backlash", d.name, d.unit, stds[d.unit], positive=True
+            )
+            for d in robot.drives
+        )
+        return cls(robot, tuple(errors))
+
+    def describe(self) -> str:
+        """Description in a few words."""
+        return "backlash of each drive"
+
+    def drives(self, coordinates: ca.SX, errors: Symbols, conditions: Symbols) -> ca.SX:
+        """Actual drive coordinates; arguments as for `Effect.drives`."""
+        backlash = ca.vertcat(*(errors[e.name] for e in self.errors))
+        return coordinates - 0.5 * backlash * conditions["approach"]

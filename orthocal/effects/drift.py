@@ -1,0 +1,51 @@
+"""Drift of a gauge: the zero of each setup moves linearly with time.
+
+    reading + rate · t
+
+with t counted from the first reading of the setup.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import casadi as ca
+
+from orthocal.effects.protocol import Effect, EffectKeys, Symbols
+from orthocal.io.documents import PositiveNumber
+from orthocal.robot.model import Robot
+from orthocal.robot.parameters import ElementaryError
+from orthocal.units import UM, read_limit
+
+
+class DriftKeys(EffectKeys):
+    """Keys under `orthocal.effects.drift`."""
+
+    tolerance_um_per_min: PositiveNumber = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Drift(Effect):
+    """Linear drift of the gauge in each setup."""
+
+    name = "drift"
+    keys = DriftKeys
+    conditions = ("time",)
+
+    setup_errors: tuple[ElementaryError, ...]
+    """`drift` of each setup, [m/s]."""
+
+    @classmethod
+    def from_keys(cls, keys: DriftKeys, robot: Robot) -> Self:
+        """The effect of a robot; arguments as for `Effect.from_keys`."""
+        std = read_limit(keys.tolerance_um_per_min) * UM / 60.0
+        return cls((ElementaryError("drift", "drift", "", "m/s", std),))
+
+    def describe(self) -> str:
+        """Description in a few words."""
+        return "drift of the gauge in each setup"
+
+    def reading(self, reading: ca.SX, errors: Symbols, conditions: Symbols) -> ca.SX:
+        """Reading of the gauge; arguments as for `Effect.reading`."""
+        return reading + errors["drift"] * conditions["time"]

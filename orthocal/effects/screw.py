@@ -1,0 +1,83 @@
+"""Periodic error of each drive's screw, once a turn.
+
+    really at  ρ + A sin(2πρ/lead) + B cos(2πρ/lead)
+
+with the commanded coordinate ρ without the controller's offset, which belongs to the screw and its
+home switch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import casadi as ca
+import numpy as np
+
+from orthocal.effects.protocol import Effect, EffectKeys, Symbols
+from orthocal.errors import RobotError
+from orthocal.io.documents import PositiveNumber
+from orthocal.robot.model import Robot
+from orthocal.robot.parameters import ElementaryError
+from orthocal.units import MM, read_limit
+
+KINDS = ("screw_sin", "screw_cos")
+"""Suffixes of the parameters of a drive: A and B."""
+
+
+class ScrewKeys(EffectKeys):
+    """Keys under `orthocal.effects.screw`."""
+
+    lead_mm: PositiveNumber
+    """Travel in a turn of the screw."""
+    periodic_tolerance_mm: PositiveNumber = 0.01
+    """Of A and of B."""
+
+
+@dataclass(frozen=True, eq=False)
+class Screw(Effect):
+    """Periodic error of the screws of all linear drives."""
+
+    name = "screw"
+    keys = ScrewKeys
+
+    robot: Robot
+    lead: float
+    """[m]."""
+    errors: tuple[ElementaryError, ...]
+    """`<drive>.screw_sin` and `<drive>.screw_cos` of each linear drive, [m]."""
+
+    @classmethod
+    def from_keys(cls, keys: ScrewKeys, robot: Robot) -> Self:
+        """The effect of a robot; arguments as for `Effect.from_keys`."""
+        std = read_limit(keys.periodic_tolerance_mm) * MM
+        linear = [d for d in robot.drives if d.unit == "m"]
+        if not linear:
+            raise RobotError("has no linear drive; expected a robot with screws")
+        for d in linear:
+            travel = d.upper - d.lower
+            if keys.lead_mm * MM > travel:
+                raise RobotError(
+                    f"found {keys.lead_mm:g}; expected at most the travel of {d.name}, "
+                    f"{travel / MM:g}",
+                    where="lead_mm",
+                )
+        errors = (
+            ElementaryError(f"{d.name}.{kind}", "screw", d.name, "m", std)
+            for d in linear
+            for kind in KINDS
+        )
+        return cls(robot, keys.lead_mm * MM, tuple(errors))
+
+    def describe(self) -> str:
+        """Description in a few words."""
+        return "periodic error of the screws"
+
+    def drives(self, coordinates: ca.SX, errors: Symbols, conditions: Symbols) -> ca.SX:
+        """Actual drive coordinates; arguments as for `Effect.drives`."""
+        phase = 2.0 * np.pi * coordinates / self.lead
+        sine, cosine = (
+            ca.vertcat(*(errors.get(f"{d.name}.{kind}", ca.SX(1, 1)) for d in self.robot.drives))
+            for kind in KINDS
+        )
+        return coordinates + sine * ca.sin(phase) + cosine * ca.cos(phase)

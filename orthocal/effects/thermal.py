@@ -1,0 +1,138 @@
+"""Thermal expansion of legs and screws.
+
+    length of a rod   L (1 + α_legs (T − T0))
+    drive really at   ρ + α_screws (T − T0) (ρ − ρ_fixed)
+
+Both coefficients are stated, with tolerances; the parameters are their deviations from the stated
+values. A screw expands from the coordinate ρ_fixed at which it is held: by default that of the
+point nearest to all drive axes, where they meet on an Orthoglide. A base that expands about this
+point with the screws changes only the scale of the machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Self
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from pydantic import Field
+
+from orthocal.effects.protocol import Effect, EffectKeys, Symbols
+from orthocal.errors import RobotError
+from orthocal.io.documents import Name, Number, PositiveNumber
+from orthocal.robot.model import Robot, joint_axis
+from orthocal.robot.parameters import ElementaryError
+from orthocal.units import MM, PPM, read_limit
+
+PARALLEL = 1e-6
+"""Smallest eigenvalue over the largest below which drive axes have no common point."""
+
+
+class ThermalKeys(EffectKeys):
+    """Keys under `orthocal.effects.thermal`; the defaults are for steel."""
+
+    reference_C: Annotated[Number, Field(ge=-50.0, le=100.0)] = 20.0
+    """Temperature at which the nominal dimensions hold."""
+    legs_ppm: Annotated[Number, Field(ge=-10.0, le=100.0)] = 11.5
+    screws_ppm: Annotated[Number, Field(ge=-10.0, le=100.0)] = 11.5
+    """Coefficients of expansion, per kelvin."""
+    tolerance_ppm: PositiveNumber = 3.0
+    fixed_mm: dict[Name, Number] = Field(default_factory=dict)
+    """Drive to the coordinate at which its screw is held."""
+
+
+@dataclass(frozen=True, eq=False)
+class Thermal(Effect):
+    """Thermal expansion of legs and screws."""
+
+    name = "thermal"
+    keys = ThermalKeys
+    conditions = ("temperature",)
+
+    robot: Robot
+    reference: float
+    """[°C]."""
+    expansion: Mapping[str, float]
+    """Stated coefficients of `legs` and `screws`, [1/K]."""
+    fixed: tuple[float | None, ...]
+    """Coordinate at which the screw of each drive is held, [m]; None for a revolute drive."""
+    errors: tuple[ElementaryError, ...]
+    """`legs.expansion` and `screws.expansion`: deviations from the stated ones, [1/K]."""
+
+    @classmethod
+    def from_keys(cls, keys: ThermalKeys, robot: Robot) -> Self:
+        """The effect of a robot; arguments as for `Effect.from_keys`."""
+        stated = {"legs": keys.legs_ppm * PPM, "screws": keys.screws_ppm * PPM}
+        std = read_limit(keys.tolerance_ppm) * PPM
+        errors = (
+            ElementaryError(f"{part}.expansion", "thermal", part, "1/K", std) for part in stated
+        )
+        return cls(robot, keys.reference_C, stated, _fixed_points(keys, robot), tuple(errors))
+
+    def describe(self) -> str:
+        """Description in a few words."""
+        return "thermal expansion of legs and screws"
+
+    def _growth(self, part: str, errors: Symbols, conditions: Symbols) -> ca.SX:
+        """Relative expansion of a part."""
+        coefficient = self.expansion[part] + errors[f"{part}.expansion"]
+        return coefficient * (conditions["temperature"] - self.reference)
+
+    def drives(self, coordinates: ca.SX, errors: Symbols, conditions: Symbols) -> ca.SX:
+        """Actual drive coordinates; arguments as for `Effect.drives`."""
+        lengths = ca.vertcat(
+            *(0.0 if f is None else coordinates[i] - f for i, f in enumerate(self.fixed))
+        )
+        return coordinates + self._growth("screws", errors, conditions) * lengths
+
+    def rods(self, errors: Symbols, conditions: Symbols) -> Mapping[tuple[str, str], ca.SX]:
+        """Changes of the lengths of rods; arguments as for `Effect.rods`."""
+        growth = self._growth("legs", errors, conditions)
+        return {
+            (leg.name, rod.name): growth * rod.length
+            for leg in self.robot.legs.values()
+            for rod in leg.rods.values()
+        }
+
+
+def _fixed_points(keys: ThermalKeys, robot: Robot) -> tuple[float | None, ...]:
+    """Coordinate at which each screw is held, [m]; None for a revolute drive."""
+    linear = [d.name for d in robot.drives if d.unit == "m"]
+    for name in keys.fixed_mm:
+        if name not in linear:
+            raise RobotError(
+                f"'{name}' is not a linear drive; expected one of {', '.join(linear)}",
+                where="fixed_mm",
+            )
+    fixed = {name: value * MM for name, value in keys.fixed_mm.items()}
+    if len(fixed) < len(linear):
+        fixed = _common_point(robot, linear) | fixed
+    return tuple(fixed.get(d.name) for d in robot.drives)
+
+
+def _common_point(robot: Robot, drives: list[str]) -> dict[str, float]:
+    """Commanded coordinate of each linear drive at the point nearest to all their axes, [m].
+
+    Raises:
+        RobotError: If the axes are parallel: no point is nearest.
+    """
+    model, data = robot.model, robot.model.createData()
+    pin.framesForwardKinematics(model, data, pin.neutral(model))
+    joints = [model.getJointId(name) for name in drives]
+    places = np.array([data.oMi[j].translation for j in joints])
+    axes = np.array([data.oMi[j].rotation @ joint_axis(model, j)[:3] for j in joints])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    total = across.sum(axis=0)
+    spread = np.linalg.eigvalsh(total)
+    if spread[0] < PARALLEL * spread[-1]:
+        raise RobotError(
+            "the drive axes do not meet; state the coordinate at which each screw is held",
+            where="fixed_mm",
+        )
+    point = np.linalg.solve(total, np.einsum("kij,kj->i", across, places))
+    gain = dict(zip((d.name for d in robot.drives), robot.drive_gain, strict=True))
+    along = ((point - places) * axes).sum(axis=1)
+    return {name: float(x / gain[name]) for name, x in zip(drives, along, strict=True)}
