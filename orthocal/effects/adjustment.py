@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Self
+from typing import Any, Self
 
 import casadi as ca
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
-from pydantic import Field
 
 from orthocal.effects.protocol import Effect, EffectKeys, Placement, Symbols
 from orthocal.errors import RobotError
@@ -155,7 +154,7 @@ def _read_foot(keys: AdjustmentKeys, robot: Robot) -> tuple[Placement, Array]:
     drives = [d.name for d in robot.drives]
     if keys.moves not in drives:
         raise RobotError(
-            f"found {keys.moves!r}; expected a drive ({', '.join(drives)}), or a rod as `lengthens`",
+            f"found {keys.moves!r}; expected one of the drives {', '.join(drives)}",
             where="moves",
         )
     for key in ("at_mm", "direction"):
@@ -171,13 +170,14 @@ def _read_foot(keys: AdjustmentKeys, robot: Robot) -> tuple[Placement, Array]:
         pivot = np.array(keys.pivot_mm) * MM
         arm = at - pivot
         arm -= (arm @ direction) * direction
-        if np.linalg.norm(arm) < SHORTEST_LEVER:
+        lever = float(np.linalg.norm(arm))
+        if lever < SHORTEST_LEVER:
             raise RobotError(
-                f"is {np.linalg.norm(arm) / MM:.3g} mm from the line of the foot; expected at least "
+                f"is {lever / MM:.3g} mm from the line of the foot; expected at least "
                 f"{SHORTEST_LEVER / MM:g} mm",
                 where="pivot_mm",
             )
-        turn = np.cross(arm, direction) / (arm @ arm)
+        turn = np.cross(arm, direction) / lever**2
         shift = -np.cross(turn, pivot)
     model, data = robot.model, robot.model.createData()
     pin.framesForwardKinematics(model, data, robot.configuration(robot.reference_posture))
