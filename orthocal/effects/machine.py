@@ -53,7 +53,7 @@ def express_machine(
             elementary[term] = elementary[term] + coefficient * value
     known = {**neutral_conditions(robot), **(conditions or {})}
     actuated, twists = commanded, dict[Placement, ca.SX]()
-    for effect in robot_effects(robot):
+    for effect in reversed(robot_effects(robot)):  # the drive's gain and offset act last
         own = {e.name: elementary[e.name] for e in effect.errors}
         needed: Symbols = {name: known[name] for name in effect.conditions}
         actuated = effect.drives(actuated, own, needed)

@@ -93,8 +93,8 @@ class Effect:
         """Actual drive coordinates.
 
         Args:
-            coordinates: Coordinates after the preceding effects, shape (n_drives,), [m, rad]; those
-                that the controller commands for the first effect.
+            coordinates: Commanded coordinates, shape (n_drives,), [m, rad], changed by those effects
+                that the robot's YAML names later. Gain and offset of the drives act last.
             errors: The effect's parameters.
             conditions: The conditions that it needs.
 

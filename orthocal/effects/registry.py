@@ -9,7 +9,11 @@ the effect, and its object is the class:
 
 from __future__ import annotations
 
+from orthocal.effects.backlash import Backlash
+from orthocal.effects.drift import Drift
 from orthocal.effects.protocol import Effect
+from orthocal.effects.screw import Screw
+from orthocal.effects.thermal import Thermal
 from orthocal.errors import OrthocalError
 from orthocal.runtime.registry import Registry
 
@@ -23,7 +27,11 @@ def _read_effect(name: str, offered: type[Effect]) -> type[Effect]:
     return offered
 
 
-_EFFECTS = Registry[type[Effect]](GROUP, "effect", _read_effect, {})
+BUILT_IN: tuple[type[Effect], ...] = (Backlash, Screw, Thermal, Drift)
+
+_EFFECTS = Registry[type[Effect]](
+    GROUP, "effect", _read_effect, {effect.name: effect for effect in BUILT_IN}
+)
 
 
 def register_effect(effect: type[Effect]) -> None:
