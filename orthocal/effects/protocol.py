@@ -93,7 +93,7 @@ class Effect:
         """Actual drive coordinates.
 
         Args:
-            coordinates: Commanded coordinates, shape (n_drives,), [m, rad], changed by those effects
+            coordinates: Commanded coordinates, shape (n_drives,), [m, rad], after those effects
                 that the robot's YAML names later. Gain and offset of the drives act last.
             errors: The effect's parameters.
             conditions: The conditions that it needs.

@@ -355,37 +355,41 @@ class Robot:
         Raises:
             ParameterError: If a name is unknown, or of an effect that placements cannot express.
         """
-        errors = self.parameters.expand(values)
-        model = self.model.copy()
         gain = np.array(self.drive_gain)
-        joint_twists: dict[str, Array] = {}
-        frame_twists: dict[str, Array] = {}
-        offsets: dict[str, float] = {}
-        for name, value in errors.items():
+        twists: dict[Placement, Array] = {}
+        offsets: dict[Placement, Array] = {}
+        for name, value in self.parameters.expand(values).items():
             e = self.parameters.elementary[name]
             if e.kind == "scale":
                 gain[[d.name for d in self.drives].index(e.owner)] += value
-            elif e.kind == "offset":
-                offsets[e.owner] = value
-            elif e.axis < 0:
+                continue
+            if e.kind != "offset" and e.axis < 0:
                 raise ParameterError(f"'{name}' cannot be written into placements")
+            placement = self.placement_of(e)
+            if e.kind == "offset":
+                offsets[placement] = value * joint_axis(self.model, placement.index)
             else:
-                twists = frame_twists if e.of_frame else joint_twists
-                twists.setdefault(e.owner, np.zeros(6))[e.axis] += value
-        for owner, twist in joint_twists.items():
-            i = model.getJointId(owner)
-            model.jointPlacements[i] = model.jointPlacements[i] * pin.exp6(twist)
-        for owner, value in offsets.items():
-            i = model.getJointId(owner)
-            shift = pin.exp6(joint_axis(model, i) * value)
-            model.jointPlacements[i] = model.jointPlacements[i] * shift
-        place_frames(model, self.model, frame_twists)
-        return replace(
-            self,
-            model=model,
-            constraints=build_constraints(model, self.closures),
-            drive_gain=read_only(gain),
-        )
+                twists.setdefault(placement, np.zeros(6))[e.axis] += value
+        displaced = self.displaced(twists).displaced(offsets)  # a drive moves in its own axes
+        return replace(displaced, drive_gain=read_only(gain))
+
+    def displaced(self, twists: Mapping[Placement, ArrayLike]) -> Robot:
+        """Robot with displaced placements of joints and frames: placement · exp6(δ).
+
+        Args:
+            twists: Placement to its twist δ, shape (6,), [m, rad].
+        """
+        model = self.model.copy()
+        frames: dict[str, Array] = {}
+        for placement, twist in twists.items():
+            delta = np.asarray(twist, dtype=np.float64)
+            if placement.of_frame:
+                frames[str(model.frames[placement.index].name)] = delta
+            else:
+                i = placement.index
+                model.jointPlacements[i] = model.jointPlacements[i] * pin.exp6(delta)
+        place_frames(model, self.model, frames)
+        return replace(self, model=model, constraints=build_constraints(model, self.closures))
 
 
 def require_tcp(robot: Robot) -> Tcp:
