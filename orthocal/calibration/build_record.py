@@ -218,7 +218,7 @@ def _estimates(
             mean=float(problem.prior_mean[i]),
             lower=finite_or_none(selection.lower[i]),
             upper=finite_or_none(selection.upper[i]),
-            at_bound=words[int(solution.at_bound[i])],
+            at_bound=words[int(solution.at_bound[i] * fit.at_bound[i])],
             interval=intervals.get(p.name),
         )
         for i, p in enumerate(problem.parameters)

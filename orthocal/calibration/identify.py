@@ -65,7 +65,8 @@ def identify(
         TypeError: If an argument is of another kind.
         ValueError: If `start` does not have one number for each free error of the machine.
     """
-    session = join_sessions(gather_sessions(sessions))
+    effects = choice.effects if isinstance(choice, Choice) else None
+    session = join_sessions(gather_sessions(sessions), effects=effects)
     require_names(profile, argument="profile")
     chosen = resolve_choice(choice, session)
     options = _solver_options(solver, loss)

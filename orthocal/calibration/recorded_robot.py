@@ -16,7 +16,7 @@ from functools import lru_cache
 from pathlib import Path, PurePosixPath
 
 from orthocal.calibration.records import CalibrationRecord, RobotFile, RobotRecord
-from orthocal.effects.loading import load_robot, load_robot_content
+from orthocal.effects.loading import load_robot, load_robot_content, with_effects
 from orthocal.errors import CalibrationFileError, ParameterError, RobotError, SessionError
 from orthocal.io.fields import finite_or_none
 from orthocal.measurement.files.readings_checks import check_conditions
@@ -42,6 +42,7 @@ def record_robot(session: Session) -> RobotRecord:
             (d.name, d.unit, finite_or_none(d.lower), finite_or_none(d.upper)) for d in robot.drives
         ),
         tolerances=tuple(robot.parameters.stated.items()),
+        effects=robot.chosen_effects,
     )
 
 
@@ -97,6 +98,8 @@ def load_recorded_robot(record: RobotRecord, *, file: str) -> Robot:
             "used as it was calibrated.",
             *(printable(text) for text in (file, record.name, str(source))),
         )
+    with _named(f"{file}: robot.effects"):
+        robot = with_effects(robot, record.effects)
     with _named(f"{file}: robot.tolerances"):
         return robot.with_tolerances(dict(record.tolerances))
 
@@ -209,7 +212,7 @@ def _named(where: str) -> Iterator[None]:
     """Turn errors about the robot into errors of the file, by default at a key."""
     try:
         yield
-    except (ParameterError, SessionError) as e:
+    except (ParameterError, RobotError, SessionError) as e:
         raise CalibrationFileError(e.problem, where=e.where or where) from None
 
 

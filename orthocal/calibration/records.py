@@ -85,6 +85,8 @@ class RobotRecord:
     tolerances: Many[tuple[str, PositiveNumber]] = ()
     """Names or globs with their units, and the tolerances in these units that the session states
     instead of the robot's."""
+    effects: Many[str] | None = None
+    """Effects beside geometry that were chosen; None for those that the robot's YAML names."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,6 +11,7 @@ from orthocal.cli.files import load_joined
 from orthocal.cli.options import (
     AllRows,
     Details,
+    Effects,
     Free,
     Json,
     Model,
@@ -19,6 +20,7 @@ from orthocal.cli.options import (
     Tolerances,
     command,
     read_tolerances,
+    split_effects,
     split_globs,
 )
 from orthocal.cli.printing import deliver_judged, judgement_on_failure
@@ -32,6 +34,7 @@ def calibrate(
     sessions: SessionPaths,
     model: Model = None,
     free: Free = None,
+    effects: Effects = None,
     known: list[str] | None = None,
     tolerance: Tolerances = None,
     prior: Annotated[bool | None, Option("--prior/--no-prior")] = None,
@@ -76,7 +79,7 @@ def calibrate(
 
     if out is not None:
         require_writable(out, FILES)
-    session = load_joined(sessions)
+    session = load_joined(sessions, effects=split_effects(effects))
     parameters = session.robot.parameters
     with judgement_on_failure(session, json=json):
         result = orthocal.calibrate(

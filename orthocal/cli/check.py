@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import orthocal
 from orthocal.cli.files import load_joined
-from orthocal.cli.options import Details, Json, SessionPaths, command
+from orthocal.cli.options import Details, Effects, Json, SessionPaths, command, split_effects
 from orthocal.cli.printing import deliver_judged
 
 
 @command()
-def check(sessions: SessionPaths, json: Json = False, details: Details = False) -> None:
+def check(
+    sessions: SessionPaths,
+    effects: Effects = None,
+    json: Json = False,
+    details: Details = False,
+) -> None:
     """Check readings for mistakes: signs, units, rows, the gauge.
 
     The verdict is that of `calibrate` on the same readings.
 
     Exit code 0: no anomaly. 3: check the readings before you continue.
     """
-    found = orthocal.check_session(load_joined(sessions))
+    found = orthocal.check_session(load_joined(sessions, effects=split_effects(effects)))
     deliver_judged(found, json=json, details=details)

@@ -9,11 +9,13 @@ from orthocal.cli.files import load_each_once
 from orthocal.cli.options import (
     AllRows,
     Details,
+    Effects,
     Json,
     SessionPaths,
     Tolerances,
     command,
     read_tolerances,
+    split_effects,
     split_globs,
 )
 from orthocal.cli.printing import deliver_judged, judgement_on_failure
@@ -24,6 +26,7 @@ def compare(
     sessions: SessionPaths,
     models: str | None = None,
     repeat: list[Path] | None = None,
+    effects: Effects = None,
     tolerance: Tolerances = None,
     json: Json = False,
     details: Details = False,
@@ -38,12 +41,13 @@ def compare(
         repeat (SESSION): Another session, to see which residuals repeat. May be stated several
             times.
     """
-    loaded = load_each_once(sessions)
+    chosen = split_effects(effects)
+    loaded = load_each_once(sessions, effects=chosen)
     with judgement_on_failure(orthocal.join_sessions(loaded), json=json):
         comparison = orthocal.compare_models(
             loaded,
             models=split_globs([models] if models else None),
             tolerances=read_tolerances(tolerance, loaded[0].robot),
-            repeat=load_each_once(repeat) if repeat else None,
+            repeat=load_each_once(repeat, effects=chosen) if repeat else None,
         )
     deliver_judged(comparison, json=json, details=details, all_rows=all_rows)

@@ -16,11 +16,18 @@ FEWEST_DIFFERENT = 4
 """Number of different values from which equal readings show that a session is a copy."""
 
 
-def load_each_once(paths: Sequence[Path]) -> list[orthocal.Session]:
+def load_each_once(
+    paths: Sequence[Path], *, effects: Sequence[str] | None = None
+) -> list[orthocal.Session]:
     """Load sessions, and refuse those whose readings would count twice.
+
+    Args:
+        paths: Their paths.
+        effects: Effects beside geometry instead of those that the sessions state.
 
     Raises:
         SessionError: If two sessions are the same, or have the same readings.
+        ParameterError: If an effect does not exist.
     """
     sessions: list[orthocal.Session] = []
     for path in paths:
@@ -37,12 +44,17 @@ def load_each_once(paths: Sequence[Path]) -> list[orthocal.Session]:
                 where=str(session.readings_path or path),
             )
         sessions.append(session)
-    return sessions
+    if effects is None:
+        return sessions
+    from orthocal.robot.parameters import errors_at
+
+    with errors_at("--effects"):
+        return [session.with_effects(effects) for session in sessions]
 
 
-def load_joined(paths: Sequence[Path]) -> orthocal.Session:
-    """Load sessions as one; for the errors see `load_each_once`."""
-    return orthocal.join_sessions(load_each_once(paths))
+def load_joined(paths: Sequence[Path], *, effects: Sequence[str] | None = None) -> orthocal.Session:
+    """Load sessions as one; arguments and errors as for `load_each_once`."""
+    return orthocal.join_sessions(load_each_once(paths, effects=effects))
 
 
 def _same_readings(one: orthocal.Session, other: orthocal.Session) -> bool:

@@ -146,6 +146,14 @@ Tolerances = Annotated[
         "any text.",
     ),
 ]
+Effects = Annotated[
+    str | None,
+    Option(
+        metavar="EFFECTS",
+        help="Effects beside geometry to identify, such as backlash,thermal, or none; default: "
+        "those that the session states, else those of the robot.",
+    ),
+]
 Error = Annotated[
     list[str] | None,
     Option(metavar="NAME=VALUE", help="Error of the machine, such as x_slide.offset_mm=1.2."),
@@ -215,6 +223,14 @@ Anyway = Annotated[
 def split_globs(texts: Sequence[str] | None) -> list[str]:
     """Globs of repeated options, each with several separated by commas."""
     return [glob.strip() for text in texts or [] for glob in text.split(",") if glob.strip()]
+
+
+def split_effects(text: str | None) -> list[str] | None:
+    """Names of the option `--effects`; None where it is absent."""
+    if text is None:
+        return None
+    names = split_globs([text])
+    return [] if names == ["none"] else names
 
 
 def load_robot_or_session(subject: str) -> tuple[orthocal.Session | None, orthocal.Robot]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import orthocal
 from orthocal.cli.files import require_new_files
 from orthocal.cli.options import (
+    Effects,
     Error,
     Errors,
     Force,
@@ -14,6 +15,7 @@ from orthocal.cli.options import (
     Tolerances,
     command,
     read_tolerances,
+    split_effects,
 )
 from orthocal.cli.printing import put_note
 from orthocal.errors import ParameterError
@@ -28,6 +30,7 @@ def simulate(
     error: Error = None,
     errors: Errors = None,
     draw: str | None = None,
+    effects: Effects = None,
     tolerance: Tolerances = None,
     exact: bool = False,
     seed: Seed = 0,
@@ -43,9 +46,13 @@ def simulate(
         exact: Without noise, gauge zeros and rounding.
     """
     from orthocal.observation.simulate import collect_errors, truth_document
+    from orthocal.robot.parameters import errors_at
 
     require_new_files(out, FILES, force=force)
     planned = orthocal.load_plan(plan)
+    if effects is not None:
+        with errors_at("--effects"):
+            planned = planned.with_effects(split_effects(effects))
     tolerances = read_tolerances(tolerance, planned.robot)
     if tolerances and draw is None:
         raise ParameterError("has no effect without --draw", where="--tolerance")

@@ -49,7 +49,13 @@ class Backlash(Effect):
         }
         errors = (
             ElementaryError(
-                f"{d.name}.backlash", "backlash", d.name, d.unit, stds[d.unit], positive=True
+                f"{d.name}.backlash",
+                cls.name,
+                d.name,
+                d.unit,
+                stds[d.unit],
+                complete=True,
+                positive=True,
             )
             for d in robot.drives
         )

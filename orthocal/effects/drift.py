@@ -40,7 +40,7 @@ class Drift(Effect):
     def from_keys(cls, keys: DriftKeys, robot: Robot) -> Self:
         """The effect of a robot; arguments as for `Effect.from_keys`."""
         std = read_limit(keys.tolerance_um_per_min) * UM / 60.0
-        return cls((ElementaryError("drift", "drift", "", "m/s", std),))
+        return cls((ElementaryError("drift", cls.name, "", "m/s", std),))
 
     def describe(self) -> str:
         """Description in a few words."""

@@ -11,13 +11,18 @@ from pydantic import Field
 
 from orthocal.effects.drive import DriveErrors, DriveTolerances
 from orthocal.effects.geometry import GeometryErrors, GeometryTolerances
-from orthocal.effects.protocol import Effect
-from orthocal.effects.registry import find_effect
+from orthocal.effects.protocol import NEUTRAL, Condition, Effect
+from orthocal.effects.registry import effect_names, find_effect, order_effects
 from orthocal.errors import OrthocalError, ParameterError, RobotError
 from orthocal.io.documents import PositiveNumber, validate
 from orthocal.robot.loading import MAX_LOADED, load_bare_content, load_bare_robot
 from orthocal.robot.model import Robot
-from orthocal.robot.parameters import COMPLETE, ElementaryError, build_parameters
+from orthocal.robot.parameters import (
+    COMPLETE,
+    ElementaryError,
+    ParameterSet,
+    build_parameters,
+)
 from orthocal.robot.redundant import find_redundant_errors
 
 MODELS: Mapping[str, Sequence[str]] = {"offsets": ("*.offset",), "full": COMPLETE}
@@ -62,6 +67,30 @@ def load_robot_content(
     return _add_parameters(load_bare_content(name, content, folder=folder))
 
 
+def with_effects(robot: Robot, names: Sequence[str] | None) -> Robot:
+    """Robot with chosen effects beside those of geometry and drives.
+
+    Args:
+        robot: The robot, with tolerances that were stated for it or not.
+        names: Names of the effects, in any order; None for those that its YAML names. Effects that
+            it does not name have their default keys.
+
+    Raises:
+        ParameterError: If there is no such effect, or a stated tolerance is of an effect that was
+            not chosen.
+        RobotError: If an effect needs keys that the robot's YAML lacks.
+    """
+    chosen = None if names is None else order_effects(names)
+    if chosen == robot.chosen_effects:
+        return robot
+    existing = effect_names()
+    for name in chosen or ():
+        if name not in existing:
+            raise ParameterError(f"'{name}' is not an effect; effects: {', '.join(existing)}")
+    plain = replace(robot, chosen_effects=chosen, parameters=ParameterSet())
+    return _add_parameters(plain).with_tolerances(robot.parameters.stated)
+
+
 @lru_cache(maxsize=MAX_LOADED)
 def _add_parameters(robot: Robot) -> Robot:
     where, declared = f"{robot.yaml}: orthocal", robot.declared
@@ -91,18 +120,18 @@ def _add_parameters(robot: Robot) -> Robot:
 
 @lru_cache(maxsize=2 * MAX_LOADED)
 def robot_effects(robot: Robot) -> tuple[Effect, ...]:
-    """Effects of a robot: drive, geometry, and those that its YAML names, in this order.
+    """Effects of a robot: drive, geometry, and those that it has beside them, in this order.
 
     Raises:
-        RobotError: If the YAML names an effect that there is not, or one of its keys does not fit.
+        RobotError: If there is no such effect, or one of its keys does not fit.
     """
     tolerances = _read_tolerances(robot)
     effects: list[Effect] = [
         DriveErrors.from_keys(tolerances, robot),
         GeometryErrors.from_keys(tolerances, robot),
     ]
-    for name, data in robot.declared.effects.items():
-        under = f"orthocal.effects.{name}"
+    for name in order_effects(robot.effect_names):
+        data, under = robot.declared.effects.get(name, {}), f"orthocal.effects.{name}"
         kind = find_effect(name, where=f"{robot.yaml}: {under}", error=RobotError)
         keys = validate(kind.keys, data, where=str(robot.yaml), error=RobotError, under=under)
         try:
@@ -111,6 +140,14 @@ def robot_effects(robot: Robot) -> tuple[Effect, ...]:
             key = ".".join(part for part in (under, e.where) if part)
             raise RobotError(e.problem, where=f"{robot.yaml}: {key}") from None
     return tuple(effects)
+
+
+def neutral_values(robot: Robot) -> dict[Condition, float]:
+    """Values of conditions that are not stated, at which the effects of a robot change nothing."""
+    values = dict(NEUTRAL)
+    for effect in robot_effects(robot):
+        values.update(effect.neutral)
+    return values
 
 
 def reading_effects(robot: Robot) -> tuple[Effect, ...]:

@@ -9,8 +9,8 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from orthocal.effects.loading import robot_effects
-from orthocal.effects.protocol import NEUTRAL, Condition, Placement, Symbols, condition_size
+from orthocal.effects.loading import neutral_values, robot_effects
+from orthocal.effects.protocol import Condition, Placement, Symbols, condition_size
 from orthocal.robot.frames import carriers, hangs_on
 from orthocal.robot.model import Robot, Rod
 
@@ -30,7 +30,8 @@ class MachineExpressions:
 
 def neutral_conditions(robot: Robot) -> dict[Condition, ca.SX]:
     """Conditions that are not stated, as constants."""
-    return {name: ca.SX([v] * condition_size(robot, name)) for name, v in NEUTRAL.items()}
+    values = neutral_values(robot)
+    return {name: ca.SX([v] * condition_size(robot, name)) for name, v in values.items()}
 
 
 def express_machine(

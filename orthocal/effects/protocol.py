@@ -4,19 +4,8 @@ Each effect is one file. It reads its own keys of the robot's YAML and returns C
 its parameters and of the conditions of a reading. All derivatives come from these expressions, and
 the same expressions serve the predicted readings, the loop closures and the program for Ipopt.
 
-How the effects that a machine may have beyond its geometry use the protocol:
-
-- Backlash: one error `<drive>.backlash` for each drive, unit m, `positive`. `conditions` is
-  ("approach",), and `drives` returns `coordinates - 0.5 * b * conditions["approach"]`.
-- Periodic error of a screw: errors `<drive>.sine` and `<drive>.cosine`, unit m. `drives` adds
-  `A sin(2πρ/lead) + B cos(2πρ/lead)`; the stated lead is a key. No condition.
-- Thermal expansion: errors `legs.expansion` and `screws.expansion`, unit 1/K, and `conditions` is
-  ("temperature",). With the change of temperature ΔT, `drives` adds `α ΔT (ρ − fixed point)`, and
-  `rods` returns `α ΔT × length` for each rod.
-- Drift of a gauge: `setup_errors` holds one rate for each setup, unit m/s, and `conditions` is
-  ("time",). `reading` adds `rate × time`.
-- Compliance: no error, but stiffnesses as keys. `rods` returns the shortening c F of each rod, with
-  F from the nominal machine.
+An effect may act on the coordinate of a drive (backlash, periodic errors of screws), on the length
+of a rod (thermal expansion), on a placement (geometry) and on a reading (drift of a gauge).
 """
 
 from __future__ import annotations
@@ -68,7 +57,8 @@ class Effect:
     """Conditions of a reading that its expressions depend on."""
 
     errors: tuple[ElementaryError, ...] = ()
-    """Parameters of the machine, 0 for the nominal machine, with their tolerances."""
+    """Parameters of the machine, 0 for the nominal machine, with their tolerances. Those that are
+    `complete` are identified with every model."""
     setup_errors: tuple[ElementaryError, ...] = ()
     """Parameters of each setup; the name of the setup comes before theirs."""
 
@@ -84,6 +74,11 @@ class Effect:
             OrthocalError: If a key does not fit the robot; its `where` is the key.
         """
         raise NotImplementedError
+
+    @property
+    def neutral(self) -> Mapping[Condition, float]:
+        """Values of conditions that are not stated, where they are others than in NEUTRAL."""
+        return {}
 
     def describe(self) -> str:
         """Description in a few words."""

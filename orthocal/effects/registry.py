@@ -9,6 +9,8 @@ the effect, and its object is the class:
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from orthocal.effects.backlash import Backlash
 from orthocal.effects.drift import Drift
 from orthocal.effects.protocol import Effect
@@ -27,7 +29,8 @@ def _read_effect(name: str, offered: type[Effect]) -> type[Effect]:
     return offered
 
 
-BUILT_IN: tuple[type[Effect], ...] = (Backlash, Screw, Thermal, Drift)
+BUILT_IN: tuple[type[Effect], ...] = (Backlash, Thermal, Screw, Drift)
+"""In the order in which a machine lists its effects; those on drives act in the reverse order."""
 
 _EFFECTS = Registry[type[Effect]](
     GROUP, "effect", _read_effect, {effect.name: effect for effect in BUILT_IN}
@@ -47,6 +50,12 @@ def unregister_effect(name: str) -> None:
 def effect_names() -> tuple[str, ...]:
     """Names of all effects that a robot's YAML may name."""
     return _EFFECTS.names
+
+
+def order_effects(names: Iterable[str]) -> tuple[str, ...]:
+    """Names of effects once each: those of orthocal in their order, then others as stated."""
+    order = {effect.name: i for i, effect in enumerate(BUILT_IN)}
+    return tuple(sorted(dict.fromkeys(names), key=lambda name: order.get(name, len(order))))
 
 
 def find_effect(name: str, *, where: str, error: type[OrthocalError]) -> type[Effect]:

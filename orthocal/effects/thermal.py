@@ -20,7 +20,7 @@ import numpy as np
 import pinocchio as pin
 from pydantic import Field
 
-from orthocal.effects.protocol import Effect, EffectKeys, Symbols
+from orthocal.effects.protocol import Condition, Effect, EffectKeys, Symbols
 from orthocal.errors import RobotError
 from orthocal.io.documents import Name, Number, PositiveNumber
 from orthocal.robot.model import Robot, joint_axis
@@ -68,9 +68,15 @@ class Thermal(Effect):
         stated = {"legs": keys.legs_ppm * PPM, "screws": keys.screws_ppm * PPM}
         std = read_limit(keys.tolerance_ppm) * PPM
         errors = (
-            ElementaryError(f"{part}.expansion", "thermal", part, "1/K", std) for part in stated
+            ElementaryError(f"{part}.expansion", cls.name, part, "1/K", std, complete=True)
+            for part in stated
         )
         return cls(robot, keys.reference_C, stated, _fixed_points(keys, robot), tuple(errors))
+
+    @property
+    def neutral(self) -> Mapping[Condition, float]:
+        """A reading without a temperature counts as one at the reference temperature."""
+        return {"temperature": self.reference}
 
     def describe(self) -> str:
         """Description in a few words."""

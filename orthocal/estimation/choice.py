@@ -40,6 +40,8 @@ class Choice:
         bounds: Name or glob with its unit to lowest and highest value, ±inf for open.
         base: Identify base parameters without priors: of each indistinguishable combination one
             parameter remains free and represents the combination.
+        effects: Effects beside geometry, such as `backlash`, which are identified with any model;
+            by default those that the session states, otherwise those of the robot's YAML.
 
     Raises:
         TypeError: If an argument has a wrong type.
@@ -52,10 +54,13 @@ class Choice:
     tolerances: Mapping[str, float] = field(default_factory=dict)
     bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     base: bool = False
+    effects: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
         require_kind(self.model, (str, type(None)), expected="the name of a model")
         require_names(self.free, argument="free")
+        if self.effects is not None:
+            require_names(self.effects, argument="effects")
         require_numbers(self.known, argument="known", counts=(1, 2))
         require_numbers(self.tolerances, argument="tolerances")
         require_numbers(self.bounds, argument="bounds", counts=(2,))

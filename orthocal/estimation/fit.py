@@ -113,8 +113,8 @@ class Fit:
 
     @property
     def at_bound(self) -> Mask:
-        """Mask of the parameters at a bound, shape (n_free,)."""
-        return np.asarray(self.solution.at_bound != 0)
+        """Mask of the parameters at a bound, shape (n_free,); see `Selection.held_at_bound`."""
+        return self.problem.selection.held_at_bound(self.solution.at_bound)
 
     def covariance(self) -> Array:
         """Covariance of the free parameters by noise and priors, (n_free, n_free), [SI].
@@ -261,7 +261,8 @@ def _evaluate(
     program: Program, solution: Solution, sigma: float, repeatability: tuple[float, int]
 ) -> _Evaluation:
     """Predictions, Jacobian, residuals and noise at a solution."""
-    problem, at_bound = program.problem, solution.at_bound != 0
+    problem = program.problem
+    at_bound = problem.selection.held_at_bound(solution.at_bound)
     prediction, jacobian = problem.predict_and_jacobian(solution.theta, solution.passive)
     information = decompose(jacobian, problem.observations)
     residual = _residual(program, solution, prediction)

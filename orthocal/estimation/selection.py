@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocal.arrays import Array, Mask
 from orthocal.errors import ParameterError
@@ -66,6 +67,18 @@ class Selection:
     def prior_stds(self) -> Array:
         """Prior standard deviation of each free parameter, shape (n_free,), [SI]."""
         return np.array([p.prior_std for p in self.parameters])
+
+    def held_at_bound(self, at_bound: NDArray[np.int8]) -> Mask:
+        """Mask of the parameters whose value is that of a bound, shape (n_free,).
+
+        A parameter that is never negative, such as backlash, may be 0 without being held: its
+        covariance remains that of the unbounded estimate.
+
+        Args:
+            at_bound: -1, 0 or 1 for each parameter at its lower, no or its upper bound.
+        """
+        never_negative = np.array([p.positive for p in self.parameters]) & (self.lower == 0.0)
+        return np.asarray((at_bound != 0) & ~((at_bound < 0) & never_negative))
 
     def with_nuisance(self, parameters: Sequence[Parameter]) -> Selection:
         """Selection with nuisance parameters appended, which have priors of mean 0."""
@@ -158,12 +171,13 @@ def select_parameters(
             for name in _match_free(parameters, glob, names):
                 i = names.index(name)
                 lower[i], upper[i] = max(low, lower[i]), high
-    only_offsets = all(parameters.are_offsets(n) for n in names if n not in priors)
+    priors_only = {*priors, *parameters.of_effects}
+    only_offsets = all(parameters.are_offsets(n) for n in names if n not in priors_only)
     everywhere = not only_offsets if prior is None else prior
     return Selection(
         label=label_choice(base, free),
         parameters=tuple(replace(parameters[n], prior_std=stds[n]) for n in names),
-        prior=np.array([everywhere or n in priors for n in names]),
+        prior=np.array([everywhere or n in priors_only for n in names]),
         mean=read_only([priors.get(n, (0.0, 0.0))[0] for n in names]),
         lower=read_only(lower),
         upper=read_only(upper),

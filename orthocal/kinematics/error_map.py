@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocal.arrays import Array, Mask
+from orthocal.effects.loading import neutral_values
 from orthocal.effects.machine import express_machine
 from orthocal.effects.protocol import NEUTRAL, Condition, condition_size
 from orthocal.kinematics.backend.batch_function import BatchFunction
@@ -117,11 +118,12 @@ class ErrorMap:
         twists = ca.vertcat(ca.SX(0, 1), *(moving[p] for p in self.moved))
         self.conditions = _conditions_in(ca.vertcat(twists, machine.actuated), symbols)
         self.placement_conditions = _conditions_in(twists, symbols)
+        neutral = neutral_values(robot)
         sizes = [condition_size(robot, c) for c in self.conditions]
         of_placements = np.repeat([c in self.placement_conditions for c in self.conditions], sizes)
         drives = np.zeros(len(robot.drives), dtype=np.bool_)
         self.of_placements = np.concatenate([drives, of_placements.astype(np.bool_)])
-        self._neutral = np.repeat([NEUTRAL[c] for c in self.conditions], sizes).astype(np.float64)
+        self._neutral = np.repeat([neutral[c] for c in self.conditions], sizes).astype(np.float64)
         conditions = ca.vertcat(ca.SX(0, 1), *(symbols[c] for c in self.conditions))
         by_errors = ca.jacobian(machine.actuated, errors)
         self.drive_errors = np.unique(np.array(by_errors.sparsity().get_triplet()[1], np.int64))

@@ -148,7 +148,7 @@ def fingerprint(robot: Robot) -> str:
         repr(robot.passive_index.tolist()),
         repr([float(v).hex() for v in robot.drive_gain]),
         repr(tuple(robot.parameters.elementary.values())),
-        repr(sorted(robot.declared.effects.items())),
+        repr([(name, robot.declared.effects.get(name)) for name in robot.effect_names]),
         *(source_digest(type(e)) for e in robot_effects(robot)),  # type: ignore[arg-type] # hashable
         repr([(p.name, p.terms) for p in robot.parameters]),
         float(robot.characteristic_length).hex(),

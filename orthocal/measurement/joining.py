@@ -33,7 +33,7 @@ def gather_sessions(given: Given | Sequence[Given]) -> list[Session]:
     return [one if isinstance(one, Session) else load_session(one) for one in several]
 
 
-def join_sessions(sessions: Sequence[Session]) -> Session:
+def join_sessions(sessions: Sequence[Session], *, effects: Sequence[str] | None = None) -> Session:
     """One session of all readings of several on the same robot.
 
     Setups, postures and gauges are named after their session. The active offsets are those of the
@@ -42,12 +42,17 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
     Args:
         sessions: In the order in which they were measured, joined ones among them or not; a single
             one is returned unchanged.
+        effects: Effects beside geometry that the machine has; by default those that the sessions
+            and the robot's YAML state.
 
     Raises:
-        SessionError: If there are none, or of different robots.
+        SessionError: If there are none, or of different robots or effects.
+        ParameterError, RobotError: If an effect does not exist, or lacks a key.
     """
     if not sessions:
         raise SessionError("there is no session to join")
+    if effects is not None:
+        sessions = [s.with_effects(effects) for s in sessions]
     if len(sessions) == 1:
         return sessions[0]
     last = sessions[-1]
@@ -57,6 +62,12 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
                 f"is of robot '{session.robot.name}'; another session is of '{last.robot.name}', "
                 "or of another version of it",
                 where=None if session.path is None else str(session.path),
+            )
+        if session.robot.effect_names != last.robot.effect_names:
+            names = (", ".join(s.robot.effect_names) or "none" for s in (session, last))
+            raise SessionError(
+                "states the effects {}; another session has {}: choose them".format(*names),
+                where=f"{session.path or 'session'}: calibration.effects",
             )
     tolerances = _join_tolerances(sessions)
     purposes = {s.purpose for s in sessions} - {None}

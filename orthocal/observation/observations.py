@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
-from itertools import product
 
 import numpy as np
 
 from orthocal.arrays import Array, Indices, Mask
-from orthocal.effects.loading import robot_effects
-from orthocal.effects.protocol import NEUTRAL, Condition, condition_size
+from orthocal.effects.loading import neutral_values, robot_effects
+from orthocal.effects.protocol import Condition, condition_size
 from orthocal.errors import SessionError
 from orthocal.kinematics.error_map import error_map
 from orthocal.robot.model import Robot
 from orthocal.session.session import Conditions, Reading, Session
+
+TIME_OF_READING = 60.0
+"""Time between successive readings of a setup that states none, [s]."""
 
 APPROACH = {"p": 1.0, "n": -1.0, "u": 0.0}
 """Letter of an approach to the direction of the drive's last motion."""
@@ -227,7 +229,8 @@ def _condition_values(
 ) -> dict[Condition, Array]:
     """Values of the conditions of entries, neutral where not stated, shape (n, size) each."""
     n = len(conditions)
-    values = {c: np.full((n, condition_size(robot, c)), v) for c, v in NEUTRAL.items()}
+    neutral = neutral_values(robot)
+    values = {c: np.full((n, condition_size(robot, c)), v) for c, v in neutral.items()}
     began: dict[int, datetime] = {}
     for i, stated in enumerate(conditions):
         if stated is None:
@@ -239,6 +242,9 @@ def _condition_values(
         if stated.time is not None:
             first = began.setdefault(int(setup[i]), stated.time)
             values["time"][i] = (stated.time - first).total_seconds()
+    for k in set(setup.tolist()) - began.keys():
+        rows = np.flatnonzero(setup == k)
+        values["time"][rows, 0] = TIME_OF_READING * np.arange(rows.size)
     return values
 
 
@@ -279,6 +285,9 @@ def drive_table(session: Session) -> Array:
 def require_conditions(session: Session, free: Collection[str]) -> None:
     """Refuse readings without a condition that the effect of a free parameter needs.
 
+    An effect that only the robot's YAML names may find its conditions in no reading: its errors
+    then keep their tolerances.
+
     Args:
         session: The session.
         free: Names of the free parameters of the machine.
@@ -288,13 +297,32 @@ def require_conditions(session: Session, free: Collection[str]) -> None:
     """
     parameters = session.robot.parameters
     errors = {term for name in free for term, _ in parameters[name].terms}
+    chosen = session.robot.chosen_effects is not None
     for effect in robot_effects(session.robot):
-        if errors.isdisjoint(e.name for e in effect.errors):
+        if not effect.setup_errors and errors.isdisjoint(e.name for e in effect.errors):
             continue
-        for reading, condition in product(session.readings, effect.conditions):
-            if getattr(reading.conditions, condition, None) is None:
-                what = "a difference" if reading.minus else f"a reading without {condition}"
-                raise SessionError(
-                    f"is {what}; the effect '{effect.name}' needs the {condition} of each reading",
-                    where=session.where(reading),
-                )
+        for condition in effect.conditions:
+            lacking = readings_without(session, condition)
+            if not lacking or (len(lacking) == len(session.readings) and not chosen):
+                continue
+            first, among = lacking[0], f"{len(lacking)} of {len(session.readings)} readings"
+            what = "is a difference" if first.minus else f"is a reading without {condition}"
+            raise SessionError(
+                f"{what}; the effect '{effect.name}' needs the {condition} of each reading, "
+                f"which {among} do not state",
+                where=session.where(first),
+            )
+
+
+def readings_without(session: Session, condition: Condition) -> list[Reading]:
+    """Readings that do not state a condition.
+
+    Where no reading of a setup states its time, its rows are in the order of time.
+    """
+    if condition == "approach":
+        return [r for r in session.readings if r.approach is None or "u" in r.approach]
+    lacking = [r for r in session.readings if getattr(r.conditions, condition, None) is None]
+    if condition == "time":
+        timed = {r.setup for r in session.readings if r.conditions and r.conditions.time}
+        return [r for r in lacking if r.minus or r.setup in timed]
+    return lacking

@@ -155,6 +155,13 @@ class Robot:
     """Joint coordinates with the drives at their mechanical zero, shape (nv,), [m, rad]."""
     drive_gain: Array
     """1 + scale error of each drive, shape (n_drives,); 1 for the nominal machine."""
+    chosen_effects: tuple[str, ...] | None = None
+    """Effects beside geometry that the machine has; None for those that its YAML names."""
+
+    @property
+    def effect_names(self) -> tuple[str, ...]:
+        """Effects that the machine has beside those of geometry and drives."""
+        return tuple(self.declared.effects) if self.chosen_effects is None else self.chosen_effects
 
     @property
     def closure_rows(self) -> int:

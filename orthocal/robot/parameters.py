@@ -51,7 +51,8 @@ class ElementaryError:
         prior_std: Standard deviation before the calibration, [unit].
         of_frame: True if the owner is a frame, False if it is a joint.
         axis: Component of the twist of a placement, 0 to 5; -1 for errors of other kinds.
-        complete: True if it is part of the complete model, unless it is redundant.
+        complete: True if it is part of the complete model, unless it is redundant. The complete
+            errors of effects beside geometry and drives are part of every model.
         positive: True for a value of at least 0 with a half-normal prior.
     """
 
@@ -149,7 +150,7 @@ class ParameterSet:
         return tuple(self._models)
 
     def patterns(self, model: str) -> tuple[str, ...]:
-        """Patterns of the free parameters of a model, as for `select`.
+        """Patterns of the free parameters of a model, those of effects included, as for `select`.
 
         Raises:
             ParameterError: If there is no such model.
@@ -161,7 +162,7 @@ class ParameterSet:
         patterns = self._models[model]
         if patterns == COMPLETE:
             return tuple(escape(name) for name in self.complete)
-        return tuple(patterns)
+        return (*patterns, *(escape(name) for name in self.of_effects))
 
     @cached_property
     def complete(self) -> tuple[str, ...]:
@@ -172,6 +173,15 @@ class ParameterSet:
     def of_parts(self) -> tuple[str, ...]:
         """Elementary errors of drives, joints and closure frames, in order."""
         return tuple(e.name for e in self.elementary.values() if e.complete)
+
+    @cached_property
+    def of_effects(self) -> tuple[str, ...]:
+        """Errors that every model contains: those of effects beside geometry and drives."""
+        return tuple(
+            e.name
+            for e in self.elementary.values()
+            if e.complete and e.axis < 0 and e.kind not in ("offset", "scale")
+        )
 
     @cached_property
     def redundant(self) -> frozenset[str]:

@@ -19,6 +19,7 @@ from pydantic import Field
 
 from orthocal.arguments import require_array
 from orthocal.arrays import Array
+from orthocal.effects.loading import with_effects
 from orthocal.io.documents import Number
 from orthocal.io.fields import CLOSED, read_only
 from orthocal.io.html import paragraph, table
@@ -358,6 +359,17 @@ class Session:
             ParameterError: If a name or unit is unknown, or a number makes no sense.
         """
         return replace(self, robot=self.robot.with_tolerances(given)) if given else self
+
+    def with_effects(self, names: Sequence[str] | None) -> Session:
+        """Session of the robot with chosen effects beside those of geometry and drives.
+
+        Args:
+            names: Names of the effects; None for those that the robot's YAML names.
+
+        Raises:
+            ParameterError, RobotError: As `orthocal.effects.loading.with_effects`.
+        """
+        return replace(self, robot=with_effects(self.robot, names))
 
     def with_values(self, values: Sequence[float] | Array) -> Session:
         """Session with other readings.

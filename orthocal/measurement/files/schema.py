@@ -127,6 +127,8 @@ class CalibrationKeys(_Keys):
     """Names or globs that are free too, or instead of a model."""
     tolerances: Annotated[dict[str, PositiveNumber], Field(max_length=MOST_NAMES)] = {}
     """Name or glob with its unit to another tolerance than the robot's, ±2 standard deviations."""
+    effects: Annotated[list[str], Field(max_length=MOST_NAMES)] | None = None
+    """Effects beside geometry; by default those that the robot's YAML names."""
 
 
 class SessionKeys(_Keys):

@@ -14,7 +14,7 @@ from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
 
-from orthocal.effects.loading import load_robot
+from orthocal.effects.loading import load_robot, with_effects
 from orthocal.errors import ParameterError, RobotError, SessionError
 from orthocal.io.documents import read_yaml, validate
 from orthocal.io.files import (
@@ -173,15 +173,18 @@ def read_purpose(
     """
     if keys is None:
         return None, robot
-    parameters = robot.parameters
-    at = "model"
+    at = "effects"
     try:
+        if keys.effects is not None:
+            robot = with_effects(robot, keys.effects)
+        parameters = robot.parameters
+        at = "model"
         patterns = [] if keys.model is None else parameters.patterns(keys.model)
         at = "free"
         free = parameters.select([*patterns, *keys.free])
         at = "tolerances"
         robot = robot.with_tolerances(keys.tolerances)
-    except ParameterError as e:
+    except (ParameterError, RobotError) as e:
         raise SessionError(e.problem, where=f"{where}.{at}") from None
     if keys.model is None and not keys.free:
         return None, robot

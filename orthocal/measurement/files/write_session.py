@@ -68,14 +68,16 @@ def _gauge_document(gauge: Gauge) -> dict[str, Any]:
 
 
 def _calibration_document(session: Session) -> dict[str, Any]:
-    """Purpose and stated tolerances of a session."""
+    """Purpose, stated tolerances and chosen effects of a session."""
     purpose = session.purpose or Purpose()
     entries = {
         "model": purpose.model,
         "free": list(purpose.free),
         "tolerances": dict(session.robot.parameters.stated),
     }
-    return {key: value for key, value in entries.items() if value}
+    document = {key: value for key, value in entries.items() if value}
+    chosen = session.robot.chosen_effects
+    return document if chosen is None else document | {"effects": list(chosen)}
 
 
 def _offsets_document(session: Session) -> dict[str, list[float]]:
