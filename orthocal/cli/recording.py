@@ -210,7 +210,8 @@ class Dialogue:
     def _stop_judging(self, error: Exception) -> None:
         """Print once why readings cannot be judged; they are recorded all the same."""
         self._can_judge = False
-        self._note(f"Readings are recorded without a check: {error}.")
+        reason = error if isinstance(error, OrthocalError) else "a posture is singular"
+        self._note(f"Readings are recorded without a check: {reason}. Use `orthocal check` later.")
 
     def _command(self, word: str, arguments: list[str]) -> None:
         """Execute a command.

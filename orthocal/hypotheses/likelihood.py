@@ -46,6 +46,9 @@ AMOUNTS = np.geomspace(6.0, 6000.0, 4)
 LEAST = 1e-9
 """Ratio to the largest singular value below which a singular value counts as 0."""
 
+LARGEST_AMOUNT = 1e9
+"""Standard deviation of the amount of an effect that no entry shows, over the noise."""
+
 MOST_SEPARATE = 2
 """Groups of effects up to which each has a τ of its own; beyond, all share one."""
 
@@ -193,8 +196,9 @@ class Likelihood:
             gains.append(gain + 0.5 * np.log(precision).sum())
         every = logs + log_of_sum(np.array(gains), axis=0) - np.log(len(grid))
         every = every + 0.5 * n_silent * np.log(2.0 * np.pi)
-        floor = 1e-12 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(len(vectors))
-        gram = gram + floor
+        # the amount of an effect that no entry shows is 0, with a standard deviation beyond all
+        floor = 1e-12 * np.trace(gram, axis1=1, axis2=2) + (LARGEST_AMOUNT * self.sigma) ** -2
+        gram = gram + floor[:, None, None] * np.eye(len(vectors))
         return self._best(every, np.linalg.solve(gram, slope[..., None])[..., 0], gram)
 
     def _best(self, logs: Array, amounts: Array, gram: Array) -> Score:

@@ -117,6 +117,19 @@ def test_a_group_of_effects_shares_one_prior(case):
     assert found.amounts.shape == (2,)
 
 
+def test_an_effect_that_no_entry_shows_has_no_amount(case):
+    """Such as that of a gauge that was displaced before its first reading."""
+    _, likelihood, deviations, effects = case
+    nothing = np.zeros((1, N))
+    alone = likelihood.score_set(deviations[0], [nothing])
+    assert alone.log_likelihood == pytest.approx(likelihood.score_set(deviations[0]).log_likelihood)
+    assert alone.amounts == pytest.approx([0.0], abs=1e-12)
+    assert alone.stds[0] > 1e6 * SIGMA
+    beside = likelihood.score_set(deviations[0], [nothing, effects[:1]])
+    one = likelihood.score_set(deviations[0], [effects[:1]])
+    assert beside.amounts[1] == pytest.approx(one.amounts[0], rel=1e-9)
+
+
 def test_separate_effects_average_over_their_own_priors(case):
     jacobian, likelihood, deviations, effects = case
     logs = []
