@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_effects import write_plan
+from effect_plans import write_plan
 
 from orthocal import (
     Choice,

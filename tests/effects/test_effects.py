@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
-from datetime import datetime, timedelta
 
 import casadi as ca
 import numpy as np
 import pytest
 from derivatives import assert_derivative, central_differences
+from effect_plans import write_plan, write_robot
 from gauges import exact
 from slack import Slack
 from tolerances import CLOSED, DERIVATIVE, KINEMATICS, SAME_OPTIMUM
@@ -41,7 +41,6 @@ from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.measurement.joining import join_sessions
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
-from orthocal.robot.loading import packaged_robots
 from orthocal.sensors.compiled import reading_conditions
 from orthocal.session.session import Conditions
 
@@ -61,16 +60,6 @@ TRUTH = {
 }
 FREE = ("*.offset", "*.slack", "*.wave", "rods.growth")
 
-PLAN = """robot: machine
-gauge: {sigma_mm: 0.001, range_mm: [-20, 20]}
-postures:
-  zero: {tcp_mm: [0, 0, 0]}
-"""
-"""Postures and setups follow."""
-
-FIRST = datetime(2025, 3, 14, 9, 26)
-ALONG = (-100, -47, 23, 60)
-
 
 @pytest.fixture(autouse=True)
 def known():
@@ -79,48 +68,10 @@ def known():
     registry.unregister_effect("slack")
 
 
-def write_robot(folder, effects):
-    """The packaged robot with further effects in its YAML."""
-    source = packaged_robots()["orthoglide"]
-    folder.mkdir(parents=True)
-    shutil.copy(source / "orthoglide.urdf", folder / "machine.urdf")
-    text = (source / "orthoglide.yaml").read_text()
-    written = text.replace("\n  tcp: ", f"\n  effects: {{{effects}}}\n  tcp: ")
-    assert written != text
-    (folder / "machine.yaml").write_text(written)
-    return folder
-
-
-def write_plan(folder, *, effects=KEYS, conditions=True):
-    """Six setups, each read along its own leg, approached from both sides while it gets warmer."""
-    write_robot(folder / "machine", effects)
-    postures, setups = PLAN, "setups:\n"
-    columns = ",approach,temperature_C,time" if conditions else ",cycle"
-    rows = [f"setup,posture,reading_mm{columns}"]
-    for leg in range(3):
-        for d in ALONG:
-            at = [d if i == leg else 7.0 * (i - leg) for i in range(3)]
-            postures += f"  {'xyz'[leg]}_{d}: {{tcp_mm: {at}}}\n"
-    for leg, direction in ((a, b) for a in range(3) for b in range(3) if a != b):
-        setup = "xyz"[direction] + "xyz"[leg]
-        setups += f"  {setup}: {{leg: {'xyz'[leg]}, direction: {'xyz'[direction]}, section: "
-        setups += "{fraction: 0.5}}\n"
-        for i, posture in enumerate(["zero", *(f"{'xyz'[leg]}_{d}" for d in ALONG)]):
-            for cycle, letter in enumerate("pn", start=1):
-                k = len(rows)
-                approach = "".join(letter if j == leg else "pn"[(i + j) % 2] for j in range(3))
-                time = (FIRST + timedelta(minutes=k)).isoformat()
-                stated = f",{approach},{19 + 0.25 * (k % 40)},{time}"
-                rows.append(f"{setup},{posture},0.0{stated if conditions else f',{cycle}'}")
-    (folder / "session.yaml").write_text(f"{postures}{setups}readings: readings.csv\n")
-    (folder / "readings.csv").write_text("\n".join(rows) + "\n")
-    return folder
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     registry.register_effect(Slack)
-    return write_plan(tmp_path_factory.mktemp("slack") / "plan")
+    return write_plan(tmp_path_factory.mktemp("slack") / "plan", effects=KEYS)
 
 
 @pytest.fixture(scope="module")
@@ -248,7 +199,7 @@ def test_each_posture_under_other_conditions_is_another_loop_closure(plan, folde
 
 
 def test_conditions_that_are_not_stated_are_neutral(tmp_path):
-    session = load_plan(write_plan(tmp_path / "plan", conditions=False))
+    session = load_plan(write_plan(tmp_path / "plan", effects=KEYS, conditions=False))
     o = build_observations(session)
     assert o.states.posture.size == len(session.postures)
     moved = {n: v for n, v in TRUTH.items() if n.endswith(("slack", "growth"))}
@@ -476,7 +427,7 @@ def test_joined_sessions_share_the_machine_and_not_the_gauge(simulated):
 
 
 def test_readings_without_the_condition_are_refused(tmp_path):
-    folder = write_plan(tmp_path / "plan", conditions=False)
+    folder = write_plan(tmp_path / "plan", effects=KEYS, conditions=False)
     session = simulate_session(load_plan(folder), {"x_slide.offset": 1e-4}, seed=1).session
     with pytest.raises(SessionError, match="needs the approach"):
         calibrate(session, Choice(free=FREE, effects=["slack"]))

@@ -1,0 +1,66 @@
+"""Plans for machines with effects beside geometry."""
+
+from __future__ import annotations
+
+import shutil
+from datetime import datetime, timedelta
+
+from orthocal.robot.loading import packaged_robots
+
+PLAN = """robot: machine
+gauge: {sigma_mm: 0.001, range_mm: [-20, 20]}
+postures:
+  zero: {tcp_mm: [0, 0, 0]}
+"""
+"""Postures and setups follow."""
+
+FIRST = datetime(2025, 3, 14, 9, 26)
+ALONG = (-100, -47, 23, 60)
+
+
+def write_robot(folder, effects, *, joints=None):
+    """The packaged robot with further effects in its YAML.
+
+    Args:
+        folder: Directory to write.
+        effects: Keys of effects, as YAML.
+        joints: Drive to the keys of its joint, as YAML.
+    """
+    source = packaged_robots()["orthoglide"]
+    folder.mkdir(parents=True)
+    shutil.copy(source / "orthoglide.urdf", folder / "machine.urdf")
+    text = (source / "orthoglide.yaml").read_text()
+    written = text.replace("\n  tcp: ", f"\n  effects: {{{effects}}}\n  tcp: ")
+    assert written != text
+    for drive, keys in (joints or {}).items():
+        entry = f"{drive}: {{zero_mm: 310.25"
+        assert entry in written
+        written = written.replace(entry, f"{entry}, joint: {keys}")
+    (folder / "machine.yaml").write_text(written)
+    return folder
+
+
+def write_plan(folder, *, effects, joints=None, conditions=True):
+    """Six setups, each read along its own leg, approached from both sides while it gets warmer."""
+    write_robot(folder / "machine", effects, joints=joints)
+    postures, setups = PLAN, "setups:\n"
+    columns = ",approach,temperature_C,time" if conditions else ",cycle"
+    rows = [f"setup,posture,reading_mm{columns}"]
+    for leg in range(3):
+        for d in ALONG:
+            at = [d if i == leg else 7.0 * (i - leg) for i in range(3)]
+            postures += f"  {'xyz'[leg]}_{d}: {{tcp_mm: {at}}}\n"
+    for leg, direction in ((a, b) for a in range(3) for b in range(3) if a != b):
+        setup = "xyz"[direction] + "xyz"[leg]
+        setups += f"  {setup}: {{leg: {'xyz'[leg]}, direction: {'xyz'[direction]}, section: "
+        setups += "{fraction: 0.5}}\n"
+        for i, posture in enumerate(["zero", *(f"{'xyz'[leg]}_{d}" for d in ALONG)]):
+            for cycle, letter in enumerate("pn", start=1):
+                k = len(rows)
+                approach = "".join(letter if j == leg else "pn"[(i + j) % 2] for j in range(3))
+                time = (FIRST + timedelta(minutes=k)).isoformat()
+                stated = f",{approach},{19 + 0.25 * (k % 40)},{time}"
+                rows.append(f"{setup},{posture},0.0{stated if conditions else f',{cycle}'}")
+    (folder / "session.yaml").write_text(f"{postures}{setups}readings: readings.csv\n")
+    (folder / "readings.csv").write_text("\n".join(rows) + "\n")
+    return folder
