@@ -354,6 +354,7 @@ def _setup_records(fit: Fit) -> tuple[SetupRecord, ...]:
             zero=zeros.get(s.name),
             aligned_at=aligned_at[s.name],
             zero_kind=s.zero,
+            payload=s.payload,
         )
         for s in fit.problem.session.setups.values()
     )

@@ -15,6 +15,7 @@ from orthocal.estimation.loss import LossKind
 from orthocal.estimation.options import SolverKind
 from orthocal.io.documents import Count, Number, PositiveInSI, PositiveNumber
 from orthocal.io.fields import CLOSED, Many, Matrix, SizeOrInf, SizeOrNaN, Vector
+from orthocal.robot.description import HEAVIEST_KG
 from orthocal.robot.files import MOST_FILES, is_inner_path
 from orthocal.sensors.protocol import GaugeZero, Sensor
 from orthocal.sensors.registry import RECORDED
@@ -240,6 +241,8 @@ class SetupRecord:
     """Posture in which the operator aligned the gauge."""
     zero_kind: GaugeZero = "free"
     """Whether the zero was estimated or known to be 0."""
+    payload: Annotated[Number, Field(ge=0.0, le=HEAVIEST_KG)] = 0.0
+    """Mass on the tool, [kg]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

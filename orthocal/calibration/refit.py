@@ -108,6 +108,7 @@ def restore_session(calibration: Calibration) -> Session:
                 None if s.active is None else np.array(s.active),
                 s.aligned_at,
                 s.zero_kind,
+                s.payload,
             )
             for s in calibration.setups
         },

@@ -59,8 +59,8 @@ def express_machine(
         needed: Symbols = {name: known[name] for name in effect.conditions}
         actuated = effect.drives(actuated, own, needed)
         changes = [effect.placements(own, needed)]
-        for (leg, rod), change in effect.rods(own, needed).items():
-            changes.append(stretch_rod(robot, robot.legs[leg].rods[rod], change))
+        for rod, change in effect.rods(own, needed).items():
+            changes.append(stretch_rod(robot, robot.rods[rod], change))
         for placement, twist in (item for part in changes for item in part.items()):
             before = twists.get(placement)
             twists[placement] = twist if before is None else before + twist

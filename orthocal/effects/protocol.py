@@ -5,7 +5,8 @@ its parameters and of the conditions of a reading. All derivatives come from the
 the same expressions serve the predicted readings, the loop closures and the program for Ipopt.
 
 An effect may act on the coordinate of a drive (backlash, periodic errors of screws), on the length
-of a rod (thermal expansion), on a placement (geometry) and on a reading (drift of a gauge).
+of a rod (thermal expansion, compliance), on a placement (geometry) and on a reading (drift of a
+gauge).
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, Self
 
 import casadi as ca
+import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from orthocal.arrays import Array
 from orthocal.robot.frames import Placement as Placement
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import ElementaryError
@@ -23,18 +26,25 @@ from orthocal.robot.parameters import ElementaryError
 Symbols = Mapping[str, ca.SX]
 """Names to expressions."""
 
-Condition = Literal["approach", "temperature", "time"]
+Condition = Literal["approach", "temperature", "time", "load"]
 """Condition of a reading: the direction of each drive's last motion, shape (n_drives,), 1 where its
 coordinate grew, -1 where it fell, 0 if unknown; the temperature, [°C]; the time since the first
-reading of the setup, [s]."""
+reading of the setup, [s]; the axial force of each rod under the weight on the tool, tension
+positive, shape (n_rods,), [N], which is computed from the posture and the payload."""
 
-NEUTRAL: dict[Condition, float] = {"approach": 0.0, "temperature": 20.0, "time": 0.0}
-"""Value of a condition that is not stated. The temperature is that of ISO 1."""
+NEUTRAL: dict[Condition, float] = {
+    "approach": 0.0,
+    "temperature": 20.0,
+    "time": 0.0,
+    "load": 0.0,
+}
+"""Value of a condition that is not stated. The temperature is that of ISO 1. Without a load a
+machine is weightless, as in the controller's nominal kinematics."""
 
 
 def condition_size(robot: Robot, name: Condition) -> int:
     """Numbers of a condition."""
-    return len(robot.drives) if name == "approach" else 1
+    return {"approach": len(robot.drives), "load": len(robot.rods)}.get(name, 1)
 
 
 class EffectKeys(BaseModel):
@@ -105,6 +115,17 @@ class Effect:
     def rods(self, errors: Symbols, conditions: Symbols) -> Mapping[tuple[str, str], ca.SX]:
         """Leg and rod to the change of the rod's length, [m]; effects on one rod add up."""
         return {}
+
+    def tool_force(self, payload: float) -> Array:
+        """Force on the tool centre point, from which the condition `load` is computed.
+
+        Args:
+            payload: Mass on the tool beside the platform, [kg].
+
+        Returns:
+            In the world, shape (3,), [N]; forces of several effects add up.
+        """
+        return np.zeros(3)
 
     def reading(self, reading: ca.SX, errors: Symbols, conditions: Symbols) -> ca.SX:
         """Reading of the gauge.

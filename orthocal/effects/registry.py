@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from orthocal.effects.backlash import Backlash
+from orthocal.effects.compliance import Compliance
 from orthocal.effects.drift import Drift
 from orthocal.effects.protocol import Effect
 from orthocal.effects.screw import Screw
@@ -29,7 +30,7 @@ def _read_effect(name: str, offered: type[Effect]) -> type[Effect]:
     return offered
 
 
-BUILT_IN: tuple[type[Effect], ...] = (Backlash, Thermal, Screw, Drift)
+BUILT_IN: tuple[type[Effect], ...] = (Backlash, Thermal, Screw, Drift, Compliance)
 """In the order in which a machine lists its effects; those on drives act in the reverse order."""
 
 _EFFECTS = Registry[type[Effect]](

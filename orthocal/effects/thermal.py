@@ -97,11 +97,7 @@ class Thermal(Effect):
     def rods(self, errors: Symbols, conditions: Symbols) -> Mapping[tuple[str, str], ca.SX]:
         """Changes of the lengths of rods; arguments as for `Effect.rods`."""
         growth = self._growth("legs", errors, conditions)
-        return {
-            (leg.name, rod.name): growth * rod.length
-            for leg in self.robot.legs.values()
-            for rod in leg.rods.values()
-        }
+        return {name: growth * rod.length for name, rod in self.robot.rods.items()}
 
 
 def _fixed_points(keys: ThermalKeys, robot: Robot) -> tuple[float | None, ...]:

@@ -17,7 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.arguments import require_kind
 from orthocal.arrays import Array, Indices, Mask
+from orthocal.effects.rod_forces import RodForces
 from orthocal.errors import ClosureError
+from orthocal.kinematics.conditions import UseConditions, tool_force
 from orthocal.kinematics.error_map import MachineGeometry
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.robot_functions import robot_functions
@@ -63,6 +65,11 @@ LARGEST_CONTINUATION_MOVE = 0.3
 """Change of a passive coordinate in one continuation step, [rad] or characteristic lengths."""
 
 LIMIT_TOLERANCE = 1e-9
+
+MOST_LOADS = 10
+SETTLED_LOAD = 1e-7
+"""Relative change of the loads of an inverse below which its drive coordinates do not change. Each
+repetition reduces it at least a hundred times."""
 
 MAX_POINTS = 4096
 """Postures of a batch of machines that are solved together, for the memory of their Jacobians."""
@@ -402,6 +409,8 @@ class LoopClosure:
         robot: The nominal robot.
         free: Names of the parameters whose values are passed to each call as `theta`, in order.
         fixed: Values of other parameters, [unit of the parameter]; 0 where absent.
+        conditions: Conditions of the postures whose commands do not state them; neutral by default:
+            middle of both sides of each drive, reference temperature, weightless.
     """
 
     def __init__(
@@ -410,10 +419,12 @@ class LoopClosure:
         *,
         free: Sequence[str] = (),
         fixed: Mapping[str, float] | None = None,
+        conditions: UseConditions | None = None,
     ) -> None:
         require_kind(robot, Robot, expected="a Robot, such as load_robot(...)")
         self.robot = robot
         self.free = tuple(free)
+        self._conditions = conditions
         self._functions = robot_functions(robot)
         self._columns = self._functions.errors.columns(self.free)
         others = {k: v for k, v in (fixed or {}).items() if k not in self.free}
@@ -550,17 +561,42 @@ class LoopClosure:
         Raises:
             ClosureError, RobotError: As `inverse`.
         """
-        geometry, _ = self._batch(None, None)
-        (x,) = solve_closures(
+        n = len(self.robot.drives)
+        if not self._has_load:
+            x = self._reach(points, np.zeros((len(points), n)), start, names, failures)
+            return x[:, :n], x[:, n:]
+        drives = nominal_closure(self.robot).inverse(points, failures={})
+        commands = self.commands(drives)
+        for _ in range(MOST_LOADS):
+            x = self._reach(points, commands[:, :n], start, names, failures)
+            before, commands = commands[:, n:], self.commands(x[:, :n])
+            change = np.abs(commands[:, n:] - before).max(initial=0.0)
+            if change <= SETTLED_LOAD * np.abs(before).max(initial=0.0):
+                break
+            start = np.where(np.isfinite(x), x, self._inverting.start)
+        return x[:, :n], x[:, n:]
+
+    def _reach(
+        self,
+        points: Array,
+        loaded_at: Array,
+        start: Array | None,
+        names: Sequence[str] | None,
+        failures: Failures | None,
+    ) -> Array:
+        """Joint coordinates of `reach` under the loads at given drive coordinates."""
+        commands = self.commands(loaded_at)
+        geometry, _ = self._batch(None, None, commands)
+        x: Array = solve_closures(
             self._inverting,
-            points,
+            np.hstack([points, commands[:, len(self.robot.drives) :]]),
             geometry,
             machines=1,
             start=start,
             names=names,
             failures=failures,
-        )
-        return x[:, : len(self.robot.drives)], x[:, len(self.robot.drives) :]
+        )[0]
+        return x
 
     def tcp(
         self,
@@ -606,6 +642,40 @@ class LoopClosure:
         """Geometry of machines for values of the free parameters; 0 by default."""
         return self._functions.errors.geometry(self.errors(theta))
 
+    def commands(self, drives: Array) -> Array:
+        """Commands of drive coordinates under the closure's conditions; commands stay as they are.
+
+        Args:
+            drives: Shape (K, n_drives), or commands, shape (K, n_command).
+
+        Returns:
+            Shape (K, n_command).
+        """
+        map_, conditions = self._functions.errors, self._conditions
+        if conditions is None or drives.shape[1] > len(self.robot.drives) or not map_.n_conditions:
+            return map_.command(drives)
+        values = conditions.values(self.robot)
+        if self._has_load:
+            values["load"] = find_loads(self.robot, drives, conditions.payload or 0.0)
+        parts = [values[c] for c in map_.conditions]
+        stated = [np.broadcast_to(v, (len(drives), v.shape[-1])) for v in parts]
+        return np.hstack([drives, *stated])
+
+    @property
+    def _has_load(self) -> bool:
+        return self._conditions is not None and "load" in self._functions.errors.conditions
+
+    def inputs(self, drives: Array, passive: Array) -> tuple[Array, Array, Array]:
+        """Inputs of the robot's functions (`RobotFunctions`) in postures of one machine.
+
+        Args:
+            drives: Commanded, shape (K, n_drives), [m, rad], or commands, shape (K, n_command).
+            passive: Shape (K, n_passive), [m, rad].
+        """
+        commands = self.commands(drives)
+        geometry, _ = self._batch(None, None, commands)
+        return geometry.drives(commands)[0], passive, geometry.placements
+
     def _theta(self, theta: ArrayLike | None) -> Array:
         if theta is None:
             return np.zeros(len(self.free))
@@ -616,7 +686,7 @@ class LoopClosure:
         self, theta: ArrayLike | None, errors: ArrayLike | None, commands: Array | None = None
     ) -> tuple[MachineGeometry, bool]:
         """Geometry with a leading dimension, and whether the arguments were a batch."""
-        at = self.errors(theta) if errors is None else np.asarray(errors, dtype=np.float64)
+        at: Array = self.errors(theta) if errors is None else np.asarray(errors, dtype=np.float64)
         return self._functions.errors.geometry(np.atleast_2d(at), commands), at.ndim > 1
 
     def _as_commands(self, drives: ArrayLike) -> tuple[Array, bool]:
@@ -626,7 +696,7 @@ class LoopClosure:
         if values.shape[-1:] == (n + map_.n_conditions,):
             n += map_.n_conditions
         rows, single = as_rows(drives, n, "drive coordinates")
-        return map_.command(rows), single
+        return self.commands(rows), single
 
     @cached_property
     def _closing(self) -> System:
@@ -655,17 +725,21 @@ class LoopClosure:
 
         def evaluate(x: Array, p: Array, geometry: MachineGeometry) -> tuple[Array, Array]:
             d, q = x[:, :n_d], x[:, n_d:]
-            actuated = map_.actuate(d, geometry.drive_errors)
-            by_commands, _ = map_.differentiate_drives(d, geometry.drive_errors)
+            target, conditions = p[:, : len(chosen)], p[:, len(chosen) :]
+            commands = np.hstack([d, conditions])
+            actuated = map_.actuate(commands, geometry.drive_errors)
+            by_commands, _ = map_.differentiate_drives(commands, geometry.drive_errors)
             g, g_a, g_q, tool, t_a, t_q = function(actuated, q, geometry.placements)
-            residuals = np.concatenate([g, tool[:, chosen] - p], axis=1)
+            residuals = np.concatenate([g, tool[:, chosen] - target], axis=1)
             by_drives = np.concatenate([g_a, t_a[:, chosen]], axis=1)
             by_drives = by_drives @ by_commands
             by_passive = np.concatenate([g_q, t_q[:, chosen]], axis=1)
             return residuals, np.concatenate([by_drives, by_passive], axis=2)
 
         index = np.concatenate([robot.drive_index, robot.passive_index])
-        origin = nominal_closure(robot).tcp(robot.drive_zero, robot.reference_passive)[chosen]
+        tool_at_zero = nominal_closure(robot).tcp(robot.drive_zero, robot.reference_passive)
+        neutral = map_.command(robot.drive_zero)[n_d:]
+        origin = np.concatenate([tool_at_zero[chosen], neutral])
         start = np.concatenate([robot.drive_zero, robot.reference_passive])
         return System(robot, evaluate, index=index, start=start, origin=origin, n_tool=len(chosen))
 
@@ -674,6 +748,36 @@ class LoopClosure:
 def nominal_closure(robot: Robot) -> LoopClosure:
     """The loop closure solver of a robot without errors, built once."""
     return LoopClosure(robot)
+
+
+@cached_per_robot(maxsize=8)
+def _rod_forces(robot: Robot) -> RodForces:
+    """The rod forces of a robot, prepared once."""
+    return RodForces(robot)
+
+
+def find_loads(robot: Robot, drives: Array, payload: ArrayLike) -> Array:
+    """Axial forces of the rods of the nominal machine under the weight on its tool.
+
+    Args:
+        robot: The nominal robot.
+        drives: Commanded drive coordinates, shape (K, n_drives), [m, rad].
+        payload: Mass on the tool beside the platform, of all postures or of each, [kg].
+
+    Returns:
+        Tension positive, shape (K, n_rods), [N]; 0 where the nominal machine cannot be.
+    """
+    result = np.zeros((len(drives), len(robot.rods)))
+    if not len(drives):
+        return result
+    masses, which = np.unique(np.broadcast_to(payload, len(drives)), return_inverse=True)
+    forces = np.array([tool_force(robot, float(m)) for m in masses])[which]
+    passive = nominal_closure(robot).close(drives, failures={})
+    reached = np.isfinite(passive).all(axis=1) & forces.any(axis=1)
+    if reached.any():
+        coordinates = robot.joint_coordinates(drives[reached], passive[reached])
+        result[reached] = _rod_forces(robot)(coordinates, forces[reached])
+    return result
 
 
 def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str]) -> Failures:

@@ -8,14 +8,19 @@ with p the tool's position and g the closures, by the errors θ and the passive 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array
+from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import robot_functions
 from orthocal.robot.model import Robot, require_tcp
+
+CONDITIONS_AT_ONCE = 64
+"""Postures with placements of their own that are differentiated together; each takes 300 kB."""
 
 
 class ToolSensitivity:
@@ -25,25 +30,30 @@ class ToolSensitivity:
         robot: The nominal robot.
         free: Names of the parameters.
         values: Values of all parameters about which to differentiate, [SI]; 0 where absent.
+        conditions: As for `LoopClosure`.
 
     Raises:
         RobotError: If the robot has no tool centre point.
     """
 
     def __init__(
-        self, robot: Robot, *, free: Sequence[str], values: Mapping[str, float] | None = None
+        self,
+        robot: Robot,
+        *,
+        free: Sequence[str],
+        values: Mapping[str, float] | None = None,
+        conditions: UseConditions | None = None,
     ) -> None:
         require_tcp(robot)
         at = dict(values or {})
         self.robot = robot
         self.free = tuple(free)
         self.theta = np.array([at.get(name, 0.0) for name in self.free])
-        self.closure = LoopClosure(robot, fixed=at)
+        self.closure = LoopClosure(robot, fixed=at, conditions=conditions)
         self._functions = robot_functions(robot)
         errors = self._functions.errors
-        columns = errors.columns(self.free)
-        self._twists = errors.jacobian(self.closure.errors(), columns)
-        self._drive_errors = columns[errors.drive_errors]
+        self._columns = errors.columns(self.free)
+        self._drive_errors = self._columns[errors.drive_errors]
 
     def __call__(
         self,
@@ -55,7 +65,7 @@ class ToolSensitivity:
         """∂p/∂θ at commanded drive coordinates.
 
         Args:
-            drives: Shape (K, n_drives), [m, rad].
+            drives: Shape (K, n_drives), [m, rad], or commands, shape (K, n_command).
             names: What to call the postures in messages.
             passive: Passive coordinates that close the loops there, shape (K, n_passive), [m, rad],
                 if they are known.
@@ -69,8 +79,28 @@ class ToolSensitivity:
         d = np.atleast_2d(np.asarray(drives, dtype=np.float64))
         if passive is None:
             passive = self.closure.close(d, names=names)
-        geometry = self.closure.geometry()
-        arguments = geometry.drives(d), passive, geometry.placements
+        commands, q = self.closure.commands(d), np.atleast_2d(passive)
+        if not self._functions.errors.placement_conditions:
+            return self._differentiate(commands, q, self._twists)
+        rows = [slice(k, k + CONDITIONS_AT_ONCE) for k in range(0, len(d), CONDITIONS_AT_ONCE)]
+        parts = [
+            self._differentiate(commands[r], q[r], self._twists_under(commands[r])) for r in rows
+        ]
+        return np.concatenate(parts)
+
+    @cached_property
+    def _twists(self) -> Array:
+        """Derivative of the moved placements by the parameters, shape (n_twists, n_free)."""
+        return self._functions.errors.jacobian(self.closure.errors(), self._columns)
+
+    def _twists_under(self, commands: Array) -> Array:
+        """The same under the conditions of commands, shape (K, n_twists, n_free)."""
+        errors = np.tile(self.closure.errors(), (len(commands), 1))
+        return self._functions.errors.jacobian(errors, self._columns, command=commands)
+
+    def _differentiate(self, commands: Array, passive: Array, moved: Array) -> Array:
+        """∂p/∂θ at commands, with the derivative of the moved placements by the parameters."""
+        arguments = self.closure.inputs(commands, passive)
         _, p_a, p_q, p_t = self._functions.tool_jacobian(*arguments)
         _, g_a, g_q, nonzeros = self._functions.closure_jacobian(*arguments)
         if g_q.shape[1] == g_q.shape[2]:
@@ -80,9 +110,9 @@ class ToolSensitivity:
         else:
             multiplier = p_q @ np.linalg.pinv(g_q, rcond=1e-10)
         twists = p_t - self._times_twists(multiplier, nonzeros)
-        _, by_drive_errors = geometry.drive_derivatives(d)
+        _, by_drive_errors = self.closure.geometry().drive_derivatives(commands)
         drives = (p_a - multiplier @ g_a) @ by_drive_errors
-        return np.asarray(twists @ self._twists + drives @ self._drive_errors)
+        return np.asarray(twists @ moved + drives @ self._drive_errors)
 
     def _times_twists(self, multiplier: Array, nonzeros: Array) -> Array:
         """Rows times ∂g by twists, shape (K, 3, n_twists) of (K, 3, n_rows) and (K, nnz)."""

@@ -12,15 +12,14 @@ from orthocal.arrays import Array, Indices, Mask
 from orthocal.effects.loading import neutral_values, robot_effects
 from orthocal.effects.protocol import Condition, condition_size
 from orthocal.errors import SessionError
+from orthocal.kinematics.conditions import APPROACH, UseConditions
 from orthocal.kinematics.error_map import error_map
+from orthocal.kinematics.loop_closure import LoopClosure, find_loads
 from orthocal.robot.model import Robot
 from orthocal.session.session import Conditions, Reading, Session
 
 TIME_OF_READING = 60.0
 """Time between successive readings of a setup that states none, [s]."""
-
-APPROACH = {"p": 1.0, "n": -1.0, "u": 0.0}
-"""Letter of an approach to the direction of the drive's last motion."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,6 +186,8 @@ def build_observations(session: Session) -> Observations:
             minus.append(find(r, r.minus))
     table = np.array(entries, dtype=np.int64).reshape(-1, 3)
     values = _condition_values(session.robot, conditions, table[:, 0])
+    if "load" in error_map(session.robot).conditions:
+        values["load"] = _find_loads(session, table[:, 0], table[:, 1])
     states, state = _find_states(session, table[:, 1], values)
     places = np.hstack([table[:, :2], values["approach"]])
     zero_setup, zero_real = tuple(k[0] for k in zeros), tuple(len(k) == 1 for k in zeros)
@@ -248,6 +249,15 @@ def _condition_values(
     return values
 
 
+def _find_loads(session: Session, setup: Indices, posture: Indices) -> Array:
+    """Axial forces of the rods at entries, shape (n, n_rods), [N]."""
+    payload = np.array([s.payload for s in session.setups.values()])[setup]
+    pairs = np.column_stack([posture, payload])
+    unique, place = np.unique(pairs, axis=0, return_inverse=True)
+    drives = drive_table(session)[unique[:, 0].astype(np.int64)]
+    return find_loads(session.robot, drives, unique[:, 1])[place.reshape(-1)]
+
+
 def _find_states(
     session: Session, posture: Indices, conditions: Mapping[Condition, Array]
 ) -> tuple[States, Indices]:
@@ -259,7 +269,9 @@ def _find_states(
         return States(count, drives, np.zeros_like(count), one, tuple(names)), posture
     read = np.hstack([posture[:, None], *(conditions[c] for c in map_.conditions)])
     unread = np.setdiff1d(count, posture)
-    others = np.column_stack([unread, map_.command(drives)[unread, drives.shape[1] :]])
+    payload = max(s.payload for s in session.setups.values())
+    loaded = LoopClosure(session.robot, conditions=UseConditions(payload=payload))
+    others = np.column_stack([unread, loaded.commands(drives[unread])[:, drives.shape[1] :]])
     rows, place = np.unique(np.vstack([read, others]), axis=0, return_inverse=True)
     of_state = rows[:, 0].astype(np.int64)
     commands = np.hstack([drives[of_state], rows[:, 1:]])

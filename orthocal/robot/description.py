@@ -31,6 +31,12 @@ LARGEST_ROD_RADIUS_MM = 500.0
 
 LARGEST_WORKSPACE_MM = 1e4
 
+LOWEST_C, HIGHEST_C = -50.0, 100.0
+"""Temperatures of a machine; others are in another unit, [°C]."""
+
+HEAVIEST_KG = 1e4
+"""Largest mass on a tool; a larger one is in another unit, [kg]."""
+
 MOST_PARTS = 100
 """Largest number of legs, of closures and of named sums."""
 

@@ -164,6 +164,12 @@ class Robot:
         return tuple(self.declared.effects) if self.chosen_effects is None else self.chosen_effects
 
     @property
+    def rods(self) -> dict[tuple[str, str], Rod]:
+        """Leg and rod to the rods of all legs, in order."""
+        legs = self.legs.values()
+        return {(leg.name, rod.name): rod for leg in legs for rod in leg.rods.values()}
+
+    @property
     def closure_rows(self) -> int:
         """Number of constrained closure rows."""
         return sum(len(c.rows) for c in self.closures)

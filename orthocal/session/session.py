@@ -92,6 +92,7 @@ class Setup:
         aligned_at: Posture in which the operator aligned the gauge; None for the rule of
             `Session.alignment_postures`.
         zero: Gauge zero: estimated from the setup's readings, or known to be 0 (absolute readings).
+        payload: Mass on the tool while the setup was read, [kg].
     """
 
     name: str
@@ -100,6 +101,7 @@ class Setup:
     active: Array | None = None
     aligned_at: str | None = None
     zero: GaugeZero = "free"
+    payload: float = 0.0
 
 
 CycleNumber = Annotated[int, Field(ge=1, lt=10**9)]

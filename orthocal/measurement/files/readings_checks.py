@@ -9,15 +9,14 @@ from pathlib import Path
 
 from orthocal.errors import SessionError
 from orthocal.io.documents import parse_number
+from orthocal.kinematics.conditions import find_approach_problem
 from orthocal.measurement.files.readings_file import CONDITIONS, RawReading
 from orthocal.measurement.files.schema import LARGEST_READING_MM, MOST_READINGS
+from orthocal.robot.description import HIGHEST_C, LOWEST_C
 from orthocal.robot.model import Robot
 from orthocal.session.session import Conditions, Gauge, Reading, ReadingKey, Session
 from orthocal.text import shorten
 from orthocal.units import MM
-
-LOWEST_C, HIGHEST_C = -50.0, 100.0
-"""No machine is measured outside: it is another unit, [°C]."""
 
 IN_UM = "; for readings in µm use `orthocal import --unit um`"
 """Remedy for readings in another unit."""
@@ -228,14 +227,9 @@ def parse_approach(text: str, robot: Robot, where: str) -> str:
     Raises:
         SessionError: If it is not a letter for each drive.
     """
-    if len(text) != len(robot.drives) or text.strip("pnu"):
-        drives = ", ".join(d.name for d in robot.drives)
-        raise SessionError(
-            f"approach is '{shorten(text)}'; expected {len(robot.drives)} letters, one for each "
-            f"drive ({drives}): p if its coordinate grew in its last motion, n if it fell, u if "
-            "unknown",
-            where=where,
-        )
+    problem = find_approach_problem(text, robot)
+    if problem:
+        raise SessionError(f"approach is {problem}", where=where)
     return text
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from orthocal.io.documents import Count, Name, Number, PositiveNumber
+from orthocal.robot.description import HEAVIEST_KG
 from orthocal.sensors.mounting import LARGEST_SCALE
 from orthocal.sensors.tips import TipKeys
 from orthocal.session.session import Gauge
@@ -142,6 +143,8 @@ class SessionKeys(_Keys):
     gauges: Annotated[dict[Name, GaugeKeys], Field(min_length=1, max_length=MOST_GAUGES)] = None  # type: ignore[assignment] # likewise
     """Of a session with several; its setups name theirs."""
     postures: Annotated[dict[Name, PostureKeys], Field(min_length=1, max_length=MOST_POSTURES)]
+    payload_kg: Annotated[Number, Field(ge=0.0, le=HEAVIEST_KG)] = 0.0
+    """Mass on the tool during the measurement."""
     controller: ControllerKeys | None = None
     calibration: CalibrationKeys | None = None
     setups: Annotated[dict[Name, dict[str, Any]], Field(min_length=1, max_length=MOST_SETUPS)]

@@ -283,7 +283,14 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
         sensor.require_fit(robot, where=where)
         _check_postures(setup, keys.postures, where)
         gauge, zero = _gauge_of(setup, gauges, where), setup.zero or default_zero(sensor)
-        setups[name] = Setup(name, sensor, gauge, zero=zero, aligned_at=setup.aligned_at)
+        setups[name] = Setup(
+            name,
+            sensor,
+            gauge,
+            zero=zero,
+            aligned_at=setup.aligned_at,
+            payload=keys.payload_kg,
+        )
     _check_shared(setups, str(file))
     return Session(
         robot=robot,

@@ -40,6 +40,8 @@ def session_document(session: Session) -> dict[str, Any]:
         }
         for p in session.postures.values()
     }
+    if payload := _payload(session):
+        document["payload_kg"] = payload
     if session.controller_offsets is not None:
         document["controller"] = _offsets_document(session)
     if calibration := _calibration_document(session):
@@ -65,6 +67,19 @@ def _gauge_document(gauge: Gauge) -> dict[str, Any]:
         "range_mm": None if gauge.range is None else [to_mm(v) for v in gauge.range],
     }
     return {k: v for k, v in entries.items() if v is not None}
+
+
+def _payload(session: Session) -> float:
+    """Mass on the tool, [kg].
+
+    Raises:
+        SessionError: If it differs among the setups, as in sessions that were joined.
+    """
+    payloads = {s.payload for s in session.setups.values()}
+    if len(payloads) > 1:
+        stated = ", ".join(f"{v:g}" for v in sorted(payloads))
+        raise SessionError(f"has setups under {stated} kg; a file has one payload_kg")
+    return payloads.pop()
 
 
 def _calibration_document(session: Session) -> dict[str, Any]:

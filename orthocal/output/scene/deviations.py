@@ -143,7 +143,7 @@ def measurement_of_calibration(calibration: Calibration) -> Measurement:
     robot, offsets = calibration.robot, calibration.session.controller_offsets
     return Measurement(
         robot=robot,
-        setups={s.name: Setup(s.name, s.sensor) for s in calibration.setups},
+        setups={s.name: Setup(s.name, s.sensor, payload=s.payload) for s in calibration.setups},
         drives={p.name: np.array(p.drives) for p in calibration.postures},
         offsets=np.zeros(len(robot.drives)) if offsets is None else np.array(offsets),
         rows=_average(
