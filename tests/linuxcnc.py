@@ -283,6 +283,8 @@ class Joint:
     home_offset: float
     home: float
     """Joint coordinate after homing."""
+    latched: int = 0
+    """Sign of HOME_LATCH_VEL; 0 for that in which the slide's coordinate grows."""
 
 
 def require_linuxcnc():
@@ -347,7 +349,7 @@ def run_program(program, joints, **options):
     return run_programs([(program[:1], [*program, "M2"])], joints, **options)[0]
 
 
-def run_programs(runs, joints, *, letters="XYZ", lines="", module=None):
+def run_programs(runs, joints, *, letters="XYZ", lines="", module=None, files=None):
     """Home the machine, then run programs one after the other.
 
     Args:
@@ -356,6 +358,7 @@ def run_programs(runs, joints, *, letters="XYZ", lines="", module=None):
         letters: Letters of the coordinates.
         lines: Lines that replace those of the same name in the INI.
         module: Folder of an exported kinematics module; without it each joint is a coordinate.
+        files: Further files beside the INI, name to text.
 
     Returns:
         Slides in every servo period of the first program, shape (K, n_joints), [mm]; and for each
@@ -365,6 +368,8 @@ def run_programs(runs, joints, *, letters="XYZ", lines="", module=None):
     with only_one(), nullcontext() if module is None else installed(module):
         folder = Path(tempfile.mkdtemp(prefix="orthocal-linuxcnc-"))
         try:
+            for name, text in (files or {}).items():
+                (folder / name).write_text(text)
             _write(folder, runs, joints, letters=letters, lines=lines)
             return _run(folder)
         finally:
@@ -409,7 +414,7 @@ def _write(folder, runs, joints, *, letters, lines):
             home=joint.home,
             home_offset=joint.home_offset,
             search=way * SEARCH,
-            latch=way * LATCH,
+            latch=(joint.latched or way) * LATCH,
         )
         hal_joints += HAL_JOINT.format(
             i=i, direction=way, begin=joint.switch - BEFORE_SWITCH, switch=joint.switch

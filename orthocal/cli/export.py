@@ -18,6 +18,7 @@ from orthocal.cli.options import (
     read_vector,
 )
 from orthocal.cli.printing import write_results
+from orthocal.errors import ParameterError
 from orthocal.units import DRIVE_UNITS, MM, UM
 
 
@@ -31,6 +32,7 @@ def export(
     half_side_mm: HalfSideMm = None,
     tool: ToolTip = None,
     home_offset: str | None = None,
+    latched: str | None = None,
     anyway: Anyway = False,
 ) -> None:
     """Write a calibration for a controller or another program.
@@ -49,12 +51,15 @@ def export(
             `correct`: of the written path.)
         home_offset (VALUES): linuxcnc: HOME_OFFSET of each joint during the measurement, separated
             by commas, mm or degrees; without it the files contain changes only.
+        latched (SIGNS): linuxcnc: sign of HOME_LATCH_VEL of each joint, such as +,+,-; needed for
+            drives with backlash.
     """
     result = orthocal.load_calibration(calibration)
     options = orthocal.ExportOptions(
         within=None if within is None else within * UM,
         tool=None if tool is None else read_vector(tool, "--tool"),
         home_offsets=None if home_offset is None else _home_offsets(home_offset, result),
+        latched=None if latched is None else _signs(latched),
         half_side=None if half_side_mm is None else half_side_mm * MM,
         module=module,
     )
@@ -66,3 +71,18 @@ def _home_offsets(text: str, calibration: orthocal.Calibration) -> tuple[float, 
     drives = calibration.robot.drives
     values = read_numbers(text, "--home-offset", [d.name for d in drives])
     return tuple(v * DRIVE_UNITS[d.unit][1] for v, d in zip(values, drives, strict=True))
+
+
+def _signs(text: str) -> tuple[int, ...]:
+    """Signs of an option, such as +,+,-.
+
+    Raises:
+        ParameterError: If a part is no sign.
+    """
+    signs = {"+": 1, "-": -1}
+    parts = [part.strip() for part in text.split(",")]
+    if not set(parts) <= signs.keys():
+        raise ParameterError(
+            f"found '{text}'; expected signs separated by commas, such as +,+,-", where="--latched"
+        )
+    return tuple(signs[part] for part in parts)

@@ -7,7 +7,7 @@ tool centre point p', is at the commanded p + t for another p' than p.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,13 +49,20 @@ class ToolTip:
     Args:
         calibration: Calibration of a robot whose drives command the tool.
         tool: Tip in the frame of the robot's tool centre point, shape (3,), [m].
+        errors: Errors of the machine instead of the identified ones, [SI].
 
     Raises:
         ExportError: If the drives do not command the tool.
         ParameterError: If the tip is out of range.
     """
 
-    def __init__(self, calibration: Calibration, tool: ArrayLike = (0.0, 0.0, 0.0)) -> None:
+    def __init__(
+        self,
+        calibration: Calibration,
+        tool: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        errors: Mapping[str, float] | None = None,
+    ) -> None:
         robot = calibration.robot
         if robot.tcp is None or len(robot.tcp.coordinates) != len(robot.drives):
             raise ExportError("the machine has no tool that its drives command")
@@ -63,7 +70,7 @@ class ToolTip:
         require_tip(self.tool.tolist())
         self.coordinates = list(robot.tcp.coordinates)
         """Indices of the coordinates that the drives control."""
-        self._closure = LoopClosure(robot, fixed=calibration.errors)
+        self._closure = LoopClosure(robot, fixed=calibration.errors if errors is None else errors)
         self._pose = robot_functions(robot).pose(robot.tcp.frame)
         (zero,) = reference_poses(robot, [robot.tcp.frame])
         self.level = np.array(zero[:3, :3])

@@ -40,6 +40,7 @@ from orthocal.assessment.controller_entries import offsets_to_enter
 from orthocal.calibration.machine import Machine
 from orthocal.export.linuxcnc.approximation import approximate, rounded_up
 from orthocal.export.linuxcnc.c_source import braced, write_core
+from orthocal.export.linuxcnc.drive_compensation import find_compensation
 from orthocal.export.linuxcnc.export import ExportOptions
 from orthocal.export.linuxcnc.home_offsets import find_homes
 from orthocal.export.linuxcnc.nominal_form import SlidesWithRods, Tangent, find_nominal_form
@@ -208,7 +209,7 @@ def test_core_reaches_the_targets_of_the_tip(full, core):
 def test_core_without_a_tool_equals_the_calibrated_machine(full, tmp_path):
     """At 10,000 points that were neither fitted nor checked."""
     approximation = approximate(full, within=WITHIN)
-    core = Core(tmp_path, write_core(full, approximation))
+    core = Core(tmp_path, write_core(full, approximation, find_compensation(full, None)))
     points = np.random.default_rng(8).uniform(-0.06, 0.06, (10_000, 3))
     joints = drives_of(full, core.inverse(points / MM))
     off = full.machine.forward(joints) - points
@@ -287,7 +288,7 @@ def test_core_of_planar_robots(root, tmp_path, name):
     assert isinstance(
         approximation.inverse.nominal, Tangent if name == "fivebar" else SlidesWithRods
     )
-    files = write_core(known, approximation)
+    files = write_core(known, approximation, find_compensation(known, None))
     assert "*/ known" not in files["orthocal_core.c"]
     core = Core(tmp_path, files)
     points = tool_at_zero(robot) + np.random.default_rng(1).uniform(-0.02, 0.02, (500, 2))
@@ -378,7 +379,7 @@ def test_bad_options_are_named(offsets, tmp_path, words, code, message):
 def test_home_offset_follows_direction_and_active_offsets(offsets):
     """Hand calculation of HOME_OFFSET and limits."""
     old = (0.35, 0.3, 0.02)
-    homes = find_homes(offsets, old=old)
+    homes = find_homes(offsets, find_compensation(offsets, None), old=old)
     change = (np.array(list(OFFSETS.values())) - ACTIVE) * [1, -1, -1]
     assert [h.change for h in homes] == pytest.approx(change, abs=1e-9)
     assert [h.new for h in homes] == pytest.approx(np.array(old) + change, abs=1e-9)

@@ -21,6 +21,7 @@ from orthocal.arrays import Array
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, ExportError
+from orthocal.export.linuxcnc.drive_compensation import without_periodic_errors
 from orthocal.export.linuxcnc.nominal_form import NominalForm, Tangent, find_nominal_form
 from orthocal.export.polynomial import Polynomial, PolynomialFit, chebyshev_line, total_degree
 from orthocal.export.tool_tip import ToolTip
@@ -127,6 +128,8 @@ def approximate(
 ) -> Approximation:
     """Inverse kinematics of the lowest degree that meets a tolerance.
 
+    Periodic errors of the drives' screws are no part of it (`drive_compensation.py`).
+
     Args:
         calibration: The calibration.
         within: Largest distance of the tip from where it belongs, [m].
@@ -138,8 +141,8 @@ def approximate(
         ExportError: If no degree meets the tolerance, with the best error; if the machine has no
             tool or does not reach the region.
     """
-    tip = ToolTip(calibration, tool)
     robot = calibration.robot
+    tip = ToolTip(calibration, tool, errors=without_periodic_errors(robot, calibration.errors))
     box = _find_box(calibration, half_side)
     middle, half = tool_at_zero(robot) + 0.5 * box.sum(axis=1), 0.5 * (box[:, 1] - box[:, 0])
     n = middle.size

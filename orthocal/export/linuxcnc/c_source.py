@@ -6,7 +6,7 @@ depends on the machine only by the coordinates that the drives command.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from string import Template
 
@@ -21,6 +21,7 @@ from orthocal.export.linuxcnc.approximation import (
     millimetres,
     rounded_up,
 )
+from orthocal.export.linuxcnc.drive_compensation import JointCompensation, find_periodic_errors
 from orthocal.export.linuxcnc.nominal_form import NominalForm, Tangent
 from orthocal.robot.model import Drive
 from orthocal.text import comment_safe
@@ -29,8 +30,18 @@ from orthocal.units import DRIVE_UNITS, MM, UM
 LONGEST_LINE = 90
 
 
-def write_core(calibration: Calibration, approximation: Approximation) -> dict[str, str]:
-    """Texts of orthocal_core.c and orthocal_core.h, which need no LinuxCNC."""
+def write_core(
+    calibration: Calibration,
+    approximation: Approximation,
+    compensation: Sequence[JointCompensation],
+) -> dict[str, str]:
+    """Texts of orthocal_core.c and orthocal_core.h, which need no LinuxCNC.
+
+    Args:
+        calibration: The calibration.
+        approximation: Inverse kinematics without periodic errors of screws.
+        compensation: Compensation of backlash by the controller.
+    """
     drives, inverse = calibration.robot.drives, approximation.inverse
     polynomial = inverse.correction
     to_joints = np.array([d.direction / DRIVE_UNITS[d.unit][1] for d in drives])
@@ -40,6 +51,8 @@ def write_core(calibration: Calibration, approximation: Approximation) -> dict[s
         "joint_units": " and ".join(dict.fromkeys(DRIVE_UNITS[d.unit][0] for d in drives)),
         "drives": len(drives),
     }
+    screws = _write_screws(calibration, compensation)
+    common["functions"] = "sqrt, sin and cos" if screws["periodic"] else "sqrt"
     core = {
         **common,
         "title": comment_safe(calibration.session.title) or "session without a title",
@@ -53,6 +66,7 @@ def write_core(calibration: Calibration, approximation: Approximation) -> dict[s
         "exponent": braced(polynomial.exponents),
         "coefficient": braced(polynomial.coefficients * to_joints[:, None]),
         "nominal": _write_nominal(inverse.nominal, drives, calibration.active_offsets),
+        **screws,
     }
     return {
         "orthocal_core.c": fill_template("orthocal_core.c", core),
@@ -66,6 +80,32 @@ def write_component(approximation: Approximation) -> dict[str, str]:
     identity = [k for k in range(len(LETTERS)) if k not in coordinates]
     values = {"commanded": braced(coordinates), "identity": braced(identity)}
     return {"orthocal_kins.c": fill_template("orthocal_kins.c", values)}
+
+
+def _write_screws(
+    calibration: Calibration, compensation: Sequence[JointCompensation]
+) -> dict[str, object]:
+    """Periodic errors of the screws, and what homing with backlash adds to each joint."""
+    drives, active = calibration.robot.drives, calibration.active_offsets
+    sizes = np.array([DRIVE_UNITS[d.unit][1] for d in drives])
+    directions = np.array([d.direction for d in drives])
+    at_zero = np.array([d.to_joint(v) for d, v in zip(drives, active, strict=True)])
+    home = [joint.trim_at_home(None) for joint in compensation]
+    periodic = find_periodic_errors(calibration.robot, calibration.errors)
+    sine, cosine = (
+        np.zeros((2, len(drives)))
+        if periodic is None
+        else np.array([periodic.sine, periodic.cosine]) * directions
+    )
+    return {
+        "home": braced(home / sizes),
+        "periodic": int(periodic is not None),
+        "rate": repr(0.0 if periodic is None else 2.0 * np.pi * MM / periodic.lead),
+        "sine": braced(sine / sizes),
+        "cosine": braced(cosine / sizes),
+        "screw_direction": braced(directions),
+        "screw_zero": braced(at_zero / sizes),
+    }
 
 
 def _write_nominal(form: NominalForm, drives: tuple[Drive, ...], active: Array) -> str:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 
-from orthocal.assessment.controller_entries import find_entries
+from orthocal.assessment.controller_entries import find_entries, offsets_to_enter
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError, ParameterError
 from orthocal.export.linuxcnc.approximation import approximate
 from orthocal.export.linuxcnc.c_source import write_component, write_core
+from orthocal.export.linuxcnc.drive_compensation import find_compensation, tabulate, write_table
 from orthocal.export.linuxcnc.home_offsets import find_homes
 from orthocal.export.linuxcnc.instructions import (
     write_home_lines,
@@ -27,6 +28,7 @@ OPTIONS = {
     "within": "--within",
     "tool": "--tool",
     "home_offsets": "--home-offset",
+    "latched": "--latched",
     "half_side": "--half-side-mm",
     "module": "--module or --offsets",
 }
@@ -50,6 +52,8 @@ class ExportOptions:
     """Tip of the tool in the frame of the robot's tool centre point, [m]."""
     home_offsets: tuple[float, ...] | None = None
     """HOME_OFFSET of each joint during the measurement, [m, rad]."""
+    latched: tuple[int, ...] | None = None
+    """Sign of HOME_LATCH_VEL of each joint, 1 or -1; needed for drives with backlash."""
     half_side: float | None = None
     """Half the side of the module's region around the mechanical zero, [m]."""
     module: bool | None = None
@@ -81,15 +85,15 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
     """Files for LinuxCNC.
 
     Returns:
-        README.md and joints.ini if the calibration identified offsets only, or if they are
-        requested; else README.md, kinematics.ini, orthocal_kins.c, orthocal_core.c and
-        orthocal_core.h.
+        README.md, joints.ini and a joint_N.comp for each drive with a periodic error, if the
+        calibration identified offsets only, or if they are requested; else README.md,
+        kinematics.ini, orthocal_kins.c, orthocal_core.c and orthocal_core.h.
 
     Raises:
         ExportError: If there is no offset to enter, or no module meets the tolerance.
         ParameterError: If an option of a module is given for HOME_OFFSET, or values are missing.
     """
-    homes = find_homes(calibration, old=options.home_offsets)
+    compensation = find_compensation(calibration, options.latched)
     module = not calibration.only_offsets if options.module is None else options.module
     if not module:
         unused = [OPTIONS[name] for name in options.requested if name in MODULE_OPTIONS]
@@ -105,10 +109,26 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
             )
         if not find_entries(calibration):
             raise ExportError("the calibration identified no offset: there is nothing to enter")
+        compensation = tabulate(
+            calibration, compensation, offsets_to_enter(calibration), latched=options.latched
+        )
+        tables = {
+            f"joint_{i}.comp": write_table(joint)
+            for i, joint in enumerate(compensation)
+            if joint.table is not None
+        }
+        if tables and options.home_offsets is None:
+            raise ParameterError(
+                "is missing; the trim of a table at the home switch depends on it",
+                where="--home-offset",
+            )
+        homes = find_homes(calibration, compensation, old=options.home_offsets)
         return {
             "README.md": write_home_page(calibration, homes),
             "joints.ini": write_home_lines(homes),
+            **tables,
         }
+    homes = find_homes(calibration, compensation, old=options.home_offsets)
     approximation = approximate(
         calibration,
         within=WITHIN if options.within is None else options.within,
@@ -119,5 +139,5 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         "README.md": write_module_page(calibration, approximation, homes),
         "kinematics.ini": write_module_lines(approximation, homes),
         **write_component(approximation),
-        **write_core(calibration, approximation),
+        **write_core(calibration, approximation, compensation),
     }

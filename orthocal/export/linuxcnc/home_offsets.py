@@ -3,9 +3,11 @@
 Homing assigns HOME_OFFSET to the joint at its switch. An offset o is the difference between the
 drive's coordinate and the one that the joint displays. With the direction s of the joint,
 
-    HOME_OFFSET_new = HOME_OFFSET_old + s (o_new − o_active).
+    HOME_OFFSET_new = HOME_OFFSET_old + s (o_new − o_active),
 
-Soft limits belong to positions of the slide and change by the same amount.
+less the trim with which the controller compensates backlash and periodic errors in the direction in
+which it latches the home switch (`drive_compensation.py`). Soft limits belong to positions of the
+slide and change by s (o_new − o_active).
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import numpy as np
 from orthocal.assessment.controller_entries import find_entries, offsets_to_enter
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ParameterError
+from orthocal.export.linuxcnc.drive_compensation import JointCompensation
 from orthocal.units import DRIVE_UNITS, Unit, format_fixed
 
 
@@ -30,9 +33,12 @@ class JointHome:
     direction: int
     """1 if the joint grows with the drive's coordinate, -1 if it falls."""
     change: float
-    """Change of HOME_OFFSET, MIN_LIMIT and MAX_LIMIT, [unit]."""
+    """Change of HOME_OFFSET, [unit]."""
+    limit_change: float
+    """Change of MIN_LIMIT and MAX_LIMIT, [unit]."""
     old: float | None
     """HOME_OFFSET during the measurement, [unit]; None if unknown."""
+    compensation: JointCompensation
     limits: tuple[float, float] | None
     """Soft limits during the measurement, [unit]; infinite without a limit. None if the session
     does not state the active offsets."""
@@ -47,7 +53,7 @@ class JointHome:
         """Soft limits to enter, [unit]."""
         if self.limits is None:
             return None
-        return self.limits[0] + self.change, self.limits[1] + self.change
+        return self.limits[0] + self.limit_change, self.limits[1] + self.limit_change
 
     @property
     def joint_unit(self) -> str:
@@ -67,12 +73,16 @@ class JointHome:
 
 
 def find_homes(
-    calibration: Calibration, *, old: Sequence[float] | None = None
+    calibration: Calibration,
+    compensation: Sequence[JointCompensation],
+    *,
+    old: Sequence[float] | None = None,
 ) -> tuple[JointHome, ...]:
     """HOME_OFFSET and limits of each drive's joint, in the order of the drives.
 
     Args:
         calibration: The calibration.
+        compensation: Compensation of each joint by the controller.
         old: HOME_OFFSET of each joint during the measurement, [m, rad].
 
     Raises:
@@ -94,6 +104,11 @@ def find_homes(
             lowest, highest = np.array(d.joint_limits) + d.direction * active[i]
             limits = float(lowest), float(highest)
         change = d.direction * float(changes[i]) if d.name in entered else 0.0
-        home = None if old is None else old[i]
-        homes.append(JointHome(d.name, d.unit, d.direction, change, home, limits))
+        home, joint = None if old is None else old[i], compensation[i]
+        trim = 0.0
+        for _ in range(2):  # a table is nearly constant over a trim
+            trim = joint.trim_at_home(None if home is None else home + change - trim)
+        homes.append(
+            JointHome(d.name, d.unit, d.direction, change - trim, change, home, joint, limits)
+        )
     return tuple(homes)

@@ -39,8 +39,9 @@ def write_home_lines(homes: Sequence[JointHome]) -> str:
             f"[JOINT_{i}]",
             f"# {comment_safe(home.drive)}, counts {home.counting}: "
             f"{home.show(home.change, sign=True)} {home.joint_unit}",
-            _line("HOME_OFFSET", home, home.new),
+            _line("HOME_OFFSET", home, home.new, home.change),
             *_limit_lines(home, None if home.new is None else home.new_limits),
+            *_compensation_lines(i, home),
         ]
     return "\n".join(lines) + "\n"
 
@@ -74,6 +75,7 @@ def write_module_lines(approximation: Approximation, homes: Sequence[JointHome])
             lines.append(f"HOME_OFFSET = {home.show(home.old)}")
         if home.limits is not None:
             lines += _limit_lines(home, home.limits)
+        lines += _compensation_lines(i, home)
     return "\n".join(lines) + "\n"
 
 
@@ -81,16 +83,50 @@ def _limit_lines(home: JointHome, limits: tuple[float, float] | None) -> list[st
     names = ("MIN_LIMIT", "MAX_LIMIT")
     values = (None, None) if limits is None else limits
     return [
-        _line(name, home, value)
+        _line(name, home, value, home.limit_change)
         for name, value in zip(names, values, strict=True)
         if value is None or math.isfinite(value)
     ]
 
 
-def _line(name: str, home: JointHome, value: float | None) -> str:
+def _line(name: str, home: JointHome, value: float | None, change: float) -> str:
     if value is None:
-        return f"# {name} = present value {home.show(home.change, sign=True)}"
+        return f"# {name} = present value {home.show(change, sign=True)}"
     return f"{name} = {home.show(value)}"
+
+
+def _compensation_lines(joint: int, home: JointHome) -> list[str]:
+    """BACKLASH of a joint, or COMP_FILE, which replaces it."""
+    if home.compensation.table is not None:
+        return [f"COMP_FILE = joint_{joint}.comp", "COMP_FILE_TYPE = 1"]
+    backlash = home.compensation.backlash
+    return [f"BACKLASH = {home.show(backlash)}"] if backlash else []
+
+
+def _describe_compensation(homes: Sequence[JointHome]) -> str:
+    """Paragraph about BACKLASH and COMP_FILE; empty without them."""
+    texts = []
+    with_backlash = [(i, h) for i, h in enumerate(homes) if h.compensation.backlash]
+    if with_backlash:
+        listed = ", ".join(
+            f"JOINT_{i} {h.show(h.compensation.backlash)} {h.joint_unit} (latched in "
+            f"{'+' if h.compensation.latched > 0 else '-'} direction)"
+            for i, h in with_backlash
+        )
+        texts.append(
+            f"**Backlash:** {listed}. LinuxCNC compensates it\nby the lines BACKLASH, or by the "
+            "columns of COMP_FILE. The sign of HOME_LATCH_VEL must be as stated here, and that of\n"
+            "HOME_SEARCH_VEL the same: half of the backlash, with this sign, is part of the zero."
+        )
+    errors = [h.compensation.error for h in homes if h.compensation.table is not None]
+    if errors:
+        error = rounded_up(max(errors) / UM)
+        texts.append(
+            "**Periodic error of the screws:** copy the files `joint_*.comp` beside your INI file."
+            f"\nBetween the entries of a table the error is up to {error} µm. A kinematics module "
+            "(`--module`)\ncorrects it exactly."
+        )
+    return "".join(f"\n{text}\n" for text in texts)
 
 
 def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str:
@@ -117,6 +153,10 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str
         rows.append(f"| {' | '.join(cells)} |")
     unit, size = DRIVE_UNITS[homes[0].unit]
     active = ", ".join(f"{v / size:.6g}" for v in offsets_to_enter(calibration))
+    keys = f"offsets_{unit}: [{active}]"
+    if any(h.compensation.backlash for h in homes):
+        listed = ", ".join(f"{h.compensation.backlash / size:.4g}" for h in homes)
+        keys += f", backlash_{unit}: [{listed}]"
     scope = "The calibration identified offsets of the drives only."
     if not calibration.only_offsets:
         scope = (
@@ -127,8 +167,8 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str
         "robot": comment_safe(calibration.robot.name),
         "scope": scope,
         "table": "\n".join(rows),
-        "unit": unit,
-        "active": active,
+        "controller": keys,
+        "compensation": _describe_compensation(homes),
     }
     return fill_template("home_offset.md", values)
 
@@ -166,6 +206,7 @@ def write_module_page(
         "tool": millimetres(approximation.tool),
         "checked": approximation.checked,
         "nominal": nominal,
+        "compensation": _describe_compensation(homes),
         "old_values": f" ({', '.join(old)})" if old else "",
         "last": len(homes) - 1,
         "drives": ", ".join(comment_safe(h.drive) for h in homes),

@@ -24,10 +24,53 @@ static const double half[N] = $half;
 static const unsigned char exponent[TERMS][N] = $exponent;
 static const double coefficient[N][TERMS] = $coefficient;
 
+/* added to each joint, mm or degrees: half of the backlash, which homing subtracts */
+static const double home[N] = $home;
+
+/* periodic errors of the screws: amplitudes in each joint, radians per mm of the slide, direction of
+   the joint, and its coordinate at slide coordinate 0 */
+#define PERIODIC $periodic
+#if PERIODIC
+static const double sine[N] = $sine;
+static const double cosine[N] = $cosine;
+static const double rate = $rate;
+static const double screw_direction[N] = $screw_direction;
+static const double screw_zero[N] = $screw_zero;
+#endif
+
 $nominal
 static double absolute(double value)
 {
     return value < 0.0 ? -value : value;
+}
+
+/* Joints whose screws are at q, in q, and their Jacobian unless it is a null pointer. */
+static void drive(double q[N], double (*jacobian)[N])
+{
+    int i;
+
+    for (i = 0; i < N; i++) {
+#if PERIODIC
+        double wanted = q[i], slope = 0.0;
+        int k, count;
+
+        for (count = 0; count < MOST_STEPS; count++) {
+            double phase = rate * screw_direction[i] * (q[i] - screw_zero[i]);
+            double next = wanted - sine[i] * sin(phase) - cosine[i] * cos(phase);
+            int settled = absolute(next - q[i]) < TOLERANCE;
+
+            slope = rate * screw_direction[i] * (sine[i] * cos(phase) - cosine[i] * sin(phase));
+            q[i] = next;
+            if (settled)
+                break;
+        }
+        for (k = 0; jacobian && k < N; k++)
+            jacobian[i][k] /= 1.0 + slope;
+#else
+        (void)jacobian;
+#endif
+        q[i] += home[i];
+    }
 }
 
 /* Joints at a point, and their Jacobian unless it is a null pointer. */
@@ -67,6 +110,7 @@ static int evaluate(const double p[N], double q[N], double (*jacobian)[N])
                 jacobian[i][k] += coefficient[i][t] * derivative;
         }
     }
+    drive(q, jacobian);
     return 0;
 }
 

@@ -1,4 +1,4 @@
-/* Calibrated kinematics of $robot. Plain C99; no memory allocation; needs sqrt only.
+/* Calibrated kinematics of $robot. Plain C99; no memory allocation; needs $functions only.
    Lengths in mm, joints in $joint_units: $joints. */
 #ifndef ORTHOCAL_CORE_H
 #define ORTHOCAL_CORE_H

@@ -1,0 +1,210 @@
+"""BACKLASH, COMP_FILE and screws in the kinematics module, run in LinuxCNC.
+
+The recorded motors move slides with play and periodic screws, simulated here without the effects'
+formulas: a slide follows its screw with a hysteresis, whatever the direction is called.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from effect_plans import write_plan
+from linuxcnc import Joint, require_linuxcnc, run_program
+from test_linuxcnc import from_pieces, require_followed
+
+from orthocal import (
+    Choice,
+    ExportOptions,
+    Machine,
+    ParameterError,
+    calibrate,
+    export_calibration,
+    load_plan,
+    load_robot,
+    simulate_session,
+)
+from orthocal.export.linuxcnc.drive_compensation import PeriodicErrors
+
+MM = 1e-3
+
+EFFECTS = "backlash: {tolerance_mm: 0.08}, screw: {lead_mm: 10, periodic_tolerance_mm: 0.02}"
+
+JOINTS = {"y_slide": "{counts: down}", "z_slide": "{counts: down, at_zero_mm: 0}"}
+
+ACTIVE = np.array([0.4, -0.1, 0.2]) * MM
+
+TRUTH = {
+    "x_slide.offset": 1.2 * MM,
+    "y_slide.offset": -0.8 * MM,
+    "z_slide.offset": 0.5 * MM,
+    "x_slide.backlash": 60e-6,
+    "y_slide.backlash": 40e-6,
+    "z_slide.backlash": 25e-6,
+    "x_slide.screw_sin": 12e-6,
+    "y_slide.screw_cos": -9e-6,
+    "z_slide.screw_sin": -6e-6,
+    "z_slide.screw_cos": 7e-6,
+}
+
+LATCHED = (1, -1, -1)
+"""With the sign of the search: of another sign the switch may open before a play is taken up."""
+
+SWITCH = np.array([352.0, 340.0, 331.0]) * MM
+
+ROUNDING = np.sqrt(3.0) * 0.5e-6
+"""Effect of offsets that are entered to 1 µm, [m]."""
+
+PROMISED = 1e-6
+"""Largest distance of the real path from the programmed one, [m]."""
+
+
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory):
+    folder = write_plan(
+        tmp_path_factory.mktemp("compensated") / "plan", effects=EFFECTS, joints=JOINTS
+    )
+    plan = load_plan(folder).with_controller(ACTIVE)
+    session = simulate_session(plan, TRUTH, seed=4, sigma=0.5e-6).session
+    return calibrate(session, Choice("offsets"), solver="variable-projection")
+
+
+def play(screws, backlash):
+    """Slides behind screws with play, shape (K, n): each moves when its play is used up."""
+    slides = np.array(screws)
+    for k in range(1, len(slides)):
+        slides[k] = np.clip(slides[k - 1], screws[k] - 0.5 * backlash, screws[k] + 0.5 * backlash)
+    return slides
+
+
+def follow(calibration, motors):
+    """Tool of the calibrated machine whose motors were recorded, shape (K, 3), [m]."""
+    robot, errors = calibration.robot, calibration.errors
+
+    def of_drives(kind):
+        return np.array([errors[f"{d.name}.{kind}"] for d in robot.drives])
+
+    turns = 2.0 * np.pi * motors / 10e-3
+    waves = of_drives("screw_sin") * np.sin(turns) + of_drives("screw_cos") * np.cos(turns)
+    rigid = {n: v for n, v in errors.items() if n.endswith(".offset")}
+    slides = play(motors + waves, of_drives("backlash"))
+    return Machine(load_robot("orthoglide"), rigid).forward(slides)
+
+
+def joints_of(calibration):
+    drives = zip(calibration.robot.drives, SWITCH, ACTIVE, LATCHED, strict=True)
+    return [
+        Joint(
+            d.direction,
+            float(s) / MM,
+            float(d.to_joint(s + active)) / MM,
+            float(d.to_joint(d.zero)) / MM,
+            latched=latched,
+        )
+        for d, s, active, latched in drives
+    ]
+
+
+CENTRE, RADIUS = (12.0, -8.0, 15.0), 16.0
+CORNERS = [
+    (24.0, -14.0, 12.0),
+    (28.0, -8.0, 15.0),
+    (-35.0, 20.0, -25.0),
+    (-35.0, -30.0, 10.0),
+    (10.0, -20.0, 20.0),
+]
+PATH = CENTRE, RADIUS, CORNERS
+COUNTS = [150, 5, 100, 60, 60]
+TAKEN_UP = 0.5
+"""Way after which every play is taken up, [mm]."""
+REVERSING = 0.02
+"""Distance from a corner, at which drives take up their play within some milliseconds, [mm]."""
+
+
+def run(calibration, files, tmp_path, *, module, inverse=None):
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    tables = {name: text for name, text in files.items() if name.endswith(".comp")}
+    program = [
+        "G21 G90 G61 G1 X24 Y-14 Z12 F6000",  # a way off, so that every play is taken up
+        "G21 G90 G61 F1500 G1 X28 Y-8 Z15",
+        "G2 X28 Y-8 Z15 I-16 J0",
+        *(f"G1 X{x:g} Y{y:g} Z{z:g}" for x, y, z in CORNERS[2:]),
+    ]
+    lines = files["kinematics.ini" if module else "joints.ini"]
+    motors = run_program(
+        program,
+        joints_of(calibration),
+        lines=lines,
+        module=tmp_path if module else inverse,
+        files=tables,
+    )
+    points = follow(calibration, motors * MM)[::5] / MM
+    away = [np.linalg.norm(points - corner, axis=1) for corner in CORNERS]
+    return points[(away[0] > TAKEN_UP) & (np.min(away, axis=0) > REVERSING)]
+
+
+def test_the_module_and_backlash_keep_the_path(calibration, tmp_path):
+    require_linuxcnc()
+    options = ExportOptions(module=True, within=0.05e-6, latched=LATCHED)
+    files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
+    assert len(re.findall(r"^BACKLASH = ", files["kinematics.ini"], re.M)) == 3
+    real = run(calibration, files, tmp_path, module=True)
+    require_followed(from_pieces(real, *PATH), PROMISED, COUNTS)
+    # without these lines the play of the drives shows
+    lines = re.sub(r"(?m)^BACKLASH.*\n", "", files["kinematics.ini"])
+    real = run(calibration, {**files, "kinematics.ini": lines}, tmp_path, module=True)
+    assert from_pieces(real, *PATH).min(axis=0).max() > 20 * PROMISED
+
+
+def test_tables_and_home_offset_keep_the_path(calibration, tmp_path):
+    """With nominal kinematics and offsets: the module of a machine without errors."""
+    require_linuxcnc()
+    old = tuple(
+        float(d.to_joint(s + active))
+        for d, s, active in zip(calibration.robot.drives, SWITCH, ACTIVE, strict=True)
+    )
+    options = ExportOptions(module=False, latched=LATCHED, home_offsets=old)
+    files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
+    assert sorted(name for name in files if name.endswith(".comp")) == [
+        f"joint_{i}.comp" for i in range(3)
+    ]
+    rows = files["joint_0.comp"].splitlines()
+    assert len(rows) == 256
+    promised = float(re.search(r"error is up to ([\d.]+) µm", files["README.md"])[1])
+    assert 0.1 < promised < 1.0
+    nominal = tmp_path / "nominal"
+    nominal.mkdir()
+    plan = load_plan(write_plan(tmp_path / "plain", effects="", joints=JOINTS))
+    exact = simulate_session(plan.with_controller(np.zeros(3)), {}, exact=True).session
+    plain = calibrate(exact, "offsets", solver="variable-projection")
+    module = export_calibration(plain, "linuxcnc", anyway=True, options=ExportOptions(module=True))
+    for name, text in module.items():
+        (nominal / name).write_text(text)
+    files = {**files, "joints.ini": module["kinematics.ini"] + files["joints.ini"]}
+    real = run(calibration, files, tmp_path, module=False, inverse=nominal)
+    within = PROMISED + promised * 1e-6 + ROUNDING
+    require_followed(from_pieces(real, *PATH), within, COUNTS)
+
+
+@pytest.mark.parametrize(
+    ("options", "where"),
+    [
+        ({"module": True}, "--latched"),
+        ({"module": False}, "--latched"),
+        ({"module": True, "latched": (1, 1)}, "--latched"),
+        ({"module": False, "latched": LATCHED}, "--home-offset"),
+    ],
+)
+def test_what_homing_does_must_be_stated(calibration, options, where):
+    with pytest.raises(ParameterError) as caught:
+        export_calibration(calibration, "linuxcnc", anyway=True, options=ExportOptions(**options))
+    assert caught.value.where == where
+
+
+def test_screws_are_inverted_exactly():
+    errors = PeriodicErrors(5e-3, np.array([9e-6, 0.0]), np.array([-4e-6, 0.0]))
+    coordinates = np.random.default_rng(0).uniform(0.1, 0.4, (200, 2))
+    assert np.abs(errors.invert(coordinates + errors(coordinates)) - coordinates).max() < 1e-15
+    assert np.abs(errors(coordinates)[:, 0]).max() > 9e-6
