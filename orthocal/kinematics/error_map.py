@@ -21,7 +21,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.arrays import Array, Mask
+from orthocal.arrays import Array, Indices, Mask
 from orthocal.effects.loading import neutral_values
 from orthocal.effects.machine import express_machine
 from orthocal.effects.protocol import NEUTRAL, Condition, condition_size
@@ -97,6 +97,7 @@ class ErrorMap:
         conditions: Conditions that follow the drive coordinates in a command.
         placement_conditions: Those on which placements depend.
         of_placements: Mask of these in a command, shape (n_command,).
+        varying: Indices of the moved placements that may depend on conditions, shape (n_varying,).
         drive_errors: Indices of the errors on which the drives depend, shape (n_drive_errors,).
         drives: Function of a command and these errors: actual drive coordinates.
         twists: Function of the conditions and of all errors: twists of the moved placements, and
@@ -142,6 +143,7 @@ class ErrorMap:
         outputs = [twists, ca.jacobian(twists, errors)]
         self.twists = ca.Function("twists", [conditions, errors], outputs)
         self._twists = _Twists(self.twists)
+        self.varying = np.unique(self._twists.curved // 6)
         nominal = [nominal_placement(robot.model, p) for p in self.moved]
         self._rotations = np.array([p.rotation for p in nominal]).reshape(-1, 3, 3)
         self._positions = np.array([p.translation for p in nominal]).reshape(-1, 3)
@@ -192,9 +194,8 @@ class ErrorMap:
         values = np.asarray(errors, dtype=np.float64)
         drive_errors = values[..., self.drive_errors]
         if commands is not None and commands.ndim > 1 and self.placement_conditions:
-            repeated = np.repeat(values, len(commands), axis=0)
-            tiled = np.tile(commands, (len(values), 1))
-            return MachineGeometry(self, self.placements(repeated, tiled), drive_errors)
+            under = self.placements_under(values, commands)
+            return MachineGeometry(self, under.reshape(-1, under.shape[-1]), drive_errors)
         command = commands if commands is not None and commands.ndim == 1 else None
         return MachineGeometry(self, self.placements(values, command), drive_errors)
 
@@ -208,12 +209,62 @@ class ErrorMap:
         Returns:
             Shape (..., 12 n_moved), [1, m].
         """
-        rotation, position = exp6(self._shaped(self.twists_of(errors, commands)))
-        rotations = self._rotations @ rotation
-        positions = (self._rotations @ position[..., None])[..., 0] + self._positions
-        columns = np.swapaxes(rotations, -1, -2).reshape(*rotations.shape[:-2], 9)
-        values = np.concatenate([columns, positions], axis=-1)
+        values = self._move(self._shaped(self.twists_of(errors, commands)), slice(None))
         return values.reshape(*values.shape[:-2], -1)
+
+    def placements_under(self, errors: Array, commands: Array) -> Array:
+        """Moved placements of S machines under the conditions of V commands.
+
+        Only those that vary are computed for each command.
+
+        Args:
+            errors: Shape (S, n_errors), [SI].
+            commands: Shape (V, n_command).
+
+        Returns:
+            Shape (S, V, 12 n_moved), [1, m].
+        """
+        first = self.placements(errors, commands[0])
+        result = np.repeat(first[:, None], len(commands), axis=1)
+        if len(commands) > 1:
+            shaped = result.reshape(*result.shape[:2], -1, 12)
+            twists = self._varying_twists(errors, commands)
+            shaped[:, :, self.varying] = self._move(twists, self.varying)
+        return result
+
+    def _move(self, twists: Array, chosen: slice | Indices) -> Array:
+        """Chosen placements with the twists δ, shape (..., n, 12) of (..., n, 6)."""
+        rotation, position = exp6(twists)
+        nominal = self._rotations[chosen]
+        positions = (nominal @ position[..., None])[..., 0] + self._positions[chosen]
+        columns = np.swapaxes(nominal @ rotation, -1, -2).reshape(*positions.shape[:-1], 9)
+        return np.concatenate([columns, positions], axis=-1)
+
+    def _varying_twists(self, errors: Array, commands: Array) -> Array:
+        """Twists of the varying placements, shape (S, V, n_varying, 6)."""
+        at = np.broadcast_to(errors[:, None], (len(errors), len(commands), errors.shape[-1]))
+        return self._shaped(self.twists_of(at, commands[None]))[:, :, self.varying]
+
+    def varying_derivatives(
+        self, errors: Array, columns: Array, commands: Array
+    ) -> VaryingDerivatives:
+        """Derivatives of the varying placements of S machines under V conditions.
+
+        Args:
+            errors: Shape (S, n_errors), [SI].
+            columns: Elementary errors of one unit of each parameter, shape (n_errors, n).
+            commands: Shape (V, n_command).
+        """
+        at = np.broadcast_to(errors[:, None], (len(errors), len(commands), errors.shape[-1]))
+        of_varying = (6 * self.varying[:, None] + np.arange(6)).reshape(-1)
+        constant, curved, by = self._twists.split(at, columns, self._conditions(commands[None]))
+        return VaryingDerivatives(
+            right_jacobian(self._varying_twists(errors, commands)),
+            constant[of_varying],
+            np.searchsorted(of_varying, self._twists.curved),
+            curved,
+            by,
+        )
 
     def actuate(self, commands: Array, drive_errors: Array) -> Array:
         """Actual drive coordinates.
@@ -310,11 +361,30 @@ class ErrorMap:
         return twists.reshape(*twists.shape[:-1], len(self.moved), 6)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class VaryingDerivatives:
+    """Derivatives ∂ξ = T ∂δ of the placements that vary, of S machines under V conditions."""
+
+    right: Array
+    """T, shape (S, V, n_varying, 6, 6)."""
+    constant: Array
+    """Part of ∂δ by parameters that is the same everywhere, shape (6 n_varying, n)."""
+    rows: Indices
+    """Rows of ∂δ that have another part, shape (n_rows,)."""
+    curved: Array
+    """The other part by some of the errors, shape (S, V, n_rows, n_some)."""
+    columns: Array
+    """These errors of one unit of each parameter, shape (n_some, n)."""
+
+
 class _Twists:
     """Twists as a function of conditions and errors, and their derivative by the errors.
 
     Errors of the geometry are single linear terms of a twist and are assigned by index. The other
     terms are evaluated by CasADi.
+
+    Attributes:
+        curved: Indices of the twists with such other terms, shape (n_curved,).
     """
 
     def __init__(self, function: ca.Function) -> None:
@@ -336,11 +406,11 @@ class _Twists:
             remainder = ca.substitute(remainder, errors[others], ca.SX.zeros(len(others)))
         self._varying = varying
         chosen = errors[varying.tolist()]
-        self._is_linear = not ca.sparsify(remainder).nnz()
+        sparsity = ca.sparsify(remainder).sparsity()
+        self.curved = np.array(sparsity.get_triplet()[0], dtype=np.int64)
+        terms = remainder[self.curved.tolist()]
         self._nonlinear = BatchFunction(
-            ca.Function(
-                "nonlinear", [conditions, chosen], [remainder, ca.jacobian(remainder, chosen)]
-            ),
+            ca.Function("nonlinear", [conditions, chosen], [terms, ca.jacobian(terms, chosen)]),
             matrices=["o1"],
         )
 
@@ -348,18 +418,34 @@ class _Twists:
         result = np.zeros((*errors.shape[:-1], self._n))
         rows, columns = self._linear
         result[..., rows] = self._slopes * errors[..., columns]
-        if not self._is_linear:
-            result += self._evaluate(errors, conditions)[0]
+        if self.curved.size:
+            result[..., self.curved] += self._evaluate(errors, conditions)[0]
         return result
 
     def columns(self, errors: Array, columns: Array, conditions: Array) -> Array:
         """∂δ by parameters; arguments as for `ErrorMap.twist_columns`."""
-        rows, of = self._linear
-        result = np.zeros((self._n, columns.shape[1]))
-        result[rows] = self._slopes[:, None] * columns[of]
-        if self._is_linear:
+        result, curved, by = self.split(errors, columns, conditions)
+        if not self.curved.size:
             return result
-        return np.asarray(result + self._evaluate(errors, conditions)[1] @ columns[self._varying])
+        result = np.array(np.broadcast_to(result, (*errors.shape[:-1], *result.shape)))
+        result[..., self.curved, :] += curved @ by
+        return result
+
+    def split(self, errors: Array, columns: Array, conditions: Array) -> tuple[Array, Array, Array]:
+        """∂δ by parameters, the part of the curved twists in two factors.
+
+        Returns:
+            The constant part, shape (n_twists, n); the other part of the curved twists by some
+            errors, shape (..., n_curved, n_some); and these errors of one unit of each parameter,
+            shape (n_some, n).
+        """
+        rows, of = self._linear
+        constant = np.zeros((self._n, columns.shape[1]))
+        constant[rows] = self._slopes[:, None] * columns[of]
+        by = columns[self._varying]
+        if not self.curved.size:
+            return constant, np.zeros((*errors.shape[:-1], 0, len(by))), by
+        return constant, self._evaluate(errors, conditions)[1], by
 
     def moved_by(self, errors: Mask) -> Mask:
         """Mask of the twists that some errors change."""

@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array, Indices
-from orthocal.kinematics.error_map import ErrorMap, MachineGeometry
+from orthocal.kinematics.error_map import ErrorMap, VaryingDerivatives
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import RobotFunctions, robot_functions
 from orthocal.observation.manual_alignment import ManualAlignment, list_alignments, virtual_session
-from orthocal.observation.observations import Observations, build_observations
+from orthocal.observation.observations import Observations, States, build_observations
 from orthocal.observation.sensor_groups import (
     NuisanceParameters,
     SensorGroup,
@@ -60,14 +60,12 @@ class FreeParameters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Block:
-    """Loop closures with the same number of readings and the same conditions of placements."""
+    """Loop closures with the same number of readings."""
 
     states: Indices
     """Shape (k,)."""
     entries: Indices
     """Entries of each state, shape (k, m)."""
-    variant: int
-    """Index of the conditions of placements."""
     members: tuple[tuple[int, Indices, Indices], ...]
     """Sensor groups: index; positions in `entries`, flat; and positions in the group, (n,) each."""
 
@@ -131,11 +129,19 @@ class _ClosurePattern:
         return result.reshape(*nonzeros.shape[:2], n_rows, self.used.size)
 
     def times(self, nonzeros: Array, twists: Array, n_rows: int) -> Array:
-        """∂g · ξ, shape (S, k, n_rows), of nonzeros, (S, k, nnz), and twists, (S, n_twists)."""
+        """∂g · ξ of nonzeros, (S, k, nnz), and twists, (S, k, n_twists), or (S, 1, n_twists).
+
+        Returns:
+            Shape (S, k, n_rows).
+        """
         n_sets = max(len(twists), len(nonzeros))
         result = np.zeros((n_sets, nonzeros.shape[1], n_rows))
         for row, part in self._row_parts(n_rows):
-            result[..., row] = (nonzeros[..., part] @ twists[:, self.columns[part], None])[..., 0]
+            moved = twists[:, :, self.columns[part]]
+            if twists.shape[1] == 1:
+                result[..., row] = (nonzeros[..., part] @ np.swapaxes(moved, 1, 2))[..., 0]
+            else:
+                result[..., row] = (nonzeros[..., part] * moved).sum(axis=-1)
         return result
 
     def _row_parts(self, n_rows: int) -> Iterator[tuple[int, slice]]:
@@ -215,20 +221,15 @@ class ObservationModel:
             Shape (n_entries,), with S in front for a batch, [m].
         """
         at, q, nu = self._batch(errors, passive, nuisance)
-        variants, n_sets = self.geometries(at), len(at)
+        machines, n_sets = _Machines(self, at), len(at)
         result = np.empty((n_sets, self.observations.size))
-        actuated = variants[0].drives(self.states.commands)
         for group in self.groups:
             size = max(1, MAX_PREDICTED // n_sets)
             for first in range(0, group.entries.size, size):
                 part = np.arange(first, min(first + size, group.entries.size))
                 states = self.observations.state[group.entries[part]]
-                geometry = variants[group.variant]
-                reference = geometry.drives(self.reference_commands[group.variant])
                 (h,) = group.reading.value(
-                    *self._inputs(
-                        group, part, geometry, actuated[:, states], q[:, states], reference, nu
-                    )
+                    *self._inputs(group, part, machines, states, q[:, states], nu)
                 )
                 result[:, group.entries[part]] = h.reshape(n_sets, part.size)
         return result if errors.ndim > 1 else result[0]
@@ -283,52 +284,51 @@ class ObservationModel:
         self,
         group: SensorGroup,
         part: Indices,
-        geometry: MachineGeometry,
-        actuated: Array,
+        machines: _Machines,
+        states: Indices,
         passive: Array,
-        reference: Array,
         nuisance: Array,
     ) -> tuple[Array, ...]:
-        """Inputs of a sensor's functions for part of its group on all machines."""
-        n_sets, n = len(actuated), part.size
+        """Inputs of a sensor's functions for part of its group on all machines.
+
+        Args:
+            group: The group.
+            part: Positions in the group, shape (n,).
+            machines: The machines.
+            states: State of each of these entries, shape (n,).
+            passive: Passive coordinates there, shape (S, n, n_passive), [m, rad].
+            nuisance: Shape (S, n_nuisance), [SI].
+        """
+        n_sets, n = len(passive), part.size
         return (
-            actuated.reshape(n_sets * n, -1),
+            machines.actuated[:, states].reshape(n_sets * n, -1),
             passive.reshape(n_sets * n, -1),
-            geometry.placements,
-            reference[:, group.setups[part]].reshape(n_sets * n, -1),
+            machines.placements(states),
+            machines.reference[:, group.setups[part]].reshape(n_sets * n, -1),
             np.tile(group.constants[part], (n_sets, 1)),
             nuisance[:, group.nuisance[part]].reshape(n_sets * n, -1),
         )
 
-    def geometries(self, errors: Array) -> list[MachineGeometry]:
-        """Geometry of machines under the conditions of each variant of placements."""
-        map_ = self.functions.errors
-        return [map_.geometry(errors, command) for command in self.states.variant_commands]
-
     @cached_property
     def reference_commands(self) -> Array:
-        """Commands of the reference posture, shape (n_variants, n_setups, n_command).
+        """Commands of the reference posture, shape (n_setups, n_command).
 
-        The drives are at the mechanical zero as each setup knew it. Placements have the conditions
-        of the variant; other conditions are neutral.
+        The drives are at the mechanical zero as each setup knew it, under neutral conditions: a
+        gauge on the base stays where it is when the machine gets warmer.
         """
-        map_, variants = self.functions.errors, self.states.variant_commands
-        commands = map_.command(self.session.zero_drives)
-        of_placements = map_.of_placements
-        return np.where(of_placements, variants[:, None], commands)
+        return self.functions.errors.command(self.session.zero_drives)
 
     def blocks(self, n_sets: int) -> tuple[_Block, ...]:
-        """All states with readings, by variant and number of readings, for a batch of machines."""
+        """All states with readings, by their number, for a batch of machines."""
         o = self.observations
         group, place = np.zeros((2, o.size), dtype=np.int64)
         for i, g in enumerate(self.groups):
             group[g.entries], place[g.entries] = i, np.arange(g.entries.size)
         order = np.argsort(o.state, kind="stable")
         states, starts, counts = np.unique(o.state[order], return_index=True, return_counts=True)
-        variant = self.states.variant[states]
         blocks = []
-        for v, m in sorted(set(zip(variant.tolist(), counts.tolist(), strict=True))):
-            chosen = np.flatnonzero((counts == m) & (variant == v))
+        for m in np.unique(counts).tolist():
+            chosen = np.flatnonzero(counts == m)
             size = max(1, min(MAX_POSTURES, MAX_READINGS // m) // n_sets)
             for first in range(0, chosen.size, size):
                 at = chosen[first : first + size]
@@ -336,12 +336,39 @@ class ObservationModel:
                 flat = entries.reshape(-1)
                 where = ((int(i), np.flatnonzero(group[flat] == i)) for i in np.unique(group[flat]))
                 members = tuple((i, w, place[flat[w]]) for i, w in where)
-                blocks.append(_Block(states[at], entries, v, members))
+                blocks.append(_Block(states[at], entries, members))
         return tuple(blocks)
 
     @cached_property
     def _single_blocks(self) -> tuple[_Block, ...]:
         return self.blocks(1)
+
+
+class _Machines:
+    """Drives and placements of S machines in the states of a model.
+
+    Args:
+        model: The observation model.
+        errors: Elementary errors, shape (S, n_errors), [SI].
+
+    Attributes:
+        actuated: Actual drive coordinates, shape (S, n_states, n_drives), [m, rad].
+        reference: The same in the reference posture of each setup, shape (S, n_setups, n_drives).
+    """
+
+    def __init__(self, model: ObservationModel, errors: Array) -> None:
+        map_, self._states = model.functions.errors, model.states
+        self.geometry = map_.geometry(errors, self._states.variant_commands[0])
+        self.actuated = self.geometry.drives(self._states.commands)
+        self.reference = self.geometry.drives(model.reference_commands)
+        self._placements = map_.placements_under(errors, self._states.variant_commands)
+
+    def placements(self, states: Indices) -> Array:
+        """Moved placements, shape (S, 12 n_moved), or (S n, 12 n_moved) if n states differ."""
+        under = self._placements
+        if under.shape[1] > 1:
+            under = under[:, self._states.variant[states]]
+        return under.reshape(-1, under.shape[-1])
 
 
 class ReadingLinearisation:
@@ -381,18 +408,14 @@ class ReadingLinearisation:
     ) -> None:
         self._model, self._free, self._batch = model, free, batch
         by_errors = alignment @ free.columns
-        self._geometries = model.geometries(errors)
-        geometry, references = self._geometries[0], model.reference_commands
-        self._actuated = geometry.drives(model.states.commands)
+        self._machines = _Machines(model, errors)
+        geometry = self._machines.geometry
         _, self._by_drive_errors = geometry.drive_derivatives(model.states.commands)
-        self._reference = [geometry.drives(commands) for commands in references]
-        self._by_reference = [geometry.drive_derivatives(commands)[1] for commands in references]
+        _, self._by_reference = geometry.drive_derivatives(model.reference_commands)
         self._pattern = free.pattern
         map_, n_sets, n = model.functions.errors, len(errors), model.observations.size
-        self._twists = [
-            _TwistChain(map_, errors, command, free, sparse=n_sets == 1 and n >= MIN_SPARSE_ROWS)
-            for command in model.states.variant_commands
-        ]
+        sparse = n_sets == 1 and n >= MIN_SPARSE_ROWS
+        self._twists = _TwistChain(map_, errors, model.states, free, sparse=sparse)
         self._by_machine = free.columns[map_.drive_errors]
         n_machine, n_nuisance = free.columns.shape[1], free.nuisance_scale.size
         reading, opening = np.empty((n_sets, n)), np.empty((n_sets, n))
@@ -434,13 +457,15 @@ class ReadingLinearisation:
         """
         d = np.atleast_2d(change)
         machine = d[:, : self._free.columns.shape[1], None]
-        twists = [chain.follow(machine) for chain in self._twists]
+        twists = self._twists.follow(machine)
         drive_errors = (self._by_machine @ machine)[:, None]
         correction = self.correction if self._batch else self.correction[None]
         result = np.array(np.broadcast_to(correction, (len(d), *correction.shape[1:])))
         for block, closures in self._blocks:
             opened = (closures.by_drive_errors @ drive_errors)[..., 0]
-            moved = twists[block.variant]
+            moved = twists
+            if twists.shape[1] > 1:
+                moved = twists[:, self._model.states.variant[block.states]]
             opened += self._pattern.times(closures.by_twists, moved, opened.shape[2])
             result[:, block.states] -= (closures.inverse @ opened[..., None])[..., 0]
         return result if change.ndim > 1 else result[0]
@@ -448,9 +473,9 @@ class ReadingLinearisation:
     def _evaluate_closures(self, block: _Block, passive: Array) -> _Closures:
         n_sets, k = len(passive), block.states.size
         outputs = self._model.functions.closure_jacobian(
-            self._actuated[:, block.states].reshape(n_sets * k, -1),
+            self._machines.actuated[:, block.states].reshape(n_sets * k, -1),
             passive[:, block.states].reshape(n_sets * k, -1),
-            self._geometries[block.variant].placements,
+            self._machines.placements(block.states),
         )
         g, g_a, g_q, nonzeros = (v.reshape(n_sets, k, *v.shape[1:]) for v in outputs)
         by_drive_errors = g_a @ self._by_drive_errors[:, block.states]
@@ -458,7 +483,7 @@ class ReadingLinearisation:
 
     def _evaluate_readings(self, block: _Block, passive: Array, nuisance: Array) -> _Readings:
         model, (k, m) = self._model, block.entries.shape
-        n_sets, actuated, q = len(passive), self._actuated, passive[:, block.states]
+        n_sets, q = len(passive), passive[:, block.states]
         n_drive_errors = self._by_drive_errors.shape[-1]
         by_twists: list[tuple[Indices, Indices, Array]] = []
         result = _Readings(
@@ -471,19 +496,11 @@ class ReadingLinearisation:
         for index, where, place in block.members:
             group, at = model.groups[index], where // m
             states, setups = block.states[at], group.setups[place]
-            inputs = model._inputs(
-                group,
-                place,
-                self._geometries[block.variant],
-                actuated[:, states],
-                q[:, at],
-                self._reference[block.variant],
-                nuisance,
-            )
+            inputs = model._inputs(group, place, self._machines, states, q[:, at], nuisance)
             outputs = group.reading.jacobian(*inputs)
             h, h_a, h_q, nonzeros, h_r, h_nu = (v.reshape(n_sets, where.size, -1) for v in outputs)
             by_drive_errors = h_a[:, :, None] @ self._by_drive_errors[:, states]
-            by_drive_errors += h_r[:, :, None] @ self._by_reference[block.variant][:, setups]
+            by_drive_errors += h_r[:, :, None] @ self._by_reference[:, setups]
             result.value[:, where] = h[..., 0]
             result.by_drive_errors[:, where] = by_drive_errors[:, :, 0]
             result.by_passive[:, where] = h_q
@@ -507,7 +524,7 @@ class ReadingLinearisation:
                 twists[:, where[:, None], at] = nonzeros[:, :, moved]
             dense = self._pattern.dense(closures.by_twists, pull.shape[-1])
             twists += (pull @ dense).reshape(n_sets, k * m, -1)
-            rows += self._twists[block.variant](twists)
+            rows += self._twists(twists, np.repeat(block.states, m))
         return rows
 
     def _squeeze(self, values: Array) -> Array:
@@ -520,28 +537,39 @@ class _TwistChain:
     Args:
         map_: The error map.
         errors: Elementary errors of the machines, shape (S, n_errors), [SI].
-        command: Command with the conditions of the placements, shape (n_command,).
+        states: States, with the conditions of their placements.
         free: The free parameters.
         sparse: Multiply rows with a sparse matrix; for one machine.
     """
 
     def __init__(
-        self, map_: ErrorMap, errors: Array, command: Array, free: FreeParameters, *, sparse: bool
+        self, map_: ErrorMap, errors: Array, states: States, free: FreeParameters, *, sparse: bool
     ) -> None:
-        self._used, self._columns = free.pattern.used, free.columns
-        self._map, self._errors, self._command = map_, errors, command
+        pattern, commands = free.pattern, states.variant_commands
+        self._used, self._columns, self._variant = pattern.used, free.columns, states.variant
+        self._map, self._errors, self._command = map_, errors, commands[0]
         self._sparse = sparse and self._used.size > 0
-        self._inner = map_.twist_columns(errors, free.columns, command)
+        self._inner = map_.twist_columns(errors, free.columns, self._command)
         self._right = np.zeros((1, len(map_.moved), 6, 6))
         if self._used.size:
-            self._right = map_.right_jacobians(errors, command)
+            self._right = map_.right_jacobians(errors, self._command)
+        self._varying: VaryingDerivatives | None = None
+        if len(commands) > 1 and self._used.size:
+            self._varying = map_.varying_derivatives(errors, free.columns, commands)
+            self._of_varying = (6 * map_.varying[:, None] + np.arange(6)).reshape(-1)
+            self._place = pattern.place[self._of_varying]
 
     @cached_property
     def _matrix(self) -> Any:  # noqa: ANN401 - SciPy has no types
-        """∂ξ/∂θ̂ of the twists that parameters move, (S, n_used, n), or sparse and transposed."""
+        """∂ξ/∂θ̂ of the twists that parameters move, (S, n_used, n), or sparse and transposed.
+
+        Twists that vary with the conditions are 0.
+        """
         jacobian = self._map.jacobian(
             self._errors, self._columns, command=self._command, right=self._right
         )
+        if self._varying is not None:
+            jacobian[:, self._of_varying] = 0.0
         matrix = jacobian[:, self._used]
         if not self._sparse:
             return matrix
@@ -549,16 +577,47 @@ class _TwistChain:
 
         return csr_array(matrix[0].T)
 
-    def __call__(self, rows: Array) -> Array:
-        """Rows by machine parameters, (S, n, n_machine), of rows by twists, (S, n, n_used)."""
+    def __call__(self, rows: Array, states: Indices) -> Array:
+        """Rows by machine parameters, (S, n, n_machine), of rows by twists, (S, n, n_used).
+
+        Args:
+            rows: The rows.
+            states: State of each of them, shape (n,).
+        """
         if self._sparse:
-            return np.asarray((self._matrix @ np.ascontiguousarray(rows[0].T)).T[None])
-        return np.asarray(rows @ self._matrix)
+            result = np.asarray((self._matrix @ np.ascontiguousarray(rows[0].T)).T[None])
+        else:
+            result = np.asarray(rows @ self._matrix)
+        if self._varying is not None:
+            result += self._by_varying(self._varying, rows, self._variant[states])
+        return result
+
+    def _by_varying(self, varying: VaryingDerivatives, rows: Array, variant: Indices) -> Array:
+        """The part of a call's result through the placements that vary."""
+        by = np.where(self._place >= 0, rows[:, :, self._place], 0.0)
+        by = by.reshape(*rows.shape[:2], -1, 1, 6) @ varying.right[:, variant]
+        local = by.reshape(*rows.shape[:2], -1)
+        curved = (local[:, :, None, varying.rows] @ varying.curved[:, variant])[:, :, 0]
+        return np.asarray(local @ varying.constant + curved @ varying.columns)
 
     def follow(self, change: Array) -> Array:
-        """Twists ∂ξ of changes of machine parameters, shape (D, n_twists) of (D, n_machine, 1)."""
+        """Twists ∂ξ of changes of machine parameters, (D, n_machine, 1).
+
+        Returns:
+            Shape (D, 1, n_twists), or (D, V, n_twists) if placements vary under V conditions.
+        """
         inner = (self._inner @ change).reshape(len(change), -1, 6, 1)
-        return np.asarray((self._right @ inner).reshape(len(change), -1))
+        result = np.asarray((self._right @ inner).reshape(len(change), 1, -1))
+        varying = self._varying
+        if varying is None:
+            return result
+        result = np.repeat(result, varying.right.shape[1], axis=1)
+        local = np.repeat((varying.constant @ change)[:, None], result.shape[1], axis=1)
+        curved = varying.curved @ (varying.columns @ change)[:, None]
+        local[:, :, varying.rows] += curved
+        moved = varying.right @ local.reshape(*local.shape[:2], -1, 6, 1)
+        result[:, :, self._of_varying] = moved.reshape(*local.shape[:2], -1)
+        return result
 
 
 def predict_readings(

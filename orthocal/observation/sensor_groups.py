@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
@@ -30,8 +29,6 @@ class SensorGroup:
     depends, shape (n, n_constants)."""
     nuisance: Indices
     """Indices of their nuisance parameters among the session's, shape (n, n_nuisance)."""
-    variant: int
-    """Index of the conditions of their placements (`States.variant`)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,11 +88,8 @@ def group_sensors(session: Session, observations: Observations) -> tuple[SensorG
         reading = compile_reading(robot, setups[i].sensor)
         members_of.setdefault(id(reading), (reading, []))[1].append(i)
     groups = []
-    variant = observations.states.variant[observations.state]
-    for (reading, members), v in product(members_of.values(), np.unique(variant).tolist()):
-        entries = np.flatnonzero(np.isin(observations.setup, members) & (variant == v))
-        if not entries.size:
-            continue
+    for reading, members in members_of.values():
+        entries = np.flatnonzero(np.isin(observations.setup, members))
         constants = {i: setups[i].sensor.constants(robot) for i in members}
         of_entry = observations.setup[entries]
         table = np.array([constants[i] for i in of_entry.tolist()])
@@ -103,5 +97,5 @@ def group_sensors(session: Session, observations: Observations) -> tuple[SensorG
         table = np.hstack([table.reshape(entries.size, -1), *conditions])
         indices = np.array([nuisance[i] for i in of_entry.tolist()], dtype=np.int64)
         indices = indices.reshape(entries.size, -1)
-        groups.append(SensorGroup(reading, entries, of_entry, table, indices, v))
+        groups.append(SensorGroup(reading, entries, of_entry, table, indices))
     return tuple(groups)

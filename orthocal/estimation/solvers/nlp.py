@@ -8,7 +8,7 @@ build it does not grow with the session. The functions are cached in memory and 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 
 import casadi as ca
@@ -136,19 +136,34 @@ class ProgramFunctions:
         first = self._n_theta + self._n_zeros
         return np.asarray(first + states[:, None] * self._n_passive + index[None, :])
 
-    def _shared_calls(self, theta: ca.MX) -> list[tuple[ca.MX, ...]]:
-        """Functions of θ̂ alone, evaluated once for all states and readings of each variant."""
+    def _shared_calls(self, theta: ca.MX) -> list[ca.MX]:
+        """Functions of θ̂ alone, evaluated once for all states and readings.
+
+        The first is θ̂ itself. The others have a column for each variant of the placements.
+        """
         commands = self.problem.states.variant_commands
         conditions = commands[:, len(self.problem.robot.drives) :]
         function = self._symbolic.error_map.function
-        return [tuple(function(theta, ca.DM(values))) for values in conditions]
+        calls = [function(theta, ca.DM(values)) for values in conditions]
+        return [theta, *(ca.horzcat(*column) for column in list(zip(*calls, strict=True))[1:])]
+
+    def _shared_arguments(
+        self, shared: list[ca.MX], states: Indices
+    ) -> tuple[list[ca.MX], list[bool]]:
+        """`_shared_calls` of states, and a mask of those that are common to all states."""
+        variant = self.problem.states.variant[states]
+        common = [v.size2() == 1 for v in shared]
+        arguments = [
+            v if one else v[:, variant.tolist()] for v, one in zip(shared, common, strict=True)
+        ]
+        return arguments, common
 
     def _add_readings(
         self,
         one: ReadingExpressions,
         x: ca.MX,
         p: ca.MX,
-        shared: list[tuple[ca.MX, ...]],
+        shared: list[ca.MX],
         lam_f: ca.MX,
         gradient: SparseSum,
         hessian: SparseSum,
@@ -218,7 +233,7 @@ class ProgramFunctions:
         local: Indices,
         x: ca.MX,
         p: ca.MX,
-        shared: Sequence[tuple[ca.MX, ...]],
+        shared: list[ca.MX],
     ) -> tuple[list[ca.MX], list[bool]]:
         """Arguments of the mapped functions of a sensor group, and a mask of the common ones.
 
@@ -227,11 +242,11 @@ class ProgramFunctions:
             local: Positions in x of its (ν̂, ẑ, q̂), shape (n, n_local).
             x: Variables of the program.
             p: Parameters of the program.
-            shared: Functions of θ̂ alone, by variant.
+            shared: Functions of θ̂ alone, as `_shared_calls` returns them.
         """
         problem, o, group = self.problem, self.problem.observations, one.group
         count, n_u = group.nuisance.shape
-        references = problem.model.reference_commands[group.variant]
+        references = problem.model.reference_commands
         prior_stds = problem.theta_scale[problem.n_machine + group.nuisance]
         separate = [
             ca.reshape(x[local[:, :n_u].reshape(-1).tolist()], n_u, count),
@@ -243,9 +258,10 @@ class ProgramFunctions:
             _columns(references[group.setups]),
             _columns(group.constants),
         ]
-        common = [p[3 * o.size], p[3 * o.size + 2], *shared[group.variant]]
-        masks = [False] * len(separate) + [True] * len(common)
-        return [*separate, *common], masks
+        of_machine, of_all = self._shared_arguments(shared, o.state[group.entries])
+        common = [p[3 * o.size], p[3 * o.size + 2]]
+        masks = [False] * len(separate) + [True] * len(common) + of_all
+        return [*separate, *common, *of_machine], masks
 
     def _cached(self, name: str, build: Callable[[], ca.Function]) -> ca.Function:
         """A cached function of one posture or one reading; its constants are part of the key."""
@@ -334,7 +350,7 @@ class ProgramFunctions:
         return ca.densify(scale @ second @ scale)
 
     def _add_closures(
-        self, x: ca.MX, lam_g: ca.MX, shared: list[tuple[ca.MX, ...]], hessian: SparseSum
+        self, x: ca.MX, lam_g: ca.MX, shared: list[ca.MX], hessian: SparseSum
     ) -> tuple[ca.MX, ca.MX]:
         """Closures of all states and their Jacobian; their curvature goes into the Hessian."""
         problem = self.problem
@@ -350,20 +366,14 @@ class ProgramFunctions:
         machine = np.tile(np.arange(problem.n_machine), (k, 1))
         variables = np.hstack([machine, self._passive_variables(np.arange(k), np.arange(n_p))])
         jacobian = SparseSum(k * n_g + self._aligned.size, x.numel())
-        parts, order = [], []
-        for variant, common in enumerate(shared):
-            states = np.flatnonzero(problem.states.variant == variant)
-            chosen = states.tolist()
-            arguments = [passive[:, chosen], commands[:, chosen], *common]
-            masks = [False, False, *(True for _ in common)]
-            parts.append(ca.vec(closure_f.map(states.size, masks, [False])(*arguments)))
-            order.append((states[:, None] * n_g + np.arange(n_g)).reshape(-1))
-            nonzeros = jacobian_f.map(states.size, masks, [False])(*arguments).nz[:]
-            rows = states[:, None] * n_g + pattern_rows[None, :]
-            jacobian.add(rows, variables[states][:, pattern_columns], nonzeros)
-        constraints = ca.vertcat(*parts)[np.argsort(np.concatenate(order)).tolist()]
+        of_machine, of_all = self._shared_arguments(shared, np.arange(k))
+        arguments, masks = [passive, commands, *of_machine], [False, False, *of_all]
+        constraints = ca.vec(closure_f.map(k, masks, [False])(*arguments))
+        nonzeros = jacobian_f.map(k, masks, [False])(*arguments).nz[:]
+        rows = np.arange(k)[:, None] * n_g + pattern_rows[None, :]
+        jacobian.add(rows, variables[:, pattern_columns], nonzeros)
         if self.hessian == "exact":
-            arguments = [passive, commands, shared[0][0], ca.reshape(lam_g[: k * n_g], n_g, k)]
+            arguments = [passive, commands, shared[0], ca.reshape(lam_g[: k * n_g], n_g, k)]
             self._add_closure_curvature(arguments, variables, hessian)
         if self._aligned.size:
             matrix, start = self._alignment_constraints()

@@ -203,6 +203,10 @@ class Task:
         low, high = self.low - theta, self.high - theta
         scale = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
         scaled, target = square * np.outer(scale, scale), gradient * scale
+        limited = np.isfinite(low) | np.isfinite(high)
+        order = np.argsort(limited, kind="stable")  # parameters with bounds come last
+        if limited.any():
+            scaled, target, scale = scaled[np.ix_(order, order)], target[order], scale[order]
         try:
             factor: Array = np.asarray(np.linalg.cholesky(scaled).T, dtype=np.float64)
         except np.linalg.LinAlgError:  # undetermined parameters: the smallest change
@@ -211,8 +215,11 @@ class Task:
             step = vectors[:, large] @ ((vectors[:, large].T @ target) / values[large])
         else:
             target = _solve_triangular(factor, target, transposed=True)
-            step = _bounded(factor, target, low / scale, high / scale)
-        return np.asarray(np.clip(step * scale, low, high))
+            limits = low[order] / scale, high[order] / scale
+            step = _bounded(factor, target, *limits, n_limited=int(limited.sum()))
+        result = np.empty_like(step)
+        result[order] = step * scale
+        return np.clip(result, low, high)
 
     def _off(self, theta: Array) -> Array:
         """Deviation of θ̂ from the mean of its prior, shape (n_free,)."""
@@ -237,17 +244,24 @@ def _solve_triangular(factor: Array, target: Array, *, transposed: bool = False)
     return np.asarray(linalg.solve_triangular(factor, target, trans="T" if transposed else "N"))
 
 
-def _bounded(factor: Array, target: Array, low: Array, high: Array) -> Array:
-    """Vector s that minimises ‖R s − t‖ within bounds, R upper triangular, shape (n,)."""
+def _bounded(factor: Array, target: Array, low: Array, high: Array, *, n_limited: int) -> Array:
+    """Vector s that minimises ‖R s − t‖ within bounds, R upper triangular, shape (n,).
+
+    The last components alone have bounds. They minimise the last rows, in which no others appear;
+    the others then solve their rows exactly.
+    """
     open_solution = _solve_triangular(factor, target)
     if ((open_solution >= low) & (open_solution <= high)).all():
-        return np.asarray(open_solution)
+        return open_solution
     from scipy.optimize import lsq_linear
 
-    movable = high > low
-    result = np.where(movable, 0.0, low)
-    remainder = target - factor @ result
+    n = len(target) - n_limited
+    result = np.where(high > low, 0.0, low)
+    movable = n + np.flatnonzero((high > low)[n:])
+    corner = factor[n:]
+    remainder = target[n:] - corner @ result
     limits = low[movable], high[movable]
-    solution = lsq_linear(factor[:, movable], remainder, bounds=limits, method="bvls", tol=1e-15)
+    solution = lsq_linear(corner[:, movable], remainder, bounds=limits, method="bvls", tol=1e-15)
     result[movable] = solution.x
-    return np.asarray(result)
+    result[:n] = _solve_triangular(factor[:n, :n], target[:n] - factor[:n, n:] @ result[n:])
+    return result
