@@ -29,8 +29,9 @@ KINDS = {
 OFFSETS = {"*.offset_mm": 4.0}
 
 LOADED = 2e-10
-"""[m] Readings under load: the independent rods rest where their energy is least to 1e-4 of what
-they give way, which is 1 µm."""
+"""[m] Readings under load: orthocal computes the forces on the machine that does not give way. Of
+the 10 µm by which the rods give way, the share of their displacement by their length, 3e-5, is
+left out."""
 
 
 class Measured:
@@ -140,20 +141,20 @@ def test_mounting_and_drift_of_gauges(folder):
 
 
 def test_readings_of_a_loaded_machine(tmp_path):
-    """All effects together, with rods that give way by 1 µm."""
-    compliance = "compliance: {rod_N_per_um: 20, platform_kg: 4}"
+    """All effects together, with rods that give way by 10 µm."""
+    compliance = "compliance: {rod_N_per_um: 2, platform_kg: 4}"
     folder = write_plan(tmp_path / "plan", effects=f"{EFFECTS}, {compliance}")
     plan = exact(load_plan(folder))
     loaded = Measured(folder, replace(plan, readings=plan.readings[4:8]))  # in two postures
     drives, place = np.unique(loaded.states.drives, axis=0, return_inverse=True)
     weight = np.array([0.0, 0.0, -4.0 * 9.80665])
-    changes = np.array([settle(d, stiffness=20e6, weight=weight)[1] for d in drives])
+    changes = np.array([settle(d, stiffness=2e6, weight=weight)[1] for d in drives])
     states = replace(loaded.states, stretch=changes[place.reshape(-1)])
     errors = draw(loaded.plan, "all", 1)
     (shown,) = loaded.read(errors, states=states)
     expected = predict_readings(loaded.plan, errors)
     assert np.abs(shown - expected).max() < LOADED
-    assert np.abs(shown - loaded.read(errors)).max() > 1e3 * LOADED
+    assert np.abs(shown - loaded.read(errors)).max() > 100.0 * LOADED
 
 
 def test_a_simulated_session_has_the_readings_of_the_independent_machine(measured):
