@@ -219,7 +219,7 @@ class Task:
             step = _bounded(factor, target, *limits, n_limited=int(limited.sum()))
         result = np.empty_like(step)
         result[order] = step * scale
-        return np.clip(result, low, high)
+        return np.asarray(np.clip(result, low, high))
 
     def _off(self, theta: Array) -> Array:
         """Deviation of θ̂ from the mean of its prior, shape (n_free,)."""
