@@ -12,7 +12,8 @@ from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
-from orthocal.kinematics.loop_closure import nominal_closure
+from orthocal.kinematics.conditions import UseConditions, UseSamples, sample_use
+from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace, find_workspace
 from orthocal.robot.model import Robot
@@ -23,36 +24,70 @@ LIMIT_SLACK = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibratedTool:
-    """The tool of a calibrated machine at commanded points."""
+    """The tool of a calibrated machine at commanded points, under C conditions of use in turn."""
 
     workspace: Workspace
+    """The points, once for each of the conditions."""
+    use: UseSamples
+    """The conditions."""
     targets: Array
-    """Where a nominal machine's tool would be, shape (K, 3), [m]."""
+    """Where a nominal machine's tool would be, shape (C K, 3), [m]."""
     drives: Array
     """Drive coordinates of a nominal machine, shape (K, n_drives), [m, rad]."""
     passive: Array
     """Its passive coordinates, shape (K, n_passive), [m, rad]: others are near."""
-    sensitivity: ToolSensitivity
+    sensitivities: tuple[ToolSensitivity, ...]
+    """Under each of the conditions."""
     jacobian: Array
-    """∂p/∂θ there, with the offsets active while measuring, shape (K, 3, n), [m per unit]."""
+    """∂p/∂θ there, with the offsets active while measuring, shape (C K, 3, n), [m per unit]."""
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.sensitivities[0].free
 
     def deviation(self, offsets: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
-        """Actual less commanded position of the tool, shape (K, 3), [m].
+        """Actual less commanded position of the tool, shape (C K, 3), [m].
 
         Args:
             offsets: In the controller, shape (n_drives,), [m, rad].
             names: What to call the points in messages.
         """
         commanded = self.drives - np.asarray(offsets, dtype=np.float64)
-        found = self.sensitivity.closure.forward(commanded, start=self.passive, names=names)
-        return np.asarray(found - self.targets)
+        return self._place(commanded, names) - self.targets
+
+    def deviation_unless_stated(self) -> Array:
+        """Error of a controller that corrects all errors for the conditions of `UseConditions()`.
+
+        Shape (C K, 3), [m].
+        """
+        closure, points = self.middle, self.workspace.points[: len(self.drives)]
+        commanded, passive = closure.reach(points)
+        reached = closure.tcp(commanded, passive)
+        return self._place(commanded, None) - np.tile(reached, (self.use.size, 1))
+
+    @property
+    def middle(self) -> LoopClosure:
+        """Closures of the machine under conditions that are not stated."""
+        closure = self.sensitivities[0].closure
+        return LoopClosure(closure.robot, fixed=closure.fixed, conditions=UseConditions())
+
+    def _place(self, commanded: Array, names: Sequence[str] | None) -> Array:
+        """Tool under each of the conditions at drive coordinates, shape (C K, 3), [m]."""
+        closures = (s.closure for s in self.sensitivities)
+        found = [c.forward(commanded, start=self.passive, names=names) for c in closures]
+        return np.concatenate(found)
 
 
-def find_tool(calibration: Calibration) -> CalibratedTool | None:
+def find_tool(calibration: Calibration, use: UseSamples | None = None) -> CalibratedTool | None:
     """The tool over the workspace, or over the largest box of its shape that the machine reaches.
 
     That is within all limits and reached by the nominal and the calibrated machine, with the
     offsets that were active while measuring and with the identified ones.
+
+    Args:
+        calibration: The calibration.
+        use: Conditions of use; those that the robot's YAML states by default.
 
     Returns:
         None for a robot whose drives do not command a tool, or whose tool hardly moves.
@@ -60,67 +95,82 @@ def find_tool(calibration: Calibration) -> CalibratedTool | None:
     robot = calibration.robot
     if robot.tcp is None or len(robot.tcp.coordinates) != len(robot.drives):
         return None
-    sensitivity = _sensitivity(calibration)
+    use = sample_use(robot) if use is None else use
+    sensitivities = _sensitivities(calibration, use)
     identified = calibration.offsets
 
     def reach(points: Array) -> None:
         drives, passive = nominal_closure(robot).reach(points)
         for offsets in (calibration.active_offsets, identified):
             _require_travel(robot, drives - offsets)
-            sensitivity.closure.forward(drives - offsets, start=passive)
+            sensitivities[0].closure.forward(drives - offsets, start=passive)
 
     try:
         space = find_workspace(robot, reach)
     except ClosureError:
         return None
-    return _place(calibration, space, sensitivity, None)
+    return _place(calibration, space, use, sensitivities)
 
 
 def place_tool(
-    calibration: Calibration, workspace: Workspace, *, names: Sequence[str] | None = None
+    calibration: Calibration,
+    workspace: Workspace,
+    use: UseSamples | None = None,
+    *,
+    names: Sequence[str] | None = None,
 ) -> CalibratedTool:
     """The tool of a calibrated machine over given points.
 
     Args:
         calibration: The calibration.
         workspace: The points.
-        names: What to call them in messages.
+        use: Conditions of use; those that the robot's YAML states by default.
+        names: What to call the points in messages.
 
     Raises:
         RobotError: If the robot has no tool centre point, or the drives do not command it.
         ClosureError: If a point cannot be reached.
     """
     named = names or [f"point {i + 1}" for i in range(len(workspace.points))]
-    return _place(calibration, workspace, _sensitivity(calibration), named)
+    samples = sample_use(calibration.robot) if use is None else use
+    sensitivities = _sensitivities(calibration, samples)
+    return _place(calibration, workspace, samples, sensitivities, named)
 
 
-def _sensitivity(calibration: Calibration) -> ToolSensitivity:
+def _sensitivities(calibration: Calibration, use: UseSamples) -> tuple[ToolSensitivity, ...]:
     """Tool sensitivity by the free parameters, the unmodelled errors and the remaining offsets."""
     robot, errors = calibration.robot, calibration.errors
     free = [*(p.name for p in calibration.free), *calibration.unmodelled.names]
     own = [row.any() for row in calibration.offset_weights]
     offsets = [f"{d.name}.offset" for d, has in zip(robot.drives, own, strict=True) if has]
     free += [n for n in offsets if n not in free]
-    return ToolSensitivity(robot, free=free, values=errors)
+    return tuple(
+        ToolSensitivity(robot, free=free, values=errors, conditions=c) for c in use.conditions
+    )
 
 
 def _place(
     calibration: Calibration,
     space: Workspace,
-    sensitivity: ToolSensitivity,
-    names: Sequence[str] | None,
+    use: UseSamples,
+    sensitivities: tuple[ToolSensitivity, ...],
+    names: Sequence[str] | None = None,
 ) -> CalibratedTool:
     nominal = nominal_closure(calibration.robot)
     drives, passive = nominal.reach(space.points, names=names)
     commanded = drives - calibration.active_offsets
-    closed = sensitivity.closure.close(commanded, start=passive, names=names)
+    jacobians = []
+    for sensitivity in sensitivities:
+        closed = sensitivity.closure.close(commanded, start=passive, names=names)
+        jacobians.append(sensitivity(commanded, passive=closed))
     return CalibratedTool(
-        workspace=space,
-        targets=read_only(nominal.tcp(drives, passive)),
+        workspace=space.repeat(use.size),
+        use=use,
+        targets=read_only(np.tile(nominal.tcp(drives, passive), (use.size, 1))),
         drives=read_only(drives),
         passive=read_only(passive),
-        sensitivity=sensitivity,
-        jacobian=read_only(sensitivity(commanded, passive=closed)),
+        sensitivities=sensitivities,
+        jacobian=read_only(np.concatenate(jacobians)),
     )
 
 

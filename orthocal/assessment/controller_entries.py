@@ -153,9 +153,9 @@ def choose_offsets(tool: CalibratedTool, start: Array, *, drives: Sequence[int])
     Raises:
         ClosureError: If the machine cannot reach a point with such offsets.
     """
-    space, names = tool.workspace, list(tool.sensitivity.free)
+    space, names, robot = tool.workspace, list(tool.free), tool.sensitivities[0].robot
     chosen = list(drives)
-    index = [names.index(f"{tool.sensitivity.robot.drives[i].name}.offset") for i in chosen]
+    index = [names.index(f"{robot.drives[i].name}.offset") for i in chosen]
     root = np.sqrt(space.weights)[:, None]
 
     def weighted(field: Array) -> tuple[Array, Array]:

@@ -26,10 +26,21 @@ from orthocal.assessment.calibrated_tool import (
     place_tool,
 )
 from orthocal.assessment.controller_entries import entered_offsets
-from orthocal.calibration.assessment_record import ControllerEntry, ToolErrorSummary
+from orthocal.calibration.assessment_record import (
+    ControllerEntry,
+    ToolErrorSummary,
+    ToolUse,
+    UsePart,
+)
 from orthocal.calibration.calibration import Calibration
+from orthocal.effects.loading import neutral_values
 from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
+from orthocal.kinematics.conditions import (
+    UseConditions,
+    UseSamples,
+    effects_by_condition,
+)
 from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
 from orthocal.robot.model import require_commanded_tool
 
@@ -89,23 +100,41 @@ class ToolAccuracy:
     """Deviation and uncertainty of the tool position, before and after a calibration."""
 
     workspace: Workspace
+    """The points, once for each of C conditions of use."""
+    use: UseSamples
+    """The conditions."""
     targets: Array
-    """Commanded tool positions, shape (K, 3), [m]."""
+    """Commanded tool positions, shape (C K, 3), [m]."""
     names: tuple[str, ...]
     """Free, then unmodelled parameters."""
     jacobian: Array
-    """∂p/∂θ at every point, shape (K, 3, n), [m per parameter unit]."""
+    """∂p/∂θ at every point, shape (C K, 3, n), [m per parameter unit]."""
     deviation: Array
-    """Actual minus commanded tool position with the active offsets, shape (K, 3), [m]."""
+    """Actual minus commanded tool position with the active offsets, shape (C K, 3), [m]."""
     error_after_offsets: Array
     """The same with the offsets to enter, in a controller that corrects offsets only."""
     before: ToolUncertainty
     """Uncertainty from the priors alone."""
     after: ToolUncertainty | None
     """Uncertainty after the calibration; None if the noise is unknown."""
+    unstated: Array | None = None
+    """Error of a controller that corrects all errors without these conditions, shape (C K, 3), [m];
+    None where they do not vary."""
+
+    @property
+    def points(self) -> Array:
+        """The points once, shape (K, n_coordinates), [m]."""
+        return self.workspace.points[: len(self.targets) // self.use.size]
+
+    def average(self, field: Array) -> Array:
+        """Mean of a field over the conditions of use, shape (K, ...)."""
+        if self.use.size == 1:
+            return field
+        fields = field.reshape(self.use.size, -1, *field.shape[1:])
+        return np.asarray(fields.mean(axis=0))
 
     def align(self, field: Array) -> Array:
-        """A field of position errors with shift and rotation removed, shape (K, 3, ...)."""
+        """A field of position errors with shift and rotation removed, shape (C K, 3, ...)."""
         return self.workspace.align(field, self.targets)
 
     def measure(self, deviations: Array) -> ErrorSizes:
@@ -173,6 +202,7 @@ def assess_tool(
     workspace: Workspace | None = None,
     *,
     names: Sequence[str] | None = None,
+    conditions: UseConditions | None = None,
 ) -> ToolAccuracy:
     """Deviation and uncertainty of the tool position, before and after a calibration.
 
@@ -183,15 +213,22 @@ def assess_tool(
         calibration: The calibration.
         workspace: Tool positions that are commanded; by default the workspace.
         names: What to call the points in messages.
+        conditions: Conditions of use; by default those that the robot's YAML states, over which
+            squared errors are averaged.
 
     Raises:
         RobotError: If the robot has no tool centre point, or its drives do not command it.
         ClosureError: If the machine cannot reach a point, or its tool hardly moves at all.
+        ParameterError: If a condition is out of range, or nothing depends on it.
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
+    use = None
+    if conditions is not None:
+        conditions.require_valid(calibration.robot)
+        use = UseSamples((conditions,))
     if workspace is None:
-        return assess_placed(calibration, require_tool(calibration, find_tool(calibration)))
-    placed = place_tool(calibration, workspace, names=names)
+        return assess_placed(calibration, require_tool(calibration, find_tool(calibration, use)))
+    placed = place_tool(calibration, workspace, use, names=names)
     return assess_placed(calibration, placed, names=names)
 
 
@@ -230,13 +267,15 @@ def assess_placed(
     left = tool.deviation(entered_offsets(calibration, entries), names=names)
     return ToolAccuracy(
         workspace=space,
+        use=tool.use,
         targets=where,
-        names=tool.sensitivity.free[: len(prior_stds)],
+        names=tool.free[: len(prior_stds)],
         jacobian=jacobian,
         deviation=read_only(tool.deviation(calibration.active_offsets, names=names)),
         error_after_offsets=read_only(left),
         before=measure_uncertainty(jacobian, np.diag(prior_stds**2), space, where),
         after=after,
+        unstated=read_only(tool.deviation_unless_stated()) if tool.use.varying else None,
     )
 
 
@@ -274,15 +313,60 @@ def summarise_tool(
     if remaining is None:
         return None
     known = remaining.sizes
+    compensated = known.reported.rms
     now, entered = (accuracy.measure(d) for d in (accuracy.deviation, accuracy.error_after_offsets))
     return ToolErrorSummary(
         box=tuple((float(low), float(high)) for low, high in accuracy.workspace.limits),
         coordinates=accuracy.workspace.letters,
         now=math.hypot(now.reported.rms, known.reported.rms),
-        entered=math.hypot(entered.reported.rms, known.reported.rms),
-        compensated=known.reported.rms,
+        entered=math.hypot(entered.reported.rms, compensated),
+        compensated=compensated,
         now_absolute=math.hypot(now.absolute.rms, known.absolute.rms),
         entered_absolute=math.hypot(entered.absolute.rms, known.absolute.rms),
+        use=_summarise_use(calibration, accuracy, compensated, scale=scale),
+    )
+
+
+def _summarise_use(
+    calibration: Calibration, accuracy: ToolAccuracy, compensated: float, *, scale: float | None
+) -> ToolUse | None:
+    """Conditions of use of the tool error, and what each that varies contributes.
+
+    Errors are nearly linear in the conditions, and a workpiece is aligned once for all of them. So
+    the mean square is that of the mean conditions and of the change by each condition, which no
+    alignment removes.
+    """
+    use, effects = accuracy.use.declared, effects_by_condition(calibration.robot)
+    if use is None or not effects:
+        return None
+    factor = calibration.tolerance_scale if scale is None else scale
+    covariance = error_covariance(calibration, excess=factor)
+    weights = accuracy.use.size * accuracy.workspace.weights[: len(accuracy.points)]
+    known, unknown = (
+        accuracy.use.changes(v) for v in (accuracy.error_after_offsets, accuracy.jacobian)
+    )
+    parts = []
+    for name, change in known.items():
+        by = unknown[name]
+        spread = np.einsum("k,fkin,nm,fkim->", weights, by, covariance, by, optimize=True)
+        parts.append(
+            UsePart(
+                name,
+                effects[name],
+                known=math.sqrt(float(np.einsum("k,fki->", weights, change**2))),
+                uncertain=math.sqrt(max(float(spread), 0.0)),
+            )
+        )
+    reference = neutral_values(calibration.robot)["temperature"]
+    unstated = (
+        0.0 if accuracy.unstated is None else accuracy.measure(accuracy.unstated).reported.rms
+    )
+    return ToolUse(
+        approach=use.approach if "approach" in effects else None,
+        temperature=(use.temperature or (reference,) * 2) if "temperature" in effects else None,
+        payload=use.payload if "payload" in effects else None,
+        parts=tuple(parts),
+        unstated=math.hypot(unstated, compensated),
     )
 
 

@@ -6,6 +6,7 @@ by text, JSON, report, scene and exports.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -15,6 +16,7 @@ import numpy as np
 from orthocal.hypotheses.anomaly import AnomalyKind
 from orthocal.io.documents import Number, PositiveInSI, write_plain
 from orthocal.io.fields import CLOSED, Many, NumberOrNaN, SizeOrNaN
+from orthocal.kinematics.conditions import UseCondition
 from orthocal.kinematics.workspace import describe_box
 from orthocal.units import InUnit, Unit
 
@@ -179,6 +181,45 @@ class ControllerEntry(InUnit):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class UsePart:
+    """Contribution of a condition of use that varies to the tool error, RMS, [m]."""
+
+    __pydantic_config__ = CLOSED
+
+    condition: UseCondition
+    effects: Many[str]
+    """Effects that depend on it."""
+    known: SizeOrNaN
+    """Known change, with the offsets to be entered."""
+    uncertain: SizeOrNaN
+    """Uncertainty of the change."""
+
+    @property
+    def size(self) -> float:
+        """Root of the sum of both squares, [m]."""
+        return math.hypot(self.known, self.uncertain)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToolUse:
+    """Conditions of use of a tool error; None where no effect of the machine depends on one."""
+
+    __pydantic_config__ = CLOSED
+
+    approach: str | None
+    """A letter for each drive: p or n for one side, u for both."""
+    temperature: tuple[Number, Number] | None
+    """Lowest and highest, [°C]."""
+    payload: tuple[Number, Number] | None
+    """Lightest and heaviest, [kg]."""
+    parts: Many[UsePart]
+    """Conditions that vary."""
+    unstated: SizeOrNaN
+    """Tool error, aligned, with all errors corrected but the conditions unknown: for the middle of
+    both sides, the reference temperature and no payload, [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ToolErrorSummary:
     """Expected RMS error of the tool over the workspace, [m].
 
@@ -200,6 +241,8 @@ class ToolErrorSummary:
     """Aligned, with a controller that corrects all identified errors."""
     entered_absolute: SizeOrNaN
     now_absolute: SizeOrNaN
+    use: ToolUse | None = None
+    """Conditions of use; None for a machine that depends on none."""
 
     @property
     def region(self) -> str:

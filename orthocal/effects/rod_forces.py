@@ -5,8 +5,8 @@ nominal machine a force f on the tool centre point causes the tension
 
     F = f · ∂p/∂ℓ
 
-With the tool's Jacobian and the closures' Jacobian by Pinocchio, the forces λ that close the loops
-balance f at the passive joints, g_qᵀ λ = p_qᵀ f, so that F = f · p_ℓ − λ · g_ℓ.
+With the tool's and the closures' Jacobians by Pinocchio, the forces λ that close the loops balance
+f at the passive joints, g_qᵀ λ = p_qᵀ f, so that F = f · p_ℓ − λ · g_ℓ.
 """
 
 from __future__ import annotations
@@ -51,65 +51,66 @@ class RodForces:
         self._axes = [
             a if c.kind == "3d" else b for c, (a, b) in zip(robot.closures, pairs, strict=True)
         ]
-        self._rods: list[list[_Displacement]] = []
-        for rod in robot.rods.values():
-            displacements = []
+        self._rods = list(robot.rods.values())
+        self._displacements: list[tuple[int, _Displacement]] = []
+        for i, rod in enumerate(self._rods):
             for placement, twist in stretch_rod(robot, rod, ca.SX(1.0)).items():
                 moves = [[_carries(model, placement, f) for f in pair] for pair in pairs]
-                displacements.append(
-                    _Displacement(
-                        placement,
-                        np.array(ca.DM(twist[:3])).reshape(3),
-                        _carries(model, placement, self._tool),
-                        tuple(int(b) - int(a) for a, b in moves),
-                    )
+                displacement = _Displacement(
+                    placement,
+                    np.array(ca.DM(twist[:3])).reshape(3),
+                    _carries(model, placement, self._tool),
+                    tuple(int(b) - int(a) for a, b in moves),
                 )
-            self._rods.append(displacements)
+                self._displacements.append((i, displacement))
+        places = dict.fromkeys(d.placement for _, d in self._displacements)
+        self._place = {placement: i for i, placement in enumerate(places)}
 
-    def __call__(self, coordinates: Array, force: Array) -> Array:
-        """Axial forces, tension positive.
+    def __call__(self, coordinates: Array) -> Array:
+        """Axial forces by unit forces on the tool centre point, ∂p/∂ℓ, tension positive.
 
         Args:
             coordinates: Joint coordinates with closed loops, shape (K, nv), [m, rad].
-            force: On the tool centre point in each posture, shape (K, 3), [N].
 
         Returns:
-            Shape (K, n_rods), in the order of `Robot.rods`, [N].
+            By x, y and z in the world, shape (K, n_rods, 3), rods in the order of `Robot.rods`.
         """
         data = self.robot.model.createData()
-        rows = [self._forces(q, f, data) for q, f in zip(coordinates, force, strict=True)]
-        return np.array(rows).reshape(len(coordinates), len(self._rods))
+        states = [self._evaluate(q, data) for q in coordinates]
+        by_joints, by_tool, axes, placements = (np.array(v) for v in zip(*states, strict=True))
+        passive = self.robot.passive_index
+        closed, tool = (np.swapaxes(v[:, :, passive], 1, 2) for v in (by_joints, by_tool))
+        if closed.shape[1] == closed.shape[2]:
+            closing = np.linalg.solve(closed, tool)
+        else:
+            closing = np.linalg.pinv(closed, rcond=1e-10) @ tool
+        along = self._closing_forces(closing, axes)
+        result = np.zeros((len(coordinates), len(self._rods), 3))
+        for i, d in self._displacements:
+            moved = placements[:, self._place[d.placement]] @ d.direction
+            balance = np.tile(np.eye(3) * d.moves_tool, (len(coordinates), 1, 1))
+            balance -= np.tensordot(np.array(d.moves_closures), along, axes=(0, 1))
+            result[:, i] += np.einsum("kij,ki->kj", balance, moved)
+        return result
 
-    def _forces(self, coordinates: Array, force: Array, data: pin.Data) -> list[float]:
-        """Axial forces in one posture, [N]."""
+    def _evaluate(self, coordinates: Array, data: pin.Data) -> tuple[Array, ...]:
+        """∂g and ∂p by the joints, rotations of the closures' axes and of the placements."""
         robot, model = self.robot, self.robot.model
         _, by_joints = robot.evaluate_constraints_at(coordinates, data=data)
         pin.updateFramePlacements(model, data)
         world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         by_tool = pin.getFrameJacobian(model, data, self._tool, world)[:3]
-        passive = robot.passive_index
-        closing = np.linalg.lstsq(
-            by_joints[:, passive].T, by_tool[:, passive].T @ force, rcond=1e-10
-        )[0]
-        along = self._closing_forces(closing, data)
-        result = []
-        for displacements in self._rods:
-            work = 0.0
-            for d in displacements:
-                moved = self._rotation(d.placement, data) @ d.direction
-                balance = force if d.moves_tool else np.zeros(3)
-                balance = balance - np.array(d.moves_closures) @ along
-                work += float(balance @ moved)
-            result.append(work)
-        return result
+        axes = np.array([data.oMf[frame].rotation for frame in self._axes]).reshape(-1, 3, 3)
+        placements = [self._rotation(placement, data) for placement in self._place]
+        return by_joints, by_tool, axes, np.array(placements).reshape(-1, 3, 3)
 
-    def _closing_forces(self, closing: Array, data: pin.Data) -> Array:
-        """Forces that close the loops, in the world, shape (n_closures, 3), [N]."""
-        result, first = np.zeros((len(self._axes), 3)), 0
-        for i, (closure, frame) in enumerate(zip(self.robot.closures, self._axes, strict=True)):
-            force = np.zeros(6)
-            force[list(closure.rows)] = closing[first : first + len(closure.rows)]
-            result[i] = data.oMf[frame].rotation @ force[:3]
+    def _closing_forces(self, closing: Array, axes: Array) -> Array:
+        """Forces that close the loops, in the world, by unit forces, (K, n_closures, 3, 3)."""
+        result, first = np.zeros((len(closing), len(self._axes), 3, 3)), 0
+        for i, closure in enumerate(self.robot.closures):
+            forces = np.zeros((len(closing), 6, 3))
+            forces[:, list(closure.rows)] = closing[:, first : first + len(closure.rows)]
+            result[:, i] = axes[:, i] @ forces[:, :3]
             first += len(closure.rows)
         return result
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 
@@ -13,13 +14,16 @@ from orthocal.effects.protocol import Condition
 from orthocal.errors import ParameterError
 from orthocal.kinematics.error_map import error_map
 from orthocal.robot.description import HEAVIEST_KG, HIGHEST_C, LOWEST_C
-from orthocal.robot.model import Robot
+from orthocal.robot.model import Robot, Use
 from orthocal.text import shorten
 
 APPROACH = {"p": 1.0, "n": -1.0, "u": 0.0}
 """Letter of an approach to the direction of the drive's last motion."""
 
-CONDITION_OF: Mapping[str, Condition] = {
+UseCondition = Literal["approach", "temperature", "payload"]
+"""Field of `UseConditions`."""
+
+CONDITION_OF: Mapping[UseCondition, Condition] = {
     "approach": "approach",
     "temperature": "temperature",
     "payload": "load",
@@ -44,7 +48,7 @@ class UseConditions:
     payload: float | None = None
 
     @property
-    def stated(self) -> tuple[str, ...]:
+    def stated(self) -> tuple[UseCondition, ...]:
         """Names of the fields that are stated."""
         return tuple(name for name in CONDITION_OF if getattr(self, name) is not None)
 
@@ -58,7 +62,7 @@ class UseConditions:
         Raises:
             ParameterError: Naming the field.
         """
-        used = used_conditions(robot)
+        used = effects_by_condition(robot)
         for name in self.stated:
             value, where = getattr(self, name), f"{prefix}{name}"
             if name == "approach":
@@ -86,9 +90,83 @@ class UseConditions:
         return result
 
 
-def used_conditions(robot: Robot) -> Collection[str]:
-    """Fields of `UseConditions` on which a robot's effects depend."""
-    return [name for name, c in CONDITION_OF.items() if c in error_map(robot).conditions]
+@dataclass(frozen=True, slots=True, eq=False)
+class UseSamples:
+    """Equally likely conditions that represent how a machine is used.
+
+    Each condition that varies has two values: both sides of a drive, or the middle of a range less
+    and plus its standard deviation. The combinations are orthogonal columns of a Hadamard matrix,
+    so that mean squares are exact for errors that are linear in the conditions.
+    """
+
+    conditions: tuple[UseConditions, ...]
+    varying: tuple[UseCondition, ...] = ()
+    """Field of `UseConditions` of each condition that varies; approach once for each such drive."""
+    signs: Array = field(default_factory=lambda: np.zeros((1, 0)))
+    """-1 and 1 for their values, shape (n_samples, n_varying)."""
+    declared: Use | None = None
+    """What the robot's YAML states, if they represent that."""
+
+    @property
+    def size(self) -> int:
+        """Number of samples."""
+        return len(self.conditions)
+
+    def changes(self, values: Array) -> dict[UseCondition, Array]:
+        """Changes of a field by the conditions that vary.
+
+        Args:
+            values: Fields of all samples in turn, shape (n_samples K, ...).
+
+        Returns:
+            Field of `UseConditions` to half the difference of its two values, one for each drive
+            with two sides of approach, shape (n, K, ...).
+        """
+        fields = values.reshape(self.size, -1, *values.shape[1:])
+        halves = np.tensordot(self.signs.T, fields, axes=1) / self.size
+        names = np.array(self.varying)
+        return {name: halves[names == name] for name in dict.fromkeys(self.varying)}
+
+
+def sample_use(robot: Robot) -> UseSamples:
+    """Conditions of use that the robot's YAML states, as far as its effects depend on them."""
+    use, used = robot.use, effects_by_condition(robot)
+    varying, widths = list[UseCondition](), dict[UseCondition, float]()
+    if "approach" in used:
+        varying += ["approach"] * use.approach.count("u")
+    ranges: tuple[UseCondition, ...] = ("temperature", "payload")
+    for name in ranges:
+        low, high = getattr(use, name) or (0.0, 0.0)
+        if name in used and low < high:
+            varying.append(name)
+            widths[name] = (high - low) / np.sqrt(12.0)
+    size = 1 << len(varying).bit_length() if varying else 1
+    columns = range(1, len(varying) + 1)
+    parity = [[(i & j).bit_count() % 2 for j in columns] for i in range(size)]
+    signs = 1.0 - 2.0 * np.array(parity, dtype=np.float64).reshape(size, len(varying))
+    samples = []
+    for row in signs:
+        stated: dict[str, Any] = {}
+        if "approach" in used:
+            sides = iter("p" if sign > 0.0 else "n" for sign in row)
+            stated["approach"] = "".join(next(sides) if c == "u" else c for c in use.approach)
+        for name in ranges:
+            limits = getattr(use, name)
+            if name in used and limits is not None:
+                sign = row[varying.index(name)] if name in widths else 0.0
+                stated[name] = float(np.mean(limits) + sign * widths.get(name, 0.0))
+        samples.append(UseConditions(**stated))
+    return UseSamples(tuple(samples), tuple(varying), signs, use)
+
+
+def effects_by_condition(robot: Robot) -> dict[UseCondition, tuple[str, ...]]:
+    """Fields of `UseConditions` on which a machine depends, with the effects that need each."""
+    conditions, effects = error_map(robot).conditions, robot_effects(robot)
+    return {
+        name: tuple(effect.name for effect in effects if c in effect.conditions)
+        for name, c in CONDITION_OF.items()
+        if c in conditions
+    }
 
 
 def find_approach_problem(text: str, robot: Robot) -> str:

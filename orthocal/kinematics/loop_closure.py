@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -65,6 +65,9 @@ LARGEST_CONTINUATION_MOVE = 0.3
 """Change of a passive coordinate in one continuation step, [rad] or characteristic lengths."""
 
 LIMIT_TOLERANCE = 1e-9
+
+MOST_TRANSMISSIONS = 8
+"""Tables of postures whose rod forces are remembered for one robot."""
 
 MOST_LOADS = 10
 SETTLED_LOAD = 1e-7
@@ -427,8 +430,9 @@ class LoopClosure:
         self._conditions = conditions
         self._functions = robot_functions(robot)
         self._columns = self._functions.errors.columns(self.free)
-        others = {k: v for k, v in (fixed or {}).items() if k not in self.free}
-        self._fixed = self._functions.errors.expand(others)
+        self.fixed = {k: v for k, v in (fixed or {}).items() if k not in self.free}
+        """Values of the parameters that are not free."""
+        self._fixed = self._functions.errors.expand(self.fixed)
 
     def close(
         self,
@@ -750,10 +754,39 @@ def nominal_closure(robot: Robot) -> LoopClosure:
     return LoopClosure(robot)
 
 
+class _Transmissions:
+    """Axial forces of the rods by forces on the tool, remembered for a few tables of postures.
+
+    The same postures recur under several payloads and with several machines.
+
+    Args:
+        robot: The nominal robot.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot, self._forces = robot, RodForces(robot)
+        self._find = lru_cache(maxsize=MOST_TRANSMISSIONS)(self._compute)
+
+    def __call__(self, drives: Array) -> Array:
+        """∂p/∂ℓ of all rods, 0 where the machine cannot be, shape (K, n_rods, 3)."""
+        return self._find(np.ascontiguousarray(drives).tobytes())
+
+    def _compute(self, content: bytes) -> Array:
+        robot, n = self._robot, len(self._robot.drives)
+        drives = np.frombuffer(content).reshape(-1, n)
+        result = np.zeros((len(drives), len(robot.rods), 3))
+        passive = nominal_closure(robot).close(drives, failures={}) if drives.size else drives
+        reached = np.isfinite(passive).all(axis=1)
+        if reached.any():
+            coordinates = robot.joint_coordinates(drives[reached], passive[reached])
+            result[reached] = self._forces(coordinates)
+        return result
+
+
 @cached_per_robot(maxsize=8)
-def _rod_forces(robot: Robot) -> RodForces:
-    """The rod forces of a robot, prepared once."""
-    return RodForces(robot)
+def _transmissions(robot: Robot) -> _Transmissions:
+    """The transmissions of a robot, prepared once."""
+    return _Transmissions(robot)
 
 
 def find_loads(robot: Robot, drives: Array, payload: ArrayLike) -> Array:
@@ -767,17 +800,9 @@ def find_loads(robot: Robot, drives: Array, payload: ArrayLike) -> Array:
     Returns:
         Tension positive, shape (K, n_rods), [N]; 0 where the nominal machine cannot be.
     """
-    result = np.zeros((len(drives), len(robot.rods)))
-    if not len(drives):
-        return result
     masses, which = np.unique(np.broadcast_to(payload, len(drives)), return_inverse=True)
-    forces = np.array([tool_force(robot, float(m)) for m in masses])[which]
-    passive = nominal_closure(robot).close(drives, failures={})
-    reached = np.isfinite(passive).all(axis=1) & forces.any(axis=1)
-    if reached.any():
-        coordinates = robot.joint_coordinates(drives[reached], passive[reached])
-        result[reached] = _rod_forces(robot)(coordinates, forces[reached])
-    return result
+    forces = np.array([tool_force(robot, float(m)) for m in masses]).reshape(-1, 3)[which]
+    return np.asarray(np.einsum("kri,ki->kr", _transmissions(robot)(drives), forces))
 
 
 def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str]) -> Failures:

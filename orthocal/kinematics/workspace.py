@@ -62,6 +62,8 @@ class Workspace:
     """Names of the coordinates."""
     requested: Array | None = None
     """Box in the robot's YAML where the machine does not reach all of it, [m]."""
+    copies: int = 1
+    """Number of times that the points are repeated: once for each of several conditions."""
 
     @classmethod
     def even(cls, points: ArrayLike) -> Workspace:
@@ -70,6 +72,18 @@ class Workspace:
         if p.ndim != 2 or not p.size:
             raise ValueError(f"found the shape {p.shape}; expected points, (K, n_coordinates)")
         return cls(p, read_only(np.full(len(p), 1.0 / len(p))))
+
+    def repeat(self, count: int) -> Workspace:
+        """The points once for each of several equally likely conditions.
+
+        Tool errors over them have a common alignment: a workpiece is aligned once.
+        """
+        if count == 1:
+            return self
+        points, weights = np.tile(self.points, (count, 1)), np.tile(self.weights, count) / count
+        return replace(
+            self, points=read_only(points), weights=read_only(weights), copies=self.copies * count
+        )
 
     @property
     def limits(self) -> Array:
@@ -91,7 +105,7 @@ class Workspace:
     def words(self) -> str:
         """Region in words: the workspace ±60 mm."""
         if self.box is None:
-            return f"{len(self.points)} points"
+            return f"{len(self.points) // self.copies} points"
         text = f"the workspace {describe_box(self.box, self.letters)}"
         if self.requested is not None:
             text += f" (the machine does not reach {describe_box(self.requested, self.letters)})"
@@ -109,16 +123,17 @@ class Workspace:
         """
         if self.line is None:
             return field, self.weights
-        n, count = self.line.size, self.points.shape[1]
+        n, count, copies = self.line.size, self.points.shape[1], self.copies
         cells = (2.0 * np.arange(CELLS_A_SIDE) + 1.0) / CELLS_A_SIDE - 1.0
         at_nodes, at_cells = (
             np.polynomial.legendre.legvander(x, n - 1) for x in (self.line, cells)
         )
         interpolation = at_cells @ np.linalg.inv(at_nodes)
-        values = field.reshape(*[n] * count, -1)
+        fields = field.reshape(copies, n**count, -1)
+        values = np.moveaxis(fields, 0, 1).reshape(*[n] * count, -1)
         for _ in range(count):  # interpolate along the first axis, then make it the last one
             values = np.moveaxis(np.tensordot(interpolation, values, axes=1), 0, count - 1)
-        size = CELLS_A_SIDE**count
+        size = CELLS_A_SIDE**count * copies
         return values.reshape(size, *field.shape[1:]), np.full(size, 1.0 / size)
 
     def remove_shift(self, field: Array) -> Array:

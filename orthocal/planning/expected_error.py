@@ -25,6 +25,7 @@ from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.estimation.selection import Selection
 from orthocal.estimation.weighting import split_by_gauge
+from orthocal.kinematics.conditions import UseSamples, effects_by_condition, sample_use
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import (
@@ -94,6 +95,7 @@ class ToolForecast:
         others: Parameters that are not identified, with prior standard deviations, [SI]; by
             default all others of the machine.
         workspace: Region over which the tool error is computed; by default the robot's.
+        use: Conditions of use; by default those that the robot's YAML states.
 
     Raises:
         RobotError: If the drives do not command the tool.
@@ -106,10 +108,12 @@ class ToolForecast:
         selection: Selection,
         workspace: Workspace | None = None,
         *,
+        use: UseSamples | None = None,
         others: Mapping[str, float] | None = None,
     ) -> None:
         self.robot, self.selection = robot, selection
-        self.workspace = find_workspace(robot) if workspace is None else workspace
+        region = find_workspace(robot) if workspace is None else workspace
+        use = sample_use(robot) if use is None else use
         parameters = robot.parameters
         free = selection.names
         determined = {parameters[n].terms[0][0] for n in (*free, *selection.fixed)}
@@ -122,11 +126,18 @@ class ToolForecast:
         own = {**(others or {}), **{p.name: p.prior_std for p in selection.parameters}}
         self.prior_stds = np.array([own.get(n, parameters[n].prior_std) for n in self.names])
         nominal = nominal_closure(robot)
-        drives, passive = nominal.reach(self.workspace.points)
-        self.positions = nominal.tcp(drives, passive)
-        sensitivity = ToolSensitivity(robot, free=self.names)
-        self.jacobian = sensitivity(drives, passive=passive)
-        """∂p/∂θ, shape (K, 3, n_names), [m per parameter unit]."""
+        drives, passive = nominal.reach(region.points)
+        self.workspace = region.repeat(use.size)
+        """The points, once for each of C conditions of use."""
+        self.positions = np.tile(nominal.tcp(drives, passive), (use.size, 1))
+        tools = [ToolSensitivity(robot, free=self.names, conditions=c) for c in use.conditions]
+        closed = [passive]
+        if effects_by_condition(robot):
+            closed = [tool.closure.close(drives, start=passive) for tool in tools]
+        self.jacobian = np.concatenate(
+            [tool(drives, passive=q) for tool, q in zip(tools, closed, strict=True)]
+        )
+        """∂p/∂θ, shape (C K, 3, n_names), [m per parameter unit]."""
 
     @property
     def before(self) -> Expected:

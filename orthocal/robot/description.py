@@ -131,6 +131,39 @@ class WorkspaceKeys(_Keys):
     box_mm: WorkspaceBox
 
 
+def _require_rising(limits: list[float]) -> list[float]:
+    low, high = limits
+    if low > high:
+        raise ValueError(f"found [{low:g}, {high:g}]; expected [lowest, highest]")
+    return limits
+
+
+_Range = Annotated[list[Number], Field(min_length=2, max_length=2), AfterValidator(_require_rising)]
+
+
+class UseKeys(_Keys):
+    """Conditions under which the machine is used."""
+
+    approach: str = "both"
+    """Side from which the tool comes to a point: both, or a letter for each drive: p if its
+    coordinate grows in the last motion, n if it falls, u for both."""
+    temperature_C: _Range | None = None
+    """Lowest and highest temperature; the reference of the effects by default."""
+    payload_kg: _Range = [0.0, 0.0]
+    """Lightest and heaviest mass on the tool beside the platform."""
+
+    @model_validator(mode="after")
+    def _within_limits(self) -> UseKeys:
+        ranges = {
+            "temperature_C": (self.temperature_C, LOWEST_C, HIGHEST_C, "degrees Celsius"),
+            "payload_kg": (self.payload_kg, 0.0, HEAVIEST_KG, "kilograms"),
+        }
+        for key, (stated, low, high, unit) in ranges.items():
+            if stated is not None and not low <= stated[0] <= stated[1] <= high:
+                raise ValueError(f"{key}|found {stated}; expected {unit} from {low:g} to {high:g}")
+        return self
+
+
 class OrthocalKeys(_Keys):
     """Keys below `orthocal`."""
 
@@ -142,6 +175,7 @@ class OrthocalKeys(_Keys):
     legs: Annotated[dict[Name, LegKeys], Field(max_length=MOST_PARTS)] = {}
     tcp: TcpKeys | None = None
     workspace: WorkspaceKeys | None = None
+    use: UseKeys = UseKeys()
     parameters: Annotated[
         dict[Name, Annotated[list[Name], Field(min_length=1)]], Field(max_length=MOST_PARTS)
     ] = {}

@@ -36,12 +36,14 @@ from orthocal.robot.model import (
     Robot,
     Rod,
     Tcp,
+    Use,
     build_constraints,
     joint_axis,
 )
 from orthocal.robot.parameters import AXES, DeclaredErrors, ParameterSet, split_unit
 from orthocal.robot.reference_posture import find_reference_posture
 from orthocal.robot.urdf import load_urdf
+from orthocal.text import shorten
 from orthocal.units import DRIVE_UNITS, MM, Unit
 
 LONGEST_LEG = 20.0
@@ -171,6 +173,7 @@ def _build_robot(
         legs={},
         tcp=_build_tcp(model, keys, where),
         workspace=_read_workspace(keys, where),
+        use=_read_use(keys, where),
         declared=DeclaredErrors(
             tolerances=keys.orthocal.tolerances,
             effects=keys.orthocal.effects,
@@ -297,6 +300,21 @@ def _read_workspace(keys: RobotKeys, where: str) -> NDArray[np.float64] | None:
             where=f"{where}: orthocal.workspace.box_mm",
         )
     return read_only(np.array(workspace.box_mm) * MM)
+
+
+def _read_use(keys: RobotKeys, where: str) -> Use:
+    """Conditions under which the machine is used."""
+    use, motors = keys.orthocal.use, keys.name_mot
+    approach = "u" * len(motors) if use.approach == "both" else use.approach
+    if len(approach) != len(motors) or approach.strip("pnu"):
+        raise RobotError(
+            f"found '{shorten(use.approach)}'; expected 'both', or {len(motors)} letters, one for "
+            f"each drive ({', '.join(motors)}): p if its coordinate grows in the last motion, n if "
+            "it falls, u for both sides",
+            where=f"{where}: orthocal.use.approach",
+        )
+    temperature = None if use.temperature_C is None else tuple(use.temperature_C)
+    return Use(approach, temperature, tuple(use.payload_kg))  # type: ignore[arg-type] # of two
 
 
 def _passive_start(robot: Robot, keys: RobotKeys, where: str) -> Array:

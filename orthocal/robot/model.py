@@ -115,6 +115,19 @@ class Tcp:
     """World coordinates that the drives control: 0, 1, 2 for x, y, z."""
 
 
+@dataclass(frozen=True, slots=True)
+class Use:
+    """Conditions under which a machine is used, over which tool errors are averaged."""
+
+    approach: str
+    """Side from which the tool comes to a point, a letter for each drive: p if its coordinate grows
+    in the last motion, n if it falls, u for both sides."""
+    temperature: tuple[float, float] | None = None
+    """Lowest and highest, [°C]; the reference of the effects by default."""
+    payload: tuple[float, float] = (0.0, 0.0)
+    """Lightest and heaviest mass on the tool beside the platform, [kg]."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Robot:
     """Robot with closed loops.
@@ -143,6 +156,8 @@ class Robot:
     workspace: Array | None
     """Box in the YAML over which tool errors are reported, relative to the mechanical zero, shape
     (n_coordinates, 2), [m]; None without one."""
+    use: Use
+    """Conditions under which the machine is used."""
     declared: DeclaredErrors
     """Errors declared in the YAML, for `orthocal.effects`."""
     parameters: ParameterSet

@@ -23,6 +23,7 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
 from orthocal.estimation.solvers.batch import BatchSolver
+from orthocal.kinematics.conditions import UseConditions, UseSamples
 from orthocal.kinematics.loop_closure import Failures, LoopClosure
 from orthocal.kinematics.workspace import (
     Workspace,
@@ -150,7 +151,8 @@ class AccuracyStudy(Study):
         """
         p: _Prepared = prepare_once(self)
         selection = p.problem.machine_selection
-        forecast = ToolForecast(p.robot, selection, p.workspace, others=self.drawn)
+        unstated = UseSamples((UseConditions(),))  # as the tools of its machines
+        forecast = ToolForecast(p.robot, selection, p.workspace, use=unstated, others=self.drawn)
         count = min(PREDICTED_MACHINES, self.machines)
         machines = [self._true_parameters(p, number) for number in range(count)]
         return forecast.after(p.session, weight=p.sigma, machines=machines)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from orthocal.assessment.wording import joined, named, note, tool_mm
-from orthocal.calibration.assessment_record import Finding, ToolErrorSummary, Verdict
+from orthocal.calibration.assessment_record import Finding, ToolErrorSummary, ToolUse, Verdict
 from orthocal.units import UM
 
 HEADLINES: dict[Verdict, str] = {
@@ -119,9 +120,52 @@ def describe_compensated(rms: float) -> str:
     return f"With all errors corrected: {tool_mm(rms)}."
 
 
-def describe_region(region: str) -> str:
-    """Region and alignment of the tool errors of an answer."""
-    return f"RMS over the workspace {region}, workpiece aligned on the machine."
+def describe_region(tool: ToolErrorSummary) -> str:
+    """Region, alignment and conditions of use of the tool errors of an answer."""
+    use = "" if tool.use is None else describe_use(tool.use)
+    return f"RMS over the workspace {tool.region}, workpiece aligned on the machine{use}."
+
+
+def describe_use(use: ToolUse) -> str:
+    """Conditions of use, each after a comma."""
+    parts = []
+    if use.approach is not None:
+        both = not use.approach.strip("u")
+        parts.append("used from both sides" if both else f"approach {use.approach}")
+    if use.temperature is not None:
+        parts.append(f"{_describe_range(use.temperature)} °C")
+    if use.payload is not None:
+        heaviest = use.payload[1]
+        parts.append(f"payload {_describe_range(use.payload)} kg" if heaviest else "no payload")
+    return "".join(f", {part}" for part in parts)
+
+
+def describe_use_parts(tool: ToolErrorSummary) -> list[str]:
+    """What each condition of use that varies adds to the tool error with the offsets entered."""
+    if tool.use is None:
+        return []
+    lines = []
+    for part in tool.use.parts:
+        without = math.sqrt(max(tool.entered**2 - part.size**2, 0.0))
+        added = tool.entered - without
+        amount = "less than 0.001 mm" if added < 0.5 * UM else tool_mm(added)
+        if part.condition == "approach":
+            what = joined([*part.effects]).capitalize()
+            verb = "adds" if len(part.effects) == 1 else "add"
+            how = " if the tool is used from both sides; approach from one side avoids it"
+            lines.append(f"{what} {verb} {amount}{how}.")
+        elif part.condition == "temperature" and tool.use.temperature is not None:
+            lines.append(
+                f"Temperatures of {_describe_range(tool.use.temperature)} °C add {amount}."
+            )
+        elif tool.use.payload is not None:
+            lines.append(f"A payload of {_describe_range(tool.use.payload)} kg adds {amount}.")
+    return lines
+
+
+def _describe_range(limits: tuple[float, float]) -> str:
+    low, high = limits
+    return f"{low:g}" if low == high else f"{low:g}…{high:g}"
 
 
 def tool_error(tool: ToolErrorSummary, *, keep: bool) -> Finding:

@@ -67,13 +67,16 @@ def _find_grid(points: Array) -> list[Array] | None:
 
 
 def _error_parts(calibration: Calibration, accuracy: ToolAccuracy, which: Field) -> Array:
-    """Tool errors after alignment, shape (K, 3), or their uncertainty, shape (K, 1), [µm]."""
+    """Tool errors after alignment, shape (K, 3), or their uncertainty, shape (K, 1), [µm].
+
+    Means over the conditions of use.
+    """
     if which == "now":
-        return accuracy.align(accuracy.deviation) / UM
+        return accuracy.average(accuracy.align(accuracy.deviation)) / UM
     remaining = assess_remaining(calibration, accuracy)
     if which == "entered" or remaining is None:
-        return accuracy.align(accuracy.error_after_offsets) / UM
-    variance = np.trace(remaining.aligned_covariance, axis1=1, axis2=2)
+        return accuracy.average(accuracy.align(accuracy.error_after_offsets)) / UM
+    variance = accuracy.average(np.trace(remaining.aligned_covariance, axis1=1, axis2=2))
     return np.asarray(np.sqrt(np.maximum(variance, 0.0))[:, None] / UM)
 
 
@@ -93,7 +96,7 @@ def plot_tool_map(calibration: Calibration, accuracy: ToolAccuracy, *, which: Fi
 
 
 def _draw_tool_map(calibration: Calibration, accuracy: ToolAccuracy, which: Field) -> Figure | None:
-    lines = _find_grid(accuracy.workspace.points)
+    lines = _find_grid(accuracy.points)
     shown = {
         "now": True,
         "entered": not calibration.only_offsets and bool(find_entries(calibration)),

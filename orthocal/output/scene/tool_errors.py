@@ -53,7 +53,10 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
         scene.facts.append(f"Tool errors are not shown. {e}.")
         return ""
     region = accuracy.workspace.words.removeprefix("the workspace ")
-    now, entered = (accuracy.align(d) for d in (accuracy.deviation, accuracy.error_after_offsets))
+    now, entered = (
+        accuracy.average(accuracy.align(d))
+        for d in (accuracy.deviation, accuracy.error_after_offsets)
+    )
     now_largest, entered_largest = (_largest(d) for d in (now, entered))
     # RMS in space, as in all tables; axes of an ellipsoid are shorter
     after, excess = assess_remaining(calibration, accuracy), calibration.tolerance_scale
@@ -74,7 +77,7 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
         scene.explain(LegendEntry(text, (TOOL_ENTERED,), css(ENTERED_COLOUR), "arrow", shown))
     headline = f"Tool error now: up to {um(now_largest)} µm over {region}, workpiece aligned."
     if after is not None:
-        _draw_ellipsoids(scene, targets, after.aligned_covariance[chosen])
+        _draw_ellipsoids(scene, targets, accuracy.average(after.aligned_covariance)[chosen])
         wider = f", errors at {excess:.1f} × tolerances" if excess > 1.0 else ""
         text = f"Tool uncertainty, all errors corrected: up to {um(spread)} µm RMS{wider} ({scale})"
         colour = css(UNCERTAINTY_COLOUR)
@@ -89,7 +92,7 @@ def _largest(deviations: Array) -> float:
 
 def _choose_points(accuracy: ToolAccuracy) -> NDArray[np.int64]:
     """Indices of the drawn grid points: middles and ends of the sides."""
-    points = accuracy.workspace.points
+    points = accuracy.points
     chosen = np.ones(len(points), dtype=bool)
     for column in points.T:
         line = np.unique(column)

@@ -144,7 +144,7 @@ def accuracy_json(calibration: Calibration, accuracy: ToolAccuracy) -> str:
         "schema": "orthocal/accuracy/2",
         "robot": calibration.robot_record.name,
         "model": calibration.model,
-        "points": len(accuracy.workspace.points),
+        "points": len(accuracy.points),
         "box": None if accuracy.workspace.box is None else accuracy.workspace.box.tolist(),
         "deviation": sizes(accuracy.measure(accuracy.deviation)),
         "offsets_entered": sizes(accuracy.measure(accuracy.error_after_offsets)),

@@ -15,7 +15,11 @@ from orthocal.assessment.assess import assessment_of, expanded_uncertainty
 from orthocal.assessment.plausibility import describe_legs
 from orthocal.assessment.wording import joined
 from orthocal.assessment.words.anomalies import describe_evidence
-from orthocal.assessment.words.entries import describe_compensated, describe_region
+from orthocal.assessment.words.entries import (
+    describe_compensated,
+    describe_region,
+    describe_use_parts,
+)
 from orthocal.calibration.assessment_record import (
     Assessment,
     ControllerEntry,
@@ -146,12 +150,12 @@ def _tool(calibration: Calibration, assessment: Assessment) -> list[RenderableTy
 
 
 def describe_conditions(calibration: Calibration) -> list[str]:
-    """Tool error with all errors corrected if they were estimated; the region of tool errors."""
+    """Tool error with all errors corrected if they were estimated; region and conditions of use."""
     tool = assessment_of(calibration).tool
     if tool is None:
         return []
     compensated = [] if calibration.only_offsets else [describe_compensated(tool.compensated)]
-    return [*compensated, describe_region(tool.region)]
+    return [*compensated, describe_region(tool), *describe_use_parts(tool)]
 
 
 def _listed(calibration: Calibration, assessment: Assessment) -> Sequence[Finding]:
