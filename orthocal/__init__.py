@@ -68,6 +68,7 @@ if TYPE_CHECKING:  # the public names; each is imported when it is first used
     from orthocal.estimation.solvers.ipopt import NonlinearProgram as NonlinearProgram
     from orthocal.export.formats import export_calibration as export_calibration
     from orthocal.export.linuxcnc.export import ExportOptions as ExportOptions
+    from orthocal.kinematics.conditions import UseConditions as UseConditions
     from orthocal.kinematics.workspace import Workspace as Workspace
     from orthocal.measurement.files.session_file import load_plan as load_plan
     from orthocal.measurement.files.session_file import load_session as load_session

@@ -16,6 +16,7 @@ from orthocal.assessment.calibrated_tool import error_covariance
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
+from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.loop_closure import (
     Failures,
     LoopClosure,
@@ -47,19 +48,23 @@ class Chunk:
     """Index in the table to why the machine cannot be there."""
 
 
-def forward_blocks(calibration: Calibration, blocks: Iterable[Block]) -> Iterator[Chunk]:
+def forward_blocks(
+    calibration: Calibration, blocks: Iterable[Block], conditions: UseConditions | None = None
+) -> Iterator[Chunk]:
     """Tool centre points of the calibrated machine, of rows as they come.
 
     Args:
         calibration: The calibration.
         blocks: Names and drive coordinates of some rows as the encoders give them, without any
             offset of the controller, shape (n, n_drives), [m, rad].
+        conditions: Conditions of use; by default the middle of both sides of each drive, the
+            reference temperature and no payload.
 
     Yields:
         Chunks of shape (n, 3), [m].
     """
     robot = calibration.robot
-    closure = LoopClosure(robot, fixed=calibration.errors)
+    closure = _closure(calibration, conditions)
 
     def evaluate(rows: Array, names: Sequence[str], failures: Failures) -> Array:
         failures.update(find_beyond_travel(robot, rows, names))
@@ -68,17 +73,20 @@ def forward_blocks(calibration: Calibration, blocks: Iterable[Block]) -> Iterato
     yield from _by_chunks(evaluate, blocks)
 
 
-def inverse_blocks(calibration: Calibration, blocks: Iterable[Block]) -> Iterator[Chunk]:
+def inverse_blocks(
+    calibration: Calibration, blocks: Iterable[Block], conditions: UseConditions | None = None
+) -> Iterator[Chunk]:
     """Drive coordinates that bring the calibrated machine's tool to points as they come.
 
     Args:
         calibration: The calibration.
         blocks: Names and coordinates of some points, shape (n, n_drives), [m].
+        conditions: As for `forward_blocks`.
 
     Yields:
         Chunks of shape (n, n_drives), as the encoders give them, [m, rad].
     """
-    closure = LoopClosure(calibration.robot, fixed=calibration.errors)
+    closure = _closure(calibration, conditions)
 
     def evaluate(rows: Array, names: Sequence[str], failures: Failures) -> Array:
         return closure.inverse(rows, names=names, failures=failures)
@@ -86,8 +94,17 @@ def inverse_blocks(calibration: Calibration, blocks: Iterable[Block]) -> Iterato
     yield from _by_chunks(evaluate, blocks)
 
 
+def _closure(calibration: Calibration, conditions: UseConditions | None) -> LoopClosure:
+    use = conditions or UseConditions()
+    return LoopClosure(calibration.robot, fixed=calibration.errors, conditions=use)
+
+
 def accuracy_rows(
-    calibration: Calibration, points: ArrayLike, *, names: Sequence[str] | None = None
+    calibration: Calibration,
+    points: ArrayLike,
+    *,
+    names: Sequence[str] | None = None,
+    conditions: UseConditions | None = None,
 ) -> Iterator[Chunk]:
     """Actual tool positions for commanded points, with absolute uncertainty.
 
@@ -97,6 +114,7 @@ def accuracy_rows(
         calibration: The calibration.
         points: In the coordinates that the drives control, shape (K, n_coordinates), [m].
         names: What to call the rows in messages.
+        conditions: As for `forward_blocks`.
 
     Yields:
         Chunks of shape (n, 9): the commanded position, by how much the tool is off it, and one
@@ -104,7 +122,9 @@ def accuracy_rows(
     """
     robot, values = calibration.robot, calibration.errors
     free = [p.name for p in calibration.free]
-    tool = ToolSensitivity(robot, free=[*free, *calibration.unmodelled.names], values=values)
+    free += calibration.unmodelled.names
+    use = conditions or UseConditions()
+    tool = ToolSensitivity(robot, free=free, values=values, conditions=use)
     nominal = nominal_closure(robot)
     rows, _ = as_rows(points, len(robot.drives), "coordinates")
     active = calibration.session.controller_offsets

@@ -8,7 +8,18 @@ from typing import Annotated
 from typer import Argument
 
 import orthocal
-from orthocal.cli.options import CalibrationPath, HalfSideMm, Json, command, require_between
+from orthocal.cli.forward import put_assumed
+from orthocal.cli.options import (
+    Approach,
+    CalibrationPath,
+    HalfSideMm,
+    Json,
+    Payload,
+    Temperature,
+    command,
+    read_conditions,
+    require_between,
+)
 from orthocal.cli.printing import deliver, print_rows
 from orthocal.errors import ClosureError, SessionError
 from orthocal.units import MM
@@ -19,11 +30,16 @@ def accuracy(
     calibration: CalibrationPath,
     points: Annotated[Path | None, Argument()] = None,
     half_side_mm: HalfSideMm = None,
+    approach: Approach = None,
+    temperature: Temperature = None,
+    payload: Payload = None,
     json: Json = False,
 ) -> None:
     """Print the tool error over the workspace, or at points.
 
     With points it prints CSV: the deviation of the tool at each, and its standard deviation.
+    Without --approach, --temperature and --payload a tool error is that under the conditions of
+    use that the robot's YAML states.
 
     Exit code 3: some points cannot be reached; they are named, and their cells are empty.
 
@@ -39,11 +55,16 @@ def accuracy(
     if half_side_mm is not None:
         require_between(half_side_mm, 0.0, 1e5, "--half-side-mm")
     result = orthocal.load_calibration(calibration)
+    conditions = read_conditions(
+        result.robot, approach=approach, temperature=temperature, payload=payload
+    )
+    stated = conditions if conditions.stated else None
     names, workspace = None, None
     if points is not None:
         names, targets = read_points(points, result.robot)
         if not json:
-            rows = accuracy_rows(result, targets, names=names)
+            rows = accuracy_rows(result, targets, names=names, conditions=conditions)
+            put_assumed(result, conditions)
             print_rows(text.POINT_COLUMNS, text.format_points, rows)
             return
         if len(targets) > MOST_POINTS:
@@ -56,7 +77,7 @@ def accuracy(
     elif half_side_mm is not None:
         workspace = cube(result.robot, half_side=half_side_mm * MM)
     try:
-        assessment = orthocal.assess_tool(result, workspace, names=names)
+        assessment = orthocal.assess_tool(result, workspace, names=names, conditions=stated)
     except ClosureError as e:
         if half_side_mm is None:
             raise SessionError(e.reason, where=e.posture) from None

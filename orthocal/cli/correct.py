@@ -17,7 +17,16 @@ from typing import IO, TYPE_CHECKING, Annotated, BinaryIO
 from typer import Option
 
 import orthocal
-from orthocal.cli.options import Anyway, CalibrationPath, ToolTip, command, read_vector
+from orthocal.cli.options import (
+    Anyway,
+    CalibrationPath,
+    Payload,
+    Temperature,
+    ToolTip,
+    command,
+    read_conditions,
+    read_vector,
+)
 from orthocal.cli.printing import put_note, put_part
 from orthocal.errors import GcodeError, OutputError, ParameterError
 from orthocal.io.files import read_parts, require_writable_file, write_file
@@ -56,6 +65,8 @@ def correct(
     work_offset_mm: list[str] | None = None,
     start_mm: str | None = None,
     tool: ToolTip = None,
+    temperature: Temperature = None,
+    payload: Payload = None,
     out: Path | None = None,
     anyway: Anyway = False,
 ) -> None:
@@ -84,6 +95,7 @@ def correct(
     from orthocal.export.formats import require_entering, warn_against_verdict
     from orthocal.gcode.interpreter import Interpreter
     from orthocal.gcode.program import ProgramCorrector
+    from orthocal.output.text.conditions import describe_assumed
 
     zeros = _read_offsets(work_offset_mm or [])
     position = None if start_mm is None else read_vector(start_mm, "--start-mm")
@@ -97,7 +109,10 @@ def correct(
     active = offsets is Offsets.ACTIVE
     values = result.active_offsets if active else offsets_to_enter(result)
     tolerance = within * UM
-    field = CorrectionField(result, values, within=tolerance, tool=tip or (0.0, 0.0, 0.0))
+    conditions = read_conditions(result.robot, temperature=temperature, payload=payload)
+    field = CorrectionField(
+        result, values, within=tolerance, tool=tip or (0.0, 0.0, 0.0), conditions=conditions
+    )
     file = "standard input" if str(program) == "-" else str(program)
     interpreter = Interpreter(
         file, axes=field.axes, offsets=zeros, start=position, one_tool=tip is not None
@@ -121,6 +136,7 @@ def correct(
         _describe(corrector.summary, field, tolerance),
         _describe_controller(result, values, active=active),
         _describe_tool(tip, interpreter.tools.used),
+        describe_assumed(result, conditions, fields=("temperature", "payload")),
         warning,
         _describe_outside(corrector.summary, file, words),
         "" if zeros else "The program's coordinates are read as machine coordinates.",

@@ -9,8 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import orthocal
-from orthocal.cli.options import CalibrationPath, command
-from orthocal.cli.printing import print_rows
+from orthocal.cli.options import (
+    Approach,
+    CalibrationPath,
+    Payload,
+    Temperature,
+    command,
+    read_conditions,
+)
+from orthocal.cli.printing import print_rows, put_note
 from orthocal.errors import SessionError
 
 if TYPE_CHECKING:
@@ -19,7 +26,13 @@ if TYPE_CHECKING:
 
 
 @command()
-def forward(calibration: CalibrationPath, joints: Path) -> None:
+def forward(
+    calibration: CalibrationPath,
+    joints: Path,
+    approach: Approach = None,
+    temperature: Temperature = None,
+    payload: Payload = None,
+) -> None:
     """Print tool positions for drive coordinates, as CSV.
 
     Drive coordinates are those of the encoders, without any offset of the controller. Tables can
@@ -34,7 +47,11 @@ def forward(calibration: CalibrationPath, joints: Path) -> None:
     from orthocal.measurement.files.coordinate_tables import TOOL_COLUMNS, stream_joints
 
     result = orthocal.load_calibration(calibration)
-    print_transformed(result, joints, stream_joints, forward_blocks, TOOL_COLUMNS)
+    conditions = read_conditions(
+        result.robot, approach=approach, temperature=temperature, payload=payload
+    )
+    transform = partial(forward_blocks, conditions=conditions)
+    print_transformed(result, joints, stream_joints, transform, TOOL_COLUMNS, conditions)
 
 
 def print_transformed(
@@ -43,6 +60,7 @@ def print_transformed(
     stream: Callable[..., Iterator[Block]],
     transform: Callable[[orthocal.Calibration, Iterable[Block]], Iterator[Chunk]],
     columns: dict[str, float],
+    conditions: orthocal.UseConditions,
 ) -> None:
     """Print a transformed table; a file is checked completely before its first row is printed.
 
@@ -52,6 +70,7 @@ def print_transformed(
         stream: Blocks of a file or a stream.
         transform: Chunks of the transformed table.
         columns: Its columns and their factors to SI units.
+        conditions: Conditions of use; a note says which are assumed.
 
     Raises:
         SessionError: Naming file and line.
@@ -66,4 +85,13 @@ def print_transformed(
         raise SessionError("is closed", where="standard input")
     else:
         blocks = stream(sys.stdin.buffer, calibration.robot, name="standard input")
+    put_assumed(calibration, conditions)
     print_rows(columns, partial(format_rows, columns), transform(calibration, blocks))
+
+
+def put_assumed(calibration: orthocal.Calibration, conditions: orthocal.UseConditions) -> None:
+    """Note which conditions are assumed, and what that costs; nothing if none matters."""
+    from orthocal.output.text.conditions import describe_assumed
+
+    if note := describe_assumed(calibration, conditions):
+        put_note(note)

@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import orthocal
 from orthocal.cli.forward import print_transformed
-from orthocal.cli.options import CalibrationPath, command
+from orthocal.cli.options import (
+    Approach,
+    CalibrationPath,
+    Payload,
+    Temperature,
+    command,
+    read_conditions,
+)
 
 
 @command()
-def inverse(calibration: CalibrationPath, targets: Path) -> None:
+def inverse(
+    calibration: CalibrationPath,
+    targets: Path,
+    approach: Approach = None,
+    temperature: Temperature = None,
+    payload: Payload = None,
+) -> None:
     """Print drive coordinates for tool positions, as CSV.
 
     Drive coordinates are those of the encoders, without any offset of the controller. Tables can
@@ -25,4 +39,8 @@ def inverse(calibration: CalibrationPath, targets: Path) -> None:
     from orthocal.measurement.files.coordinate_tables import drive_columns, stream_points
 
     result = orthocal.load_calibration(calibration)
-    print_transformed(result, targets, stream_points, inverse_blocks, drive_columns(result.robot))
+    conditions = read_conditions(
+        result.robot, approach=approach, temperature=temperature, payload=payload
+    )
+    columns, transform = drive_columns(result.robot), partial(inverse_blocks, conditions=conditions)
+    print_transformed(result, targets, stream_points, transform, columns, conditions)

@@ -200,6 +200,19 @@ ToolTip = Annotated[
         help="Tip of the tool in the frame of the tool centre point, mm; default: 0,0,0.",
     ),
 ]
+Approach = Annotated[
+    str | None,
+    Option(
+        metavar="LETTERS",
+        help="Sides from which the drives come, a letter for each: p if its coordinate grew in the "
+        "last motion, n if it fell, u if unknown, such as pnp; default: the middle of both sides.",
+    ),
+]
+Temperature = Annotated[
+    float | None,
+    Option(metavar="C", help="Temperature of the machine, °C; default: that of its dimensions."),
+]
+Payload = Annotated[float | None, Option(metavar="KG", help="Mass on the tool, kg; default: none.")]
 Positive = Annotated[int | None, Option(min=1)]
 Seed = Annotated[int, Option(min=0, metavar="N", help="Seed of the random numbers.")]
 Workers = Annotated[
@@ -348,6 +361,23 @@ def read_workspace(text: str, robot: orthocal.Robot, *, where: str = "--workspac
     if problem:
         raise ParameterError(problem, where=where)
     return box
+
+
+def read_conditions(
+    robot: orthocal.Robot,
+    *,
+    approach: str | None = None,
+    temperature: float | None = None,
+    payload: float | None = None,
+) -> orthocal.UseConditions:
+    """Conditions of `--approach`, `--temperature` and `--payload`.
+
+    Raises:
+        ParameterError: If one is out of range, or no effect of the machine depends on it.
+    """
+    conditions = orthocal.UseConditions(approach, temperature, payload)
+    conditions.require_valid(robot, prefix="--")
+    return conditions
 
 
 def require_between(value: float, low: float, high: float, option: str) -> None:

@@ -24,6 +24,7 @@ from orthocal.arrays import Array, Indices
 from orthocal.calibration.calibration import Calibration
 from orthocal.export.polynomial import Polynomial, PolynomialFit, chebyshev_line
 from orthocal.export.tool_tip import ToolTip
+from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.loop_closure import Failures, nominal_closure
 from orthocal.kinematics.workspace import grid_points
 
@@ -85,6 +86,7 @@ class CorrectionField:
         offsets: Offsets in the controller, shape (n_drives,), [m, rad].
         within: Tolerance of the corrected path, of which the field uses a part, [m].
         tool: Tip in the frame of the robot's tool centre point, [m].
+        conditions: Conditions of use, as for `ToolTip`.
 
     Raises:
         ExportError: If the robot's drives command no tool.
@@ -98,9 +100,10 @@ class CorrectionField:
         *,
         within: float,
         tool: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        conditions: UseConditions | None = None,
     ) -> None:
         robot = calibration.robot
-        self._tip = ToolTip(calibration, tool)
+        self._tip = ToolTip(calibration, tool, conditions=conditions)
         self.axes = tuple(self._tip.coordinates)
         """Indices of the axes that the drives command."""
         self.bound = ERROR_PART * within

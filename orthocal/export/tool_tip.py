@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError, ParameterError
+from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.loop_closure import Failures, LoopClosure
 from orthocal.kinematics.robot_functions import reference_poses, robot_functions
 from orthocal.units import MM
@@ -50,6 +51,8 @@ class ToolTip:
         calibration: Calibration of a robot whose drives command the tool.
         tool: Tip in the frame of the robot's tool centre point, shape (3,), [m].
         errors: Errors of the machine instead of the identified ones, [SI].
+        conditions: Conditions of use; by default the middle of both sides of each drive, the
+            reference temperature and no payload.
 
     Raises:
         ExportError: If the drives do not command the tool.
@@ -62,6 +65,7 @@ class ToolTip:
         tool: ArrayLike = (0.0, 0.0, 0.0),
         *,
         errors: Mapping[str, float] | None = None,
+        conditions: UseConditions | None = None,
     ) -> None:
         robot = calibration.robot
         if robot.tcp is None or len(robot.tcp.coordinates) != len(robot.drives):
@@ -70,7 +74,8 @@ class ToolTip:
         require_tip(self.tool.tolist())
         self.coordinates = list(robot.tcp.coordinates)
         """Indices of the coordinates that the drives control."""
-        self._closure = LoopClosure(robot, fixed=calibration.errors if errors is None else errors)
+        fixed = calibration.errors if errors is None else errors
+        self._closure = LoopClosure(robot, fixed=fixed, conditions=conditions or UseConditions())
         self._pose = robot_functions(robot).pose(robot.tcp.frame)
         (zero,) = reference_poses(robot, [robot.tcp.frame])
         self.level = np.array(zero[:3, :3])
@@ -88,9 +93,8 @@ class ToolTip:
 
     def poses(self, drives: Array, *, start: Array | None = None) -> Array:
         """Poses of the robot's tool centre point, shape (k, 4, 4), [1, m]."""
-        machine = self._closure.geometry()
         passive = self._closure.close(drives, start=start)
-        (poses,) = self._pose(machine.drives(drives), passive, machine.placements)
+        (poses,) = self._pose(*self._closure.inputs(drives, passive))
         return np.asarray(poses)
 
     def reach(self, points: Array, *, failures: Failures | None = None) -> tuple[Array, Array]:

@@ -122,12 +122,12 @@ def describe_compensated(rms: float) -> str:
 
 def describe_region(tool: ToolErrorSummary) -> str:
     """Region, alignment and conditions of use of the tool errors of an answer."""
-    use = "" if tool.use is None else describe_use(tool.use)
+    use = "" if tool.use is None else f", {describe_use(tool.use)}"
     return f"RMS over the workspace {tool.region}, workpiece aligned on the machine{use}."
 
 
 def describe_use(use: ToolUse) -> str:
-    """Conditions of use, each after a comma."""
+    """Conditions of use."""
     parts = []
     if use.approach is not None:
         both = not use.approach.strip("u")
@@ -137,7 +137,7 @@ def describe_use(use: ToolUse) -> str:
     if use.payload is not None:
         heaviest = use.payload[1]
         parts.append(f"payload {_describe_range(use.payload)} kg" if heaviest else "no payload")
-    return "".join(f", {part}" for part in parts)
+    return ", ".join(parts)
 
 
 def describe_use_parts(tool: ToolErrorSummary) -> list[str]:

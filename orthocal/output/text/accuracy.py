@@ -20,9 +20,15 @@ from orthocal.assessment.tool_error import (
     assess_tool,
     summarise_tool,
 )
-from orthocal.assessment.words.entries import describe_compensated, describe_tool_error
+from orthocal.assessment.words.entries import (
+    describe_compensated,
+    describe_tool_error,
+    describe_use,
+    describe_use_parts,
+)
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
+from orthocal.output.text.conditions import describe_conditions_of
 from orthocal.output.text.layout import noted, print_rich, table_of, um
 from orthocal.units import MM, UM, read_limit
 
@@ -84,6 +90,8 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
         cells.append((name, *("" if v is None else um(v) for v in values)))
     headers = ("[µm]", "RMS", "95 %", "worst point", "translation removed", "absolute")
     notes = [f"Over {accuracy.workspace.words}. {COLUMNS_NOTE}"]
+    if accuracy.use.declared is None:
+        notes.append(describe_conditions_of(calibration, accuracy.use.conditions[0]))
     if accuracy.after is None:
         notes.append(
             "The uncertainty after calibration is unknown, because the noise of the readings is."
@@ -96,6 +104,9 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
             notes.append(describe_tool_error(summary, keep=keep))
             if not calibration.only_offsets:
                 notes.append(describe_compensated(summary.compensated))
+            if summary.use is not None:
+                notes.append(f"Averaged over the conditions of use: {describe_use(summary.use)}.")
+                notes += describe_use_parts(summary)
         notes += describe_remaining(find_remaining_errors(calibration, accuracy, count=2))
     return noted(table_of(headers, cells), *notes)
 

@@ -1,0 +1,69 @@
+"""Conditions of use in words: those that were stated, and those that were assumed."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from orthocal.assessment.assess import assessment_of
+from orthocal.assessment.wording import joined, tool_mm
+from orthocal.assessment.words.entries import describe_use
+from orthocal.calibration.calibration import Calibration
+from orthocal.effects.loading import neutral_values
+from orthocal.kinematics.conditions import (
+    CONDITION_OF,
+    UseCondition,
+    UseConditions,
+    effects_by_condition,
+)
+
+
+def describe_assumed(
+    calibration: Calibration,
+    conditions: UseConditions,
+    *,
+    fields: Collection[UseCondition] = tuple(CONDITION_OF),
+) -> str:
+    """Conditions that a command assumes because they are not stated, and what that costs.
+
+    Args:
+        calibration: The calibration.
+        conditions: The stated conditions.
+        fields: Conditions that the command can take.
+
+    Returns:
+        "" for a machine that depends on none of the missing ones.
+    """
+    effects = effects_by_condition(calibration.robot)
+    missing = [f for f in fields if f in effects and getattr(conditions, f) is None]
+    if not missing:
+        return ""
+    names = joined([f"{_assumption(calibration, f)} (--{f})" for f in missing])
+    text = f"Assumed: {names}."
+    tool = assessment_of(calibration).tool
+    if tool is None or tool.use is None or len(missing) < len(effects):
+        return text
+    return (
+        f"{text} Expected tool error with all errors corrected, {describe_use(tool.use)}: "
+        f"{tool_mm(tool.use.unstated)} RMS without stating them, {tool_mm(tool.compensated)} if "
+        "they are stated."
+    )
+
+
+def describe_conditions_of(calibration: Calibration, conditions: UseConditions) -> str:
+    """Conditions of a tool error: as stated, otherwise as assumed; "" if none matters."""
+    words = []
+    for name in effects_by_condition(calibration.robot):
+        value = getattr(conditions, name)
+        unit = {"approach": "approach {}", "temperature": "{:g} °C", "payload": "payload {:g} kg"}
+        stated = value is not None
+        words.append(unit[name].format(value) if stated else _assumption(calibration, name))
+    return f"Conditions: {joined(words)}." if words else ""
+
+
+def _assumption(calibration: Calibration, name: UseCondition) -> str:
+    """Value of a condition that is not stated."""
+    if name == "approach":
+        return "the middle of both sides of each drive"
+    if name == "payload":
+        return "no payload"
+    return f"{neutral_values(calibration.robot)['temperature']:g} °C"

@@ -1,0 +1,290 @@
+"""Tool error in use: approach from both sides, a range of temperatures, a payload."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from effect_plans import write_plan, write_robot
+
+from orthocal import (
+    Choice,
+    UseConditions,
+    Workspace,
+    assess_tool,
+    load_calibration,
+    load_plan,
+    load_robot,
+    simulate_session,
+    summarize,
+    write_calibration,
+)
+from orthocal.assessment.assess import assess
+from orthocal.assessment.calibrated_tool import error_covariance
+from orthocal.assessment.controller_entries import entered_offsets
+from orthocal.assessment.judgement import Judgement
+from orthocal.assessment.recommendation import Recommendation
+from orthocal.assessment.tool_error import summarise_tool
+from orthocal.calibration.identify import identify
+from orthocal.errors import ParameterError, RobotError
+from orthocal.kinematics.conditions import sample_use
+from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
+from orthocal.kinematics.workspace import box_workspace, cube_limits
+from orthocal.planning.expected_error import ToolForecast
+
+EFFECTS = "backlash: {}, thermal: {}, compliance: {rod_N_per_um: 0.2, platform_kg: 3}"
+USE = "use: {temperature_C: [15, 35], payload_kg: [0, 4]}"
+TRUTH = {
+    "x_slide.offset": 4e-4,
+    "y_slide.offset": -3e-4,
+    "x_slide.backlash": 30e-6,
+    "y_slide.backlash": 12e-6,
+    "z_slide.backlash": 40e-6,
+    "legs.expansion": 1e-6,
+}
+MACHINES = 24
+
+
+def use_machine(folder, use):
+    """The YAML of a machine, with conditions of use."""
+    text = (folder / "machine.yaml").read_text()
+    (folder / "machine.yaml").write_text(text.replace("\n  tcp: ", f"\n  {use}\n  tcp: "))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory):
+    folder = write_plan(tmp_path_factory.mktemp("use") / "plan", effects=EFFECTS)
+    use_machine(folder / "machine", USE)
+    table = (folder / "readings.csv").read_text().splitlines()
+    head, *rows = (line.split(",") for line in table)
+    at = head.index("temperature_C")
+    rows = [[*r[:at], "20" if i % 2 else "26", *r[at + 1 :]] for i, r in enumerate(rows)]
+    (folder / "readings.csv").write_text("\n".join(",".join(r) for r in (head, *rows)) + "\n")
+    session = simulate_session(load_plan(folder), TRUTH, seed=4, sigma=1e-6).session
+    choice = Choice("offsets", prior=True)
+    return identify(session, choice, solver="variable-projection")[0]
+
+
+@pytest.fixture(scope="module")
+def workspace(calibration):
+    robot = calibration.robot
+    return box_workspace(robot, cube_limits(robot), points_a_side=3)
+
+
+def with_use(calibration, **changes):
+    robot = calibration.robot
+    return replace(calibration, robot=replace(robot, use=replace(robot.use, **changes)))
+
+
+# ---- samples
+
+
+def test_samples_have_the_moments_of_the_use(calibration):
+    use = sample_use(calibration.robot)
+    assert use.varying == ("approach",) * 3 + ("temperature", "payload")
+    assert use.size == 8
+    assert np.array_equal(use.signs.T @ use.signs, 8 * np.eye(5))
+    assert not use.signs.sum(axis=0).any()
+    for name, (low, high) in (("temperature", (15, 35)), ("payload", (0, 4))):
+        values = [getattr(c, name) for c in use.conditions]
+        assert np.mean(values) == pytest.approx(0.5 * (low + high))
+        assert np.std(values) == pytest.approx((high - low) / np.sqrt(12))
+    for k in range(3):
+        assert sorted(c.approach[k] for c in use.conditions) == ["n"] * 4 + ["p"] * 4
+
+
+def test_conditions_that_nothing_depends_on_are_not_sampled(orthoglide, tmp_path):
+    plain = sample_use(orthoglide)
+    assert (plain.size, plain.conditions) == (1, (UseConditions(),))
+    folder = use_machine(write_robot(tmp_path / "machine", "backlash: {}"), "use: {approach: pun}")
+    one = sample_use(load_robot(folder))
+    assert [c.approach for c in one.conditions] == ["ppn", "pnn"]
+    assert {c.temperature for c in one.conditions} == {None}
+
+
+def test_a_machine_without_effects_is_assessed_at_each_point_once(orthoglide):
+    forecast = ToolForecast(orthoglide, Choice("offsets").select(orthoglide.parameters))
+    assert len(forecast.workspace.weights) == 125
+    assert forecast.workspace.copies == 1
+
+
+@pytest.mark.parametrize(
+    ("use", "key"),
+    [
+        ("use: {approach: up}", "approach"),
+        ("use: {approach: one}", "approach"),
+        ("use: {temperature_C: [26, 18]}", "temperature_C"),
+        ("use: {temperature_C: [18, 260]}", "temperature_C"),
+        ("use: {temperature_C: 20}", "temperature_C"),
+        ("use: {payload_kg: [-1, 2]}", "payload_kg"),
+        ("use: {payload_kg: [0, 1, 2]}", "payload_kg"),
+        ("use: {speed: 3}", "speed"),
+    ],
+)
+def test_a_use_that_cannot_be_is_refused(tmp_path, use, key):
+    folder = use_machine(write_robot(tmp_path / "machine", "backlash: {}"), use)
+    with pytest.raises(RobotError) as caught:
+        load_robot(folder)
+    assert f"orthocal.use.{key}" in caught.value.where
+
+
+# ---- the tool error
+
+
+def full_factorial():
+    """Both sides of each drive, and two Gauss points of the other ranges, with weights."""
+    nodes, weights = np.polynomial.legendre.leggauss(2)
+    for sides in itertools.product("pn", repeat=3):
+        for (t, wt), (m, wm) in itertools.product(zip(nodes, weights, strict=True), repeat=2):
+            yield UseConditions("".join(sides), 25 + 10 * t, 2 + 2 * m), wt * wm / 32
+
+
+def align(fields, positions, weights):
+    """Fields of all conditions less one shift and rotation by least squares, shape (n, K, 3)."""
+    rows = [
+        np.hstack([np.eye(3), -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])])
+        for x, y, z in positions
+    ]
+    basis = np.tile(np.vstack(rows), (len(fields), 1))
+    root = np.sqrt(np.repeat(weights.reshape(-1), 3))
+    motion = np.linalg.lstsq(root[:, None] * basis, root * fields.reshape(-1), rcond=None)[0]
+    return fields - (basis @ motion).reshape(fields.shape)
+
+
+def test_it_is_that_of_sampled_machines_under_sampled_conditions(calibration, workspace):
+    """Machines about the estimate, commanded by controllers that correct offsets, or everything."""
+    accuracy = assess_tool(calibration, workspace)
+    figures = summarise_tool(calibration, accuracy)
+    robot, names = calibration.robot, accuracy.names
+    values, vectors = np.linalg.eigh(error_covariance(calibration))
+    draws = np.random.default_rng(7).normal(size=(MACHINES, values.size))
+    errors = (draws * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    at = calibration.errors
+    theta = np.array([at.get(n, 0.0) for n in names]) + errors
+    nominal = nominal_closure(robot)
+    targets = nominal.forward(drives := nominal.inverse(workspace.points))
+    commanded = {
+        "now": drives - calibration.active_offsets,
+        "entered": drives - entered_offsets(calibration),
+        "unstated": calibration.machine.inverse(workspace.points),
+    }
+    conditions, shares = zip(*full_factorial(), strict=True)
+    weights = np.outer(shares, workspace.weights)
+    fields = {name: [] for name in (*commanded, "compensated")}
+    for c in conditions:
+        closure = LoopClosure(robot, free=names, fixed=at, conditions=c)
+        for name, at_drives in commanded.items():
+            fields[name].append(closure.forward(at_drives, theta=theta) - targets)
+        corrected = calibration.machine.inverse(workspace.points, conditions=c)
+        fields["compensated"].append(closure.forward(corrected, theta=theta) - targets)
+    expected = {name: getattr(figures, name) for name in ("now", "entered", "compensated")}
+    expected["unstated"] = figures.use.unstated
+    for name, field in fields.items():
+        of_machines = np.array(field).swapaxes(0, 1)
+        squares = [
+            (weights * (align(f, targets, weights) ** 2).sum(axis=2)).sum() for f in of_machines
+        ]
+        assert np.sqrt(np.mean(squares)) == pytest.approx(expected[name], rel=0.08), name
+    assert figures.entered > 1.1 * figures.compensated
+    assert figures.use.unstated > figures.compensated
+
+
+def test_parts_are_what_constant_conditions_save(calibration, workspace):
+    accuracy = assess_tool(calibration, workspace)
+    both = summarise_tool(calibration, accuracy)
+    parts = {p.condition: p.size for p in both.use.parts}
+    assert list(parts) == ["approach", "temperature", "payload"]
+    lag = [0.5 * calibration[f"{k}_slide.backlash"].value for k in "xyz"]
+    assert both.use.parts[0].known == pytest.approx(np.linalg.norm(lag), rel=0.05)
+    assert both.use.parts[0].effects == ("backlash",)
+    changes = {
+        "approach": {"approach": "ppp"},
+        "temperature": {"temperature": (25.0, 25.0)},
+        "payload": {"payload": (2.0, 2.0)},
+    }
+    for name, change in changes.items():
+        other = with_use(calibration, **change)
+        found = summarise_tool(other, assess_tool(other, workspace))
+        without = np.sqrt(both.entered**2 - parts[name] ** 2)
+        assert found.entered == pytest.approx(without, rel=0.02), name
+        assert name not in [p.condition for p in found.use.parts]
+
+
+def test_stated_conditions_are_those_of_the_figures(calibration, workspace):
+    use = UseConditions("pnp", 30.0, 1.0)
+    accuracy = assess_tool(calibration, workspace, conditions=use)
+    assert len(accuracy.targets) == len(workspace.points)
+    machine = calibration.machine
+    drives = nominal_closure(calibration.robot).inverse(workspace.points)
+    off = machine.forward(drives - calibration.active_offsets, conditions=use) - accuracy.targets
+    assert np.abs(off - accuracy.deviation).max() < 1e-11
+    assert accuracy.unstated is None
+    assert summarise_tool(calibration, accuracy).use is None
+    with pytest.raises(ParameterError):
+        assess_tool(calibration, workspace, conditions=UseConditions("pn"))
+
+
+def test_percentiles_and_single_points_are_over_all_conditions(calibration, workspace):
+    accuracy = assess_tool(calibration, workspace)
+    field = accuracy.align(accuracy.deviation)
+    parts, weights = accuracy.workspace.spread(field)
+    assert weights.sum() == pytest.approx(1.0)
+    one = [workspace.spread(f)[0] for f in field.reshape(8, -1, 3)]
+    assert np.array_equal(np.sort(parts, axis=0), np.sort(np.concatenate(one), axis=0))
+    even = assess_tool(calibration, Workspace.even(workspace.points[:3]))
+    assert len(even.points) == 3
+    assert len(even.targets) == 24
+
+
+def test_the_forecast_of_a_plan_is_over_the_same_conditions(calibration, workspace):
+    robot = calibration.robot
+    forecast = ToolForecast(robot, Choice("offsets", prior=True).select(robot.parameters))
+    assert len(forecast.positions) == 8 * 125
+    names = list(forecast.names)
+    covariance = np.zeros((len(names),) * 2)
+    chosen = [names.index(f"{k}_slide.backlash") for k in "xyz"]
+    covariance[chosen, chosen] = (20e-6) ** 2
+    tool = forecast._expected(covariance).sizes
+    # half the backlash of three drives, which no alignment removes
+    assert tool.aligned.rms == pytest.approx(np.sqrt(3) * 10e-6, rel=0.05)
+    one_sided = replace(robot, use=replace(robot.use, approach="pnp"))
+    selection = Choice("offsets", prior=True).select(robot.parameters)
+    one = ToolForecast(one_sided, selection)._expected(covariance).sizes
+    assert one.aligned.rms < 0.3 * tool.aligned.rms
+    assert one.absolute.rms == pytest.approx(tool.absolute.rms, rel=0.05)
+
+
+# ---- the assessment
+
+
+@pytest.fixture(scope="module")
+def assessed(calibration):
+    judged, recommended = Judgement((), 1.0), Recommendation("full", 1.0, (), 0.0)
+    return replace(
+        calibration,
+        assessment=assess(calibration, judgement=judged, recommendation=recommended),
+    )
+
+
+def test_the_assessment_states_the_tool_error_in_use(assessed, tmp_path):
+    tool = assessed.assessment.tool
+    assert (tool.use.approach, tool.use.temperature, tool.use.payload) == (
+        "uuu",
+        (15.0, 35.0),
+        (0.0, 4.0),
+    )
+    write_calibration(assessed, tmp_path / "calibration.json")
+    document = json.loads((tmp_path / "calibration.json").read_text())
+    use = document["assessment"]["tool"]["use"]
+    assert [p["condition"] for p in use["parts"]] == ["approach", "temperature", "payload"]
+    again = load_calibration(tmp_path / "calibration.json").assessment.tool
+    assert again.use.unstated == tool.use.unstated
+    text = " ".join(summarize(assessed).split())
+    assert "used from both sides, 15…35 °C, payload 0…4 kg." in text
+    assert "if the tool is used from both sides; approach from one side avoids it." in text
+    assert "Temperatures of 15…35 °C add" in text
+    assert "A payload of 0…4 kg adds" in text
