@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import run_orthocal
 from effect_plans import write_plan, write_robot
 
 from orthocal import (
@@ -288,3 +290,115 @@ def test_the_assessment_states_the_tool_error_in_use(assessed, tmp_path):
     assert "if the tool is used from both sides; approach from one side avoids it." in text
     assert "Temperatures of 15…35 °C add" in text
     assert "A payload of 0…4 kg adds" in text
+
+
+# ---- commands
+
+
+JOINTS = "x_slide_mm,y_slide_mm,z_slide_mm\n310.25,330,300\n"
+
+
+@pytest.fixture(scope="module")
+def folder(assessed, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("commands")
+    write_calibration(assessed, folder / "calibration.json")
+    (folder / "joints.csv").write_text(JOINTS)
+    return folder
+
+
+def numbers(text):
+    return np.array([float(v) for v in text.splitlines()[1].split(",")])
+
+
+def test_forward_and_inverse_take_conditions(folder, assessed):
+    stated = ("--approach", "pnp", "--temperature", "31", "--payload", "2.5")
+    code, out, note = run_orthocal(folder, "forward", ".", "joints.csv", *stated)
+    assert (code, note) == (0, "")
+    drives = [0.31025, 0.33, 0.3]
+    use = UseConditions("pnp", 31.0, 2.5)
+    tool = assessed.machine.forward(drives, conditions=use)
+    assert numbers(out) == pytest.approx(tool * 1e3, abs=1e-6)
+    (folder / "points.csv").write_text(out)
+    back = run_orthocal(folder, "inverse", ".", "points.csv", *stated)
+    assert numbers(back.stdout) == pytest.approx(np.array(drives) * 1e3, abs=1e-5)
+    opposite = assessed.machine.forward(drives, conditions=replace(use, approach="npn"))
+    assert np.linalg.norm(opposite - tool) > 20e-6
+
+
+def test_what_is_assumed_is_said_with_its_cost(folder, assessed):
+    code, out, note = run_orthocal(folder, "forward", ".", "joints.csv")
+    assert code == 0
+    assert numbers(out) == pytest.approx(assessed.machine.forward([0.31025, 0.33, 0.3]) * 1e3)
+    tool = assessed.assessment.tool
+    assert "--approach" in note
+    assert "20 °C (--temperature)" in note
+    assert "no payload (--payload)" in note
+    shown = [float(v) for v in re.findall(r"(0\.\d+) mm", note)]
+    assert shown == pytest.approx([tool.use.unstated * 1e3, tool.compensated * 1e3], abs=6e-4)
+    _, _, note = run_orthocal(folder, "inverse", ".", "points.csv", "--approach", "uuu")
+    assert "approach" not in note
+    assert "20 °C" in note
+    _, out, note = run_orthocal(folder, "accuracy", ".", "points.csv", "--payload", "1")
+    assert "--payload" not in note
+    assert "--temperature" in note
+
+
+def test_accuracy_is_over_the_use_or_under_stated_conditions(folder, assessed):
+    _, text, _ = run_orthocal(folder, "accuracy", ".")
+    assert "used from both sides, 15…35 °C, payload 0…4 kg" in " ".join(text.split())
+    stated = ("--approach", "ppp", "--temperature", "25", "--payload", "2")
+    _, text, _ = run_orthocal(folder, "accuracy", ".", *stated)
+    assert "Conditions: approach ppp, 25 °C and payload 2 kg." in " ".join(text.split())
+    _, text, _ = run_orthocal(folder, "accuracy", ".", *stated, "--json")
+    found = json.loads(text)
+    use = UseConditions("ppp", 25.0, 2.0)
+    expected = assess_tool(assessed, conditions=use)
+    assert found["points"] == 125
+    assert found["deviation"]["aligned"]["rms"] == pytest.approx(
+        expected.measure(expected.deviation).aligned.rms
+    )
+
+
+def test_a_corrected_program_is_that_of_its_temperature_and_payload(folder, assessed):
+    (folder / "part.ngc").write_text("G21\nG0 X0 Y0 Z0\nG0 X10 Y-20 Z5\n")
+    words = ("correct", ".", "part.ngc", "--anyway", "--offsets", "active")
+    code, cold, note = run_orthocal(folder, *words)
+    assert code == 0
+    assert "20 °C (--temperature)" in note
+    code, warm, note = run_orthocal(folder, *words, "--temperature", "34", "--payload", "4")
+    assert code == 0
+    assert "--temperature" not in note
+
+    def last(text):
+        line = text.strip().splitlines()[-1]
+        return np.array([float(re.search(rf"{k}(-?[\d.]+)", line)[1]) for k in "XYZ"]) * 1e-3
+
+    point = np.array([0.01, -0.02, 0.005])
+    for text, use in ((cold, UseConditions()), (warm, UseConditions(None, 34.0, 4.0))):
+        drives = nominal_closure(assessed.robot).inverse(last(text)) - assessed.active_offsets
+        reached = assessed.machine.forward(drives, conditions=use)
+        assert np.abs(reached - point).max() < 1e-6
+    assert np.abs(last(cold) - last(warm)).max() > 5e-6
+
+
+@pytest.mark.parametrize(
+    ("options", "where"),
+    [
+        (("--approach", "pp"), "--approach"),
+        (("--approach", "xyz"), "--approach"),
+        (("--temperature", "300"), "--temperature"),
+        (("--temperature", "nan"), "--temperature"),
+        (("--payload", "-1"), "--payload"),
+    ],
+)
+@pytest.mark.parametrize("command", ["forward", "accuracy"])
+def test_conditions_out_of_range_are_refused(folder, command, options, where):
+    code, out, message = run_orthocal(folder, command, ".", "joints.csv", *options)
+    assert (code, out) == (2, "")
+    assert where in message
+
+
+def test_a_condition_that_nothing_depends_on_is_refused(orthoglide):
+    with pytest.raises(ParameterError) as caught:
+        UseConditions(temperature=22.0).require_valid(orthoglide, prefix="--")
+    assert caught.value.where == "--temperature"
