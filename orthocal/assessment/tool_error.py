@@ -33,13 +33,13 @@ from orthocal.calibration.assessment_record import (
     UsePart,
 )
 from orthocal.calibration.calibration import Calibration
-from orthocal.effects.loading import neutral_values
 from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.conditions import (
     UseConditions,
     UseSamples,
     effects_by_condition,
+    stated_use,
 )
 from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
 from orthocal.robot.model import require_commanded_tool
@@ -336,8 +336,8 @@ def _summarise_use(
     the mean square is that of the mean conditions and of the change by each condition, which no
     alignment removes.
     """
-    use, effects = accuracy.use.declared, effects_by_condition(calibration.robot)
-    if use is None or not effects:
+    stated, effects = stated_use(calibration.robot), effects_by_condition(calibration.robot)
+    if accuracy.use.declared is None or stated is None:
         return None
     factor = calibration.tolerance_scale if scale is None else scale
     covariance = error_covariance(calibration, excess=factor)
@@ -357,17 +357,10 @@ def _summarise_use(
                 uncertain=math.sqrt(max(float(spread), 0.0)),
             )
         )
-    reference = neutral_values(calibration.robot)["temperature"]
     unstated = (
         0.0 if accuracy.unstated is None else accuracy.measure(accuracy.unstated).reported.rms
     )
-    return ToolUse(
-        approach=use.approach if "approach" in effects else None,
-        temperature=(use.temperature or (reference,) * 2) if "temperature" in effects else None,
-        payload=use.payload if "payload" in effects else None,
-        parts=tuple(parts),
-        unstated=math.hypot(unstated, compensated),
-    )
+    return ToolUse(**stated, parts=tuple(parts), unstated=math.hypot(unstated, compensated))
 
 
 def _spread_size(covariances: Array, workspace: Workspace) -> ErrorSize:

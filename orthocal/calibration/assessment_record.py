@@ -16,7 +16,7 @@ import numpy as np
 from orthocal.hypotheses.anomaly import AnomalyKind
 from orthocal.io.documents import Number, PositiveInSI, write_plain
 from orthocal.io.fields import CLOSED, Many, NumberOrNaN, SizeOrNaN
-from orthocal.kinematics.conditions import UseCondition
+from orthocal.kinematics.conditions import StatedUse, UseCondition
 from orthocal.kinematics.workspace import describe_box
 from orthocal.units import InUnit, Unit
 
@@ -217,6 +217,11 @@ class ToolUse:
     unstated: SizeOrNaN
     """Tool error, aligned, with all errors corrected but the conditions unknown: for the middle of
     both sides, the reference temperature and no payload, [m]."""
+
+    @property
+    def stated(self) -> StatedUse:
+        """The conditions."""
+        return StatedUse(approach=self.approach, temperature=self.temperature, payload=self.payload)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

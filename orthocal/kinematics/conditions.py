@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict
 
 import numpy as np
 
@@ -167,6 +167,31 @@ def effects_by_condition(robot: Robot) -> dict[UseCondition, tuple[str, ...]]:
         for name, c in CONDITION_OF.items()
         if c in conditions
     }
+
+
+class StatedUse(TypedDict):
+    """Conditions of use on which a machine depends; None for others."""
+
+    approach: str | None
+    """A letter for each drive: p or n for one side, u for both."""
+    temperature: tuple[float, float] | None
+    """Lowest and highest, [°C]."""
+    payload: tuple[float, float] | None
+    """Lightest and heaviest, [kg]."""
+
+
+def stated_use(robot: Robot) -> StatedUse | None:
+    """Conditions of use that a robot's YAML states; None if no effect depends on any."""
+    use, effects = robot.use, effects_by_condition(robot)
+    if not effects:
+        return None
+    reference = neutral_values(robot)["temperature"]
+    temperature = use.temperature or (reference, reference)
+    return StatedUse(
+        approach=use.approach if "approach" in effects else None,
+        temperature=temperature if "temperature" in effects else None,
+        payload=use.payload if "payload" in effects else None,
+    )
 
 
 def find_approach_problem(text: str, robot: Robot) -> str:

@@ -6,7 +6,8 @@ import math
 from collections.abc import Sequence
 
 from orthocal.assessment.wording import joined, named, note, tool_mm
-from orthocal.calibration.assessment_record import Finding, ToolErrorSummary, ToolUse, Verdict
+from orthocal.calibration.assessment_record import Finding, ToolErrorSummary, Verdict
+from orthocal.kinematics.conditions import StatedUse
 from orthocal.units import UM
 
 HEADLINES: dict[Verdict, str] = {
@@ -122,21 +123,28 @@ def describe_compensated(rms: float) -> str:
 
 def describe_region(tool: ToolErrorSummary) -> str:
     """Region, alignment and conditions of use of the tool errors of an answer."""
-    use = "" if tool.use is None else f", {describe_use(tool.use)}"
-    return f"RMS over the workspace {tool.region}, workpiece aligned on the machine{use}."
+    use = None if tool.use is None else tool.use.stated
+    return describe_aligned(f"the workspace {tool.region}", use)
 
 
-def describe_use(use: ToolUse) -> str:
+def describe_aligned(region: str, use: StatedUse | None) -> str:
+    """The same for a region and conditions of use."""
+    under = "" if use is None else f", {describe_use(use)}"
+    return f"RMS over {region}, workpiece aligned on the machine{under}."
+
+
+def describe_use(use: StatedUse) -> str:
     """Conditions of use."""
     parts = []
-    if use.approach is not None:
-        both = not use.approach.strip("u")
-        parts.append("used from both sides" if both else f"approach {use.approach}")
-    if use.temperature is not None:
-        parts.append(f"{_describe_range(use.temperature)} °C")
-    if use.payload is not None:
-        heaviest = use.payload[1]
-        parts.append(f"payload {_describe_range(use.payload)} kg" if heaviest else "no payload")
+    approach, temperature, payload = use["approach"], use["temperature"], use["payload"]
+    if approach is not None:
+        both = not approach.strip("u")
+        parts.append("used from both sides" if both else f"approach {approach}")
+    if temperature is not None:
+        parts.append(f"{_describe_range(temperature)} °C")
+    if payload is not None:
+        heaviest = payload[1]
+        parts.append(f"payload {_describe_range(payload)} kg" if heaviest else "no payload")
     return ", ".join(parts)
 
 

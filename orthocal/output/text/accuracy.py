@@ -105,7 +105,9 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
             if not calibration.only_offsets:
                 notes.append(describe_compensated(summary.compensated))
             if summary.use is not None:
-                notes.append(f"Averaged over the conditions of use: {describe_use(summary.use)}.")
+                notes.append(
+                    f"Averaged over the conditions of use: {describe_use(summary.use.stated)}."
+                )
                 notes += describe_use_parts(summary)
         notes += describe_remaining(find_remaining_errors(calibration, accuracy, count=2))
     return noted(table_of(headers, cells), *notes)

@@ -12,6 +12,8 @@ from rich.padding import Padding
 from rich.text import Text
 
 from orthocal.assessment.wording import tool_mm
+from orthocal.assessment.words.entries import describe_aligned
+from orthocal.kinematics.conditions import stated_use
 from orthocal.kinematics.workspace import find_workspace
 from orthocal.measurement.motion.motion import APPROACH
 from orthocal.output.text.accuracy import describe_remaining
@@ -92,7 +94,7 @@ def describe_expected(plan: MeasuringPlan) -> list[str]:
     lines = [
         f"Expected tool error with all errors corrected: {expected} after the second measurement "
         f"(first: {before}; now {now}).",
-        f"RMS over {workspace.words}, workpiece aligned on the machine.",
+        describe_aligned(workspace.words, stated_use(plan.forecast.robot)),
     ]
     if first.lost > SOME_LOST:
         lines.append(
