@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
+
+from orthocal.units import Unit
 
 AnomalyKind = Literal[
     "wrong unit",
@@ -18,6 +21,9 @@ AnomalyKind = Literal[
     "stuck dial",
     "displaced gauge",
     "drift",
+    "backlash",
+    "thermal expansion",
+    "periodic screw error",
     "offsets not entered",
     "offsets reversed",
     "offsets entered twice",
@@ -27,6 +33,14 @@ AnomalyKind = Literal[
 ]
 """Kinds of anomaly; `offset of one drive` is one that differs from the stated offset and matches
 no known way to enter it wrongly."""
+
+EFFECT_KINDS: Mapping[str, AnomalyKind] = {
+    "backlash": "backlash",
+    "thermal": "thermal expansion",
+    "screw": "periodic screw error",
+    "drift": "drift",
+}
+"""Effects that readings may show although the machine's model lacks them."""
 
 WRONGLY_ENTERED: tuple[AnomalyKind, ...] = (
     "offsets not entered",
@@ -66,7 +80,8 @@ class Explanation:
     """Factor that corrects the readings."""
     amount: float | None = None
     """Amount by which the rows are too large, [m] (misread dial, outlier, displaced gauge; for a
-    drift of the last row against the first); of `machine changed` the change, [SI]."""
+    drift of the last row against the first; of other effects the range of what they add to the
+    rows); of `machine changed` the change, [SI]."""
     std: float | None = None
     """Standard deviation of the amount, [SI]."""
     missing: bool | None = None
@@ -78,7 +93,13 @@ class Explanation:
     """Offsets that are in the controller instead of those stated, one per drive of the robot,
     [m, rad]."""
     parameters: tuple[str, ...] = ()
-    """Error parameters that changed."""
+    """Error parameters that changed, or those of an effect."""
+    amounts: tuple[float, ...] = ()
+    """Of an effect the value of each parameter, [SI]."""
+    stds: tuple[float, ...] = ()
+    """Standard deviations of the amounts, [SI]."""
+    units: tuple[Unit, ...] = ()
+    """Their units."""
     sessions: tuple[str, ...] = ()
     """Sessions that are concerned, or the first session after a change; empty for a single one."""
 

@@ -10,8 +10,9 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.arrays import Array, Indices
+from orthocal.arrays import Array, Indices, Mask
 from orthocal.hypotheses.anomaly import Explanation
+from orthocal.robot.parameters import Parameter
 from orthocal.session.session import Gauge, Session
 
 Key = TypeVar("Key")
@@ -109,12 +110,41 @@ class MachineShift:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SystematicEffect:
+    """Effect of the machine or its gauges that the model lacks, to first order."""
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    """Its parameters, shape (k,)."""
+    change: Array
+    """Change of the rows by the nominal effect, all parameters 0, shape (n_rows,), [m]."""
+    columns: Array
+    """Change of the rows by one prior std of each parameter, shape (k, n_rows), [m]."""
+
+    @property
+    def prior_stds(self) -> Array:
+        """Prior standard deviation of each parameter, shape (k,), [SI]."""
+        return np.array([p.prior_std for p in self.parameters])
+
+    @property
+    def positive(self) -> Mask:
+        """Mask of parameters that are never negative, shape (k,)."""
+        return np.array([p.positive for p in self.parameters], dtype=bool)
+
+    def select(self, chosen: Mask) -> SystematicEffect:
+        """Effect of some of its parameters."""
+        kept = tuple(p for p, c in zip(self.parameters, chosen, strict=True) if c)
+        return SystematicEffect(self.name, kept, self.change, self.columns[chosen])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Family:
     """Hypotheses of one kind, which share a prior probability equally.
 
     Each changes rows by known amounts (`edits`), adds an effect of unknown amount (`effects`), adds
-    several effects, each of its own amount (`groups`), declares rows to say nothing (`silent`), or
-    changes the machine between sessions (`shifts`, by a known or an unknown amount).
+    several effects, each of its own amount (`groups`; `systematic` for those of a machine),
+    declares rows to say nothing (`silent`), or changes the machine between sessions (`shifts`, by a
+    known or an unknown amount).
     """
 
     explain: Callable[[int], Explanation]
@@ -131,6 +161,8 @@ class Family:
     rows, the logarithm of the density of what they show."""
     groups: Sequence[Sequence[Indices]] = ()
     """Rows that share an unknown amount, several groups per hypothesis."""
+    systematic: Sequence[SystematicEffect] = ()
+    """Effects that the machine may have."""
     silent: Sequence[Indices] = ()
     """Rows that say nothing."""
     shifts: Sequence[MachineShift] = ()

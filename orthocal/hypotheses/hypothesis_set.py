@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from orthocal.arrays import Array
 from orthocal.hypotheses.anomaly import Explanation
-from orthocal.hypotheses.hypothesis import MachineShift
+from orthocal.hypotheses.hypothesis import MachineShift, SystematicEffect
 from orthocal.hypotheses.likelihood import Score
 from orthocal.hypotheses.linear_model import ModelLinearisation
 from orthocal.session.session import Session
@@ -30,6 +30,8 @@ class Term:
     """Correction of the rows, shape (n_rows,), [m]."""
     effects: Array | None = None
     """Effects of unknown amounts on the rows, shape (k, n_rows)."""
+    systematic: SystematicEffect | None = None
+    """Effect of the machine, of which `change` and `effects` are the change and the columns."""
     silent: NDArray[np.int64] | None = None
     """Rows that say nothing."""
     shift: MachineShift | None = None
@@ -101,10 +103,27 @@ def explain_with_amounts(state: HypothesisSet) -> list[Explanation]:
         e = term.explanation
         unit = 1.0 if term.shift is None else term.shift.unit
         single = term.effects is not None and len(term.effects) == 1 and e.kind != "row offset"
-        if single or (term.shift is not None and not term.known):
+        if term.systematic is not None:
+            e = _with_parameters(e, term.systematic, amounts, stds)
+        elif single or (term.shift is not None and not term.known):
             e = replace(e, amount=float(amounts[0] * unit), std=float(stds[0] * unit))
         result.append(e)
     return result
+
+
+def _with_parameters(
+    e: Explanation, effect: SystematicEffect, amounts: Array, stds: Array
+) -> Explanation:
+    """Explanation with the parameters of an effect that were estimated, in prior std."""
+    values = np.where(effect.positive, np.maximum(amounts, 0.0), amounts)
+    return replace(
+        e,
+        amount=float(np.ptp(effect.change + values @ effect.columns)),
+        parameters=tuple(p.name for p in effect.parameters),
+        units=tuple(p.unit for p in effect.parameters),
+        amounts=tuple((values * effect.prior_stds).tolist()),
+        stds=tuple((stds * effect.prior_stds).tolist()),
+    )
 
 
 def is_same_place(one: HypothesisSet, other: HypothesisSet) -> bool:

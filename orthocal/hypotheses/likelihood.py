@@ -13,14 +13,14 @@ over a grid of τ. Rows that say nothing are effects with a flat prior.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from orthocal.arrays import Array, Mask
 
 TOLERANCE_SCALES = np.geomspace(0.1, 16.0, 9)
 """Grid of the tolerance scale e."""
@@ -49,6 +49,9 @@ LEAST = 1e-9
 LARGEST_AMOUNT = 1e9
 """Standard deviation of the amount of an effect that no entry shows, over the noise."""
 
+LEAST_CHANCE = 1e-300
+"""Probability below which no smaller one is distinguished."""
+
 MOST_SEPARATE = 2
 """Groups of effects up to which each has a τ of its own; beyond, all share one."""
 
@@ -61,6 +64,16 @@ class Products:
     """With the principal directions, shape (h, r), [m]."""
     square: Array
     """With themselves, shape (h,), [m²]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AmountPrior:
+    """Prior of the amounts of a group of effects, per unit."""
+
+    stds: Array
+    """Grid of their common standard deviation τ, shape (t,)."""
+    positive: Mask
+    """Mask of amounts that are never negative (half-normal), shape (k,)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,7 +177,12 @@ class Likelihood:
         return np.asarray(logs - 0.5 * max(self.dof - len(variance), 0) * np.log(noise))
 
     def score_set(
-        self, deviation: Array, groups: Sequence[Array] = (), silent: Array | None = None
+        self,
+        deviation: Array,
+        groups: Sequence[Array] = (),
+        silent: Array | None = None,
+        *,
+        priors: Sequence[AmountPrior | None] = (),
     ) -> Score:
         """Marginal likelihood of one deviation with any number of effects.
 
@@ -173,6 +191,7 @@ class Likelihood:
             groups: Effects per unit, zeros projected out, (k, n_entries) each; the amounts of a
                 group share one prior standard deviation τ.
             silent: Indicators of rows that say nothing, zeros projected out, (m, n_entries).
+            priors: Of the amounts of each group; None for normal ones with τ on the grid AMOUNTS.
         """
         logs = self.log_densities(self.products(deviation[None]))[0] + self.weights
         sizes = [len(g) for g in groups]
@@ -181,24 +200,25 @@ class Likelihood:
             return self._best(logs, np.zeros((logs.size, 0)), np.zeros((logs.size, 0, 0)))
         vectors = np.concatenate([*groups, *([] if silent is None else [silent])])
         gram, slope = self._gram(deviation, vectors)
-        separate = len(sizes) <= MOST_SEPARATE
-        grid = (
-            list(product(AMOUNTS, repeat=len(sizes)))
-            if separate
-            else [(a,) * len(sizes) for a in AMOUNTS]
-        )
+        chosen = list(priors) or [None] * len(groups)
+        grid = _grid_of_stds([AMOUNTS * self.sigma if p is None else p.stds for p in chosen])
+        signs = [
+            np.zeros(k, bool) if p is None else p.positive
+            for p, k in zip(chosen, sizes, strict=True)
+        ]
+        positive = np.concatenate([*signs, np.zeros(n_silent, bool)])
         gains = []
         for taus in grid:
-            precision = np.repeat(1.0 / (np.array(taus) * self.sigma) ** 2, sizes)
-            full = gram + np.diag(np.append(precision, np.zeros(n_silent)))
-            solution = np.linalg.solve(full, slope[..., None])[..., 0]
-            gain = 0.5 * ((slope * solution).sum(axis=1) - np.linalg.slogdet(full)[1])
-            gains.append(gain + 0.5 * np.log(precision).sum())
+            precision = np.append(np.repeat(np.array(taus) ** -2.0, sizes), np.zeros(n_silent))
+            gains.append(_integrate_amounts(gram, slope, precision, positive))
         every = logs + log_of_sum(np.array(gains), axis=0) - np.log(len(grid))
         every = every + 0.5 * n_silent * np.log(2.0 * np.pi)
         # the amount of an effect that no entry shows is 0, with a standard deviation beyond all
         floor = 1e-12 * np.trace(gram, axis1=1, axis2=2) + (LARGEST_AMOUNT * self.sigma) ** -2
         gram = gram + floor[:, None, None] * np.eye(len(vectors))
+        likeliest = grid[int(np.argmax([log_of_sum(logs + g) for g in gains]))]
+        known = [t**-2.0 if p else 0.0 for p, t in zip(chosen, likeliest, strict=True)]
+        gram = gram + np.diag(np.append(np.repeat(known, sizes), np.zeros(n_silent)))
         return self._best(every, np.linalg.solve(gram, slope[..., None])[..., 0], gram)
 
     def _best(self, logs: Array, amounts: Array, gram: Array) -> Score:
@@ -229,6 +249,38 @@ class Likelihood:
             (components * along) @ inverse + np.outer(perpendicular @ deviation, inverse_noise)
         ).T
         return gram, np.asarray(slope)
+
+
+def _grid_of_stds(stds: Sequence[Array]) -> list[tuple[float, ...]]:
+    """Standard deviations of the groups: all combinations of few groups, else one for all."""
+    if len(stds) <= MOST_SEPARATE:
+        return list(product(*(s.tolist() for s in stds)))
+    most = max(s.size for s in stds)
+    return [tuple(float(s[i % s.size]) for s in stds) for i in range(most)]
+
+
+def _integrate_amounts(gram: Array, slope: Array, precision: Array, positive: Mask) -> Array:
+    """Gain of log likelihood by amounts with a normal or half-normal prior, shape (g,).
+
+    A half-normal amount a ≥ 0 has twice the density, and of its posterior N(m, s²) the part above
+    0 counts: ln 2 Φ(m/s). Several are treated as independent.
+
+    Args:
+        gram: W V⁻¹ Wᵀ, shape (g, k, k).
+        slope: W V⁻¹ d, shape (g, k).
+        precision: Of the priors, 0 for a flat one, shape (k,).
+        positive: Mask of half-normal priors, shape (k,).
+    """
+    full = gram + np.diag(precision)
+    solution = np.linalg.solve(full, slope[..., None])[..., 0]
+    gain = 0.5 * ((slope * solution).sum(axis=1) - np.linalg.slogdet(full)[1])
+    gain += 0.5 * np.log(precision[precision > 0.0]).sum()
+    if positive.any():
+        stds = np.sqrt(np.diagonal(np.linalg.inv(full), axis1=1, axis2=2))
+        ratio = (solution / stds)[:, positive]
+        doubled = [math.erfc(-r / math.sqrt(2.0)) for r in ratio.ravel().tolist()]
+        gain += np.log(np.maximum(doubled, LEAST_CHANCE)).reshape(ratio.shape).sum(axis=1)
+    return np.asarray(gain)
 
 
 def log_of_sum(logs: Array, axis: int | None = None) -> Array:

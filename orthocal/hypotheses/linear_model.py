@@ -20,6 +20,7 @@ from orthocal.hypotheses.hypothesis import (
     MachineShift,
     Patterns,
     Sparse,
+    SystematicEffect,
     row_products,
 )
 from orthocal.hypotheses.likelihood import Likelihood, Products, build_likelihood
@@ -266,6 +267,34 @@ class LinearModel:
             except (ClosureError, np.linalg.LinAlgError):
                 break
         return about
+
+    def linearise_effect(self, name: str) -> SystematicEffect:
+        """Change of the rows by an effect that the robot lacks, about the nominal machine.
+
+        Args:
+            name: Name of the effect.
+
+        Raises:
+            RobotError: If the effect needs keys that the robot's YAML lacks.
+        """
+        session, o = self.problem.session, self.problem.observations
+        robot = session.robot
+        other = session.with_effects((*robot.effect_names, name))
+        known = other.robot.parameters
+        errors = [n for n in known.names if n not in robot.parameters]
+        offsets = [self.problem.free[i] for i in self.offsets.values()]
+        selection = select_parameters(known, free=[*offsets, *errors], prior=True)
+        problem = CalibrationProblem(other, selection)
+        reading, jacobian = problem.predict_and_jacobian(problem.active_theta)
+        nominal = self.problem.predict(self.problem.active_theta) * self.problem.noise_ratio
+        own = set(self.problem.free) | set(offsets)
+        new = [i for i, n in enumerate(problem.free) if n not in own]
+        return SystematicEffect(
+            name,
+            tuple(problem.parameters[i] for i in new),
+            o.rows(reading - nominal),
+            o.rows(jacobian[:, new]).T,
+        )
 
     def shift_entries(self, about: ModelLinearisation, shift: MachineShift) -> Array:
         """Effect of a machine shift on the entries, zeros projected out, (n_entries,), [m]."""

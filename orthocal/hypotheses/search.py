@@ -20,13 +20,14 @@ from orthocal.arrays import Array
 from orthocal.errors import ClosureError
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, AnomalyKind
 from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
+from orthocal.hypotheses.families.effects import find_effects, unmodelled_effects
 from orthocal.hypotheses.families.inconsistent_group import inconsistent_groups
 from orthocal.hypotheses.families.row_offset import row_offsets
 from orthocal.hypotheses.families.sessions import MOST_DRIVES, changes_between_sessions
 from orthocal.hypotheses.families.single_reading import wrong_readings
 from orthocal.hypotheses.families.swapped_rows import swapped_rows
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
-from orthocal.hypotheses.hypothesis import Family, Rows, sparse_rows, to_dense
+from orthocal.hypotheses.hypothesis import Family, Rows, SystematicEffect, sparse_rows, to_dense
 from orthocal.hypotheses.hypothesis_set import (
     HypothesisSet,
     Term,
@@ -40,7 +41,7 @@ from orthocal.hypotheses.hypothesis_set import (
     share_rows,
     split_amounts,
 )
-from orthocal.hypotheses.likelihood import Products, log_of_sum
+from orthocal.hypotheses.likelihood import AmountPrior, Products, log_of_sum
 from orthocal.hypotheses.linear_model import (
     FURTHEST,
     MOST_ROUNDS,
@@ -55,13 +56,20 @@ CLEARLY = 7.0
 """Logarithm of the Bayes factor from which on an anomaly is reported: by chance in at most one of
 e⁷ = 1,100 sessions."""
 
+EFFECT_CLEARLY = 5.0
+"""Logarithm of the Bayes factor, prior probability aside, from which on an effect of the machine is
+reported that the model lacks: such effects are usual. By chance in at most one of 150 sessions."""
+
+EFFECT_SCALES = np.array([1.0, 4.0])
+"""Grid of factors between the parameters of an effect and their tolerances."""
+
 NEARLY = 3.0
 """Logarithm of the Bayes factor up to which another explanation is nearly as likely."""
 
 WORTH_REFITTING = 4.0
 """Logarithm of the Bayes factor, to first order, from which on hypotheses are linearised anew."""
 
-FAMILIES = 28.0
+FAMILIES = 31.0
 """Families that share the prior probability."""
 
 MOST_ANOMALIES = 4
@@ -129,6 +137,7 @@ class _Search:
         self.model = model
         self.values = session.values
         self.slopes = len(model.labels) > 1
+        self.effects = find_effects(model)
         start = model.linearise(np.zeros(model.problem.n_free), (), None, slopes=self.slopes)
         self.sound = self.evaluate((), start)
 
@@ -178,6 +187,11 @@ class _Search:
         entries = model.entries(rows[None])[0]
         known = [t.shift for t in terms if t.shift is not None and t.known]
         free = [t.shift for t in terms if t.shift is not None and not t.known]
+        priors = [
+            None if t.systematic is None else _prior_of(t.systematic)
+            for t in terms
+            if t.effects is not None or (t.shift is not None and not t.known)
+        ]
         applied, about = np.zeros(len(free)), start
         if known or free:
             base = self.sound.about
@@ -186,7 +200,7 @@ class _Search:
         for k in range(MOST_ROUNDS + 1):
             groups, silent, steps = self._vectors(terms, about)
             deviation = entries - about.expected + applied @ steps
-            score = about.likelihood.score_set(deviation, groups, silent)
+            score = about.likelihood.score_set(deviation, groups, silent, priors=priors)
             every = [*groups, *([] if silent is None else [silent])]
             remaining = deviation - (score.amounts @ np.concatenate(every) if every else 0.0)
             errors = about.errors_for(
@@ -238,15 +252,28 @@ class _Search:
     ) -> tuple[HypothesisSet | None, list[HypothesisSet]]:
         """The best set with one or two hypotheses more, and others nearly as likely."""
         rows = Rows(self.session, state.corrected)
-        scored = list(self._score(state, _families(self.model, rows, grouped=grouped)))
+        families = [
+            *_families(self.model, rows, grouped=grouped),
+            *unmodelled_effects(rows, self._lacking(state)),
+        ]
+        scored = list(self._score(state, families))
+        effects = [
+            self._term(f, 0, rows)
+            for f, evidence in scored
+            if f.systematic and evidence[0] > EFFECT_CLEARLY - np.log(FAMILIES) - COARSE
+        ]
         totals = [log_of_sum(evidence) for _, evidence in scored if evidence.size]
         pairs, total = self._pairs(state, scored)
         best = float(log_of_sum(np.array([*totals, total]))) if totals else -np.inf
-        if best < WORTH_REFITTING:
+        if best < WORTH_REFITTING and not effects:
             return None, []
         scored += list(self._score(state, inconsistent_groups(rows)))
         single = self._shortlist(scored, rows)
-        chosen = [*((t,) for t in single), *pairs, *self._moved_together(state, scored, rows)]
+        chosen = [
+            *((t,) for t in (*effects, *single)),
+            *pairs,
+            *self._moved_together(state, scored, rows),
+        ]
         tried = [self.evaluate((*state.terms, *more), state.about) for more in chosen]
         likeliest = min(tried, key=negative_log_posterior)
         if not self.is_plausible(likeliest) and len(state.terms) + 2 <= MOST_ANOMALIES:
@@ -256,13 +283,23 @@ class _Search:
         plausible = [s for s in ranked if self.is_plausible(s)]
         if plausible and plausible[0].log_posterior > ranked[0].log_posterior - CLEARLY:
             ranked = plausible
-        if ranked[0].log_posterior < state.log_posterior + CLEARLY:
+        clear = [s for s in ranked if _is_clear(s, state)]
+        if not clear or clear[0].log_posterior < ranked[0].log_posterior - NEARLY:
             return None, []
+        if not _is_clear(ranked[0], state):
+            return clear[0], []
         near = _nearly_as_likely(ranked, plausible)
+        if _needed(ranked[0].terms[-1]) < CLEARLY:
+            near = [s for s in near if _is_clear(s, state)]
         simplest = min(near, key=lambda s: s.size)
         if is_same_place(simplest, near[0]):
             simplest = near[0]
         return simplest, [s for s in near if s is not simplest]
+
+    def _lacking(self, state: HypothesisSet) -> list[SystematicEffect]:
+        """Effects of the machine that a state lacks."""
+        have = {t.systematic.name for t in state.terms if t.systematic is not None}
+        return [e for e in self.effects if e.name not in have]
 
     def _moved_together(
         self, state: HypothesisSet, scored: list[tuple[Family, Array]], rows: Rows
@@ -305,11 +342,12 @@ class _Search:
         """Take out hypotheses that the others make superfluous."""
         while len(state.terms) > 1:
             fewer = [
-                self.evaluate([t for t in state.terms if t is not out], self.sound.about)
+                (min(NEARLY, _needed(out)), self.evaluate(others, self.sound.about))
                 for out in state.terms
+                for others in [[t for t in state.terms if t is not out]]
             ]
-            best = max(fewer, key=lambda s: s.log_posterior)
-            if best.log_posterior < state.log_posterior - NEARLY:
+            least, best = max(fewer, key=lambda pair: pair[1].log_posterior)
+            if best.log_posterior < state.log_posterior - least:
                 break
             state = best
         return state
@@ -330,6 +368,17 @@ class _Search:
                             deviation, [self.model.entries(_marks(g, rows_count))]
                         ).log_likelihood
                         for g in family.groups
+                    ]
+                )
+            elif family.systematic:
+                logs = np.array(
+                    [
+                        likelihood.score_set(
+                            deviation - self.model.entries(e.change[None])[0],
+                            [self.model.entries(e.columns)],
+                            priors=[_prior_of(e)],
+                        ).log_likelihood
+                        for e in family.systematic
                     ]
                 )
             elif family.silent:
@@ -389,6 +438,9 @@ class _Search:
         explanation = family.explain(h)
         if family.groups:
             return Term(explanation, prior, effects=_marks(family.groups[h], rows.count))
+        if family.systematic:
+            effect = family.systematic[h]
+            return Term(explanation, prior, -effect.change, effect.columns, effect)
         if family.silent:
             return Term(explanation, prior, silent=family.silent[h])
         if family.shifts:
@@ -410,7 +462,8 @@ class _Search:
         ranked = sorted(
             (
                 (float(evidence[h]), i, h)
-                for i, (_, evidence) in enumerate(scored)
+                for i, (family, evidence) in enumerate(scored)
+                if not family.systematic
                 for h in np.argsort(-evidence)[:MOST_REFITTED].tolist()
             ),
             reverse=True,
@@ -500,6 +553,17 @@ class _Search:
         )
 
 
+def _is_clear(found: HypothesisSet, state: HypothesisSet) -> bool:
+    """True if a set is so much more likely than a state, which it extends, that it is reported."""
+    gain = found.log_posterior - state.log_posterior
+    return gain >= max(_needed(t) for t in found.terms[len(state.terms) :])
+
+
+def _needed(term: Term) -> float:
+    """Gain of log posterior from which on a hypothesis is reported."""
+    return CLEARLY if term.systematic is None else EFFECT_CLEARLY - float(np.log(FAMILIES))
+
+
 def _nearly_as_likely(
     ranked: list[HypothesisSet], plausible: list[HypothesisSet]
 ) -> list[HypothesisSet]:
@@ -531,7 +595,7 @@ def _is_paired(family: Family) -> bool:
 
     Those that change the machine do not, nor those that scale a volume of many readings.
     """
-    if family.edits is None and family.effects is None:
+    if family.systematic or (family.edits is None and family.effects is None):
         return False
     if family.edits is not None and family.effects is not None:
         return False
@@ -542,6 +606,11 @@ def _prior(family: Family) -> Array:
     """Logarithms of prior probabilities, with the factor on volumes, shape (h,)."""
     prior = np.full(family.count, -np.log(family.size * FAMILIES))
     return prior if family.log_volume is None else prior + family.log_volume
+
+
+def _prior_of(effect: SystematicEffect) -> AmountPrior:
+    """Prior of the parameters of an effect, in prior std."""
+    return AmountPrior(EFFECT_SCALES, effect.positive)
 
 
 def _marks(groups: Sequence[NDArray[np.int64]], count: int) -> Array:

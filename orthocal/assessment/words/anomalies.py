@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from orthocal.assessment.wording import joined, note, plain, review, signed, spans, um
+from orthocal.assessment.wording import joined, mm, note, plain, review, signed, spans, um
 from orthocal.calibration.assessment_record import Finding, Place
-from orthocal.hypotheses.anomaly import Anomalies, Anomaly, Explanation
+from orthocal.hypotheses.anomaly import EFFECT_KINDS, Anomalies, Anomaly, Explanation
 from orthocal.session.session import Session
-from orthocal.units import MM, UM
+from orthocal.units import EDGE_UNITS, MM, UM, Unit
 
 MOST_PLACES = 20
 """Places of a finding that are kept."""
@@ -41,6 +41,10 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
     text = f"{_lines(session, e)}it looks as if {' or '.join(ways)}."
     text = f"{text[0].upper()}{text[1:]}"
     numbers = _numbers(result, anomaly)
+    if e.amounts:
+        numbers["amount_um"] = (e.amount or 0.0) / UM
+        action = _effect_remedy(session, result)
+        return review(e.kind, text, action, _effect_places(session, e), **numbers)
     if anomaly.expected is not None:
         text += (
             f" It reads {signed(first.value / MM)} mm; the other readings predict "
@@ -53,6 +57,28 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
         }
     action = "Read it again, or leave it out." if anomaly.causes else _remedy(session, e)
     return review(e.kind, text, action, _places(session, e), **numbers)
+
+
+def _effect_places(session: Session, e: Explanation) -> tuple[Place, ...]:
+    """Setups of a drift; otherwise the parameters of an effect that clearly differ from 0."""
+    if e.kind == "drift":
+        return _places(session, e)
+    return tuple(Place(parameter=name) for name, *_ in _clear_amounts(e))
+
+
+def _effect_remedy(session: Session, result: Anomalies) -> str:
+    """Calibration with all effects that were found, beside those that the machine has."""
+    kinds = {a.explanation.kind for a in result.found if a.explanation.amounts}
+    names = [*session.robot.effect_names, *(n for n, kind in EFFECT_KINDS.items() if kind in kinds)]
+    return f"Calibrate with `--effects {','.join(names)}`."
+
+
+def _clear_amounts(e: Explanation) -> list[tuple[str, float, float, Unit]]:
+    """Parameters of an effect that clearly differ from 0, or the clearest: value, std and unit."""
+    every = range(len(e.amounts))
+    found = [(e.parameters[i], e.amounts[i], e.stds[i], e.units[i]) for i in every]
+    found.sort(key=lambda entry: -abs(entry[1]) / entry[2])
+    return [f for f in found if abs(f[1]) > 2.0 * f[2]] or found[:1]
 
 
 def _ambiguous(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding:
@@ -249,10 +275,18 @@ def _text(session: Session, e: Explanation) -> str:
             f"the same {len(e.rows)} times"
         ),
         "displaced gauge": lambda: _displaced(session, e),
-        "drift": lambda: (
-            f"the readings of setup {e.setups[0]} drifted from the first to the last"
-            if len(e.setups) == 1
-            else "the readings of every setup drifted alike from its first to its last"
+        "drift": lambda: _drifted(e),
+        "backlash": lambda: (
+            f"the drives have backlash: {_amounts(e)}. Readings differ by up to "
+            f"{mm(e.amount or 0.0)} mm with the side from which a posture is approached"
+        ),
+        "thermal expansion": lambda: (
+            f"the readings follow the temperature, by up to {mm(e.amount or 0.0)} mm: legs and "
+            "screws expand differently"
+        ),
+        "periodic screw error": lambda: (
+            f"the drives have a periodic error, {_amounts(e)}: readings change with the "
+            f"turn of the screws by up to {mm(e.amount or 0.0)} mm"
         ),
         "machine changed": lambda: _changed(session, e),
         "offset of one drive": lambda: (
@@ -267,6 +301,23 @@ def _text(session: Session, e: Explanation) -> str:
         "offsets interchanged": lambda: _entered(e, "was interchanged", "were interchanged"),
     }
     return texts[e.kind]()
+
+
+def _amounts(e: Explanation) -> str:
+    """Parameters of an effect with their limits: x_slide.backlash 0.045 ± 0.010 mm."""
+    texts = []
+    for name, amount, std, unit in _clear_amounts(e):
+        edge, size = EDGE_UNITS[unit]
+        texts.append(f"{name} {plain(amount / size)} ± {plain(2.0 * std / size)} {edge}")
+    return joined(texts)
+
+
+def _drifted(e: Explanation) -> str:
+    if len(e.setups) == 1:
+        return f"the readings of setup {e.setups[0]} drifted from the first to the last"
+    if not e.amounts:
+        return "the readings of every setup drifted alike from its first to its last"
+    return f"the gauges drifted while they were read, by up to {mm(e.amount or 0.0)} mm in a setup"
 
 
 def _written(session: Session, e: Explanation, how: str) -> str:
@@ -362,7 +413,8 @@ def _remedy(session: Session, e: Explanation) -> str:
         "displaced gauge": f"If so, read setup {''.join(e.names[:1])} again, or make a new setup "
         "of the later readings.",
         "drift": "Wait until machine and gauge have the same temperature, and return to the first "
-        "posture at the end of the setup.",
+        "posture at the end of the setup. Or calibrate with `--effects "
+        f"{','.join((*session.robot.effect_names, 'drift'))}`.",
     }
     return remedies.get(e.kind, "Read it again, or leave it out.")
 

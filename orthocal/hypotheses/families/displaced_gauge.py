@@ -1,6 +1,6 @@
-"""Displaced gauge, drift and stuck dial: what changes while a setup is read.
+"""Displaced gauge and stuck dial: what changes while a setup is read.
 
-Differences of postures show neither a displaced gauge nor a drift.
+Differences of postures do not show a displaced gauge.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from orthocal.hypotheses.anomaly import Explanation
 from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, Tails, sparse_rows
 
 FEWEST = 4
-"""Readings of a setup below which a tail or a drift is not distinguished from an outlier."""
+"""Readings of a setup below which a tail is not distinguished from an outlier."""
 
 FEWEST_STUCK = 3
 """Equal readings in a row from which on a dial may have stuck."""
@@ -24,13 +24,13 @@ MOST_STUCK = 16
 
 
 def displaced_gauges(rows: Rows, sigma: float) -> Iterator[Family]:
-    """Gauges displaced within a setup or for one cycle, drifts, stuck dials.
+    """Gauges displaced within a setup or for one cycle, stuck dials.
 
     Args:
         rows: The rows.
         sigma: Standard deviation of a reading, [m].
     """
-    for family in (_displaced(rows), _cycle_apart(rows), _drift(rows), _stuck(rows, sigma)):
+    for family in (_displaced(rows), _cycle_apart(rows), _stuck(rows, sigma)):
         if family is not None:
             yield family
 
@@ -68,25 +68,6 @@ def _cycle_apart(rows: Rows) -> Family | None:
             at = tuple(indices.tolist())
             found.append(Explanation("displaced gauge", "cycle", at, names=(name,), cycle=cycle))
     return Family.with_effects(rows, found) if found else None
-
-
-def _drift(rows: Rows) -> Family | None:
-    """Drift of each setup, and the same drift of all."""
-    drifting = {
-        name: indices
-        for name, indices in rows.setups.items()
-        if indices.size >= FEWEST and rows.single[indices].all()
-    }
-    found = [
-        Explanation("drift", "setup", tuple(indices.tolist()), (name,))
-        for name, indices in drifting.items()
-    ]
-    ramps = [np.linspace(0.0, 1.0, indices.size) for indices in drifting.values()]
-    if len(found) > 1:
-        every = tuple(i for e in found for i in e.rows)
-        found.append(Explanation("drift", "session", every, tuple(drifting)))
-        ramps.append(np.concatenate(ramps))
-    return Family.with_effects(rows, found, ramps) if found else None
 
 
 def _stuck(rows: Rows, sigma: float) -> Family | None:

@@ -1,0 +1,100 @@
+"""Systematic effects that readings show although the machine's model lacks them.
+
+How an effect changes the readings comes from the effect itself (`LinearModel.linearise_effect`).
+Effects that the model has are not sought.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from orthocal.arrays import Indices
+from orthocal.effects.loading import with_effects
+from orthocal.effects.registry import find_effect
+from orthocal.errors import RobotError
+from orthocal.hypotheses.anomaly import EFFECT_KINDS, Explanation
+from orthocal.hypotheses.hypothesis import Family, Rows, SystematicEffect, group_rows
+from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.observation.observations import readings_without
+from orthocal.session.session import Session
+
+FEWEST = 4
+"""Readings of a setup below which a drift is not distinguished from an outlier."""
+
+LEAST_COLUMN = 1e-3
+"""Part of the noise by which a parameter must move the readings to be considered."""
+
+
+def missing_effects(session: Session) -> tuple[str, ...]:
+    """Names of the effects that the robot of a session could have, and has not."""
+    found = []
+    for name in EFFECT_KINDS:
+        if name in session.robot.effect_names:
+            continue
+        try:
+            with_effects(session.robot, (*session.robot.effect_names, name))
+        except RobotError:  # the YAML lacks one of its keys
+            continue
+        found.append(name)
+    return tuple(found)
+
+
+def rows_without(session: Session, name: str) -> Indices:
+    """Rows that lack a condition which an effect needs."""
+    kind = find_effect(name, where="effects", error=RobotError)
+    lacking = {id(r) for c in kind.conditions for r in readings_without(session, c)}
+    return np.flatnonzero([id(r) in lacking for r in session.readings])
+
+
+def find_effects(model: LinearModel) -> list[SystematicEffect]:
+    """Effects that the readings of a session could show, but the model lacks."""
+    session, found = model.problem.session, []
+    for name in missing_effects(session):
+        lacking = rows_without(session, name)
+        if lacking.size == len(session.readings):
+            continue
+        effect = model.linearise_effect(name)
+        seen = np.abs(effect.columns).max(axis=1) > LEAST_COLUMN * model.sigma
+        if lacking.size:  # those of setups whose rows all have the conditions
+            seen &= ~effect.columns[:, lacking].any(axis=1)
+            seen &= [p.name.startswith("setup.") for p in effect.parameters]
+        if seen.any():
+            found.append(effect.select(seen))
+    return found
+
+
+def unmodelled_effects(rows: Rows, effects: Sequence[SystematicEffect]) -> Iterator[Family]:
+    """Effects with all their parameters, and drifts of single setups.
+
+    Args:
+        rows: The rows.
+        effects: Of `find_effects`.
+    """
+    for effect in effects:
+        if effect.name == "drift":
+            yield from _drifts(rows, effect)
+        every = np.flatnonzero(effect.change.astype(bool) | effect.columns.any(axis=0))
+        setups = tuple(dict.fromkeys(rows.session.readings[i].setup for i in every))
+        e = Explanation(EFFECT_KINDS[effect.name], "session", tuple(every.tolist()), setups)
+        yield Family.of([e], systematic=[effect])
+
+
+def _drifts(rows: Rows, effect: SystematicEffect) -> Iterator[Family]:
+    """Drift of each setup by any amount, and the same drift of all."""
+    session, found, ramps = rows.session, [], []
+    of_setup = group_rows(r.setup for r in session.readings)
+    for column in effect.columns:
+        setup = session.readings[int(np.abs(column).argmax())].setup
+        if of_setup[setup].size >= FEWEST:
+            found.append(Explanation("drift", "setup", tuple(of_setup[setup].tolist()), (setup,)))
+            ramp = column[of_setup[setup]]
+            ramps.append(ramp / np.ptp(ramp))
+    if len(found) > 1:
+        every = tuple(i for e in found for i in e.rows)
+        names = tuple(e.setups[0] for e in found)
+        found.append(Explanation("drift", "session", every, names))
+        ramps.append(np.concatenate(ramps))
+    if found:
+        yield Family.with_effects(rows, found, ramps)
