@@ -1,0 +1,153 @@
+"""Effects that the model lacks: named from the readings, and never without them.
+
+`python tests/benchmarks/checking.py --effects 1000` prints the shares.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from effect_plans import write_plan
+from scipy.integrate import quad
+
+from orthocal import check_session, load_plan, load_session, simulate_session
+from orthocal.hypotheses.families.effects import find_effects, missing_effects
+from orthocal.hypotheses.likelihood import AmountPrior, build_likelihood
+from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.hypotheses.search import find_anomalies
+
+EFFECTS = "backlash: {}, thermal: {}, drift: {}, screw: {lead_mm: 10}"
+GEOMETRY = {"x_slide.offset": 0.1e-3, "y_leg.length": 40e-6, "z_slide.offset": -0.2e-3}
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory):
+    """Three setups, each posture approached from both sides while it gets warmer."""
+    plan = load_plan(write_plan(tmp_path_factory.mktemp("effects") / "plan", effects=EFFECTS))
+    return plan.select([r for r in plan.readings if r.setup in ("yx", "xy", "xz")])
+
+
+def read(plan, effect, errors):
+    """Readings of a machine that has an effect, as of one whose model has none."""
+    machine = plan.with_effects([effect] if effect else [])
+    return simulate_session(machine, GEOMETRY | errors, seed=4).session.with_effects([])
+
+
+@pytest.fixture(scope="module")
+def with_backlash(plan):
+    return read(plan, "backlash", {"y_slide.backlash": 50e-6})
+
+
+def test_backlash_is_named_with_its_drive_and_amount(with_backlash):
+    (found,) = find_anomalies(with_backlash).found
+    e = found.explanation
+    assert (e.kind, found.ambiguous) == ("backlash", False)
+    amounts = dict(zip(e.parameters, zip(e.amounts, e.stds, strict=True), strict=True))
+    value, std = amounts["y_slide.backlash"]
+    assert value == pytest.approx(50e-6, abs=3.0 * std)
+    assert std < 10e-6
+    assert amounts["x_slide.backlash"][0] < 10e-6
+
+
+def test_the_finding_says_what_to_do(with_backlash):
+    assessment = check_session(with_backlash)
+    (found,) = [f for f in assessment.findings if f.severity != "note"]
+    assert (found.kind, found.severity) == ("backlash", "review")
+    assert [p.parameter for p in found.places] == ["y_slide.backlash"]
+    assert "--effects backlash" in found.action
+    assert assessment.decision.verdict == "review"
+
+
+def test_an_effect_in_the_model_is_not_sought(with_backlash):
+    chosen = with_backlash.with_effects(["backlash"])
+    assert "backlash" not in missing_effects(chosen)
+    assert find_anomalies(chosen).found == ()
+
+
+def test_drift_of_the_gauges_is_named(plan):
+    """Rates of up to 2.5 µm/min, in the time that the readings state."""
+    session = read(plan, None, {})
+    rate = dict(zip(session.setups, (2.5e-6, -2.0e-6, 2.2e-6), strict=True))
+    began = {r.setup: r.conditions.time for r in reversed(session.readings)}
+    drifted = [
+        r.value + rate[r.setup] * (r.conditions.time - began[r.setup]).total_seconds() / 60.0
+        for r in session.readings
+    ]
+    (found,) = find_anomalies(session.with_values(drifted)).found
+    e = found.explanation
+    assert (e.kind, e.scope, e.setups) == ("drift", "session", tuple(session.setups))
+    difference = np.array(e.amounts) - np.array(list(rate.values())) / 60.0
+    assert (np.abs(difference) < 3.0 * np.array(e.stds)).all()
+
+
+@pytest.mark.parametrize("effect", ["backlash", "thermal", "screw", "drift"])
+def test_sound_machines_show_no_effect(plan, effect):
+    """Also where the machine has the effect, but at a thousandth of its tolerance."""
+    machine = plan.with_effects([effect])
+    names = [n for n in machine.robot.parameters.of_effects]
+    errors = {n: 1e-3 * machine.robot.parameters[n].prior_std for n in names}
+    assert find_anomalies(read(plan, effect, errors)).found == ()
+
+
+def test_an_approach_from_one_side_shows_no_backlash(plan):
+    """Whatever its size: it moves the readings as an offset does."""
+    one_side = [r for r in plan.readings if r.approach[r.setup != "yx"] == "p"]
+    readings = [replace(r, conditions=replace(r.conditions, approach="ppp")) for r in one_side]
+    session = read(plan.select(readings), "backlash", {"y_slide.backlash": 0.1e-3})
+    assert find_anomalies(session).found == ()
+
+
+def test_a_reversed_sign_is_not_called_an_effect(plan):
+    session = read(plan, None, {})
+    values = session.values.copy()
+    row = int(np.abs(values).argmax())
+    values[row] *= -1.0
+    (found,) = find_anomalies(session.with_values(values)).found
+    assert (found.explanation.kind, found.explanation.rows) == ("reversed sign", (row,))
+
+
+def test_readings_without_conditions_show_no_backlash(root):
+    session = load_session(root / "examples/raw-cycles")
+    assert missing_effects(session) == ("backlash", "thermal", "drift")
+    assert [e.name for e in find_effects(LinearModel(session))] == ["drift"]
+
+
+@pytest.mark.parametrize("effect", ["backlash", "thermal", "screw"])
+def test_the_columns_are_those_of_the_effect(plan, effect):
+    """Differences of exact readings of machines with and without it."""
+    bare, machine = plan.with_effects([]), plan.with_effects([effect])
+    found = LinearModel(bare).linearise_effect(effect)
+
+    def differ(one, other):
+        """Of readings whose first of each setup is 0."""
+        shown = one.values - other.values
+        firsts = [next(i for i, r in enumerate(bare.readings) if r.setup == n) for n in bare.setups]
+        of_setup = [list(bare.setups).index(r.setup) for r in bare.readings]
+        return shown, np.array(firsts)[of_setup]
+
+    nominal = simulate_session(machine, {}, exact=True).session
+    change, first = differ(nominal, simulate_session(bare, {}, exact=True).session)
+    assert found.change - found.change[first] == pytest.approx(change, abs=1e-10)
+    for parameter, column in zip(found.parameters, found.columns, strict=True):
+        errors = {parameter.name: 0.1 * parameter.prior_std}
+        moved, _ = differ(simulate_session(machine, errors, exact=True).session, nominal)
+        assert 0.1 * (column - column[first]) == pytest.approx(moved, abs=1e-9)
+
+
+def test_a_half_normal_amount_is_integrated_over():
+    """One column, against quadrature at each pair of scales."""
+    rng = np.random.default_rng(3)
+    jacobian, column = rng.normal(size=(8, 3)), rng.normal(size=8)
+    likelihood, _, _ = build_likelihood(jacobian, sigma=1.0, dof=8, stated=True)
+    prior = AmountPrior(np.array([1.5]), np.array([True]))
+    for amount in (2.0, -1.0):
+        deviation = amount * column + rng.normal(size=8)
+
+        def likelihood_of(a, deviation=deviation):
+            log = likelihood.score(likelihood.products((deviation - a * column)[None]))[0]
+            return np.exp(log - 0.5 * (a / 1.5) ** 2) * 2.0 / (1.5 * np.sqrt(2.0 * np.pi))
+
+        found = likelihood.score_set(deviation, [column[None]], priors=[prior]).log_likelihood
+        assert np.exp(found) == pytest.approx(quad(likelihood_of, 0.0, 12.0)[0], rel=1e-6)
