@@ -10,6 +10,7 @@ from typing import Any
 
 from orthocal.arguments import require_names
 from orthocal.assessment.assess import assess
+from orthocal.assessment.effect_comparison import EffectComparison, compare_effects
 from orthocal.assessment.judgement import Judgement, judge_session, rank
 from orthocal.assessment.predictive import Repetition, measure_repetition
 from orthocal.assessment.recommendation import Recommendation, recommend_model
@@ -61,6 +62,8 @@ class Comparison:
     repeat_title: str
     """Of that other session; empty without."""
     recommendation: Recommendation
+    effects: EffectComparison | None
+    """Effects beside geometry; None if the readings cannot show any."""
     judgement: Judgement
     """Of the readings, whatever the model is."""
     assessments: tuple[Assessment, ...]
@@ -105,6 +108,7 @@ class Comparison:
                     e.model: finite_or_none(e.log_evidence) for e in self.recommendation.evidence
                 },
             },
+            "effects": None if self.effects is None else _effects_document(self.effects),
         }
         return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
@@ -164,6 +168,7 @@ def compare_models(
         repetition=None,
         repeat_title=join_sessions(others).title if others else "",
         recommendation=recommendation,
+        effects=compare_effects(session),
         judgement=judgement,
         assessments=tuple(
             assess(r.calibration, session, judgement=judgement, recommendation=recommendation)
@@ -203,6 +208,7 @@ def _assess(comparison: Comparison) -> Assessment:
     judged, best = comparison.judgement, comparison.best
     notes = words.describe_recommendation(comparison.recommendation)
     notes += [words.not_determined(u.model, u.reason) for u in comparison.undetermined]
+    notes += words.describe_effects(comparison.effects, len(comparison.labels))
     tool = None
     if best is not None:
         assessed = comparison.assessments[comparison.results.index(best)]
@@ -267,6 +273,21 @@ def find_known_noise(session: Session) -> KnownNoise:
     if session.gauge.sigma is not None:
         return KnownNoise(session.gauge.sigma, "gauge")
     return KnownNoise(math.nan, "unknown")
+
+
+def _effects_document(found: EffectComparison) -> dict[str, Any]:
+    return {
+        "recommended": list(found.recommended),
+        "weighed": [
+            {
+                "effects": list(w.effects),
+                "log_evidence": finite_or_none(w.log_evidence),
+                "unseen_rms": finite_or_none(w.unseen_rms),
+            }
+            for w in found.weighed
+        ],
+        "lacking": {name: count for name, (count, _) in found.lacking.items()},
+    }
 
 
 def _result_document(result: ModelResult) -> dict[str, Any]:

@@ -76,11 +76,11 @@ def recommend_model(session: Session, models: Sequence[str] = ()) -> Recommendat
     parameters = session.robot.parameters
     complete = complete_model(parameters)
     names = [m for m in dict.fromkeys(models or parameters.models) if m != complete]
-    reference, by_scale = _evidence(session, complete)
+    reference, by_scale = weigh_model(session, complete)
     evidence = [ModelEvidence(complete, 0.0)]
     for name in names:
         try:
-            evidence.append(ModelEvidence(name, _evidence(session, name)[0] - reference))
+            evidence.append(ModelEvidence(name, weigh_model(session, name)[0] - reference))
         except OrthocalError:
             evidence.append(ModelEvidence(name, math.nan))
     prior = -0.5 * (np.log(SCALES) / SCALE_SPREAD) ** 2
@@ -100,7 +100,7 @@ def recommend_model(session: Session, models: Sequence[str] = ()) -> Recommendat
     return Recommendation(complete, scale, tuple(evidence), gain if strong_scale else 0.0)
 
 
-def _evidence(session: Session, model: str) -> tuple[float, Array]:
+def weigh_model(session: Session, model: str) -> tuple[float, Array]:
     """Ln p(y | M) at the stated tolerances, and at each of SCALES, shape (n_scales,)."""
     total, by_scale = 0.0, np.zeros(SCALES.size)
     for part in split_sessions(session):

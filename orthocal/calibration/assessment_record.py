@@ -58,6 +58,8 @@ FindingKind = Literal[
     "held by a bound",
     "linearisation error",
     "inseparable",
+    "effect not shown",
+    "effects inseparable",
     "below the noise",
     "line assumed",
     # of what to enter
@@ -73,6 +75,8 @@ FindingKind = Literal[
     "not recommended",
     "not determined",
     "tolerances differ",
+    "effects recommended",
+    "effect not weighed",
     "residuals repeat",
     "residuals differ",
     "repetition unknown",

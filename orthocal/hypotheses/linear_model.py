@@ -245,6 +245,29 @@ class LinearModel:
         )
         return (math.nan if math.isinf(std) else float(rows[row] - amount)), float(std)
 
+    def predict_left_out(self, rows: Array) -> Array:
+        """Errors of the prediction of each setup from all others, shape (n_rows,), [m].
+
+        About the most likely machine, with errors at their tolerances and noise as stated.
+
+        Args:
+            rows: Readings, shape (n_rows,), [m].
+
+        Raises:
+            ClosureError: If the nominal machine cannot reach a posture.
+        """
+        near = self.most_likely(rows)
+        about = self.linearise(near.theta, (), near.passive, slopes=True)
+        deviation = self.entries(rows[None])[0] - about.expected
+        o, errors = self.problem.observations, np.zeros(deviation.size)
+        for setup in np.unique(o.setup):
+            out = o.setup == setup
+            slopes = about.slopes[~out]
+            normal = slopes.T @ slopes + self.sigma**2 * np.eye(slopes.shape[1])
+            theta = np.linalg.solve(normal, slopes.T @ deviation[~out])
+            errors[out] = deviation[out] - about.slopes[out] @ theta
+        return o.rows(errors * self.problem.noise_ratio)
+
     def _approach(self, entries: Array, effect: Array) -> ModelLinearisation:
         """Linearise about the most likely machine, beside an effect of unknown amount.
 

@@ -69,8 +69,8 @@ NEARLY = 3.0
 WORTH_REFITTING = 4.0
 """Logarithm of the Bayes factor, to first order, from which on hypotheses are linearised anew."""
 
-FAMILIES = 31.0
-"""Families that share the prior probability."""
+FAMILIES = 28.0
+"""Families of mistakes that share the prior probability; each effect is as likely as a family."""
 
 MOST_ANOMALIES = 4
 """Anomalies that are sought in a session."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 
+from orthocal.assessment.effect_comparison import EffectComparison
 from orthocal.assessment.recommendation import Recommendation
-from orthocal.assessment.wording import mm, note, tool_mm
+from orthocal.assessment.wording import joined, mm, note, tool_mm
 from orthocal.calibration.assessment_record import Finding
 from orthocal.units import MM, UM
 
@@ -42,6 +43,45 @@ def describe_recommendation(found: Recommendation, *, chosen: str | None = None)
             )
         )
     return findings
+
+
+def describe_effects(found: EffectComparison | None, readings: int) -> list[Finding]:
+    """Effects that the readings support, and those that they cannot show.
+
+    Args:
+        found: The comparison; None without candidates.
+        readings: Number of readings.
+    """
+    if found is None:
+        return []
+    notes = [
+        note(
+            "effect not weighed",
+            f"{name} was not weighed: {count} of {readings} readings lack its conditions, the "
+            f"first in {first}.",
+            readings=float(count),
+        )
+        for name, (count, first) in found.lacking.items()
+    ]
+    if not found.weighed:
+        return notes
+    none, best = found.weighed[0], found.best
+    tried = joined([w.effects[0] for w in found.weighed if len(w.effects) == 1], "or")
+    if not found.recommended:
+        text, action = (
+            f"Recommended effects: none. The readings do not support {tried} strongly.",
+            "",
+        )
+    else:
+        names = found.recommended
+        text = (
+            f"Recommended effects: {joined(names)}. With "
+            f"{'it' if len(names) == 1 else 'them'} left-out setups are "
+            f"predicted to {mm(best.unseen_rms)} mm, without to {mm(none.unseen_rms)} mm."
+        )
+        action = f"Calibrate with `--effects {','.join(names)}`."
+    numbers = {"log_evidence": best.log_evidence, "unseen_rms_mm": best.unseen_rms / MM}
+    return [note("effects recommended", text, action, **numbers), *notes]
 
 
 def not_recommended(model: str, evidence: float, unseen: float, best_unseen: float) -> Finding:

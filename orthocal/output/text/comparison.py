@@ -68,6 +68,7 @@ def render_comparison(
         *answer,
         section("Further findings", bullets([noise, *further])),
         section("Scores", _scores(c)),
+        *([section("Effects", _effects(c))] if c.effects and c.effects.weighed else []),
         section("Estimates", _estimates(c, all_rows)),
         section("Residuals by model", _residuals(c, all_rows)),
     )
@@ -127,6 +128,15 @@ def _scores(comparison: Comparison) -> RenderableType:
         "CV: cross-validation, RMS error of predicting each setup from all others",
         "uncertainty: of the tool after calibration, RMS, workpiece aligned, stated tolerances",
     )
+
+
+def _effects(comparison: Comparison) -> RenderableType:
+    weighed = comparison.effects.weighed if comparison.effects else ()
+    rows = [
+        (", ".join(w.effects) or "none", f"{w.log_evidence:+.1f}", plain(w.unseen_rms / MM, 4))
+        for w in weighed
+    ]
+    return table_of(("effects", "ln evidence", "CV [mm]"), rows)
 
 
 def _estimates(comparison: Comparison, all_rows: bool) -> RenderableType:

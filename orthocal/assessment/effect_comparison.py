@@ -1,0 +1,110 @@
+"""Effects beside geometry, weighed by the readings as models are.
+
+By the marginal likelihood of the complete model with each set of effects, and by the prediction of
+each setup from all others. Effects are added one after the other as long as the evidence for them
+is strong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthocal.assessment.recommendation import STRONG, weigh_model
+from orthocal.effects.registry import order_effects
+from orthocal.estimation.selection import complete_model
+from orthocal.hypotheses.anomaly import EFFECT_KINDS
+from orthocal.hypotheses.families.effects import missing_effects, rows_without
+from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.session.session import Session
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WeighedEffects:
+    """A set of effects, and what speaks for it."""
+
+    effects: tuple[str, ...]
+    log_evidence: float
+    """ln p(y) less that without any of the candidates."""
+    unseen_rms: float
+    """RMS error of the prediction of setups from all others, [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EffectComparison:
+    """Effects that could be identified beside geometry, weighed by the readings."""
+
+    weighed: tuple[WeighedEffects, ...]
+    """Without effects first, then each by itself, then the supported ones together."""
+    recommended: tuple[str, ...]
+    lacking: Mapping[str, tuple[int, str]]
+    """Effect that was not weighed to the number of readings without its conditions, and the place
+    of the first."""
+
+    @property
+    def best(self) -> WeighedEffects:
+        """The recommended set."""
+        return next(w for w in self.weighed if w.effects == self.recommended)
+
+
+def compare_effects(session: Session) -> EffectComparison | None:
+    """Weigh the effects that a session or its robot chooses; without a choice all possible ones.
+
+    Without a choice drift needs the time of the readings, as the others need their conditions.
+
+    Args:
+        session: The session, or several that were joined.
+
+    Returns:
+        None if there is nothing to weigh.
+
+    Raises:
+        ClosureError: If the nominal machine cannot reach a posture.
+    """
+    candidates, lacking = _candidates(session)
+    if not candidates:
+        return EffectComparison((), (), lacking) if lacking else None
+    others = [n for n in session.robot.effect_names if n not in EFFECT_KINDS]
+    model = complete_model(session.robot.parameters)
+    known: dict[tuple[str, ...], tuple[float, float]] = {}
+
+    def weigh(names: Sequence[str]) -> float:
+        chosen = order_effects(names)
+        if chosen not in known:
+            with_them = session.with_effects((*others, *chosen))
+            errors = LinearModel(with_them).predict_left_out(session.values)
+            rms = float(np.sqrt(np.mean(errors**2)))
+            known[chosen] = weigh_model(with_them, model)[0], rms
+        return known[chosen][0]
+
+    weigh(())
+    supported: tuple[str, ...] = ()
+    while more := [n for n in candidates if n not in supported]:
+        likeliest = max(more, key=lambda n: weigh((*supported, n)))
+        if weigh((*supported, likeliest)) < weigh(supported) + STRONG:
+            break
+        supported = order_effects((*supported, likeliest))
+    weighed = [WeighedEffects(n, e - known[()][0], rms) for n, (e, rms) in known.items()]
+    return EffectComparison(tuple(weighed), supported, lacking)
+
+
+def _candidates(session: Session) -> tuple[list[str], dict[str, tuple[int, str]]]:
+    """Effects to weigh, and those that lack conditions in some of the readings."""
+    robot = session.robot
+    own = [n for n in robot.effect_names if n in EFFECT_KINDS]
+    stated = any(r.conditions for r in session.readings)
+    possible = missing_effects(session) if stated and robot.chosen_effects is None else ()
+    timed = any(r.conditions and r.conditions.time for r in session.readings)
+    candidates, lacking = [], {}
+    for name in (*own, *possible):
+        rows = rows_without(session, name)
+        if name == "drift" and name not in own and not timed:
+            continue
+        if not rows.size:
+            candidates.append(name)
+        elif rows.size < len(session.readings) or name in own:
+            first = session.where(session.readings[int(rows[0])])
+            lacking[name] = (int(rows.size), first)
+    return candidates, lacking
