@@ -22,6 +22,9 @@ from scipy.spatial.transform import Rotation
 CLOSED = 1e-13
 """[m, rad] Loops that are left open."""
 
+ROUNDING = 1e-11
+"""[m, rad] What is left open below this by rounding."""
+
 STEP = 1e-6
 """[m, rad] Of finite differences."""
 
@@ -95,6 +98,7 @@ class IndependentMachine:
     """
 
     def __init__(self, folder, errors, *, lead=5e-3, expansion=None):
+        self.folder = folder
         (urdf,) = folder.glob("*.urdf")
         (about,) = (yaml.safe_load(f.read_text()) for f in folder.glob("*.yaml"))
         self.about, self.lead, self.expansion = about["orthocal"], lead, expansion
@@ -216,22 +220,28 @@ class IndependentMachine:
 
     def close(self, actual, growth):
         """Passive coordinates with closed loops, shape (M, K, 18), [rad]."""
-        shape = (self.count, actual.shape[1], len(self.passive))
-        q = np.zeros(shape)
-        size, jacobian = np.inf, None
+        q, inverse, size = self._begin(actual), None, np.inf
         for _ in range(60):
             opening = self.opening(actual, q, growth)
             before, size = size, np.abs(opening).max()
-            if size < CLOSED:
-                break
-            if size < 1e-11 and size > 0.5 * before:
-                break  # rounding
-            if jacobian is None or size > 0.05 * before:
-                jacobian = self._slopes(actual, q, growth)
-            q = q - np.linalg.solve(jacobian, opening[..., None])[..., 0]
-        else:
-            raise RuntimeError(f"loops stay open by {size:.2g}")
-        return q
+            if size < CLOSED or (size < ROUNDING and size > 0.5 * before):
+                return q
+            if inverse is None or size > 0.1 * before:
+                # that of the nominal machines for a batch, until it converges slowly
+                shared = inverse is None and self.count > 1
+                machine = IndependentMachine(self.folder, {}) if shared else self
+                at = (a.mean(axis=0, keepdims=True) if shared else a for a in (actual, q, growth))
+                inverse = np.linalg.inv(machine._slopes(*at))
+            q = q - (inverse @ opening[..., None])[..., 0]
+        raise RuntimeError(f"loops stay open by {size:.2g}")
+
+    def _begin(self, actual):
+        """Passive coordinates to start from: the nominal machine's for a batch."""
+        shape = (self.count, actual.shape[1], len(self.passive))
+        if self.count == 1:
+            return np.zeros(shape)
+        nominal, mean = IndependentMachine(self.folder, {}), actual.mean(axis=0, keepdims=True)
+        return np.broadcast_to(nominal.close(mean, np.zeros((1, shape[1], 6))), shape)
 
     def _slopes(self, actual, q, growth):
         """Derivative of the opening by finite differences, shape (M, K, 18, 18)."""

@@ -1,0 +1,146 @@
+"""Derivatives of the effects of orthocal, and their identification by all solvers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from derivatives import central_differences
+from effect_plans import write_plan
+from tolerances import DERIVATIVE, SAME_OPTIMUM
+
+from orthocal import load_plan, simulate_session
+from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.batch import BatchSolver
+from orthocal.estimation.solvers.ipopt import NonlinearProgram
+from orthocal.estimation.solvers.variable_projection import VariableProjection
+from orthocal.measurement.joining import join_sessions
+
+KEYS = {
+    "backlash": "backlash: {}",
+    "thermal": "thermal: {}",
+    "screw": "screw: {lead_mm: 7}",
+    "drift": "drift: {}",
+}
+SIGMA = 1e-6
+SOME = ("*.offset", "*.scale", "x_coupler.*", "y_leg.length")
+"""Errors of geometry beside those of the effect."""
+
+
+@pytest.fixture(scope="module")
+def plans(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("built-in")
+    keys = {**KEYS, "all": ", ".join(KEYS.values())}
+    return {n: load_plan(write_plan(folder / n, effects=text)) for n, text in keys.items()}
+
+
+def errors_of(plan):
+    """Names of the errors of effects."""
+    geometry = plan.robot.parameters.names
+    plain = plan.with_effects([]).robot.parameters.names
+    return [n for n in geometry if n not in plain]
+
+
+def build(plan):
+    return build_problem(plan, free=(*SOME, *errors_of(plan)), prior=True)
+
+
+def point(problem, seed=2):
+    """Free parameters away from the nominal machine, in SI."""
+    theta = 0.7 * problem.theta_scale * np.random.default_rng(seed).normal(size=problem.n_free)
+    theta[[n.endswith(".offset") for n in problem.free]] *= 0.1
+    return np.maximum(theta, problem.selection.lower)
+
+
+def require_derivatives(problem, theta, jacobian):
+    """Refuse a Jacobian other than central differences, each column by its size or by 10 nm."""
+    scale = problem.theta_scale
+    numeric = central_differences(lambda t: problem.predict(t * scale), theta / scale, step=1e-2)
+    size = np.maximum(np.abs(numeric).max(axis=0), 1e-8)
+    assert (np.abs(jacobian - numeric) / size).max() < 10 * DERIVATIVE
+
+
+@pytest.mark.parametrize("name", KEYS)
+def test_derivatives_are_those_of_the_readings(plans, name):
+    problem = build(plans[name])
+    theta = point(problem)
+    _, jacobian = problem.predict_and_jacobian(theta)
+    require_derivatives(problem, theta, jacobian)
+    names = [*errors_of(plans[name]), *(n for n in problem.free if n.endswith(".drift"))]
+    at = [problem.free.index(n) for n in names]
+    assert at
+    assert (np.abs(jacobian[:, at]).max(axis=0) > 0.0).all()
+
+
+def test_derivatives_of_all_effects_together(plans):
+    """Two machines at once, under many conditions."""
+    problem = build(plans["all"])
+    thetas = np.array([point(problem, seed) for seed in (3, 4)])
+    _, jacobians = problem.predict_and_jacobian(thetas)
+    for theta, jacobian in zip(thetas, jacobians, strict=True):
+        require_derivatives(problem, theta, jacobian)
+
+
+def require_same(problem, sigma=SIGMA):
+    """Refuse solvers that differ; return the solution of variable projection."""
+    projected = VariableProjection(problem).solve(sigma=sigma)
+    for solution in (
+        NonlinearProgram(problem).solve(sigma=sigma).theta,
+        BatchSolver(problem).solve(problem.values[None], sigma=sigma).theta[0],
+    ):
+        off = np.abs(solution - projected.theta) / problem.theta_scale
+        assert off.max() < SAME_OPTIMUM / 1e-4
+    return projected
+
+
+def simulate(plan, errors, seed=5):
+    return simulate_session(plan, errors, seed=seed, sigma=SIGMA).session
+
+
+@pytest.mark.parametrize("name", [*KEYS, "all"])
+def test_all_solvers_identify_them_alike(plans, name):
+    plan = plans[name]
+    problem = build(plan)
+    truth = dict(zip(problem.free, point(problem), strict=True))
+    errors = {n: truth[n] for n in problem.machine_selection.names}
+    found = require_same(build(simulate(plan, errors)))
+    names = list(problem.free)
+    for n in errors_of(plan):
+        i = names.index(n)
+        assert abs(found.theta[i] - truth[n]) < 3.0 * problem.theta_scale[i]
+
+
+def difference_of_expansions(problem, theta):
+    """Legs less screws, value and std, [prior std]; together they change the scale alone."""
+    _, jacobian = problem.predict_and_jacobian(theta)
+    zeros = problem.zero_incidence
+    centred = jacobian - zeros @ (np.linalg.pinv(zeros) @ jacobian)
+    covariance = np.linalg.inv(centred.T @ centred / SIGMA**2 + np.eye(problem.n_free))
+    names = ("legs.expansion", "screws.expansion")
+    along = np.array([float(n == names[0]) - float(n == names[1]) for n in problem.free])
+    return along @ (theta / problem.theta_scale), np.sqrt(along @ covariance @ along)
+
+
+def test_two_days_at_16_and_27_degrees(plans):
+    """One day alone cannot distinguish growth from errors of geometry."""
+    plan = plans["thermal"].with_effects(["thermal"])
+
+    def at(temperature):
+        readings = tuple(
+            replace(r, conditions=replace(r.conditions, temperature=temperature))
+            for r in plan.readings
+        )
+        return replace(plan, readings=readings)
+
+    errors = {"legs.expansion": 2.4e-6, "screws.expansion": -1.9e-6, "x_slide.offset": 0.5e-3}
+    days = [simulate(at(t), errors, seed=int(t)) for t in (16.0, 27.0)]
+    problem = build(join_sessions(days))
+    found = require_same(problem)
+    value, std = difference_of_expansions(problem, found.theta)
+    parameter = plan.robot.parameters["legs.expansion"]
+    assert abs(value - (2.4e-6 + 1.9e-6) / parameter.prior_std) < 4.0 * std
+    alone = build(days[1])
+    _, std_alone = difference_of_expansions(alone, np.zeros(alone.n_free))
+    assert std_alone > 0.99 * np.sqrt(2.0)  # as before any reading
+    assert std < 0.65 * std_alone

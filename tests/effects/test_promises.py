@@ -1,0 +1,54 @@
+"""Promises of calibrations of machines with effects, on readings by an independent simulator.
+
+A sample of `tests/benchmarks/effects.py`.
+"""
+
+from __future__ import annotations
+
+from datetime import timedelta
+
+import numpy as np
+import pytest
+from effect_machines import EFFECTS, EffectMachines, rms, write_plan
+from scipy.stats import binom
+
+MACHINES = 40
+"""About 480 intervals of what readings determine: standard deviations that are too small by 15 %
+leave the band of their number in nine of ten runs. The tool error of so many machines scatters by a
+tenth."""
+
+TOOL = 1.3
+"""Largest ratio of the RMS tool error of these machines to the predicted one."""
+
+
+def check(outcome):
+    for covered in (outcome.covered, outcome.covered[outcome.determined]):
+        low, high = binom.interval(0.99, covered.size, 0.95)
+        assert low <= covered.sum() <= high
+    assert outcome.ratio < TOOL
+    least = binom.ppf(0.005, outcome.covered_backlash.size, 0.95)
+    assert outcome.covered_backlash.sum() >= least
+
+
+@pytest.mark.slow
+def test_intervals_and_tool_errors_with_all_effects(tmp_path):
+    machines = EffectMachines(write_plan(tmp_path / "plan"), EFFECTS)
+    truth = machines.draw(np.random.default_rng(11), MACHINES)
+    outcome = machines.identify(truth, np.random.default_rng(12))
+    check(outcome)
+    # with a model that ignores the effects the tool is further off
+    plain = EffectMachines(machines.folder.parent, ())
+    values = machines.read(truth, np.random.default_rng(12))
+    names = machines.problem.free
+    same = truth[:, [names.index(name) for name in plain.problem.free]]
+    blind = plain.identify_values(same, values, machines.machines(truth))
+    assert rms(blind.found) > 1.15 * rms(outcome.found)
+
+
+@pytest.mark.slow
+def test_eight_hours_with_drift_and_growth(tmp_path):
+    """Drift and temperature both grow with the time: their sum is known better than each."""
+    folder = write_plan(tmp_path / "plan", between=timedelta(minutes=8), growing=True)
+    machines = EffectMachines(folder, ("thermal", "drift"))
+    truth = machines.draw(np.random.default_rng(13), MACHINES // 2)
+    check(machines.identify(truth, np.random.default_rng(14)))
