@@ -78,7 +78,7 @@ def test_offsets_are_chosen_by_least_error_at_the_tool(quarter):
     )
     moved = replace(result, parameters=parameters, assessment=None)
     change = (entered_offsets(moved) - best) / step
-    column = gain[:, list(tool.sensitivity.free).index(name)]
+    column = gain[:, list(tool.free).index(name)]
     assert change == pytest.approx(column, abs=0.05 * np.abs(column).max())
 
 
