@@ -30,6 +30,8 @@ TITLES: dict[Field, str] = {
     "uncertainty": "Uncertainty of the tool error, RMS, workpiece aligned",
 }
 
+AVERAGED = ", mean over the conditions of use"
+
 FINEST = 1e-3
 """Errors and differences of errors below this are zero, [µm]."""
 
@@ -114,7 +116,8 @@ def _draw_tool_map(calibration: Calibration, accuracy: ToolAccuracy, which: Fiel
         between = _interpolate(sides, _cut(grid, plane))
         maps.append((plane, sides, between, *_refine(sides, between)))
     levels = _choose_levels(np.concatenate([size.reshape(-1) for *_, size in maps]))
-    figure = open_figure(3.0 if len(planes) > 1 else 5.0, TITLES[which], legend=False)
+    title = TITLES[which] + (AVERAGED if accuracy.use.size > 1 else "")
+    figure = open_figure(3.0 if len(planes) > 1 else 5.0, title, legend=False)
     panels = np.atleast_1d(figure.subplots(1, len(planes)))
     for axes, (plane, sides, between, x, y, size) in zip(panels, maps, strict=True):
         axes.set(aspect="equal", title=_describe_cut(lines, plane, world))
