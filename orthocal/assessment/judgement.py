@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocal.arrays import Array
+from orthocal.assessment.effect_separability import find_unshown_effects
 from orthocal.assessment.plausibility import (
     are_finer,
     find_finer,
@@ -95,7 +96,8 @@ def judge_session(session: Session) -> Judgement:
         elif scale > 1.0:
             beyond = [words.above_tolerances(scale)]
     unchanged = [] if anomalies or not session.joined else [_describe_detectable(session)]
-    return Judgement(rank([*implausible, *anomalies, *unchanged, *beyond]), scale)
+    unshown = find_unshown_effects(session)
+    return Judgement(rank([*implausible, *anomalies, *unchanged, *beyond, *unshown]), scale)
 
 
 def find_warnings(session: Session) -> tuple[Finding, ...]:

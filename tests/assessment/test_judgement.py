@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from commands import run_orthocal
 from drawn_machines import DrawnMachines
+from effect_plans import write_plan
 
 from orthocal import (
     Choice,
@@ -87,9 +88,26 @@ def displace(session, setup, by):
     return session.with_values(values)
 
 
-def spoilt(cycles, workshop, table1):
+def drift(session, by):
+    """Session in which the gauge of each setup moves from its first reading to its last."""
+    values = session.values.copy()
+    for setup in session.setups:
+        rows = [i for i, r in enumerate(session.readings) if r.setup == setup]
+        values[rows] += by * np.linspace(0.0, 1.0, len(rows))
+    return session.with_values(values)
+
+
+def with_backlash(folder):
+    """A machine whose robot lacks the backlash that its readings show."""
+    plan = load_plan(write_plan(folder, effects="screw: {lead_mm: 10}")).with_effects(["backlash"])
+    plan = plan.select([r for r in plan.readings if r.setup in ("yx", "xy", "xz")])
+    errors = {"y_slide.backlash": 50e-6, "x_slide.offset": 0.1e-3}
+    return simulate_session(plan, errors, seed=4).session.with_effects([])
+
+
+def spoilt(cycles, workshop, table1, folder):
     """Sessions by what is wrong with them, with the verdict that they deserve."""
-    largest = int(np.abs(cycles.values).argmax())
+    largest, backlash = int(np.abs(cycles.values).argmax()), with_backlash(folder)
     return {
         "sound": (cycles, "enter"),
         "workshop": (workshop, "enter"),
@@ -103,19 +121,22 @@ def spoilt(cycles, workshop, table1):
         "inches": (cycles.with_values(np.round(cycles.values / 25.4, 7)), "review"),
         "swapped rows": (swap(cycles, 1, 2), "review"),
         "displaced gauge": (displace(cycles, "yx", 0.2e-3), "review"),
+        "drift": (drift(cycles, 0.1e-3), "review"),
+        "backlash": (backlash, "review"),
+        "backlash in the model": (backlash.with_effects(["backlash"]), "enter"),
     }
 
 
 CASES = [
     *("sound", "workshop", "experiment 2", "experiment 3", "experiment 1 as printed"),
     *("experiment 1 corrected", "reversed setup", "reversed sign", "decimal point", "inches"),
-    *("swapped rows", "displaced gauge"),
+    *("swapped rows", "displaced gauge", "drift", "backlash", "backlash in the model"),
 ]
 
 
 @pytest.fixture(scope="module")
-def cases(cycles, workshop, table1):
-    return spoilt(cycles, workshop, table1)
+def cases(cycles, workshop, table1, tmp_path_factory):
+    return spoilt(cycles, workshop, table1, tmp_path_factory.mktemp("backlash") / "plan")
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +150,7 @@ def calibrated(cases):
     return made
 
 
-@pytest.mark.parametrize("case", ["sound", "reversed sign", "experiment 1 as printed"])
+@pytest.mark.parametrize("case", ["sound", "reversed sign", "experiment 1 as printed", "backlash"])
 def test_every_command_has_the_same_verdict(cases, calibrated, case, tmp_path):
     """One case for each verdict: in the document, as exit code, and by what is exported."""
     session, expected = cases[case]

@@ -56,6 +56,8 @@ LISTED: tuple[FindingKind, ...] = (
     "held by a bound",
     "not significant",
     "line assumed",
+    "effect not shown",
+    "effects inseparable",
 )
 """Kinds of notes that the short answer lists."""
 

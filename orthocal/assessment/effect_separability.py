@@ -1,0 +1,127 @@
+"""Effects of a machine's model that its readings do not show, or do not separate.
+
+Effects a and b change readings alike if the columns of a, weighted by the covariance of the
+readings under all other errors,
+
+    V = σ² I + J P Jᵀ,  A = Wᵀ V⁻¹ W,
+
+are nearly combinations of those of b: R² = A_ab A_bb⁻¹ A_ba / A_aa, as in a regression.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations_with_replacement
+
+import numpy as np
+
+from orthocal.arrays import Array, Indices
+from orthocal.assessment.words import effects as words
+from orthocal.calibration.assessment_record import Finding
+from orthocal.effects.loading import robot_effects
+from orthocal.hypotheses.anomaly import EFFECT_KINDS
+from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.observation.observations import drive_table
+from orthocal.session.session import Session
+
+ALIKE = 0.95
+"""Part R² of a parameter's information that another effect shares, from which on the readings do
+not separate them: the standard deviation is more than four times as large as without the other."""
+
+LEAST_INFORMATION = 1e-2
+"""Information about a parameter, over that of its prior, below which readings do not show it."""
+
+
+def find_unshown_effects(session: Session) -> list[Finding]:
+    """Effects of the robot's model that its readings do not show, or do not separate.
+
+    Raises:
+        ClosureError: If the nominal machine cannot reach a posture.
+    """
+    if not any(name in EFFECT_KINDS for name in session.robot.effect_names):
+        return []
+    found = [*_unshown_backlash(session), *_unshown_expansion(session)]
+    return [*found, *_alike(session)] if len(session.readings) > 1 else found
+
+
+def _unshown_backlash(session: Session) -> Iterator[Finding]:
+    """Drives that all readings approach from one side, or whose approach none states."""
+    if "backlash" not in session.robot.effect_names:
+        return
+    stated = [r.approach for r in session.readings if r.approach is not None]
+    if not stated:
+        yield words.approach_not_stated()
+        return
+    names = list(session.postures)
+    read = sorted({names.index(r.posture) for r in session.readings})
+    distance = np.abs(drive_table(session)[read] - session.robot.drive_zero)
+    one_sided = {
+        drive.name: names[read[int(distance[:, i].argmax())]]
+        for i, drive in enumerate(session.robot.drives)
+        if len({letters[i] for letters in stated} - {"u"}) < 2
+    }
+    if one_sided:
+        yield words.approached_from_one_side(one_sided)
+
+
+def _unshown_expansion(session: Session) -> Iterator[Finding]:
+    """Readings that were all taken at one temperature."""
+    if "thermal" not in session.robot.effect_names:
+        return
+    stated = {r.conditions.temperature for r in session.readings if r.conditions} - {None}
+    if len(stated) < 2:
+        yield words.one_temperature(next(iter(stated), None), next(iter(session.setups)))
+
+
+def _alike(session: Session) -> Iterator[Finding]:
+    """Parameters of effects that change the readings alike."""
+    model = LinearModel(session)
+    about = model.linearise(np.zeros(model.problem.n_free), (), None, slopes=True)
+    members = _members(session, model.problem.free)
+    every = [i for indices in members.values() for i in indices]
+    columns, others = about.slopes[:, every], np.delete(about.slopes, every, axis=1)
+    normal = others.T @ others + model.sigma**2 * np.eye(others.shape[1])
+    white = columns - others @ np.linalg.solve(normal, others.T @ columns)
+    information = columns.T @ white / model.sigma**2
+    place = {i: k for k, i in enumerate(every)}
+    seen = {
+        name: np.array(
+            [k for k in (place[i] for i in indices) if information[k, k] > LEAST_INFORMATION], int
+        )
+        for name, indices in members.items()
+    }
+    labels = [model.problem.free[i] for i in every]
+    for one, other in combinations_with_replacement(seen, 2):
+        alike = _explained(information, seen[one], seen[other], same=one == other)
+        if alike:
+            partners = sorted({labels[q] for _, q in alike} - {labels[p] for p, _ in alike})
+            yield words.effects_alike(one, other, [labels[p] for p, _ in alike], partners)
+
+
+def _members(session: Session, free: tuple[str, ...]) -> dict[str, list[int]]:
+    """Places of the parameters of each effect among the free ones."""
+    members: dict[str, list[int]] = {}
+    for effect in robot_effects(session.robot):
+        if type(effect).name not in EFFECT_KINDS:
+            continue
+        names = {e.name for e in effect.errors}
+        names |= {f"setup.{s}.{e.name}" for s in session.setups for e in effect.setup_errors}
+        members[type(effect).name] = [i for i, name in enumerate(free) if name in names]
+    return members
+
+
+def _explained(
+    information: Array, one: Indices, other: Indices, *, same: bool
+) -> list[tuple[int, int]]:
+    """Parameters of one effect that another explains, with the most similar one of that."""
+    found = []
+    for p in one:
+        among = other[other != p] if not same else other[other > p]
+        if not among.size:
+            continue
+        shared = information[p, among]
+        inverse = np.linalg.pinv(information[np.ix_(among, among)], hermitian=True)
+        if shared @ inverse @ shared > ALIKE * information[p, p]:
+            alone = shared**2 / np.diag(information)[among]
+            found.append((int(p), int(among[int(alone.argmax())])))
+    return found

@@ -1,0 +1,90 @@
+"""Wording of findings about effects that readings do not show or do not separate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from orthocal.assessment.wording import joined, named, note
+from orthocal.calibration.assessment_record import Finding, Place
+
+PARTS = {
+    "backlash": "backlash",
+    "thermal": "thermal expansion",
+    "screw": "the periodic error of the screws",
+    "drift": "the drift of the gauge",
+}
+"""Effects in words."""
+
+
+def approach_not_stated() -> Finding:
+    """No reading states from which side its posture was approached."""
+    return note(
+        "effect not shown",
+        "No reading states from which side its posture was approached: the backlash of the drives "
+        "is not estimated, and their tolerance is assumed.",
+        "State it in the column `approach`.",
+    )
+
+
+def approached_from_one_side(drives: Mapping[str, str]) -> Finding:
+    """Drives that all readings approach from one side.
+
+    Args:
+        drives: Drive to a posture that would show its backlash.
+    """
+    postures = joined(list(dict.fromkeys(drives.values())))
+    return note(
+        "effect not shown",
+        f"All readings approach {joined(list(drives))} from the same side. They cannot show "
+        f"{'its' if len(drives) == 1 else 'their'} backlash, whatever its size.",
+        f"Approach {postures} also from the other side.",
+        named(*drives),
+    )
+
+
+def one_temperature(temperature: float | None, setup: str) -> Finding:
+    """All readings were taken at one temperature, or none states it."""
+    text = (
+        "No reading states its temperature"
+        if temperature is None
+        else f"All readings were taken at {temperature:g} °C"
+    )
+    return note(
+        "effect not shown",
+        f"{text}. The readings do not show how legs and screws expand: the stated coefficients are "
+        "assumed.",
+        f"Read setup {setup} again at another temperature, and state it in `temperature_C`.",
+        (Place(setup=setup),),
+    )
+
+
+def effects_alike(
+    one: str, other: str, parameters: Sequence[str], partners: Sequence[str]
+) -> Finding:
+    """Parameters of effects that change the readings alike."""
+    what = f"{joined(parameters)} from {joined(partners)}" if partners else joined(parameters)
+    why = (
+        f"{PARTS[one]} and {PARTS[other]} change them alike"
+        if one != other
+        else f"these parts of {PARTS[one]} change them alike"
+    )
+    return note(
+        "effects inseparable",
+        f"These readings do not separate {what}: {why}.",
+        _separating({one, other}),
+        named(*parameters, *partners),
+    )
+
+
+def _separating(effects: set[str]) -> str:
+    """The reading that separates effects."""
+    if effects == {"thermal"}:
+        return "A gauge at the tool, read at two temperatures, separates them."
+    if "backlash" in effects:
+        return "Approach the same postures also from the other side."
+    if "screw" in effects:
+        return "Read postures at other fractions of a turn of the screws."
+    return (
+        "Return to the first posture at the end of each setup, and read one setup again at another "
+        "temperature."
+    )

@@ -1,0 +1,92 @@
+"""What readings cannot show of the effects in the model, and which of them they do not separate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import timedelta
+
+import numpy as np
+import pytest
+from effect_plans import FIRST, write_plan
+
+from orthocal import check_session, load_plan, simulate_session
+from orthocal.assessment.effect_separability import ALIKE, find_unshown_effects
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.selection import select_parameters
+from orthocal.statistics.zeros import project_out_zeros
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("separable") / "plan"
+    return load_plan(write_plan(folder, effects="screw: {lead_mm: 10}")).with_effects([])
+
+
+def under(session, change):
+    """Session with other conditions: a function of the row and its present ones."""
+    readings = [
+        replace(r, conditions=change(i, r.conditions)) for i, r in enumerate(session.readings)
+    ]
+    return replace(session, readings=tuple(readings))
+
+
+def find(session, effects):
+    return find_unshown_effects(session.with_effects(effects))
+
+
+def test_nothing_is_said_without_effects_or_where_readings_show_them(plan):
+    assert find(plan, []) == []
+    assert find(plan, ["backlash"]) == []
+    assert find(plan, ["backlash", "drift"]) == []
+
+
+def test_an_approach_from_one_side_is_said_once_and_accuses_nobody(plan):
+    one = under(plan, lambda _, c: replace(c, approach=f"p{c.approach[1:]}"))
+    (found,) = find(one, ["backlash"])
+    assert (found.kind, found.severity) == ("effect not shown", "note")
+    assert [p.parameter for p in found.places] == ["x_slide"]
+    session = simulate_session(one.with_effects(["backlash"]), {"x_slide.backlash": 0.1e-3}).session
+    assessment = check_session(session)
+    assert len(assessment.of_kind("effect not shown")) == 1
+    assert assessment.decision.verdict == "enter"
+
+
+def test_conditions_that_nobody_stated_are_named(plan):
+    bare = replace(plan, readings=tuple(replace(r, conditions=None) for r in plan.readings[::2]))
+    kinds = [f.kind for f in find(bare, ["backlash", "thermal"])]
+    assert kinds[:2] == ["effect not shown"] * 2
+
+
+def test_temperature_and_drift_that_grow_together_are_not_separated(plan):
+    """One posture of each setup, read again and again while it gets warmer."""
+    kept = plan.select([r for r in plan.readings if r.posture == f"{r.setup[1]}_60"])
+    rows = [replace(r, cycle=r.cycle + 2 * k) for k in range(3) for r in kept.readings]
+    rows.sort(key=lambda r: r.setup)
+    repeated = replace(kept, readings=tuple(rows))
+    together = under(
+        repeated,
+        lambda i, c: replace(c, temperature=20.0 + 0.2 * i, time=FIRST + timedelta(minutes=i)),
+    )
+    found = [f for f in find(together, ["thermal", "drift"]) if f.kind == "effects inseparable"]
+    names = [{p.parameter for p in f.places} for f in found]
+    assert any({"legs.expansion", "setup.yx.drift"} <= n for n in names)
+    rng = np.random.default_rng(1)
+    apart = under(together, lambda i, c: replace(c, temperature=20.0 + float(rng.normal())))
+    found = [f for f in find(apart, ["thermal", "drift"]) if f.kind == "effects inseparable"]
+    assert not any("setup.yx.drift" in {p.parameter for p in f.places} for f in found)
+
+
+def test_growth_of_legs_and_screws_is_alike(plan):
+    """By the correlation of the two columns under all other errors, from the covariance itself."""
+    (found,) = find(plan, ["thermal"])
+    assert {p.parameter for p in found.places} == {"legs.expansion", "screws.expansion"}
+    session = plan.with_effects(["thermal"])
+    selection = select_parameters(session.robot.parameters, model="full", prior=True)
+    problem = CalibrationProblem(session, selection)
+    _, jacobian = problem.predict_and_jacobian(problem.active_theta)
+    jacobian = project_out_zeros(jacobian, problem.observations)
+    pair = [problem.free.index(n) for n in ("legs.expansion", "screws.expansion")]
+    others = np.delete(jacobian, pair, axis=1)
+    weight = np.linalg.inv(others @ others.T + plan.gauge.sigma**2 * np.eye(len(others)))
+    a = jacobian[:, pair].T @ weight @ jacobian[:, pair]
+    assert a[0, 1] ** 2 / (a[0, 0] * a[1, 1]) > ALIKE
