@@ -80,8 +80,11 @@ class ToolSensitivity:
         if passive is None:
             passive = self.closure.close(d, names=names)
         commands, q = self.closure.commands(d), np.atleast_2d(passive)
-        if not self._functions.errors.placement_conditions:
+        under = commands[:, self._functions.errors.of_placements]
+        if not under.size:
             return self._differentiate(commands, q, self._twists)
+        if (under == under[0]).all():
+            return self._differentiate(commands, q, self._twists_under(commands[:1])[0])
         rows = [slice(k, k + CONDITIONS_AT_ONCE) for k in range(0, len(d), CONDITIONS_AT_ONCE)]
         parts = [
             self._differentiate(commands[r], q[r], self._twists_under(commands[r])) for r in rows
