@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:  # the public names; each is imported when it is first used
+    from orthocal.assessment.adjustment_plan import AdjustmentPlan as AdjustmentPlan
+    from orthocal.assessment.adjustment_plan import plan_adjustments as plan_adjustments
     from orthocal.assessment.assess import assess as assess
     from orthocal.assessment.assess import calibrate as calibrate
     from orthocal.assessment.assess import check_session as check_session
@@ -34,6 +36,7 @@ if TYPE_CHECKING:  # the public names; each is imported when it is first used
     from orthocal.assessment.validation import validate_calibration as validate_calibration
     from orthocal.builder.build import make_robot as make_robot
     from orthocal.builder.machine_file import Dimensions as Dimensions
+    from orthocal.calibration.adjusting import adjust_calibration as adjust_calibration
     from orthocal.calibration.assessment_record import Assessment as Assessment
     from orthocal.calibration.assessment_record import Decision as Decision
     from orthocal.calibration.assessment_record import Finding as Finding

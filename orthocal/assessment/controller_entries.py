@@ -153,30 +153,43 @@ def choose_offsets(tool: CalibratedTool, start: Array, *, drives: Sequence[int])
     Raises:
         ClosureError: If the machine cannot reach a point with such offsets.
     """
-    space, names, robot = tool.workspace, list(tool.free), tool.sensitivities[0].robot
+    names, robot = list(tool.free), tool.sensitivities[0].robot
     chosen = list(drives)
     index = [names.index(f"{robot.drives[i].name}.offset") for i in chosen]
-    root = np.sqrt(space.weights)[:, None]
-
-    def weighted(field: Array) -> tuple[Array, Array]:
-        parts = (space.remove_motion(field, tool.targets), field)
-        flat = [root * part.reshape(len(root), -1) for part in parts]
-        return (flat[0].reshape(-1, *field.shape[2:]), flat[1].reshape(-1, *field.shape[2:]))
-
-    aligned, absolute = weighted(tool.jacobian)
+    aligned, absolute = weigh_field(tool, tool.jacobian)
     gain = np.zeros((len(start), len(names)))
-    gain[chosen] = _solve_in_order(aligned[:, index], absolute[:, index], aligned, absolute)
+    gain[chosen] = solve_in_order(aligned[:, index], absolute[:, index], aligned, absolute)
     offsets = np.array(start, dtype=np.float64)
     for _ in range(MOST_STEPS):
-        error = weighted(tool.deviation(offsets))
-        step = _solve_in_order(aligned[:, index], absolute[:, index], *error)
+        error = weigh_field(tool, tool.deviation(offsets))
+        step = solve_in_order(aligned[:, index], absolute[:, index], *error)
         offsets[chosen] += step
         if np.abs(step).max() < SETTLED:
             break
     return Entering(read_only(offsets), read_only(gain))
 
 
-def _solve_in_order(first: Array, second: Array, first_rows: Array, second_rows: Array) -> Array:
+def weigh_field(tool: CalibratedTool, field: Array) -> tuple[Array, Array]:
+    """Field of position errors after alignment of the workpiece, and absolute.
+
+    The sum of squares of either is the mean square over the workspace.
+
+    Args:
+        tool: The tool over its workspace of K points.
+        field: Shape (K, 3, ...), [m].
+
+    Returns:
+        Two arrays of shape (3 K, ...), [m].
+    """
+    root = np.sqrt(tool.workspace.weights)[:, None]
+    parts = (tool.workspace.remove_motion(field, tool.targets), field)
+    aligned, absolute = (
+        (root * p.reshape(len(root), -1)).reshape(-1, *field.shape[2:]) for p in parts
+    )
+    return aligned, absolute
+
+
+def solve_in_order(first: Array, second: Array, first_rows: Array, second_rows: Array) -> Array:
     """Least-squares solution X of first X = first_rows, where ill-determined of the second system.
 
     A direction of X is determined by `first` if its effect there is at least DECIDED times its

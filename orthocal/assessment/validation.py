@@ -33,6 +33,7 @@ from orthocal.assessment.predictive import (
 )
 from orthocal.assessment.words import validation as words
 from orthocal.assessment.words.anomalies import describe_anomalies
+from orthocal.calibration.adjusting import adjust_calibration
 from orthocal.calibration.assessment_record import (
     Assessment,
     ControllerEntry,
@@ -45,6 +46,7 @@ from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.recorded_robot import require_calibrated_robot
 from orthocal.calibration.refit import repeat_fit, restore_session
+from orthocal.effects.adjustment import subtract_amounts
 from orthocal.errors import SessionError
 from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomaly
 from orthocal.hypotheses.search import find_anomalies
@@ -169,7 +171,8 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
     Args:
         calibration: The calibration whose offsets were entered.
         sessions: Measured afterwards, with its offsets active in the controller. A session that
-            does not state the offsets of its controller is assumed to have them.
+            does not state the offsets of its controller is assumed to have them. Mechanical
+            adjustments that the sessions state change the predicted readings.
 
     Raises:
         SessionError: If a session is of another robot, or states offsets of another calibration.
@@ -178,6 +181,7 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     given = gather_sessions(sessions)
+    calibration = _as_adjusted(calibration, given)
     measured = [_with_active_offsets(calibration, one) for one in given]
     session = join_sessions(measured)
     judgement = judge_session(session)
@@ -222,13 +226,30 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
     )
 
 
+def _as_adjusted(calibration: Calibration, sessions: Sequence[Session]) -> Calibration:
+    """The calibration of the machine with the mechanical adjustments that new sessions state.
+
+    Raises:
+        SessionError: If a session is of another robot, or two sessions state other adjustments.
+    """
+    first = sessions[0]
+    for session in sessions:
+        require_calibrated_robot(calibration, session)
+        if subtract_amounts(session.adjusted, first.adjusted):
+            raise SessionError(
+                "states other adjustments than the session before it; validate them separately",
+                where=f"{session.path or 'session'}: adjusted_mm",
+            )
+    changes = subtract_amounts(first.adjusted, dict(calibration.session.adjusted))
+    return adjust_calibration(calibration, changes)
+
+
 def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
     """The session with the offsets that were active: as stated, otherwise as calibrated.
 
     Raises:
-        SessionError: If it is of another robot, or states other offsets.
+        SessionError: If it states other offsets.
     """
-    require_calibrated_robot(calibration, session)
     drives = [d.name for d in session.robot.drives]
     entries = {drives.index(e.drive): e for e in find_entries(calibration)}
     if session.controller_offsets is None:

@@ -46,6 +46,10 @@ offset, [m]."""
 RAIL = 0.09
 """Length of a rail beyond the travel, [m]."""
 
+FEET = "Feet of the rails, made from machine.yaml until this line is removed."
+"""Comment above the adjustments of a machine whose feet follow its dimensions."""
+
+_FEET = re.compile(rf"(?m)^ *# {re.escape(FEET)}\n(?: *#.*\n)* *adjustments:.*\n(?: {{4,}}.*\n)*")
 _HEAD = re.compile(r"\A(?:# (?:A machine of the Orthoglide's kind|Made from).*\n)+")
 _DRIVE = r"(?m)^(?P<name> *{axis}_slide: )\{{[^#\n]*zero_mm: [^#\n]*\}}(?P<rest> *(?:#.*)?)$"
 _WORKSPACE = re.compile(r"(?m)^(?P<indent> +)workspace:.*\n(?:(?P=indent) +.*\n)*")
@@ -89,7 +93,9 @@ def describe_machine(
     if tolerances:
         pattern = _override(pattern, tolerances, f"{name}.yaml")
     return {
-        f"{name}.yaml": _describe(pattern, dimensions, counting, f"{name}.yaml"),
+        f"{name}.yaml": _describe(
+            pattern, dimensions, counting, f"{name}.yaml", made=description is None
+        ),
         f"{name}.urdf": _draw(urdf, dimensions),
         MACHINE: machine_text(dimensions, tuple(counting)),
     }
@@ -193,8 +199,7 @@ def _draw(pattern: bytes, dimensions: Dimensions) -> str:
         _set_cylinder(visual(f"{k}_crossbar", 0), length=dimensions.rods_apart + 0.02)
     for mount in ("platform_mount", "y_foot_end_mount", "z_foot_end_mount"):
         place(joints[mount], dimensions.attachment, 0.0, 0.0)
-    middle = 0.5 * (dimensions.lower + dimensions.upper) + dimensions.attachment + SLIDER
-    rail = dimensions.upper - dimensions.lower + RAIL
+    middle, rail = _rail(dimensions)
     for i in range(3):
         origin = visual("base", i).find("origin")
         places = origin.get("xyz").split()
@@ -208,8 +213,10 @@ def _draw(pattern: bytes, dimensions: Dimensions) -> str:
     return f'<?xml version="1.0"?>\n<!-- {_words(dimensions)} -->\n{text}\n'
 
 
-def _describe(pattern: str, dimensions: Dimensions, counting: Sequence[Counting], file: str) -> str:
-    """YAML with the zeros of the drives, the radii of the rods, the joints and the workspace.
+def _describe(
+    pattern: str, dimensions: Dimensions, counting: Sequence[Counting], file: str, *, made: bool
+) -> str:
+    """YAML with zeros of the drives, radii of the rods, joints, workspace, and feet of the rails.
 
     Raises:
         RobotError: If the YAML has no place for one of them.
@@ -233,7 +240,52 @@ def _describe(pattern: str, dimensions: Dimensions, counting: Sequence[Counting]
             raise RobotError("has no key orthocal with others below it", where=file)
         at = place.start("indent")
         text = f"{text[:at]}{place['indent']}workspace: {{box_mm: {box}}}\n{text[at:]}"
+    feet = _feet_text(dimensions)
+    text = f"{text.rstrip()}\n\n{feet}" if made else _FEET.sub(feet, text)
     return f"# {_words(dimensions)}\n# Made from {MACHINE}: change dimensions there.\n{text}"
+
+
+def _feet_text(dimensions: Dimensions) -> str:
+    """Adjustments at both ends of each rail, across it, and under one of its sides, as YAML."""
+    inner, outer = (_rail(dimensions)[0] + s * _rail(dimensions)[1] / 2.0 for s in (-1.0, 1.0))
+    half = dimensions.rods_apart / 2.0
+
+    def point(axis: int, along: float, across: int = 0, beside: float = 0.0) -> str:
+        values = [0.0, 0.0, 0.0]
+        values[axis] = along
+        values[(axis + across) % 3] += beside
+        return f"[{', '.join(in_mm(v) for v in values)}]"
+
+    def unit(axis: int) -> str:
+        return f"[{', '.join('1' if k == axis else '0' for k in range(3))}]"
+
+    lines = []
+    for axis, letter in enumerate(AXES):
+        moves = f"{{moves: {letter}_slide, at_mm:"
+        for end, at, pivot in (("inner", inner, outer), ("outer", outer, inner)):
+            for k in ((axis + 1) % 3, (axis + 2) % 3):
+                lines.append(
+                    f"{letter}_{end}_foot_{AXES[k]}: {moves} {point(axis, at)}, "
+                    f"direction: {unit(k)}, pivot_mm: {point(axis, pivot)}}}"
+                )
+        side, other = (point(axis, 0.5 * (inner + outer), 1, s * half) for s in (1.0, -1.0))
+        k = (axis + 2) % 3
+        lines.append(
+            f"{letter}_side_foot_{AXES[k]}: {moves} {side}, direction: {unit(k)}, "
+            f"pivot_mm: {other}}}"
+        )
+    body = "".join(f"    {line}\n" for line in lines)
+    return (
+        f"  # {FEET}\n"
+        "  # Shims move the ends of a rail, and raise one of its sides, as far apart as two rods.\n"
+        f"  adjustments:\n{body}"
+    )
+
+
+def _rail(dimensions: Dimensions) -> tuple[float, float]:
+    """Middle of a rail along its axis, and its length, as drawn, [m]."""
+    middle = 0.5 * (dimensions.lower + dimensions.upper) + dimensions.attachment + SLIDER
+    return middle, dimensions.upper - dimensions.lower + RAIL
 
 
 def _override(pattern: str, tolerances: Mapping[str, float], file: str) -> str:

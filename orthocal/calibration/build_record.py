@@ -44,6 +44,7 @@ from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.weighting import split_by_gauge
 from orthocal.io.documents import LARGEST_NUMBER
 from orthocal.io.fields import finite_or_none, read_only
+from orthocal.robot.model import Robot
 from orthocal.session.session import Session
 from orthocal.statistics.chance import confidence_factor
 from orthocal.statistics.identifiability import (
@@ -96,7 +97,10 @@ def assemble_calibration(
         model=problem.selection.label,
         prior=bool(problem.machine_selection.prior.any()),
         solver=_solver_record(fit),
-        parameters=(*estimates[:n], *_held_estimates(problem)),
+        parameters=(
+            *estimates[:n],
+            *(hold_parameter(session.robot, *known) for known in problem.fixed.items()),
+        ),
         sensors=estimates[n:],
         model_covariance=read_only(covariance[:n, :n]),
         noise_covariance=read_only(noise_covariance[:n, :n]),
@@ -225,31 +229,27 @@ def _estimates(
     )
 
 
-def _held_estimates(problem: CalibrationProblem) -> tuple[ParameterEstimate, ...]:
-    estimates = []
-    for name, value in problem.fixed.items():
-        p = problem.robot.parameters[name]
-        estimates.append(
-            ParameterEstimate(
-                name=name,
-                unit=p.unit,
-                value=value,
-                linear=value,
-                std=0.0,
-                std_scatter=0.0,
-                prior_std=p.prior_std,
-                free=False,
-                identifiable=False,
-                start=value,
-                prior=False,
-                mean=0.0,
-                lower=None,
-                upper=None,
-                at_bound=None,
-                interval=None,
-            )
-        )
-    return tuple(estimates)
+def hold_parameter(robot: Robot, name: str, value: float) -> ParameterEstimate:
+    """A parameter of a robot that is held at a known value, [SI]."""
+    p = robot.parameters[name]
+    return ParameterEstimate(
+        name=name,
+        unit=p.unit,
+        value=value,
+        linear=value,
+        std=0.0,
+        std_scatter=0.0,
+        prior_std=p.prior_std,
+        free=False,
+        identifiable=False,
+        start=value,
+        prior=False,
+        mean=0.0,
+        lower=None,
+        upper=None,
+        at_bound=None,
+        interval=None,
+    )
 
 
 @cache
@@ -271,6 +271,7 @@ def _session_record(session: Session) -> SessionRecord:
         controller_offsets=None if offsets is None else tuple(offsets.tolist()),
         purpose=session.purpose,
         seed=session.seed,
+        adjusted=tuple(session.adjusted.items()),
         parts=tuple(_session_record(part) for part in session.parts),
     )
 
@@ -355,6 +356,7 @@ def _setup_records(fit: Fit) -> tuple[SetupRecord, ...]:
             aligned_at=aligned_at[s.name],
             zero_kind=s.zero,
             payload=s.payload,
+            adjusted=None if s.adjusted is None else tuple(s.adjusted.items()),
         )
         for s in fit.problem.session.setups.values()
     )

@@ -16,7 +16,13 @@ from functools import lru_cache
 from pathlib import Path, PurePosixPath
 
 from orthocal.calibration.records import CalibrationRecord, RobotFile, RobotRecord
-from orthocal.effects.loading import load_robot, load_robot_content, with_effects
+from orthocal.effects.adjustment import require_adjustment
+from orthocal.effects.loading import (
+    load_robot,
+    load_robot_content,
+    with_adjustments,
+    with_effects,
+)
 from orthocal.errors import CalibrationFileError, ParameterError, RobotError, SessionError
 from orthocal.io.fields import finite_or_none
 from orthocal.measurement.files.readings_checks import check_conditions
@@ -43,6 +49,7 @@ def record_robot(session: Session) -> RobotRecord:
         ),
         tolerances=tuple(robot.parameters.stated.items()),
         effects=robot.chosen_effects,
+        adjusted=robot.adjusted,
     )
 
 
@@ -100,6 +107,8 @@ def load_recorded_robot(record: RobotRecord, *, file: str) -> Robot:
         )
     with _named(f"{file}: robot.effects"):
         robot = with_effects(robot, record.effects)
+    if record.adjusted:
+        robot = with_adjustments(robot)
     with _named(f"{file}: robot.tolerances"):
         return robot.with_tolerances(dict(record.tolerances))
 
@@ -200,6 +209,13 @@ def require_consistent(record: CalibrationRecord, robot: Robot, *, file: str) ->
     for i, setup in enumerate(record.setups):
         with _named(f"{file}: setups[{i}].reads"):
             setup.sensor.require_fit(robot, where=f"{file}: setups[{i}].reads")
+    for key, adjusted in (
+        ("session", record.session.adjusted),
+        *((f"setups[{i}]", s.adjusted or ()) for i, s in enumerate(record.setups)),
+    ):
+        for name, _ in adjusted:
+            where = f"{file}: {key}.adjusted"
+            require_adjustment(robot, name, where=where, error=CalibrationFileError)
     for i, row in enumerate(record.residuals):
         if row.conditions is not None:
             where = f"{file}: residuals[{i}].conditions"

@@ -88,6 +88,8 @@ class RobotRecord:
     instead of the robot's."""
     effects: Many[str] | None = None
     """Effects beside geometry that were chosen; None for those that the robot's YAML names."""
+    adjusted: bool = False
+    """True if sessions with different mechanical adjustments were calibrated together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,6 +113,8 @@ class SessionRecord:
     """Model and free errors that the session states."""
     seed: Count | None
     """Seed of simulated readings; None for measured readings."""
+    adjusted: Many[tuple[str, Number]] = ()
+    """Mechanical adjustments since the machine was built and their amounts, [m]."""
     parts: Many[SessionRecord] = ()
     """The sessions that were joined into this one."""
 
@@ -243,6 +247,8 @@ class SetupRecord:
     """Whether the zero was estimated or known to be 0."""
     payload: Annotated[Number, Field(ge=0.0, le=HEAVIEST_KG)] = 0.0
     """Mass on the tool, [kg]."""
+    adjusted: Many[tuple[str, Number]] | None = None
+    """Mechanical adjustments and their amounts, [m], where they were not those of the session."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -109,6 +109,7 @@ def restore_session(calibration: Calibration) -> Session:
                 s.aligned_at,
                 s.zero_kind,
                 s.payload,
+                None if s.adjusted is None else dict(s.adjusted),
             )
             for s in calibration.setups
         },
@@ -126,6 +127,7 @@ def restore_session(calibration: Calibration) -> Session:
             for r in calibration.residuals
         ),
         controller_offsets=None if offsets is None else read_only(offsets),
+        adjusted=dict(record.adjusted),
         path=None if record.path is None else Path(record.path),
         readings_path=None if record.readings_path is None else Path(record.readings_path),
         sha256=record.sha256,

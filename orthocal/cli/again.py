@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import orthocal
 from orthocal.cli.files import require_new_files
-from orthocal.cli.options import Anyway, CalibrationPath, OutDirectory, command
+from orthocal.cli.options import (
+    Anyway,
+    CalibrationPath,
+    OutDirectory,
+    command,
+    read_number,
+    require_between,
+    split_globs,
+)
 from orthocal.cli.printing import put_note, put_out
 from orthocal.cli.sheet import sheet_or_problem
 from orthocal.errors import ParameterError
+from orthocal.units import MM
 
 FILES = ("session.yaml", "readings.csv", "sheet.html")
 
@@ -21,6 +31,7 @@ def again(
     calibration: CalibrationPath,
     out: OutDirectory,
     session: Path | None = None,
+    adjusted: str | None = None,
     anyway: Anyway = False,
 ) -> None:
     """Plan the same readings again, with the offsets to enter.
@@ -31,6 +42,8 @@ def again(
 
     Args:
         session (SESSION): Session with the setups and postures; default: that of the calibration.
+        adjusted (NAME=MM,...): Mechanical adjustments since the calibration and their amounts, such
+            as x_outer_foot_y=0.12; or plan, for those that `orthocal adjust` prints.
     """
     from orthocal.export.formats import require_entering
 
@@ -38,7 +51,8 @@ def again(
     result = orthocal.load_calibration(calibration)
     if not anyway:
         require_entering(result)
-    new = _plan_again(result, session)
+    amounts = _read_amounts(result, adjusted)
+    new = _plan_again(result, session, amounts)
     comment = (
         "A plan: enter these offsets, then run `orthocal record .` in this directory, or fill in\n"
         "readings.csv. Compare the readings with the calibration by `orthocal validate`."
@@ -53,6 +67,9 @@ def again(
     )
     down = [d.name for d in new.robot.drives if d.direction < 0]
     sign = f" For joints that count down the sign changes: {', '.join(down)}." if down else ""
+    if amounts:
+        settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
+        put_out(f"The machine is expected with these adjustments: {settings}.")
     put_out(
         f"Enter these offsets of the slides, home, and measure again: {offsets}.{sign}\n"
         f"  orthocal record {out}\n"
@@ -61,10 +78,44 @@ def again(
     put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, and sheet.html")
 
 
-def _plan_again(calibration: orthocal.Calibration, path: Path | None) -> orthocal.Session:
-    """The rows of a session, with the offsets to enter as active offsets."""
+def _read_amounts(calibration: orthocal.Calibration, text: str | None) -> dict[str, float]:
+    """Adjustments of the option `--adjusted`, name to amount, [m].
+
+    Raises:
+        ParameterError: If the text is not NAME=MM, or a name is unknown or stated twice.
+        RobotError: If adjustments are to be planned, and the robot declares none.
+    """
+    from orthocal.effects.adjustment import LARGEST_AMOUNT_MM, require_adjustment
+
+    where, amounts = "--adjusted", dict[str, float]()
+    if text == "plan":
+        return orthocal.plan_adjustments(calibration).amounts
+    for part in [] if text is None else split_globs([text]):
+        name, equals, value = (piece.strip() for piece in part.partition("="))
+        if not equals:
+            raise ParameterError(f"found '{part}'; expected NAME=MM, or plan", where=where)
+        require_adjustment(calibration.robot, name, where=where, error=ParameterError)
+        if name in amounts:
+            raise ParameterError(f"'{name}' is given twice", where=where)
+        amount = read_number(value, where, name)
+        require_between(amount, -LARGEST_AMOUNT_MM, LARGEST_AMOUNT_MM, where)
+        amounts[name] = amount * MM
+    return amounts
+
+
+def _plan_again(
+    calibration: orthocal.Calibration, path: Path | None, amounts: Mapping[str, float]
+) -> orthocal.Session:
+    """The rows of a session, with the offsets to enter as active offsets.
+
+    Args:
+        calibration: The calibration.
+        path: A session with these rows; None for that of the calibration.
+        amounts: Mechanical adjustments since the calibration, name to amount, [m].
+    """
     from orthocal.assessment.controller_entries import offsets_to_enter
     from orthocal.calibration.recorded_robot import require_calibrated_robot
+    from orthocal.effects.adjustment import add_amounts
 
     if path is not None:
         planned = orthocal.load_plan(path)
@@ -77,5 +128,8 @@ def _plan_again(calibration: orthocal.Calibration, path: Path | None) -> orthoca
     else:
         planned = orthocal.restore_session(calibration)
     title = planned.title.removeprefix("Simulated: ")
-    planned = planned.with_controller(offsets_to_enter(calibration))
-    return replace(planned, title=title, source="", seed=None)
+    planned = planned.with_controller(
+        offsets_to_enter(orthocal.adjust_calibration(calibration, amounts))
+    )
+    adjusted = add_amounts(dict(calibration.session.adjusted), amounts)
+    return replace(planned, title=title, source="", seed=None, adjusted=adjusted)

@@ -24,7 +24,7 @@ PANELS = {
     "Prepare": ("new", "plan"),
     "Measure": ("sheet", "record", "import", "simulate", "check"),
     "Calibrate": ("calibrate", "compare", "report", "validate", "again"),
-    "Use": ("forward", "inverse", "accuracy", "correct", "export", "view"),
+    "Use": ("forward", "inverse", "accuracy", "adjust", "correct", "export", "view"),
     "Study": ("study",),
 }
 """Panels of `orthocal --help` and their commands, in the order of work."""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from pydantic import Field
 
+from orthocal.effects.adjustment import AdjustmentChanges, adjustment_parameters
 from orthocal.effects.drive import DriveErrors, DriveTolerances
 from orthocal.effects.geometry import GeometryErrors, GeometryTolerances
 from orthocal.effects.protocol import NEUTRAL, Condition, Effect
@@ -91,6 +92,14 @@ def with_effects(robot: Robot, names: Sequence[str] | None) -> Robot:
     return _add_parameters(plain).with_tolerances(robot.parameters.stated)
 
 
+def with_adjustments(robot: Robot) -> Robot:
+    """Robot whose placements depend on the mechanical adjustments under which it was measured."""
+    if robot.adjusted:
+        return robot
+    plain = replace(robot, adjusted=True, parameters=ParameterSet())
+    return _add_parameters(plain).with_tolerances(robot.parameters.stated)
+
+
 @lru_cache(maxsize=MAX_LOADED)
 def _add_parameters(robot: Robot) -> Robot:
     where, declared = f"{robot.yaml}: orthocal", robot.declared
@@ -112,6 +121,7 @@ def _add_parameters(robot: Robot) -> Robot:
             overrides=_read_tolerances(robot).overrides,
             models=models,
             find_redundant=partial(find_redundant_errors, robot, elementary),
+            further=adjustment_parameters(robot, errors),
         )
     except ParameterError as e:
         raise RobotError(e.problem, where=where) from None
@@ -120,7 +130,7 @@ def _add_parameters(robot: Robot) -> Robot:
 
 @lru_cache(maxsize=2 * MAX_LOADED)
 def robot_effects(robot: Robot) -> tuple[Effect, ...]:
-    """Effects of a robot: drive, geometry, and those that it has beside them, in this order.
+    """Effects of a robot: drive, geometry, adjustments between sessions, and those beside them.
 
     Raises:
         RobotError: If there is no such effect, or one of its keys does not fit.
@@ -129,6 +139,7 @@ def robot_effects(robot: Robot) -> tuple[Effect, ...]:
     effects: list[Effect] = [
         DriveErrors.from_keys(tolerances, robot),
         GeometryErrors.from_keys(tolerances, robot),
+        *([AdjustmentChanges.of_robot(robot)] if robot.adjusted else []),
     ]
     for name in order_effects(robot.effect_names):
         data, under = robot.declared.effects.get(name, {}), f"orthocal.effects.{name}"

@@ -6,16 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import casadi as ca
-import numpy as np
-import pinocchio as pin
 
 from orthocal.effects.loading import neutral_values, robot_effects
 from orthocal.effects.protocol import Condition, Placement, Symbols, condition_size
-from orthocal.robot.frames import carriers, hangs_on
-from orthocal.robot.model import Robot, Rod
-
-SAME_PLACE = 1e-6
-"""Distance of two places along a rod that count as one, as a share of the rod's length."""
+from orthocal.effects.rods import stretch_rod
+from orthocal.robot.model import Robot
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,59 +60,3 @@ def express_machine(
             before = twists.get(placement)
             twists[placement] = twist if before is None else before + twist
     return MachineExpressions(actuated, twists)
-
-
-def stretch_rod(robot: Robot, rod: Rod, change: ca.SX) -> dict[Placement, ca.SX]:
-    """Twists of the placements on a rod whose length changes, uniformly along its axis.
-
-    Args:
-        robot: The nominal robot.
-        rod: One of its rods.
-        change: Change of the length, [m].
-    """
-    model = robot.model
-    data = model.createData()
-    pin.framesForwardKinematics(model, data, robot.configuration(robot.reference_posture))
-    root, tip = (data.oMf[robot.frame_id(f)].translation for f in (rod.root, rod.tip))
-    axis = (tip - root) / rod.length
-
-    def share(position: np.ndarray) -> float:
-        return float(axis @ (position - root)) / rod.length
-
-    body = _body_of(robot, rod, {i: share(data.oMi[i].translation) for i in range(model.njoints)})
-    twists: dict[Placement, ca.SX] = {}
-
-    def move(placement: Placement, pose: pin.SE3, carrier: pin.SE3) -> None:
-        part = share(pose.translation) - share(carrier.translation)
-        if abs(part) > SAME_PLACE:
-            local = pose.rotation.T @ axis * part
-            local[np.abs(local) < SAME_PLACE] = 0.0
-            twists[placement] = ca.vertcat(ca.sparsify(ca.SX(local)) * change, ca.SX(3, 1))
-
-    for joint in range(1, model.njoints):
-        if int(model.parents[joint]) == body:
-            # before its motion, in which placements act
-            pose = data.oMi[body] * model.jointPlacements[joint]
-            move(Placement(joint, False), pose, data.oMi[body])
-    for frame in sorted(_used_frames(robot)):
-        if int(model.frames[frame].parentJoint) == body:
-            above = hangs_on(model, frame)
-            carrier = data.oMi[body] if above is None else data.oMf[above]
-            move(Placement(frame, True), data.oMf[frame], carrier)
-    return twists
-
-
-def _body_of(robot: Robot, rod: Rod, share: Mapping[int, float]) -> int:
-    """Joint that moves a rod's link: the last one before its tip, from the root's."""
-    model = robot.model
-    first, joint = (int(model.frames[robot.frame_id(f)].parentJoint) for f in (rod.root, rod.tip))
-    while joint != first and joint > 0 and share[joint] > 1.0 - SAME_PLACE:
-        joint = int(model.parents[joint])
-    return joint
-
-
-def _used_frames(robot: Robot) -> set[int]:
-    """Frames of closures, legs, rods and the tool, with the frames that carry them."""
-    rods = (rod for leg in robot.legs.values() for rod in leg.rods.values())
-    names = {*robot.frames, *(f for rod in rods for f in (rod.root, rod.tip))}
-    return {f for name in names for f in carriers(robot.model, robot.frame_id(name))}

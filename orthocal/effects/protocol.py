@@ -26,17 +26,19 @@ from orthocal.robot.parameters import ElementaryError
 Symbols = Mapping[str, ca.SX]
 """Names to expressions."""
 
-Condition = Literal["approach", "temperature", "time", "load"]
+Condition = Literal["approach", "temperature", "time", "load", "adjustment"]
 """Condition of a reading: the direction of each drive's last motion, shape (n_drives,), 1 where its
 coordinate grew, -1 where it fell, 0 if unknown; the temperature, [°C]; the time since the first
 reading of the setup, [s]; the axial force of each rod under the weight on the tool, tension
-positive, shape (n_rods,), [N], which is computed from the posture and the payload."""
+positive, shape (n_rods,), [N], which is computed from the posture and the payload; the amounts by
+which the machine was adjusted otherwise than it is at last, shape (n_adjustments,), [m]."""
 
 NEUTRAL: dict[Condition, float] = {
     "approach": 0.0,
     "temperature": 20.0,
     "time": 0.0,
     "load": 0.0,
+    "adjustment": 0.0,
 }
 """Value of a condition that is not stated. The temperature is that of ISO 1. Without a load a
 machine is weightless, as in the controller's nominal kinematics."""
@@ -44,7 +46,12 @@ machine is weightless, as in the controller's nominal kinematics."""
 
 def condition_size(robot: Robot, name: Condition) -> int:
     """Numbers of a condition."""
-    return {"approach": len(robot.drives), "load": len(robot.rods)}.get(name, 1)
+    sizes = {
+        "approach": len(robot.drives),
+        "load": len(robot.rods),
+        "adjustment": len(robot.declared.adjustments),
+    }
+    return sizes.get(name, 1)
 
 
 class EffectKeys(BaseModel):

@@ -149,6 +149,7 @@ def fingerprint(robot: Robot) -> str:
         repr([float(v).hex() for v in robot.drive_gain]),
         repr(tuple(robot.parameters.elementary.values())),
         repr([(name, robot.declared.effects.get(name)) for name in robot.effect_names]),
+        repr(robot.declared.adjustments) if robot.adjusted else "",
         *(source_digest(type(e)) for e in robot_effects(robot)),  # type: ignore[arg-type] # hashable
         repr([(p.name, p.terms) for p in robot.parameters]),
         float(robot.characteristic_length).hex(),

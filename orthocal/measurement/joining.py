@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from orthocal.arguments import require_kind
+from orthocal.effects.adjustment import subtract_amounts
+from orthocal.effects.loading import with_adjustments
 from orthocal.errors import SessionError
 from orthocal.measurement.files.session_file import load_session
 from orthocal.session.session import Posture, Session, Setup
@@ -36,8 +38,8 @@ def gather_sessions(given: Given | Sequence[Given]) -> list[Session]:
 def join_sessions(sessions: Sequence[Session], *, effects: Sequence[str] | None = None) -> Session:
     """One session of all readings of several on the same robot.
 
-    Setups, postures and gauges are named after their session. The active offsets are those of the
-    last session.
+    Setups, postures and gauges are named after their session. The active offsets and the mechanical
+    adjustments are those of the last session: the errors of the machine are those that it has then.
 
     Args:
         sessions: In the order in which they were measured, joined ones among them or not; a single
@@ -72,13 +74,16 @@ def join_sessions(sessions: Sequence[Session], *, effects: Sequence[str] | None 
     tolerances = _join_tolerances(sessions)
     purposes = {s.purpose for s in sessions} - {None}
     parts = [_rename(s, labels) for s, labels in zip(sessions, _labels(sessions), strict=True)]
+    setups = _merged(p.setups for p in parts)
+    if any(subtract_amounts(s.adjusted or {}, last.adjusted) for s in setups.values()):
+        last = replace(last, robot=with_adjustments(last.robot))
     return replace(
         last.with_tolerances(tolerances),
         title=" + ".join(dict.fromkeys(s.title for s in sessions if s.title)),
         source="; ".join(dict.fromkeys(s.source for s in sessions if s.source)),
         gauges=_merged(p.gauges for p in parts),
         postures=_merged(p.postures for p in parts),
-        setups=_merged(p.setups for p in parts),
+        setups=setups,
         readings=tuple(r for p in parts for r in p.readings),
         path=None,
         readings_path=None,
@@ -178,6 +183,7 @@ def _rename(session: Session, labels: Mapping[str, str]) -> Session:
             gauge=named(s.gauge),
             active=active if s.active is None else s.active,
             aligned_at=named(aligned_at[s.name]),
+            adjusted=session.adjusted if s.adjusted is None else s.adjusted,
         )
 
     def posture(p: Posture) -> Posture:

@@ -7,7 +7,8 @@ first order,
     ν = ν_deviation + S (θ − θ_active)
 
 with S the sensitivity of a virtual sensor in that posture, and θ_active the offsets that the
-controller already applies. Second-order terms, some hundredths of a millimetre for offsets of
+controller already applies. In a session before mechanical adjustments θ is that of the machine
+then. Second-order terms, some hundredths of a millimetre for offsets of
 millimetres, are far below the uncertainty of alignment by eye.
 """
 
@@ -30,7 +31,8 @@ class ManualAlignment:
     sensitivity: Array
     """S, derivative by all elementary errors, shape (n_nuisance, n_errors), [SI]."""
     start: Array
-    """Value without errors, −S θ_active, shape (n_nuisance,), [SI]."""
+    """Value without errors, −S θ_active and what later adjustments changed, shape (n_nuisance,),
+    [SI]."""
 
     def __call__(self, errors: Array) -> Array:
         """Nuisance parameters, shape (..., n_nuisance) of errors (..., n_errors), [SI]."""

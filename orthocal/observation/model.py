@@ -23,11 +23,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array, Indices
+from orthocal.effects.adjustment import find_adjustments
 from orthocal.kinematics.error_map import ErrorMap, VaryingDerivatives
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import RobotFunctions, robot_functions
 from orthocal.observation.manual_alignment import ManualAlignment, list_alignments, virtual_session
-from orthocal.observation.observations import Observations, States, build_observations
+from orthocal.observation.observations import (
+    Observations,
+    States,
+    adjustment_table,
+    build_observations,
+)
 from orthocal.observation.sensor_groups import (
     NuisanceParameters,
     SensorGroup,
@@ -190,11 +196,15 @@ class ObservationModel:
         alignments = list_alignments(self.session, self.nuisance)
         if alignments:
             index = [a.parameter for a in alignments]
-            by_errors = nominal_sensitivity(virtual_session(self.session, alignments))
+            virtual = virtual_session(self.session, alignments)
+            by_errors = nominal_sensitivity(virtual)
             offsets = errors.columns([f"{d.name}.offset" for d in self.session.robot.drives])
             active = np.array([a.active for a in alignments])
             sensitivity[index] = by_errors
             start[index] = -((by_errors @ offsets) * active).sum(axis=1)
+            amounts = [a.parameter for a in find_adjustments(self.session.robot)]
+            changes = (by_errors @ errors.columns(amounts)) * adjustment_table(virtual)
+            start[index] += changes.sum(axis=1)
         return ManualAlignment(sensitivity, start)
 
     def parametrise(self, columns: Array, nuisance_scale: Array) -> FreeParameters:

@@ -9,6 +9,7 @@ from datetime import datetime
 import numpy as np
 
 from orthocal.arrays import Array, Indices, Mask
+from orthocal.effects.adjustment import subtract_amounts
 from orthocal.effects.loading import neutral_values, robot_effects
 from orthocal.effects.protocol import Condition, condition_size
 from orthocal.errors import SessionError
@@ -188,6 +189,7 @@ def build_observations(session: Session) -> Observations:
     values = _condition_values(session.robot, conditions, table[:, 0])
     if "load" in error_map(session.robot).conditions:
         values["load"] = _find_loads(session, table[:, 0], table[:, 1])
+    values["adjustment"] = adjustment_table(session)[table[:, 0]]
     states, state = _find_states(session, table[:, 1], values)
     places = np.hstack([table[:, :2], values["approach"]])
     zero_setup, zero_real = tuple(k[0] for k in zeros), tuple(len(k) == 1 for k in zeros)
@@ -256,6 +258,17 @@ def _find_loads(session: Session, setup: Indices, posture: Indices) -> Array:
     unique, place = np.unique(pairs, axis=0, return_inverse=True)
     drives = drive_table(session)[unique[:, 0].astype(np.int64)]
     return find_loads(session.robot, drives, unique[:, 1])[place.reshape(-1)]
+
+
+def adjustment_table(session: Session) -> Array:
+    """Adjustments of the setups less those of the session, shape (n_setups, n_adjustments), [m]."""
+    names, last = list(session.robot.declared.adjustments), session.adjusted
+    result = np.zeros((len(session.setups), len(names)))
+    for row, setup in zip(result, session.setups.values(), strict=True):
+        amounts = last if setup.adjusted is None else setup.adjusted
+        for name, change in subtract_amounts(amounts, last).items():
+            row[names.index(name)] = change
+    return result
 
 
 def _find_states(
@@ -331,6 +344,8 @@ def readings_without(session: Session, condition: Condition) -> list[Reading]:
 
     Where no reading of a setup states its time, its rows are in the order of time.
     """
+    if condition == "adjustment":  # the session states it
+        return []
     if condition == "approach":
         return [r for r in session.readings if r.approach is None or "u" in r.approach]
     lacking = [r for r in session.readings if getattr(r.conditions, condition, None) is None]

@@ -184,6 +184,8 @@ class OrthocalKeys(_Keys):
     """Tolerances of the rigid-body errors, read by `orthocal.effects`."""
     effects: Annotated[dict[Name, dict[str, Any]], Field(max_length=MOST_PARTS)] = {}
     """Further effects by name; each reads its own keys."""
+    adjustments: Annotated[dict[Name, dict[str, Any]], Field(max_length=MOST_PARTS)] = {}
+    """Mechanical adjustments by name, read by `orthocal.effects.adjustment`."""
     models: dict[Name, Annotated[list[Name], Field(min_length=1)] | Literal["complete"]] = {}
     """Patterns of parameter names, or all observable errors."""
 

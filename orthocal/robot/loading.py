@@ -179,6 +179,7 @@ def _build_robot(
             effects=keys.orthocal.effects,
             sums=keys.orthocal.parameters,
             models=keys.orthocal.models,
+            adjustments=keys.orthocal.adjustments,
         ),
         parameters=ParameterSet(),
         drive_index=np.array(drive_index, dtype=np.int64),

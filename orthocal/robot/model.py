@@ -172,6 +172,8 @@ class Robot:
     """1 + scale error of each drive, shape (n_drives,); 1 for the nominal machine."""
     chosen_effects: tuple[str, ...] | None = None
     """Effects beside geometry that the machine has; None for those that its YAML names."""
+    adjusted: bool = False
+    """True if its placements depend on the mechanical adjustments under which it was measured."""
 
     @property
     def effect_names(self) -> tuple[str, ...]:

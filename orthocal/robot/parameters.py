@@ -10,7 +10,7 @@ import difflib
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 from glob import escape, has_magic
@@ -79,6 +79,8 @@ class DeclaredErrors:
     """Key `orthocal.parameters`: name of a sum to names of elementary errors; '-' subtracts."""
     models: Mapping[str, Sequence[str]]
     """Key `orthocal.models`: name of a model to patterns, or to COMPLETE."""
+    adjustments: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Key `orthocal.adjustments`: name of a mechanical adjustment to its keys."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -384,6 +386,7 @@ def build_parameters(
     overrides: Mapping[str, float],
     models: Mapping[str, Sequence[str]],
     find_redundant: Callable[[], frozenset[str]],
+    further: Iterable[Parameter] = (),
 ) -> ParameterSet:
     """Build the parameter set of a robot.
 
@@ -394,6 +397,7 @@ def build_parameters(
             prior standard deviations; later ones win.
         models: Model name to patterns, or to COMPLETE.
         find_redundant: As for `ParameterSet`.
+        further: Parameters beside the errors and their sums.
 
     Raises:
         ParameterError: If a name is unknown, stated twice, or of another unit than its sum.
@@ -407,6 +411,10 @@ def build_parameters(
         if name in parameters:
             raise ParameterError(f"parameters.{name}: this name is taken by an elementary error")
         parameters[name] = _sum_errors(name, members, by_name)
+    for parameter in further:
+        if parameter.name in parameters:
+            raise ParameterError(f"parameters.{parameter.name}: this name is that of an adjustment")
+        parameters[parameter.name] = parameter
     for key, value in overrides.items():
         glob, unit, factor = split_unit(key)
         names = [name for name in parameters if fnmatchcase(name, glob)]

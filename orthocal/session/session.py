@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Literal
@@ -93,6 +93,8 @@ class Setup:
             `Session.alignment_postures`.
         zero: Gauge zero: estimated from the setup's readings, or known to be 0 (absolute readings).
         payload: Mass on the tool while the setup was read, [kg].
+        adjusted: Mechanical adjustments during this setup, name to amount, [m]; by default those of
+            the session.
     """
 
     name: str
@@ -102,6 +104,7 @@ class Setup:
     aligned_at: str | None = None
     zero: GaugeZero = "free"
     payload: float = 0.0
+    adjusted: Mapping[str, float] | None = None
 
 
 CycleNumber = Annotated[int, Field(ge=1, lt=10**9)]
@@ -223,6 +226,9 @@ class Session:
     readings: tuple[Reading, ...]
     controller_offsets: Array | None = None
     """Offsets active in the controller, shape (n_drives,), [m, rad]; None where not stated."""
+    adjusted: Mapping[str, float] = field(default_factory=dict)
+    """Mechanical adjustments since the machine was built, name to amount, [m]; 0 where absent. The
+    errors of the machine are those under these adjustments."""
     path: Path | None = None
     """The session.yaml, or None for a session that is not from a file."""
     readings_path: Path | None = None

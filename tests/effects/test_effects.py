@@ -28,7 +28,7 @@ from orthocal import (
 )
 from orthocal.effects import registry
 from orthocal.effects.loading import robot_effects
-from orthocal.effects.machine import stretch_rod
+from orthocal.effects.rods import stretch_rod
 from orthocal.errors import ParameterError, RobotError, SessionError
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem

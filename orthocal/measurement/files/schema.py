@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from orthocal.effects.adjustment import LARGEST_AMOUNT_MM
 from orthocal.io.documents import Count, Name, Number, PositiveNumber
 from orthocal.robot.description import HEAVIEST_KG
 from orthocal.sensors.mounting import LARGEST_SCALE
@@ -39,6 +40,8 @@ MOST_NAMES = 1_000
 
 GaugeLength = Annotated[PositiveNumber, Field(le=COARSEST_MM)]
 GaugeEnd = Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)]
+
+Adjusted = Annotated[Number, Field(ge=-LARGEST_AMOUNT_MM, le=LARGEST_AMOUNT_MM)]
 
 
 OFFSET_KEYS: dict[str, tuple[Unit, float]] = {
@@ -146,6 +149,8 @@ class SessionKeys(_Keys):
     payload_kg: Annotated[Number, Field(ge=0.0, le=HEAVIEST_KG)] = 0.0
     """Mass on the tool during the measurement."""
     controller: ControllerKeys | None = None
+    adjusted_mm: Annotated[dict[Name, Adjusted], Field(max_length=MOST_NAMES)] = {}
+    """Mechanical adjustments since the machine was built, name to amount."""
     calibration: CalibrationKeys | None = None
     setups: Annotated[dict[Name, dict[str, Any]], Field(min_length=1, max_length=MOST_SETUPS)]
     """What each may say is the sensor's own affair; see `orthocal.sensors.registry`."""

@@ -14,6 +14,7 @@ from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
 
+from orthocal.effects.adjustment import require_adjustment
 from orthocal.effects.loading import load_robot, with_effects
 from orthocal.errors import ParameterError, RobotError, SessionError
 from orthocal.io.documents import read_yaml, validate
@@ -37,7 +38,7 @@ from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import NuisanceParameter, Sensor, SetupKeys, default_zero
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Gauge, Purpose, Reading, Session, Setup
-from orthocal.units import show_limit
+from orthocal.units import MM, show_limit
 
 SESSION = "session.yaml"
 
@@ -276,6 +277,8 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
     require_given_zero(robot, f"{file}: robot")
     purpose, robot = read_purpose(keys.calibration, robot, where=f"{file}: calibration")
     offsets = build_offsets(keys.controller, robot, f"{file}: controller")
+    for name in keys.adjusted_mm:
+        require_adjustment(robot, name, where=f"{file}: adjusted_mm", error=SessionError)
     gauges = {name: g.to_gauge() for name, g in keys.named_gauges.items()}
     setups = {}
     for name, (setup, sensor) in read.items():
@@ -302,6 +305,7 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
         setups=setups,
         readings=(),
         controller_offsets=offsets,
+        adjusted={name: amount * MM for name, amount in keys.adjusted_mm.items()},
         path=file,
         purpose=purpose,
         seed=keys.seed,

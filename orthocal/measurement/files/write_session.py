@@ -44,6 +44,8 @@ def session_document(session: Session) -> dict[str, Any]:
         document["payload_kg"] = payload
     if session.controller_offsets is not None:
         document["controller"] = _offsets_document(session)
+    if session.adjusted:
+        document["adjusted_mm"] = {n: tidy(v / MM) for n, v in session.adjusted.items()}
     if calibration := _calibration_document(session):
         document["calibration"] = calibration
     aligned_at = session.alignment_postures

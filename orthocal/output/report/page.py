@@ -28,6 +28,7 @@ from orthocal.output.report.reading_plots import plot_residuals, plot_setups, pl
 from orthocal.output.report.tool_map import Field, plot_tool_map
 from orthocal.output.scene.drawing import draw_scene
 from orthocal.output.text.accuracy import render_tool
+from orthocal.output.text.adjustment import render_adjustments
 from orthocal.output.text.answer import (
     render_answer,
     render_method,
@@ -98,6 +99,7 @@ def build_report(calibration: Calibration, *, saved: Path | None = None) -> str:
     sections = [
         ("verdict", "Verdict", _verdict(calibration, saved)),
         ("tool", "Tool error", _tool(calibration)),
+        *_adjustments(calibration, saved),
         ("fit", "Residuals", _fit(calibration)),
         ("residuals", "Readings", _readings(calibration)),
         ("parameters", "Parameters", _parameters(calibration)),
@@ -152,6 +154,14 @@ def _tool(calibration: Calibration) -> str:
         return words + _maps(calibration, assess_tool(calibration))
     except (ClosureError, RobotError):  # the text states the reason
         return words
+
+
+def _adjustments(calibration: Calibration, saved: Path | None) -> list[tuple[str, str, str]]:
+    """Section with the plan of adjustments; none for a robot that declares no adjustments."""
+    if not calibration.robot.declared.adjustments:
+        return []
+    content = to_markup(render_adjustments(calibration, saved=saved))
+    return [("adjustment", "Mechanical adjustment", content)]
 
 
 def _maps(calibration: Calibration, accuracy: ToolAccuracy) -> str:

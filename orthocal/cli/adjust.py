@@ -1,0 +1,42 @@
+"""The command `adjust`."""
+
+from __future__ import annotations
+
+import orthocal
+from orthocal.cli.options import Anyway, CalibrationPath, Json, command, split_globs
+from orthocal.cli.printing import deliver
+from orthocal.errors import ParameterError
+
+
+@command()
+def adjust(
+    calibration: CalibrationPath,
+    among: str | None = None,
+    json: Json = False,
+    anyway: Anyway = False,
+) -> None:
+    """Plan mechanical adjustments: which feet, shims and threads to set, by how much.
+
+    The robot's YAML declares them under orthocal.adjustments.
+
+    Exit code 3: the verdict is not `enter`; the reason is printed.
+
+    Args:
+        among (NAMES): Adjustments that may be used, separated by commas; default: all.
+    """
+    from orthocal.effects.adjustment import require_adjustment
+    from orthocal.export.formats import require_entering
+    from orthocal.output.text import adjustment as text
+
+    result = orthocal.load_calibration(calibration)
+    names = None if among is None else split_globs([among])
+    for name in names or ():
+        require_adjustment(result.robot, name, where="--among", error=ParameterError)
+    if not anyway:
+        require_entering(result)
+    plan = orthocal.plan_adjustments(result, among=names)
+    deliver(
+        lambda: text.plan_json(result, plan),
+        lambda: text.print_plan(result, plan, saved=calibration),
+        json=json,
+    )

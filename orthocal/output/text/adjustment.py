@@ -1,0 +1,130 @@
+"""Plan of mechanical adjustments as text and JSON."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from rich.console import Group, RenderableType
+from rich.padding import Padding
+from rich.text import Text
+
+from orthocal.assessment.adjustment_plan import AdjustmentPlan, plan_adjustments
+from orthocal.assessment.assess import assessment_of
+from orthocal.assessment.words.adjustment import (
+    HEADLINES,
+    describe_gain,
+    describe_limits,
+    describe_setting,
+)
+from orthocal.assessment.words.entries import describe_region
+from orthocal.calibration.assessment_record import ControllerEntry, ToolErrorSummary
+from orthocal.calibration.calibration import Calibration
+from orthocal.errors import ClosureError, OrthocalError
+from orthocal.io.documents import write_plain
+from orthocal.io.fields import finite_or_none
+from orthocal.output.text.answer import quote_path, render_next
+from orthocal.output.text.layout import EXPANDED, bullets, plain, print_rich, signed, table_of
+from orthocal.units import MM
+
+SCHEMA = "orthocal/adjustment/1"
+
+
+def render_adjustments(calibration: Calibration, *, saved: Path | None = None) -> RenderableType:
+    """The plan of adjustments of a calibration, or why there is none.
+
+    Args:
+        calibration: The calibration.
+        saved: Its directory, for the next command.
+    """
+    decision = assessment_of(calibration).decision
+    if decision.verdict != "enter":
+        return Text(f"Not planned: {decision.headline}")
+    try:
+        return render_plan(calibration, plan_adjustments(calibration), saved=saved)
+    except (OrthocalError, ClosureError) as e:
+        return Text(f"The adjustments cannot be planned: {e}.")
+
+
+def print_plan(calibration: Calibration, plan: AdjustmentPlan, *, saved: Path) -> None:
+    """Print a plan of adjustments."""
+    head = f"Mechanical adjustment of {calibration.robot_record.name}, model '{calibration.model}'"
+    print_rich(Group(Text(head), Text(), render_plan(calibration, plan, saved=saved)))
+
+
+def render_plan(
+    calibration: Calibration, plan: AdjustmentPlan, *, saved: Path | None
+) -> RenderableType:
+    """A plan of adjustments; arguments as for `render_adjustments`."""
+    parts: list[RenderableType] = [Text(HEADLINES[plan.judgement]), Text()]
+    notes = describe_limits(plan)
+    if plan.adjustments:
+        rows = [
+            (
+                str(i),
+                p.adjustment.name,
+                describe_setting(p),
+                signed(p.amount / MM),
+                plain(p.uncertainty / MM),
+                plain(p.tool_error / MM),
+            )
+            for i, p in enumerate(plan.adjustments, start=1)
+        ]
+        headers = ("", "adjustment", "set", "amount", "±", "tool error")
+        parts += [Padding(table_of(headers, rows, left=3), (0, 0, 0, 2)), Text()]
+        notes = [
+            "amount, ± and tool error in mm. tool error: after this adjustment and those before "
+            "it, with the offsets entered again.",
+            EXPANDED,
+            *notes,
+        ]
+    parts += [Text(line) for line in describe_gain(plan)]
+    parts.append(Text(describe_region(plan.before.region)))
+    if plan.adjustments and plan.judgement == "worthwhile":
+        offsets = ", ".join(
+            f"{e.drive} {signed(e.enter * e.edge_factor)} {e.edge_unit}" for e in plan.entries
+        )
+        parts.append(Text(f"Offsets to enter afterwards: {offsets}."))
+    parts.append(bullets(notes))
+    if plan.adjustments and saved is not None and plan.judgement == "worthwhile":
+        new = quote_path(f"{saved}-adjusted")
+        parts.append(
+            render_next(
+                "adjust the machine, then measure again:",
+                (
+                    f"orthocal again {quote_path(saved)} --adjusted plan --out {new}",
+                    f"orthocal record {new}",
+                    f"orthocal validate {quote_path(saved)} {new}",
+                ),
+            )
+        )
+    return Group(*parts)
+
+
+def plan_json(calibration: Calibration, plan: AdjustmentPlan) -> str:
+    """A plan of adjustments as JSON, SI units."""
+    document = {
+        "schema": SCHEMA,
+        "robot": calibration.robot_record.name,
+        "model": calibration.model,
+        "judgement": plan.judgement,
+        "worthwhile": plan.judgement == "worthwhile",
+        "gain": plan.gain,
+        "adjustments": [
+            {
+                "name": p.adjustment.name,
+                "amount": p.amount,
+                "expanded_uncertainty": finite_or_none(p.uncertainty),
+                "turns": p.turns,
+                "step": p.adjustment.step,
+                "largest": p.adjustment.largest,
+                "tool_error": p.tool_error,
+                "set": describe_setting(p),
+            }
+            for p in plan.adjustments
+        ],
+        "enter": [write_plain(e, ControllerEntry) for e in plan.entries],
+        "before": write_plain(plan.before, ToolErrorSummary),
+        "after": write_plain(plan.after, ToolErrorSummary),
+    }
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"

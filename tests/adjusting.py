@@ -1,0 +1,59 @@
+"""Machines whose feet were shimmed, as rigid bodies: nothing here is a formula of orthocal's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from scipy.spatial.transform import Rotation
+
+from orthocal import Dimensions, make_robot
+from orthocal.planning.equipment import Equipment
+from orthocal.planning.first_plan import paper_plan
+
+TOLERANCES = {"*_slide.r?_mrad": 6.0, "*.offset_mm": 2.0}
+"""A machine whose axes are three times as far off as the packaged tolerances say."""
+
+
+def shimmed_plan(folder):
+    """The paper's readings on a machine as `orthocal new` makes it, with feet under its rails."""
+    robot = make_robot(Dimensions(), folder)
+    return paper_plan(robot, Equipment()).with_tolerances(TOLERANCES)
+
+
+def turned(keys, amount):
+    """World displacement (rotation, translation) of a rail one of whose feet is moved, [m]."""
+    direction = np.array(keys["direction"], dtype=float)
+    direction /= np.linalg.norm(direction)
+    if "pivot_mm" not in keys:
+        return np.eye(3), amount * direction
+    pivot = np.array(keys["pivot_mm"]) * 1e-3
+    arm = np.array(keys["at_mm"]) * 1e-3 - pivot
+    arm = arm - (arm @ direction) * direction
+    axis = np.cross(arm, direction)
+    axis /= np.linalg.norm(axis)
+    rotation = Rotation.from_rotvec(np.arctan(amount / np.linalg.norm(arm)) * axis).as_matrix()
+    return rotation, pivot - rotation @ pivot
+
+
+def shim(machine, amounts):
+    """Pinocchio model of a machine (with errors) whose feet are moved, one after the other.
+
+    Args:
+        machine: The robot.
+        amounts: Adjustment to its amount, [m]; feet of slides that stand on the base.
+    """
+    model = machine.model.copy()
+    for name, amount in amounts.items():
+        keys = machine.declared.adjustments[name]
+        joint = model.getJointId(keys["moves"])
+        assert model.parents[joint] == 0
+        model.jointPlacements[joint] = pin.SE3(*turned(keys, amount)) * model.jointPlacements[joint]
+    return model
+
+
+def aligned_rms(positions, targets):
+    """RMS distance after the best rigid motion (Kabsch), [m]."""
+    a, b = positions - positions.mean(axis=0), targets - targets.mean(axis=0)
+    u, _, vt = np.linalg.svd(a.T @ b)
+    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    return float(np.sqrt((((u @ flip @ vt).T @ a.T - b.T) ** 2).sum(axis=0).mean()))

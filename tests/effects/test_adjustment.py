@@ -1,0 +1,306 @@
+"""Mechanical adjustments: what a foot or a thread moves, and sessions before and after."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from adjusting import TOLERANCES, shim, shimmed_plan, turned
+from derivatives import assert_derivative
+from machines import frames
+from tolerances import CLOSED, DERIVATIVE, KINEMATICS
+
+from orthocal import (
+    Choice,
+    calibrate,
+    join_sessions,
+    load_calibration,
+    load_robot,
+    load_session,
+    restore_session,
+    simulate_session,
+    write_calibration,
+    write_session,
+)
+from orthocal.effects.adjustment import find_adjustments
+from orthocal.errors import RobotError, SessionError
+from orthocal.estimation.problem import build_problem
+from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.robot.loading import packaged_robots
+
+QUICK = {"solver": "variable-projection"}
+
+FEET = """
+  adjustments:
+    far: {moves: x_slide, at_mm: [480, 20, 5], direction: [0, 2, 1], pivot_mm: [150, -30, 0]}
+    along: {moves: y_slide, at_mm: [0, 0, 0], direction: [0, 3, 0]}
+    tilted: {moves: z_slide, at_mm: [30, 10, 300], direction: [1, 0, 0.2], pivot_mm: [-5, -40, 200]}
+    thread: {lengthens: x.b, pitch_mm: 0.5, step_mm: 0.05}
+"""
+
+
+def write_robot(folder, text=FEET):
+    source = packaged_robots()["orthoglide"]
+    folder.mkdir(parents=True)
+    shutil.copy(source / "orthoglide.urdf", folder / "machine.urdf")
+    (folder / "machine.yaml").write_text((source / "orthoglide.yaml").read_text() + text)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return load_robot(write_robot(tmp_path_factory.mktemp("feet") / "machine"))
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory):
+    return shimmed_plan(tmp_path_factory.mktemp("shimmed") / "mill")
+
+
+# ---- what an adjustment moves
+
+
+@pytest.mark.parametrize("name", ["far", "along", "tilted"])
+def test_a_foot_moves_the_slide_as_a_rigid_body(robot, name):
+    """Place of the leg's root on the slide, with the slide where it is."""
+    leg, drives = keys_of(robot, name)["moves"][0], robot.drive_zero + 0.03
+    frame = robot.frame_id(f"{leg}_leg_root")
+    q = robot.configuration(robot.joint_coordinates(drives, robot.reference_passive))
+
+    def place(model):
+        data = model.createData()
+        pin.framesForwardKinematics(model, data, q)
+        return np.array(data.oMf[frame].homogeneous)
+
+    def by_shims(t):
+        return place(shim(robot, {name: 1e-3 * t[0]})).ravel()
+
+    def by_errors(t):
+        return place(robot.with_errors({f"{name}.adjustment": 1e-3 * t[0]}).model).ravel()
+
+    slope = (by_errors(np.array([1e-3])) - by_errors(np.array([-1e-3])))[:, None] / 2e-3
+    assert_derivative(slope, by_shims, np.zeros(1))
+    assert np.abs(slope).max() > 1e-4
+    # at 1 mm the rail has turned by 3 mrad, and their difference is of second order
+    assert np.abs(by_errors([1.0]) - by_shims(np.ones(1))).max() < 3e-5
+
+
+def keys_of(robot, name):
+    return robot.declared.adjustments[name]
+
+
+def test_the_foot_moves_by_its_amount_and_the_pivot_stays(robot):
+    keys, amount = keys_of(robot, "far"), 1e-6
+    rotation, shift = turned(keys, amount)
+    direction = np.array(keys["direction"]) / np.linalg.norm(keys["direction"])
+    at, pivot = (np.array(keys[k]) * 1e-3 for k in ("at_mm", "pivot_mm"))
+    assert abs(direction @ (rotation @ at + shift - at) - amount) < 1e-11
+    one = find_adjustments(robot)[0]
+    ((placement, twist),) = one.twists.items()
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, robot.configuration(robot.reference_posture))
+    world = robot.model.jointPlacements[placement.index].act(pin.Motion(twist))
+    v, w = world.linear, world.angular
+    assert np.abs(v + np.cross(w, pivot)).max() < KINEMATICS
+    assert direction @ (v + np.cross(w, at)) == pytest.approx(1.0, abs=KINEMATICS)
+
+
+def test_along_the_axis_of_its_drive_it_is_an_offset(robot):
+    assert robot.parameters["along.adjustment"].terms == (("y_slide.offset", pytest.approx(1.0)),)
+
+
+def test_a_thread_lengthens_its_rod(robot):
+    longer = robot.with_errors({"thread.adjustment": 0.4e-3})
+    rods = robot.legs["x"].rods
+    for machine, rod, length in (
+        (longer, "b", rods["b"].length + 0.4e-3),
+        (longer, "a", rods["a"].length),
+        (robot, "b", rods["b"].length),
+    ):
+        at = frames(machine, robot.drive_zero)
+        distance = np.linalg.norm(at[rods[rod].tip] - at[rods[rod].root])
+        assert distance == pytest.approx(length, abs=CLOSED * 10)
+
+
+def test_the_machine_after_both_ways_is_the_same(robot):
+    """Loops closed by orthocal and by Pinocchio alone."""
+    amounts = {"far": 0.3e-3, "tilted": -0.2e-3}
+    values = {f"{n}.adjustment": v for n, v in amounts.items()}
+    drives = robot.drive_zero + np.array([0.02, -0.03, 0.01])
+    tool = LoopClosure(robot, fixed=values).forward(drives)
+    shimmed = replace(robot, model=shim(robot, amounts))
+    rebuilt = shimmed.displaced({})
+    by_shims = frames(rebuilt, drives)[robot.tcp.frame]
+    unmoved = LoopClosure(robot).forward(drives)
+    assert np.linalg.norm(tool - by_shims) < 2e-3 * np.linalg.norm(tool - unmoved)
+    assert np.linalg.norm(tool - unmoved) > 2e-5
+
+
+def test_it_is_in_no_model(robot):
+    for model in robot.parameters.models:
+        assert not [n for n in robot.parameters.select_model(model) if n.endswith("adjustment")]
+    assert not [n for n in robot.parameters.elementary if n.endswith(("adjustment", "setting"))]
+
+
+# ---- bad keys
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ("{at_mm: [0, 0, 0], direction: [0, 1, 0]}", "moves"),
+        ("{moves: w_slide, at_mm: [0, 0, 0], direction: [0, 1, 0]}", "moves"),
+        ("{moves: x_slide, direction: [0, 1, 0]}", "at_mm"),
+        ("{moves: x_slide, at_mm: [0, 0, 0]}", "direction"),
+        ("{moves: x_slide, at_mm: [0, 0], direction: [0, 1, 0]}", "at_mm"),
+        ("{moves: x_slide, at_mm: [0, 0, 0], direction: [0, 0, 0]}", "direction"),
+        (
+            "{moves: x_slide, at_mm: [0, 9, 0], direction: [0, 1, 0], pivot_mm: [0, 0, 0]}",
+            "pivot_mm",
+        ),
+        ("{lengthens: x.c}", "lengthens"),
+        ("{lengthens: x.a, at_mm: [0, 0, 0]}", "at_mm"),
+        ("{lengthens: x.a, step_mm: 0}", "step_mm"),
+        ("{lengthens: x.a, step_mm: 0.5, largest_mm: 0.4}", "largest_mm"),
+        ("{lengthens: x.a, turns: 3}", "turns"),
+        ("3", ""),
+    ],
+)
+def test_a_bad_key_is_named(tmp_path, text, key):
+    folder = write_robot(tmp_path / "machine", f"\n  adjustments:\n    foot: {text}\n")
+    with pytest.raises(RobotError) as caught:
+        load_robot(folder)
+    where = "orthocal.adjustments.foot" + (f".{key}" if key else "")
+    assert where in str(caught.value)
+    assert "machine.yaml" in str(caught.value)
+
+
+def test_a_sum_cannot_have_its_name(tmp_path):
+    yaml = write_robot(tmp_path / "machine") / "machine.yaml"
+    taken = "    far.adjustment: [x_slide.y]\n    x_leg.length:"
+    yaml.write_text(yaml.read_text().replace("    x_leg.length:", taken))
+    with pytest.raises(RobotError, match=r"far\.adjustment"):
+        load_robot(yaml.parent)
+
+
+# ---- sessions before and after
+
+
+AMOUNTS = {"x_outer_foot_z": 0.5e-3, "y_side_foot_x": -0.3e-3}
+TRUTH = {
+    "x_slide.offset": 0.4e-3,
+    "y_slide.offset": -0.3e-3,
+    "x_slide.ry": -2e-3,
+    "y_slide.rx": 3e-3,
+    "z_slide.rx": 1e-3,
+}
+"""Errors after the adjustments."""
+
+
+def sessions_of(plan, *, stated=AMOUNTS, exact=True):
+    """Sessions before and after adjustments, those that the second one states or others."""
+    before = {f"{n}.adjustment": -v for n, v in AMOUNTS.items()}
+    return [
+        replace(
+            simulate_session(plan, {**TRUTH, **more}, seed=k, exact=exact).session,
+            adjusted=adjusted,
+        )
+        for k, (more, adjusted) in enumerate(((before, {}), ({}, stated)))
+    ]
+
+
+def test_sessions_before_and_after_are_one_machine(plan):
+    joined = join_sessions(sessions_of(plan))
+    assert joined.robot.adjusted
+    problem = build_problem(joined, model="full", prior=True)
+    assert "x_outer_foot_z.setting" in problem.free
+    theta = np.array([TRUTH.get(n, 0.0) for n in problem.free])
+    residual = problem.values - problem.predict(theta)
+    zeros = problem.zero_incidence
+    assert np.abs(residual - zeros @ np.linalg.lstsq(zeros, residual)[0]).max() < 2e-6
+    # without the statement the second session contradicts the first
+    other = build_problem(join_sessions(sessions_of(plan, stated={})), model="full", prior=True)
+    theta = np.array([TRUTH.get(n, 0.0) for n in other.free])
+    residual = other.values - other.predict(theta)
+    assert np.abs(residual - zeros @ np.linalg.lstsq(zeros, residual)[0]).max() > 2e-5
+
+
+def test_the_order_of_the_sessions_decides_which_machine_is_meant(plan):
+    first, last = sessions_of(plan)
+    moved = [dict(plan.robot.parameters[f"{n}.adjustment"].terms) for n in AMOUNTS]
+    choice = Choice(free=sorted({*TRUTH, *moved[0], *moved[1]}))
+    change = AMOUNTS["x_outer_foot_z"] * moved[0]["x_slide.ry"]
+    found = calibrate([first, last], choice, **QUICK).errors["x_slide.ry"]
+    assert found == pytest.approx(TRUTH["x_slide.ry"], abs=0.05 * abs(change))
+    found = calibrate([last, first], choice, **QUICK).errors["x_slide.ry"]
+    assert found == pytest.approx(TRUTH["x_slide.ry"] - change, abs=0.05 * abs(change))
+
+
+def test_sessions_that_agree_need_no_further_parameters(plan):
+    first, last = sessions_of(plan)
+    same = join_sessions([replace(first, adjusted=AMOUNTS), last])
+    assert not same.robot.adjusted
+    assert not [n for n in build_problem(same, model="full", prior=True).free if "setting" in n]
+
+
+def test_the_jacobian_under_adjustments_is_exact(plan):
+    """By the errors of the setting among others, at random errors."""
+    problem = build_problem(join_sessions(sessions_of(plan)), model="full", prior=True)
+    rng = np.random.default_rng(2)
+    scale = problem.theta_scale
+    theta = 0.1 * scale * rng.normal(size=problem.n_free)
+    _, jacobian = problem.predict_and_jacobian(theta)
+    chosen = [problem.free.index(n) for n in problem.free if n.endswith(".setting")]
+    chosen += list(rng.choice(problem.n_machine, 12, replace=False))
+    for j in chosen:
+        at = np.zeros_like(theta)
+        at[j] = 1e-2 * scale[j]
+        numeric = (problem.predict(theta + at) - problem.predict(theta - at)) / 2e-2
+        size = max(np.abs(numeric).max(), 1e-9)
+        assert np.abs(jacobian[:, j] - numeric).max() / size < 100 * DERIVATIVE, problem.free[j]
+    moved = problem.free.index("x_outer_foot_z.setting")
+    still = problem.free.index("x_inner_foot_z.setting")
+    assert np.abs(jacobian[:, moved]).max() > 1e-8
+    assert not jacobian[:, still].any()
+
+
+def test_a_calibration_keeps_them(plan, tmp_path):
+    result = calibrate(sessions_of(plan, exact=False), **QUICK)
+    write_calibration(result, tmp_path / "calibration.json")
+    again = load_calibration(tmp_path / "calibration.json")
+    assert dict(again.session.adjusted) == pytest.approx(AMOUNTS)
+    assert again.robot.adjusted
+    assert again["x_outer_foot_z.setting"].std > 0.0
+    restored = restore_session(again)
+    assert restored.adjusted == pytest.approx(AMOUNTS)
+    stated = {s.name: s.adjusted for s in restored.setups.values()}
+    assert sorted(map(len, stated.values())) == [0] * 6 + [2] * 6
+
+
+def test_a_session_file_states_them(plan, tmp_path):
+    _, after = sessions_of(plan)
+    write_session(after, tmp_path / "after")
+    text = (tmp_path / "after/session.yaml").read_text()
+    assert "adjusted_mm: {x_outer_foot_z: 0.5, y_side_foot_x: -0.3}" in text
+    assert load_session(tmp_path / "after").adjusted == pytest.approx(AMOUNTS)
+    for wrong, message in (("z_foot: 0.5", "z_foot"), ("x_outer_foot_z: 80", "x_outer_foot_z")):
+        changed = text.replace("x_outer_foot_z: 0.5", wrong)
+        (tmp_path / "after/session.yaml").write_text(changed)
+        with pytest.raises(SessionError) as caught:
+            load_session(tmp_path / "after")
+        assert "adjusted_mm" in str(caught.value)
+        assert message in str(caught.value)
+
+
+def test_feet_follow_the_dimensions(plan):
+    """Ends of the rails as drawn: 90 mm longer than the travel."""
+    keys = plan.robot.declared.adjustments
+    assert len(keys) == 15
+    inner, outer = (keys[f"y_{end}_foot_x"]["at_mm"][1] for end in ("inner", "outer"))
+    assert outer - inner == pytest.approx(390 - 120 + 90)
+    side = keys["z_side_foot_y"]
+    assert abs(side["at_mm"][0] - side["pivot_mm"][0]) == 80
+    assert plan.robot.parameters.stated == TOLERANCES
