@@ -157,7 +157,7 @@ def plan_adjustments(
             break
         amounts = improved
         adjusted = adjust_calibration(calibration, search.named(amounts))
-        placed = place_tool(adjusted, tool.workspace)
+        placed = place_tool(adjusted, tool.workspace.once(tool.use.size))
         entries = compute_entries(adjusted, placed)
         accuracy = assess_placed(adjusted, placed, entries)
         summary = summarise_tool(adjusted, accuracy, scale=calibration.tolerance_scale)
@@ -194,10 +194,12 @@ class _Search:
         own = np.flatnonzero(calibration.offset_weights.any(axis=1)).tolist()
         offsets = [f"{drives[i].name}.offset" for i in own]
         names = [*offsets, *(a.parameter for a in candidates)]
-        sensitivity = ToolSensitivity(robot, free=names, values=calibration.errors)
         commanded = tool.drives - calibration.active_offsets
-        passive = sensitivity.closure.close(commanded, start=tool.passive)
-        field = sensitivity(commanded, passive=passive)
+        under = (
+            ToolSensitivity(robot, free=names, values=calibration.errors, conditions=c)
+            for c in tool.use.conditions
+        )
+        field = np.concatenate([sensitivity(commanded) for sensitivity in under])
         self._by_offsets = weigh_field(tool, field[:, :, : len(offsets)])
         self.effects = self._without_offsets(field[:, :, len(offsets) :])
         self._deviate(self._without_offsets(tool.deviation(entered_offsets(calibration))))

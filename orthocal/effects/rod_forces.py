@@ -18,8 +18,8 @@ import numpy as np
 import pinocchio as pin
 
 from orthocal.arrays import Array
-from orthocal.effects.machine import stretch_rod
 from orthocal.effects.protocol import Placement
+from orthocal.effects.rods import stretch_rod
 from orthocal.robot.frames import carriers
 from orthocal.robot.model import Robot, require_tcp
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.effects.loading import neutral_values, robot_effects
-from orthocal.effects.protocol import Condition
+from orthocal.effects.protocol import Condition, condition_size
 from orthocal.errors import ParameterError
 from orthocal.kinematics.error_map import error_map
 from orthocal.robot.description import HEAVIEST_KG, HIGHEST_C, LOWEST_C
@@ -81,10 +81,12 @@ class UseConditions:
 
     def values(self, robot: Robot) -> dict[Condition, Array]:
         """Values of the conditions except the load, neutral where not stated."""
-        result = {c: np.array([v]) for c, v in neutral_values(robot).items()}
-        result["approach"] = np.array([APPROACH[letter] for letter in self.approach or ""])
-        if self.approach is None:
-            result["approach"] = np.zeros(len(robot.drives))
+        neutral = neutral_values(robot).items()
+        result: dict[Condition, Array] = {
+            c: np.full(condition_size(robot, c), v) for c, v in neutral
+        }
+        if self.approach is not None:
+            result["approach"] = np.array([APPROACH[letter] for letter in self.approach])
         if self.temperature is not None:
             result["temperature"] = np.array([self.temperature])
         return result

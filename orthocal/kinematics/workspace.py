@@ -85,6 +85,16 @@ class Workspace:
             self, points=read_only(points), weights=read_only(weights), copies=self.copies * count
         )
 
+    def once(self, count: int) -> Workspace:
+        """Inverse of `repeat`."""
+        first = len(self.points) // count
+        return replace(
+            self,
+            points=self.points[:first],
+            weights=read_only(self.weights[:first] * count),
+            copies=self.copies // count,
+        )
+
     @property
     def limits(self) -> Array:
         """Limits of the box, shape (n_coordinates, 2), [m].

@@ -79,7 +79,7 @@ def render_plan(
             *notes,
         ]
     parts += [Text(line) for line in describe_gain(plan)]
-    parts.append(Text(describe_region(plan.before.region)))
+    parts.append(Text(describe_region(plan.before)))
     if plan.adjustments and plan.judgement == "worthwhile":
         offsets = ", ".join(
             f"{e.drive} {signed(e.enter * e.edge_factor)} {e.edge_unit}" for e in plan.entries
