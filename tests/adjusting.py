@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
+from machines import place
 from scipy.spatial.transform import Rotation
 
 from orthocal import Dimensions, make_robot
+from orthocal.assessment.controller_entries import offsets_to_enter
+from orthocal.effects.adjustment import find_adjustments
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.first_plan import paper_plan
 
@@ -57,3 +64,20 @@ def aligned_rms(positions, targets):
     u, _, vt = np.linalg.svd(a.T @ b)
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     return float(np.sqrt((((u @ flip @ vt).T @ a.T - b.T) ** 2).sum(axis=0).mean()))
+
+
+def reached(errors, adjusted, amounts, *, seed):
+    """Tool error of the real machine with shims as they are set, by Pinocchio alone, [m]."""
+    robot, rng = adjusted.robot, np.random.default_rng(seed)
+    real = {
+        a.name: amounts[a.name] + a.setting_std(amounts[a.name]) * rng.normal()
+        for a in find_adjustments(robot)
+        if a.name in amounts
+    }
+    machine = robot.with_errors(errors)
+    machine = replace(machine, model=shim(machine, real)).displaced({})
+    # nodes of Gauss for the mean over the cube
+    points = np.array(list(itertools.product((-0.06, 0.06), repeat=3))) / np.sqrt(3.0)
+    drives, _ = nominal_closure(robot).reach(points)
+    entered = drives - offsets_to_enter(adjusted)
+    return aligned_rms(np.array([place(machine, d, robot.tcp.frame) for d in entered]), points)

@@ -1,0 +1,218 @@
+"""Plans of mechanical adjustments: adjusted machines reach what was promised."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from adjusting import reached, shimmed_plan
+
+from orthocal import (
+    calibrate,
+    draw_errors,
+    plan_adjustments,
+    simulate_session,
+    validate_calibration,
+    write_calibration,
+)
+from orthocal.assessment.adjustment_plan import LEAST_GAIN, _Search
+from orthocal.assessment.calibrated_tool import find_tool
+from orthocal.assessment.controller_entries import offsets_to_enter
+from orthocal.calibration.adjusting import adjust_calibration
+from orthocal.effects.adjustment import find_adjustments
+from orthocal.errors import RobotError
+
+QUICK = {"solver": "variable-projection"}
+SEEDS = (2, 4)
+
+
+def machine_of(plan, seed, **options):
+    """Errors of a machine, and its calibration from simulated readings."""
+    errors = draw_errors(plan.robot, plan.robot.parameters.patterns("full"), seed=seed)
+    session = simulate_session(plan, errors, seed=seed, sigma=3e-6).session
+    return errors, calibrate(session, **QUICK, **options)
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory):
+    return shimmed_plan(tmp_path_factory.mktemp("planned") / "mill")
+
+
+@pytest.fixture(scope="module")
+def machines(plan):
+    return {seed: machine_of(plan, seed) for seed in SEEDS}
+
+
+@pytest.fixture(scope="module")
+def plans(machines):
+    return {seed: plan_adjustments(calibration) for seed, (_, calibration) in machines.items()}
+
+
+def test_adjusted_machines_reach_what_was_promised(machines, plans):
+    """A sample; tests/benchmarks/adjusting.py has more machines, whose mean is within 1.15."""
+    ratios, wrong = [], []
+    for seed, (errors, calibration) in machines.items():
+        planned = plans[seed]
+        adjusted = adjust_calibration(calibration, planned.amounts)
+        found = reached(errors, adjusted, planned.amounts, seed=seed)
+        ratios.append((found / planned.after.entered) ** 2)
+        turned = {n: -v for n, v in planned.amounts.items()}
+        wrong.append((reached(errors, adjusted, turned, seed=seed) / planned.after.entered) ** 2)
+    # few directions carry the uncertainty: the square of one ratio scatters by about 0.8
+    assert np.mean(ratios) < 1.0 + 2.0 * 0.8 / np.sqrt(len(ratios))
+    assert np.mean(wrong) > 2.0 * (1.0 + 2.0 * 0.8 / np.sqrt(len(ratios)))
+
+
+def test_amounts_can_be_set(plans):
+    for planned in plans.values():
+        assert planned.judgement == "worthwhile"
+        errors = [planned.before.entered, *(p.tool_error for p in planned.adjustments)]
+        assert (np.diff(errors) < 0.0).all()
+        assert errors[-1] == planned.after.entered
+        for p in planned.adjustments:
+            steps = p.amount / p.adjustment.step
+            assert abs(steps - round(steps)) < 1e-9
+            assert 0.0 < abs(p.amount) <= p.adjustment.largest * (1.0 + 1e-12)
+            assert p.turns is None
+
+
+def search_of(calibration):
+    tool = find_tool(calibration)
+    candidates = find_adjustments(calibration.robot)
+    return _Search(calibration, tool, candidates, calibration.assessment.tool.compensated)
+
+
+def test_no_other_choice_of_as_many_is_much_better(machines, plans):
+    """All triples: forward selection with exchange may miss the best one by little."""
+    search = search_of(machines[4][1])
+    chosen = search.choose()
+    assert len(chosen) == len(plans[4].adjustments) == 3
+    own = search.error(search.fit(chosen))
+    best = min(search.error(search.fit(t)) for t in itertools.combinations(range(15), len(chosen)))
+    assert best <= own < best * (1.0 + LEAST_GAIN)
+
+
+def test_best_amounts_are_a_minimum(machines):
+    """Within their limits no change of an amount is better, by central differences."""
+    search = search_of(machines[4][1])
+    chosen = search.choose()
+    amounts = search.fit(chosen)
+    own = search.error(amounts)
+    for i in chosen:
+        for change in (-1e-5, 1e-5):
+            trial = np.array(amounts)
+            trial[i] += change
+            assert search.error(trial) > own or abs(trial[i]) > search.largest[i]
+
+
+def test_the_effects_are_those_of_the_adjusted_machine(machines):
+    """First order, with offsets entered again, against loops closed with the amounts."""
+    calibration = machines[4][1]
+    search = search_of(calibration)
+    plain = search_of(calibration)
+    for i in (1, 4, 7):
+        amounts = np.zeros(15)
+        amounts[i] = 0.05e-3
+        adjusted = adjust_calibration(calibration, search.named(amounts))
+        change = search_of(replace(adjusted, assessment=calibration.assessment))
+        moved = np.linalg.norm(plain.effects[:, i] * amounts[i])
+        assert abs(change.error(0.0 * amounts) - plain.error(amounts)) < 0.02 * moved
+
+
+def test_uncertainties_of_amounts_by_sampling(machines):
+    """Best amounts of machines as uncertain as the calibration says."""
+    calibration = machines[4][1]
+    search = search_of(calibration)
+    search.largest = np.full(15, 1.0)
+    chosen = search.choose()[:2]
+    stated = search.uncertainties(chosen) / 2.0
+    root = np.linalg.cholesky(search._covariance() + 1e-24 * np.eye(len(search._covariance())))
+    rng = np.random.default_rng(3)
+    n = root.shape[0]
+    field = search._without_offsets(search.tool.jacobian[:, :, :n])
+    deviation = search._without_offsets(search.tool.deviation(calibration.active_offsets))
+    found = []
+    for _ in range(200):
+        search._deviate(deviation + field @ (root @ rng.normal(size=n)))
+        found.append(search.fit(chosen)[chosen])
+    assert np.std(found, axis=0) == pytest.approx(stated, rel=0.2)
+
+
+def test_an_adjusted_calibration_is_the_machine_with_its_amounts(machines):
+    _, calibration = machines[2]
+    adjusted = adjust_calibration(calibration, {"x_outer_foot_z": 0.3e-3})
+    terms = dict(calibration.robot.parameters["x_outer_foot_z.adjustment"].terms)
+    moved = {n: calibration.errors[n] + 0.3e-3 * c for n, c in terms.items()}
+    drives = calibration.robot.drive_zero + np.array([[0.01, -0.02, 0.03]])
+    same = replace(calibration.machine, errors={**calibration.errors, **moved})
+    assert np.abs(adjusted.machine.forward(drives) - same.forward(drives)).max() < 1e-10
+    (grown,) = (adjusted[n].std ** 2 - calibration[n].std ** 2 for n in ("x_slide.ry",))
+    one = next(a for a in find_adjustments(calibration.robot) if a.name == "x_outer_foot_z")
+    assert grown == pytest.approx((terms["x_slide.ry"] * one.setting_std(0.3e-3)) ** 2, rel=1e-6)
+    assert adjust_calibration(calibration, {}) is calibration
+
+
+def test_a_machine_of_right_angles_is_left_alone(plan):
+    errors = {"x_slide.offset": 0.4e-3, "y_slide.offset": -0.6e-3}
+    session = simulate_session(plan, errors, seed=1, sigma=3e-6, exact=True).session
+    planned = plan_adjustments(calibrate(session, **QUICK))
+    assert planned.judgement == "small gain"
+    assert planned.gain < 0.05
+
+
+def test_a_robot_without_adjustments_is_refused(orthoglide, root):
+    with pytest.raises(RobotError, match=r"orthocal\.adjustments"):
+        plan_adjustments(calibrate(root / "examples/table1/experiment-2", "offsets"))
+
+
+def test_validation_expects_the_adjusted_machine(plan, machines, plans):
+    errors, calibration = machines[4]
+    amounts = plans[4].amounts
+    adjusted = adjust_calibration(calibration, amounts)
+    entered = plan.with_controller(offsets_to_enter(adjusted))
+    now = {**errors, **{f"{n}.adjustment": v for n, v in amounts.items()}}
+    after = simulate_session(entered, now, seed=12, sigma=3e-6).session
+    confirmed = validate_calibration(calibration, replace(after, adjusted=amounts))
+    assert confirmed.confirmed is True
+    reversed_ = {n: -v for n, v in amounts.items()}
+    wrong = {**errors, **{f"{n}.adjustment": v for n, v in reversed_.items()}}
+    after = simulate_session(entered, wrong, seed=12, sigma=3e-6).session
+    assert validate_calibration(calibration, replace(after, adjusted=amounts)).confirmed is not True
+
+
+def test_the_command_and_the_report(machines, tmp_path):
+    from test_cli import orthocal as run
+
+    from orthocal.output.report.page import build_report
+
+    _, calibration = machines[4]
+    write_calibration(calibration, tmp_path / "calibration.json")
+    code, out, _ = run("adjust", tmp_path)
+    assert code == 0
+    code, text, _ = run("adjust", tmp_path, "--json")
+    document = json.loads(text)
+    assert document["schema"] == "orthocal/adjustment/1"
+    names = [a["name"] for a in document["adjustments"]]
+    assert all(name in out for name in names)
+    assert document["after"]["entered"] < document["before"]["entered"]
+    assert names[0] in build_report(calibration)
+    code, _, err = run("adjust", tmp_path, "--among", "w_foot")
+    assert code == 2
+    assert "--among" in err
+    for text in (
+        "x_side_foot_z",
+        "w_foot=1",
+        "x_side_foot_z=99",
+        "x_side_foot_z=.1,x_side_foot_z=.1",
+    ):
+        code, _, err = run("again", tmp_path, "--adjusted", text, "--out", tmp_path / "new")
+        assert code == 2
+        assert "--adjusted" in err
+    code, out, _ = run(
+        "again", tmp_path, "--adjusted", f"{names[0]}=0.12", "--out", tmp_path / "new"
+    )
+    assert code == 0
+    assert f"adjusted_mm: {{{names[0]}: 0.12}}" in (tmp_path / "new/session.yaml").read_text()
