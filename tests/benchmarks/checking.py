@@ -3,6 +3,7 @@
 python tests/benchmarks/checking.py                     a few sessions of every example
 python tests/benchmarks/checking.py --sessions 10 --sound 334
 python tests/benchmarks/checking.py --pairs 40          two reversed signs in different setups
+python tests/benchmarks/checking.py --effects 1000      effects that the model lacks
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
+from effect_machines import EffectSearch, plan_with_conditions, read_machines
 from made_mistakes import SIZES, is_named, make_mistakes, sound_session
 from rich import box
 from rich.console import Console
@@ -157,6 +159,52 @@ def print_pairs(console: Console, pairs: int) -> None:
     console.print(table)
 
 
+EFFECTS = {None: 1.0, "backlash": 1.0, "thermal": 10.0, "screw": 3.0, "drift": 10.0}
+"""Effects of the machines, and the factor of their tolerances that readings of a dial show."""
+
+ENOUGH = 5.0
+"""Gain in ln evidence of the true effect from which on it has to be named."""
+
+
+def print_effects(console: Console, machines: int) -> None:
+    """Print how often effects that the model lacks are named, and how often by a wrong name."""
+    plan = plan_with_conditions()
+    table = Table("effect", "times tolerance", "machines", "gain > 5", "of these named", "others")
+    for effect, level in EFFECTS.items():
+        count = machines if effect is None else max(machines // 5, 1)
+        readings = read_machines(plan, effect, count, level=level, seed=5)
+        tool = EffectSearch(plan, effect)
+        found = [tool.name(values) for values in readings]
+        enough = [n for n in found if n.gain > ENOUGH]
+        named = sum(n.effects[:1] == (effect,) for n in enough)
+        others = sum(bool(n.effects) and n.effects[0] != effect for n in found)
+        share = f"{named / len(enough):.3f}" if enough else ""
+        row = (effect or "none", f"{level:g}", count, len(enough), share, others)
+        table.add_row(*map(str, row))
+    console.print(table)
+
+
+def print_misnamed(console: Console, sessions: int) -> None:
+    """Print how many mistakes in sessions with conditions are taken for an effect."""
+    plan = plan_with_conditions(("yx", "xy", "xz")).with_effects([])
+    made = named = 0
+    for seed in range(sessions):
+        session = sound_session(plan, seed, entered=True)
+        for name, _, mistake in make_mistakes(session, seed, sizes=(5.0,)):
+            found = search.find_anomalies(session.with_values(mistake.values)).found
+            made += 1
+            taken = [a.explanation.kind for a in found if a.explanation.amounts]
+            if taken and not a_drift(mistake):
+                named += 1
+                console.print(f"{name}: {', '.join(taken)}")
+    console.print(f"{named} of {made} mistakes taken for an effect")
+
+
+def a_drift(mistake) -> bool:
+    """Whether a mistake is a drift, which is an effect too."""
+    return "drift" in mistake.kinds
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sessions", type=int, default=2, help="with mistakes, of every example")
@@ -164,8 +212,13 @@ def main() -> None:
     parser.add_argument("--example", action="append", choices=EXAMPLES)
     parser.add_argument("--size", action="append", type=float)
     parser.add_argument("--pairs", type=int, help="pairs of reversed signs on each plan")
+    parser.add_argument("--effects", type=int, help="machines without and, a fifth, with effects")
     given = parser.parse_args()
     console = Console(width=100)
+    if given.effects:
+        print_effects(console, given.effects)
+        print_misnamed(console, given.sessions)
+        return
     if given.pairs:
         print_pairs(console, given.pairs)
         return

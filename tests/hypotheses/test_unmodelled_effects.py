@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from effect_machines import EffectSearch, plan_with_conditions, read_machines
 from effect_plans import write_plan
 from scipy.integrate import quad
 
@@ -82,6 +83,22 @@ def test_drift_of_the_gauges_is_named(plan):
     assert (np.abs(difference) < 3.0 * np.array(e.stds)).all()
 
 
+def test_expansion_as_stated_needs_no_deviation(tmp_path):
+    """Legs that grow on screws that do not: the nominal change explains the readings."""
+    plan = load_plan(write_plan(tmp_path / "plan", effects="thermal: {screws_ppm: 0}"))
+    kept = [r for r in plan.readings if r.setup in ("yx", "xy", "xz")]
+    warm = np.random.default_rng(2).uniform(15.0, 30.0, len(kept))
+    readings = [
+        replace(r, conditions=replace(r.conditions, temperature=float(t)))
+        for r, t in zip(kept, warm, strict=True)
+    ]
+    (found,) = find_anomalies(read(plan.select(readings), "thermal", {})).found
+    e = found.explanation
+    assert e.kind == "thermal expansion"
+    assert (np.abs(e.amounts) < 3.0 * np.array(e.stds)).all()
+    assert e.amount > 5e-6
+
+
 @pytest.mark.parametrize("effect", ["backlash", "thermal", "screw", "drift"])
 def test_sound_machines_show_no_effect(plan, effect):
     """Also where the machine has the effect, but at a thousandth of its tolerance."""
@@ -151,3 +168,19 @@ def test_a_half_normal_amount_is_integrated_over():
 
         found = likelihood.score_set(deviation, [column[None]], priors=[prior]).log_likelihood
         assert np.exp(found) == pytest.approx(quad(likelihood_of, 0.0, 12.0)[0], rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("effect", ["backlash", None])
+def test_effects_are_named_where_the_readings_show_them(effect):
+    """A sample of the benchmark: backlash at its tolerance, read with a dial of 0.01 mm."""
+    plan = plan_with_conditions()
+    tool = EffectSearch(plan, effect)
+    found = [tool.name(values) for values in read_machines(plan, effect, 30, seed=11)]
+    if effect is None:
+        assert [n.effects for n in found if n.effects] == []
+        return
+    enough = [n for n in found if n.gain > 5.0]
+    assert len(enough) >= 10
+    named = [n for n in enough if n.effects[:1] == (effect,)]
+    assert len(named) >= 0.9 * len(enough)

@@ -1,0 +1,117 @@
+"""Machines with an effect that the model lacks: how much the readings say of it, and what is named.
+
+The gain is that of the true effect with its tolerances, in ln evidence over no effect.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from datetime import timedelta
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from effect_plans import write_plan
+
+from orthocal import load_plan
+from orthocal.estimation.diagnostics.unmodelled import machine_errors
+from orthocal.estimation.problem import build_problem
+from orthocal.hypotheses import search
+from orthocal.hypotheses.families.effects import unmodelled_effects
+from orthocal.hypotheses.hypothesis import Rows
+from orthocal.hypotheses.linear_model import LinearModel
+
+EFFECTS = "backlash: {}, thermal: {}, drift: {}, screw: {lead_mm: 10}"
+SIGMA, STEP = 5e-6, 10e-6
+ENTERED = 0.02
+"""Part of their tolerances that offsets have left once they were entered."""
+
+
+def plan_with_conditions(setups=None):
+    """A plan for a dial of 0.01 mm, each posture approached from both sides while it gets warmer.
+
+    Each setup ends with its first reading.
+
+    Args:
+        setups: Names of its setups; all six by default.
+    """
+    with TemporaryDirectory() as folder:
+        plan = load_plan(write_plan(Path(folder) / "plan", effects=EFFECTS))
+    plan = plan.with_gauge(replace(plan.gauge, sigma=SIGMA, resolution=STEP))
+    if setups is not None:
+        plan = plan.select([r for r in plan.readings if r.setup in setups])
+    return plan.select([r for name in plan.setups for r in _closed(plan, name)])
+
+
+def _closed(plan, setup):
+    """Readings of a setup, and its first one again at the end."""
+    readings = [r for r in plan.readings if r.setup == setup]
+    first, last = readings[0], readings[-1].conditions
+    time = last.time + timedelta(seconds=30)
+    conditions = replace(first.conditions, temperature=last.temperature, time=time)
+    return [*readings, replace(first, cycle=3, conditions=conditions)]
+
+
+def read_machines(plan, effect, count, *, level=1.0, seed=0):
+    """Readings of machines drawn from their tolerances, shape (count, n_rows), [m].
+
+    Args:
+        plan: What is read where.
+        effect: The effect that they have, or None.
+        count: Number of machines.
+        level: Factor of the tolerances of the effect.
+        seed: Of the random numbers.
+    """
+    machine = plan.with_effects([effect] if effect else [])
+    problem = build_problem(machine, free=machine_errors(machine.robot), prior=True)
+    rng = np.random.default_rng(seed)
+    scale = problem.theta_scale * [ENTERED if n.endswith(".offset") else 1.0 for n in problem.free]
+    known = machine.robot.parameters.of_effects
+    own = [n in known or n.endswith(".drift") for n in problem.free]
+    theta = rng.normal(size=(count, problem.n_free)) * scale * np.where(own, level, 1.0)
+    positive = [p.positive for p in problem.parameters]
+    values, _, reached = problem.simulate(np.where(positive, np.abs(theta), theta))
+    assert reached.all()
+    shown = values + SIGMA * rng.normal(size=values.shape)
+    return np.round(shown / STEP) * STEP
+
+
+@dataclass
+class Named:
+    """What the first step of the search says of one machine."""
+
+    gain: float
+    effects: tuple[str, ...]
+    """Effects that are clear, the most likely first."""
+
+
+class EffectSearch:
+    """The search for effects in many sessions of one plan."""
+
+    def __init__(self, plan, effect):
+        bare = plan.with_effects([])
+        self.search = search._Search(bare, LinearModel(bare))
+        self.start, self.rows = self.search.sound.about, bare
+        self.true = LinearModel(plan.with_effects([effect] if effect else []))
+        self.about = self.true.linearise(np.zeros(self.true.problem.n_free), (), None, slopes=False)
+
+    def name(self, values):
+        """What is named in the readings of a machine, shape (n_rows,), [m]."""
+        found = self.search
+        found.values = values
+        found.sound = found.evaluate((), self.start)
+        families = unmodelled_effects(Rows(self.rows, values), found.effects)
+        scores = {
+            f.systematic[0].name: float(evidence[0])
+            for f, evidence in found._score(found.sound, families)
+            if f.systematic
+        }
+        needed = search.EFFECT_CLEARLY - np.log(search.FAMILIES)
+        clear = sorted((n for n in scores if scores[n] >= needed), key=lambda n: -scores[n])
+        gain = self._evidence(self.true, self.about, values)
+        return Named(gain - self._evidence(found.model, self.start, values), tuple(clear))
+
+    @staticmethod
+    def _evidence(model, about, values):
+        deviation = model.entries(values[None])[0] - about.expected
+        return float(about.likelihood.score(about.likelihood.products(deviation[None]))[0])
