@@ -20,12 +20,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
-from effect_machines import EffectSearch, plan_with_conditions, read_machines
 from made_mistakes import SIZES, is_named, make_mistakes, sound_session
 from rich import box
 from rich.console import Console
 from rich.table import Table
 from typer.testing import CliRunner
+from unmodelled_machines import EffectSearch, plan_with_conditions, read_machines
 
 from orthocal import check_session, load_plan
 from orthocal.cli import make_program

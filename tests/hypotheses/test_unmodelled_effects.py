@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from effect_machines import EffectSearch, plan_with_conditions, read_machines
 from effect_plans import write_plan
 from scipy.integrate import quad
+from unmodelled_machines import EffectSearch, plan_with_conditions, read_machines
 
 from orthocal import check_session, load_plan, load_session, simulate_session
 from orthocal.hypotheses.families.effects import find_effects, missing_effects
