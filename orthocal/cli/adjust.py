@@ -15,9 +15,10 @@ def adjust(
     json: Json = False,
     anyway: Anyway = False,
 ) -> None:
-    """Plan mechanical adjustments: which feet, shims and threads to set, by how much.
+    """Plan mechanical adjustments of feet, shims and threads.
 
-    The robot's YAML declares them under orthocal.adjustments.
+    Prints which to set, by how much and in which order. The robot's YAML declares them under
+    orthocal.adjustments.
 
     Exit code 3: the verdict is not `enter`; the reason is printed.
 
