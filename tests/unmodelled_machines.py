@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from effect_plans import write_plan
+from effect_plans import FIRST, write_plan
 
 from orthocal import load_plan
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
@@ -27,20 +27,27 @@ ENTERED = 0.02
 """Part of their tolerances that offsets have left once they were entered."""
 
 
-def plan_with_conditions(setups=None):
+def plan_with_conditions(setups=None, *, pace=1.0):
     """A plan for a dial of 0.01 mm, each posture approached from both sides while it gets warmer.
 
     Each setup ends with its first reading.
 
     Args:
         setups: Names of its setups; all six by default.
+        pace: Minutes between the readings.
     """
     with TemporaryDirectory() as folder:
         plan = load_plan(write_plan(Path(folder) / "plan", effects=EFFECTS))
     plan = plan.with_gauge(replace(plan.gauge, sigma=SIGMA, resolution=STEP))
     if setups is not None:
         plan = plan.select([r for r in plan.readings if r.setup in setups])
-    return plan.select([r for name in plan.setups for r in _closed(plan, name)])
+    return plan.select([_slower(r, pace) for name in plan.setups for r in _closed(plan, name)])
+
+
+def _slower(reading, pace):
+    """Reading at a time so many times later after the first one of the session."""
+    time = FIRST + pace * (reading.conditions.time - FIRST)
+    return replace(reading, conditions=replace(reading.conditions, time=time))
 
 
 def _closed(plan, setup):

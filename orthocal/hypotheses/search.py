@@ -56,9 +56,10 @@ CLEARLY = 7.0
 """Logarithm of the Bayes factor from which on an anomaly is reported: by chance in at most one of
 e⁷ = 1,100 sessions."""
 
-EFFECT_CLEARLY = 5.0
+EFFECT_CLEARLY = 4.5
 """Logarithm of the Bayes factor, prior probability aside, from which on an effect of the machine is
-reported that the model lacks: such effects are usual. By chance in at most one of 150 sessions."""
+reported that the model lacks: such effects are usual. By chance in at most one of 90 sessions, and
+far less often in simulated ones (`tests/benchmarks/checking.py --effects 1000`)."""
 
 EFFECT_SCALES = np.array([1.0, 4.0])
 """Grid of factors between the parameters of an effect and their tolerances."""

@@ -159,8 +159,15 @@ def print_pairs(console: Console, pairs: int) -> None:
     console.print(table)
 
 
-EFFECTS = {None: 1.0, "backlash": 1.0, "thermal": 10.0, "screw": 3.0, "drift": 10.0}
-"""Effects of the machines, and the factor of their tolerances that readings of a dial show."""
+EFFECTS = {
+    None: (1.0, 1.0),
+    "backlash": (1.0, 1.0),
+    "thermal": (10.0, 1.0),
+    "screw": (3.0, 1.0),
+    "drift": (1.0, 8.0),
+}
+"""Effects of the machines: the factor of their tolerances that readings of a dial show, and the
+minutes between the readings; with 8 a session has the length of a working day."""
 
 ENOUGH = 5.0
 """Gain in ln evidence of the true effect from which on it has to be named."""
@@ -168,9 +175,9 @@ ENOUGH = 5.0
 
 def print_effects(console: Console, machines: int) -> None:
     """Print how often effects that the model lacks are named, and how often by a wrong name."""
-    plan = plan_with_conditions()
     table = Table("effect", "times tolerance", "machines", "gain > 5", "of these named", "others")
-    for effect, level in EFFECTS.items():
+    for effect, (level, pace) in EFFECTS.items():
+        plan = plan_with_conditions(pace=pace)
         count = machines if effect is None else max(machines // 5, 1)
         readings = read_machines(plan, effect, count, level=level, seed=5)
         tool = EffectSearch(plan, effect)
@@ -187,6 +194,7 @@ def print_effects(console: Console, machines: int) -> None:
 def print_misnamed(console: Console, sessions: int) -> None:
     """Print how many mistakes in sessions with conditions are taken for an effect."""
     plan = plan_with_conditions(("yx", "xy", "xz")).with_effects([])
+    plan = plan.select([r for r in plan.readings if r.cycle < 3])  # without closing readings
     made = named = 0
     for seed in range(sessions):
         session = sound_session(plan, seed, entered=True)
