@@ -1,10 +1,9 @@
-"""What all errors of a machine are worth to somebody with a dial, and what spoils it.
+"""Tool error after calibrations with a dial indicator, as expected and actual.
 
-Simulated: machines with all errors within their tolerances, read by a ball on a rod with a dial
-that stands as crooked as a hand makes it: the paper's seven postures, 18 readings. The main loop
-twice: measure, calibrate, enter the offsets, measure again. No calibration reads the truth; it is
-used at the end to see how far each one is from it. Errors of the tool are told with shift and
-rotation of the whole region taken out: a workpiece is aligned on the machine.
+Simulated: machines with all errors within their tolerances. A ball touches a rod, with realistic
+misalignment of the gauge: the paper's seven postures, 18 readings. Measure, calibrate, enter the
+offsets, measure again. Only the last step uses the true errors: it compares the calibrated tool
+with the actual one. The workpiece is aligned on the machine.
 """
 
 from collections import defaultdict
@@ -14,65 +13,63 @@ from pathlib import Path
 import numpy as np
 
 import orthocal
-from orthocal import Calibration, Choice, Session
-from orthocal.assessment.controller_entries import entered_offsets
-from orthocal.assessment.tool_error import assess_tool
-from orthocal.kinematics.loop_closure import LoopClosure
-from orthocal.kinematics.workspace import cube
-from orthocal.sensors.leg_indicator import LegIndicator
-from orthocal.sensors.mounting import EXACT
 
 MACHINES = 4
 FIRST = {"*.offset_mm": 4.0}  # limits of the offsets, ±2 standard deviations
 AGAIN = {"*.offset_mm": 1.0}  # once they were entered
+EXACT = orthocal.Mounting(direction=0.0, section=0.0, lateral=0.0, scale=0.0)
 
 plan = orthocal.load_plan(Path(__file__).parent / "workshop/plan.yaml")
-robot, space = plan.robot, cube(plan.robot, points_a_side=5)  # ±60 mm around the mechanical zero
-drives = LoopClosure(robot).inverse(space.points)  # as a nominal controller commands them
+nominal = orthocal.Machine(plan.robot, {})
 
 
-def simplify(session: Session) -> Session:
-    """The same readings as if an exact dial had touched the line between the rods."""
+def simplify(session: orthocal.Session) -> orthocal.Session:
+    """The same readings as if an exact gauge had touched the line between the rods."""
     setups = {}
     for name, setup in session.setups.items():
         s = setup.sensor
-        setups[name] = replace(setup, sensor=LegIndicator(s.leg, s.direction, s.section, EXACT))
+        line = orthocal.LegIndicator(s.leg, s.direction, s.section, EXACT)
+        setups[name] = replace(setup, sensor=line)
     return replace(session, setups=setups)
 
 
-promised, kept = defaultdict(list), defaultdict(list)  # mean squares at the tool, by what was done
+expected, actual = defaultdict(list), defaultdict(list)  # mean squares of tool errors, by label
 
 
-def hold(label: str, session: Session, choice: Choice, real: LoopClosure) -> Calibration:
-    """Calibrate, and hold the calibrated tool against the real one."""
+def evaluate(
+    label: str, session: orthocal.Session, choice: orthocal.Choice, real: orthocal.Machine
+) -> orthocal.Calibration:
+    """Calibrate, and compare the calibrated tool with the actual one."""
     result = orthocal.calibrate(session, choice, solver="variable-projection")
-    at = drives - result.active_offsets
-    left = space.remove_motion(result.machine.forward(at) - real.forward(at), space.points)
-    kept[label].append(space.weights @ (left**2).sum(axis=1))
-    promised[label].append(assess_tool(result, space).after.sizes.aligned.rms ** 2)
+    tool = orthocal.assess_tool(result)
+    drives = nominal.inverse(tool.workspace.points) - result.active_offsets
+    errors = tool.measure(result.machine.forward(drives) - real.forward(drives))
+    actual[label].append(errors.aligned.rms**2)
+    expected[label].append(tool.after.sizes.aligned.rms**2)
     return result
 
 
 for seed in range(MACHINES):
-    errors = orthocal.draw_errors(
-        robot, robot.parameters.patterns("full"), seed=seed, tolerances=FIRST
-    )
-    real = LoopClosure(robot, fixed=errors)
+    names = plan.robot.parameters.patterns("full")
+    errors = orthocal.draw_errors(plan.robot, names, seed=seed, tolerances=FIRST)
+    real = orthocal.Machine(plan.robot, errors)
 
     first = orthocal.simulate_session(plan, errors, seed=seed).session
-    hold("first round, offsets", first, Choice("offsets", tolerances=FIRST), real)
-    found = hold("first round, full", first, Choice("full", tolerances=FIRST), real)
-    hold("  as of a line, exactly", simplify(first), Choice("full", tolerances=FIRST), real)
+    evaluate("first round, offsets", first, orthocal.Choice("offsets", tolerances=FIRST), real)
+    full = orthocal.Choice("full", tolerances=FIRST)
+    calibration = evaluate("first round, full", first, full, real)
+    evaluate("  as of a line, exactly", simplify(first), full, real)
 
-    # what `orthocal calibrate` says to enter, and the same readings once more
-    entered = plan.with_controller(np.round(entered_offsets(found), 6))
+    # the offsets that `orthocal calibrate` prints, and the same readings once more
+    offsets = np.round([entry.enter for entry in calibration.assessment.entries], 6)
+    entered = plan.with_controller(offsets)
     second = orthocal.simulate_session(entered, errors, seed=100 + seed).session
-    hold("offsets entered, offsets", second, Choice("offsets", tolerances=AGAIN), real)
-    hold("offsets entered, full", second, Choice("full", tolerances=AGAIN), real)
+    evaluate("offsets entered, offsets", second, orthocal.Choice("offsets", tolerances=AGAIN), real)
+    evaluate("offsets entered, full", second, orthocal.Choice("full", tolerances=AGAIN), real)
 
-print(f"{'µm at the tool, of ' + str(MACHINES) + ' machines':36}{'promised':>10}{'kept':>10}")
-for label, squares in kept.items():
-    sizes = (1e6 * np.sqrt(np.mean(v)) for v in (promised[label], squares))
+print(f"{f'tool error of {MACHINES} machines, µm RMS':36}{'expected':>10}{'actual':>10}")
+for label, squares in actual.items():
+    sizes = (1e6 * np.sqrt(np.mean(v)) for v in (expected[label], squares))
     print(f"{label:36}" + "".join(f"{size:10.1f}" for size in sizes))
-print("\nOffsets alone leave what legs and axes do. With offsets millimetres off, a ball half a")
-print("millimetre beside its place tells less; once they are entered, it hardly matters.")
+print("\nOffsets alone do not correct legs and axes. While the offsets are millimetres wrong, a")
+print("ball half a millimetre beside its place costs accuracy. Later it hardly matters.")

@@ -91,8 +91,18 @@ if TYPE_CHECKING:  # the public names; each is imported when it is first used
     from orthocal.planning.plan import plan_readings as plan_readings
     from orthocal.robot.model import Robot as Robot
     from orthocal.robot.parameters import ElementaryError as ElementaryError
+    from orthocal.sensors.leg_indicator import LegIndicator as LegIndicator
+    from orthocal.sensors.leg_indicator import Section as Section
+    from orthocal.sensors.mounting import Mounting as Mounting
+    from orthocal.sensors.protocol import Contact as Contact
+    from orthocal.sensors.protocol import Frames as Frames
+    from orthocal.sensors.protocol import NuisanceParameter as NuisanceParameter
     from orthocal.sensors.protocol import Sensor as Sensor
+    from orthocal.sensors.protocol import SetupKeys as SetupKeys
+    from orthocal.sensors.protocol import TouchingTip as TouchingTip
+    from orthocal.sensors.protocol import View as View
     from orthocal.sensors.registry import register_sensor as register_sensor
+    from orthocal.sensors.tips import Tip as Tip
     from orthocal.session.session import Conditions as Conditions
     from orthocal.session.session import Gauge as Gauge
     from orthocal.session.session import Posture as Posture

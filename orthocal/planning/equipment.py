@@ -192,7 +192,7 @@ def place_tool(robot: Robot, names: Sequence[str], points: Array) -> dict[str, P
         ClosureError: If a point cannot be reached; names the posture.
     """
     drives = nominal_closure(robot).inverse(points, names=names)
-    return {n: Posture(n, "tcp_mm", p, d) for n, p, d in zip(names, points, drives, strict=True)}
+    return {n: Posture(n, "tcp", p, d) for n, p, d in zip(names, points, drives, strict=True)}
 
 
 def load_dial(path: str | Path, equipment: Equipment) -> Equipment:

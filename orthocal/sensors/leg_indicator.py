@@ -167,6 +167,10 @@ class LegIndicator:
     touch: ClassVar[Callable[..., ca.SX]] = touch_by_blade
     """Reading of its tip on a rod."""
 
+    def __post_init__(self) -> None:
+        if (self.tip.form == "ball") != isinstance(self, BallIndicator):
+            raise ValueError(f"tip: found a {self.tip.form}; `on_rod` makes an indicator with it")
+
     @classmethod
     def from_keys(cls, keys: LegKeys) -> LegIndicator:
         """Build from the keys of a session.yaml.

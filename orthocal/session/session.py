@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,8 +31,8 @@ ALIKE = 9
 """Decimals to which distances of postures from the mechanical zero are compared, [m, rad]."""
 
 
-PostureForm = Literal["tcp_mm", "joints_mm", "joints_deg"]
-"""Key of a posture in session.yaml: coordinates of the tool or of the drives, and their unit."""
+PostureForm = Literal["tcp", "joints"]
+"""What commands a posture: coordinates of the tool centre point or of the drives."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,15 +68,22 @@ class Posture:
 
     Args:
         name: Name in the session.
-        form: Key in session.yaml: tcp_mm, joints_mm or joints_deg. The values are in SI units.
-        values: Commanded coordinates of the tool or the drives, by `form`, [m] or [rad].
+        form: Meaning of `values`: `tcp` or `joints`.
+        values: Commanded coordinates, of the tool centre point [m] or of the drives [m, rad].
         drives: Commanded drive coordinates ρ minus the active offsets, [m, rad].
+
+    Raises:
+        ValueError: If the form is unknown.
     """
 
     name: str
     form: PostureForm
     values: Array
     drives: Array
+
+    def __post_init__(self) -> None:
+        if self.form not in get_args(PostureForm):
+            raise ValueError(f"form: found {self.form!r}; expected 'tcp' or 'joints'")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

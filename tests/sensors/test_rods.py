@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 from orthocal import (
+    LegIndicator,
+    Section,
+    Tip,
     calibrate,
     draw_scene,
     load_calibration,
@@ -23,6 +26,7 @@ from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import ObservationModel, predict_readings
 from orthocal.observation.observations import build_observations
 from orthocal.observation.sensor_groups import nuisance_parameters
+from orthocal.sensors.tips import touch_by_ball
 
 PLAN = """robot: orthoglide
 gauge: {{sigma_mm: 0.005, resolution_mm: 0.001, range_mm: [-20, 20]}}
@@ -239,3 +243,10 @@ def test_the_dial_that_is_drawn_touches_the_rods_surface(tmp_path):
         away = at - root - ((at - root) @ unit) * unit
         assert np.linalg.norm(away) == pytest.approx(5.5e-3, abs=1e-9)
         assert away @ d > 5e-3
+
+
+def test_a_ball_is_not_read_as_a_blade():
+    line, ball = LegIndicator("x", "y", Section("fraction", 0.5)), Tip("ball", 2e-3)
+    with pytest.raises(ValueError, match="on_rod"):
+        LegIndicator("x", "y", Section("fraction", 0.5), rod="a", tip=ball)
+    assert type(line.on_rod("a", ball)).touch is touch_by_ball

@@ -37,8 +37,8 @@ class UnmodelledEffect:
     prior_stds: Sizes
     """Prior standard deviation of each, shape (n_unmodelled,), [SI]."""
     leakage: Matrix
-    """B: change of the machine's free parameters per unit of each unmodelled error, shape
-    (n_machine, n_unmodelled), [SI per SI]."""
+    """Matrix B above and in docs/mathematics.md: bias of the machine's free parameters per unit of
+    each unmodelled error, shape (n_machine, n_unmodelled), [SI per SI]."""
     residual_rms: Number
     """Expected RMS of the rows' residuals due to unmodelled errors within their priors, [m of the
     first gauge]."""

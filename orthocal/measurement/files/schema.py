@@ -91,11 +91,19 @@ class PostureKeys(_Keys):
 
     @model_validator(mode="after")
     def _one_form(self) -> PostureKeys:
-        stated = [k for k in ("tcp_mm", "joints_mm", "joints_deg") if getattr(self, k) is not None]
+        stated = self.model_dump(exclude_none=True)
         if len(stated) != 1:
             shown = " and ".join(stated) or "none"
-            raise ValueError(f"found {shown}; expected one of tcp_mm, joints_mm, joints_deg")
+            raise ValueError(
+                f"found {shown}; expected one of {', '.join(PostureKeys.model_fields)}"
+            )
         return self
+
+    @property
+    def stated(self) -> tuple[str, list[float]]:
+        """Key of the posture, and its coordinates in the key's unit."""
+        ((key, values),) = self.model_dump(exclude_none=True).items()
+        return key, values
 
 
 class ControllerKeys(_Keys):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 
@@ -59,7 +58,7 @@ def build_postures(
     active = np.zeros(len(robot.drives)) if offsets is None else offsets
     stated = [] if keys.controller is None else keys.controller.stated
     values = {n: _read_posture(p, robot, f"{file}: postures.{n}") for n, p in keys.postures.items()}
-    points = {name: point for name, (form, point) in values.items() if form == "tcp_mm"}
+    points = {name: point for name, (form, point) in values.items() if form == "tcp"}
     try:
         commanded = {name: v for name, (_, v) in values.items()}
         if points:
@@ -80,31 +79,31 @@ def build_postures(
 
 def _read_posture(keys: PostureKeys, robot: Robot, where: str) -> tuple[PostureForm, Array]:
     """Form and coordinates of a posture, [m, rad]."""
-    form = next(f for f in get_args(PostureForm) if getattr(keys, f) is not None)
-    values, count = getattr(keys, form), len(robot.drives)
-    if form == "tcp_mm":
+    key, values = keys.stated
+    count = len(robot.drives)
+    if key == "tcp_mm":
         if robot.tcp is None or len(robot.tcp.coordinates) != count:
             raise SessionError(
                 f"{robot.name} cannot be commanded by its tool; give joints", where=where
             )
         if len(values) != count:
             raise SessionError(
-                f"has {len(values)} coordinates; expected {count}", where=f"{where}.{form}"
+                f"has {len(values)} coordinates; expected {count}", where=f"{where}.{key}"
             )
-        return form, np.array(values) * MM
-    where = f"{where}.{form}"
+        return "tcp", np.array(values) * MM
+    where = f"{where}.{key}"
     if len(values) != count:
         names = ", ".join(d.name for d in robot.drives)
         raise SessionError(
             f"has {len(values)} numbers; expected {count}, one a drive: {names}", where=where
         )
-    unit = "m" if form == "joints_mm" else "rad"
+    unit = "m" if key == "joints_mm" else "rad"
     for drive in robot.drives:
         if drive.unit != unit:
             raise SessionError(
                 f"drive {drive.name} is in {DRIVE_UNITS[drive.unit][0]}", where=where
             )
-    return form, np.array(values) * MM if unit == "m" else np.deg2rad(values)
+    return "joints", np.array(values) * MM if unit == "m" else np.deg2rad(values)
 
 
 def _check_travel(robot: Robot, drives: Array, key: str, file: Path) -> None:

@@ -14,9 +14,10 @@ from orthocal.errors import SessionError
 from orthocal.io.files import exists, write_file, write_files
 from orthocal.measurement.files.readings_file import RawReading, format_readings
 from orthocal.robot.loading import packaged_robots, robot_digest
+from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import default_zero
 from orthocal.sensors.registry import write_sensor
-from orthocal.session.session import Conditions, Gauge, Purpose, Reading, Session
+from orthocal.session.session import Conditions, Gauge, Posture, Purpose, Reading, Session
 from orthocal.units import MM, tidy, to_mm, trim_zeros
 
 
@@ -35,10 +36,7 @@ def session_document(session: Session) -> dict[str, Any]:
     elif gauges[""]:
         document["gauge"] = gauges[""]
     document["postures"] = {
-        p.name: {
-            p.form: [tidy(np.rad2deg(v)) if p.form == "joints_deg" else to_mm(v) for v in p.values]
-        }
-        for p in session.postures.values()
+        p.name: _posture_document(p, session.robot) for p in session.postures.values()
     }
     if payload := _payload(session):
         document["payload_kg"] = payload
@@ -60,6 +58,12 @@ def session_document(session: Session) -> dict[str, Any]:
     }
     document["readings"] = "readings.csv"
     return document
+
+
+def _posture_document(posture: Posture, robot: Robot) -> dict[str, list[float]]:
+    if posture.form == "joints" and robot.drives[0].unit == "rad":
+        return {"joints_deg": [tidy(np.rad2deg(v)) for v in posture.values]}
+    return {f"{posture.form}_mm": [to_mm(v) for v in posture.values]}
 
 
 def _gauge_document(gauge: Gauge) -> dict[str, Any]:

@@ -139,7 +139,7 @@ class SetupMotion:
     """Postures to read, and the first of them again."""
 
     def closing(self, stop: Stop) -> str:
-        """What the dial shows if nothing moved, at a stop in the first posture again."""
+        """Reading to expect when the first posture is read again; empty for other stops."""
         if stop.repeats is None:
             return ""
         first = "0" if self.stops[0].role == "subtracted" else f"the reading of line {stop.repeats}"
@@ -327,7 +327,7 @@ def _predict(
     sampled = replace(
         session,
         postures={
-            n: Posture(n, "tcp_mm", p, d - session.active_offsets)
+            n: Posture(n, "tcp", p, d - session.active_offsets)
             for n, p, d in zip(names, points, drives, strict=True)
         }
         | {aligned.name: aligned},
