@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 from orthocal.arguments import require_names
 from orthocal.assessment.assess import assess
@@ -19,7 +19,7 @@ from orthocal.assessment.tool_error import ErrorSize
 from orthocal.assessment.words import comparison as words
 from orthocal.assessment.words.entries import SESSION_HEADLINES
 from orthocal.assessment.words.validation import describe_repetition
-from orthocal.calibration.assessment_record import Assessment, Decision, Finding, FindingKind
+from orthocal.calibration.assessment_record import Assessment, Decision, Finding, NoiseKind
 from orthocal.calibration.refit import repeat_calibration
 from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.estimation.options import SolverOptions
@@ -28,17 +28,6 @@ from orthocal.io.fields import finite_or_none
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.session.session import Session
 from orthocal.statistics.noise import KnownNoise, estimate_repeatability
-
-NOISE_KINDS: tuple[FindingKind, ...] = (
-    "noise unknown",
-    "noise from residuals",
-    "noise as stated",
-    "model error",
-    "gauge overstated",
-    "fits",
-    "no redundancy",
-)
-"""Kinds of findings about the residuals of the recommended model."""
 
 CRITERIA = ("rms", "chi_square", "dof", "aicc", "bic", "unseen_rms")
 """Numbers of a score in the JSON document."""
@@ -145,26 +134,15 @@ def compare_models(
         _require_another(other, chosen)
     noise = find_known_noise(session)
     cycles = len({r.cycle for r in session.readings}) > 1
-    parameters = session.robot.parameters
-    given = parameters.read_tolerances(tolerances or {})
-    results, undetermined = [], []
-    for model in dict.fromkeys(models or parameters.models):
-        free = set(parameters.select_model(model))
-        stds = {g: v for g, v in given.items() if free & set(parameters.select([g]))}
-        score = _score_with_prior(session, model, stds, noise.sigma, options)
-        if isinstance(score, Undetermined):
-            undetermined.append(score)
-        else:
-            results.append(score)
-    results.sort(key=lambda r: r.n_free)
+    results, undetermined = _score_models(session, models, tolerances or {}, noise.sigma, options)
     recommendation, judgement = recommend_model(session, models), judge_session(session)
     compared = Comparison(
         title=session.title,
         labels=tuple(r.label + (f", cycle {r.cycle}" if cycles else "") for r in session.readings),
         noise=noise,
         independent=results[0].spare + results[0].rank if results else 0,
-        results=tuple(results),
-        undetermined=tuple(undetermined),
+        results=results,
+        undetermined=undetermined,
         repetition=None,
         repeat_title=join_sessions(others).title if others else "",
         recommendation=recommendation,
@@ -180,6 +158,28 @@ def compare_models(
     best = compared.best.calibration
     again = repeat_calibration(best, others)
     return replace(compared, repetition=measure_repetition(best, again))
+
+
+def _score_models(
+    session: Session,
+    models: Sequence[str],
+    tolerances: Mapping[str, float],
+    noise: float,
+    options: SolverOptions | None,
+) -> tuple[tuple[ModelResult, ...], tuple[Undetermined, ...]]:
+    """Results of the models, the smallest first, and those that are not identifiable."""
+    parameters = session.robot.parameters
+    given = parameters.read_tolerances(tolerances)
+    results, undetermined = [], []
+    for model in dict.fromkeys(models or parameters.models):
+        free = set(parameters.select_model(model))
+        stds = {g: v for g, v in given.items() if free & set(parameters.select([g]))}
+        score = _score_with_prior(session, model, stds, noise, options)
+        if isinstance(score, Undetermined):
+            undetermined.append(score)
+        else:
+            results.append(score)
+    return tuple(sorted(results, key=lambda r: r.n_free)), tuple(undetermined)
 
 
 def _score_with_prior(
@@ -213,7 +213,7 @@ def _assess(comparison: Comparison) -> Assessment:
     if best is not None:
         assessed = comparison.assessments[comparison.results.index(best)]
         notes += _others(comparison, best)
-        notes += assessed.of_kind(*NOISE_KINDS)
+        notes += assessed.of_kind(*get_args(NoiseKind))
         if comparison.repetition is not None:
             title = comparison.repeat_title
             notes.append(describe_repetition(comparison.repetition, title=title))

@@ -28,6 +28,17 @@ EXIT_CODES: dict[Verdict, int] = {"enter": 0, "review": 3, "reject": 3}
 Severity = Literal["reject", "review", "note"]
 """What a finding does to the verdict: `reject` and `review` decide it, a note does not."""
 
+NoiseKind = Literal[
+    "noise unknown",
+    "noise from residuals",
+    "noise as stated",
+    "model error",
+    "gauge overstated",
+    "fits",
+    "no redundancy",
+]
+"""Kinds of findings about the residuals of a fit."""
+
 FindingKind = Literal[
     # mistakes in readings and changes between sessions (hypotheses)
     AnomalyKind,
@@ -47,13 +58,7 @@ FindingKind = Literal[
     "legs differ",
     # of a fit
     "no convergence",
-    "noise unknown",
-    "noise from residuals",
-    "noise as stated",
-    "model error",
-    "gauge overstated",
-    "fits",
-    "no redundancy",
+    NoiseKind,
     "nothing moved",
     "held by a bound",
     "linearisation error",
@@ -170,7 +175,7 @@ class ControllerEntry(InUnit):
     identified: Number
     """Offset of the identified machine, [unit]."""
     enter: Number
-    """Offset to enter, [unit]; what to add to the present one if that is unknown."""
+    """Offset to enter, [unit]; the change to add to the active one if that is unknown."""
     std: SizeOrNaN
     """Standard deviation of `enter` from noise, priors and unmodelled errors, [unit]."""
     std_scatter: SizeOrNaN

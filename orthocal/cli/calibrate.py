@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 from typer import Option
@@ -70,13 +71,6 @@ def calibrate(
     """
     from orthocal.estimation.selection import read_bounds, read_known
 
-    def files() -> dict[str, str]:
-        from orthocal.calibration.file import calibration_json
-        from orthocal.output.report.page import build_report
-
-        texts = (calibration_json(result), build_report(result, saved=out))
-        return dict(zip(FILES, texts, strict=True))
-
     if out is not None:
         require_writable(out, FILES)
     session = load_joined(sessions, effects=split_effects(effects))
@@ -98,4 +92,13 @@ def calibrate(
             profile=split_globs(profile),
         )
     shown = {"details": details, "all_rows": all_rows, "saved": out}
-    deliver_judged(result, json=json, out=out, files=files, **shown)
+    deliver_judged(result, json=json, out=out, files=lambda: _build_files(result, out), **shown)
+
+
+def _build_files(result: orthocal.Calibration, out: Path | None) -> dict[str, str]:
+    """Texts of `FILES`, by name."""
+    from orthocal.calibration.file import calibration_json
+    from orthocal.output.report.page import build_report
+
+    texts = (calibration_json(result), build_report(result, saved=out))
+    return dict(zip(FILES, texts, strict=True))

@@ -125,13 +125,7 @@ def correct(
             _spool(_with_comment(texts, warning) if warning else texts, spool)
         if not corrector.summary.lines:
             raise GcodeError("is empty; expected a program", where=file)
-        if out is not None:
-            write_file(out, iter(lambda: spool.read(BLOCK), b""))
-        else:
-            text = io.TextIOWrapper(spool, encoding="utf-8", errors="replace", newline="")
-            while part := text.read(BLOCK):
-                put_part(part)
-            sys.stdout.flush()
+        _put_program(spool, out)
     notes = [
         _describe(corrector.summary, field, tolerance),
         _describe_controller(result, values, active=active),
@@ -144,6 +138,17 @@ def correct(
     if corrector.summary.unit_assumed:
         notes.append("No G20 or G21 before the first coordinates: read as mm.")
     put_note("\n".join(note for note in notes if note))
+
+
+def _put_program(spool: IO[bytes], out: Path | None) -> None:
+    """Write a corrected program to its file, or to standard output."""
+    if out is not None:
+        write_file(out, iter(lambda: spool.read(BLOCK), b""))
+        return
+    text = io.TextIOWrapper(spool, encoding="utf-8", errors="replace", newline="")
+    while part := text.read(BLOCK):
+        put_part(part)
+    sys.stdout.flush()
 
 
 @contextmanager

@@ -30,6 +30,14 @@ from orthocal.io.files import exists, read_file, require_plain_name, write_files
 FIRST = "first"
 """Directory of the first session, in that of the machine."""
 
+COMMENT = (
+    "A plan. Print sheet.html and measure: run `orthocal record .` in this directory, or fill\n"
+    "in readings.csv in its order. Then\n"
+    "orthocal calibrate .\n"
+    "offsets_mm: those that are active in the controller during the measurement."
+)
+"""Comment at the top of the first session's session.yaml."""
+
 
 @command()
 def new(
@@ -82,9 +90,7 @@ def new(
         "--at-zero-mm": at_zero_mm,
     }
     if again:
-        for option, value in {**dimensions, "--workspace-mm": workspace_mm}.items():
-            if value is not None:
-                raise ParameterError("found with --again, which reads machine.yaml", where=option)
+        _require_none({**dimensions, "--workspace-mm": workspace_mm})
         _make_again(folder)
         return
     if paper and hours is not None:
@@ -116,14 +122,15 @@ def new(
     write_files(folder, describe_machine(machine, name=name, counting=counting, tolerances=stated))
     robot = orthocal.load_robot(folder).with_tolerances(stated)
     session = replace(session, robot=robot, robot_reference=str(folder.resolve()))
-    comment = (
-        "A plan. Print sheet.html and measure: run `orthocal record .` in this directory, or fill\n"
-        "in readings.csv in its order. Then\n"
-        "orthocal calibrate .\n"
-        "offsets_mm: those that are active in the controller during the measurement."
-    )
-    orthocal.write_session(session, folder / FIRST, comment=comment, extra=files, blank=True)
+    orthocal.write_session(session, folder / FIRST, comment=COMMENT, extra=files, blank=True)
     _report(folder, machine.words, plan, session, files)
+
+
+def _require_none(options: Mapping[str, str | None]) -> None:
+    """Refuse options that --again reads from machine.yaml."""
+    for option, value in options.items():
+        if value is not None:
+            raise ParameterError("found with --again, which reads machine.yaml", where=option)
 
 
 def _require_new(folder: Path, *, force: bool) -> str:

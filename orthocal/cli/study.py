@@ -43,6 +43,7 @@ from orthocal.io.files import Content, exists, require_writable
 from orthocal.units import MM
 
 if TYPE_CHECKING:
+    from orthocal.planning.first_plan import Displacements
     from orthocal.study.runner import Progress
 
 studies = make_group("Simulate many machines, or resample readings.")
@@ -159,15 +160,10 @@ def linearisation(
         sigma_mm (MM): Standard deviation of a reading, mm; default: 0.02, as in the paper.
         resolution_mm (MM): Resolution of a reading, mm; default: 0.01, as in the paper.
     """
-    from orthocal.planning.first_plan import PAPER_GAUGE, Displacements
+    from orthocal.planning.first_plan import PAPER_GAUGE
 
-    scale = _scale_of(leg_mm) if leg_mm is not None and leg_mm > 0.0 else 1.0
-    usual = Displacements()
-    maximum = scale * usual.maximum / MM if max_mm is None else max_mm
-    minimum = scale * usual.minimum / MM if min_mm is None else min_mm
     require_between(largest_mm, 0.0, LARGEST_MM, "--largest-mm")
-    require_between(maximum, 0.0, LARGEST_MM, "--max-mm")
-    require_between(minimum, -LARGEST_MM, 0.0, "--min-mm")
+    displacements = _read_displacements(leg_mm, max_mm, min_mm)
     for name, value in (("--sigma-mm", sigma_mm), ("--resolution-mm", resolution_mm)):
         if value is not None:
             require_between(value, 0.0, 1e3, name)
@@ -180,7 +176,7 @@ def linearisation(
             count=sizes,
             directions=directions,
             along=None if along is None else read_numbers(along, "--along"),
-            displacements=Displacements(maximum * MM, minimum * MM),
+            displacements=displacements,
             gauge=orthocal.Gauge(
                 gauge.sigma if sigma_mm is None else sigma_mm * MM,
                 gauge.resolution if resolution_mm is None else resolution_mm * MM,
@@ -189,6 +185,21 @@ def linearisation(
             seed=seed,
         )
     _run(study, out, workers, dask, json=json, all_rows=False, force=force)
+
+
+def _read_displacements(
+    leg_mm: float | None, max_mm: float | None, min_mm: float | None
+) -> Displacements:
+    """Displacements of the paper's postures, by default scaled with the legs."""
+    from orthocal.planning.first_plan import Displacements
+
+    scale = _scale_of(leg_mm) if leg_mm is not None and leg_mm > 0.0 else 1.0
+    usual = Displacements()
+    maximum = scale * usual.maximum / MM if max_mm is None else max_mm
+    minimum = scale * usual.minimum / MM if min_mm is None else min_mm
+    require_between(maximum, 0.0, LARGEST_MM, "--max-mm")
+    require_between(minimum, -LARGEST_MM, 0.0, "--min-mm")
+    return Displacements(maximum * MM, minimum * MM)
 
 
 @command(studies)

@@ -138,19 +138,8 @@ def select_parameters(
         patterns += parameters.patterns(base)
     with errors_at("free"):
         chosen = set(parameters.select([*patterns, *free]))
-    fixed: dict[str, float] = {}
-    priors: dict[str, tuple[float, float]] = {}
-    for name, entry in (known or {}).items():
-        with errors_at("known"):
-            parameter = parameters[name]
-            _refuse_length(entry[0] if isinstance(entry, tuple) else entry, parameter)
-            if isinstance(entry, tuple):
-                spread = require_prior_std(entry[1], parameters.defaults[name])
-                priors[name] = (_finite(entry[0], name), spread)
-                chosen.add(name)
-            else:
-                fixed[name] = _finite(entry, name)
-                chosen.discard(name)
+    fixed, priors = _split_known(parameters, known or {})
+    chosen = (chosen | set(priors)) - set(fixed)
     names = [n for n in parameters.names if n in chosen]
     if not names:
         raise ParameterError("no free parameters: there is nothing to identify")
@@ -162,15 +151,7 @@ def select_parameters(
             for name in _match_free(parameters, glob, names):
                 stds[name] = require_prior_std(value, parameters.defaults[name])
     stds.update({n: s for n, (_, s) in priors.items()})
-    lower = np.array([_lowest(parameters[n]) for n in names])
-    upper = np.full(len(names), np.inf)
-    for glob, (low, high) in (bounds or {}).items():
-        with errors_at("bounds"):
-            if not low < high:
-                raise ParameterError(f"the lower bound of '{glob}' is not below the upper one")
-            for name in _match_free(parameters, glob, names):
-                i = names.index(name)
-                lower[i], upper[i] = max(low, lower[i]), high
+    lower, upper = _find_bounds(parameters, names, bounds or {})
     priors_only = {*priors, *parameters.of_effects}
     only_offsets = all(parameters.are_offsets(n) for n in names if n not in priors_only)
     everywhere = not only_offsets if prior is None else prior
@@ -183,6 +164,40 @@ def select_parameters(
         upper=read_only(upper),
         fixed=fixed,
     )
+
+
+def _split_known(
+    parameters: ParameterSet, known: Mapping[str, KnownWithStd]
+) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+    """Fixed values, and means and standard deviations of priors, [SI]."""
+    fixed: dict[str, float] = {}
+    priors: dict[str, tuple[float, float]] = {}
+    for name, entry in known.items():
+        with errors_at("known"):
+            parameter = parameters[name]
+            _refuse_length(entry[0] if isinstance(entry, tuple) else entry, parameter)
+            if isinstance(entry, tuple):
+                spread = require_prior_std(entry[1], parameters.defaults[name])
+                priors[name] = (_finite(entry[0], name), spread)
+            else:
+                fixed[name] = _finite(entry, name)
+    return fixed, priors
+
+
+def _find_bounds(
+    parameters: ParameterSet, names: list[str], bounds: Mapping[str, tuple[float, float]]
+) -> tuple[Array, Array]:
+    """Lowest and highest values of free parameters, shape (n_free,) each, [SI]."""
+    lower = np.array([_lowest(parameters[n]) for n in names])
+    upper = np.full(len(names), np.inf)
+    for glob, (low, high) in bounds.items():
+        with errors_at("bounds"):
+            if not low < high:
+                raise ParameterError(f"the lower bound of '{glob}' is not below the upper one")
+            for name in _match_free(parameters, glob, names):
+                i = names.index(name)
+                lower[i], upper[i] = max(low, lower[i]), high
+    return lower, upper
 
 
 def read_known(

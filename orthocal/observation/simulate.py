@@ -120,6 +120,29 @@ def simulate_session(
     entries = predict_readings(plan, errors, observations=observations, nuisance=drawn)
     entries, zeros = show_readings(plan, observations, entries, rng=rng, sigma=sigma, exact=exact)
     rows = observations.rows(entries)
+    _require_readable(plan, rows)
+    session = replace(
+        plan.with_values(rows),
+        gauges={
+            name: replace(g, resolution=None) if exact else g for name, g in plan.gauges.items()
+        },
+        title=plan.title if plan.title.startswith("Simulated") else f"Simulated: {plan.title}",
+        source=f"Simulated by orthocal, not measured (seed {seed})",
+        path=None,
+        readings_path=None,
+        seed=seed,
+    )
+    truth = {p.name: float(v) for p, v in zip(nuisance, drawn, strict=True)}
+    return SimulatedSession(session, dict(errors), zeros, truth)
+
+
+def _require_readable(plan: Session, rows: Array) -> None:
+    """Refuse simulated readings that do not exist or leave the gauge's range.
+
+    Args:
+        plan: The session whose rows are simulated.
+        rows: Readings, shape (n_rows,), [m].
+    """
     for reading, value in zip(plan.readings, rows, strict=True):
         if not math.isfinite(value):
             raise SessionError(
@@ -134,19 +157,6 @@ def simulate_session(
                 f"range ends at {beyond / MM:g} mm",
                 where=_where(plan, gauge_name, "range_mm") if plan.path is not None else None,
             )
-    session = replace(
-        plan.with_values(rows),
-        gauges={
-            name: replace(g, resolution=None) if exact else g for name, g in plan.gauges.items()
-        },
-        title=plan.title if plan.title.startswith("Simulated") else f"Simulated: {plan.title}",
-        source=f"Simulated by orthocal, not measured (seed {seed})",
-        path=None,
-        readings_path=None,
-        seed=seed,
-    )
-    truth = {p.name: float(v) for p, v in zip(nuisance, drawn, strict=True)}
-    return SimulatedSession(session, dict(errors), zeros, truth)
 
 
 def show_readings(

@@ -307,28 +307,17 @@ def build_linearisation_study(
         paper = used if names == offsets else None
     else:
         session, paper = source, None
+    gauge = gauge or session.gauge
     if along is None:
         vectors = np.random.default_rng(seed).normal(size=(directions, len(names)))
     else:
-        vectors = np.array([along], dtype=np.float64)
-        if vectors.shape[1] != len(names) or not np.abs(vectors).max() > 0.0:
-            raise ParameterError(
-                f"found {', '.join(f'{v:g}' for v in along)}; expected {len(names)} numbers, not "
-                f"all 0: {', '.join(names)}",
-                where="--along",
-            )
+        vectors = _read_direction(along, names)
     # the size of (1, −0.6, 0.3) is its largest component
     unit = vectors / np.abs(vectors).max(axis=1, keepdims=True)
     if sizes is None:
         sizes = np.geomspace(min(SMALLEST_SIZE, largest), largest, count).tolist()
-    gauge = gauge or session.gauge
-    setups = {
-        name: replace(setup, sensor=_without_mounting_errors(setup.sensor))
-        for name, setup in session.setups.items()
-    }
-    session = replace(session, setups=setups).with_values(np.zeros(len(session.readings)))
     return LinearisationStudy(
-        session=session,
+        session=_idealise(session),
         free=tuple(names),
         sizes=tuple(float(f"{v:.4g}") for v in sizes),
         directions=tuple(tuple(v.tolist()) for v in unit),
@@ -336,6 +325,27 @@ def build_linearisation_study(
         sigma=noise_floor(gauge.sigma, gauge.resolution),
         resolution=gauge.resolution or 0.0,
     )
+
+
+def _idealise(session: Session) -> Session:
+    """A session with readings of 0 and exact mounting."""
+    setups = {
+        name: replace(setup, sensor=_without_mounting_errors(setup.sensor))
+        for name, setup in session.setups.items()
+    }
+    return replace(session, setups=setups).with_values(np.zeros(len(session.readings)))
+
+
+def _read_direction(along: Sequence[float], names: Sequence[str]) -> Array:
+    """Stated direction of the errors, shape (1, n_errors)."""
+    vector = np.array([along], dtype=np.float64)
+    if vector.shape[1] != len(names) or not np.abs(vector).max() > 0.0:
+        raise ParameterError(
+            f"found {', '.join(f'{v:g}' for v in along)}; expected {len(names)} numbers, not "
+            f"all 0: {', '.join(names)}",
+            where="--along",
+        )
+    return vector
 
 
 def _paper_differences(session: Session) -> Array:

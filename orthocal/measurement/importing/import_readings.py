@@ -31,7 +31,7 @@ from orthocal.measurement.importing.headings import (
     parse_role,
 )
 from orthocal.measurement.importing.long_table import LongTable, make_long_table
-from orthocal.session.session import Conditions, Reading
+from orthocal.session.session import Conditions, Reading, Session
 from orthocal.text import shorten
 
 Key = tuple[str, str, str, int]
@@ -114,29 +114,7 @@ def import_readings(
     _check_options(options)
     path = Path(table)
     plan, readings_path = load_unread(session)
-    content = read_table(
-        path,
-        read_file(path, error=SessionError),
-        lambda rows: find_header(rows, options.columns),
-        expected=EXPECTED,
-        sheet=options.sheet,
-        separator=options.separator,
-        encoding=options.encoding,
-    )
-    columns = choose_columns(
-        content.header, options.columns, where=content.place(content.header_line)
-    )
-    if "time" not in options.columns:
-        columns = _without_clock_times(content, columns)
-    long_table = make_long_table(
-        content,
-        columns,
-        names={"setup": plan.setups, "posture": plan.postures},
-        decimal=cast("Sign | None", options.decimal),
-        unit=cast("UnitName | None", options.unit),
-        separator_known=options.separator is not None,
-        fill=options.fill,
-    )
+    content, columns, long_table = _read_long_table(path, plan, options)
     readings = check_readings(long_table.rows, plan, file=path)
     new = list(zip(long_table.rows, readings, strict=True))
     with content_withheld_outside((plan.path or Path(session)).parent, readings_path):
@@ -161,6 +139,36 @@ def import_readings(
         added=counts["added"],
         empty=sum(not row.reading_mm for row in merged),
     )
+
+
+def _read_long_table(
+    path: Path, plan: Session, options: TableOptions
+) -> tuple[Table, Columns, LongTable]:
+    """Table of a file with the roles of its columns, and its long form."""
+    content = read_table(
+        path,
+        read_file(path, error=SessionError),
+        lambda rows: find_header(rows, options.columns),
+        expected=EXPECTED,
+        sheet=options.sheet,
+        separator=options.separator,
+        encoding=options.encoding,
+    )
+    columns = choose_columns(
+        content.header, options.columns, where=content.place(content.header_line)
+    )
+    if "time" not in options.columns:
+        columns = _without_clock_times(content, columns)
+    long_table = make_long_table(
+        content,
+        columns,
+        names={"setup": plan.setups, "posture": plan.postures},
+        decimal=cast("Sign | None", options.decimal),
+        unit=cast("UnitName | None", options.unit),
+        separator_known=options.separator is not None,
+        fill=options.fill,
+    )
+    return content, columns, long_table
 
 
 def write_import(result: TableImport) -> None:

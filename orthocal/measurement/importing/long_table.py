@@ -124,20 +124,15 @@ def make_long_table(
     unit_assumed = False
     rows, missing = [], []
     for entry in entries:
-        written = (entry.row.setup, entry.row.posture, entry.row.minus)
-        meant = [
-            _session_name(name, of_session)
-            for name, of_session in zip(written, (setups, postures, postures), strict=True)
-        ]
-        setup, posture, minus = meant
-        row = replace(entry.row, setup=setup, posture=posture, minus=minus)
+        row = _with_session_names(entry.row, setups, postures)
         if entry.number is None:
             if row.setup in setups and row.posture in postures:
                 missing.append(row)
             elif (row.line, NO_READING) not in skipped[-1:]:
                 skipped.append((row.line, NO_READING))
             continue
-        renamed |= {old: new for old, new in zip(written, meant, strict=True) if old != new}
+        names_of_rows = zip(_names(entry.row), _names(row), strict=True)
+        renamed |= {old: new for old, new in names_of_rows if old != new}
         value = _parse_value(entry, sign.sign)
         entry_unit = _choose_unit(entry, unit, table.header[entry.column])
         units[entry_unit] = None
@@ -152,6 +147,22 @@ def make_long_table(
         unit_assumed=unit_assumed,
         skipped=tuple(skipped),
         renamed=tuple(renamed.items()),
+    )
+
+
+def _names(row: RawReading) -> tuple[str, str, str]:
+    return row.setup, row.posture, row.minus
+
+
+def _with_session_names(
+    row: RawReading, setups: Mapping[str, str], postures: Mapping[str, str]
+) -> RawReading:
+    """A row with the names of the session in place of those of the table."""
+    return replace(
+        row,
+        setup=_session_name(row.setup, setups),
+        posture=_session_name(row.posture, postures),
+        minus=_session_name(row.minus, postures),
     )
 
 
