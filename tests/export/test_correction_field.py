@@ -13,7 +13,7 @@ from commands import run_orthocal
 from programs import distances, read_polyline
 
 from orthocal import ExportError, calibrate, draw_errors, write_calibration
-from orthocal.assessment.controller_entries import entered_offsets
+from orthocal.assessment.controller_entries import entered_offsets, offsets_to_enter
 from orthocal.export.correction_field import CorrectionField
 from orthocal.gcode.interpreter import Interpreter
 from orthocal.gcode.program import ProgramCorrector
@@ -210,21 +210,27 @@ PROGRAM = "G21 G0 X1 Y2 Z3\r\nG1 X5 F100 (\xe9)\r\n"
 
 
 def test_command_line(command, tmp_path):
-    """Offsets alone need a correction only until they are entered, to 1 µm."""
+    """Offsets alone need a correction until they are entered; then what rounding leaves."""
+    machine = command.calibration
+    nominal = nominal_closure(machine.robot)
+
+    def expected(point, offsets):
+        drives = machine.machine.inverse(np.array(point) * 1e-3) + offsets
+        return nominal.forward(drives) * 1e3
+
     code, out, err = command(PROGRAM)
     assert code == 0
     found = re.fullmatch(r"G21 G0 X(\S+) Y(\S+) Z(\S+)", out.splitlines()[0])
-    assert [float(v) for v in found.groups()] == pytest.approx([1.0, 2.0, 3.0], abs=1e-3)
+    rounded = expected([1.0, 2.0, 3.0], offsets_to_enter(machine))
+    assert [float(v) for v in found.groups()] == pytest.approx(rounded, abs=1e-4)
+    assert np.abs(rounded - [1.0, 2.0, 3.0]).max() > 2e-4  # more than the tolerance
     assert "For a controller with the offsets to enter: x_slide -0.5" in err
     assert "The program's coordinates are read as machine coordinates." in err
     code, out, err = command(PROGRAM, "--offsets", "active", "--work-offset-mm", "10,0,-5")
     assert code == 0
     assert "active during the measurement: x_slide +0.000 mm" in err
-    wanted = np.array([11.0, 2.0, -2.0]) * 1e-3
-    machine = command.calibration
-    expected = nominal_closure(machine.robot).forward(machine.machine.inverse(wanted))
     got = read_polyline(out.splitlines())[0][0][0] + [10.0, 0.0, -5.0]
-    assert np.abs(got - expected * 1e3).max() < 1e-4
+    assert got == pytest.approx(expected([11.0, 2.0, -2.0], np.zeros(3)), abs=1e-4)
     assert np.abs(entered_offsets(machine)).max() > 1e-4
     code, _, err = command(PROGRAM, "--out", str(tmp_path / "o.ngc"), "--tool=-3,0,-50.5")
     assert "For a tip at -3, 0, -50.5 mm from the tool centre point." in err
