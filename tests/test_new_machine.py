@@ -133,7 +133,7 @@ def test_without_paper_a_plan_is_chosen(planned):
     assert list(dict.fromkeys(steps)) == ["computing", "choosing", "search", "comparing", "drawing"]
     assert re.search(r"Plan: \d+ readings in \d setups?, about 1\d min\.", out)
     assert re.search(
-        r"all errors corrected: [\d.]+ mm after .*first: [\d.]+ mm; now [\d.]+ mm", out
+        r"all identified errors corrected: [\d.]+ mm after .*first: [\d.]+ mm; now [\d.]+ mm", out
     )
     assert "RMS over the workspace ±40 mm" in out
     first = mill / "first"

@@ -98,7 +98,7 @@ def test_the_part_is_as_good_as_promised(walked):
     assert whole < 1.2 * promised
     assert whole < 0.5 * after
     assert after < 0.5 * before
-    told = re.search(r"With all errors corrected: ([0-9.]+) mm", said)
+    told = re.search(r"With all identified errors corrected: ([0-9.]+) mm", said)
     assert float(told[1]) == pytest.approx(promised * 1e3, abs=0.5e-3)
     assert two.assessment.tool.compensated == pytest.approx(promised)
 

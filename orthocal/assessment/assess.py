@@ -48,9 +48,9 @@ EXPLANATIONS: tuple[FindingKind, ...] = (
 
 
 KEEPING: dict[FindingKind, str] = {
-    "no offset": words.NOTHING,
-    "no change needed": words.KEEP,
-    "nothing moved": words.KEEP,
+    "no offset": words.NOTHING_HEADLINE,
+    "no change needed": words.KEEP_HEADLINE,
+    "nothing moved": words.KEEP_HEADLINE,
 }
 """Kinds of notes that leave nothing to enter, and their headlines."""
 
@@ -152,7 +152,9 @@ def check_session(session: Session) -> Assessment:
     findings = found.findings
     if found.verdict == "enter":
         within = found.tolerance_scale == 1.0
-        findings = rank([*findings, words.sound(len(session.readings), within_tolerances=within)])
+        findings = rank(
+            [*findings, words.no_anomaly(len(session.readings), within_tolerances=within)]
+        )
     lead = next((f for f in findings if f.severity != "note"), findings[-1])
     decision = Decision(
         found.verdict, words.SESSION_HEADLINES[found.verdict], lead.text, lead.action
@@ -186,16 +188,16 @@ def _entry_findings(
 
     if not entries:
         return [words.no_offset(), *expected(keep=True)]
-    found = []
-    if entries[0].active is None:
-        found.append(words.controller_not_stated([e.drive for e in entries]))
     by_readings = [e for e in entries if e.held is None and math.isfinite(e.std)]
     large = [e.drive for e in by_readings if is_significant(calibration, e)]
     small = [e.drive for e in by_readings if e.drive not in large]
-    if small and not large and not _tool_changes(tool):
+    keep = bool(small) and not large and not _tool_changes(tool)
+    found = expected(keep=keep)
+    if entries[0].active is None:
+        found.append(words.controller_not_stated([e.drive for e in entries], keep=keep))
+    if keep:
         ratio = max((abs(e.change) / e.std for e in by_readings if e.std > 0.0), default=0.0)
-        return [words.no_change_needed(small, ratio, tool), *expected(keep=True), *found]
-    found = [*expected(keep=False), *found]
+        return [words.no_change_needed(small, ratio, tool), *found]
     if large:
         found.append(words.must_change(large))
     if small:
@@ -212,8 +214,8 @@ def _tool_changes(tool: ToolErrorSummary | None) -> bool:
     """True if the tool error changes by more than its uncertainty if the offsets are entered.
 
     Offsets that are correlated may do so although each of them changes insignificantly. Entering
-    moves the tool by √(now² - entered²); a controller that corrects all errors leaves its
-    uncertainty.
+    moves the tool by √(now² - entered²); a controller that corrects all identified
+    errors leaves its uncertainty.
     """
     if tool is None:
         return False
@@ -242,5 +244,5 @@ def _decide(findings: Sequence[Finding]) -> Decision:
     why = first_of(findings, *EXPLANATIONS)
     reason, action = ("", "") if why is None else (why.text, why.action)
     return Decision(
-        verdict, words.HEADLINES[verdict], reason, f"{words.next_step(None)} {action}".strip()
+        verdict, words.HEADLINES[verdict], reason, f"{words.NEXT_STEP} {action}".strip()
     )

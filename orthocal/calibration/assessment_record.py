@@ -224,8 +224,8 @@ class ToolUse:
     parts: Many[UsePart]
     """Conditions that vary."""
     unstated: SizeOrNaN
-    """Tool error, aligned, with all errors corrected but the conditions unknown: for the middle of
-    both sides, the reference temperature and no payload, [m]."""
+    """Tool error, aligned, with all identified errors corrected but the conditions unknown: for the
+    middle of both sides, the reference temperature and no payload, [m]."""
 
     @property
     def stated(self) -> StatedUse:

@@ -201,7 +201,7 @@ def test_one_tool_error_in_one_sentence_everywhere(answers, name):
     assert words_of(calibration).count(sentence) == 1
     # the answer, the section of the tool and the findings
     assert answers.complete(name).count(sentence) == 3
-    assert ("With all errors corrected: " in words_of(calibration)) == (
+    assert ("With all identified errors corrected: " in words_of(calibration)) == (
         not calibration.only_offsets
     )
 

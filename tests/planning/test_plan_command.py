@@ -129,7 +129,7 @@ def test_the_same_seed_gives_the_same_plan_in_python(orthoglide):
     plan = plan_readings(orthoglide, "full", equipment=equipment, starts=1, seed=3)
     again = plan_readings(orthoglide, "full", equipment=equipment, starts=1, seed=3)
     assert isinstance(plan, MeasuringPlan)
-    assert "Expected tool error with all errors corrected: " in summarize(plan)
+    assert "Expected tool error with all identified errors corrected: " in summarize(plan)
     assert "Largest contributions" in summarize(plan, details=True)
     assert [r.posture for r in plan.session.readings] == [r.posture for r in again.session.readings]
 

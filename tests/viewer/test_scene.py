@@ -501,7 +501,7 @@ def test_headline_of_the_tool_states_error_and_uncertainty(calibration):
     known = measure_uncertainty(found.jacobian, covariance, found.workspace, found.targets)
     known = known.sizes.aligned.largest
     assert known > 1.2 * found.after.sizes.aligned.largest
-    assert f"With all errors corrected: up to {known * 1e6:.0f} µm RMS" in scene.headline
+    assert f"With all identified errors corrected: up to {known * 1e6:.0f} µm RMS" in scene.headline
     (told,) = (e.text for e in scene.legend if e.nodes == (tool_errors.TOOL_UNCERTAINTY,))
     assert f"errors at {calibration.tolerance_scale:.1f} × tolerances" in told
 

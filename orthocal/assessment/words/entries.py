@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from orthocal.assessment.wording import joined, named, note, tool_mm
+from orthocal.assessment.wording import counted, joined, named, note, tool_mm
 from orthocal.calibration.assessment_record import Finding, ToolErrorSummary, Verdict
 from orthocal.kinematics.conditions import StatedUse
 from orthocal.units import UM
@@ -15,40 +15,56 @@ HEADLINES: dict[Verdict, str] = {
     "review": "Check these readings before you enter anything.",
     "reject": "Do not enter these offsets.",
 }
-KEEP = "Leave the offsets as they are."
-NOTHING = "Nothing to enter: no offset was identified."
+"""Headlines of the verdicts on a calibration."""
 
-SOUND = "No anomaly found."
+KEEP_HEADLINE = "Leave the offsets as they are."
+"""Headline of a calibration that changes no offset."""
+
+NOTHING_HEADLINE = "Nothing to enter: no offset was identified."
+"""Headline of a calibration without offsets."""
+
 SESSION_HEADLINES: dict[Verdict, str] = {
-    "enter": SOUND,
+    "enter": "No anomaly found.",
     "review": "Check these readings first.",
     "reject": "These readings cannot be used.",
 }
+"""Headlines of the verdicts on readings."""
+
+NEXT_STEP = "`orthocal again` makes the session that measures again, `orthocal validate` judges it."
+"""Next step after the offsets are entered."""
 
 
-def next_step(session: str | None) -> str:
-    """Next step after the offsets are entered."""
-    return "`orthocal again` makes the session that measures again, `orthocal validate` judges it."
+def no_anomaly(readings: int, *, within_tolerances: bool) -> Finding:
+    """Finding about readings that show no anomaly.
 
-
-def sound(readings: int, *, within_tolerances: bool) -> Finding:
-    """No anomaly was found."""
-    noun = "reading agrees" if readings == 1 else "readings agree"
-    return note(
-        "fits",
-        f"The {readings} {noun} with each other"
-        + (" and with a machine within its tolerances." if within_tolerances else "."),
-        readings=float(readings),
-    )
+    Args:
+        readings: Number of readings, at least 1.
+        within_tolerances: Whether errors within the tolerances explain the readings.
+    """
+    machine = "with a machine within its tolerances"
+    if readings > 1:
+        agreement = f"with each other and {machine}" if within_tolerances else "with each other"
+        text = f"The {counted(readings, 'reading')} agree {agreement}."
+    elif within_tolerances:
+        text = f"The reading agrees {machine}."
+    else:
+        text = "There is no second reading to compare the reading with."
+    return note("fits", text, readings=float(readings))
 
 
 def no_offset() -> Finding:
-    """No offset was identified."""
+    """Finding that no offset was identified."""
     return note("no offset", "No offset was identified.")
 
 
 def no_change_needed(drives: Sequence[str], ratio: float, tool: ToolErrorSummary | None) -> Finding:
-    """Neither an offset nor the tool error changes by more than its uncertainty."""
+    """Finding that no offset, and if known no tool error, changes by more than its uncertainty.
+
+    Args:
+        drives: Drives whose offsets the readings determine.
+        ratio: Largest |change| of these offsets, in standard deviations.
+        tool: Expected tool error; None if unknown.
+    """
     numbers = {"largest_change_over_std": ratio}
     too = ""
     if tool is not None:
@@ -64,52 +80,51 @@ def no_change_needed(drives: Sequence[str], ratio: float, tool: ToolErrorSummary
 
 
 def must_change(drives: Sequence[str]) -> Finding:
-    """Offsets that change by more than their uncertainty."""
-    return note(
-        "must change",
-        f"{_changes(drives)} by more than {_their(drives)} uncertainty.",
-        "",
-        named(*drives),
-    )
+    """Finding about offsets that change by more than their uncertainty."""
+    return note("must change", _describe_change(drives, "more"), "", named(*drives))
 
 
 def not_significant(drives: Sequence[str]) -> Finding:
-    """Offsets that change by less than their uncertainty."""
-    return note(
-        "not significant",
-        f"{_changes(drives)} by less than {_their(drives)} uncertainty. Entering "
-        f"{'it' if len(drives) == 1 else 'them'} does no harm.",
-        "",
-        named(*drives),
-    )
+    """Finding about offsets that change by less than their uncertainty."""
+    them = "it" if len(drives) == 1 else "them"
+    text = f"{_describe_change(drives, 'less')} Entering {them} does no harm."
+    return note("not significant", text, "", named(*drives))
 
 
-def _changes(drives: Sequence[str]) -> str:
-    return f"{joined(drives)} {'changes' if len(drives) == 1 else 'change'}"
+def _describe_change(drives: Sequence[str], compared: str) -> str:
+    change, their = ("changes", "its") if len(drives) == 1 else ("change", "their")
+    return f"{joined(drives)} {change} by {compared} than {their} uncertainty."
 
 
-def _their(drives: Sequence[str]) -> str:
-    return "its" if len(drives) == 1 else "their"
+def controller_not_stated(drives: Sequence[str], *, keep: bool) -> Finding:
+    """Finding that the values to enter are changes, as the active offsets are not stated.
 
-
-def controller_not_stated(drives: Sequence[str]) -> Finding:
-    """The session does not state the offsets that were active."""
+    Args:
+        drives: Drives with a value to enter.
+        keep: Whether the offsets stay as they are.
+    """
+    if len(drives) == 1:
+        meaning = "The value is a change, not a complete offset"
+        action = f"Add it to the active offset of {drives[0]}."
+    else:
+        meaning = "The values are changes, not complete offsets"
+        action = "Add each to the active offset of its drive."
     return note(
         "controller not stated",
-        "The session does not state the offsets that were active (`controller`).",
-        f"Add these values to the present offsets of {joined(drives)}.",
+        f"The session does not state the active offsets (`controller`). {meaning}.",
+        "" if keep else action,
     )
 
 
 def describe_tool_error(tool: ToolErrorSummary, *, keep: bool = False) -> str:
-    """The expected tool error in one sentence, the same in every output.
+    """Sentence about the expected tool error, the same in every output.
 
     Args:
         tool: The tool error.
         keep: Whether the offsets stay as they are.
     """
     if keep:
-        return f"Expected tool error with the present offsets: {tool_mm(tool.now)} RMS."
+        return f"Expected tool error with the active offsets: {tool_mm(tool.now)} RMS."
     return (
         f"Expected tool error with these offsets: {tool_mm(tool.entered)} RMS "
         f"(now {tool_mm(tool.now)})."
@@ -117,24 +132,28 @@ def describe_tool_error(tool: ToolErrorSummary, *, keep: bool = False) -> str:
 
 
 def describe_compensated(rms: float) -> str:
-    """The expected tool error with a controller that corrects all identified errors."""
-    return f"With all errors corrected: {tool_mm(rms)}."
+    """Sentence about the tool error with a controller that corrects all identified errors.
+
+    Args:
+        rms: RMS of that tool error, [m].
+    """
+    return f"With all identified errors corrected: {tool_mm(rms)}."
 
 
 def describe_region(tool: ToolErrorSummary) -> str:
-    """Region, alignment and conditions of use of the tool errors of an answer."""
+    """Sentence about region, alignment and conditions of use of the tool errors of an answer."""
     use = None if tool.use is None else tool.use.stated
     return describe_aligned(f"the workspace {tool.region}", use)
 
 
 def describe_aligned(region: str, use: StatedUse | None) -> str:
-    """The same for a region and conditions of use."""
+    """Sentence about the alignment of tool errors over a region under conditions of use."""
     under = "" if use is None else f", {describe_use(use)}"
     return f"RMS over {region}, workpiece aligned on the machine{under}."
 
 
 def describe_use(use: StatedUse) -> str:
-    """Conditions of use."""
+    """Conditions of use, separated by commas."""
     parts = []
     approach, temperature, payload = use["approach"], use["temperature"], use["payload"]
     if approach is not None:
@@ -149,7 +168,7 @@ def describe_use(use: StatedUse) -> str:
 
 
 def describe_use_parts(tool: ToolErrorSummary) -> list[str]:
-    """What each condition of use that varies adds to the tool error with the offsets entered."""
+    """Sentences about the tool error that each varying condition of use adds."""
     if tool.use is None:
         return []
     lines = []
@@ -177,7 +196,7 @@ def _describe_range(limits: tuple[float, float]) -> str:
 
 
 def tool_error(tool: ToolErrorSummary, *, keep: bool) -> Finding:
-    """Expected error of the tool."""
+    """Finding about the expected tool error; `keep` as in `describe_tool_error`."""
     return note(
         "tool error",
         describe_tool_error(tool, keep=keep),
@@ -190,5 +209,5 @@ def tool_error(tool: ToolErrorSummary, *, keep: bool) -> Finding:
 
 
 def out_of_reach(reason: str) -> Finding:
-    """The tool error cannot be computed."""
+    """Finding that the tool error cannot be computed, with the reason."""
     return note("out of reach", f"The tool error is unknown: {reason}.")

@@ -15,7 +15,7 @@ FEW_NAMES = 6
 
 
 def noise_unknown() -> Finding:
-    """As many parameters as readings, and nothing stated of the gauge."""
+    """Finding that neither residuals nor the session determine the noise."""
     return note(
         "noise unknown",
         "There are as many parameters as readings and the session does not state the gauge's "

@@ -124,8 +124,8 @@ def describe_repetition(repetition: Repetition, *, new: bool = False, title: str
 
 
 def controller_assumed() -> Finding:
-    """The session does not state the active offsets; the identified ones are assumed."""
+    """Finding that the active offsets are not stated, and those to enter are assumed."""
     return note(
         "controller not stated",
-        "The session does not state which offsets were active; the values to enter are assumed.",
+        "The session does not state the active offsets; the offsets to enter are assumed.",
     )

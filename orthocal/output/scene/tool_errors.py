@@ -79,10 +79,11 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
     if after is not None:
         _draw_ellipsoids(scene, targets, accuracy.average(after.aligned_covariance)[chosen])
         wider = f", errors at {excess:.1f} × tolerances" if excess > 1.0 else ""
-        text = f"Tool uncertainty, all errors corrected: up to {um(spread)} µm RMS{wider} ({scale})"
+        size = f"up to {um(spread)} µm RMS"
+        text = f"Tool uncertainty, all identified errors corrected: {size}{wider} ({scale})"
         colour = css(UNCERTAINTY_COLOUR)
         scene.explain(LegendEntry(text, (TOOL_UNCERTAINTY,), colour, "ball", shown))
-        headline += f" With all errors corrected: up to {um(spread)} µm RMS."
+        headline += f" With all identified errors corrected: {size}."
     return headline
 
 

@@ -375,7 +375,7 @@ def _approach(robot: Robot, side: int) -> str:
 
 
 def _is_corrected(session: Session) -> bool:
-    """Whether the controller has offsets of a calibration."""
+    """True if the controller has offsets of a calibration."""
     return session.controller_offsets is not None and bool(np.any(session.controller_offsets))
 
 

@@ -152,7 +152,7 @@ def _tool(calibration: Calibration, assessment: Assessment) -> list[RenderableTy
 
 
 def describe_conditions(calibration: Calibration) -> list[str]:
-    """Tool error with all errors corrected if they were estimated; region and conditions of use."""
+    """Tool error with more than offsets corrected, if identified; region and conditions of use."""
     tool = assessment_of(calibration).tool
     if tool is None:
         return []
@@ -275,13 +275,13 @@ def render_values(calibration: Calibration) -> RenderableType:
     complete = assessment.decision.verdict != "reject" and calibration.only_offsets
     table = entry_table(calibration, identified=not calibration.only_offsets)
     notes = [_example(calibration, assessment.entries[0])]
-    notes += [f.text for f in assessment.of_kind("controller not stated")]
+    notes += [f.words for f in assessment.of_kind("controller not stated")]
     notes.append(EXPANDED)
     if not calibration.only_offsets:
         notes.append(
             "enter: best value for a controller that corrects nothing else; it compensates a part "
             "of the other errors. identified: offset of the slide, for a controller that corrects "
-            "all errors."
+            "all identified errors."
         )
     return noted(Group() if complete else table, *notes)
 
@@ -318,7 +318,7 @@ def _example(calibration: Calibration, entry: ControllerEntry) -> str:
     factor, unit = drive.edge_factor, drive.edge_unit
     meaning = "Slide coordinate = encoder coordinate + offset"
     if entry.active is None:
-        return f"{meaning}. Add these values to the present offsets."
+        return f"{meaning}."
     at, actual = drive.zero * factor, (drive.zero + entry.identified) * factor
     shown = ""
     if drive.direction < 0 or drive.joint_zero is not None:
@@ -326,5 +326,5 @@ def _example(calibration: Calibration, entry: ControllerEntry) -> str:
         shown = f" (the controller's joint shows {joint:.3f} {unit})"
     return (
         f"{meaning}. With {drive.name}'s encoder at {at:.3f} {unit}{shown}, its slide is at "
-        f"{actual:.3f} {unit}. Enter the complete offset in place of the present one."
+        f"{actual:.3f} {unit}. Enter the complete offset in place of the active one."
     )

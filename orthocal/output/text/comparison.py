@@ -85,7 +85,7 @@ def _tool_errors(comparison: Comparison) -> RenderableType:
         corrected = "" if only else tool_mm(tool.compensated)
         rows.append((result.model, tool_mm(tool.now), tool_mm(tool.entered), corrected))
     rows += [(u.model, "not identifiable", "", "") for u in comparison.undetermined]
-    headers = ("model", "tool error now", "with its offsets", "all errors corrected")
+    headers = ("model", "tool error now", "with its offsets", "identified errors corrected")
     regions = dict.fromkeys(describe_region(a.tool) for a in comparison.assessments if a.tool)
     return noted(table_of(headers, rows), *regions)
 

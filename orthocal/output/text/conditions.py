@@ -43,8 +43,8 @@ def describe_assumed(
     if tool is None or tool.use is None or len(missing) < len(effects):
         return text
     return (
-        f"{text} Expected tool error with all errors corrected, {describe_use(tool.use.stated)}: "
-        f"{tool_mm(tool.use.unstated)} RMS without stating them, {tool_mm(tool.compensated)} if "
+        f"{text} Expected tool error with all identified errors corrected, "
+        f"{describe_use(tool.use.stated)}: {tool_mm(tool.use.unstated)} RMS without stating them, {tool_mm(tool.compensated)} if "
         "they are stated."
     )
 

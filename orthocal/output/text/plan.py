@@ -92,8 +92,8 @@ def describe_expected(plan: MeasuringPlan) -> list[str]:
     first, workspace = plan.first_round, plan.forecast.workspace
     expected, before, now = (tool_mm(e.reported.rms) for e in (plan.expected, first, plan.known))
     lines = [
-        f"Expected tool error with all errors corrected: {expected} after the second measurement "
-        f"(first: {before}; now {now}).",
+        f"Expected tool error with all identified errors corrected: {expected} after the second "
+        f"measurement (first: {before}; now {now}).",
         describe_aligned(workspace.words, stated_use(plan.forecast.robot)),
     ]
     if first.lost > SOME_LOST:
