@@ -109,7 +109,7 @@ class AdjustmentPlan:
 
     @property
     def judgement(self) -> Judgement:
-        """Whether adjusting is worth doing."""
+        """Judgement of the gain by the adjustments."""
         if self.gain < WORTHWHILE:
             return "small gain"
         moved = math.sqrt(self.before.entered**2 - self.after.entered**2)
@@ -304,7 +304,7 @@ class _Search:
         self._deviate(aligned - self.effects @ amounts)
 
     def _gain(self, chosen: Sequence[int]) -> Array:
-        """How the best amounts follow from the parameters, shape (n_chosen, n), [SI]."""
+        """Derivative of the best amounts by the parameters, shape (n_chosen, n), [SI]."""
         n = len(self.calibration.free) + len(self.calibration.unmodelled.names)
         by_errors = self._without_offsets(self.tool.jacobian[:, :, :n])
         effects = self.effects[:, chosen]

@@ -97,7 +97,7 @@ class ToolSensitivity:
         return self._functions.errors.jacobian(self.closure.errors(), self._columns)
 
     def _twists_under(self, commands: Array) -> Array:
-        """The same under the conditions of commands, shape (K, n_twists, n_free)."""
+        """Derivative of the moved placements under commands, shape (K, n_twists, n_free)."""
         errors = np.tile(self.closure.errors(), (len(commands), 1))
         return self._functions.errors.jacobian(errors, self._columns, command=commands)
 

@@ -26,7 +26,7 @@ HEADLINES: dict[Judgement, str] = {
 
 
 def describe_setting(planned: PlannedAdjustment) -> str:
-    """What to do for one adjustment, without a sign: how far, and which way."""
+    """Instruction for one adjustment, without a sign: how far, and which way."""
     keys, amount = planned.adjustment.keys, planned.amount
     turns = planned.turns
     how = f"{format_fixed(abs(amount) / MM, 3)} mm"

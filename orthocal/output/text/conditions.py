@@ -44,8 +44,8 @@ def describe_assumed(
         return text
     return (
         f"{text} Expected tool error with all identified errors corrected, "
-        f"{describe_use(tool.use.stated)}: {tool_mm(tool.use.unstated)} RMS without stating them, {tool_mm(tool.compensated)} if "
-        "they are stated."
+        f"{describe_use(tool.use.stated)}: {tool_mm(tool.use.unstated)} RMS without stating them, "
+        f"{tool_mm(tool.compensated)} if they are stated."
     )
 
 
