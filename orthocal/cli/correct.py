@@ -141,13 +141,13 @@ def correct(
 
 
 def _put_program(spool: IO[bytes], out: Path | None) -> None:
-    """Write a corrected program to its file, or to standard output."""
+    """Write a corrected program to its file, or to standard output; closes the spool."""
     if out is not None:
         write_file(out, iter(lambda: spool.read(BLOCK), b""))
         return
-    text = io.TextIOWrapper(spool, encoding="utf-8", errors="replace", newline="")
-    while part := text.read(BLOCK):
-        put_part(part)
+    with io.TextIOWrapper(spool, encoding="utf-8", errors="replace", newline="") as text:
+        while part := text.read(BLOCK):
+            put_part(part)
     sys.stdout.flush()
 
 
