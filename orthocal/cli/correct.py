@@ -56,12 +56,20 @@ class Offsets(StrEnum):
     ACTIVE = "active"
 
 
+class Backlash(StrEnum):
+    """What takes up the backlash of the drives."""
+
+    PROGRAM = "program"
+    CONTROLLER = "controller"
+
+
 @command()
 def correct(
     calibration: CalibrationPath,
     program: Path,
     within: Annotated[float, Option(min=0.01, max=1000.0)] = 1.0,
     offsets: Offsets = Offsets.ENTERED,
+    backlash: Backlash = Backlash.PROGRAM,
     work_offset_mm: list[str] | None = None,
     start_mm: str | None = None,
     tool: ToolTip = None,
@@ -85,12 +93,15 @@ def correct(
         within (UM): Largest distance of the written path from the corrected path, µm.
         offsets: Offsets in the controller when the program runs: those that `calibrate` says to
             enter, or those that were active during the measurement.
+        backlash: Who takes up identified backlash: the program, or the controller (LinuxCNC:
+            BACKLASH).
         work_offset_mm ([G54=]X,Y,Z): Zero of the program in machine coordinates; repeat for G55 ...
         start_mm (X,Y,Z): Position that the controller displays before the program; needed if the
             first motion does not have X, Y and Z.
         out (FILE): File for the corrected program; default: standard output.
     """
     from orthocal.assessment.controller_entries import offsets_to_enter
+    from orthocal.export.approach_sides import ApproachSides, find_lags
     from orthocal.export.correction_field import CorrectionField
     from orthocal.export.formats import require_entering, warn_against_verdict
     from orthocal.gcode.interpreter import Interpreter
@@ -118,7 +129,10 @@ def correct(
         file, axes=field.axes, offsets=zeros, start=position, one_tool=tip is not None
     )
     region, words = _find_region(result)
-    corrector = ProgramCorrector(interpreter, field, within=tolerance, region=region)
+    lags = find_lags(result.robot, result.errors)
+    taken_up = backlash is Backlash.PROGRAM and bool(lags.any())
+    sides = ApproachSides(result.robot, lags) if taken_up else None
+    corrector = ProgramCorrector(interpreter, field, within=tolerance, region=region, sides=sides)
     with tempfile.TemporaryFile() as spool:  # nothing is written before all lines are corrected
         with _frozen():
             texts = corrector.run(_lines(program, file))
@@ -131,6 +145,7 @@ def correct(
         _describe_controller(result, values, active=active),
         _describe_tool(tip, interpreter.tools.used),
         describe_assumed(result, conditions, fields=("temperature", "payload")),
+        _describe_backlash(result, lags, taken_up=taken_up),
         warning,
         _describe_outside(corrector.summary, file, words),
         "" if zeros else "The program's coordinates are read as machine coordinates.",
@@ -287,6 +302,19 @@ def _describe_tool(tip: Vector | None, tools: Sequence[str]) -> str:
         f"Several tools ({', '.join(tools)}) and no --tool: corrected at the tool centre point. "
         "The tilt of the platform moves their tips."
     )
+
+
+def _describe_backlash(result: orthocal.Calibration, lags: Array, *, taken_up: bool) -> str:
+    if not lags.any():
+        return ""
+    listed = []
+    for drive, lag in zip(result.robot.drives, lags.tolist(), strict=True):
+        unit, size = DRIVE_UNITS[drive.unit]
+        listed.append(f"{drive.name} {format_fixed(2.0 * lag / size, 3)} {unit}")
+    if taken_up:
+        text = "The program takes up the backlash of the drives where they reverse; the controller"
+        return f"{text} must not: {', '.join(listed)}."
+    return f"For a controller that takes up the backlash of the drives: {', '.join(listed)}."
 
 
 def _describe_controller(

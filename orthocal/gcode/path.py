@@ -130,6 +130,27 @@ class Paths:
         beyond = (points < region[:, 0] - BORDER) | (points > region[:, 1] + BORDER)
         return np.asarray(np.bincount(of, weights=beyond.any(axis=1), minlength=len(curves)) > 0.0)
 
+    def parts(self, of: Indices, first: Array, last: Array) -> Paths:
+        """Parts of the curves.
+
+        Args:
+            of: Index of the motion of each part, shape (k,).
+            first: Parameter of its start, 0 to 1, shape (k,).
+            last: Parameter of its end, shape (k,).
+        """
+        size = last - first
+        return Paths(
+            self.base[of] + first[:, None] * self.slope[of],
+            size[:, None] * self.slope[of],
+            np.stack(
+                [self.radius[of, 0] + first * self.radius[of, 1], size * self.radius[of, 1]], axis=1
+            ),
+            np.stack(
+                [self.angle[of, 0] + first * self.angle[of, 1], size * self.angle[of, 1]], axis=1
+            ),
+            self.axes[of],
+        )
+
     def points(self, of: Indices, t: Array) -> Array:
         """Points on the curves, shape (k, 3), [m].
 

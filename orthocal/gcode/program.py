@@ -13,6 +13,7 @@ from orthocal.errors import GcodeError
 from orthocal.gcode.interpreter import Interpreter, Step
 from orthocal.gcode.lines import CONTROL, Line, split_line, split_point_line
 from orthocal.gcode.path import Motion, Paths
+from orthocal.gcode.reversals import Sides
 from orthocal.gcode.segmentation import LONGEST_SEGMENT, Correction, Refused, segment_motions
 from orthocal.gcode.writer import Writer
 from orthocal.units import UM
@@ -62,6 +63,7 @@ class ProgramCorrector:
         correct: Correction of points.
         within: Largest distance of the written path from the corrected one, [m].
         region: Limits of x, y and z beyond which the summary names a line, shape (3, 2), [m].
+        sides: Sides of drives whose backlash the program takes up.
 
     Raises:
         GcodeError: If the error bound of the correction exceeds the tolerance.
@@ -74,8 +76,10 @@ class ProgramCorrector:
         *,
         within: float,
         region: Array | None = None,
+        sides: Sides | None = None,
     ) -> None:
         self._interpreter, self._correct, self._region = interpreter, correct, region
+        self._sides = sides
         self._file = interpreter.file
         self._writer = Writer(
             interpreter.axes, rounding=ROUNDING * within, start=interpreter.position
@@ -144,7 +148,9 @@ class ProgramCorrector:
             leaving = np.flatnonzero(paths.leave(self._region))
             if leaving.size:
                 self.summary.outside = moving[leaving[0]].line.number
-        results = iter(segment_motions(paths, self._correct, tolerance=self._tolerance))
+        results = iter(
+            segment_motions(paths, self._correct, tolerance=self._tolerance, sides=self._sides)
+        )
         summary, low, high = self.summary, *self.summary.stretch
         texts: list[str] = []
         for step in steps:

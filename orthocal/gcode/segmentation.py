@@ -7,14 +7,15 @@ short compared with the curvature of any correction.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from orthocal.arrays import Array, Indices
+from orthocal.arrays import Array, Indices, Mask
 from orthocal.gcode.path import Paths
+from orthocal.gcode.reversals import Sides, split_at_reversals
 
 LONGEST_SEGMENT = 10e-3
 """Largest length of a segment, [m]."""
@@ -57,6 +58,8 @@ class Correction(Protocol):
 class Segments(NamedTuple):
     """Polyline of a motion."""
 
+    start: list[float]
+    """Corrected x, y, z of its start, [m]."""
     points: list[list[float]]
     """Corrected x, y, z of the segments' ends, without the start of the motion, [m]."""
     stretch: list[float]
@@ -75,7 +78,7 @@ class Refused:
 
 
 def segment_motions(
-    paths: Paths, correct: Correction, *, tolerance: float
+    paths: Paths, correct: Correction, *, tolerance: float, sides: Sides | None = None
 ) -> list[Segments | Refused]:
     """Divide motions into as few segments as the tolerance allows.
 
@@ -83,7 +86,58 @@ def segment_motions(
         paths: Curves of the motions.
         correct: Correction of points.
         tolerance: Largest distance of the corrected motion from its chords, [m].
+        sides: Sides of drives with backlash. Motions are then divided where a drive reverses, and
+            a further segment takes up its backlash there.
     """
+    if sides is None or not len(paths.base):
+        return _segment(paths, correct, tolerance)
+    reversals = split_at_reversals(paths, sides)
+    parts = paths.parts(reversals.of, reversals.first, reversals.last)
+    segments = _segment(parts, correct, tolerance, sides=sides, of_part=reversals.sides)
+    return [
+        _join([segments[k] for k in range(*ends)], reversals.turned[slice(*ends)])
+        for ends in zip(reversals.starts, reversals.ends, strict=True)
+    ]
+
+
+def _join(parts: list[Segments | Refused], turned: Mask) -> Segments | Refused:
+    """One polyline of the parts of a motion, which takes up backlash where drives turned."""
+    points: list[list[float]] = []
+    stretch: list[float] = []
+    for part, has_turned in zip(parts, turned.tolist(), strict=True):
+        if isinstance(part, Refused):
+            return part
+        if has_turned:
+            points.append(part.start)
+            stretch.append(1.0)
+        points += part.points
+        stretch += part.stretch
+    joined = [part for part in parts if isinstance(part, Segments)]
+    return Segments(
+        joined[0].start,
+        points,
+        stretch,
+        max(part.deviation for part in joined),
+        max(part.correction for part in joined),
+    )
+
+
+def _segment(
+    paths: Paths,
+    correct: Correction,
+    tolerance: float,
+    *,
+    sides: Sides | None = None,
+    of_part: Array | None = None,
+) -> list[Segments | Refused]:
+    """Segments of each motion, on the sides of each motion, shape (n, n_drives)."""
+
+    def on_sides(points: Array, of: Indices) -> tuple[Array, Mapping[int, str]]:
+        corrected, refused = correct(points)
+        if sides is None or of_part is None:
+            return corrected, refused
+        return sides.command(corrected, of_part[of]), refused
+
     lengths, radii = paths.lengths, paths.largest_radii
     # sagitta of an arc: s²/8r
     longest = np.where(radii > 0.0, np.sqrt(8.0 * radii * EVALUATED * tolerance), np.inf)
@@ -100,7 +154,7 @@ def segment_motions(
             )
         refined: list[int] = []
         for group in _groups(pending[counts[pending] <= MOST_SEGMENTS], counts):
-            for i, count in _segment_group(paths, group, counts, correct, tolerance, results):
+            for i, count in _segment_group(paths, group, counts, on_sides, tolerance, results):
                 counts[i] = count
                 refined.append(i)
         pending = np.array(refined, dtype=np.int64)
@@ -122,7 +176,7 @@ def _segment_group(
     paths: Paths,
     group: Indices,
     counts: Array,
-    correct: Correction,
+    correct: Callable[[Array, Indices], tuple[Array, Mapping[int, str]]],
     tolerance: float,
     results: list[Segments | Refused | None],
 ) -> Iterator[tuple[int, float]]:
@@ -137,7 +191,7 @@ def _segment_group(
     member = np.repeat(np.arange(group.size), size)
     step = np.arange(member.size) - first[member]
     points = paths.points(group[member], step / (4.0 * n[member]))
-    corrected, refused = correct(points)
+    corrected, refused = correct(points, group[member])
     corrections = np.maximum.reduceat(np.linalg.norm(corrected - points, axis=1), first)
     reasons: dict[int, str] = {}
     for k, reason in refused.items():
@@ -153,7 +207,7 @@ def _segment_group(
     part = paths.lengths[group[member[starts]]] / n[member[starts]]
     with np.errstate(divide="ignore", invalid="ignore"):
         stretch = np.where(part > 0.0, np.linalg.norm(b - a, axis=1) / part, 1.0)
-    ends, stretches = b.tolist(), stretch.tolist()
+    begins, ends, stretches = corrected[first].tolist(), b.tolist(), stretch.tolist()
     last = 0
     columns = (group.tolist(), n.tolist(), deviations.tolist(), corrections.tolist())
     for k, (i, count, largest, correction) in enumerate(zip(*columns, strict=True)):
@@ -165,4 +219,4 @@ def _segment_group(
             # the deviation of a chord grows with the square of its length
             yield i, max(count + 1.0, math.ceil(count * math.sqrt(largest / tolerance) * 1.05))
         else:
-            results[i] = Segments(ends[part_of], stretches[part_of], largest, correction)
+            results[i] = Segments(begins[k], ends[part_of], stretches[part_of], largest, correction)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from effect_plans import write_plan
 from linuxcnc import Joint, require_linuxcnc, run_program
+from programs import read_polyline
 from test_linuxcnc import from_pieces, require_followed
 
 from orthocal import (
@@ -25,7 +26,13 @@ from orthocal import (
     load_robot,
     simulate_session,
 )
+from orthocal.export.approach_sides import ApproachSides, find_lags
+from orthocal.export.correction_field import CorrectionField
 from orthocal.export.linuxcnc.drive_compensation import PeriodicErrors
+from orthocal.gcode.interpreter import Interpreter
+from orthocal.gcode.path import Motion, Paths, arc_about
+from orthocal.gcode.program import ProgramCorrector
+from orthocal.gcode.reversals import split_at_reversals
 
 MM = 1e-3
 
@@ -152,10 +159,6 @@ def test_the_module_and_backlash_keep_the_path(calibration, tmp_path):
     assert len(re.findall(r"^BACKLASH = ", files["kinematics.ini"], re.M)) == 3
     real = run(calibration, files, tmp_path, module=True)
     require_followed(from_pieces(real, *PATH), PROMISED, COUNTS)
-    # without these lines the play of the drives shows
-    lines = re.sub(r"(?m)^BACKLASH.*\n", "", files["kinematics.ini"])
-    real = run(calibration, {**files, "kinematics.ini": lines}, tmp_path, module=True)
-    assert from_pieces(real, *PATH).min(axis=0).max() > 20 * PROMISED
 
 
 def test_tables_and_home_offset_keep_the_path(calibration, tmp_path):
@@ -208,3 +211,99 @@ def test_screws_are_inverted_exactly():
     coordinates = np.random.default_rng(0).uniform(0.1, 0.4, (200, 2))
     assert np.abs(errors.invert(coordinates + errors(coordinates)) - coordinates).max() < 1e-15
     assert np.abs(errors(coordinates)[:, 0]).max() > 9e-6
+
+
+# ---- programs that take up backlash themselves
+
+DENSE = 0.02
+"""Distance of the points at which a corrected program is followed, [mm]."""
+
+
+def run_corrected(calibration, *, backlash):
+    """Tool of the calibrated machine along a corrected program, shape (K, 3), [mm]."""
+    field = CorrectionField(calibration, ACTIVE, within=WITHIN)
+    lags = find_lags(calibration.robot, calibration.errors)
+    sides = ApproachSides(calibration.robot, lags) if backlash else None
+    interpreter = Interpreter("p", axes=field.axes, offsets={})
+    corrector = ProgramCorrector(interpreter, field, within=WITHIN, sides=sides)
+    x, y, z = CORNERS[0]
+    program = [
+        f"G21 G90 G0 X{x:g} Y{y:g} Z{z:g}",
+        "G1 X28 Y-8 Z15 F600",
+        "G2 X28 Y-8 Z15 I-16 J0",
+        *(f"G1 X{x:g} Y{y:g} Z{z:g}" for x, y, z in CORNERS[2:]),
+    ]
+    text = "".join(corrector.run(f"{line}\n" for line in program))
+    read = read_polyline(text.splitlines())
+    corners = np.array([point for written in read.values() for point, _ in written])
+    lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    counts = np.maximum(np.ceil(lengths / DENSE).astype(int), 1)
+    pieces = zip(corners[:-1], corners[1:], counts, strict=True)
+    points = np.vstack([a + (b - a) * np.linspace(0, 1, n + 1)[1:, None] for a, b, n in pieces])
+    motors = Machine(load_robot("orthoglide"), {}).inverse(points * MM) - ACTIVE
+    real = follow(calibration, motors) / MM
+    return real[np.linalg.norm(real - CORNERS[0], axis=1) > TAKEN_UP]
+
+
+WITHIN = 1e-6
+
+
+def test_a_corrected_program_takes_up_backlash(calibration):
+    off = from_pieces(run_corrected(calibration, backlash=True), *PATH)
+    assert off.min(axis=0).max() < WITHIN
+    assert (np.count_nonzero(off < WITHIN, axis=1) > COUNTS).all()
+    ignored = from_pieces(run_corrected(calibration, backlash=False), *PATH)
+    assert ignored.min(axis=0).max() > 20 * WITHIN
+
+
+def test_lags_are_half_the_backlash(calibration, orthoglide):
+    lags = find_lags(calibration.robot, calibration.errors)
+    half = [0.5 * calibration.errors[f"{d.name}.backlash"] for d in calibration.robot.drives]
+    assert lags == pytest.approx(half, rel=1e-9)
+    assert not find_lags(orthoglide, {}).any()
+
+
+def test_drives_without_backlash_change_no_program(calibration):
+    """Sides that move nothing divide motions, but do not move their ends."""
+    points = np.array([[10.0, 5.0, 0.0], [20.0, -5.0, 30.0]]) * MM
+    sides = ApproachSides(calibration.robot, np.zeros(3))
+    assert np.array_equal(sides.command(points, np.ones((2, 3))), points)
+
+
+def test_motions_are_divided_where_a_drive_reverses():
+    """Drives that are the coordinates themselves: a circle reverses each of two twice."""
+
+    class Plain:
+        last = np.zeros(3)
+
+        def drives(self, points):
+            return points
+
+        def command(self, points, sides):
+            return points
+
+    arc = arc_about(
+        (10e-3, 0.0, 0.0),
+        (10e-3, 0.0, 0.0),
+        (0.0, 0.0),
+        plane=17,
+        clockwise=False,
+        turns=1,
+        where="",
+    )
+    paths = Paths.of(
+        [
+            Motion((0.0, 0.0, 0.0), (10e-3, 0.0, 0.0)),
+            Motion((10e-3, 0.0, 0.0), (10e-3, 0.0, 0.0), arc),
+            Motion((10e-3, 0.0, 0.0), (0.0, 0.0, 5e-3)),
+        ]
+    )
+    sides = Plain()
+    parts = split_at_reversals(paths, sides)
+    assert parts.of.tolist() == [0, *[1] * 4, 2]
+    assert parts.first[1:5] == pytest.approx([0.0, 0.25, 0.5, 0.75], abs=1e-6)
+    assert parts.sides.astype(int).tolist() == [
+        *([1, 0, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 1]),
+    ]
+    assert parts.turned.all()
+    assert sides.last.tolist() == [-1.0, 1.0, 1.0]
