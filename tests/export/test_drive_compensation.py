@@ -125,7 +125,7 @@ PATH = CENTRE, RADIUS, CORNERS
 COUNTS = [150, 5, 100, 60, 60]
 TAKEN_UP = 0.5
 """Way after which every play is taken up, [mm]."""
-REVERSING = 0.02
+REVERSING = 0.3
 """Distance from a corner, at which drives take up their play within some milliseconds, [mm]."""
 
 
