@@ -488,10 +488,20 @@ def test_readings_do_not_count_twice(days, tmp_path):
     )
 
 
-def test_of_several_sessions_one_is_measured_again(days, tmp_path):
-    words = ["again", days[0] / "out", "--anyway", "--out", tmp_path / "next"]
-    code, _, err = orthocal(*words)
-    assert code == 2
-    assert "--session: is missing: the calibration is of several sessions" in err
-    code, _, err = orthocal(*words, "--session", days[0] / "tuesday")
+def test_of_several_sessions_the_last_is_measured_again(days, tmp_path):
+    words = ["again", days[0] / "out", "--anyway", "--out"]
+    code, _, err = orthocal(*words, tmp_path / "next")
     assert code == 0, err
+    code, _, err = orthocal(*words, tmp_path / "chosen", "--session", days[0] / "tuesday")
+    assert code == 0, err
+    rows = [(tmp_path / name / "readings.csv").read_text() for name in ("next", "chosen")]
+    assert rows[0] == rows[1]
+
+
+def test_offsets_and_a_module_are_not_exported_together(days, tmp_path):
+    words = ["export", days[0] / "out", "--anyway", "--to", "linuxcnc", "--out", tmp_path / "out"]
+    assert orthocal(*words, "--offsets")[0] == 0
+    code, _, err = orthocal(*words, "--module")
+    assert code == 2
+    assert "joints.ini" in err
+    assert not (tmp_path / "out/kinematics.ini").exists()

@@ -149,8 +149,8 @@ class Decision:
 
     @property
     def words(self) -> str:
-        """Headline, reason and action in one paragraph."""
-        return " ".join(t for t in (self.headline, self.reason, self.action) if t)
+        """Headline, reason and action in one paragraph, lists included."""
+        return " ".join(" ".join((self.headline, self.reason, self.action)).split())
 
     @property
     def exit_code(self) -> int:

@@ -21,6 +21,7 @@ from orthocal.cli.options import (
 from orthocal.cli.printing import put_note, put_out
 from orthocal.cli.sheet import sheet_or_problem
 from orthocal.errors import ParameterError
+from orthocal.io.files import exists
 from orthocal.units import MM
 
 FILES = ("session.yaml", "readings.csv", "sheet.html")
@@ -41,7 +42,8 @@ def again(
     Exit code 3: the verdict is not `enter`; the reason is printed, and nothing is written.
 
     Args:
-        session (SESSION): Session with the setups and postures; default: that of the calibration.
+        session (SESSION): Session with the setups and postures; default: that of the calibration,
+            of several the last.
         adjusted (NAME=MM,...): Mechanical adjustments since the calibration and their amounts, such
             as x_outer_foot_y=0.12; or plan, for those that `orthocal adjust` prints.
     """
@@ -117,14 +119,18 @@ def _plan_again(
     from orthocal.calibration.recorded_robot import require_calibrated_robot
     from orthocal.effects.adjustment import add_amounts
 
+    parts = calibration.session.parts
+    if path is None and parts:
+        last = None if parts[-1].path is None else Path(parts[-1].path)
+        if last is None or not exists(last):
+            raise ParameterError(
+                "is missing; the last session of the calibration is not there any more",
+                where="--session",
+            )
+        path = last
     if path is not None:
         planned = orthocal.load_plan(path)
         require_calibrated_robot(calibration, planned)
-    elif calibration.session.parts:
-        raise ParameterError(
-            "is missing: the calibration is of several sessions; choose one of them",
-            where="--session",
-        )
     else:
         planned = orthocal.restore_session(calibration)
     title = planned.title.removeprefix("Simulated: ")

@@ -19,7 +19,11 @@ from orthocal.cli.options import (
 )
 from orthocal.cli.printing import write_results
 from orthocal.errors import ParameterError
+from orthocal.io.files import exists
 from orthocal.units import DRIVE_UNITS, MM, UM
+
+ALTERNATIVES = ("joints.ini", "kinematics.ini")
+"""Lines with new HOME_OFFSET, and lines of a module that contains the offsets."""
 
 
 @command()
@@ -63,7 +67,15 @@ def export(
         half_side=None if half_side_mm is None else half_side_mm * MM,
         module=module,
     )
-    write_results(out, orthocal.export_calibration(result, to, anyway=anyway, options=options))
+    files = orthocal.export_calibration(result, to, anyway=anyway, options=options)
+    for mine, other in (ALTERNATIVES, ALTERNATIVES[::-1]):
+        if mine in files and exists(out / other):
+            raise ParameterError(
+                f"is of another export; with both {mine} and {other} entered the controller "
+                "would correct offsets twice: choose another directory",
+                where=str(out / other),
+            )
+    write_results(out, files)
 
 
 def _home_offsets(text: str, calibration: orthocal.Calibration) -> tuple[float, ...]:

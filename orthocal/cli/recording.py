@@ -276,8 +276,8 @@ class Dialogue:
             raise SessionError(f"line {rows[index].line} was not read yet")
         index = self._recording.repeat(index)
         self._note(
-            f"Added: line {self._recording.rows[index].line}. The lines after it are now one "
-            "further down than on the sheet."
+            f"Added: line {self._recording.rows[index].line}. The lines after it "
+            "move down by one against the sheet."
         )
         if self._warnings:  # their lines have changed
             self._judge()
@@ -297,8 +297,8 @@ class Dialogue:
         if self._last is not None and self._last >= index:
             self._last = None if self._last == index else self._last - 1
         self._note(
-            f"Deleted: line {row.line}, {row.label_with_cycle}. The lines after it are now one "
-            "further up than on the sheet."
+            f"Deleted: line {row.line}, {row.label_with_cycle}. The lines after it "
+            "move up by one against the sheet."
         )
         self._judge()
         self._ask_for_next()

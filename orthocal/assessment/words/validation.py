@@ -66,8 +66,8 @@ def as_predicted(achieved: float, expected: float, numbers: Mapping[str, float])
     """Deviations are as the calibration predicts."""
     return note(
         "as predicted",
-        f"The new readings deviate from the predictions by {mm(achieved)} mm RMS, within their "
-        f"uncertainty ({mm(expected)} mm expected).",
+        f"The new readings agree with the predictions. They deviate by {mm(achieved)} mm RMS; "
+        f"{mm(expected)} mm are expected.",
         **numbers,
     )
 
