@@ -11,10 +11,12 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
+
+# as the command line does it, before NumPy is imported: threads of small matrices get in each
+# other's way
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from gauges import exact
 
-# as the command line does it: threads of small matrices get in each other's way
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from orthocal import load_plan, load_robot, load_session
 from orthocal.robot import loading
 from orthocal.robot.model import Robot
