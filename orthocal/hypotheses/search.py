@@ -103,6 +103,9 @@ LARGEST_TOLERANCE_SCALE = 5.0
 LARGEST_NOISE_SCALE = 2.5
 """Noise scale that no gauge with a stated noise reaches."""
 
+LARGEST_CHANGE = 100.0
+"""Change of an error of the machine, in prior std, that no machine makes between two sessions."""
+
 LARGEST_VOLUME = float(np.log(1000.0))
 """Logarithm of the factor on volumes beyond which a family is not considered in pairs."""
 
@@ -225,6 +228,13 @@ class _Search:
             except (ClosureError, np.linalg.LinAlgError):
                 break
             last, applied = errors, step
+        changes = [
+            abs(a[0]) * np.abs(t.shift.direction).max()
+            for t, a in zip(terms, amounts, strict=True)
+            if t.shift is not None and not t.known
+        ]
+        if max(changes, default=0.0) > LARGEST_CHANGE:
+            score = replace(score, log_likelihood=-np.inf)
         return HypothesisSet(
             tuple(terms), score, about, remaining, correct_rows(rows, terms, amounts), amounts, stds
         )
