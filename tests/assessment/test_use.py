@@ -362,6 +362,7 @@ def test_accuracy_is_over_the_use_or_under_stated_conditions(folder, assessed):
 def test_a_corrected_program_is_that_of_its_temperature_and_payload(folder, assessed):
     (folder / "part.ngc").write_text("G21\nG0 X0 Y0 Z0\nG0 X10 Y-20 Z5\n")
     words = ("correct", ".", "part.ngc", "--anyway", "--offsets", "active")
+    words += ("--backlash", "controller")
     code, cold, note = run_orthocal(folder, *words)
     assert code == 0
     assert "20 °C (--temperature)" in note

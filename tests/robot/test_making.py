@@ -9,7 +9,7 @@ import pytest
 from lxml import etree
 from tolerances import CLOSED_FORM
 
-from orthocal.builder.build import describe_machine, make_robot, remake_robot
+from orthocal.builder.build import FEET, describe_machine, make_robot, remake_robot
 from orthocal.builder.machine_file import MACHINE, Counting, Dimensions, read_machine
 from orthocal.errors import RobotError
 from orthocal.kinematics import orthoglide as closed_forms
@@ -32,7 +32,12 @@ def test_the_packaged_machine_comes_out_of_its_own_sizes():
     assert elements(made["orthoglide.urdf"].partition("\n")[2]) == elements(
         (folder / "orthoglide.urdf").read_text().partition("\n")[2]
     )
-    assert made["orthoglide.yaml"].endswith((folder / "orthoglide.yaml").read_text())
+    head, packaged, feet = made["orthoglide.yaml"].partition(
+        (folder / "orthoglide.yaml").read_text()
+    )
+    assert packaged
+    assert all(line.startswith("#") for line in head.splitlines())
+    assert FEET in feet
 
 
 @pytest.mark.parametrize("sizes", [SMALL, Dimensions(leg=0.5, lower=0.3, upper=0.7)])
