@@ -116,7 +116,9 @@ def _describe_compensation(homes: Sequence[JointHome]) -> str:
         texts.append(
             f"**Backlash:** {listed}. LinuxCNC compensates it\nby the lines BACKLASH, or by the "
             "columns of COMP_FILE. The sign of HOME_LATCH_VEL must be as stated here, and that of\n"
-            "HOME_SEARCH_VEL the same: half of the backlash, with this sign, is part of the zero."
+            "HOME_SEARCH_VEL the same: half of the backlash, with this sign, is part of the zero.\n"
+            "**Take readings for orthocal with the old INI lines:** it knows no controller that\n"
+            "takes up backlash."
         )
     errors = [h.compensation.error for h in homes if h.compensation.table is not None]
     if errors:
@@ -153,10 +155,6 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str
         rows.append(f"| {' | '.join(cells)} |")
     unit, size = DRIVE_UNITS[homes[0].unit]
     active = ", ".join(f"{v / size:.6g}" for v in offsets_to_enter(calibration))
-    keys = f"offsets_{unit}: [{active}]"
-    if any(h.compensation.backlash for h in homes):
-        listed = ", ".join(f"{h.compensation.backlash / size:.4g}" for h in homes)
-        keys += f", backlash_{unit}: [{listed}]"
     scope = "The calibration identified offsets of the drives only."
     if not calibration.only_offsets:
         scope = (
@@ -167,7 +165,8 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str
         "robot": comment_safe(calibration.robot.name),
         "scope": scope,
         "table": "\n".join(rows),
-        "controller": keys,
+        "unit": unit,
+        "active": active,
         "compensation": _describe_compensation(homes),
     }
     return fill_template("home_offset.md", values)
