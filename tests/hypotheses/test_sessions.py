@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_mistakes import sound_session
+from made_mistakes import Sheet, plain_mistakes, sound_machine, sound_session
 
-from orthocal import draw_errors, load_plan, load_session, simulate_session
+from orthocal import draw_errors, load_plan, load_session, simulate_session, write_session
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.hypotheses.families.sessions import enter_wrongly
 from orthocal.hypotheses.search import find_anomalies
@@ -239,3 +239,23 @@ def test_memory_is_linear_in_the_readings(root):
         tracemalloc.stop()
         assert [a.explanation.rows for a in found.found] == [(count // 3,)]
     assert peaks[1] < 2.5 * peaks[0]
+
+
+def test_no_machine_changes_by_a_hundred_tolerances(root, tmp_path):
+    """With two mistakes in the first session that the search of both does not name."""
+    plan, seed = load_plan(root / "examples/sweep/plan.yaml"), 78
+    errors, first = sound_machine(plan, seed, entered=True)
+    rng, makes, mistakes = np.random.default_rng((seed, 5)), list(plain_mistakes().values()), 0
+    while mistakes < 2:
+        made = makes[rng.integers(len(makes))](Sheet(first, rng))
+        if made is not None and not np.array_equal(made.values, first.values):
+            first, mistakes = first.with_values(made.values), mistakes + 1
+    active = [errors[f"{d.name}.offset"] for d in plan.robot.drives]
+    second = simulate_session(plan.with_controller(active), errors, seed=10_000 + seed).session
+    paths = [write_session(s, tmp_path / n) for s, n in ((first, "first"), (second, "second"))]
+    session = join_sessions([load_session(path) for path in paths])  # as rounded in files
+    found = [a.explanation for a in find_anomalies(session).found]
+    changes = [abs(e.amount) for e in found if e.kind == "machine changed" and e.amount]
+    assert changes
+    largest = max(p.prior_std for p in plan.robot.parameters)
+    assert max(changes) < 100.0 * largest

@@ -429,8 +429,8 @@ def _session_remedy(session: Session, e: Explanation) -> str:
             "the right ones and measure again."
         )
     apart = (
-        f"Calibrate the sessions from {since} on without those before: the values to enter must "
-        "belong to the machine as it is now."
+        f"Calibrate session {since} and later ones without the earlier ones: the values to enter "
+        "must belong to the present machine."
     )
     if not e.drives:
         return apart

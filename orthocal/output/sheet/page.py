@@ -113,7 +113,7 @@ def _front(
         f"joints: {'; '.join(_travel(session))}.",
         f"Jog each slide a little outwards. Its number must {_count_outwards(robot)}.",
         _active_offsets(session),
-        "Check each rod and each hinge for play by hand. The calibration does not remove play.",
+        "Check each rod and each hinge for play. The calibration does not remove play.",
     ]
     rules = [
         f"Approach every posture from the same side: the last {approach_length(robot)} go towards "
