@@ -53,7 +53,7 @@ from orthocal.statistics import chance
 LEAST_GAIN = 0.04
 """Reduction of the expected tool error below which a further adjustment is left out."""
 
-WORTHWHILE = 0.05
+WORTHWHILE = 0.15
 """Reduction of the expected tool error below which the machine is better left alone."""
 
 MOST_ROUNDS = 5

@@ -18,9 +18,9 @@ from orthocal.units import MM, format_fixed
 
 HEADLINES: dict[Judgement, str] = {
     "worthwhile": "Adjust the machine in this order, then enter the offsets and measure again.",
-    "small gain": "Leave the machine as it is: adjusting it reduces the expected tool error by "
+    "small gain": "Do not adjust the machine: adjusting it reduces the expected tool error by "
     f"less than {WORTHWHILE:.0%}.",
-    "uncertain gain": "Leave the machine as it is: adjusting it moves the tool by less than the "
+    "uncertain gain": "Do not adjust the machine: adjusting it moves the tool by less than the "
     "uncertainty of this calibration. Measure more, then plan again.",
 }
 
