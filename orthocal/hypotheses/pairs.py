@@ -65,6 +65,8 @@ class _Scaled:
         scale = np.full(vectors[0].shape[-1], 1.0 / np.sqrt(noise))
         scale[: variance.size] = 1.0 / np.sqrt(variance)
         self.vectors = tuple(v * scale for v in vectors)
+        self.squares = tuple((v**2).sum(axis=-1) for v in self.vectors)
+        """Shapes as `vectors` without the last axis."""
         logs = np.log(variance).sum() + max(likelihood.dof - len(variance), 0) * np.log(noise)
         self.largest = float(likelihood.weights[g] - 0.5 * logs)
         """Logarithm of the marginal likelihood of a deviation of 0, which no pair exceeds."""
@@ -72,10 +74,10 @@ class _Scaled:
     def score_edits(self, block: slice, taus: Array) -> Array:
         """Logarithms of pairs of a block of edits with these and later edits, and all effects."""
         deviation, edits, effects = self.vectors
-        changed, later = deviation + edits[block], edits[block.start :]
+        changed, later = deviation + edits[block], slice(block.start, None)
         misfit = 0.5 * (changed**2).sum(axis=1)[:, None]
-        two_edits = -(changed @ later.T) - misfit - 0.5 * (later**2).sum(axis=1)
-        information, square = (effects**2).sum(axis=1), (changed @ effects.T) ** 2
+        two_edits = -(changed @ edits[later].T) - misfit - 0.5 * self.squares[1][later]
+        information, square = self.squares[2], (changed @ effects.T) ** 2
         gain = np.full(square.shape, -np.inf)
         for tau in taus:
             widened = 1.0 + tau * information
@@ -86,7 +88,7 @@ class _Scaled:
         """Logarithms of pairs of a block of effects with these and later effects."""
         deviation, _, effects = self.vectors
         later = slice(block.start, None)
-        information, slope = (effects**2).sum(axis=1), effects @ deviation
+        information, slope = self.squares[2], effects @ deviation
         forms = (
             *(information[block, None], information[later], effects[block] @ effects[later].T),
             *(slope[block, None], slope[later]),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
-from importlib.metadata import entry_points
+from functools import lru_cache
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Generic, TypeVar
 
 from orthocal.errors import OrthocalError
@@ -43,8 +45,11 @@ class Registry(Generic[Kind]):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all kinds, with those of installed packages."""
-        offered = (e.name for e in entry_points(group=self._group))
-        return tuple(dict.fromkeys([*self._kinds, *offered]))
+        return tuple(dict.fromkeys([*self._kinds, *(e.name for e in self._offered)]))
+
+    @property
+    def _offered(self) -> tuple[EntryPoint, ...]:
+        return _list_offered(self._group, tuple(sys.path))
 
     def find(self, name: object, *, where: str, error: type[OrthocalError]) -> Kind:
         """Find the kind of a name.
@@ -59,7 +64,7 @@ class Registry(Generic[Kind]):
         """
         if isinstance(name, str) and name in self._kinds:
             return self._kinds[name]
-        point = next((e for e in entry_points(group=self._group) if e.name == name), None)
+        point = next((e for e in self._offered if e.name == name), None)
         if point is None:
             expected = f"expected one of {', '.join(self.names)}" if self.names else "there is none"
             raise error(f"found {name!r}; {expected}", where=where)
@@ -71,3 +76,9 @@ class Registry(Generic[Kind]):
                 f"the {self._noun} '{name}'{package} cannot be loaded: {type(e).__name__}: {e}",
                 where=where,
             ) from None
+
+
+@lru_cache(maxsize=8)
+def _list_offered(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    """Entry points of a group; packages are searched for once in each search path."""
+    return tuple(entry_points(group=group))

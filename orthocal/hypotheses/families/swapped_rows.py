@@ -38,8 +38,11 @@ def swapped_rows(rows: Rows) -> Iterator[Family]:
 
 
 def _swapped(rows: Rows, pairs: Sequence[Explanation]) -> Family:
-    both = [np.array(p.rows) for p in pairs]
-    change = [rows.values[np.roll(i, i.size // 2)] - rows.values[i] for i in both]
+    change = []
+    for pair in pairs:
+        one, other = np.array(pair.rows).reshape(2, -1)
+        gain = rows.values[other] - rows.values[one]
+        change.append(np.concatenate([gain, -gain]))
     return Family.edited(rows, pairs, change)
 
 

@@ -16,12 +16,15 @@ from orthocal.kinematics.backend import llvm
 
 Backend = Literal["casadi", "llvm"]
 
-BLOCK_SIZES = (32, 8, 1)
-"""Points of one call of a mapped CasADi function, largest first."""
+LARGE_BLOCK, SMALL_BLOCK = 32, 8
+"""Points of one call of a mapped CasADi function."""
 
-MIN_POINTS, MIN_OPERATIONS = 16, 2e4
-"""Points of a call, and instructions times points, from which the LLVM backend is used. It takes a
-tenth of CasADi's time, but 0.1 s once to start: sessions of a few postures do not start it."""
+CALL = 2000
+"""Instructions that take as long as a call."""
+
+MIN_POINTS, MIN_OPERATIONS = 3, 2e3
+"""Points of a call, and instructions times points, from which the LLVM backend is used. It takes
+the time of two to three points of CasADi for up to 16 points, and 0.03 s once to start."""
 
 
 class BatchFunction:
@@ -118,18 +121,25 @@ class BatchFunction:
     def _run_casadi(self, arrays: Sequence[Array], count: int) -> list[Array]:
         """Nonzeros of each output, shape (count, nnz)."""
         results = [np.empty((count, rows * columns)) for rows, columns in self._shapes]
-        repeats = [count // len(a) if count else 1 for a in arrays]
         first = 0
-        for size in BLOCK_SIZES:
-            while count - first >= size:
-                block = self._block(size)
-                for buffer, a, repeat in zip(block.inputs, arrays, repeats, strict=True):
-                    buffer[...] = a[np.arange(first, first + size) // repeat]
-                block.evaluate()
-                for values, result in zip(block.outputs, results, strict=True):
-                    result[first : first + size] = values
-                first += size
+        while first < count:
+            size = self._block_size(count - first)
+            block, end = self._block(size), min(first + size, count)
+            points = np.minimum(np.arange(first, first + size), count - 1)
+            for buffer, a in zip(block.inputs, arrays, strict=True):
+                buffer[...] = a if len(a) == 1 else a[points // (count // len(a))]
+            block.evaluate()
+            for values, result in zip(block.outputs, results, strict=True):
+                result[first:end] = values[: end - first]
+            first = end
         return results
+
+    def _block_size(self, count: int) -> int:
+        """Points of the next call; a few more than there are, where that saves calls."""
+        if count >= LARGE_BLOCK:
+            return LARGE_BLOCK
+        more = (SMALL_BLOCK - count) * self._n_instructions
+        return SMALL_BLOCK if more <= (count - 1) * CALL else 1
 
     def _block(self, size: int) -> _MappedBlock:
         """The mapped function of a number of points, with memory of this thread."""
