@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import cached_property, reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,40 +60,54 @@ class Pairs:
 class _Scaled:
     """Vectors at one pair (e, s) of scales, in coordinates in which V is the identity."""
 
-    def __init__(self, likelihood: Likelihood, vectors: Sequence[Array], g: int) -> None:
-        noise, variance = (v[..., g] for v in likelihood.grid())
+    def __init__(
+        self, likelihood: Likelihood, vectors: Sequence[Array], grid: tuple[Array, Array], g: int
+    ) -> None:
+        noise, variance = (v[..., g] for v in grid)
         scale = np.full(vectors[0].shape[-1], 1.0 / np.sqrt(noise))
         scale[: variance.size] = 1.0 / np.sqrt(variance)
         self.vectors = tuple(v * scale for v in vectors)
-        self.squares = tuple((v**2).sum(axis=-1) for v in self.vectors)
-        """Shapes as `vectors` without the last axis."""
         logs = np.log(variance).sum() + max(likelihood.dof - len(variance), 0) * np.log(noise)
         self.largest = float(likelihood.weights[g] - 0.5 * logs)
         """Logarithm of the marginal likelihood of a deviation of 0, which no pair exceeds."""
 
+    @cached_property
+    def _second_edits(self) -> Array:
+        """Edits e, 1 and -|e|²/2: with x, c and 1 their products are c + x·e - |e|²/2."""
+        edits = self.vectors[1]
+        return np.column_stack([edits, np.ones(len(edits)), -0.5 * (edits**2).sum(axis=1)])
+
+    @cached_property
+    def _information(self) -> Array:
+        """Information of each effect, shape (n_effects,)."""
+        return np.asarray((self.vectors[2] ** 2).sum(axis=1))
+
     def score_edits(self, block: slice, taus: Array) -> Array:
         """Logarithms of pairs of a block of edits with these and later edits, and all effects."""
         deviation, edits, effects = self.vectors
-        changed, later = deviation + edits[block], slice(block.start, None)
-        misfit = 0.5 * (changed**2).sum(axis=1)[:, None]
-        two_edits = -(changed @ edits[later].T) - misfit - 0.5 * self.squares[1][later]
-        information, square = self.squares[2], (changed @ effects.T) ** 2
-        gain = np.full(square.shape, -np.inf)
+        changed, later = deviation + edits[block], self._second_edits[block.start :]
+        level = self.largest - 0.5 * (changed**2).sum(axis=1)
+        score = np.empty((len(changed), len(later) + len(effects)))
+        first = np.column_stack([-changed, level, np.ones(len(changed))])
+        np.matmul(first, later.T, out=score[:, : len(later)])
+        square, gain = (changed @ effects.T) ** 2, score[:, len(later) :]
+        gain[...] = -np.inf
         for tau in taus:
-            widened = 1.0 + tau * information
+            widened = 1.0 + tau * self._information
             np.maximum(gain, square * (0.5 * tau / widened) - 0.5 * np.log(widened), out=gain)
-        return np.hstack([two_edits, gain - np.log(taus.size) - misfit]) + self.largest
+        gain += level[:, None] - np.log(taus.size)
+        return score
 
     def score_effects(self, block: slice, taus: Array) -> Array:
         """Logarithms of pairs of a block of effects with these and later effects."""
         deviation, _, effects = self.vectors
         later = slice(block.start, None)
-        information, slope = self.squares[2], effects @ deviation
+        information, slope = self._information, effects @ deviation
         forms = (
             *(information[block, None], information[later], effects[block] @ effects[later].T),
             *(slope[block, None], slope[later]),
         )
-        gain = reduce(np.maximum, (_gain(tau, *forms) for tau in taus))
+        gain = _largest(_gain(tau, *forms) for tau in taus)
         return np.asarray(gain - np.log(taus.size) + self.largest - 0.5 * (deviation @ deviation))
 
 
@@ -113,7 +127,8 @@ def find_pairs(
     vectors = (deviation @ basis, singles.edits @ basis, singles.effects @ basis)
     taus = (AMOUNTS * likelihood.sigma) ** 2
     places = [e * NOISE_SCALES.size + s for e in COARSE_TOLERANCES for s in COARSE_NOISES]
-    grid = [_Scaled(likelihood, vectors, g) for g in places]
+    full = likelihood.grid()
+    grid = [_Scaled(likelihood, vectors, full, g) for g in places]
     best_prior = 2.0 * singles.prior.max(initial=-np.inf)
     grid = [scaled for scaled in grid if scaled.largest + best_prior > least]
     members, scores = [np.empty((0, 2), dtype=np.int64)], [np.empty(0)]
@@ -138,11 +153,16 @@ def _score_blocks(grid: list[_Scaled], taus: Array) -> Iterator[tuple[slice, Arr
     n, m = len(grid[0].vectors[1]), len(grid[0].vectors[2])
     for begin in range(0, n, BLOCK):
         block = slice(begin, min(begin + BLOCK, n))
-        yield block, reduce(np.maximum, (scaled.score_edits(block, taus) for scaled in grid))
+        yield block, _largest(scaled.score_edits(block, taus) for scaled in grid)
     for begin in range(0, m, BLOCK):
         block = slice(begin, min(begin + BLOCK, m))
-        score = reduce(np.maximum, (scaled.score_effects(block, taus) for scaled in grid))
+        score = _largest(scaled.score_effects(block, taus) for scaled in grid)
         yield slice(n + block.start, n + block.stop), score
+
+
+def _largest(scores: Iterator[Array]) -> Array:
+    """Largest of the elements of arrays, in the memory of the first one."""
+    return reduce(lambda best, score: np.maximum(best, score, out=best), scores)
 
 
 def _gain(tau: float, one: Array, other: Array, shared: Array, s: Array, t: Array) -> Array:
@@ -159,9 +179,9 @@ def _score_pairs(
     deviation, edits, effects = vectors
     changed = deviation + np.vstack([edits, np.zeros_like(effects)])[members].sum(axis=1)
     both = np.vstack([np.zeros_like(edits), effects])[members]
-    logs = np.empty((likelihood.weights.size, len(members)))
+    logs, grid = np.empty((likelihood.weights.size, len(members))), likelihood.grid()
     for g in range(len(logs)):
-        scaled = _Scaled(likelihood, (changed, both[:, 0], both[:, 1]), g)
+        scaled = _Scaled(likelihood, (changed, both[:, 0], both[:, 1]), grid, g)
         x, one, other = scaled.vectors
         products = [(one, one), (other, other), (one, other), (one, x), (other, x), (x, x)]
         *forms, misfit = (np.einsum("ij,ij->i", a, b) for a, b in products)

@@ -26,6 +26,7 @@ from orthocal.effects.loading import neutral_values
 from orthocal.effects.machine import express_machine
 from orthocal.effects.protocol import NEUTRAL, Condition, condition_size
 from orthocal.kinematics.backend.batch_function import BatchFunction
+from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.se3 import exp6, right_jacobian
 from orthocal.kinematics.symbolic import Pose, nominal_placement
 from orthocal.robot.model import Robot
@@ -461,7 +462,7 @@ class _Twists:
         return twists.reshape(*shape, -1), jacobian.reshape(*shape, *jacobian.shape[1:])
 
 
-@lru_cache(maxsize=8)
+@cached_per_robot(maxsize=8)
 def error_map(robot: Robot) -> ErrorMap:
     """The error map of a robot, built once."""
     return ErrorMap(robot)
