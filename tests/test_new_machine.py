@@ -63,7 +63,7 @@ def test_a_new_directory_has_all_files(made):
     assert [d.direction for d in robot.drives] == [1, -1, 1]
     assert [float(d.to_joint(d.zero)) for d in robot.drives] == [0.0, 0.0, 0.0]
     rows = (made / "first/readings.csv").read_text().splitlines()
-    assert rows[:2] == ["setup,posture,cycle,reading_mm", "yx,zero,1,"]
+    assert rows[:2] == ["setup,posture,cycle,reading_mm,approach", "yx,zero,1,,ppp"]
     assert len(rows) == 1 + 24
     session = load_plan(made / "first")
     assert session.controller_offsets.tolist() == [0.0, 0.0, 0.0]
@@ -71,6 +71,35 @@ def test_a_new_directory_has_all_files(made):
     commands = etree.HTML((made / "first/sheet.html").read_text()).xpath("//code/text()")
     assert commands[-1] == "orthocal calibrate ."
     assert session.purpose == Purpose("full")
+
+
+def test_a_new_machine_has_backlash(made, tmp_path):
+    """It is identified from readings that state their approach; 0.03 mm come back."""
+    robot = load_robot(made)
+    assert robot.effect_names == ("backlash",)
+    assert robot.parameters["x_slide.backlash"].prior_std == 2e-5
+    plain, folder = tmp_path / "plain", tmp_path / "warm"
+    assert orthocal("new", plain, *options(), "--paper", "--effects", "none").returncode == 0
+    assert load_robot(plain).effect_names == ()
+    assert "approach" not in (plain / "first/readings.csv").read_text()
+    words = ["--paper", "--effects", "thermal,backlash"]
+    assert orthocal("new", folder, *options(), *words).returncode == 0
+    assert load_robot(folder).effect_names == ("backlash", "thermal")
+    head = (folder / "first/readings.csv").read_text().partition("\n")[0]
+    assert head == "setup,posture,cycle,reading_mm,approach,temperature_C"
+    assert orthocal("new", folder, "--again").returncode == 0
+    assert load_robot(folder).effect_names == ("backlash", "thermal")
+
+
+@pytest.mark.parametrize(
+    ("effects", "message"),
+    [("rust", "found 'rust'; expected one of"), ("screw", "screw.lead_mm: is missing")],
+)
+def test_effects_without_usual_keys_are_refused(tmp_path, effects, message):
+    code, _, err = orthocal("new", tmp_path / "mill", *options(), "--effects", effects)
+    assert code == 2
+    assert f"orthocal: --effects: {message}" in err
+    assert not (tmp_path / "mill").exists()
 
 
 def test_what_is_read_on_it_calibrates_it(made, tmp_path):
@@ -103,7 +132,7 @@ def test_a_machine_is_made_again_after_a_change(copied):
 def test_readings_are_not_overwritten(copied):
     file = copied / "first/readings.csv"
     head, *rows = file.read_text().splitlines()
-    file.write_text("\n".join([head, *(f"{row}0.12" for row in rows)]) + "\n")
+    file.write_text("\n".join([head, *(row.replace(",,", ",0.12,") for row in rows)]) + "\n")
     before = files_of(copied)
     for words in (
         ["new", copied, *options(), "--paper"],

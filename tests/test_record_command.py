@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from datetime import datetime
 
 import numpy as np
 import pytest
@@ -56,9 +57,13 @@ def run(monkeypatch):
     return record
 
 
+def rows_of(folder):
+    head, *rows = (folder / "readings.csv").read_text().splitlines()
+    return [dict(zip(head.split(","), row.split(","), strict=True)) for row in rows]
+
+
 def cells(folder):
-    rows = (folder / "readings.csv").read_text().splitlines()[1:]
-    return [row.split(",")[-1] for row in rows]
+    return [row["reading_mm"] for row in rows_of(folder)]
 
 
 def sound_readings(folder):
@@ -178,7 +183,7 @@ TURNS = {
     "two of them": (
         ["s"],
         [],
-        "Not recorded: 's' is not a command (skip or show?); `help` lists them.",
+        "Not recorded: 's' is not a command (skip or side or show?); `help` lists them.",
     ),
     "none": (["burn"], [], "Not recorded: 'burn' is not a command; `help` lists them."),
     "too much": (["skip 3"], [], "Not recorded: `skip` has no argument '3'."),
@@ -436,3 +441,96 @@ def test_a_session_that_somebody_records_is_refused(folder, run):
 def test_help_says_what_it_does():
     text = " ".join(orthocal("record", "--help").stdout.split())
     assert "Every reading is on disk before the next" in text
+
+
+def with_effects(folder, effects, table=None):
+    """The plan for a machine with effects; its readings.csv states approaches."""
+    with (folder / "session.yaml").open("a") as stream:
+        stream.write(f"calibration: {{effects: [{effects}]}}\n")
+    if table is not None:
+        (folder / "readings.csv").write_text(table)
+        with (folder / "session.yaml").open("a") as stream:
+            stream.write("readings: readings.csv\n")
+
+
+TABLE = """setup,posture,cycle,reading_mm,approach
+yx,zero,1,,ppp
+yx,zero,1,,nnn
+yx,x_min,1,,ppp
+zx,zero,1,,ppp
+zx,x_min,1,,nnn
+"""
+
+
+def test_the_planned_approach_and_the_temperature_are_recorded(folder, run):
+    """The temperature is asked for in each setup, and changed by a command."""
+    with_effects(folder, "backlash, thermal", TABLE)
+    code, out, _ = run(folder, "21,5", "0.01", "0.02", "t 22.5", "0.03", "", "0.04", "-0.05")
+    assert code == 0
+    text = " ".join(out.split())
+    assert text.count("Temperature of the machine in °C?") == 2
+    assert "Enter leaves it open" in text
+    assert "Enter keeps 22.5 °C" in text
+    assert "approach ↓ in the last 2 mm" in text
+    assert "All 5 readings are recorded." in text
+    rows = rows_of(folder)
+    assert [r["approach"] for r in rows] == ["ppp", "nnn", "ppp", "ppp", "nnn"]
+    assert [r["temperature_C"] for r in rows] == ["21.5", "21.5", "22.5", "22.5", "22.5"]
+    assert "time" not in rows[0]  # lines of a pipe were not read by the clock
+    journal = (folder / f"readings.csv{SUFFIX}").read_text()
+    assert journal.count('"temperature_C": 22.5') == 3
+    session = load_session(folder)
+    assert [r.conditions.temperature for r in session.readings][:3] == [21.5, 21.5, 22.5]
+
+
+def test_an_open_temperature_stops_no_recording(folder, run):
+    with_effects(folder, "thermal")
+    code, out, _ = run(
+        folder, "", "0.01", "hot", "t hot", "t 400", "0.02", "t", "0.03", "t 20", "0.04"
+    )
+    assert code == 0
+    assert out.count("Not recorded") == 4
+    assert [r.get("temperature_C") for r in rows_of(folder)] == ["", "", "", "20", "", ""]
+
+
+def test_the_side_is_asked_for_where_the_plan_states_none(folder, run):
+    """Enter is the side of the programs; a letter is for all drives."""
+    with_effects(folder, "backlash")
+    code, out, _ = run(folder, "", "0.01", "side n", "0.02", "side pnu", "0.03", "side up", "0.04")
+    assert code == 0
+    text = " ".join(out.split())
+    assert text.count("From which side are the postures approached?") == 1
+    assert "Enter: ppp (↑), as the programs do" in text
+    assert text.count("Not recorded: the side") == 1
+    assert [r["approach"] for r in rows_of(folder)] == ["ppp", "nnn", "pnu", "pnu", "", ""]
+    # the same command continues, and asks again
+    _, out, _ = run(folder, "n", "0.05")
+    assert [r["approach"] for r in rows_of(folder)][4:] == ["nnn", ""]
+
+
+def test_no_condition_is_asked_for_without_an_effect(folder, run):
+    code, out, _ = run(folder, *sound_readings(folder))
+    assert code == 0
+    assert "Temperature of" not in out
+    assert "From which side" not in out
+    assert (folder / "readings.csv").read_text().startswith("setup,posture,reading_mm\n")
+
+
+def test_a_temperature_is_noted_on_any_machine(folder, run):
+    run(folder, "t 19,5", "0.01")
+    assert rows_of(folder)[0]["temperature_C"] == "19.5"
+
+
+def test_the_clock_is_noted_where_it_runs(folder, run):
+    """All times of a setup or none, in the form of those that are there."""
+    _, out, _ = run(folder, "clock", "0.01", "0.02", "clock", "0.03", "clock", "0.04")
+    assert "The time is not noted; lines count as read in their order" in " ".join(out.split())
+    times = [r["time"] for r in rows_of(folder)]
+    assert [bool(t) for t in times] == [True, True, False, True, False, False]
+    stamp = datetime.fromisoformat(times[0])
+    assert abs((datetime.now().astimezone() - stamp).total_seconds()) < PATIENCE
+    _, out, _ = run(folder, "clock", "0.05")
+    assert rows_of(folder)[4]["time"]
+    # a reading of the first setup without a time: no more times there
+    _, out, _ = run(folder, "clock", "again 2", "0.06")
+    assert rows_of(folder)[1]["time"] == ""

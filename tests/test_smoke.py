@@ -57,7 +57,8 @@ def test_prepare_measure_calibrate_and_use(root, workplace):
     calibrated.write_text(text, encoding="utf-8")
     run("compare", root / "examples/raw-cycles", cwd=workplace)
     run("accuracy", calibrated, cwd=workplace)
-    run("export", calibrated, "--to", "linuxcnc", "--out", "linuxcnc", cwd=workplace)
+    latched = ["--latched", "+,+,+"]
+    run("export", calibrated, "--to", "linuxcnc", *latched, "--out", "linuxcnc", cwd=workplace)
     (workplace / "part.ngc").write_text("G21 G90\nG0 X0 Y0 Z0\nG1 X10 Y-10 F600\nM2\n")
     run("correct", calibrated, "part.ngc", "--out", "corrected.ngc", cwd=workplace)
     assert (workplace / "corrected.ngc").is_file()

@@ -27,6 +27,7 @@ from orthocal.builder.machine_file import (
     workspace_text,
 )
 from orthocal.effects.loading import load_robot
+from orthocal.effects.registry import find_effect, order_effects
 from orthocal.errors import RobotError
 from orthocal.io.files import exists, read_file, write_files
 from orthocal.robot.loading import packaged_robots
@@ -65,6 +66,7 @@ def describe_machine(
     counting: Sequence[Counting] = (AS_DRIVE,) * 3,
     description: str | None = None,
     tolerances: Mapping[str, float] | None = None,
+    effects: Sequence[str] = (),
 ) -> dict[str, str]:
     """Files of a machine: name to text.
 
@@ -75,6 +77,7 @@ def describe_machine(
         description: YAML of the robot to change; by default the packaged one.
         tolerances: Names or globs with their unit, such as *.offset_mm, mapped to tolerances that
             replace the packaged ones; not with a description, which has its own.
+        effects: Effects beside geometry, with their default keys; not with a description.
 
     Raises:
         RobotError: If the dimensions are impossible, or the YAML has no place for one of them.
@@ -92,6 +95,8 @@ def describe_machine(
     pattern = packaged.decode() if description is None else description
     if tolerances:
         pattern = _override(pattern, tolerances, f"{name}.yaml")
+    if effects:
+        pattern = f"{pattern.rstrip()}\n\n{_effects_text(effects)}"
     return {
         f"{name}.yaml": _describe(
             pattern, dimensions, counting, f"{name}.yaml", made=description is None
@@ -102,7 +107,11 @@ def describe_machine(
 
 
 def make_robot(
-    dimensions: Dimensions, folder: Path, *, counting: Sequence[Counting] = (AS_DRIVE,) * 3
+    dimensions: Dimensions,
+    folder: Path,
+    *,
+    counting: Sequence[Counting] = (AS_DRIVE,) * 3,
+    effects: Sequence[str] = (),
 ) -> Robot:
     """Write the directory of a machine, with machine.yaml, and load it.
 
@@ -110,13 +119,15 @@ def make_robot(
         dimensions: Dimensions of the machine.
         folder: Directory; created if it does not exist.
         counting: Relation of the controller's joints x, y and z to the drives.
+        effects: Effects beside geometry, with their default keys.
 
     Raises:
-        RobotError: If the dimensions are impossible.
+        RobotError: If the dimensions are impossible, or an effect has no default keys.
         OrthocalError: If the directory cannot be written.
     """
     name = folder.resolve().name
-    write_files(folder, describe_machine(dimensions, name=name, counting=counting))
+    files = describe_machine(dimensions, name=name, counting=counting, effects=effects)
+    write_files(folder, files)
     return load_robot(folder.resolve())
 
 
@@ -279,6 +290,19 @@ def _feet_text(dimensions: Dimensions) -> str:
         f"  # {FEET}\n"
         "  # Shims move the ends of a rail, and raise one of its sides, as far apart as two rods.\n"
         f"  adjustments:\n{body}"
+    )
+
+
+def _effects_text(names: Sequence[str]) -> str:
+    """Effects beside geometry with their default limits, as YAML."""
+    lines = []
+    for name in order_effects(names):
+        fields = find_effect(name, where="effects", error=RobotError).keys.model_fields.items()
+        keys = {key: f.default for key, f in fields if isinstance(f.default, float)}
+        lines.append(f"    {name}: {json.dumps(keys).replace(chr(34), '')}\n")
+    return (
+        "  # Effects beside geometry: limits of backlash and others, which are identified from\n"
+        f"  # readings that state their conditions.\n  effects:\n{''.join(lines)}"
     )
 
 

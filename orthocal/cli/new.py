@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
 import orthocal
 from orthocal.cli.files import require_new_files, require_no_readings
 from orthocal.cli.options import (
+    Day,
     Force,
     Gauge,
     Hours,
@@ -20,12 +22,20 @@ from orthocal.cli.options import (
     Tolerances,
     WorkspaceMm,
     command,
+    read_temperatures,
     read_tolerances,
     read_workspace,
+    split_effects,
 )
 from orthocal.cli.printing import put_note, put_out
 from orthocal.errors import OrthocalError, ParameterError, RobotError
 from orthocal.io.files import exists, read_file, require_plain_name, write_files
+
+if TYPE_CHECKING:
+    from orthocal.builder.build import Counting, Dimensions
+
+EFFECTS = "backlash"
+"""Effects of a new machine, where none are chosen."""
 
 FIRST = "first"
 """Directory of the first session, in that of the machine."""
@@ -54,6 +64,8 @@ def new(
     hours: Hours = None,
     gauge: Gauge = None,
     model: Model = None,
+    effects: str = EFFECTS,
+    temperature: Day = None,
     tolerance: Tolerances = None,
     again: bool = False,
     force: Force = False,
@@ -77,6 +89,8 @@ def new(
             moves outwards: one for all, or x,y,z.
         at_zero_mm (MM[,...]): Coordinate that the controller shows where the legs are parallel to
             their axes: one for all, or x,y,z.
+        effects (EFFECTS): Effects beside geometry that the machine has, such as
+            backlash,thermal, or none.
         paper: Use the paper's seven postures and six setups; no search.
         again: Make URDF, YAML and sheets again from DIRECTORY/machine.yaml.
     """
@@ -100,13 +114,14 @@ def new(
     from orthocal.planning.equipment import load_dial
 
     name = _require_new(folder, force=force)
-    equipment = orthocal.Equipment()
+    equipment = orthocal.Equipment(temperatures=read_temperatures(temperature))
     if gauge is not None:
         equipment = load_dial(gauge, equipment)
+    chosen = split_effects(effects) or []
     machine, counting = find_answers(dimensions)
     asked = None in dimensions.values()
     with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
-        robot = orthocal.make_robot(machine, Path(trial) / name, counting=counting)
+        robot = _make_trial(machine, Path(trial) / name, counting, chosen)
         if asked or workspace_mm is not None:
             robot = _with_workspace(robot, workspace_mm)
         if asked and tolerance is None:
@@ -119,11 +134,36 @@ def new(
         put_note("orthocal: drawing the measuring sheet")
         files = _draw(plan, session)
     stated = session.robot.parameters.stated
-    write_files(folder, describe_machine(machine, name=name, counting=counting, tolerances=stated))
+    described = describe_machine(
+        machine, name=name, counting=counting, tolerances=stated, effects=chosen
+    )
+    write_files(folder, described)
     robot = orthocal.load_robot(folder).with_tolerances(stated)
     session = replace(session, robot=robot, robot_reference=str(folder.resolve()))
     orthocal.write_session(session, folder / FIRST, comment=COMMENT, extra=files, blank=True)
     _report(folder, machine.words, plan, session, files)
+
+
+def _make_trial(
+    machine: Dimensions, folder: Path, counting: Sequence[Counting], effects: Sequence[str]
+) -> orthocal.Robot:
+    """Robot of the machine in a temporary directory.
+
+    Raises:
+        ParameterError: If there is no such effect, or one needs keys that have no default.
+    """
+    try:
+        return orthocal.make_robot(machine, folder, counting=counting, effects=effects)
+    except RobotError as e:
+        place = (e.where or "").partition("orthocal.effects.")[2]
+        if not place and e.where != "effects":
+            raise
+        what = (
+            f"{place}: {e.problem}; add the effect to the robot's YAML later"
+            if place
+            else e.problem
+        )
+        raise ParameterError(what, where="--effects") from None
 
 
 def _require_none(options: Mapping[str, str | None]) -> None:

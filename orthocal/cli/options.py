@@ -154,6 +154,14 @@ Effects = Annotated[
         "those that the session states, else those of the robot.",
     ),
 ]
+Day = Annotated[
+    str | None,
+    Option(
+        "--temperature",
+        metavar="FIRST:LAST",
+        help="Temperature at the first and at the last reading, °C, such as 20:28.",
+    ),
+]
 Error = Annotated[
     list[str] | None,
     Option(metavar="NAME=VALUE", help="Error of the machine, such as x_slide.offset_mm=1.2."),
@@ -244,6 +252,24 @@ def split_effects(text: str | None) -> list[str] | None:
         return None
     names = split_globs([text])
     return [] if names == ["none"] else names
+
+
+def read_temperatures(text: str | None) -> tuple[float, float] | None:
+    """Temperatures of the first and the last reading from the option `--temperature`, [°C].
+
+    Raises:
+        ParameterError: If the text is neither a temperature nor two.
+    """
+    from orthocal.robot.description import HIGHEST_C, LOWEST_C
+
+    if text is None:
+        return None
+    where = "--temperature"
+    first, colon, last = text.partition(":")
+    found = read_number(first, where), read_number(last if colon else first, where)
+    for value in found:
+        require_between(value, LOWEST_C, HIGHEST_C, where)
+    return found
 
 
 def load_robot_or_session(subject: str) -> tuple[orthocal.Session | None, orthocal.Robot]:

@@ -10,7 +10,9 @@ from typer import Option
 import orthocal
 from orthocal.cli.files import require_new_files, require_no_readings
 from orthocal.cli.options import (
+    Day,
     Details,
+    Effects,
     Force,
     Gauge,
     Hours,
@@ -26,9 +28,11 @@ from orthocal.cli.options import (
     load_robot_or_session,
     read_box,
     read_numbers,
+    read_temperatures,
     read_tolerances,
     read_workspace,
     require_between,
+    split_effects,
     split_globs,
 )
 from orthocal.cli.printing import deliver, put_note
@@ -57,6 +61,8 @@ def plan(
     minutes_a_reading: float = 0.5,
     workspace_mm: WorkspaceMm = None,
     criterion: str = "aligned",
+    effects: Effects = None,
+    temperature: Day = None,
     tolerance: Tolerances = None,
     starts: Annotated[int | None, Option(min=1, max=100)] = None,
     seed: Seed = 0,
@@ -73,7 +79,8 @@ def plan(
     Args:
         subject (ROBOT|SESSION): A robot, or a measured session that the plan complements.
         setups (N): Number of setups; default: 6.
-        readings (N): Number of readings in all setups; default: 3 per setup.
+        readings (N): Number of readings in all setups; default: 3 per setup, and 4 more in six
+            setups with backlash.
         add (N): Number of further setups for a session.
         touches (RODS): Rods that the gauge can touch, separated by commas.
         sections (FRACTIONS): Sections as fractions of a leg's length from its slide; default:
@@ -90,10 +97,12 @@ def plan(
         starts (N): For research: number of starts of the search; default: 20000 divided by the
             number of candidate readings, at least 3 and at most 30.
     """
+    from orthocal.effects.loading import with_effects
     from orthocal.kinematics.workspace import box_workspace, coordinate_letters
     from orthocal.output.text.plan import plan_json
     from orthocal.output.text.summary import print_summary
     from orthocal.planning.expected_error import CRITERIA
+    from orthocal.robot.parameters import errors_at
     from orthocal.runtime.worker_pool import available_cores, worker_budget
 
     if criterion not in CRITERIA:
@@ -120,14 +129,18 @@ def plan(
         across_mm=across_mm,
         minutes_a_setup=minutes_a_setup,
         minutes_a_reading=minutes_a_reading,
+        temperatures=read_temperatures(temperature),
     )
     workspace = None
     if workspace_mm is not None:
         workspace = box_workspace(robot, read_workspace(workspace_mm, robot))
     count = workers or available_cores()
+    names = split_effects(effects)
+    with errors_at("--effects"):
+        robot = robot if names is None else with_effects(robot, names)
     chosen = orthocal.plan_readings(
         robot,
-        orthocal.Choice(model, tolerances=read_tolerances(tolerance, robot)),
+        orthocal.Choice(model, tolerances=read_tolerances(tolerance, robot), effects=names),
         setups=setups if add is None else add,
         readings=readings,
         hours=hours,
@@ -157,12 +170,15 @@ def _write(plan: orthocal.MeasuringPlan, directory: Path) -> None:
     from orthocal.output.text.plan import draw_plan, plan_json
     from orthocal.runtime.worker_pool import call_in_parallel
 
+    stated = any(r.approach for r in plan.session.readings)
+    approach = "as the column approach states" if stated else "from the same side"
+    approach = f"Approach every posture {approach}"
     comment = (
         "A plan: run `orthocal record .` in this directory, or fill in readings.csv; then\n"
         "orthocal calibrate .\n"
         "State the offsets that are active in the controller during the measurement, such as\n"
         "controller: {offsets_mm: [0, 0, 0]}, one number for each drive.\n"
-        "Approach every posture from the same side. The last reading of a setup is its first\n"
+        f"{approach}. The last reading of a setup is its first\n"
         "posture again."
     )
     (sheet, problem), figure = call_in_parallel(

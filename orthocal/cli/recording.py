@@ -12,6 +12,7 @@ import numpy as np
 from orthocal.assessment.judgement import find_warnings, is_doubtful, judge_session
 from orthocal.calibration.assessment_record import Finding
 from orthocal.cli.printing import put_out
+from orthocal.cli.recorded_conditions import RecordedConditions
 from orthocal.errors import OrthocalError, SessionError
 from orthocal.hypotheses.linear_model import LinearModel
 from orthocal.io.tables.numerals import parse_typed_reading
@@ -36,6 +37,7 @@ class Dialogue:
         self._recording = recording
         self._path = path
         self._text = RecordingText(recording)
+        self._conditions = RecordedConditions(recording, self._text.programmed_approach)
         self._warnings: tuple[Finding, ...] = ()
         """Findings about the readings so far."""
         self._can_judge = True
@@ -84,6 +86,15 @@ class Dialogue:
             self._say("", self._text.setup(setup))
             self._shown = setup
         self._say("", self._text.row(index))
+        if self._question is not None:
+            self._note(self._text.question(self._question, self._conditions.temperature))
+
+    @property
+    def _question(self) -> str | None:
+        """Condition that is asked for before the reading."""
+        if self._asked is None:
+            return None
+        return self._conditions.question(self._recording.rows[self._asked])
 
     def _show_again(self) -> None:
         self._shown = None
@@ -101,6 +112,9 @@ class Dialogue:
             prompt = printable(f"{row.setup} {row.posture} [mm]> ")
             if len(prompt) > self._text.width // 2:
                 prompt = f"line {row.line} [mm]> "
+            prompt = {None: prompt, "temperature": "temperature [°C]> "}.get(
+                self._question, f"{self._question}> "
+            )
         if sys.stdin is None:
             raise _EndOfDialogue
         if isinstance(sys.stdin, io.TextIOWrapper) and sys.stdin.errors != "replace":
@@ -125,7 +139,9 @@ class Dialogue:
         """Execute a line; errors are printed, and the question is repeated."""
         word, *arguments = line.split() or [""]
         try:
-            if not word:
+            if self._question is not None and self._is_answer(word, arguments):
+                self._answer_question(self._question, word)
+            elif not word:
                 self._keep()
             elif word[0].isalpha() or word == "?":
                 self._command(word.lower(), arguments)
@@ -134,6 +150,34 @@ class Dialogue:
                 self._record(index, parse_typed_reading(line))
         except SessionError as e:
             self._note(f"Not recorded: {e}.")
+
+    def _is_answer(self, word: str, arguments: list[str]) -> bool:
+        """Whether a line answers the question about a condition: no command and no more than it."""
+        if arguments:
+            return False
+        if self._question == "approach" and word and not word.strip("pnu"):
+            return True
+        return not (word and (word[0].isalpha() or word == "?"))
+
+    def _answer_question(self, question: str, word: str) -> None:
+        """Note a condition, and ask for the next one or for the reading."""
+        row = self._recording.rows[self._require_row()]
+        self._conditions.answer(question, word, row)
+        self._note(self._text.conditions(self._conditions.of(row)))
+        if self._question is not None:
+            self._note(self._text.question(self._question, self._conditions.temperature))
+
+    def _set_condition(self, name: str, text: str) -> None:
+        """Set a condition of the following readings."""
+        if name == "temperature":
+            self._conditions.set_temperature(text)
+        else:
+            self._conditions.set_approach(text)
+        if self._asked is not None:
+            row = self._recording.rows[self._asked]
+            if name == "temperature":  # it need not be asked for, too
+                self._conditions.answer("temperature", "", row)
+            self._note(self._text.conditions(self._conditions.of(row)))
 
     def _keep(self) -> None:
         """Keep the reading of the row that is asked for; end where none is."""
@@ -147,7 +191,7 @@ class Dialogue:
         """Record a reading, compare it with its prediction, and judge the readings if necessary."""
         recording = self._recording
         corrected = recording.rows[index].is_read
-        recording.read(index, value)
+        recording.read(index, value, self._conditions.of(recording.rows[index]))
         row = recording.rows[index]
         self._skipped.discard(row.key)
         self._last = index
@@ -226,6 +270,9 @@ class Dialogue:
             raise SessionError(f"'{shorten(word)}' is not a command{which}; `help` lists them")
         name = names[0]
         with_row = {"back": self._back, "again": self._again, "drop": self._drop}
+        if name in ("temperature", "side") and len(arguments) == 1:
+            self._set_condition(name, arguments[0])
+            return
         if arguments and (name not in with_row or len(arguments) > 1):
             raise SessionError(f"`{name}` has no argument '{shorten(arguments[0])}'")
         if name in with_row:
@@ -236,6 +283,12 @@ class Dialogue:
             self._say(self._text.list_commands())
         elif name == "quit":
             raise _EndOfDialogue
+        elif name in ("temperature", "side"):
+            example = "21.5" if name == "temperature" else "p or n"
+            raise SessionError(f"`{name}` needs a value, such as {example}")
+        elif name == "clock":
+            self._conditions.clock = not self._conditions.clock
+            self._note(self._text.clock(on=self._conditions.clock))
         else:
             {"skip": self._skip, "restart": self._restart, "show": self._show_again}[name]()
 

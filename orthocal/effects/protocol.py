@@ -78,6 +78,9 @@ class Effect:
     `complete` are identified with every model."""
     setup_errors: tuple[ElementaryError, ...] = ()
     """Parameters of each setup; the name of the setup comes before theirs."""
+    period: float | None = None
+    """Travel of a drive after which its errors repeat, [m]: readings at multiples of it show none
+    of their variation."""
 
     @classmethod
     def from_keys(cls, keys: Any, robot: Robot) -> Self:  # noqa: ANN401 - an instance of `keys`

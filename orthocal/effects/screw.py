@@ -69,6 +69,11 @@ class Screw(Effect):
         )
         return cls(robot, keys.lead_mm * MM, tuple(errors))
 
+    @property
+    def period(self) -> float:  # type: ignore[override]
+        """The lead, [m]."""
+        return self.lead
+
     def describe(self) -> str:
         """Description in a few words."""
         return "periodic error of the screws"

@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.arrays import Array, Indices
+from orthocal.effects.loading import robot_effects
 from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.measurement.motion.approach import can_approach, usual_approaches
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import nominal_sensitivity
 from orthocal.observation.observations import build_observations
@@ -25,7 +27,7 @@ from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.direction import Direction
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.tips import Tip
-from orthocal.session.session import Posture, Reading, Session, Setup
+from orthocal.session.session import Conditions, Posture, Reading, Session, Setup
 from orthocal.statistics.noise import noise_floor
 from orthocal.units import MM
 
@@ -40,6 +42,9 @@ ON_BLADE = 0.4
 
 WHOLE = 5e-3
 """Step of the positions, [m]."""
+
+PHASES = 4
+"""Phases of a periodic error in which successive positions along a leg lie."""
 
 OVERLAP = 1.0
 """Distance of neighbouring lateral positions of a tip, in half widths."""
@@ -152,7 +157,7 @@ def list_candidates(robot: Robot, equipment: Equipment, *, reference: str = "") 
         setups=setups,
         readings=tuple(readings),
     )
-    return _touching(_with_lateral_positions(session))
+    return _with_approaches(_touching(_with_lateral_positions(session)))
 
 
 def measure_candidates(
@@ -213,7 +218,8 @@ def _list_aligned(
                 aligned.setdefault(unknown, {})[name] = replace(setup, sensor=sensor)
     listed: dict[str, list[tuple[int, Array]]] = {}
     for unknown, setups in aligned.items():
-        readings = tuple(r for r in session.readings if r.setup in setups)
+        # operators align a gauge whatever the approach was
+        readings = tuple(replace(r, conditions=None) for r in session.readings if r.setup in setups)
         views = replace(session, setups=setups, readings=readings)
         jacobian = nominal_sensitivity(views) @ problem.errors_per_theta
         setup_of = build_observations(views).setup
@@ -254,7 +260,7 @@ def _add_postures(
             lines.append(np.unique(np.clip(side, low, high)))
         else:
             line = np.linspace(low, high, equipment.along if own else PLACES_ACROSS)
-            whole = np.round(line / WHOLE) * WHOLE
+            whole = np.round(line / WHOLE) * WHOLE + _phases(robot, line.size)
             lines.append(np.unique(np.clip(whole, low, high).round(9)))
     points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(lines))
     points = np.unique(np.vstack([np.clip(middle, box[:, 0], box[:, 1]), points.round(9)]), axis=0)
@@ -265,6 +271,12 @@ def _add_postures(
     for name, posture in place_tool(robot, names, points).items():
         postures.setdefault(name, posture)
     return names
+
+
+def _phases(robot: Robot, count: int) -> Array:
+    """Fractions of a period by which positions along a leg are shifted, shape (count,), [m]."""
+    period = next((e.period for e in robot_effects(robot) if e.period is not None), 0.0)
+    return np.asarray(np.arange(count) % PHASES * (period / PHASES))
 
 
 def _name(point: Array, robot: Robot, middle: Array) -> str:
@@ -343,6 +355,31 @@ def _lateral_room(sensor: LegIndicator, robot: Robot) -> float:
     if sensor.tip.form == "ball":
         return STEEPEST * float(sensor.constants(robot)[14])  # radii of rod and ball
     return ON_BLADE * sensor.tip.width
+
+
+def _with_approaches(session: Session) -> Session:
+    """Each candidate once for every approach that the robot's effects distinguish.
+
+    Raises:
+        ParameterError: If no posture can be approached.
+    """
+    approaches = usual_approaches(session.robot)
+    if not approaches:
+        return session
+    drives = np.array([p.drives for p in session.postures.values()])
+    possible = {
+        a: dict(zip(session.postures, can_approach(session.robot, drives, a), strict=True))
+        for a in approaches
+    }
+    readings = tuple(
+        replace(r, conditions=Conditions(a))
+        for r in session.readings
+        for a in approaches
+        if possible[a][r.posture]
+    )
+    if not readings:
+        raise ParameterError("no posture can be approached within the travel", where="plan")
+    return replace(session, readings=readings).select(readings)
 
 
 def _touching(session: Session) -> Session:

@@ -20,6 +20,7 @@ from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import Failures, nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.files.schema import GaugeKeys
+from orthocal.observation.conditions import MINUTES_A_READING, MINUTES_A_SETUP, in_course
 from orthocal.planning.expected_error import state_noise
 from orthocal.robot.model import Leg, Robot, require_commanded_tool
 from orthocal.sensors.direction import Direction
@@ -44,9 +45,6 @@ ACROSS = 0.02
 """Default displacement of the tool across a leg's direction, [m]."""
 
 SPARE_RANGE = 3.0
-
-MINUTES_A_SETUP = 10.0
-MINUTES_A_READING = 0.5
 
 USUAL_DIAL = Gauge(5e-6, 10e-6, (-5e-3, 5e-3))
 """Dial indicator of ±5 mm with a resolution of 10 µm."""
@@ -81,6 +79,9 @@ class Equipment:
     range has room."""
     minutes_a_setup: float = MINUTES_A_SETUP
     minutes_a_reading: float = MINUTES_A_READING
+    temperatures: tuple[float, float] | None = None
+    """Temperature at the first and at the last reading, [°C]; by default that at which the nominal
+    dimensions hold."""
 
     def list_sensors(self, leg: Leg, direction: Direction, fraction: float) -> list[LegIndicator]:
         """Indicators at a section of a leg: one for each rod that the tip can touch.
@@ -103,6 +104,15 @@ class Equipment:
     def minutes(self, setups: int, readings: int) -> float:
         """Duration of setups and their readings."""
         return setups * self.minutes_a_setup + readings * self.minutes_a_reading
+
+    def in_course(self, plan: Session) -> Session:
+        """Planned readings with the times and temperatures at which they will be taken."""
+        return in_course(
+            plan,
+            temperatures=self.temperatures,
+            minutes_a_setup=self.minutes_a_setup,
+            minutes_a_reading=self.minutes_a_reading,
+        )
 
 
 @cached_per_robot(maxsize=8)

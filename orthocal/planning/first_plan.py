@@ -10,6 +10,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.errors import ParameterError, RobotError
 from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.measurement.motion.approach import state_common_approach
 from orthocal.planning.equipment import Equipment, choose_box, place_tool
 from orthocal.robot.model import Robot
 from orthocal.sensors.mounting import EXACT
@@ -140,7 +141,7 @@ def _read_legs(
             setups[setup] = Setup(setup, equipment.list_sensors(leg, "xyz"[k], 0.5)[0])
             readings += [Reading(setup, posture) for posture in ("zero", *extremes)]
             readings += [Reading(setup, "zero", cycle=2)] if closing else []
-    return Session(
+    session = Session(
         robot=robot,
         robot_reference=robot.name,
         title=title,
@@ -149,3 +150,4 @@ def _read_legs(
         setups=setups,
         readings=tuple(readings),
     )
+    return state_common_approach(session)

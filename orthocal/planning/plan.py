@@ -13,11 +13,13 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.assessment.remaining_errors import RemainingError, rank_errors
+from orthocal.effects.loading import robot_effects, with_effects
 from orthocal.errors import ParameterError
 from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.workspace import Workspace
 from orthocal.measurement.joining import join_sessions
+from orthocal.measurement.motion.approach import usual_approaches
 from orthocal.planning.candidates import (
     FEWEST,
     Candidates,
@@ -33,6 +35,7 @@ from orthocal.planning.cost_curve import (
     find_enough,
     scale_curve,
 )
+from orthocal.planning.effect_limits import EffectLimits, find_limits
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import (
     VAGUE,
@@ -57,6 +60,16 @@ READINGS_A_SETUP = (3, 5, 9, 16)
 """Numbers of readings of a setup that are tried for a given time."""
 
 USUAL_SETUPS = 6
+
+GOAL = 0.4
+"""Limit of backlash after a plan, in its limit before, that plans reach if they can: the tool may
+be used from both sides, or the controller compensates backlash."""
+
+EMPHASIS = 3.0
+"""Factor of tool errors from backlash in the search for a plan that reaches the goal."""
+
+MORE_FOR_APPROACH = 2 / 3
+"""Further readings of a setup where each posture can be approached from either side."""
 
 SIMPLER = 3e-2
 """Relative increase of the error, in total, for tips on the crests of their rods."""
@@ -88,6 +101,8 @@ class MeasuringPlan:
     equipment: Equipment
     candidates: int
     """Number of candidate readings."""
+    effects: tuple[EffectLimits, ...] = ()
+    """Limits of the effects beside geometry, before and after."""
 
     def find_remaining(self, *, count: int = 3) -> tuple[RemainingError, ...]:
         """Combinations of errors with the largest effect at the tool after these readings."""
@@ -131,8 +146,9 @@ def plan_readings(
         choice: Parameters to identify, or the name of a model; by default those of the measured
             session, or "full". The plan's session states it.
         setups: Number of setups; by default 6, or as many as `hours` allow.
-        readings: Number of readings, at least 2 per setup; by default 3 per setup, or as many as
-            `hours` allow. The first posture of each setup is read again at its end in addition.
+        readings: Number of readings, at least 2 per setup; by default 3 per setup, and 4 more in
+            six setups if the machine has backlash, or as many as `hours` allow. The first posture
+            of each setup is read again at its end in addition.
         hours: Available time; not with numbers.
         equipment: Available gauge, tip and region.
         measured: Existing readings, which the plan complements.
@@ -152,11 +168,11 @@ def plan_readings(
     """
     say = report or (lambda text: None)
     equipment = equipment or Equipment()
-    options = _list_counts(setups, readings, hours, equipment)
     measured = None if measured is None else state_noise(measured)
     chosen = resolve_choice(choice, measured, default_model=MODEL)
-    robot = (robot if measured is None else measured.robot).with_tolerances(chosen.tolerances)
-    measured = None if measured is None else measured.with_tolerances(chosen.tolerances)
+    robot, measured = _with_choice(robot, measured, chosen)
+    each = READINGS_A_SETUP[0] + (MORE_FOR_APPROACH if usual_approaches(robot) else 0.0)
+    options = _list_counts(setups, readings, hours, equipment, each)
     forecast = ToolForecast(robot, chosen.select(robot.parameters), workspace)
     session = list_candidates(robot, equipment, reference=reference)
     say(f"computing {len(session.readings)} candidate readings")
@@ -170,19 +186,80 @@ def plan_readings(
     )
     counts = options[0] if len(options) == 1 else _choose_counts(search, seed, workers, options)
     say(f"choosing readings of {len(counts)} setup{'s' * (len(counts) > 1)}")
-    planned = search.choose(
-        counts,
-        seed=seed,
-        starts=starts,
-        workers=workers,
-        report=lambda start, _: say(f"search {start} finished"),
+    sides = _find_sides(candidates, robot)
+    planned = _choose_setups(
+        search,
+        sides,
+        lambda weighted: weighted.choose(
+            counts,
+            seed=seed,
+            starts=starts,
+            workers=workers,
+            report=lambda start, _: say(f"search {start} finished"),
+        ),
     )
-    planned = _simplify(candidates, planned, search)
+    planned = _simplify(candidates, planned, search, sides)
     plan = build_session(candidates, planned.setups, measured)
     plan = replace(plan, purpose=Purpose(chosen.model, tuple(chosen.free)))
     say("comparing the plan with others")
     comparison = Comparison(candidates, plan, equipment, forecast, measured)
     return _evaluate(search, planned, comparison, criterion, workers)
+
+
+def _with_choice(
+    robot: Robot, measured: Session | None, choice: Choice
+) -> tuple[Robot, Session | None]:
+    """Robot and measured session with the chosen effects and tolerances."""
+    if measured is not None:
+        if choice.effects is not None:
+            measured = measured.with_effects(choice.effects)
+        measured = measured.with_tolerances(choice.tolerances)
+        return measured.robot, measured
+    if choice.effects is not None:
+        robot = with_effects(robot, choice.effects)
+    return robot.with_tolerances(choice.tolerances), None
+
+
+def _find_sides(candidates: Candidates, robot: Robot) -> list[int]:
+    """Indices in the state of the parameters that depend on the side of approach."""
+    names = {
+        error.name
+        for effect in robot_effects(robot)
+        if "approach" in effect.conditions
+        for error in effect.errors
+    }
+    return [i for i, name in enumerate(candidates.state) if name in names]
+
+
+def _choose_setups(
+    search: SetupSearch, sides: list[int], choose: Callable[[SetupSearch], PlannedSetups]
+) -> PlannedSetups:
+    """Setups with the smallest error that reach the goal for backlash, if any do.
+
+    If those with the smallest error miss it, effects of the side of approach count more.
+
+    Args:
+        search: Search for the smallest error.
+        sides: Indices of the parameters that depend on the side of approach.
+        choose: Choose setups by a search.
+    """
+    first = choose(search)
+    prior = np.asarray(np.linalg.inv(search.prior))
+    root = search.weigh(prior)
+    if search.weigh(prior) is not root or _is_reached(first, sides):
+        return first
+    emphasised = root.copy()
+    emphasised[sides] *= EMPHASIS
+    planned = choose(replace(search, weigh=lambda covariance: emphasised))
+    if not _is_reached(planned, sides):
+        return first
+    return replace(planned, error=search.error_of(planned.information))
+
+
+def _is_reached(planned: PlannedSetups, sides: list[int]) -> bool:
+    """Whether the limits of parameters, in their limits before, are within the goal."""
+    variance = np.diag(np.linalg.inv(planned.information))[sides]
+    return bool(np.sqrt(variance.max(initial=0.0)) <= GOAL)
 
 
 def _evaluate(
@@ -194,12 +271,13 @@ def _evaluate(
 ) -> MeasuringPlan:
     """Plan with its expected errors, and those of others."""
     plan, measured, forecast = comparison.plan, comparison.measured, comparison.forecast
-    joined = plan if measured is None else join_sessions([measured, plan])
+    plan_in_course = comparison.equipment.in_course(plan)
+    joined = plan_in_course if measured is None else join_sessions([measured, plan_in_course])
     setups, readings = len(planned.setups), sum(len(s.chosen) for s in planned.setups)
     minutes = comparison.equipment.minutes(setups, len(plan.readings))
     each = round(readings / setups)
     with worker_budget(workers):
-        curve, helps, compared, expected, first_round, nominal, known = call_in_parallel(
+        curve, helps, compared, expected, first_round, nominal, known, limits = call_in_parallel(
             (
                 lambda: compute_curve(search, each, setups, comparison.equipment),
                 comparison.list_alternatives,
@@ -208,6 +286,7 @@ def _evaluate(
                 lambda: forecast.after(joined, entered=False),
                 lambda: forecast.about_nominal(joined),
                 lambda: forecast.before if measured is None else forecast.after(measured),
+                lambda: find_limits(forecast.problem(joined), noise_of(joined)),
             ),
             killed=KILLED,
         )
@@ -227,6 +306,7 @@ def _evaluate(
         curve=scale_curve(curve, factor, remainder),
         equipment=comparison.equipment,
         candidates=len(comparison.candidates.session.readings),
+        effects=limits,
     )
 
 
@@ -362,17 +442,21 @@ def _information(problem: CalibrationProblem, state: Sequence[str], measured: Se
 
 
 def _list_counts(
-    setups: int | None, readings: int | None, hours: float | None, equipment: Equipment
+    setups: int | None,
+    readings: int | None,
+    hours: float | None,
+    equipment: Equipment,
+    each: float,
 ) -> list[list[int]]:
-    """Possible numbers of readings of each setup."""
+    """Possible numbers of readings of each setup; `each` is the usual mean."""
     if hours is not None:
         if setups is not None or readings is not None:
             raise ParameterError("found with --setups or --readings; expected one", where="--hours")
         options = []
-        for each in READINGS_A_SETUP:
-            count = int(hours * HOUR / equipment.minutes(1, each + 1))
+        for most in READINGS_A_SETUP:
+            count = int(hours * HOUR / equipment.minutes(1, most + 1))
             if 1 <= count <= MOST_SETUPS:
-                options.append([each] * count)
+                options.append([most] * count)
         if not options:
             least = equipment.minutes(1, READINGS_A_SETUP[0] + 1) / HOUR
             raise ParameterError(
@@ -382,7 +466,7 @@ def _list_counts(
             )
         return options
     count = USUAL_SETUPS if setups is None else setups
-    total = READINGS_A_SETUP[0] * count if readings is None else readings
+    total = math.ceil(each * count - 1e-9) if readings is None else readings
     if not 1 <= count <= MOST_SETUPS:
         raise ParameterError(f"found {count}; expected 1 to {MOST_SETUPS}", where="--setups")
     if total < FEWEST * count:
@@ -410,8 +494,13 @@ def _quick_error(search: SetupSearch, seed: int, options: Sequence[list[int]], w
     return math.inf
 
 
-def _simplify(candidates: Candidates, planned: PlannedSetups, search: SetupSearch) -> PlannedSetups:
-    """Plan with tips nearer to the rods in the mechanical zero, at little cost."""
+def _simplify(
+    candidates: Candidates, planned: PlannedSetups, search: SetupSearch, sides: list[int]
+) -> PlannedSetups:
+    """Plan with tips nearer to the rods in the mechanical zero, at little cost.
+
+    A goal for the parameters that depend on the side of approach stays reached.
+    """
     session, setups = candidates.session, candidates.setups
 
     def distance(which: int) -> float:
@@ -421,10 +510,10 @@ def _simplify(candidates: Candidates, planned: PlannedSetups, search: SetupSearc
         sensor = indicator_of(session.setups[setups[which].name])
         return replace(sensor, beside=(0.0, 0.0, 0.0))
 
-    most = (1.0 + SIMPLER) * planned.error
+    most, reached = (1.0 + SIMPLER) * planned.error, _is_reached(planned, sides)
     for k, old in enumerate(planned.setups):
         candidate = setups[old.candidate]
-        postures = [session.readings[i].posture for i in candidate.rows[list(old.chosen)]]
+        postures = [session.readings[i].place[1:] for i in candidate.rows[list(old.chosen)]]
         base = without_lateral(old.candidate)
         others = planned.information - search.information_of(old)
         for which in sorted(range(len(setups)), key=distance):
@@ -432,7 +521,7 @@ def _simplify(candidates: Candidates, planned: PlannedSetups, search: SetupSearc
                 break
             if without_lateral(which) != base:
                 continue
-            rows = {session.readings[r].posture: i for i, r in enumerate(setups[which].rows)}
+            rows = {session.readings[r].place[1:]: i for i, r in enumerate(setups[which].rows)}
             if not set(postures) <= set(rows):
                 continue
             new = PlannedSetup(which, tuple(rows[p] for p in postures))
@@ -440,8 +529,9 @@ def _simplify(candidates: Candidates, planned: PlannedSetups, search: SetupSearc
                 continue
             information = others + search.information_of(new)
             error = search.error_of(information)
-            if error <= most:
-                changed = (*planned.setups[:k], new, *planned.setups[k + 1 :])
-                planned = PlannedSetups(changed, information, error)
+            setups_now = (*planned.setups[:k], new, *planned.setups[k + 1 :])
+            changed = PlannedSetups(setups_now, information, error)
+            if error <= most and (_is_reached(changed, sides) or not reached):
+                planned = changed
                 break
     return planned

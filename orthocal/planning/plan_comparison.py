@@ -108,6 +108,8 @@ class Comparison:
     def _line(self, setup: CandidateSetup) -> tuple[list[int], int]:
         """Readings of a setup on the line along the leg through the mechanical zero.
 
+        All postures are approached from one side.
+
         Returns:
             Rows in the order of the line, and the index of the one nearest to the zero.
         """
@@ -117,7 +119,8 @@ class Comparison:
         points -= tool_at_zero(session.robot)
         along = int(np.ptp(points, axis=0).argmax())
         across = np.delete(np.abs(points), along, axis=1).max(axis=1, initial=0.0)
-        on = np.flatnonzero(across < 1e-9)
+        same = np.array([r.approach == readings[0].approach for r in readings])
+        on = np.flatnonzero((across < 1e-9) & same)
         on = on[np.argsort(points[on, along])]
         nearest = int(np.abs(points[on, along]).argmin()) if on.size else 0
         return setup.rows[on].tolist(), nearest

@@ -535,3 +535,67 @@ def test_a_clean_table_is_read_as_readings_csv(table, encoding, session):
     assert [(r.setup, r.posture, "", r.cycle) for r in found] == [key[:4] for key in THREE]
     assert [r.value for r in found] == [float(value) * 1e-3 for *_, value in THREE]
     assert [r.line for r in found] == [2, 3, 4]
+
+
+# ---- conditions
+
+SIDES = """setup,posture,cycle,reading_mm,approach
+xy,zero,1,,pp
+xy,zero,1,,nn
+xy,x_max,1,,nn
+"""
+
+
+@pytest.mark.parametrize(
+    ("heading", "cells", "expected"),
+    [
+        ("temperature_C", ("21.5", "", "22"), [21.5, None, 22.0]),
+        ("Temperatur [°C]", ("21,5", "−1", "22 °C"), [21.5, -1.0, 22.0]),
+        ("temperature", ("70 °F", "21", "68 deg F"), [21.111, 21.0, 20.0]),
+        ("Temperature (F)", ("70", "68", "21 °C"), [21.111, 20.0, 21.0]),
+        ("temp", ("20", "70", ""), "the temperature '70' may be in °C or °F"),
+        ("temperature_C", ("20", "700", ""), "temperature_C is 700; expected degrees Celsius"),
+        ("temperature_C", ("20", "warm", ""), "temperature_C is 'warm'"),
+    ],
+)
+def test_temperatures_of_a_table(heading, cells, expected, session):
+    head, *rows = GERMAN.splitlines()
+    lines = [f"{head};{heading}", *(f"{r};{c}" for r, c in zip(rows, cells, strict=True))]
+    found = read(session, text("warm", "\n".join(lines)))
+    if isinstance(expected, str):
+        assert expected in found
+        return
+    loaded = [r.conditions and r.conditions.temperature for r in load_session(session).readings]
+    assert loaded == expected
+
+
+def test_times_of_a_table(session):
+    """Dates of German tables too; clock times alone are no column of a session."""
+    times = ("14.03.2025 9:26", "14.3.2025 09:28:10", "2025-03-14 09:30")
+    head, *rows = GERMAN.splitlines()
+    lines = [f"{head};Datum und Uhrzeit", *(f"{r};{c}" for r, c in zip(rows, times, strict=True))]
+    assert not isinstance(read(session, text("day", "\n".join(lines))), str)
+    found = [r.conditions.time.isoformat() for r in load_session(session).readings]
+    assert found == ["2025-03-14T09:26:00", "2025-03-14T09:28:10", "2025-03-14T09:30:00"]
+    (session / "readings.csv").unlink()
+    clock = [f"{head};Zeitpunkt", *(f"{r};9:26" for r in rows)]
+    read(session, text("clock", "\n".join(clock)))
+    assert {r.conditions for r in load_session(session).readings} == {None}
+
+
+def test_planned_sides_are_matched_or_asked_for(session, orthocal):
+    """The only reading of a posture needs no approach in the table; two need it."""
+    table = put(session, "setup;posture;Messwert [mm]\nxy;x_max;0,5\n", SIDES)
+    assert orthocal("import", table, session)[0] == 0
+    assert "xy,x_max,0.50,nn\n" in (session / "readings.csv").read_text()
+    table = put(session, "setup;posture;Messwert [mm]\nxy;zero;0,5\n", None)
+    before = (session / "readings.csv").read_text()
+    code, _, err = orthocal("import", table, session)
+    assert code == 2
+    assert f"{table}:2: xy zero of cycle 1 is read from several sides (pp, nn)" in err
+    assert (session / "readings.csv").read_text() == before
+    lines = "setup;posture;Messwert [mm];Anfahrrichtung\nxy;zero;0,5;NN\nxy;zero;0,4;PP\n"
+    assert orthocal("import", put(session, lines, None), session)[0] == 0
+    assert (session / "readings.csv").read_text().splitlines()[1:] == [
+        *("xy,zero,0.40,pp", "xy,zero,0.50,nn", "xy,x_max,0.50,nn")
+    ]

@@ -23,8 +23,10 @@ from orthocal.builder.machine_file import Counting, Dimensions
 from orthocal.errors import ParameterError, SessionError
 from orthocal.export.linuxcnc.export import ExportOptions
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.measurement.motion.motion import APPROACH, plan_motion, shown_joints
+from orthocal.measurement.motion.approach import APPROACH
+from orthocal.measurement.motion.motion import plan_motion, shown_joints
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
+from orthocal.session.session import Conditions, Reading
 from orthocal.units import MM
 
 ROUNDED = 1e-4
@@ -140,7 +142,7 @@ def test_every_drive_approaches_from_the_same_side(small, motions):
     robot = small.robot
     for motion in motions:
         points, _ = read_program(write_program(small, motion), robot)
-        assert motion.side == -1
+        assert {s.approach for s in motion.stops} == {"ppp"}
         for before, after in zip(points[0::2], points[1::2], strict=True):
             shares = np.linspace(0.0, 1.0, 9)[:, None]
             drives = nominal_closure(robot).inverse((before + shares * (after - before)) * MM)
@@ -152,13 +154,68 @@ def test_approach_from_the_other_side_at_the_end_of_travel(small):
     lower = replace(small.robot.drives[0], lower=0.2)
     robot = replace(small.robot, drives=(lower, *small.robot.drives[1:]))
     motion = plan_motion(replace(small, robot=robot))[0]
-    assert motion.side == 1
+    assert {s.approach for s in motion.stops} == {"nnn"}
     stop = motion.stops[0]
     assert stop.approach_drives - stop.drives == pytest.approx([APPROACH] * 3)
     both = replace(lower, upper=max(s.drives[0] for s in motion.stops) + 1e-3)
     robot = replace(small.robot, drives=(both, *small.robot.drives[1:]))
     with pytest.raises(SessionError, match="neither from below nor from above by 2 mm: x_slide"):
         plan_motion(replace(small, robot=robot))
+
+
+@pytest.fixture(scope="module")
+def sided(small):
+    """The first setup, with another approach for each reading; zero is read from all sides."""
+    name = next(iter(small.setups))
+    postures = ("zero", "out", "out", "zero", "in", "zero", "zero", "zero")
+    sides = ("nnn", "ppp", "nnn", "ppp", "pnp", "npp", "puu", "nnn")
+    readings = (
+        Reading(name, p, cycle=i, line=i + 1, conditions=Conditions(side))
+        for i, (p, side) in enumerate(zip(postures, sides, strict=True), 1)
+    )
+    return replace(small, readings=tuple(readings))
+
+
+def directions(side):
+    return np.array([{"p": 1.0, "n": -1.0}[letter] for letter in side])
+
+
+def test_every_drive_approaches_as_its_reading_states(sided):
+    """Drives whose direction is unknown come from the usual side."""
+    motion = plan_motion(sided)[0]
+    stated = [r.approach for r in sided.readings]
+    assert [s.approach for s in motion.stops] == [side.replace("u", "p") for side in stated]
+    # only the last stop is that of the first reading again
+    assert [s.repeats for s in motion.stops] == [None] * 7 + [2]
+    text = write_program(sided, motion)
+    points, pauses = read_program(text, sided.robot)
+    assert len(pauses) == len(stated) == len(points) / 2
+    inverse = nominal_closure(sided.robot).inverse
+    for before, after, stop in zip(points[0::2], points[1::2], motion.stops, strict=True):
+        shares = np.linspace(0.0, 1.0, 9)[:, None]
+        drives = inverse((before + shares * (after - before)) * MM)
+        way = directions(stop.approach)
+        assert np.all(np.diff(drives, axis=0) * way > 0.0)
+        assert drives[-1] - drives[0] == pytest.approx(APPROACH * way, abs=3e-7)
+        assert f"approach {stop.approach}; joints" in text
+
+
+def test_an_approach_from_beyond_the_travel_is_refused(sided):
+    """Growing from below to the shortest coordinate of the x drive, which is the end of it."""
+    least = sided.postures["in"].drives[0]
+    lower = replace(sided.robot.drives[0], lower=least - 1e-3)
+    robot = replace(sided.robot, drives=(lower, *sided.robot.drives[1:]))
+    with pytest.raises(SessionError, match=r"as stated \(pnp\) by 2 mm: x_slide") as refused:
+        plan_motion(replace(sided, robot=robot))
+    assert refused.value.where.endswith("postures.in")
+
+
+def test_the_setup_returns_from_the_side_of_its_first_reading(sided):
+    motion = plan_motion(replace(sided, readings=sided.readings[:7]))[0]
+    assert [(s.posture, s.role, s.approach) for s in motion.stops[-2:]] == [
+        ("zero", "reading", "ppp"),
+        ("zero", "return", "nnn"),
+    ]
 
 
 def test_motion_ends_in_the_first_posture(motions, raw_cycles):
@@ -297,26 +354,59 @@ CONTROLLER_STATES = {
 """Lines before the program; no two displacements in `all` cancel."""
 
 
-def test_linuxcnc_joints_do_not_depend_on_offsets_rotation_or_tool_length(small, motions, tmp_path):
-    """At every pause LinuxCNC's joints equal those in the program's comment, on nominal legs."""
-    robot = small.robot
-    anything = replace(small, gauges={"": replace(small.gauge, range=None)})
+def _run_nominal(session, program, folder, before=((),)):
+    """A program on nominal legs, after lines of MDI; as `run_programs`."""
+    robot = session.robot
+    anything = replace(session, gauges={"": replace(session.gauge, range=None)})
     exact = simulate_session(anything, {}, exact=True).session
     options = ExportOptions(module=True, half_side=0.055)
     files = export_calibration(
         calibrate(exact, "offsets"), "linuxcnc", anyway=True, options=options
     )
     for name, text in files.items():
-        (tmp_path / name).write_text(text)
-    fast = ProgramOptions(feed=12_000.0, approach_feed=3_000.0)
-    program = write_program(small, motions[0], fast)
+        (folder / name).write_text(text)
     switch = [d.zero / MM + 10.0 for d in robot.drives]
     joints = [
         Joint(d.direction, s, float(d.to_joint(s * MM)) / MM, float(d.to_joint(d.zero)) / MM)
         for d, s in zip(robot.drives, switch, strict=True)
     ]
-    runs = [([*RESET, *mdi], program.splitlines()) for mdi in CONTROLLER_STATES.values()]
-    _, pauses = run_programs(runs, joints, lines=files["kinematics.ini"], module=tmp_path)
+    runs = [([*RESET, *mdi], program.splitlines()) for mdi in before]
+    return run_programs(runs, joints, lines=files["kinematics.ini"], module=folder)
+
+
+def test_linuxcnc_joints_do_not_depend_on_offsets_rotation_or_tool_length(small, motions, tmp_path):
+    """At every pause LinuxCNC's joints equal those in the program's comment, on nominal legs."""
+    robot = small.robot
+    fast = ProgramOptions(feed=12_000.0, approach_feed=3_000.0)
+    program = write_program(small, motions[0], fast)
+    before = [[*RESET, *mdi] for mdi in CONTROLLER_STATES.values()]
+    _, pauses = _run_nominal(small, program, tmp_path, before)
     expected = np.array([shown for _, shown in read_program(program, robot)[1]])
     for state, shown in zip(CONTROLLER_STATES, pauses, strict=True):
         assert shown == pytest.approx(expected, abs=2 * ROUNDED), state
+
+
+STANDSTILL = 50
+"""Servo periods without motion in a pause."""
+
+
+def test_linuxcnc_takes_up_backlash_from_the_stated_side(small, sided, tmp_path):
+    """Slides that stay behind by half of the backlash, however they went before."""
+    motion = plan_motion(sided)[0]
+    program = write_program(sided, motion, ProgramOptions(feed=6000.0, approach_feed=1500.0))
+    # the driver resumes at once
+    slides, (pauses,) = _run_nominal(small, program.replace("\nM0", "\nG4 P0.2\nM0"), tmp_path)
+    still = np.abs(np.diff(slides, axis=0)).max(axis=1) < 1e-6
+    edges = np.flatnonzero(np.diff(np.r_[False, still, False].astype(int)))
+    begun = [a for a, b in edges.reshape(-1, 2) if b - a > STANDSTILL]
+    expected = np.array([stop.drives for stop in motion.stops]) / MM
+    assert len(pauses) == len(expected)
+    at = begun[-len(expected) :]
+    assert slides[at] == pytest.approx(expected, abs=5e-4)
+    backlash = np.array([0.03, 0.04, 0.05])
+    actual, follows = np.empty_like(slides), slides[0]
+    for k, commanded in enumerate(slides):  # the slide is pushed at either end of the play
+        follows = np.clip(follows, commanded - backlash / 2.0, commanded + backlash / 2.0)
+        actual[k] = follows
+    sides = np.array([directions(stop.approach) for stop in motion.stops])
+    assert actual[at] - slides[at] == pytest.approx(-backlash / 2.0 * sides, abs=1e-6)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from decimal import Decimal
@@ -77,17 +77,21 @@ UNSTATED = {"cycle": "1"}
 """Values of optional columns that need not be stated."""
 
 
-def format_readings(rows: Sequence[RawReading], *, blank: bool = False) -> str:
+def format_readings(
+    rows: Sequence[RawReading], *, blank: bool = False, needed: Collection[str] = ()
+) -> str:
     """Text of a readings.csv without the optional columns that no row needs.
 
     Args:
         rows: The rows.
         blank: Leave the cells of measured conditions empty.
+        needed: Optional columns to be filled in, with or without content.
     """
     columns = [
         c
         for c in COLUMNS
-        if c in REQUIRED or any(getattr(r, c) not in ("", UNSTATED.get(c)) for r in rows)
+        if c in (*REQUIRED, *needed)
+        or any(getattr(r, c) not in ("", UNSTATED.get(c)) for r in rows)
     ]
     cells = [
         ["" if blank and c in MEASURED else getattr(r, c) or UNSTATED.get(c, "") for c in columns]

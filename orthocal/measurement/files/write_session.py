@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,12 @@ import yaml
 
 from orthocal.errors import SessionError
 from orthocal.io.files import exists, write_file, write_files
-from orthocal.measurement.files.readings_file import RawReading, format_readings
+from orthocal.measurement.files.readings_file import (
+    COLUMN_OF_ROLE,
+    RawReading,
+    format_readings,
+)
+from orthocal.observation.conditions import needed_conditions
 from orthocal.robot.loading import packaged_robots, robot_digest
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import default_zero
@@ -144,7 +149,9 @@ def write_session(
     text = head + yaml.safe_dump(
         document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=100
     )
-    table = readings_table(session.readings, decimals=decimals, blank=blank)
+    conditions = needed_conditions(session.robot) if blank else ()
+    needed = [COLUMN_OF_ROLE.get(c, c) for c in conditions]
+    table = readings_table(session.readings, decimals=decimals, blank=blank, needed=needed)
     files = {"session.yaml": text, "readings.csv": table, **(extra or {})}
     write_files(folder, files)
     return folder / "session.yaml"
@@ -169,13 +176,20 @@ def _place_robot(session: Session, folder: Path) -> str:
     return f"./{robot.name}"
 
 
-def readings_table(readings: Sequence[Reading], *, decimals: int = 6, blank: bool = False) -> str:
+def readings_table(
+    readings: Sequence[Reading],
+    *,
+    decimals: int = 6,
+    blank: bool = False,
+    needed: Collection[str] = (),
+) -> str:
     """Text of a readings.csv; cells of readings that are NaN are empty.
 
     Args:
         readings: The readings, in order.
         decimals: Decimals of a reading in mm.
         blank: Leave readings and measured conditions empty.
+        needed: Optional columns to be filled in.
     """
     rows = []
     for r in readings:
@@ -197,4 +211,4 @@ def readings_table(readings: Sequence[Reading], *, decimals: int = 6, blank: boo
             time="" if conditions.time is None else conditions.time.isoformat(),
         )
         rows.append(row)
-    return format_readings(rows, blank=blank)
+    return format_readings(rows, blank=blank, needed=needed)

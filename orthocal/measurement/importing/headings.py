@@ -50,13 +50,25 @@ WORDS: dict[Role, tuple[str, ...]] = {
         *("indicator", "dial", "dial reading", "indicator reading", "gauge reading"),
         *("messwert", "messwerte", "ablesung", "anzeige", "wert", "messuhr", "gemessen"),
     ),
-    "approach": ("approach",),
-    "temperature": ("temperature c",),
-    "time": ("time",),
+    "approach": (
+        *("approach", "approach direction", "direction of approach", "side of approach"),
+        *("anfahrrichtung", "anfahrt", "anfahrseite"),
+    ),
+    "temperature": (
+        *("temperature", "temp", "machine temperature", "temperature of the machine"),
+        *("temperatur", "maschinentemperatur"),
+    ),
+    "time": (
+        *("time", "date and time", "date time", "datetime", "timestamp", "time of reading"),
+        *("zeitpunkt", "zeitstempel", "datum und uhrzeit", "datum uhrzeit"),
+    ),
 }
 """Headings of every role, in lower case, with single blanks."""
 
 _ROLES = {word: role for role, words in WORDS.items() for word in words}
+
+Degrees = Literal["C", "F"]
+"""Unit of a temperature: degrees Celsius or Fahrenheit."""
 
 UnitName = Literal["mm", "um", "inch", "cm", "thou"]
 UNITS: dict[UnitName, Decimal] = {
@@ -84,6 +96,9 @@ _BRACKETED = re.compile(r"[\[(]([^\[\]()]*)[\])]")
 _BREAK = re.compile(r"[\s_\-/,;:\[\]()]+")
 _THOU = re.compile(r"0[.,]001[ _]?(?:inch|in(?![a-z])|\")")
 _INCH = re.compile(r"(?:[/,;:_] ?|(?<![a-z])in |^)in\.?(?=_|$)")
+_DEGREES = re.compile(
+    r"(?:[\s\[(,;:/_-]+|(?=[°º]))(?:in )?(?:[°º]|deg(?:rees|\.)?)? ?(c|f|celsius|fahrenheit)[\])]?"
+)
 _NUMBERED = re.compile(r"([^0-9]*?)\s*(?:#|nr\.?|no\.?)?\s*([0-9]{1,4})\.?")
 _NUMBER_FIRST = re.compile(r"([0-9]{1,4})(?:\.|st|nd|rd|th)?\s+([^0-9]+)")
 
@@ -126,11 +141,23 @@ def read_heading(text: str) -> Heading | None:
     heading = _read_words(plain)
     if heading is not None:
         return heading
+    warm, degrees = split_degrees(plain)
+    if degrees is not None and _ROLES.get(" ".join(_BREAK.split(warm)).strip()) == "temperature":
+        return Heading("temperature")
     words, unit = _split_unit(plain)
     heading = None if unit is None else _read_words(words)
     if heading is None or heading.role != "reading":
         return None
     return Heading("reading", heading.cycle, unit)
+
+
+def split_degrees(text: str) -> tuple[str, Degrees | None]:
+    """Text before the unit of a temperature at its end, and the unit; the text without one."""
+    plain = _normalize(text)
+    for match in _DEGREES.finditer(plain):
+        if match.end() == len(plain):
+            return plain[: match.start()], "C" if match[1].startswith("c") else "F"
+    return plain, None
 
 
 def _normalize(text: str) -> str:

@@ -30,7 +30,7 @@ from orthocal.measurement.importing.headings import (
     find_header,
     parse_role,
 )
-from orthocal.measurement.importing.long_table import LongTable, make_long_table
+from orthocal.measurement.importing.long_table import LongTable, make_long_table, read_time
 from orthocal.session.session import Conditions, Reading, Session
 from orthocal.text import shorten
 
@@ -198,7 +198,7 @@ def _without_clock_times(table: Table, columns: Columns) -> Columns:
     at = columns.single.get("time")
     if at is None:
         return columns
-    texts = (row.cell(at).text.strip() for row in table.rows)
+    texts = (read_time(row.cell(at).text) for row in table.rows)
     try:
         for text in texts:
             if text:
@@ -279,8 +279,28 @@ def _merge(
             where=first.where,
         )
     added = [row for of_place in pending.values() for row, _ in of_place]
+    _require_approaches(added, [row for row, _ in existing])
     counts["added"] = len(added)
     return [*rows, *added], counts
+
+
+def _require_approaches(added: Sequence[RawReading], existing: Sequence[RawReading]) -> None:
+    """Refuse new rows without an approach in postures that the session reads from several sides.
+
+    Raises:
+        SessionError: Naming the first one.
+    """
+    for row in added:
+        place = row.setup, row.posture, row.minus, row.cycle or "1"
+        sides = [
+            r.approach for r in existing if (r.setup, r.posture, r.minus, r.cycle or "1") == place
+        ]
+        if not row.approach and len(sides) > 1 and all(sides):
+            raise SessionError(
+                f"{row.setup} {row.posture} of cycle {place[3]} is read from several sides "
+                f"({', '.join(sides)}); expected a column 'approach' that states which",
+                where=row.where,
+            )
 
 
 def _match(row: RawReading, among: Sequence[_Row], alone: bool) -> _Row | None:

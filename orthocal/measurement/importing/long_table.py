@@ -38,6 +38,7 @@ from orthocal.measurement.importing.headings import (
     Role,
     UnitName,
     parse_unit,
+    split_degrees,
 )
 from orthocal.text import composed, shorten
 
@@ -54,6 +55,10 @@ CHOOSE_SIGN = "choose one by --decimal comma or --decimal point"
 LONGEST_NAME = 200
 """Maximum length of a name in a session."""
 
+WARMEST = Decimal(45)
+"""Largest temperature of a workshop in °C; larger ones without a unit may be in °F."""
+
+_DAY_FIRST = re.compile(r"([0-9]{1,2})\.([0-9]{1,2})\.([0-9]{4}),? +([0-9]{1,2})(:[0-9]{2}.*)")
 _NUMBER_AND_WORD = re.compile(r"(.*[0-9.,])\s*([^0-9.,\s].*)", re.S)
 
 
@@ -203,7 +208,7 @@ def _read_entries(
                     f"has a reading but no {role}; --fill copies the {role} from the row above",
                     where=table.place(row.line),
                 )
-        cells = _read_optional_cells(row, columns) | {role: names[role] for role in NAMED}
+        cells = _read_optional_cells(table, row, columns) | {role: names[role] for role in NAMED}
         for i, heading in columns.readings.items():
             where = table.place(row.line, i)
             numbered = cells if heading.cycle is None else {**cells, "cycle": str(heading.cycle)}
@@ -220,18 +225,47 @@ def _read_entries(
             yield replace(entry, number=number, value=value, unit=unit or stated)
 
 
-def _read_optional_cells(row: Row, columns: Columns) -> dict[str, str]:
+def _read_optional_cells(table: Table, row: Row, columns: Columns) -> dict[str, str]:
     """Cells of a row in the optional columns of a readings.csv."""
     cells = {role: row.cell(columns.single.get(role)) for role in SINGLE}
-    temperature = cells["temperature"].text.strip()
-    value = parse_numeral(temperature, "comma" if "," in temperature else "point")
+    warm = columns.single.get("temperature")
     return {
         "minus": _name(cells["minus"]),
         "cycle": _name(cells["cycle"]),
-        "approach": _name(cells["approach"]),
-        "temperature_C": temperature if value is None else f"{value:f}",
-        "time": cells["time"].text.strip(),
+        "approach": _name(cells["approach"]).casefold(),
+        "temperature_C": "" if warm is None else _read_temperature(table, row, warm),
+        "time": read_time(cells["time"].text),
     }
+
+
+def _read_temperature(table: Table, row: Row, column: int) -> str:
+    """Temperature of a row in °C; text that is no number as it is.
+
+    Raises:
+        SessionError: If it may be in °C or °F.
+    """
+    text = row.cell(column).text.strip()
+    number, own = split_degrees(text)
+    degrees = own or split_degrees(table.header[column])[1]
+    value = parse_numeral(number.strip(), "comma" if "," in number else "point")
+    if value is None or value.adjusted() > 3:
+        return text
+    if degrees is None and value > WARMEST:
+        raise SessionError(
+            f"the temperature '{shorten(text)}' may be in °C or °F; write the unit into the "
+            "heading, such as temperature [°F]",
+            where=table.place(row.line, column),
+        )
+    if degrees == "F":
+        value = round((value - 32) / Decimal("1.8"), 3).normalize()
+    return f"{value:f}"
+
+
+def read_time(text: str) -> str:
+    """Date and time of ISO 8601, of a day such as 14.03.2025; other text as it is."""
+    text = text.strip()
+    day = _DAY_FIRST.match(text)
+    return text if day is None else f"{day[3]}-{day[2]:0>2}-{day[1]:0>2}T{day[4]:0>2}{day[5]}"
 
 
 def _read_units_row(row: Row, columns: Columns) -> dict[int, UnitName]:

@@ -1,14 +1,15 @@
 """Path of the machine through the postures of a session.
 
 A setup begins in its alignment posture, where the operator mounts and aligns the gauge. Every
-posture is approached from one side: on its last motion each drive moves in the same direction, so
-that backlash acts alike in all readings. Each segment of the path is sampled to check that the
+posture is approached as its reading states, by the last motion of each drive. Where nothing is
+stated, all postures are approached from one side, so that backlash acts alike in all readings: the
+drives pass the posture and come back to it. Each segment of the path is sampled to check that the
 drives reach it, that the tip stays on the rod and that the dial stays in its range.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, NamedTuple
@@ -20,21 +21,16 @@ from orthocal.arrays import Array
 from orthocal.errors import ClosureError, SessionError
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.measurement.motion.approach import approach_length, approach_steps, fill_approach
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations, drive_table
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import Contact
 from orthocal.session.session import Gauge, Posture, Reading, Session
-from orthocal.units import DEG, MM
+from orthocal.units import MM
 
 Role = Literal["alignment", "reading", "subtracted", "return"]
-
-APPROACH = 2e-3
-"""Length of the approach of a sliding drive, [m]."""
-
-APPROACH_TURN = 0.5 * DEG
-"""Angle of the approach of a turning drive, [rad]."""
 
 STEP = 5e-3
 """Largest distance between samples of a segment, [m]."""
@@ -105,6 +101,8 @@ class Stop:
     repeats: int | None
     """Line of the setup's first reading, if this stop reads the first posture again."""
     cycle: int
+    approach: str
+    """Direction of each drive at the end of the path: p if its coordinate grows, n if it falls."""
     drives: Array
     """Nominal drive coordinates, shape (n_drives,), [m, rad]."""
     approach_drives: Array
@@ -131,8 +129,6 @@ class SetupMotion:
     """Position in the order of measurement, from 1."""
     count: int
     """Number of setups."""
-    side: int
-    """Side of the approach: -1 from smaller drive coordinates, 1 from larger ones."""
     alignment: Stop | None
     """Stop in the alignment posture; None if that is the first posture of `stops`."""
     stops: tuple[Stop, ...]
@@ -170,22 +166,17 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
         line = i + 2 if reading.line is None else reading.line
         rows.setdefault(reading.setup, []).append((line, reading))
     aligned_at = session.alignment_postures
-    side, stop_at = _find_approaches(session, {aligned_at[setup] for setup in rows})
+    first = {setup: of_setup[0][1] for setup, of_setup in rows.items()}
+    apart = {aligned_at[s] for s, r in first.items() if aligned_at[s] != (r.minus or r.posture)}
+    stop_at = _find_approaches(session, apart)
     motions = []
     for number, (setup, rows_of_setup) in enumerate(rows.items(), 1):
         stops = _list_stops(rows_of_setup, aligned_at[setup], stop_at)
         if _commands_tool(session.robot):
             stops = _follow_stops(session, setup, stops)
         alignment = stops.pop(0) if stops[0].role == "alignment" else None
-        motions.append(SetupMotion(setup, number, len(rows), side, alignment, tuple(stops)))
+        motions.append(SetupMotion(setup, number, len(rows), alignment, tuple(stops)))
     return tuple(motions)
-
-
-def approach_length(robot: Robot) -> str:
-    """Length of an approach with its unit."""
-    if any(d.unit == "m" for d in robot.drives):
-        return f"{APPROACH / MM:g} mm"
-    return f"{APPROACH_TURN / DEG:g}°"
 
 
 def dial_zero(gauge: Gauge) -> str:
@@ -216,64 +207,103 @@ def _commands_tool(robot: Robot) -> bool:
     return robot.tcp is not None and len(robot.tcp.coordinates) == len(robot.drives)
 
 
-def _find_approaches(session: Session, alignment: set[str]) -> tuple[int, dict[str, Stop]]:
-    """Side from which all postures can be approached, and a stop to read in each posture.
+Approaches = dict[tuple[str, str | None], Stop]
+"""Posture and its stated approach, or None where none is stated, to the stop that reads it."""
+
+
+def _find_approaches(session: Session, alignment: set[str]) -> Approaches:
+    """Stops to read, or to align a gauge, each at the end of its approach.
+
+    Postures without a stated approach are all approached from one side; so are drives whose
+    direction is stated as unknown.
 
     Args:
         session: The session.
         alignment: Names of the alignment postures.
 
     Raises:
-        SessionError: If no side serves all postures.
+        SessionError: If no side serves all these postures, or one cannot be approached as stated.
     """
-    robot = session.robot
-    used = alignment | {p for r in session.readings for p in (r.posture, r.minus) if p is not None}
-    names = [n for n in session.postures if n in used]
-    nominal = np.array([session.postures[n].drives + session.active_offsets for n in names])
-    step = np.array([APPROACH if d.unit == "m" else APPROACH_TURN for d in robot.drives])
-    closure = nominal_closure(robot)
+    wanted: set[tuple[str, str | None]] = {(name, None) for name in alignment}
+    wanted |= {(r.posture, r.approach) for r in session.readings}
+    wanted |= {(r.minus, None) for r in session.readings if r.minus is not None}
+    order = {name: i for i, name in enumerate(session.postures)}
+    places = sorted(wanted, key=lambda place: (order[place[0]], place[1] or ""))
     refused: list[ClosureError] = []
-    for side in (-1, 1):
-        drives = nominal + side * step
-        failures = find_beyond_travel(robot, drives, names)
-        if not failures:
-            passive = closure.close(drives, names=names, failures=failures)
-        if failures:
-            refused.append(next(iter(failures.values())))
+    for letter in "pn":
+        stops, failures = _begin_approaches(session, places, letter)
+        first = next((e for (_, s), e in failures.items() if s is None or "u" in s), None)
+        if first is not None:
+            refused.append(first)
             continue
-        ends: Sequence[Array | None] = [None] * len(names)
-        starts = ends
-        if _commands_tool(robot) and robot.tcp is not None:
-            coordinates = list(robot.tcp.coordinates)
-            ends = list(closure.forward(nominal, names=names)[:, coordinates])
-            starts = list(closure.tcp(drives, passive)[:, coordinates])
-        columns = zip(names, nominal, drives, ends, starts, strict=True)
-        return side, {
-            name: Stop(name, "reading", None, None, 1, *parts) for name, *parts in columns
-        }
+        for (name, stated), error in failures.items():
+            raise SessionError(
+                f"cannot be approached as stated ({stated}) by {approach_length(session.robot)}: "
+                f"{error.reason}",
+                where=f"{session.path or 'session'}: postures.{name}",
+            )
+        return stops
     raise SessionError(
-        f"can be approached neither from below nor from above by {APPROACH / MM:g} mm: "
-        f"{refused[0].reason}",
+        "can be approached neither from below nor from above by "
+        f"{approach_length(session.robot)}: {refused[0].reason}",
         where=f"{session.path or 'session'}: postures.{refused[0].posture}",
     )
 
 
+def _begin_approaches(
+    session: Session, places: Sequence[tuple[str, str | None]], letter: str
+) -> tuple[Approaches, dict[tuple[str, str | None], ClosureError]]:
+    """Stops of postures with their approaches, and those whose approach is out of reach.
+
+    Args:
+        session: The session.
+        places: Postures and stated approaches.
+        letter: Direction of drives for which none is stated.
+    """
+    robot, names = session.robot, [name for name, _ in places]
+    closure, unknown = nominal_closure(robot), "u" * len(robot.drives)
+    nominal = np.array([session.postures[n].drives + session.active_offsets for n in names])
+    steps = [approach_steps(robot, stated or unknown, letter) for _, stated in places]
+    drives = nominal - np.array(steps)
+    failures = find_beyond_travel(robot, drives, names)
+    if not failures:
+        passive = closure.close(drives, names=names, failures=failures)
+    if failures:
+        return {}, {places[i]: error for i, error in failures.items()}
+    ends: Sequence[Array | None] = [None] * len(names)
+    starts = ends
+    if _commands_tool(robot) and robot.tcp is not None:
+        coordinates = list(robot.tcp.coordinates)
+        ends = list(closure.forward(nominal, names=names)[:, coordinates])
+        starts = list(closure.tcp(drives, passive)[:, coordinates])
+    approaches = [fill_approach(robot, stated, letter) for _, stated in places]
+    columns = zip(places, names, approaches, nominal, drives, ends, starts, strict=True)
+    return {
+        place: Stop(name, "reading", None, None, 1, *parts) for place, name, *parts in columns
+    }, {}
+
+
 def _list_stops(
-    rows: Sequence[tuple[int, Reading]], aligned_at: str, stop_at: Mapping[str, Stop]
+    rows: Sequence[tuple[int, Reading]], aligned_at: str, stop_at: Approaches
 ) -> list[Stop]:
     """Alignment of the gauge, stops in the order of the rows, and the first posture again."""
     first_line, row = rows[0]
     first = row.minus or row.posture
-    stops = [] if aligned_at == first else [replace(stop_at[aligned_at], role="alignment")]
+    begin = stop_at[first, row.approach]
+    stops = [] if aligned_at == first else [replace(stop_at[aligned_at, None], role="alignment")]
     for line, r in rows:
         if r.minus is not None:
-            subtracted = replace(stop_at[r.minus], role="subtracted", line=line, cycle=r.cycle)
+            subtracted = replace(
+                stop_at[r.minus, None], role="subtracted", line=line, cycle=r.cycle
+            )
             stops.append(subtracted)
-        again = r.minus is None and r.posture == first and line != first_line
+        same = (r.posture, r.approach) == (first, row.approach)
+        again = r.minus is None and same and line != first_line
         repeats = first_line if again else None
-        stops.append(replace(stop_at[r.posture], line=line, repeats=repeats, cycle=r.cycle))
-    if stops[-1].posture != first:
-        stops.append(replace(stop_at[first], role="return", repeats=first_line))
+        stop = stop_at[r.posture, r.approach]
+        stops.append(replace(stop, line=line, repeats=repeats, cycle=r.cycle))
+    if (stops[-1].posture, stops[-1].approach) != (first, begin.approach):
+        stops.append(replace(begin, role="return", repeats=first_line))
     return stops
 
 

@@ -110,6 +110,7 @@ def write_program(
     sensor, gauge = of_setup.sensor, session.gauges[of_setup.gauge]
     ball = isinstance(sensor, BallIndicator)
     mount = f"mount the gauge, {'centre its ball on the rod' if ball else 'align it'}"
+    stated = any(r.approach for r in session.readings)
     stops = motion.stops if motion.alignment is None else (motion.alignment, *motion.stops)
     for i, stop in enumerate(stops):
         zero = "0" if stop.role == "subtracted" else ""
@@ -122,7 +123,9 @@ def write_program(
         )
         instruction = ", then ".join(action for action in actions if action)
         instruction = "; ".join(text for text in (instruction, motion.closing(stop)) if text)
-        lines += [f"({_label(stop)}; joints {_joints(robot, stop)})", *_moves(robot, stop, options)]
+        side = f"; approach {stop.approach}" if stated else ""
+        lines.append(f"({_label(stop)}{side}; joints {_joints(robot, stop)})")
+        lines += _moves(robot, stop, options)
         lines.append(f"(MSG, {_label(stop)}: {instruction})")
         if i + 1 < len(stops) and stops[i + 1].lift:
             lines.append(f"(MSG, hold the plunger up on the way to {_label(stops[i + 1])})")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Collection, Sequence
 from importlib import resources
 
 import numpy as np
@@ -10,16 +11,17 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.assessment.wording import name_direction
 from orthocal.io.html import escape, heading, page, paragraph, prose, table
+from orthocal.measurement.motion.approach import approach_length, describe_approach
 from orthocal.measurement.motion.motion import (
     SetupMotion,
     Stop,
-    approach_length,
     guide,
     plan_motion,
     set_dial,
     shown_joints,
 )
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
+from orthocal.observation.conditions import needed_conditions
 from orthocal.output.sheet.gauge_position import (
     ABOUT_ALONG,
     GaugePosition,
@@ -116,8 +118,7 @@ def _front(
         "Check each rod and each hinge for play. The calibration does not remove play.",
     ]
     rules = [
-        f"Approach every posture from the same side: the last {approach_length(robot)} go towards "
-        f"{_approach(robot, motions[0].side)}. The programs do this. Do the same if you jog.",
+        _approach_rule(robot, motions),
         "Keep the tip on its rod from the first reading of a setup to the last.",
         "After you have set the gauge zero, do not touch the bezel, the stand or the arm of the "
         "gauge. If the gauge was bumped, start that setup again.",
@@ -126,7 +127,7 @@ def _front(
     ]
     blanks = "".join(
         f"<p>{escape(text)}: <span class='fill'>&nbsp;</span></p>"
-        for text in ("Date, name", "Temperature at the start, at the end")
+        for text in ("Date, name", *_asked_once(session))
     )
     return (
         f"<header>{heading('Measuring sheet', level=1)}"
@@ -265,21 +266,27 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
     """Table of the readings: line, posture, tool, joints, and a box to write into."""
     robot = session.robot
     tool = motion.stops[0].point is not None
+    approaches = any(r.approach for r in session.readings)
+    to_note = _asked_for_each(session)
     letters = [] if robot.tcp is None or not tool else ["xyz"[c] for c in robot.tcp.coordinates]
     expected = any(abs(s.expected) > VISIBLE for s in motion.stops)
     headers = [
         ("line", "number"),
         ("posture", ""),
+        *([("approach", "")] if approaches else []),
         *([(f"tool {', '.join(letters)} [mm]", "")] if letters else []),
         *((f"{d.name} [{DRIVE_UNITS[d.unit][0]}]", "number") for d in robot.drives),
         *([("perfect machine shows [mm]", "number")] if expected else []),
         ("reading [mm]", ""),
+        *((text, "") for text in to_note),
         ("remarks", ""),
     ]
     head = "".join(f'<th class="{kind}">{escape(text)}</th>' for text, kind in headers)
     rows = []
     for stop in motion.stops:
         cells = [("" if stop.line is None else str(stop.line), "number"), (_posture(stop), "")]
+        if approaches:
+            cells.append((describe_approach(robot, stop.approach), ""))
         if tool and stop.point is not None:
             cells.append((", ".join(_short(v) for v in stop.point), ""))
         cells += [(text, "number") for text in _joint_values(robot, stop.drives)]
@@ -287,11 +294,26 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
             cells.append((_number(stop.expected / MM, 2, sign=True), "number"))
         body = "".join(f'<td class="{kind}">{escape(text)}</td>' for text, kind in cells)
         box = "<td>set to 0</td>" if stop.role == "subtracted" else '<td class="box"></td>'
+        box += '<td class="box"></td>' * len(to_note)
         remark = escape(motion.closing(stop))
         rows.append(f'<tr>{body}{box}<td class="note">{remark}</td></tr>')
     return (
         f'<table class="boxes"><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
     )
+
+
+def _asked_once(session: Session) -> tuple[str, ...]:
+    """Conditions that the operator writes down at the start and at the end of the session."""
+    if "temperature" in needed_conditions(session.robot):
+        return ()
+    return ("Temperature at the start, at the end",)
+
+
+def _asked_for_each(session: Session) -> tuple[str, ...]:
+    """Headings of boxes for the conditions of each reading."""
+    words = {"temperature": "temperature [°C]", "time": "time"}
+    needed = needed_conditions(session.robot)
+    return tuple(text for condition, text in words.items() if condition in needed)
 
 
 def _posture(stop: Stop) -> str:
@@ -364,14 +386,41 @@ def _count_outwards(robot: Robot) -> str:
     return ", ".join(f"{verbs[d.direction]} for {d.name}" for d in robot.drives)
 
 
-def _approach(robot: Robot, side: int) -> str:
-    """Direction of the last move to a posture, in joint numbers."""
-    ways = ["larger" if -side * d.direction > 0 else "smaller" for d in robot.drives]
-    if len(set(ways)) == 1:
-        return f"{ways[0]} numbers of all joints"
-    return ", ".join(
-        f"{way} numbers of {d.name}" for way, d in zip(ways, robot.drives, strict=True)
+def _approach_rule(robot: Robot, motions: Sequence[SetupMotion]) -> str:
+    """Rule for the last motion to a posture, in joint numbers."""
+    length = approach_length(robot)
+    arrows = {describe_approach(robot, s.approach) for m in motions for s in m.stops}
+    jog = (
+        f"If you jog, go {length} past the posture with every joint first, and come back to it in "
+        "one motion of all joints"
     )
+    if len(arrows) > 1:
+        return (
+            "Approach each posture as its arrow shows: ↑ with growing numbers of the joints, ↓ "
+            f"with falling ones{_order_of_arrows(robot, arrows)}. The programs do this in the last "
+            f"{length}. {jog}. If a joint went too far, begin the approach again."
+        )
+    (arrow,) = arrows
+    return (
+        f"Approach every posture from the same side: the last {length} go towards "
+        f"{_describe_arrow(robot, arrow)}. The programs do this. {jog}."
+    )
+
+
+def _order_of_arrows(robot: Robot, arrows: Collection[str]) -> str:
+    """Meaning of several arrows side by side."""
+    if all(len(arrow) == 1 for arrow in arrows):
+        return ""
+    return f"; of several arrows one is for each of {', '.join(d.name for d in robot.drives)}"
+
+
+def _describe_arrow(robot: Robot, arrow: str) -> str:
+    """Direction of an approach in words."""
+    words = {"↑": "larger", "↓": "smaller"}
+    if len(arrow) == 1:
+        return f"{words[arrow]} numbers of all joints"
+    ways = zip(arrow, robot.drives, strict=True)
+    return ", ".join(f"{words[a]} numbers of {d.name}" for a, d in ways)
 
 
 def _is_corrected(session: Session) -> bool:

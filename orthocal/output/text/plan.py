@@ -15,15 +15,17 @@ from orthocal.assessment.wording import tool_mm
 from orthocal.assessment.words.entries import describe_aligned
 from orthocal.kinematics.conditions import stated_use
 from orthocal.kinematics.workspace import find_workspace
-from orthocal.measurement.motion.motion import APPROACH
+from orthocal.measurement.motion.approach import approach_length, describe_approach
 from orthocal.output.text.accuracy import describe_remaining
 from orthocal.output.text.layout import bullets, counted, plain, section, table_of
 from orthocal.planning.cost_curve import ENOUGH, HOUR, Stage
+from orthocal.planning.effect_limits import EffectLimits
 from orthocal.planning.expected_error import Criterion, Expected
 from orthocal.planning.plan import MeasuringPlan
 from orthocal.planning.plan_comparison import Alternative
 from orthocal.robot.model import Robot
-from orthocal.units import MM, UM
+from orthocal.session.session import Reading
+from orthocal.units import EDGE_UNITS, MM, UM
 
 FORMS: dict[Criterion, str] = {
     "aligned": "RMS tool error, workpiece aligned on the machine",
@@ -51,12 +53,8 @@ NOTICEABLE = 0.02
 MOST_LISTED = 24
 """Largest number of setups that are listed one by one."""
 
-HOW = (
-    "In each setup mount the gauge so that it touches at `section`. Go to the first posture and "
-    "set the dial to the middle of its range there.",
-    f"Approach every posture from the same side: the last {APPROACH / MM:g} mm in one direction.",
-    "Read the first posture again at the end of the setup (cycle 2). This reveals drift.",
-)
+DETERMINED = 0.9
+"""Ratio of the limits of an effect after and before the readings below which they determine it."""
 
 EVENLY = "evenly spaced"
 
@@ -82,7 +80,7 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
         section("Other gauges", bullets(_helps(plan))),
         *([section("Largest contributions", bullets(remaining))] if remaining else []),
         section("Setups", _setups(plan)),
-        section("How to measure", bullets(list(HOW))),
+        section("How to measure", bullets(_how_to_measure(plan))),
     ]
     return Group(*parts)
 
@@ -101,7 +99,39 @@ def describe_expected(plan: MeasuringPlan) -> list[str]:
             f"With offsets within their tolerances the tip misses the rod in {first.lost:.0%} of "
             "the readings. Enter offsets from a few readings first, or use a blade."
         )
-    return lines
+    return [*lines, *map(_describe_limits, plan.effects)]
+
+
+def _describe_limits(effect: EffectLimits) -> str:
+    """Limit of an effect before and after the readings, in a sentence."""
+    unit, factor = EDGE_UNITS[effect.unit]
+    words = unit.replace("_per_", "/").replace("um/", "µm/")
+    if words == "mm":
+        before, after = (tool_mm(v) for v in (effect.before, effect.after))
+    else:
+        before, after = (f"{v / factor:.2g} {words}" for v in (effect.before, effect.after))
+    name = f"{effect.words[:1].upper()}{effect.words[1:]}"
+    if effect.after < DETERMINED * effect.before:
+        return f"{name}: known to ±{after} after these readings (now ±{before})."
+    return f"{name}: these readings do not determine it; it keeps its tolerance of ±{before}."
+
+
+def _how_to_measure(plan: MeasuringPlan) -> list[str]:
+    """Instructions for the operator."""
+    robot = plan.session.robot
+    length = approach_length(robot)
+    approach = f"Approach every posture from the same side: the last {length} in one direction."
+    if any(r.approach for r in plan.session.readings):
+        approach = (
+            f"Approach each posture as its arrow shows, in the last {length}: ↑ with growing "
+            "numbers of the joints, ↓ with falling ones. The programs do this."
+        )
+    return [
+        "In each setup mount the gauge so that it touches at `section`. Go to the first posture "
+        "and set the dial to the middle of its range there.",
+        approach,
+        "Read the first posture again at the end of the setup (cycle 2). This reveals drift.",
+    ]
 
 
 def describe_basis(robot: Robot) -> dict[str, Any]:
@@ -156,6 +186,7 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
         "helps": [alternative(a) for a in plan.helps],
         "curve": [stage(s) for s in plan.curve],
         "enough": None if plan.enough is None else stage(plan.enough),
+        "effects": [asdict(e) for e in plan.effects],
         "remaining": [
             {"rms_um": r.rms / UM, "parts": [{"name": n, "prior_stds": t} for n, t in r.parts]}
             for r in plan.find_remaining()
@@ -247,13 +278,19 @@ def _helps(plan: MeasuringPlan) -> list[str]:
     return texts
 
 
+def _posture(reading: Reading, robot: Robot) -> str:
+    """Posture of a reading, with an arrow for its approach."""
+    approach = reading.approach
+    return reading.posture + ("" if approach is None else describe_approach(robot, approach))
+
+
 def _setups(plan: MeasuringPlan) -> RenderableType:
     s = plan.session
     rows = [
         (
             setup.name,
             setup.sensor.describe(),
-            " ".join(r.posture for r in s.readings if r.setup == setup.name),
+            " ".join(_posture(r, s.robot) for r in s.readings if r.setup == setup.name),
         )
         for setup in list(s.setups.values())[:MOST_LISTED]
     ]

@@ -11,10 +11,17 @@ from collections.abc import Sequence
 from orthocal.assessment.judgement import is_far
 from orthocal.assessment.wording import counted, joined, mm, name_direction, spans
 from orthocal.calibration.assessment_record import Finding
-from orthocal.measurement.motion.motion import approach_length, guide, set_dial
+from orthocal.measurement.motion.approach import (
+    approach_length,
+    common_approach,
+    describe_approach,
+    fill_approach,
+)
+from orthocal.measurement.motion.motion import guide, set_dial
 from orthocal.measurement.recording import Recording
+from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
-from orthocal.session.session import Reading, Session, Setup
+from orthocal.session.session import Conditions, Reading, Session, Setup
 from orthocal.text import printable
 from orthocal.units import DRIVE_UNITS, MM, format_fixed, to_mm, trim_zeros
 
@@ -30,6 +37,9 @@ COMMANDS = {
     "skip": "leave this line empty for now",
     "drop": "delete this line from the session; `drop 7` line 7",
     "restart": "delete the readings of this setup and read it again, if stand or dial moved",
+    "temperature": "temperature of the following readings in °C, such as `t 22.5`",
+    "side": "side of approach of the following readings where the plan states none: `side n`",
+    "clock": "begin or stop to note the time of each reading; stop if you type from paper",
     "list": "all lines and their readings",
     "show": "this setup and posture once more",
     "help": "this list",
@@ -45,6 +55,48 @@ class RecordingText:
         self._recording = recording
         self._session = recording.session
         self._guidance = guide(recording.session)
+
+    @property
+    def programmed_approach(self) -> str:
+        """Approach of a program whose plan states none."""
+        robot, drives = self._session.robot, drive_table(self._session)
+        return common_approach(robot, drives + self._session.active_offsets) or fill_approach(
+            robot, None, "p"
+        )
+
+    def question(self, condition: str, temperature: float | None) -> str:
+        """Question for a condition of the next readings.
+
+        Args:
+            condition: "approach" or "temperature".
+            temperature: That of the readings before, [°C].
+        """
+        if condition == "temperature":
+            keep = "leaves it open" if temperature is None else f"keeps {temperature:g} °C"
+            return f"Temperature of the machine in °C? Enter {keep}. `t 22.5` changes it later."
+        programmed = self.programmed_approach
+        arrow = describe_approach(self._session.robot, programmed)
+        drives = ", ".join(d.name for d in self._session.robot.drives)
+        return (
+            f"From which side are the postures approached? One letter for each of {drives}, or "
+            "one for all: p if its drive coordinate grows at the end, n if it falls, u if unknown. "
+            f"Enter: {programmed} ({arrow}), as the programs do. `side n` changes it later."
+        )
+
+    def conditions(self, conditions: Conditions | None) -> str:
+        """Conditions that are noted with the next readings."""
+        noted = []
+        if conditions is not None and conditions.approach is not None:
+            noted.append(f"approach {conditions.approach}")
+        if conditions is not None and conditions.temperature is not None:
+            noted.append(f"{conditions.temperature:g} °C")
+        return f"Noted with the next readings: {', '.join(noted) or 'no temperature'}."
+
+    def clock(self, *, on: bool) -> str:
+        """Whether the time of each reading is noted."""
+        if on:
+            return "The time of each reading is noted."
+        return "The time is not noted; lines count as read in their order, a minute apart."
 
     @property
     def width(self) -> int:
@@ -93,9 +145,12 @@ class RecordingText:
             "Type the reading of the dial in mm. It is on disk before the next question. `help` "
             "lists the commands. Lines are those of the sheet and of readings.csv."
         )
+        length = approach_length(session.robot)
         parts.append(
-            "Approach every posture from the same side: the last "
-            f"{approach_length(session.robot)} in one direction."
+            f"Approach each posture as its line states, in the last {length}: ↑ with growing "
+            "numbers of the joints, ↓ with falling ones."
+            if any(r.approach for r in rows)
+            else f"Approach every posture from the same side: the last {length} in one direction."
         )
         return "\n".join(self.wrap(part) for part in parts)
 
@@ -155,6 +210,10 @@ class RecordingText:
         missing = len(self._recording.missing)
         left = f" ({missing} of {len(rows)} missing)" if missing else ""
         lines = [self.wrap(f"Line {row.line}: {row.label_with_cycle}{left}")]
+        if row.approach is not None:
+            arrow = describe_approach(self._session.robot, row.approach)
+            length = approach_length(self._session.robot)
+            lines.append(self.wrap(f"approach {arrow} in the last {length}", indent="  "))
         for posture in (row.posture, *([row.minus] if row.minus else [])):
             name = f"{posture}: " if row.minus else ""
             lines.append(self._coordinates(posture, name))

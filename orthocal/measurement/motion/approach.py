@@ -1,0 +1,115 @@
+"""Approach of a posture: the last motion of each drive before a reading.
+
+An approach is written as in readings.csv: a letter for each drive, p if its coordinate grows, n if
+it falls, u if it does not matter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from orthocal.arrays import Array, Mask
+from orthocal.effects.loading import robot_effects
+from orthocal.kinematics.conditions import APPROACH as DIRECTIONS
+from orthocal.kinematics.loop_closure import Failures, find_beyond_travel, nominal_closure
+from orthocal.robot.model import Robot
+from orthocal.session.session import Conditions, Session
+from orthocal.units import DEG, MM
+
+APPROACH = 2e-3
+"""Length of the approach of a sliding drive, [m]."""
+
+APPROACH_TURN = 0.5 * DEG
+"""Angle of the approach of a turning drive, [rad]."""
+
+
+ARROWS = {1.0: "↑", -1.0: "↓", 0.0: "·"}
+"""Sign of the change of a joint's number to its arrow."""
+
+
+def usual_approaches(robot: Robot) -> tuple[str, ...]:
+    """Approaches of planned readings: all drives one way, or all the other; none if no matter."""
+    if not any("approach" in e.conditions for e in robot_effects(robot)):
+        return ()
+    return tuple(letter * len(robot.drives) for letter in "pn")
+
+
+def approach_length(robot: Robot) -> str:
+    """Length of an approach with its unit."""
+    if any(d.unit == "m" for d in robot.drives):
+        return f"{APPROACH / MM:g} mm"
+    return f"{APPROACH_TURN / DEG:g}°"
+
+
+def describe_approach(robot: Robot, approach: str) -> str:
+    """Change of each joint's number in an approach: ↑ where it grows, ↓ where it falls.
+
+    One arrow where all are alike; · where the direction does not matter.
+    """
+    arrows = [
+        ARROWS[DIRECTIONS[letter] * d.direction]
+        for letter, d in zip(approach, robot.drives, strict=True)
+    ]
+    return arrows[0] if len(set(arrows)) == 1 else "".join(arrows)
+
+
+def approach_steps(robot: Robot, approach: str, other: str = "p") -> Array:
+    """Motion of each drive in an approach, shape (n_drives,), [m, rad].
+
+    Args:
+        robot: The robot.
+        approach: A letter for each drive.
+        other: Letter in place of u.
+    """
+    lengths = np.array([APPROACH if d.unit == "m" else APPROACH_TURN for d in robot.drives])
+    return lengths * [DIRECTIONS[letter] or DIRECTIONS[other] for letter in approach]
+
+
+def common_approach(robot: Robot, drives: Array) -> str | None:
+    """First usual approach that serves all postures; None without one."""
+    return next((a for a in usual_approaches(robot) if can_approach(robot, drives, a).all()), None)
+
+
+def fill_approach(robot: Robot, stated: str | None, other: str) -> str:
+    """Approach with a letter in place of each u, and of one that is not stated."""
+    return (stated or "u" * len(robot.drives)).replace("u", other)
+
+
+def state_common_approach(session: Session) -> Session:
+    """Session whose readings without a stated approach come from one side, as programs do it.
+
+    A session as it is if no effect depends on the approach, or no side serves all postures.
+    """
+    drives = np.array([p.drives for p in session.postures.values()]) + session.active_offsets
+    common = common_approach(session.robot, drives)
+    if common is None:
+        return session
+    readings = tuple(
+        replace(r, conditions=replace(r.conditions or Conditions(), approach=common))
+        if r.minus is None and r.approach is None
+        else r
+        for r in session.readings
+    )
+    return replace(session, readings=readings)
+
+
+def can_approach(robot: Robot, drives: Array, approach: str) -> Mask:
+    """Mask of the postures whose approach begins within the travel, shape (n,).
+
+    Args:
+        robot: The robot.
+        drives: Nominal drive coordinates of the postures, shape (n, n_drives), [m, rad].
+        approach: A letter for each drive.
+    """
+    start = drives - approach_steps(robot, approach)
+    names = [""] * len(drives)
+    beyond = find_beyond_travel(robot, start, names)
+    possible = np.ones(len(drives), dtype=np.bool_)
+    possible[list(beyond)] = False
+    failures = Failures()
+    inside = np.flatnonzero(possible)
+    nominal_closure(robot).close(start[inside], names=[""] * inside.size, failures=failures)
+    possible[inside[list(failures)]] = False
+    return possible

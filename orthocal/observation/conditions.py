@@ -1,0 +1,73 @@
+"""Conditions of the readings of a session in the course of a day."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import datetime, timedelta
+from itertools import pairwise
+
+import numpy as np
+
+from orthocal.effects.loading import neutral_values, robot_effects
+from orthocal.effects.protocol import Condition
+from orthocal.robot.model import Robot
+from orthocal.session.session import Conditions, Session
+
+MINUTES_A_SETUP = 10.0
+"""Usual time to mount a gauge."""
+
+MINUTES_A_READING = 0.5
+
+MORNING = datetime(2025, 1, 6, 9, 0)
+"""Time of the first reading of a day that is not dated."""
+
+
+STATED: tuple[Condition, ...] = ("approach", "temperature", "time")
+"""Conditions that a reading states; others belong to the machine or to the session."""
+
+
+def needed_conditions(robot: Robot) -> tuple[Condition, ...]:
+    """Conditions of a reading on which effects of a robot depend, in the order of their columns."""
+    needed = {c for effect in robot_effects(robot) for c in effect.conditions}
+    return tuple(c for c in STATED if c in needed)
+
+
+def in_course(
+    session: Session,
+    *,
+    temperatures: tuple[float, float] | None = None,
+    minutes_a_setup: float = MINUTES_A_SETUP,
+    minutes_a_reading: float = MINUTES_A_READING,
+    start: datetime = MORNING,
+) -> Session:
+    """Session whose readings were taken one after the other on a day that warms or cools evenly.
+
+    Differences have no conditions.
+
+    Args:
+        session: The session; approaches stay what they are.
+        temperatures: Temperature of the first and the last reading, [°C]; by default the neutral
+            one.
+        minutes_a_setup: Time to mount a gauge.
+        minutes_a_reading: Time of a reading.
+        start: Time of the first reading.
+    """
+    setups = [r.setup for r in session.readings]
+    if not setups:
+        return session
+    begun = np.cumsum([False, *(a != b for a, b in pairwise(setups))])
+    minutes = begun * minutes_a_setup + np.arange(len(setups)) * minutes_a_reading
+    neutral = neutral_values(session.robot)["temperature"]
+    first, last = temperatures or (neutral, neutral)
+    warmth = np.interp(minutes, [0.0, max(float(minutes[-1]), 1e-9)], [first, last])
+    readings = []
+    for reading, minute, temperature in zip(session.readings, minutes, warmth, strict=True):
+        if reading.minus is None:
+            stated = Conditions(
+                None if reading.conditions is None else reading.conditions.approach,
+                round(float(temperature), 1),
+                start + timedelta(minutes=float(minute)),
+            )
+            reading = replace(reading, conditions=stated)
+        readings.append(reading)
+    return replace(session, readings=tuple(readings), sha256="")

@@ -1,0 +1,76 @@
+"""Limits of effects, such as backlash, that planned readings reach."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from orthocal.effects.loading import robot_effects
+from orthocal.effects.protocol import Effect
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.planning.expected_error import VAGUE
+from orthocal.robot.model import Robot
+from orthocal.statistics.information import Information
+from orthocal.statistics.zeros import project_out_zeros
+from orthocal.units import LIMIT, Unit
+
+
+@dataclass(frozen=True, slots=True)
+class EffectLimits:
+    """Largest limits of the parameters of an effect with one unit, ±2 standard deviations."""
+
+    effect: str
+    words: str
+    """Effect in words."""
+    unit: Unit
+    """SI unit of the parameters."""
+    count: int
+    """Number of parameters."""
+    before: float
+    """Limit from their tolerances, [SI]."""
+    after: float
+    """Limit after the readings, the largest of them, [SI]."""
+
+
+def added_effects(robot: Robot) -> tuple[Effect, ...]:
+    """Effects of a robot beside those of geometry and drives."""
+    return tuple(e for e in robot_effects(robot) if e.name in robot.effect_names)
+
+
+def find_limits(problem: CalibrationProblem, noise: float) -> tuple[EffectLimits, ...]:
+    """Limits of the parameters of effects after the readings of a problem.
+
+    To first order about the nominal machine; a parameter that is never negative counts like one
+    with a normal prior.
+
+    Args:
+        problem: Calibration problem with priors.
+        noise: Standard deviation of a reading, [m].
+    """
+    robot = problem.session.robot
+    effects = added_effects(robot)
+    if not effects:
+        return ()
+    _, jacobian = problem.predict_and_jacobian(problem.active_theta)
+    slopes = project_out_zeros(jacobian, problem.observations)
+    precision = np.maximum(problem.prior_precision, VAGUE)
+    variance = np.diag(Information(slopes).covariance(sigma=noise, precision=precision))
+    after = LIMIT * np.sqrt(variance) * problem.theta_scale
+    before = LIMIT * problem.theta_scale
+    limits = []
+    for effect in effects:
+        units = {e.name: e.unit for e in effect.errors}
+        units |= {
+            f"setup.{setup}.{e.name}": e.unit
+            for e in effect.setup_errors
+            for setup in problem.session.setups
+        }
+        for unit in dict.fromkeys(units.values()):
+            own = [i for i, n in enumerate(problem.free) if units.get(n) == unit]
+            if own:
+                sizes = before[own].max(), after[own].max()
+                limits.append(
+                    EffectLimits(effect.name, effect.describe(), unit, len(own), *map(float, sizes))
+                )
+    return tuple(limits)
