@@ -40,6 +40,8 @@ class NuisanceParameter:
     for a parameter of one setup."""
     of_gauge: bool = False
     """True if all setups with the same gauge share it."""
+    nominal: float = 0.0
+    """Quantity of which it is the error, for setups that share it, [unit]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,6 +16,7 @@ from orthocal.errors import OrthocalError
 from orthocal.io.documents import validate
 from orthocal.io.fields import As
 from orthocal.runtime.registry import Registry
+from orthocal.sensors.ball_bar import BallBar, BallBarKeys
 from orthocal.sensors.leg_indicator import LegIndicator, LegKeys
 from orthocal.sensors.protocol import Sensor, SetupKeys
 
@@ -34,7 +35,11 @@ def _read_kind(name: str, offered: type[Sensor]) -> Kind:
     return offered.keys, offered.from_keys
 
 
-_KINDS = Registry[Kind](GROUP, "sensor", _read_kind, {DEFAULT: (LegKeys, LegIndicator.from_keys)})
+_PACKAGED: dict[str, Kind] = {
+    DEFAULT: (LegKeys, LegIndicator.from_keys),
+    BallBar.kind: (BallBarKeys, BallBar.from_keys),
+}
+_KINDS = Registry[Kind](GROUP, "sensor", _read_kind, _PACKAGED)
 
 
 def register_sensor(kind: type[Sensor]) -> None:

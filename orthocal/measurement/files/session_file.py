@@ -325,6 +325,8 @@ def _check_shared(setups: Mapping[str, Setup], file: str) -> None:
                 problem = f"stands at {' '.join(before.sensor.place)}"
             elif other.prior_std != parameter.prior_std:
                 problem = f"states a tolerance of {show_limit(other.prior_std):g} {other.unit}"
+            elif other.nominal != parameter.nominal:
+                problem = f"states {other.nominal:g} {other.unit}"
             else:
                 continue
             raise SessionError(

@@ -1,0 +1,210 @@
+"""Ball bar: the distance between a ball at the tool and a ball at a fixed place.
+
+With b the ball at the tool and c the fixed ball, the reading is the length of the bar beyond its
+length at reading 0:
+
+    h = (1 + s) (|b − c| − L)
+
+s is the error of the dial's scale. Position c, length L and s are nuisance parameters. The length
+and the scale belong to the gauge, so that all setups with one bar share them. If L is known, or has
+a tolerance, the gauge zero is known; readings of a bar of unknown length have a free gauge zero in
+each setup, or share an unknown length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
+
+import casadi as ca
+import numpy as np
+from pydantic import Field
+
+from orthocal.arrays import Array
+from orthocal.errors import SessionError
+from orthocal.io.documents import Name, Number, PositiveNumber
+from orthocal.robot.model import Robot, require_tcp
+from orthocal.sensors.mounting import SCALE
+from orthocal.sensors.protocol import (
+    Contact,
+    Frames,
+    GaugeZero,
+    NuisanceParameter,
+    Sensor,
+    SetupKeys,
+    View,
+)
+from orthocal.units import MM, read_limit, show_limit, tidy, to_mm
+
+CENTRE = 1.0 * MM
+"""Position of a fixed ball to which the tool was jogged, [m]."""
+
+UNKNOWN = 1.0 * MM
+"""Prior standard deviation of a length that nobody measured but with a ruler, [m]."""
+
+LARGEST_MM = 5000.0
+"""Largest length and coordinate; a larger one has a wrong unit."""
+
+Coordinate = Annotated[Number, Field(ge=-LARGEST_MM, le=LARGEST_MM)]
+Point = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
+Tolerance = Annotated[Number, Field(ge=0.0, le=LARGEST_MM)]
+
+
+class BallBarKeys(SetupKeys):
+    """Keys of a setup with a ball bar, as in a session.yaml."""
+
+    centre_mm: Point
+    """Nominal position of the fixed ball, in the world."""
+    ball: Name | None = None
+    """Name of the fixed ball, if several setups use one that stays in its place."""
+    centre_tolerance_mm: Tolerance = show_limit(CENTRE) / MM
+    """Of each of its coordinates; 0 if it is known."""
+    tool_mm: Point = Field(default_factory=lambda: [0.0, 0.0, 0.0])
+    """Ball at the tool, from the tool centre point, in the tool's frame."""
+    length_mm: Annotated[PositiveNumber, Field(le=LARGEST_MM)]
+    """Distance of the balls at reading 0."""
+    length_tolerance_mm: Tolerance | Literal["unknown"] = 0.0
+    scale_tolerance: Annotated[Number, Field(ge=0.0, le=0.4)] = show_limit(SCALE)
+
+
+@dataclass(frozen=True, slots=True)
+class BallBar:
+    """A ball bar between the tool and a fixed ball."""
+
+    centre: tuple[float, float, float]
+    """Nominal position of the fixed ball, in the world, [m]."""
+    length: float
+    """Nominal distance of the balls at reading 0, [m]."""
+    centre_std: float = CENTRE
+    """Prior standard deviation of each coordinate of the fixed ball, [m]."""
+    length_std: float = 0.0
+    """Prior standard deviation of the length, [m]; 0 if it is known."""
+    scale_std: float = SCALE
+    """Prior standard deviation of the dial's scale, [1]."""
+    tool: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Ball at the tool, from the tool centre point, in the tool's frame, [m]."""
+    ball: str | None = None
+    """Name of the fixed ball that several setups share."""
+
+    kind: ClassVar[str] = "ball_bar"
+    keys: ClassVar[type[SetupKeys]] = BallBarKeys
+    ideal: ClassVar[str] = "on a sphere"
+    zero: ClassVar[GaugeZero] = "known"
+
+    @classmethod
+    def from_keys(cls, keys: BallBarKeys) -> BallBar:
+        """Build from the keys of a session.yaml."""
+        length, tolerance = keys.length_mm * MM, keys.length_tolerance_mm
+        unknown = tolerance == "unknown"
+        return cls(
+            centre=_metres(keys.centre_mm),
+            length=length,
+            centre_std=tidy(read_limit(keys.centre_tolerance_mm) * MM),
+            length_std=UNKNOWN if unknown else tidy(read_limit(float(tolerance)) * MM),
+            scale_std=read_limit(keys.scale_tolerance),
+            tool=_metres(keys.tool_mm),
+            ball=keys.ball,
+        )
+
+    def to_keys(self) -> dict[str, Any]:
+        """Keys for a session.yaml."""
+        keys: dict[str, Any] = {
+            "centre_mm": [to_mm(v) for v in self.centre],
+            "centre_tolerance_mm": tidy(show_limit(self.centre_std) / MM),
+            "length_mm": to_mm(self.length),
+        }
+        if self.ball is not None:
+            keys["ball"] = self.ball
+        if any(self.tool):
+            keys["tool_mm"] = [to_mm(v) for v in self.tool]
+        if self.length_std:
+            unknown = self.length_std == UNKNOWN
+            tolerance = "unknown" if unknown else tidy(show_limit(self.length_std) / MM)
+            keys["length_tolerance_mm"] = tolerance
+        if self.scale_std != SCALE:
+            keys["scale_tolerance"] = show_limit(self.scale_std)
+        return keys
+
+    def require_fit(self, robot: Robot, *, where: str) -> None:
+        """Refuse a robot without a tool.
+
+        Raises:
+            SessionError: Naming the key.
+        """
+        if robot.tcp is None:
+            raise SessionError(
+                f"'{robot.name}' has no tool for a ball bar; add orthocal.tcp to {robot.yaml}",
+                where=f"{where}.sensor",
+            )
+
+    @property
+    def place(self) -> tuple[str, str]:
+        """The tool."""
+        return "tool", ""
+
+    def describe(self) -> str:
+        """Length and fixed ball."""
+        centre = ", ".join(f"{v / MM:g}" for v in self.centre)
+        return f"ball bar of {self.length / MM:g} mm about ({centre}) mm"
+
+    def frames(self, robot: Robot) -> Frames:
+        """The tool's frame."""
+        return Frames((require_tcp(robot).frame,))
+
+    def constants(self, robot: Robot) -> Array:
+        """Fixed ball (3), length (1), ball at the tool (3)."""
+        del robot
+        return np.array([*self.centre, self.length, *self.tool])
+
+    @property
+    def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
+        """Position of the fixed ball, length and scale with a standard deviation above 0."""
+        shared = None if self.ball is None else f"ball.{self.ball}"
+        parameters = (
+            *(
+                NuisanceParameter(f"centre_{k}", "m", self.centre_std, shared, nominal=c)
+                for k, c in zip("xyz", self.centre, strict=True)
+            ),
+            NuisanceParameter("length", "m", self.length_std, of_gauge=True, nominal=self.length),
+            NuisanceParameter("scale", "1", self.scale_std, of_gauge=True),
+        )
+        return tuple(p for p in parameters if p.prior_std > 0.0)
+
+    def aligned_to(self, robot: Robot) -> Mapping[str, Sensor]:
+        """No parameter depends on the machine."""
+        del robot
+        return {}
+
+    def expression(self, view: View, robot: Robot) -> ca.SX:
+        """Reading with the gauge zero at 0, [m]."""
+        del robot
+        errors = {p.name: view.nuisance[i] for i, p in enumerate(self.nuisance_parameters)}
+        centre = view.constants[:3] + ca.vertcat(*(errors.get(f"centre_{k}", 0.0) for k in "xyz"))
+        (tool,) = view.frames
+        ball = tool.position + tool.rotation @ view.constants[4:7]
+        length = view.constants[3] + errors.get("length", 0.0)
+        return ca.SX((1.0 + errors.get("scale", 0.0)) * (ca.norm_2(ball - centre) - length))
+
+    def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
+        """Balls at the tool; a reading grows along the bar, towards them on average."""
+        del at_zero, robot
+        poses = frames[0]
+        balls = poses[:, :3, 3] + poses[:, :3, :3] @ np.array(self.tool)
+        bars = balls - np.array(self.centre)
+        distances = np.linalg.norm(bars, axis=1)
+        units = bars / np.maximum(distances, 1e-12)[:, None]
+        direction = units[0]
+        along = np.linalg.svd(direction[None])[2][-1]
+        problems = [
+            ""
+            if abs(d - self.length) <= 0.5 * self.length
+            else f"the balls would be {d / MM:.1f} mm apart; the bar has {self.length / MM:g} mm"
+            for d in distances.tolist()
+        ]
+        return Contact(balls, direction, along, problems, "centre_mm")
+
+
+def _metres(point: Sequence[float]) -> tuple[float, float, float]:
+    x, y, z = (v * MM for v in point)
+    return x, y, z

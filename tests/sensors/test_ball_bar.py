@@ -1,0 +1,200 @@
+"""Ball bars: readings against Pinocchio and plain distances, bounds, machines with all errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from machines import place
+from tolerances import CLOSED_FORM
+
+from orthocal import draw_errors, load_plan, load_session, write_session
+from orthocal.assessment.tool_error import measure_uncertainty
+from orthocal.errors import SessionError
+from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.variable_projection import VariableProjection
+from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.kinematics.sensitivity import ToolSensitivity
+from orthocal.kinematics.workspace import cube
+from orthocal.observation.model import predict_readings
+from orthocal.observation.sensor_groups import nuisance_parameters
+from orthocal.observation.simulate import simulate_session
+from orthocal.statistics.chance import confidence_factor
+
+RADIUS_MM, POINTS = 50.0, 16
+SIGMA_BAR, SIGMA_DIAL = 2e-6, np.hypot(5e-6, 10e-6 / np.sqrt(12.0))
+ERRORS = {"x_slide.offset": 0.7e-3, "y_slide.offset": -0.4e-3, "z_swivel.rx": 1.5e-3}
+LEGS = """  leg_{d}{leg}: {{leg: {leg}, direction: {d}, section: {{fraction: 0.5}}, gauge: dial,
+    postures: [zero, {leg}_max, {leg}_min]}}"""
+
+
+def circles(folder, *, length="unknown", legs=False, keys="", zero="known", tool=(0, 0, 0)):
+    """Plan with three circles of a bar about one fixed ball, and the paper's readings of legs."""
+    postures, setups = ["  zero: {tcp_mm: [0, 0, 0]}"], []
+    for plane, (i, j) in {"xy": (0, 1), "yz": (1, 2), "zx": (2, 0)}.items():
+        names = []
+        for k, angle in enumerate(2.0 * np.pi * np.arange(POINTS) / POINTS):
+            point = np.zeros(3)
+            point[[i, j]] = RADIUS_MM * np.cos(angle), RADIUS_MM * np.sin(angle)
+            names.append(f"{plane}_{k}")
+            postures.append(f"  {names[-1]}: {{tcp_mm: {point.round(9).tolist()}}}")
+        setups.append(
+            f"  {plane}: {{sensor: ball_bar, centre_mm: {list(tool)}, ball: post, gauge: bar, "
+            f"length_mm: {RADIUS_MM}, length_tolerance_mm: {length}, zero: {zero}{keys}, "
+            f"tool_mm: {list(tool)}, "
+            f"postures: [{', '.join(names)}]}}"
+        )
+    if legs:
+        for k, leg in enumerate("xyz"):
+            for name, value in (("max", 60), ("min", -100)):
+                point = [value if k == i else 0 for i in range(3)]
+                postures.append(f"  {leg}_{name}: {{tcp_mm: {point}}}")
+            setups += [LEGS.format(leg=leg, d=d) for d in "xyz" if d != leg]
+    gauges = (
+        "gauges:\n  bar: {sigma_mm: 0.002, range_mm: [-5, 5]}\n"
+        "  dial: {sigma_mm: 0.005, resolution_mm: 0.01, range_mm: [-5, 5]}\n"
+    )
+    if not legs:
+        gauges = gauges.rsplit("  dial", 1)[0]
+    text = (
+        "robot: orthoglide\ncontroller: {offsets_mm: [0, 0, 0]}\n"
+        f"{gauges}postures:\n{chr(10).join(postures)}\nsetups:\n{chr(10).join(setups)}\n"
+    )
+    folder.mkdir(exist_ok=True)
+    (folder / "plan.yaml").write_text(text)
+    return load_plan(folder / "plan.yaml")
+
+
+def test_readings_are_distances_between_the_balls(tmp_path):
+    """Machine by Pinocchio; errors of the fixed ball, the length, the scale; ball off the tool."""
+    plan = circles(tmp_path, tool=(4, -3, -40))
+    names = [p.name for p in nuisance_parameters(plan).parameters]
+    assert names == [
+        *(f"ball.post.centre_{k}" for k in "xyz"),
+        *("gauge.bar." + n for n in ("length", "scale")),
+    ]
+    nuisance = np.array([0.9e-3, -0.5e-3, 0.3e-3, 0.6e-3, 1.5e-3])
+    found = predict_readings(plan, ERRORS, nuisance=nuisance)
+    machine = plan.robot.with_errors(ERRORS)
+    tool = plan.robot.tcp.frame
+    for row in range(0, len(plan.readings), 7):
+        drives = plan.postures[plan.readings[row].posture].drives
+        ball = place(machine, drives, tool) + _rotation(machine, drives, tool) @ [
+            4e-3,
+            -3e-3,
+            -40e-3,
+        ]
+        distance = np.sqrt(((ball - [4e-3, -3e-3, -40e-3] - nuisance[:3]) ** 2).sum())
+        expected = (1.0 + nuisance[4]) * (distance - RADIUS_MM * 1e-3 - nuisance[3])
+        assert abs(found[row] - expected) < CLOSED_FORM
+
+
+def _rotation(machine, drives, frame):
+    from machines import _closed
+
+    data = _closed(machine, tuple(drives.tolist()), tuple(machine.reference_passive.tolist()))
+    return np.array(data.oMf[machine.frame_id(frame)].rotation)
+
+
+def bound_um(plan, space):
+    """Least RMS tool error, workpiece aligned, in plain linear algebra with columns for zeros."""
+    prior = {"*.offset": 2e-3}
+    problem = build_problem(
+        plan, free=plan.robot.parameters.select_model("full"), prior=True, prior_stds=prior
+    )
+    n = problem.n_machine
+    _, jacobian = problem.predict_and_jacobian(np.zeros(problem.n_free))
+    sigma = np.array(
+        [SIGMA_DIAL if plan.setups[r.setup].gauge == "dial" else SIGMA_BAR for r in plan.readings]
+    )
+    free = [name for name, s in plan.setups.items() if s.zero == "free"]
+    zeros = np.array([[float(r.setup == name) for name in free] for r in plan.readings])
+    design = np.hstack([jacobian, zeros.reshape(len(plan.readings), -1)]) / sigma[:, None]
+    precision = np.zeros(design.shape[1])
+    precision[: problem.n_free] = problem.prior_precision
+    posterior = np.linalg.inv(design.T @ design + np.diag(precision))[:n, :n]
+    scale = problem.theta_scale[:n]
+    tool = ToolSensitivity(plan.robot, free=problem.free[:n])(
+        LoopClosure(plan.robot).inverse(space.points)
+    )
+    sizes = measure_uncertainty(tool, posterior * np.outer(scale, scale), space, space.points).sizes
+    return 1e6 * sizes.aligned.rms
+
+
+@pytest.mark.parametrize(
+    ("length", "zero", "published"),
+    [("unknown", "known", 5.5), ("0", "known", 4.5), ("0", "free", 5.5)],
+)
+def test_bounds_beside_the_papers_readings(tmp_path, orthoglide, length, zero, published):
+    space = cube(orthoglide, points_a_side=5)
+    found = bound_um(circles(tmp_path, length=length, zero=zero, legs=True), space)
+    assert found == pytest.approx(published, rel=0.10)
+
+
+@pytest.mark.slow
+def test_tool_errors_and_intervals_of_machines_with_all_errors(tmp_path):
+    """Readings of 40 machines in closed loops, with all errors at their priors."""
+    plan = circles(tmp_path)
+    robot = plan.robot
+    problem = build_problem(plan, model="full", prior_stds={"*.offset": 0.5e-3})
+    n, scale, space = problem.n_machine, problem.theta_scale, cube(robot, points_a_side=5)
+    names = problem.free[:n]
+    closure, drives = LoopClosure(robot, free=names), LoopClosure(robot).inverse(space.points)
+    program = VariableProjection(problem)
+    tool = ToolSensitivity(robot, free=names)(drives)
+    commanded = np.array([plan.postures[r.posture].drives for r in plan.readings])
+    squares, promised, hits = [], [], []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        errors = draw_errors(robot, names, seed=seed, tolerances={"*.offset_mm": 1.0})
+        truth = np.array([errors[name] for name in names])
+        balls = closure.forward(commanded, theta=truth)
+        centre, length = 1e-3 * rng.normal(size=3), RADIUS_MM * 1e-3 + 1e-3 * rng.normal()
+        shown = (1.0 + 0.002 * rng.normal()) * (np.linalg.norm(balls - centre, axis=1) - length)
+        values = problem.observations.values(shown + SIGMA_BAR * rng.normal(size=len(shown)))
+        found = program.solve(sigma=SIGMA_BAR, values=values)
+        _, slopes = problem.predict_and_jacobian(found.theta, found.passive)
+        covariance = np.linalg.inv(
+            slopes.T @ slopes / SIGMA_BAR**2 + np.diag(problem.prior_precision)
+        )
+        covariance *= np.outer(scale, scale)
+        missed = closure.forward(drives, theta=found.theta[:n]) - closure.forward(
+            drives, theta=truth
+        )
+        missed = space.remove_motion(missed, space.points)
+        squares.append(space.weights @ (missed**2).sum(axis=1))
+        sizes = measure_uncertainty(tool, covariance[:n, :n], space, space.points).sizes
+        promised.append(sizes.aligned.rms**2)
+        std = np.sqrt(np.diag(covariance)[:n])
+        hits.append(np.abs(found.theta[:n] - truth) < confidence_factor(np.inf) * std)
+    achieved, expected = (float(np.sqrt(np.mean(v))) for v in (squares, promised))
+    assert 0.75 * expected < achieved < 1.15 * expected
+    assert 0.93 < np.mean(hits) < 0.97
+
+
+def test_a_simulated_session_comes_back_from_its_files(tmp_path):
+    plan = circles(tmp_path, length="0.5", keys=", scale_tolerance: 0.001", tool=(0, 0, -40))
+    session = simulate_session(plan, ERRORS, seed=3).session
+    write_session(session, tmp_path / "session")
+    again = load_session(tmp_path / "session")
+    assert {n: s.sensor for n, s in again.setups.items()} == {
+        n: s.sensor for n, s in session.setups.items()
+    }
+    assert {s.zero for s in again.setups.values()} == {"known"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "place"),
+    [
+        ("centre_mm: [0, 0, 0], ball: post", "centre_mm: [0, 0, 0, 1], ball: post", "centre_mm"),
+        ("length_mm: 50.0, ", "", "length_mm"),
+        ("length_tolerance_mm: unknown", "length_tolerance_mm: about", "length_tolerance_mm"),
+        ("centre_mm: [0, 0, 0], ball: post", "centre_mm: [0, 0, 9], ball: post", "setups.yz"),
+    ],
+)
+def test_a_wrong_key_is_refused_by_name(tmp_path, old, new, place):
+    circles(tmp_path)
+    file = tmp_path / "plan.yaml"
+    file.write_text(file.read_text().replace(old, new, 1))
+    with pytest.raises(SessionError) as caught:
+        load_plan(file)
+    assert place in str(caught.value.where)
