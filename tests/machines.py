@@ -18,6 +18,13 @@ def place(machine, drives, frame, *, start=None):
     return np.array(data.oMf[machine.frame_id(frame)].translation)
 
 
+def frame_pose(machine, drives, frame):
+    """Pose of a frame, loops closed by Pinocchio."""
+    start = machine.reference_passive
+    data = _closed(machine, tuple(np.ravel(drives).tolist()), tuple(np.ravel(start).tolist()))
+    return data.oMf[machine.frame_id(frame)].copy()
+
+
 def frames(machine, drives):
     """Positions of all frames by name, loops closed by Pinocchio, [m]."""
     start = machine.reference_passive

@@ -161,16 +161,16 @@ def mount(
     """
     error = {p.name: values[i] for i, p in enumerate(parameters)}
     roll = ca.SX(error.get("roll", 0.0) + error.get("square", 0.0))
-    pitched = _rotate(direction, side, -error.get("pitch", ca.SX(0.0)))
+    pitched = rotate(direction, side, -error.get("pitch", ca.SX(0.0)))
     return MountedGauge(
-        direction=_rotate(pitched, axis, roll),
-        edge=_rotate(side, axis, roll),
+        direction=rotate(pitched, axis, roll),
+        edge=rotate(side, axis, roll),
         displacement=error.get("section", 0.0) * axis + error.get("lateral", 0.0) * side,
         scale=1.0 + error.get("scale", ca.SX(0.0)),
     )
 
 
-def _rotate(vector: ca.SX, axis: ca.SX, angle: ca.SX) -> ca.SX:
+def rotate(vector: ca.SX, axis: ca.SX, angle: ca.SX) -> ca.SX:
     """Rotation of a vector about a unit vector (Rodrigues)."""
     along = ca.dot(axis, vector) * axis
     return along + ca.cos(angle) * (vector - along) + ca.sin(angle) * ca.cross(axis, vector)

@@ -19,6 +19,7 @@ from orthocal.runtime.registry import Registry
 from orthocal.sensors.ball_bar import BallBar, BallBarKeys
 from orthocal.sensors.leg_indicator import LegIndicator, LegKeys
 from orthocal.sensors.protocol import Sensor, SetupKeys
+from orthocal.sensors.tool_indicator import ToolIndicator, ToolIndicatorKeys
 
 DEFAULT = LegIndicator.kind
 
@@ -38,6 +39,7 @@ def _read_kind(name: str, offered: type[Sensor]) -> Kind:
 _PACKAGED: dict[str, Kind] = {
     DEFAULT: (LegKeys, LegIndicator.from_keys),
     BallBar.kind: (BallBarKeys, BallBar.from_keys),
+    ToolIndicator.kind: (ToolIndicatorKeys, ToolIndicator.from_keys),
 }
 _KINDS = Registry[Kind](GROUP, "sensor", _read_kind, _PACKAGED)
 

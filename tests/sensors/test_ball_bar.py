@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from machines import place
+from bounds import bound_um
+from machines import frame_pose
 from tolerances import CLOSED_FORM
 
 from orthocal import draw_errors, load_plan, load_session, write_session
@@ -21,7 +22,7 @@ from orthocal.observation.simulate import simulate_session
 from orthocal.statistics.chance import confidence_factor
 
 RADIUS_MM, POINTS = 50.0, 16
-SIGMA_BAR, SIGMA_DIAL = 2e-6, np.hypot(5e-6, 10e-6 / np.sqrt(12.0))
+SIGMA_BAR = 2e-6
 ERRORS = {"x_slide.offset": 0.7e-3, "y_slide.offset": -0.4e-3, "z_swivel.rx": 1.5e-3}
 LEGS = """  leg_{d}{leg}: {{leg: {leg}, direction: {d}, section: {{fraction: 0.5}}, gauge: dial,
     postures: [zero, {leg}_max, {leg}_min]}}"""
@@ -78,46 +79,10 @@ def test_readings_are_distances_between_the_balls(tmp_path):
     tool = plan.robot.tcp.frame
     for row in range(0, len(plan.readings), 7):
         drives = plan.postures[plan.readings[row].posture].drives
-        ball = place(machine, drives, tool) + _rotation(machine, drives, tool) @ [
-            4e-3,
-            -3e-3,
-            -40e-3,
-        ]
+        ball = frame_pose(machine, drives, tool).act(np.array([4e-3, -3e-3, -40e-3]))
         distance = np.sqrt(((ball - [4e-3, -3e-3, -40e-3] - nuisance[:3]) ** 2).sum())
         expected = (1.0 + nuisance[4]) * (distance - RADIUS_MM * 1e-3 - nuisance[3])
         assert abs(found[row] - expected) < CLOSED_FORM
-
-
-def _rotation(machine, drives, frame):
-    from machines import _closed
-
-    data = _closed(machine, tuple(drives.tolist()), tuple(machine.reference_passive.tolist()))
-    return np.array(data.oMf[machine.frame_id(frame)].rotation)
-
-
-def bound_um(plan, space):
-    """Least RMS tool error, workpiece aligned, in plain linear algebra with columns for zeros."""
-    prior = {"*.offset": 2e-3}
-    problem = build_problem(
-        plan, free=plan.robot.parameters.select_model("full"), prior=True, prior_stds=prior
-    )
-    n = problem.n_machine
-    _, jacobian = problem.predict_and_jacobian(np.zeros(problem.n_free))
-    sigma = np.array(
-        [SIGMA_DIAL if plan.setups[r.setup].gauge == "dial" else SIGMA_BAR for r in plan.readings]
-    )
-    free = [name for name, s in plan.setups.items() if s.zero == "free"]
-    zeros = np.array([[float(r.setup == name) for name in free] for r in plan.readings])
-    design = np.hstack([jacobian, zeros.reshape(len(plan.readings), -1)]) / sigma[:, None]
-    precision = np.zeros(design.shape[1])
-    precision[: problem.n_free] = problem.prior_precision
-    posterior = np.linalg.inv(design.T @ design + np.diag(precision))[:n, :n]
-    scale = problem.theta_scale[:n]
-    tool = ToolSensitivity(plan.robot, free=problem.free[:n])(
-        LoopClosure(plan.robot).inverse(space.points)
-    )
-    sizes = measure_uncertainty(tool, posterior * np.outer(scale, scale), space, space.points).sizes
-    return 1e6 * sizes.aligned.rms
 
 
 @pytest.mark.parametrize(
