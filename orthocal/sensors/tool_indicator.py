@@ -60,8 +60,10 @@ Length = Annotated[PositiveNumber, Field(le=LARGEST_MM)]
 STRAIGHT = ("straight_2", "straight_3")
 """Deviations of an edge: Legendre polynomials of degree 2 and 3."""
 
-FLAT = ("flat_20", "flat_11", "flat_02")
-"""Deviations of a plate: products of Legendre polynomials along its two axes."""
+
+def flat_terms(degree: int) -> tuple[str, ...]:
+    """Deviations of a plane: products of Legendre polynomials along its axes, degree 2 or more."""
+    return tuple(f"flat_{n - j}{j}" for n in range(2, degree + 1) for j in range(n + 1))
 
 
 class _Lying(BaseModel):
@@ -146,6 +148,9 @@ class Artefact:
     """Yaw and roll, [rad]."""
     form_std: float = 0.0
     """Deviation from straight or flat at its ends, [m]."""
+    form_degree: int = 2
+    """Largest degree of the deviations from flat; those of degree n have a standard deviation
+    that falls as 1/n², a smooth surface."""
     square_std: float = 0.0
     """Angle of a square, [rad]."""
     reversed: bool = False
@@ -297,14 +302,18 @@ class ToolIndicator:
         placed = f"{owner}.reversed" if owner and a.reversed else owner
         of_arm = None if owner is None else f"{owner}.{a.along}"
         edge = a.along is not None
-        forms = () if a.kind == "gauge_block" else STRAIGHT if edge else FLAT
-        form_std = a.form_std / np.sqrt(max(len(forms), 1))
+        forms = STRAIGHT if edge else flat_terms(a.form_degree)
+        share = np.array([1.0 if edge else 1.0 / sum(map(int, f[-2:])) ** 2 for f in forms])
+        form_std = a.form_std * share / np.linalg.norm(share)
         yaw_of = placed if a.kind == "square" else None
         parameters = (
             NuisanceParameter("yaw", "rad", a.direction_std, yaw_of),
             NuisanceParameter("roll", "rad", a.direction_std),
             NuisanceParameter("square", "rad", a.square_std, owner),
-            *(NuisanceParameter(name, "m", float(form_std), of_arm) for name in forms),
+            *(
+                NuisanceParameter(name, "m", float(std), of_arm)
+                for name, std in zip(forms, form_std, strict=True)
+            ),
             NuisanceParameter("height", "m", a.height_std),
             NuisanceParameter("scale", "1", self.scale_std, of_gauge=True),
         )
@@ -357,15 +366,22 @@ def _form(errors: Mapping[str, ca.SX], s: ca.SX, t: ca.SX) -> ca.SX:
         s: Position along it, in half lengths.
         t: Position across it, in half lengths.
     """
-    second = {"s": (3.0 * s**2 - 1.0) / 2.0, "t": (3.0 * t**2 - 1.0) / 2.0}
-    shapes = {
-        "straight_2": second["s"],
-        "straight_3": (5.0 * s**3 - 3.0 * s) / 2.0,
-        "flat_20": second["s"],
-        "flat_11": s * t,
-        "flat_02": second["t"],
-    }
-    return sum((errors[name] * f for name, f in shapes.items() if name in errors), ca.SX(0.0))
+    deviation = ca.SX(0.0)
+    for name, value in errors.items():
+        kind, _, degrees = name.partition("_")
+        if kind == "straight":
+            deviation += value * _legendre(int(degrees), s)
+        elif kind == "flat":
+            deviation += value * _legendre(int(degrees[0]), s) * _legendre(int(degrees[1]), t)
+    return deviation
+
+
+def _legendre(degree: int, x: ca.SX) -> ca.SX:
+    """Legendre polynomial, by the recursion of Bonnet."""
+    before, present = ca.SX(0.0), ca.SX(1.0)
+    for n in range(degree):
+        before, present = present, ((2 * n + 1) * x * present - n * before) / (n + 1)
+    return present
 
 
 def _std(tolerance: float, unit: float) -> float:

@@ -1,0 +1,124 @@
+"""Touch probe or nozzle on a bed: drive coordinates at the trigger.
+
+Each posture holds the drive coordinates at which the probe triggered, and its reading is the height
+of the surface there, usually 0. The surface is a plane with unknown tilt, with or without a smooth
+deviation from flat. Heights count against the direction of the probe:
+
+    h = −(n · q)/(n · u) − f(q) − o
+
+with the notation of `tool_indicator`, and o the height at which the probe triggers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import casadi as ca
+from pydantic import BaseModel, ConfigDict, Field
+
+from orthocal.robot.model import Robot
+from orthocal.sensors.protocol import GaugeZero, NuisanceParameter, SetupKeys, View
+from orthocal.sensors.tool_indicator import (
+    ALIGNMENT,
+    LENGTH_MM,
+    Artefact,
+    Length,
+    Millimetres,
+    Milliradians,
+    Point,
+    ToolIndicator,
+)
+from orthocal.units import MM, MRAD, read_limit, show_limit, tidy, to_mm
+
+TRIGGER = 0.5 * MM
+"""Height of the bed at the trigger, [m]."""
+
+SMOOTH = 4
+"""Degree of the deviations of a bed from flat."""
+
+
+class SurfaceKeys(BaseModel):
+    """Surface that is not flat."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+    flat_tolerance_mm: Millimetres
+    length_mm: Length = LENGTH_MM
+
+
+class ProbeKeys(SetupKeys):
+    """Keys of a setup with a probe, as in a session.yaml."""
+
+    direction: Literal["x", "y", "z", "-x", "-y", "-z"] = "-z"
+    surface: Literal["plane"] | SurfaceKeys = "plane"
+    direction_tolerance_mrad: Milliradians = show_limit(ALIGNMENT) / MRAD
+    trigger_tolerance_mm: Millimetres = show_limit(TRIGGER) / MM
+    """Of the height at which the probe triggers."""
+    tool_mm: Point = Field(default_factory=lambda: [0.0, 0.0, 0.0])
+    """Tip of the probe, from the tool centre point, in the tool's frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class Probe(ToolIndicator):
+    """A probe at the tool that triggers at a surface."""
+
+    scale_std: float = 0.0
+    trigger_std: float = TRIGGER
+    """Prior standard deviation of the height at which it triggers, [m]."""
+
+    kind: ClassVar[str] = "probe"
+    keys: ClassVar[type[SetupKeys]] = ProbeKeys
+    ideal: ClassVar[str] = "on the surface"
+    zero: ClassVar[GaugeZero] = "known"
+
+    @classmethod
+    def from_keys(cls, keys: Any) -> Probe:  # noqa: ANN401 - of `keys`
+        """Build from the keys of a session.yaml."""
+        direction_std = tidy(read_limit(keys.direction_tolerance_mrad) * MRAD)
+        surface = Artefact("plate", direction_std=direction_std, form_degree=SMOOTH)
+        if isinstance(keys.surface, SurfaceKeys):
+            surface = Artefact(
+                "plate",
+                length=keys.surface.length_mm * MM,
+                direction_std=direction_std,
+                form_std=tidy(read_limit(keys.surface.flat_tolerance_mm) * MM),
+                form_degree=SMOOTH,
+            )
+        x, y, z = (v * MM for v in keys.tool_mm)
+        trigger = tidy(read_limit(keys.trigger_tolerance_mm) * MM)
+        return cls(keys.direction, surface, (x, y, z), trigger_std=trigger)
+
+    def to_keys(self) -> dict[str, Any]:
+        """Keys for a session.yaml."""
+        a = self.artefact
+        surface: Any = "plane"
+        if a.form_std:
+            surface = {
+                "flat_tolerance_mm": tidy(show_limit(a.form_std) / MM),
+                "length_mm": to_mm(a.length),
+            }
+        keys = {
+            "direction": self.direction,
+            "surface": surface,
+            "direction_tolerance_mrad": tidy(show_limit(a.direction_std) / MRAD),
+            "trigger_tolerance_mm": tidy(show_limit(self.trigger_std) / MM),
+        }
+        return {**keys, **({"tool_mm": [to_mm(v) for v in self.tool]} if any(self.tool) else {})}
+
+    def describe(self) -> str:
+        """Direction of the probe and surface."""
+        return f"probe towards {self.direction}"
+
+    @property
+    def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
+        """Direction and form of the surface, height of the trigger."""
+        surface = ToolIndicator.nuisance_parameters.fget(self)  # type: ignore[attr-defined]
+        trigger = (NuisanceParameter("trigger", "m", self.trigger_std),) * (self.trigger_std > 0.0)
+        return (*surface, *trigger)
+
+    def expression(self, view: View, robot: Robot) -> ca.SX:
+        """Height of the surface, [m]."""
+        errors = {p.name: view.nuisance[i] for i, p in enumerate(self.nuisance_parameters)}
+        indicated = ToolIndicator.expression(self, view, robot)
+        return ca.SX(-indicated - errors.get("trigger", 0.0))
