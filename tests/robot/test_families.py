@@ -10,6 +10,7 @@ from tolerances import CLOSED, KINEMATICS
 from orthocal import load_robot
 from orthocal.builder.families import ORTHOGONAL, InclinedOrthoglide, LinearDelta
 from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.robot.loading import packaged_robots
 from orthocal.units import DEG
 
 POINTS = np.array([[0.0, 0.0, 0.0], [0.05, 0.02, 0.04], [-0.06, 0.05, 0.02], [0.01, -0.05, 0.05]])
@@ -58,3 +59,9 @@ def test_orthogonal_slides_make_an_orthoglide(tmp_path, orthoglide):
 @pytest.mark.parametrize("machine", [LinearDelta(), InclinedOrthoglide(elevation=60 * DEG)])
 def test_the_complete_model_has_the_errors_of_the_orthoglide(tmp_path, machine):
     assert len(written(tmp_path, machine).parameters.select_model("full")) == 129
+
+
+def test_the_packaged_delta_is_made_from_its_dimensions():
+    folder, delta = packaged_robots()["linear_delta"], LinearDelta()
+    assert (folder / "linear_delta.urdf").read_text() == delta.urdf("linear_delta")
+    assert (folder / "linear_delta.yaml").read_text() == delta.yaml()

@@ -1,0 +1,187 @@
+"""A probe on the bed of a linear delta: planes, a printer that was published, machines with errors.
+
+The seven triggers are of a printer with rods of 280 mm, from the public NixOS configuration of the
+GitHub user gianarb, together with what Klipper's `DELTA_CALIBRATE` saved: delta radius, angles of
+two towers, and endstops. Facts; read in November 2026.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from machines import frame_pose
+from scipy.spatial.transform import Rotation
+from tolerances import CLOSED_FORM
+
+from orthocal import (
+    Choice,
+    calibrate,
+    draw_errors,
+    load_plan,
+    load_robot,
+    load_session,
+    simulate_session,
+    write_session,
+)
+from orthocal.builder.families import LinearDelta
+from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.observation.model import predict_readings
+from orthocal.observation.sensor_groups import nuisance_parameters
+from orthocal.units import MM
+
+STEP_MM = 0.01
+TRIGGERS = (
+    (35612.667, 35612.667, 35612.667),
+    (41651.333, 41651.333, 32050.333),
+    (34755.667, 45279.667, 34755.667),
+    (32169.333, 40578.0, 40578.0),
+    (34586.333, 34586.333, 42096.333),
+    (39715.0, 32422.333, 39715.0),
+    (43607.0, 34688.0, 34688.0),
+)
+"""Steps of the carriages a, b and c below their endstops where the probe triggered."""
+
+PROBE_MM = 17.197
+"""Height of the nozzle where it triggered."""
+
+ENDSTOPS_MM = (372.971746, 373.433577, 373.629930)
+RADIUS_MM, ANGLES_DEG = 141.553523, (210.181908, 329.784204)
+KLIPPER_MM, KLIPPER_DEG = 1e-3, 5e-4
+
+
+@pytest.fixture(scope="module")
+def printer(tmp_path_factory):
+    """Directory of a printer with rods of 280 mm and a radius of 140 mm."""
+    folder = tmp_path_factory.mktemp("printer") / "printer"
+    folder.mkdir()
+    delta = LinearDelta(travel=(0.02, 0.75))
+    (folder / "printer.urdf").write_text(delta.urdf("printer"))
+    (folder / "printer.yaml").write_text(delta.yaml())
+    return folder
+
+
+def bed(folder, printer, postures, *, surface="plane", keys="", readings=None):
+    """Session with a probe over a bed; a plan without readings."""
+    names = [f"p{i}" for i in range(len(postures))]
+    lines = [
+        f"robot: {printer}",
+        "gauge: {sigma_mm: 0.01, range_mm: [-30, 30]}",
+        "controller: {offsets_mm: [0, 0, 0]}",
+        "postures:",
+        *(f"  {n}: {p}" for n, p in zip(names, postures, strict=True)),
+        f"setups:\n  bed: {{sensor: probe, surface: {surface}{keys}}}",
+    ]
+    folder.mkdir(exist_ok=True)
+    if readings is not None:
+        lines.append("readings: readings.csv")
+        rows = [f"bed,{n},{r:.6f}" for n, r in zip(names, readings, strict=True)]
+        (folder / "readings.csv").write_text("\n".join(["setup,posture,reading_mm", *rows]) + "\n")
+    (folder / "session.yaml").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def rings():
+    """41 points on the bed."""
+    points = [(0.0, 0.0)]
+    for radius, count in ((22, 6), (44, 10), (64, 12), (80, 12)):
+        angles = 2.0 * np.pi * np.arange(count) / count + 0.1 * radius
+        points += [(radius * np.cos(a), radius * np.sin(a)) for a in angles]
+    return [f"{{tcp_mm: [{x:.3f}, {y:.3f}, 0]}}" for x, y in points]
+
+
+def test_readings_are_heights_of_the_tip_above_the_surface(tmp_path, printer):
+    surface = "{flat_tolerance_mm: 0.1, length_mm: 160}"
+    folder = bed(tmp_path, printer, rings()[::8], surface=surface, keys=", tool_mm: [3, -2, -15]")
+    plan = load_plan(folder)
+    names = [p.name.rpartition(".")[2] for p in nuisance_parameters(plan).parameters]
+    rng = np.random.default_rng(2)
+    stds = np.array([p.prior_std for p in nuisance_parameters(plan).parameters])
+    nuisance = stds * rng.normal(size=len(names))
+    value = dict(zip(names, nuisance, strict=True))
+    errors = {"a_slide.offset": 0.8e-3, "radius": 1.2e-3, "b_slide.ry": 3e-3}
+    found = predict_readings(plan, errors, nuisance=nuisance)
+    machine = plan.robot.with_errors(errors)
+    turn = Rotation.from_rotvec([0.0, value["yaw"], 0.0])
+    normal = (turn * Rotation.from_rotvec([value["roll"], 0.0, 0.0])).apply([0.0, 0.0, -1.0])
+    legendre = np.polynomial.legendre.Legendre.basis
+    for row, reading in enumerate(plan.readings):
+        pose = frame_pose(machine, plan.postures[reading.posture].drives, "tcp")
+        tip = pose.act(np.array([3e-3, -2e-3, -15e-3]))
+        height = -(normal @ tip) / (normal @ pose.rotation @ [0.0, 0.0, -1.0])
+        for name in names:
+            if name.startswith("flat"):
+                i, j = int(name[-2]), int(name[-1])
+                height -= value[name] * legendre(i)(tip[0] / 0.08) * legendre(j)(tip[1] / 0.08)
+        assert abs(found[row] - height + value["trigger"]) < CLOSED_FORM
+
+
+def published(folder, printer):
+    """Session of the published triggers."""
+    middle = ENDSTOPS_MM[0] + np.sqrt(280.0**2 - 140.0**2)
+    heights = middle - STEP_MM * np.array(TRIGGERS)
+    postures = [f"{{joints_mm: {[round(float(v), 6) for v in row]}}}" for row in heights]
+    keys = f", direction_tolerance_mrad: 0, trigger_tolerance_mm: 0, tool_mm: [0, 0, -{PROBE_MM}]"
+    return load_session(bed(folder, printer, postures, keys=keys, readings=np.zeros(7)))
+
+
+SIX = ["radius", "a_tower.tangential", "b_tower.tangential", "*.offset"]
+
+
+def test_klippers_answer_from_its_own_triggers(tmp_path, printer):
+    """Six parameters without priors, as Klipper's search has them."""
+    session = published(tmp_path, printer)
+    value = {p.name: p.value / MM for p in calibrate(session, Choice(free=SIX, prior=False)).free}
+    radius = 140.0 + value["radius"]
+    assert radius == pytest.approx(RADIUS_MM, abs=KLIPPER_MM)
+    for name, angle, expected in zip("ab", (210.0, 330.0), ANGLES_DEG, strict=True):
+        turned = angle + np.degrees(value[f"{name}_tower.tangential"] / radius)
+        assert turned == pytest.approx(expected, abs=KLIPPER_DEG)
+    offsets = np.array([value[f"{k}_slide.offset"] for k in "abc"])
+    apart = np.array(ENDSTOPS_MM) - ENDSTOPS_MM[0]
+    assert offsets - offsets[0] == pytest.approx(apart, abs=KLIPPER_MM)
+
+
+def test_seven_triggers_determine_less_than_klipper_prints(tmp_path, printer):
+    """Six decimals are printed. The readings leave a millimetre of radius, and with all errors of a
+    printer they improve the offsets by half at most."""
+    session = published(tmp_path, printer)
+    free = calibrate(session, Choice(free=SIX, prior=False))
+    assert free["radius"].std > 0.5e-3
+    complete = calibrate(session)
+    shares = {p.name: p.std / p.prior_std for p in complete.free if p.name.endswith(".offset")}
+    assert min(shares.values()) > 0.4
+
+
+def test_tool_errors_of_printers_with_all_errors(tmp_path, printer):
+    """Heights of the bed over 41 points after the calibration; z scores of all parameters."""
+    plan = load_plan(bed(tmp_path, printer, rings()))
+    robot = plan.robot
+    names = robot.parameters.select_model("full")
+    drives = np.array([plan.postures[r.posture].drives for r in plan.readings])
+    z = []
+    for seed in range(10):
+        errors = draw_errors(robot, names, seed=seed)
+        session = simulate_session(plan, errors, seed=seed).session
+        result = calibrate(session)
+        z += [(p.value - errors[p.name]) / p.std for p in result.free if p.name in errors]
+        truth = LoopClosure(robot, free=names).forward(
+            drives, theta=np.array([errors[n] for n in names])
+        )
+        fitted = np.array([result[n].value for n in names])
+        missed = truth[:, 2] - LoopClosure(robot, free=names).forward(drives, theta=fitted)[:, 2]
+        plane = np.column_stack([np.ones(len(truth)), truth[:, :2]])
+        missed -= plane @ np.linalg.lstsq(plane, missed, rcond=None)[0]
+        assert np.sqrt(np.mean(missed**2)) < 0.01 * MM
+    z = np.array(z)
+    assert 0.93 < np.mean(np.abs(z) < 2.0) < 0.98
+
+
+def test_a_session_comes_back_from_its_files(tmp_path, printer):
+    surface = "{flat_tolerance_mm: 0.2}"
+    plan = load_plan(bed(tmp_path / "a", printer, rings()[:9], surface=surface))
+    session = simulate_session(plan, {"radius": 1e-3}, seed=3).session
+    write_session(session, tmp_path / "b")
+    again = load_session(tmp_path / "b")
+    assert again.setups["bed"].sensor == session.setups["bed"].sensor
+    assert again.setups["bed"].zero == "known"
+    assert load_robot(printer).name == again.robot.name
