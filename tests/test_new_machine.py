@@ -216,14 +216,33 @@ def test_a_workspace_out_of_reach_is_refused_and_nothing_is_written(copied):
     assert files_of(copied) == before
 
 
-def test_a_renamed_directory_is_named(copied):
+def test_a_renamed_directory_works(copied):
+    """machine.yaml is not the robot's; the files keep their names, also if made again."""
+    before = load_robot(copied)
     renamed = copied.rename(copied.with_name("lathe"))
+    assert load_robot(renamed).sha256 == before.sha256
+    assert load_plan(renamed / "first").robot.name == "lathe"
+    names = set(files_of(renamed))
+    file = renamed / "machine.yaml"
+    file.write_text(file.read_text().replace("leg_mm: 250", "leg_mm: 260"))
     code, _, err = orthocal("new", renamed, "--again")
-    assert (code, err) == (
-        2,
-        f"orthocal: {renamed}/lathe.yaml: there is no such file; there is {copied.name}.yaml: was "
-        "the directory renamed?\n",
-    )
+    assert (code, err) == (0, "")
+    assert set(files_of(renamed)) == names
+    assert load_robot(renamed).drive_zero == pytest.approx([0.26] * 3)
+
+
+def test_a_directory_with_files_of_two_robots_is_refused(copied):
+    renamed = copied.rename(copied.with_name("lathe"))
+    (renamed / "other.urdf").write_bytes((renamed / "mill.urdf").read_bytes())
+    code, _, err = orthocal("check", renamed / "first")
+    assert code == 2
+    assert f"expected one URDF file, or one named lathe.urdf; found {'mill.urdf, other.urdf'}" in err
+
+
+def test_dimensions_alone_are_no_robot(copied):
+    (copied / "mill.yaml").unlink()
+    code, _, err = orthocal("new", copied, "--again")
+    assert (code, "contains no YAML of a robot beside machine.yaml" in err) == (2, True)
 
 
 def test_entries_of_joints_that_count_down_are_described(made, tmp_path):
