@@ -236,7 +236,7 @@ def test_a_directory_with_files_of_two_robots_is_refused(copied):
     (renamed / "other.urdf").write_bytes((renamed / "mill.urdf").read_bytes())
     code, _, err = orthocal("check", renamed / "first")
     assert code == 2
-    assert f"expected one URDF file, or one named lathe.urdf; found {'mill.urdf, other.urdf'}" in err
+    assert "one URDF file, or one named lathe.urdf; found mill.urdf, other.urdf" in err
 
 
 def test_dimensions_alone_are_no_robot(copied):
