@@ -102,6 +102,20 @@ def test_effects_without_usual_keys_are_refused(tmp_path, effects, message):
     assert not (tmp_path / "mill").exists()
 
 
+def test_zeros_have_one_usual_tolerance(made, tmp_path):
+    """4 mm, with all dimensions as options as in the dialogue; the sheet's limit follows it."""
+    assert load_plan(made / "first").robot.parameters.stated == {"*.offset_mm": 4.0}
+    assert load_robot(made).parameters["z_slide.offset"].prior_std == 2e-3
+    sheet = (made / "first/sheet.html").read_text()
+    assert "differs by more than 7 mm" in sheet  # 4 mm, and half a degree of legs of 250 mm
+    words = [*options(), "--paper", "--tolerance", "x_slide.offset_mm=12"]
+    code, _, err = orthocal("new", tmp_path / "mill", *words)
+    assert (code, err.splitlines()) == (0, ["orthocal: drawing the measuring sheet"])
+    tolerances = {"*.offset_mm": 4.0, "x_slide.offset_mm": 12.0}
+    assert load_plan(tmp_path / "mill/first").robot.parameters.stated == tolerances
+    assert "differs by more than 15 mm" in (tmp_path / "mill/first/sheet.html").read_text()
+
+
 def test_what_is_read_on_it_calibrates_it(made, tmp_path):
     """1.5 mm in one drive's zero come back, the controller counting down or not."""
     out = tmp_path / "try"
@@ -160,7 +174,9 @@ def test_without_paper_a_plan_is_chosen(planned):
     assert code == 0, err
     steps = [line.split()[1] for line in err.splitlines()]
     assert list(dict.fromkeys(steps)) == ["computing", "choosing", "search", "comparing", "drawing"]
-    assert re.search(r"Plan: \d+ readings in \d setups?, about 1\d min\.", out)
+    size = r"(\d+) readings \((\d) closing\) in (\d) setups?"
+    read, closing, setups = map(int, re.search(rf"Plan: {size}, about 1\d min\.", out).groups())
+    assert (read, setups) == (len(load_plan(mill / "first").readings), closing)
     assert re.search(
         r"all identified errors corrected: [\d.]+ mm after .*first: [\d.]+ mm; now [\d.]+ mm", out
     )
@@ -325,7 +341,7 @@ def test_invalid_answers_are_asked_for_again(root, tmp_path):
     assert "  the machine does not reach the workspace ±90 mm" in said
     assert "  found '40:30'; expected half the side of a cube" in said
     assert "  found 0 mm; expected more than 0, and at most 100 mm" in said
-    assert "Plan: 24 readings in 6 setups." in said
+    assert "Plan: 24 readings (6 closing) in 6 setups." in said
     robot = load_robot(tmp_path / "mill")
     assert robot.workspace.tolist() == [[-0.05, 0.06], [-0.05, 0.06], [-0.04, 0.04]]
     assert [d.direction for d in robot.drives] == [1, -1, 1]
