@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import typer
 
 import orthocal
-from orthocal.cli.dialogue import USUAL_OFFSET
 from orthocal.cli.files import require_new_files, require_no_readings
 from orthocal.cli.options import (
     Day,
@@ -35,8 +34,8 @@ from orthocal.io.files import exists, read_file, require_plain_name, write_files
 if TYPE_CHECKING:
     from orthocal.builder.build import Counting, Dimensions
 
-USUAL_TOLERANCES = {"*.offset_mm": float(USUAL_OFFSET)}
-"""Tolerances of a new machine: its home switches were never measured."""
+USUAL_OFFSET = 4.0
+"""Tolerance of the zeros of a new machine, whose home switches were never measured, [mm]."""
 
 EFFECTS = "backlash"
 """Effects of a new machine, where none are chosen."""
@@ -130,11 +129,11 @@ def new(
         if asked or workspace_mm is not None:
             robot = _with_workspace(robot, workspace_mm)
         if asked and tolerance is None:
-            tolerance = ask_tolerance()
+            tolerance = ask_tolerance(USUAL_OFFSET)
         if robot.workspace is not None:
             box = tuple((low, high) for low, high in robot.workspace.tolist())
             machine = replace(machine, workspace=box)
-        tolerances = USUAL_TOLERANCES | read_tolerances(tolerance, robot)
+        tolerances = {"*.offset_mm": USUAL_OFFSET} | read_tolerances(tolerance, robot)
         plan, session = _plan(robot, equipment, tolerances, paper=paper, hours=hours, model=model)
         put_note("orthocal: drawing the measuring sheet")
         files = _draw(plan, session)
@@ -149,7 +148,7 @@ def new(
     _report(folder, machine.words, plan, session, files)
     if tolerance is None:
         put_note(
-            f"The zeros of the joints are assumed to be within ±{USUAL_OFFSET} mm. If that is not "
+            f"The zeros of the joints are assumed to be within ±{USUAL_OFFSET:g} mm. If that is not "
             "so: --tolerance '*.offset_mm=10'"
         )
 
