@@ -148,8 +148,8 @@ def new(
     _report(folder, machine.words, plan, session, files)
     if tolerance is None:
         put_note(
-            f"The zeros of the joints are assumed to be within ±{USUAL_OFFSET:g} mm. If that is not "
-            "so: --tolerance '*.offset_mm=10'"
+            f"The zeros of the joints are assumed to be within ±{USUAL_OFFSET:g} mm. Otherwise: "
+            "--tolerance '*.offset_mm=10'"
         )
 
 
