@@ -102,6 +102,20 @@ def test_effects_without_usual_keys_are_refused(tmp_path, effects, message):
     assert not (tmp_path / "mill").exists()
 
 
+def test_zeros_have_one_usual_tolerance(made, tmp_path):
+    """4 mm, with all dimensions as options as in the dialogue; the sheet's limit follows it."""
+    assert load_plan(made / "first").robot.parameters.stated == {"*.offset_mm": 4.0}
+    assert load_robot(made).parameters["z_slide.offset"].prior_std == 2e-3
+    sheet = (made / "first/sheet.html").read_text()
+    assert "differs by more than 7 mm" in sheet  # 4 mm, and half a degree of legs of 250 mm
+    words = [*options(), "--paper", "--tolerance", "x_slide.offset_mm=12"]
+    code, _, err = orthocal("new", tmp_path / "mill", *words)
+    assert (code, err.splitlines()) == (0, ["orthocal: drawing the measuring sheet"])
+    tolerances = {"*.offset_mm": 4.0, "x_slide.offset_mm": 12.0}
+    assert load_plan(tmp_path / "mill/first").robot.parameters.stated == tolerances
+    assert "differs by more than 15 mm" in (tmp_path / "mill/first/sheet.html").read_text()
+
+
 def test_what_is_read_on_it_calibrates_it(made, tmp_path):
     """1.5 mm in one drive's zero come back, the controller counting down or not."""
     out = tmp_path / "try"
@@ -160,7 +174,9 @@ def test_without_paper_a_plan_is_chosen(planned):
     assert code == 0, err
     steps = [line.split()[1] for line in err.splitlines()]
     assert list(dict.fromkeys(steps)) == ["computing", "choosing", "search", "comparing", "drawing"]
-    assert re.search(r"Plan: \d+ readings in \d setups?, about 1\d min\.", out)
+    size = r"(\d+) readings \((\d) closing\) in (\d) setups?"
+    read, closing, setups = map(int, re.search(rf"Plan: {size}, about 1\d min\.", out).groups())
+    assert (read, setups) == (len(load_plan(mill / "first").readings), closing)
     assert re.search(
         r"all identified errors corrected: [\d.]+ mm after .*first: [\d.]+ mm; now [\d.]+ mm", out
     )
@@ -216,14 +232,33 @@ def test_a_workspace_out_of_reach_is_refused_and_nothing_is_written(copied):
     assert files_of(copied) == before
 
 
-def test_a_renamed_directory_is_named(copied):
+def test_a_renamed_directory_works(copied):
+    """machine.yaml is not the robot's; the files keep their names, also if made again."""
+    before = load_robot(copied)
     renamed = copied.rename(copied.with_name("lathe"))
+    assert load_robot(renamed).sha256 == before.sha256
+    assert load_plan(renamed / "first").robot.name == "lathe"
+    names = set(files_of(renamed))
+    file = renamed / "machine.yaml"
+    file.write_text(file.read_text().replace("leg_mm: 250", "leg_mm: 260"))
     code, _, err = orthocal("new", renamed, "--again")
-    assert (code, err) == (
-        2,
-        f"orthocal: {renamed}/lathe.yaml: there is no such file; there is {copied.name}.yaml: was "
-        "the directory renamed?\n",
-    )
+    assert (code, err) == (0, "")
+    assert set(files_of(renamed)) == names
+    assert load_robot(renamed).drive_zero == pytest.approx([0.26] * 3)
+
+
+def test_a_directory_with_files_of_two_robots_is_refused(copied):
+    renamed = copied.rename(copied.with_name("lathe"))
+    (renamed / "other.urdf").write_bytes((renamed / "mill.urdf").read_bytes())
+    code, _, err = orthocal("check", renamed / "first")
+    assert code == 2
+    assert "one URDF file, or one named lathe.urdf; found mill.urdf, other.urdf" in err
+
+
+def test_dimensions_alone_are_no_robot(copied):
+    (copied / "mill.yaml").unlink()
+    code, _, err = orthocal("new", copied, "--again")
+    assert (code, "contains no YAML of a robot beside machine.yaml" in err) == (2, True)
 
 
 def test_entries_of_joints_that_count_down_are_described(made, tmp_path):
@@ -306,7 +341,7 @@ def test_invalid_answers_are_asked_for_again(root, tmp_path):
     assert "  the machine does not reach the workspace ±90 mm" in said
     assert "  found '40:30'; expected half the side of a cube" in said
     assert "  found 0 mm; expected more than 0, and at most 100 mm" in said
-    assert "Plan: 24 readings in 6 setups." in said
+    assert "Plan: 24 readings (6 closing) in 6 setups." in said
     robot = load_robot(tmp_path / "mill")
     assert robot.workspace.tolist() == [[-0.05, 0.06], [-0.05, 0.06], [-0.04, 0.04]]
     assert [d.direction for d in robot.drives] == [1, -1, 1]

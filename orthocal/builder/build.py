@@ -29,8 +29,8 @@ from orthocal.builder.machine_file import (
 from orthocal.effects.loading import load_robot
 from orthocal.effects.registry import find_effect, order_effects
 from orthocal.errors import RobotError
-from orthocal.io.files import exists, read_file, write_files
-from orthocal.robot.loading import packaged_robots
+from orthocal.io.files import read_file, write_files
+from orthocal.robot.loading import find_robot_files, packaged_robots
 from orthocal.robot.model import Robot
 
 __all__ = ["Counting", "Dimensions", "describe_machine", "make_robot", "remake_robot"]
@@ -145,24 +145,24 @@ def remake_robot(folder: Path, *, check: Callable[[Robot], object] | None = None
             place for one of them.
         OrthocalError: If the directory cannot be written.
     """
-    name = folder.resolve().name
     dimensions, counting = read_machine(folder / MACHINE)
-    yaml_file = folder / f"{name}.yaml"
-    if not exists(yaml_file):
-        others = sorted(p.name for p in folder.glob("*.yaml") if p.name != MACHINE)
-        there = f"; there is {', '.join(others[:3])}: was the directory renamed?" if others else ""
-        raise RobotError(f"there is no such file{there}", where=str(yaml_file))
-    description = read_file(yaml_file, error=RobotError).decode("utf-8", "replace")
-    files = describe_machine(dimensions, name=name, counting=counting, description=description)
+    yaml_file = find_robot_files(folder)[0]
+    if yaml_file.name == MACHINE:
+        raise RobotError(f"contains no YAML of a robot beside {MACHINE}", where=str(folder))
+    name, description = yaml_file.stem, read_file(yaml_file, error=RobotError)
+    files = describe_machine(
+        dimensions, name=name, counting=counting, description=description.decode("utf-8", "replace")
+    )
     del files[MACHINE]
     with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
-        write_files(Path(trial) / name, files)
+        place = Path(trial) / folder.resolve().name
+        write_files(place, files)
         try:
-            robot = load_robot(Path(trial) / name)
+            robot = load_robot(place)
             if check is not None:
                 check(robot)
         except RobotError as e:
-            where = None if e.where is None else e.where.replace(f"{trial}/{name}", str(folder))
+            where = None if e.where is None else e.where.replace(str(place), str(folder))
             raise RobotError(e.problem, where=where) from None
     write_files(folder, files)
     return load_robot(folder.resolve())

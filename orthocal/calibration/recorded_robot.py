@@ -178,7 +178,8 @@ def require_calibrated_robot(calibration: CalibrationRecord, session: Session) -
     if session.robot.sha256 != record.sha256:
         raise SessionError(
             f"is of robot '{session.robot.name}'; the calibration is of another, or of another "
-            f"version of '{record.name}'",
+            f"version of '{record.name}'. If the files of the robot have changed since, calibrate "
+            "again",
             where=None if session.path is None else str(session.path),
         )
 

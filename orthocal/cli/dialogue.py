@@ -27,9 +27,6 @@ AXES = "xyz"
 
 Answer = TypeVar("Answer")
 
-USUAL_OFFSET = "4"
-"""Proposed tolerance of the home switches, [mm]."""
-
 LARGEST_OFFSET = 100.0
 """Largest tolerance of the home switches, [mm]."""
 
@@ -151,15 +148,18 @@ def _length(text: str, option: str) -> float:
     return read_number(text, option) * MM
 
 
-def ask_tolerance() -> list[str]:
+def ask_tolerance(usual: float) -> list[str]:
     """Tolerance of the drives' offsets, as values of --tolerance.
+
+    Args:
+        usual: The usual one, [mm].
 
     Raises:
         ParameterError: If the input ends.
     """
 
     def read(text: str) -> list[str]:
-        size = _length(text or USUAL_OFFSET, "--tolerance") / MM
+        size = _length(text or f"{usual:g}", "--tolerance") / MM
         if not 0.0 < size <= LARGEST_OFFSET:
             raise ParameterError(
                 f"found {size:g} mm; expected more than 0, and at most {LARGEST_OFFSET:g} mm"
@@ -168,7 +168,7 @@ def ask_tolerance() -> list[str]:
 
     return _ask_until_valid(
         "By how much may the zeros of the joints be off, ± limit in mm? Enter alone: "
-        f"{USUAL_OFFSET}, usual for home switches that were never measured",
+        f"{usual:g}, usual for home switches that were never measured",
         "--tolerance",
         read,
     )

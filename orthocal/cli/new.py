@@ -34,6 +34,9 @@ from orthocal.io.files import exists, read_file, require_plain_name, write_files
 if TYPE_CHECKING:
     from orthocal.builder.build import Counting, Dimensions
 
+USUAL_OFFSET = 4.0
+"""Tolerance of the zeros of a new machine, whose home switches were never measured, [mm]."""
+
 EFFECTS = "backlash"
 """Effects of a new machine, where none are chosen."""
 
@@ -72,7 +75,8 @@ def new(
 ) -> None:
     """Make a machine of your dimensions, a first plan and its sheet.
 
-    Missing dimensions are asked for at a terminal.
+    Missing dimensions are asked for at a terminal. Without --tolerance the zeros of the joints may
+    be off by up to 4 mm.
 
     Exit code 3 with --again: an existing plan no longer fits the changed machine.
 
@@ -125,11 +129,11 @@ def new(
         if asked or workspace_mm is not None:
             robot = _with_workspace(robot, workspace_mm)
         if asked and tolerance is None:
-            tolerance = ask_tolerance()
+            tolerance = ask_tolerance(USUAL_OFFSET)
         if robot.workspace is not None:
             box = tuple((low, high) for low, high in robot.workspace.tolist())
             machine = replace(machine, workspace=box)
-        tolerances = read_tolerances(tolerance, robot)
+        tolerances = {"*.offset_mm": USUAL_OFFSET} | read_tolerances(tolerance, robot)
         plan, session = _plan(robot, equipment, tolerances, paper=paper, hours=hours, model=model)
         put_note("orthocal: drawing the measuring sheet")
         files = _draw(plan, session)
@@ -142,6 +146,11 @@ def new(
     session = replace(session, robot=robot, robot_reference=str(folder.resolve()))
     orthocal.write_session(session, folder / FIRST, comment=COMMENT, extra=files, blank=True)
     _report(folder, machine.words, plan, session, files)
+    if tolerance is None:
+        put_note(
+            f"The zeros of the joints are assumed to be within ±{USUAL_OFFSET:g} mm. Otherwise: "
+            "--tolerance '*.offset_mm=10'"
+        )
 
 
 def _make_trial(
@@ -264,9 +273,9 @@ def _report(
 ) -> None:
     """Print the expected tool error, the files and the next commands."""
     from orthocal.output.text.layout import counted
-    from orthocal.output.text.plan import describe_expected, show_duration
+    from orthocal.output.text.plan import describe_expected, describe_size, show_duration
 
-    size = f"{counted(len(session.readings), 'reading')} in {counted(len(session.setups), 'setup')}"
+    size = describe_size(session)
     lines = [f"Plan: {size}."]
     if plan is not None:
         lines = [

@@ -477,7 +477,8 @@ class SymbolicErrorMap:
     """Placements and drives of a machine as expressions of scaled parameters θ̂.
 
     The choice of free parameters is a matrix of constants; the CasADi function of one placement is
-    mapped over all of them.
+    mapped over all of them. Placements that may depend on conditions are apart from the others,
+    which are then evaluated once for all conditions.
 
     Args:
         errors: The robot's error map.
@@ -485,36 +486,48 @@ class SymbolicErrorMap:
         columns: Elementary errors of one unit of each θ̂, shape (n_errors, n_free).
 
     Attributes:
-        placements: Symbol of the moved placements, shape (12 n_moved,).
-        symbols: θ̂, placements and the nonzeros of ∂ξ/∂θ̂: the inputs of posture and reading
-            functions.
-        function: θ̂ and conditions to the values of the symbols.
+        placements: The moved placements, shape (12 n_moved,).
+        symbols: θ̂; placements and the nonzeros of ∂ξ/∂θ̂ of those that do not vary; the same of
+            those that do: the inputs of posture and reading functions.
         digest: Digest of the numbers that are constants here.
     """
 
     def __init__(self, errors: ErrorMap, *, fixed: Array, columns: Array) -> None:
-        n_moved, n_free = len(errors.moved), columns.shape[1]
         self.digest = hashlib.sha256(fixed.tobytes() + columns.tobytes()).hexdigest()
-        at, conditions = ca.MX.sym("theta", n_free), ca.MX.sym("conditions", errors.n_conditions)
-        by_theta = ca.MX(ca.sparsify(ca.DM(columns)))
-        twists, by_errors = errors.twists(conditions, ca.DM(fixed) + by_theta @ at)
-        values, right = ca.MX(12, 0), ca.MX(27, 0)
-        if n_moved:
-            mapped = _moved_placement().map(n_moved)
-            values, right = mapped(ca.reshape(twists, 6, n_moved), ca.DM(errors.nominal.T))
-        blocks = ca.diagcat(*[_right_jacobian_sparsity()] * n_moved)
-        by_twists = ca.MX(blocks, ca.vec(right)) @ (by_errors @ by_theta)
-        self.function = ca.Function(
-            "error_map", [at, conditions], [at, ca.densify(ca.vec(values)), by_twists.nz[:]]
-        )
-        theta = ca.SX.sym("theta", n_free)
-        twist_jacobian = ca.SX.sym("twist_jacobian", by_twists.sparsity())
-        self.placements = ca.SX.sym("placements", 12 * n_moved)
-        self.symbols = (theta, self.placements, twist_jacobian.nz[:])
-        self._twist_jacobian = twist_jacobian
+        varying = errors.varying
+        others = np.setdiff1d(np.arange(len(errors.moved)), varying)
+        theta = ca.SX.sym("theta", columns.shape[1])
+        symbols, jacobians = [theta], []
+        self._functions = []
+        for chosen in (others, varying):
+            function, sparsity = _moved_placements(errors, chosen, fixed=fixed, columns=columns)
+            jacobians.append(ca.SX.sym("twist_jacobian", sparsity))
+            symbols += [ca.SX.sym("placements", 12 * chosen.size), jacobians[-1].nz[:]]
+            self._functions.append(function)
+        self.symbols = tuple(symbols)
+        place = np.argsort(np.concatenate([others, varying]))
+
+        def ordered(parts: list[ca.SX], size: int) -> ca.SX:
+            rows = (size * place[:, None] + np.arange(size)).reshape(-1)
+            return ca.vertcat(*parts)[rows.tolist(), :]
+
+        self.placements = ordered([symbols[1], symbols[3]], 12)
+        self._twist_jacobian = ordered(jacobians, 6)
         chosen = errors.drive_errors
         self._drives = errors.drives
         self._drive_errors = ca.SX(fixed[chosen]) + ca.sparsify(ca.SX(columns[chosen])) @ theta
+
+    def values(self, theta: ca.MX, conditions: Array) -> list[ca.MX]:
+        """Values of the symbols: one column, or one for each of V > 1 conditions if they vary.
+
+        Args:
+            theta: θ̂, shape (n_free,).
+            conditions: Conditions of a command, shape (V, n_conditions).
+        """
+        others, varying = self._functions
+        count = len(conditions)
+        under = varying if count == 1 else varying.map(count, [True, False], [False, False])
+        return [theta, *others(theta, ca.DM(conditions[0])), *under(theta, ca.DM(conditions.T))]
 
     def actuated(self, command: ca.SX) -> ca.SX:
         """Actual drive coordinates of a command, shape (n_drives,), [m, rad]."""
@@ -526,6 +539,40 @@ class SymbolicErrorMap:
         return by_twists @ self._twist_jacobian + by_actuated @ by_theta
 
 
+def _moved_placements(
+    errors: ErrorMap, chosen: Indices, *, fixed: Array, columns: Array
+) -> tuple[ca.Function, ca.Sparsity]:
+    """Function of θ̂ and conditions: some placements and the nonzeros of their ∂ξ/∂θ̂.
+
+    Args:
+        errors: The robot's error map.
+        chosen: Indices of the moved placements, shape (n,).
+        fixed: As for `SymbolicErrorMap`.
+        columns: As for `SymbolicErrorMap`.
+
+    Returns:
+        The function, and the sparsity of ∂ξ/∂θ̂, shape (6 n, n_free).
+    """
+    at, conditions = ca.MX.sym("theta", columns.shape[1]), ca.MX.sym("u", errors.n_conditions)
+    rows = (6 * chosen[:, None] + np.arange(6)).reshape(-1).tolist()
+    symbols = errors.twists.sx_in()
+    outputs = [v[rows, :] for v in errors.twists(*symbols)]
+    twists = ca.Function("twists", symbols, outputs)
+    by_theta = ca.MX(ca.sparsify(ca.DM(columns)))
+    delta, by_errors = twists(conditions, ca.DM(fixed) + by_theta @ at)
+    values, right = ca.MX(12, 0), ca.MX(27, 0)
+    if chosen.size:
+        mapped = _moved_placement().map(chosen.size)
+        values, right = mapped(ca.reshape(delta, 6, -1), ca.DM(errors.nominal[chosen].T))
+    blocks = ca.diagcat(ca.Sparsity(0, 0), *[_right_jacobian_sparsity()] * chosen.size)
+    by_twists = ca.MX(blocks, ca.vec(right)) @ (by_errors @ by_theta)
+    function = ca.Function(
+        "error_map", [at, conditions], [ca.densify(ca.vec(values)), by_twists.nz[:]]
+    )
+    return function, by_twists.sparsity()
+
+
+@lru_cache(maxsize=1)
 def _right_jacobian_sparsity() -> ca.Sparsity:
     """Nonzeros of T: rotations of a placement do not depend on translations."""
     return right_jacobian(ca.SX.sym("twist", 6)).sparsity()

@@ -85,9 +85,10 @@ class MeasuringPlan:
     criterion: Criterion
     minutes: float
     known: Expected
-    """Expected error before: from the priors of the machine, and from measured readings."""
+    """Expected error before: from the priors of the machine; of a session, after its readings."""
     expected: Expected
-    """Expected error after, with offsets that are near those that the controller corrects."""
+    """Expected error after, with offsets that are near those that the controller corrects; with
+    readings of a session without active offsets, with offsets anywhere within tolerances."""
     first_round: Expected
     """The same with offsets anywhere within their tolerances."""
     compared: tuple[Alternative, ...]
@@ -101,6 +102,8 @@ class MeasuringPlan:
     equipment: Equipment
     candidates: int
     """Number of candidate readings."""
+    complements: bool
+    """Whether the readings complement those of a session."""
     effects: tuple[EffectLimits, ...] = ()
     """Limits of the effects beside geometry, before and after."""
 
@@ -282,10 +285,14 @@ def _evaluate(
                 lambda: compute_curve(search, each, setups, comparison.equipment),
                 comparison.list_alternatives,
                 comparison.list_usual_plans,
-                lambda: forecast.after(joined),
+                lambda: forecast.after(joined, entered=comparison.entered),
                 lambda: forecast.after(joined, entered=False),
                 lambda: forecast.about_nominal(joined),
-                lambda: forecast.before if measured is None else forecast.after(measured),
+                lambda: (
+                    forecast.before
+                    if measured is None
+                    else forecast.after(measured, entered=comparison.entered)
+                ),
                 lambda: find_limits(forecast.problem(joined), noise_of(joined)),
             ),
             killed=KILLED,
@@ -306,6 +313,7 @@ def _evaluate(
         curve=scale_curve(curve, factor, remainder),
         equipment=comparison.equipment,
         candidates=len(comparison.candidates.session.readings),
+        complements=measured is not None,
         effects=limits,
     )
 

@@ -48,6 +48,14 @@ class Comparison:
     forecast: ToolForecast
     measured: Session | None
 
+    @property
+    def entered(self) -> bool:
+        """Whether identified offsets are entered before the readings are taken.
+
+        A session is complemented under its own offsets.
+        """
+        return self.measured is None or bool(np.any(self.measured.active_offsets))
+
     def list_usual_plans(self) -> tuple[Alternative, ...]:
         """Usual plans with as many setups and readings.
 
@@ -89,7 +97,7 @@ class Comparison:
     def _assess(self, name: str, session: Session, *, in_range: bool = True) -> Alternative:
         whole = session if self.measured is None else join_sessions([self.measured, session])
         minutes = self.equipment.minutes(len(session.setups), len(session.readings))
-        expected = self.forecast.after(whole) if in_range else None
+        expected = self.forecast.after(whole, entered=self.entered) if in_range else None
         return Alternative(name, len(session.setups), len(session.readings), minutes, expected)
 
     def _middle_setups(self) -> list[CandidateSetup]:

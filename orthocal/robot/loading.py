@@ -135,7 +135,7 @@ def _load_folder(folder: Path) -> Robot:
 
 def _read_folder(folder: Path) -> tuple[Path, Path, tuple[bytes, bytes]]:
     """URDF and YAML of a robot directory, and their contents."""
-    yaml_path, urdf_path = _find_files(folder)
+    yaml_path, urdf_path = find_robot_files(folder)
     urdf, yaml = (read_file(p, error=RobotError) for p in (urdf_path, yaml_path))
     return urdf_path, yaml_path, (urdf, yaml)
 
@@ -194,21 +194,31 @@ def _build_robot(
     return replace(robot, legs=_build_legs(robot, keys, where))
 
 
-def _find_files(folder: Path) -> tuple[Path, Path]:
-    """YAML and URDF of a robot directory: those with its name, or the only ones."""
-    paths = []
-    for suffix in (".yaml", ".urdf"):
-        preferred = folder / f"{folder.resolve().name}{suffix}"
-        files = [preferred] if preferred.is_file() else sorted(folder.glob(f"*{suffix}"))
-        if len(files) != 1:
-            names = ", ".join(f.name for f in files) or "none"
-            raise RobotError(
-                f"expected one {suffix[1:].upper()} file, or one named {preferred.name}; found "
-                f"{names}",
-                where=str(folder),
-            )
-        paths.append(files[0])
-    return paths[0], paths[1]
+def find_robot_files(folder: Path) -> tuple[Path, Path]:
+    """YAML and URDF of a robot directory.
+
+    They have the name of the directory. If the directory was renamed, its only URDF counts, and the
+    YAML of the same name.
+
+    Raises:
+        RobotError: If it is not clear which files are meant.
+    """
+    urdf = _find_file(folder, ".urdf", folder.resolve().name)
+    return _find_file(folder, ".yaml", folder.resolve().name, urdf.stem), urdf
+
+
+def _find_file(folder: Path, suffix: str, *names: str) -> Path:
+    """File with the first of the names that exists, or the only one."""
+    preferred = [folder / f"{name}{suffix}" for name in names]
+    files = [p for p in preferred if p.is_file()][:1] or sorted(folder.glob(f"*{suffix}"))
+    if len(files) != 1:
+        found = ", ".join(f.name for f in files) or "none"
+        raise RobotError(
+            f"expected one {suffix[1:].upper()} file, or one named {preferred[-1].name}; found "
+            f"{found}",
+            where=str(folder),
+        )
+    return files[0]
 
 
 def _has_zero(keys: RobotKeys, motor: str) -> bool:

@@ -20,6 +20,8 @@ from tolerances import KINEMATICS, SAME_OPTIMUM
 
 from orthocal import load_robot, load_session
 from orthocal.estimation.choice import Choice
+from orthocal.estimation.fit import build_program
+from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
@@ -82,14 +84,16 @@ nothing of the tool. 8 to 12 were measured on a busy machine."""
 LINEARISED = 4.0
 """The same of machines that are off by offsets, identified in six ways. 7 to 8 were measured."""
 
-WITH_EFFECTS = 2.5
+WITH_EFFECTS = {"ipopt": 2.4, "variable-projection": 2.2}
 """Full model with all effects over that without, 162 readings approached from both sides at six
-temperatures, by variable projection, building included. 1.8 to 2.0 were measured: there are twice
-as many loop closures."""
+temperatures, building included. 1.9 to 2.0 and 1.6 to 1.8 were measured: there are twice as many
+loop closures, and Ipopt takes one or two iterations more because backlash has a bound. With all
+placements evaluated for each temperature, and a monotone barrier, Ipopt took 3.4."""
 
-OWN_TEMPERATURES = 3.0
-"""The same with a temperature of its own for every reading, over one for all. 1.6 to 2.1 were
-measured: there are three times as many loop closures."""
+OWN_TEMPERATURES = {"ipopt": 4.0, "variable-projection": 3.0}
+"""The same with a temperature of its own for every reading, over one for all. 2.5 to 2.9 and 1.6 to
+2.1 were measured: there are three times as many loop closures. With all placements evaluated for
+each temperature Ipopt took 5.6."""
 
 SHARE_AGAIN = 0.3
 """Of building all and solving, for solving again. 0.17 to 0.24 were measured: building takes half
@@ -310,23 +314,27 @@ def with_conditions(session, robot, temperatures):
     return replace(session, robot=robot, readings=readings)
 
 
-def test_effects_take_little_more_than_geometry(session, tmp_path, record):
+def test_effects_take_little_more_than_geometry(session, tmp_path, solver, record):
     keys = "backlash: {}, thermal: {}, screw: {lead_mm: 5}, drift: {}"
     robot = load_robot(write_robot(tmp_path / "machine", keys))
     assert len(session.readings) == 162
 
     def seconds(of):
         def solve():
-            VariableProjection(build_problem(of, model="full")).solve(sigma=SIGMA)
+            problem = build_problem(of, model=MODEL)
+            build_program(problem, SolverOptions(solver=solver)).solve(sigma=SIGMA)
 
         return fastest(solve)
 
+    def measured(temperatures):
+        return cases.resimulate(with_conditions(session, robot, temperatures), seed=1)
+
     plain = seconds(session)
-    one, six, own = (seconds(with_conditions(session, robot, n)) for n in (1, 6, 162))
+    one, six, own = (seconds(measured(n)) for n in (1, 6, 162))
     record("with_effects", six / plain)
     record("own_temperatures", own / one)
-    assert six < WITH_EFFECTS * plain
-    assert own < OWN_TEMPERATURES * one
+    assert six < WITH_EFFECTS[solver] * plain
+    assert own < OWN_TEMPERATURES[solver] * one
 
 
 def growth(measured, figure):

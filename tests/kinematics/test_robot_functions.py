@@ -96,8 +96,12 @@ def test_a_choice_of_parameters_as_expressions_is_the_same_in_numbers(request, n
     theta = 1e-2 * rng.normal(size=len(free))
     at, slopes = fixed + columns @ theta, errors.jacobian(fixed + columns @ theta, columns)
     _, d, q = _draw(robot, 0.0)
-    values = [np.asarray(v.full()).reshape(-1) for v in chosen.function(theta, [])]
-    assert np.abs(values[1] - errors.placements(at)).max() < KINEMATICS
+    neutral = errors.command(robot.drive_zero)[None, len(robot.drives) :]
+    at_theta = ca.Function("values", [], chosen.values(ca.MX(ca.DM(theta)), neutral))
+    values = [np.asarray(v.full()).reshape(-1) for v in at_theta.call([])]
+    arranged = ca.Function("placements", list(chosen.symbols), [chosen.placements])
+    placements = np.asarray(arranged(*values).full()).reshape(-1)
+    assert np.abs(placements - errors.placements(at)).max() < KINEMATICS
 
     drives = ca.SX.sym("drives", len(robot.drives))
     passive = ca.SX.sym("passive", robot.passive_index.size)
@@ -112,7 +116,7 @@ def test_a_choice_of_parameters_as_expressions_is_the_same_in_numbers(request, n
     actuated, by_theta = (np.asarray(v.full()) for v in function(d, q, *values))
     assert np.abs(actuated[:, 0] - errors.geometry(at).drives(d)).max() < KINEMATICS
     _, g_a, _, g_t = _derivatives(
-        functions, errors.geometry(at).drives(d)[None], q[None], values[1]
+        functions, errors.geometry(at).drives(d)[None], q[None], placements
     )
     _, by_drive_errors = errors.geometry(at).drive_derivatives(d)
     expected = g_t @ slopes + g_a @ by_drive_errors @ columns[errors.drive_errors]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -36,7 +37,8 @@ def test_a_plan_is_written_ready_to_measure(tmp_path):
     words = ["plan", "orthoglide", *QUICK, *entered, "--gauge", dial, "--out", out]
     code, text, err = run_orthocal(".", *words)
     assert code == 0
-    assert "18 readings in 6 setups, about 72 min" in text
+    assert "24 readings (6 closing) in 6 setups, about 72 min" in text
+    assert re.search(r"this plan +6 +24 ", text)
     assert len(text.splitlines()) <= 45
     assert {p.name for p in out.iterdir()} == {
         *("session.yaml", "readings.csv", "plan.json", "plan.svg", "sheet.html"),
@@ -122,6 +124,12 @@ def test_further_setups_of_a_session_are_planned(root):
     found = json.loads(text)
     assert found["setups"] == 2
     assert found["expected"]["aligned_um"] < found["before"]["aligned_um"]
+    code, text, _ = run_orthocal(".", "plan", session, "--add", 2, *QUICK)
+    said = " ".join(text.split())
+    words = r"([\d.]+) mm with these readings added \(([\d.]+) mm with those of the session alone\)"
+    after, before = map(float, re.search(words, said).groups())
+    assert after < before
+    assert "now" not in said.partition("Beyond")[0]
 
 
 def test_the_same_seed_gives_the_same_plan_in_python(orthoglide):

@@ -51,6 +51,10 @@ COMPLEMENTARITY = 1e-11
 """Largest product of a bound's multiplier and the distance to it, both scaled. A parameter closer
 to its bound than the square root of this counts as at it: 16 nm for a tolerance of 10 mm."""
 
+LARGEST_BARRIER = 1e-3
+"""Largest barrier parameter. The first step of squares is nearly the solution, so that a larger
+barrier only delays convergence: the parameters and the objective are of order one."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expressions:
@@ -321,6 +325,9 @@ class NonlinearProgram(Program):
             "nlp_scaling_method": "none",  # everything is of order one already
             "linear_solver": "mumps",
             "mumps_pivot_order": 6,  # QAMD, made for a few dense rows: the parameters
+            # with bounds: two thirds of the iterations of the monotone strategy
+            "mu_strategy": "adaptive",
+            "mu_max": LARGEST_BARRIER,
             **_plain(self.options.ipopt),
         }
         _require_accepted(self.options.ipopt)

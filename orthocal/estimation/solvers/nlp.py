@@ -139,13 +139,11 @@ class ProgramFunctions:
     def _shared_calls(self, theta: ca.MX) -> list[ca.MX]:
         """Functions of θ̂ alone, evaluated once for all states and readings.
 
-        The first is θ̂ itself. The others have a column for each variant of the placements.
+        The first is θ̂ itself. Those of placements that vary have a column for each variant.
         """
         commands = self.problem.states.variant_commands
         conditions = commands[:, len(self.problem.robot.drives) :]
-        function = self._symbolic.error_map.function
-        calls = [function(theta, ca.DM(values)) for values in conditions]
-        return [theta, *(ca.horzcat(*column) for column in list(zip(*calls, strict=True))[1:])]
+        return self._symbolic.error_map.values(theta, conditions)
 
     def _shared_arguments(
         self, shared: list[ca.MX], states: Indices

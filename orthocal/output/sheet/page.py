@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Collection, Sequence
 from importlib import resources
@@ -32,7 +33,7 @@ from orthocal.output.sheet.pictures import draw_machine, draw_section
 from orthocal.output.text.layout import counted, true_minus
 from orthocal.robot.model import Robot
 from orthocal.session.session import Gauge, Session
-from orthocal.units import DRIVE_UNITS, MM, format_fixed
+from orthocal.units import DRIVE_UNITS, LIMIT, MM, format_fixed
 from orthocal.viewer.visuals import load_visuals
 
 SHEET = "sheet.html"
@@ -44,6 +45,9 @@ END = (
     "gauge and jog the machine to its mechanical zero."
 )
 """What to do after the readings of a setup."""
+
+BY_EYE = 0.01
+"""Angle between a leg and its axis that the eye does not see: half a degree, [rad]."""
 
 VISIBLE = 5e-5
 """Smallest distance that the sheet mentions and smallest deflection that a dial shows, [m]."""
@@ -110,9 +114,9 @@ def _front(
         "Warm the machine up. Home it once. Do not home it again until all readings are taken.",
         "Move the machine to its mechanical zero: each leg parallel to its axis, by eye. The "
         f"controller must show about {_joint_list(robot, robot.drive_zero)}. {normal}If a number "
-        "differs by more than 10 mm, a dimension or the direction of counting is wrong: correct it "
-        "in machine.yaml (`orthocal new DIRECTORY --again`) or in the robot's YAML. Travel of the "
-        f"joints: {'; '.join(_travel(session))}.",
+        f"differs by more than {_largest_difference(robot)}, a dimension or the direction of "
+        "counting is wrong: correct it in machine.yaml (`orthocal new DIRECTORY --again`) or in "
+        f"the robot's YAML. Travel of the joints: {'; '.join(_travel(session))}.",
         f"Jog each slide a little outwards. Its number must {_count_outwards(robot)}.",
         _active_offsets(session),
         "Check each rod and each hinge for play. The calibration does not remove play.",
@@ -141,6 +145,22 @@ def _front(
         + table(headers, rows, left=3)
         + (_programs(options) if with_programs else "")
     )
+
+
+def _largest_difference(robot: Robot) -> str:
+    """Largest difference of a joint's number in the mechanical zero that errors explain.
+
+    The tolerance of its offset, and what the eye does not see.
+    """
+    leg = max((leg.length for leg in robot.legs.values()), default=0.0)
+    largest: dict[str, float] = {}
+    for drive in robot.drives:
+        unit, size = DRIVE_UNITS[drive.unit]
+        unseen = BY_EYE * (leg if drive.unit == "m" else 1.0)
+        offset = robot.parameters[f"{drive.name}.offset"]
+        limit = math.ceil((LIMIT * offset.prior_std + unseen) / size)
+        largest[unit] = max(largest.get(unit, 0), limit)
+    return " or ".join(f"{limit} {unit}" for unit, limit in largest.items())
 
 
 def _programs(options: ProgramOptions | None) -> str:

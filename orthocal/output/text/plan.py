@@ -24,7 +24,7 @@ from orthocal.planning.expected_error import Criterion, Expected
 from orthocal.planning.plan import MeasuringPlan
 from orthocal.planning.plan_comparison import Alternative
 from orthocal.robot.model import Robot
-from orthocal.session.session import Reading
+from orthocal.session.session import Reading, Session
 from orthocal.units import EDGE_UNITS, MM, UM
 
 FORMS: dict[Criterion, str] = {
@@ -64,19 +64,17 @@ OUT_OF_RANGE = "beyond the dial's range"
 def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType:
     """Plan as rich renderables, its expected tool error first."""
     s, robot = plan.session, plan.session.robot
-    read, closing = _counts(plan)
     remaining = describe_remaining(plan.find_remaining()) if details else []
     parts: list[RenderableType] = [
         Text(
-            f"Plan for {robot.name}, model {plan.forecast.selection.label}: "
-            f"{counted(read, 'reading')} in {counted(len(s.setups), 'setup')}, about "
-            f"{show_duration(plan.minutes)}",
+            f"Plan for {robot.name}, model {plan.forecast.selection.label}: {describe_size(s)}, "
+            f"about {show_duration(plan.minutes)}",
             style="bold",
         ),
         Text(),
         *map(Text, describe_expected(plan)),
         Text(_when_enough(plan)),
-        section("Other plans in the same time", _alternatives(plan, closing)),
+        section("Other plans in the same time", _alternatives(plan)),
         section("Other gauges", bullets(_helps(plan))),
         *([section("Largest contributions", bullets(remaining))] if remaining else []),
         section("Setups", _setups(plan)),
@@ -85,13 +83,23 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
     return Group(*parts)
 
 
+def describe_size(session: Session) -> str:
+    """Numbers of readings and setups of a plan; readings are counted as on its sheet."""
+    closing = sum(r.cycle > 1 for r in session.readings)
+    words = f" ({closing} closing)" if closing else ""
+    readings, setups = len(session.readings), len(session.setups)
+    return f"{counted(readings, 'reading')}{words} in {counted(setups, 'setup')}"
+
+
 def describe_expected(plan: MeasuringPlan) -> list[str]:
     """Expected tool error with its conditions, and the readings that are impossible at first."""
     first, workspace = plan.first_round, plan.forecast.workspace
     expected, before, now = (tool_mm(e.reported.rms) for e in (plan.expected, first, plan.known))
+    condition = f"after the second measurement (first: {before}; now {now})"
+    if plan.complements:
+        condition = f"with these readings added ({now} with those of the session alone)"
     lines = [
-        f"Expected tool error with all identified errors corrected: {expected} after the second "
-        f"measurement (first: {before}; now {now}).",
+        f"Expected tool error with all identified errors corrected: {expected} {condition}.",
         describe_aligned(workspace.words, stated_use(plan.forecast.robot)),
     ]
     if first.lost > SOME_LOST:
@@ -112,7 +120,7 @@ def _describe_limits(effect: EffectLimits) -> str:
         before, after = (f"{v / factor:.2g} {words}" for v in (effect.before, effect.after))
     name = f"{effect.words[:1].upper()}{effect.words[1:]}"
     if effect.after < DETERMINED * effect.before:
-        return f"{name}: known to ±{after} after these readings (now ±{before})."
+        return f"{name}: known to ±{after} after these readings (tolerance ±{before})."
     return f"{name}: these readings do not determine it; it keeps its tolerance of ±{before}."
 
 
@@ -245,16 +253,14 @@ def _when_enough(plan: MeasuringPlan) -> str:
     )
 
 
-def _alternatives(plan: MeasuringPlan, closing: int) -> RenderableType:
+def _alternatives(plan: MeasuringPlan) -> RenderableType:
     s = plan.session
-    read = len(s.readings) - closing
-    this = Alternative("this plan", len(s.setups), read, plan.minutes, plan.expected)
+    this = Alternative("this plan", len(s.setups), len(s.readings), plan.minutes, plan.expected)
     rows = []
     for a in (this, *plan.compared):
         error = OUT_OF_RANGE if a.expected is None else show_um(a.expected)
-        count = f"{read} + {closing}" if a is this else str(a.readings)
         name = EVENLY if a.name == "even" else a.name
-        rows.append((name, str(a.setups), count, show_duration(a.minutes), error))
+        rows.append((name, str(a.setups), str(a.readings), show_duration(a.minutes), error))
     headers = ("plan", "setups", "readings", "time", "tool error [µm]")
     return table_of(headers, rows)
 
