@@ -32,7 +32,7 @@ from orthocal.output.text.layout import counted, typeset
 from orthocal.robot.model import Robot, coordinate_units
 from orthocal.robot.reference_posture import count_free_motions
 from orthocal.session.session import Session
-from orthocal.units import MM
+from orthocal.units import DRIVE_UNITS, MM
 from orthocal.viewer.machine import MachineScene
 from orthocal.viewer.motion import (
     Timeline,
@@ -151,10 +151,11 @@ def _draw_robot(robot: Robot, posture: str | None) -> Scene:
 
 
 def _state_zero(robot: Robot) -> list[str]:
-    """Facts about the mechanical zero and about free motions there."""
+    """Facts about the mechanical zero, as the controller counts, and about free motions there."""
     drives = ", ".join(
-        f"{d.name} {d.zero * (1e3 if d.unit == 'm' else 1.0):g} {'mm' if d.unit == 'm' else 'rad'}"
+        f"{d.name} {float(d.to_joint(d.zero)) / size + 0.0:.6g} {unit}"
         for d in robot.drives
+        for unit, size in [DRIVE_UNITS[d.unit]]
     )
     facts = [f"Mechanical zero: {drives}."]
     computed = [d.name for d in robot.drives if d.zero_computed]
