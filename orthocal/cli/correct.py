@@ -376,11 +376,14 @@ def _describe_backlash(result: orthocal.Calibration, lags: Array, *, taken_up: b
 def _describe_controller(
     result: orthocal.Calibration, values: Iterable[float], *, active: bool
 ) -> str:
+    from orthocal.assessment.assess import assessment_of
+
     listed = []
     for drive, value in zip(result.robot.drives, values, strict=True):
         unit, size = DRIVE_UNITS[drive.unit]
         listed.append(f"{drive.name} {format_fixed(float(value) / size, 3, sign=True)} {unit}")
-    state = "active during the measurement" if active else "to enter"
+    keep = assessment_of(result).keeps_offsets
+    state = "active during the measurement" if active else "that stay" if keep else "to enter"
     if result.session.controller_offsets is None:
         state += " (in addition to those that were active during the measurement)"
     return f"For a controller with the offsets {state}: {', '.join(listed)}."

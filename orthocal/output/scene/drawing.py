@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocal.arrays import Array
+from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, ParameterError
@@ -241,9 +242,9 @@ def _draw_calibration(
         for e in find_entries(calibration)
     )
     if entries:
-        scene.facts.insert(
-            0, f"Offsets to enter: {entries}. Each leg leans by the offsets of all drives."
-        )
+        keep = assessment_of(calibration).keeps_offsets
+        which = "Offsets that stay as they are" if keep else "Offsets to enter"
+        scene.facts.insert(0, f"{which}: {entries}. Each leg leans by the offsets of all drives.")
     _finish(scene, calibration.session.source, stops, left_out)
     return scene
 
