@@ -14,14 +14,17 @@ INSTALLED = $(VENV)/.installed
 TESTED = $(VENV)/.installed-test
 DOCUMENTED = $(VENV)/.installed-docs
 
-.PHONY: calibrate test smoke check docs clean
+.PHONY: calibrate test benchmarks smoke check docs clean
 
 calibrate: $(INSTALLED)
 	$(VENV)/bin/orthocal calibrate $(SESSION) --out out/$(notdir $(SESSION))
 
-test: $(TESTED) check
+test: $(TESTED)
+	$(MAKE) --jobs 2 --output-sync check benchmarks
 	$(VENV)/bin/python -m pytest --numprocesses $(WORKERS) --dist worksteal --ignore tests/benchmarks
-	$(VENV)/bin/python -m pytest tests/benchmarks  # by themselves: they compare times
+
+benchmarks: $(TESTED)  # not among the other tests: they compare times
+	$(VENV)/bin/python -m pytest tests/benchmarks
 
 check: $(TESTED)
 	$(VENV)/bin/ruff check .

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,38 +43,45 @@ def find_pythons() -> dict[tuple[int, int], Path]:
     return pythons
 
 
-def run_lane(python: Path, *, resolution: str) -> None:
-    """Install orthocal into a new environment and run the smoke tests there."""
+def run(command: list[str | Path], *, env: dict[str, str] | None = None) -> str:
+    """What a command prints, on both streams."""
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    return subprocess.run(command, check=True, text=True, cwd=ROOT, env=env, **streams).stdout
+
+
+def run_lane(python: Path, *, resolution: str) -> str:
+    """Install orthocal into a new environment, run the smoke tests there, and return the report."""
     uv = [sys.executable, "-m", "uv", "--quiet"]
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="orthocal-smoke-") as directory:
         environment = Path(directory) / "environment"
         inside = environment / "bin/python"
-        subprocess.run([*uv, "venv", "--python", python, environment], check=True)
+        run([*uv, "venv", "--python", python, environment])
         install = [*uv, "pip", "install", "--python", inside, "--resolution", resolution]
         tools = ["pytest>=8.0", "pytest-timeout>=2.3"]
-        subprocess.run([*install, "--editable", ROOT, *tools], check=True)
+        run([*install, "--editable", ROOT, *tools])
         cache = {**os.environ, "ORTHOCAL_CACHE": str(Path(directory) / "cache")}
         # Python shows no user the deprecations within libraries
         options = ["-q", "-p", "no:cacheprovider", "-W", "ignore::DeprecationWarning"]
-        tests = [inside, "-m", "pytest", *options, *TESTS]
-        subprocess.run(tests, check=True, cwd=ROOT, env=cache)
-    print(f"{python} with {resolution} versions: {time.monotonic() - began:.0f} s", flush=True)
+        said = run([inside, "-m", "pytest", *options, *TESTS], env=cache)
+    return f"{said}{python} with {resolution} versions: {time.monotonic() - began:.0f} s"
 
 
 def main() -> None:
-    """Run all lanes; the exit code is that of the first that fails."""
+    """Run all lanes, one on each core; the exit code is that of the first that fails."""
     pythons = find_pythons()
     lanes = [(min(pythons), "lowest-direct")]
     tested = sys.version_info[:2]
     lanes += [(v, "highest") for v in sorted({min(pythons), max(pythons)} - {tested})]
-    for version, resolution in lanes:
-        run_lane(pythons[version], resolution=resolution)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        running = [pool.submit(run_lane, pythons[v], resolution=r) for v, r in lanes]
+        for lane in running:
+            print(lane.result(), flush=True)
 
 
 if __name__ == "__main__":
     try:
         main()
     except subprocess.CalledProcessError as error:
-        print(error, file=sys.stderr)
+        print(error.stdout, error, sep="\n", file=sys.stderr)
         sys.exit(error.returncode)

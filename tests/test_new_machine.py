@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from commands import orthocal
 from folders import files_of
@@ -18,8 +19,10 @@ from lxml import etree
 from orthocal import load_plan, load_robot
 from orthocal.builder.build import remake_robot
 from orthocal.cli import dialogue as asking
-from orthocal.errors import ParameterError
+from orthocal.errors import ClosureError, ParameterError
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import find_workspace
+from orthocal.output.scene.drawing import draw_scene
 from orthocal.session.session import Purpose
 
 SIZES = {
@@ -114,6 +117,20 @@ def test_zeros_have_one_usual_tolerance(made, tmp_path):
     tolerances = {"*.offset_mm": 4.0, "x_slide.offset_mm": 12.0}
     assert load_plan(tmp_path / "mill/first").robot.parameters.stated == tolerances
     assert "differs by more than 15 mm" in (tmp_path / "mill/first/sheet.html").read_text()
+
+
+def test_numbers_of_drives_are_those_of_the_controller(made):
+    """0 in the mechanical zero; the travel is 150 mm inwards and 70 mm outwards, y counts down."""
+    robot = load_robot(made)
+    assert "Mechanical zero: x_slide 0 mm, y_slide 0 mm, z_slide 0 mm." in draw_scene(robot).facts
+    for axis, name, limits in ((0, "x_slide", "-150 ... 70"), (1, "y_slide", "-70 ... 150")):
+        point = np.zeros((1, 3))
+        point[0, axis] = 0.08
+        with pytest.raises(ClosureError) as refused:
+            nominal_closure(robot).inverse(point)
+        number = 80 if axis == 0 else -80
+        place = f"joint '{name}' would be at {number} mm, outside its limits {limits} mm"
+        assert place in str(refused.value)
 
 
 def test_what_is_read_on_it_calibrates_it(made, tmp_path):

@@ -47,6 +47,10 @@ EXPLANATIONS: tuple[FindingKind, ...] = (
 """Kinds of which the first explains the decision to enter."""
 
 
+WORTH_ENTERING = 0.05
+"""Share by which the expected tool error must fall for the offsets to be entered. Also that by
+which it must fall for a correction of all errors to be recommended."""
+
 KEEPING: dict[FindingKind, str] = {
     "no offset": words.NOTHING_HEADLINE,
     "no change needed": words.KEEP_HEADLINE,
@@ -121,9 +125,14 @@ def assess(
     placed = find_tool(calibration)
     entries = compute_entries(calibration, placed)
     tool, unreached = _tool(calibration, judgement, placed, entries)
+    keep, best = _keeps(calibration, entries, tool), tool
+    if keep:
+        entries = tuple(e.kept for e in entries)
+        tool, _ = _tool(calibration, judgement, placed, entries)
     notes = [
         *find_fit_findings(calibration),
-        *_entry_findings(calibration, entries, tool),
+        *([_no_change_needed(calibration, entries, best)] if keep else []),
+        *_entry_findings(calibration, entries, tool, keep=keep),
         *describe_recommendation(
             recommendation or recommend_model(measured), chosen=calibration.model
         ),
@@ -176,51 +185,74 @@ def _tool(
     return summarise_tool(calibration, accuracy, scale=judgement.tolerance_scale), []
 
 
+def _keeps(
+    calibration: Calibration, entries: Sequence[ControllerEntry], tool: ToolErrorSummary | None
+) -> bool:
+    """True if the offsets stay as they are: entering them gains too little at the tool.
+
+    Args:
+        calibration: The calibration.
+        entries: Offsets with the least tool error.
+        tool: The tool error with them; None without a tool to judge by: then significance decides.
+    """
+    if not entries:
+        return False
+    if tool is not None:
+        return not lowers(tool.now, tool.entered)
+    known = _by_readings(entries)
+    return bool(known) and not any(is_significant(calibration, e) for e in known)
+
+
+def lowers(now: float, then: float) -> bool:
+    """True if an expected tool error, [m], falls enough to enter or to correct something."""
+    return not then > (1.0 - WORTH_ENTERING) * now
+
+
+def _by_readings(entries: Sequence[ControllerEntry]) -> list[ControllerEntry]:
+    """Entries whose values and uncertainties the readings determine."""
+    return [e for e in entries if e.held is None and math.isfinite(e.std)]
+
+
+def _no_change_needed(
+    calibration: Calibration, entries: Sequence[ControllerEntry], best: ToolErrorSummary | None
+) -> Finding:
+    """Finding that the offsets stay as they are; `best` is the tool error with the best ones."""
+    ratios = [abs(e.best_change) / e.std for e in _by_readings(entries) if e.std > 0.0]
+    drives = [e.drive for e in entries]
+    share = WORTH_ENTERING
+    return words.no_change_needed(drives, max(ratios, default=0.0), best, share=share)
+
+
 def _entry_findings(
     calibration: Calibration,
     entries: Sequence[ControllerEntry],
     tool: ToolErrorSummary | None,
+    *,
+    keep: bool,
 ) -> list[Finding]:
-    """Findings about the values to enter."""
+    """Findings about the values to enter.
 
-    def expected(*, keep: bool) -> list[Finding]:
-        return [] if tool is None else [words.tool_error(tool, keep=keep)]
-
+    Args:
+        calibration: The calibration.
+        entries: The offsets to enter.
+        tool: The tool error with them; None if unknown.
+        keep: Whether they are the active ones.
+    """
+    expected = [] if tool is None else [words.tool_error(tool, keep=keep or not entries)]
     if not entries:
-        return [words.no_offset(), *expected(keep=True)]
-    by_readings = [e for e in entries if e.held is None and math.isfinite(e.std)]
-    large = [e.drive for e in by_readings if is_significant(calibration, e)]
-    small = [e.drive for e in by_readings if e.drive not in large]
-    keep = bool(small) and not large and not _tool_changes(tool)
-    found = expected(keep=keep)
+        return [words.no_offset(), *expected]
     if entries[0].active is None:
-        found.append(words.controller_not_stated([e.drive for e in entries], keep=keep))
-    if keep:
-        ratio = max((abs(e.change) / e.std for e in by_readings if e.std > 0.0), default=0.0)
-        return [words.no_change_needed(small, ratio, tool), *found]
-    if large:
-        found.append(words.must_change(large))
-    if small:
-        found.append(words.not_significant(small))
-    return found
+        expected.append(words.controller_not_stated([e.drive for e in entries], keep=keep))
+    known = _by_readings(entries)
+    large = [e.drive for e in known if is_significant(calibration, e)]
+    small = [e.drive for e in known if e.drive not in large]
+    found = [words.must_change(large)] if large else []
+    return [*expected, *found, *([words.not_significant(small)] if small else [])]
 
 
 def is_significant(calibration: Calibration, entry: ControllerEntry) -> bool:
-    """True if a value to enter differs from the active one by more than its uncertainty."""
-    return not abs(entry.change) <= expanded_uncertainty(calibration, entry)
-
-
-def _tool_changes(tool: ToolErrorSummary | None) -> bool:
-    """True if the tool error changes by more than its uncertainty if the offsets are entered.
-
-    Offsets that are correlated may do so although each of them changes insignificantly. Entering
-    moves the tool by √(now² - entered²); a controller that corrects all identified
-    errors leaves its uncertainty.
-    """
-    if tool is None:
-        return False
-    moved = math.sqrt(max(tool.now**2 - tool.entered**2, 0.0))
-    return not moved <= chance.COVERAGE * tool.compensated
+    """True if the best value differs from the active one by more than its uncertainty."""
+    return not abs(entry.best_change) <= expanded_uncertainty(calibration, entry)
 
 
 def expanded_uncertainty(calibration: Calibration, entry: ControllerEntry) -> float:

@@ -37,9 +37,9 @@ SETTLED = 1e-10
 def find_entries(calibration: Calibration) -> tuple[ControllerEntry, ...]:
     """Offsets to enter into a controller that corrects offsets only.
 
-    The offsets that leave the least error at the tool (`choose_offsets`); they are the identified
-    ones where the machine has no other errors, or no tool to judge by. Empty where no offset was
-    identified.
+    As the assessment records them: those that leave the least error at the tool
+    (`choose_offsets`), or the active ones where the offsets stay as they are. Empty where no offset
+    was identified.
     """
     if calibration.assessment is not None:
         return calibration.assessment.entries
@@ -65,7 +65,7 @@ def offsets_to_enter(calibration: Calibration) -> Array:
 def compute_entries(
     calibration: Calibration, tool: CalibratedTool | None
 ) -> tuple[ControllerEntry, ...]:
-    """Offsets to enter, computed anew.
+    """Offsets with the least tool error, computed anew, to be entered all.
 
     Args:
         calibration: The calibration.
@@ -101,6 +101,7 @@ def compute_entries(
             unit=drives[i].unit,
             active=None if active is None else active[i],
             identified=float(identified[i]),
+            best=float(enter[i]),
             enter=float(enter[i]),
             std=float(total[i]),
             std_scatter=float(scatter[i]),

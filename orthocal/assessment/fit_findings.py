@@ -59,7 +59,9 @@ def _residuals(calibration: Calibration) -> list[Finding]:
             return [words.fits_stated_noise(noise.sigma)]
         return [words.noise_as_stated(noise.sigma)]
     if noise.source == "cycles":
-        return [words.fits_cycles(noise.cycles_sigma)]
+        if calibration.redundancy > 0:
+            return [words.fits_cycles(noise.cycles_sigma)]
+        return [words.noise_from_cycles(noise.cycles_sigma)]
     if noise.cycles_dof > 0:
         return [excess(noise.cycles_sigma, "the scatter of repeated readings")]
     if stated is None:

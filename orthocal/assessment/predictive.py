@@ -24,7 +24,13 @@ from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.fit import Fit
 from orthocal.measurement.joining import name_within
 from orthocal.session.session import known_approach
-from orthocal.statistics.distributions import beta_share, chi_square_tail, f_tail
+from orthocal.statistics.chance import BY_CHANCE
+from orthocal.statistics.distributions import (
+    beta_share,
+    chi_square_tail,
+    f_tail,
+    least_number,
+)
 from orthocal.statistics.information import whiten
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -35,8 +41,20 @@ CHANCE = 0.05
 """Probability below which a repetition of residuals is not due to chance."""
 
 
-def chance_of_deviations(calibration: Calibration, fit: Fit) -> float:
-    """Probability of deviations as large as those of a new session, or larger.
+@dataclass(frozen=True, slots=True)
+class DeviationTest:
+    """Test of the deviations of a new session against their prediction."""
+
+    chance: float
+    """Probability of deviations as large, or larger; NaN if the calibration does not determine the
+    noise."""
+    limit: float
+    """Factor on the deviations at which this probability is BY_CHANCE: they are as predicted if it
+    is above 1. NaN if unknown."""
+
+
+def judge_deviations(calibration: Calibration, fit: Fit) -> DeviationTest:
+    """Test of the deviations of a new session against their predictive distribution.
 
     χ² = rᵀ V⁻¹ r with r = y - h(θ, 0), gauge zeros eliminated. It is an F statistic where the noise
     was estimated. Without a prior the residuals of the calibration are the noise: they contain the
@@ -46,8 +64,6 @@ def chance_of_deviations(calibration: Calibration, fit: Fit) -> float:
         calibration: The calibration.
         fit: The same parameters fitted to the new session.
 
-    Returns:
-        The probability; NaN if the calibration does not determine the noise.
     """
     problem, n = fit.problem, fit.problem.n_machine
     scale, o, noise = problem.theta_scale, problem.observations, calibration.noise
@@ -56,7 +72,7 @@ def chance_of_deviations(calibration: Calibration, fit: Fit) -> float:
         sigma, sigma_dof = float(np.fmax(sigma, noise.sigma)), noise.dof
     dof = o.size - o.n_free_zeros
     if not (sigma > 0.0 and sigma_dof > 0.0 and dof > 0):
-        return math.nan
+        return DeviationTest(math.nan, math.nan)
     covariance = np.diag(np.append(np.zeros(n), 1.0 / problem.prior_precision[n:]))
     covariance[:n, :n] = np.nan_to_num(calibration.model_covariance) / np.outer(
         scale[:n], scale[:n]
@@ -67,9 +83,15 @@ def chance_of_deviations(calibration: Calibration, fit: Fit) -> float:
     deviation = project_out_zeros(problem.values - problem.predict(theta), o)
     white = whiten(deviation, project_out_zeros(fit.jacobian, o) @ root, sigma=sigma)
     square = float(white @ white)
-    if math.isinf(sigma_dof):
-        return chi_square_tail(dof, square)
-    return f_tail(dof, sigma_dof, square / dof)
+
+    def chance(factor: float) -> float:
+        scaled = square * factor**2
+        if math.isinf(sigma_dof):
+            return chi_square_tail(dof, scaled)
+        return f_tail(dof, sigma_dof, scaled / dof)
+
+    limit = least_number(lambda f: chance(f) < BY_CHANCE) if square > 0.0 else math.nan
+    return DeviationTest(chance(1.0), limit)
 
 
 def expect_rms(calibration: Calibration, fit: Fit) -> float:

@@ -26,9 +26,10 @@ from orthocal.assessment.assess import (
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.assessment.judgement import Judgement, judge_session, rank, verdict_of
 from orthocal.assessment.predictive import (
+    DeviationTest,
     Repetition,
-    chance_of_deviations,
     expect_rms,
+    judge_deviations,
     measure_repetition,
 )
 from orthocal.assessment.words import validation as words
@@ -119,7 +120,7 @@ class Validation:
             {
                 "drive": e.drive,
                 "unit": e.unit,
-                "change": e.change,
+                "change": e.best_change,
                 "expanded_uncertainty": finite_or_none(expanded_uncertainty(refit, e)),
                 "significant": is_significant(refit, e),
             }
@@ -189,8 +190,9 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
     refit = assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
     refit = replace(refit, assessment=assess(refit, session, judgement=judgement))
     mistake, changes, wrongly_entered = _find_changes(calibration, measured, judgement)
-    expected_rms, excess = expect_rms(calibration, fit), chance_of_deviations(calibration, fit)
-    lead = _agreement(refit, excess, expected_rms, explained=bool(changes))
+    expected_rms, test = expect_rms(calibration, fit), judge_deviations(calibration, fit)
+    excess = test.chance
+    lead = _agreement(refit, test, expected_rms, explained=bool(changes))
     confirmed = None
     if not math.isnan(excess):
         confirmed = lead.severity == "note" and not changes
@@ -305,12 +307,14 @@ def _find_changes(
     return mistake, findings, e.kind in WRONGLY_ENTERED and e.sessions[0] in new
 
 
-def _agreement(refit: Calibration, excess: float, expected: float, *, explained: bool) -> Finding:
+def _agreement(
+    refit: Calibration, test: DeviationTest, expected: float, *, explained: bool
+) -> Finding:
     """Agreement of the deviations with their prediction, and of the values to enter.
 
     Args:
         refit: Fit of the new readings, assessed.
-        excess: Probability of deviations as large as those measured.
+        test: Test of the deviations.
         expected: RMS of the deviations as predicted, [m].
         explained: Whether a change between the sessions explains the deviations.
     """
@@ -319,22 +323,23 @@ def _agreement(refit: Calibration, excess: float, expected: float, *, explained:
         "expected_rms_mm": expected / MM,
         "achieved_rms_mm": achieved / MM,
         "refit_rms_mm": refit.rms_after / MM,
-        "chance": excess,
+        "limit_rms_mm": test.limit * achieved / MM,
+        "chance": test.chance,
     }
-    as_expected = _is_expected(excess)
+    as_expected = _is_expected(test.chance)
     if as_expected is None:
         return words.nothing_predicted(numbers)
     if not as_expected:
         worst = max(refit.residuals, key=lambda r: abs(r.deviation))
         return words.larger_than_predicted(
             achieved,
-            expected,
+            test.limit * achieved,
             None if explained else refit.rms_after,
             removed=refit.rms_after < REMOVED * achieved,
             numbers=numbers,
             place=Place(line=worst.line, setup=worst.setup, posture=worst.postures),
         )
-    return words.as_predicted(achieved, expected, numbers)
+    return words.as_predicted(achieved, test.limit * achieved, numbers)
 
 
 def _find_further_change(refit: Calibration) -> list[Finding]:

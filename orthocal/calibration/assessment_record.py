@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -174,10 +174,13 @@ class ControllerEntry(InUnit):
     """Offset now in the controller, [unit]; None if the session does not state it."""
     identified: Number
     """Offset of the identified machine, [unit]."""
+    best: Number
+    """Offset with the least tool error, [unit]; its change if the active one is unknown."""
     enter: Number
-    """Offset to enter, [unit]; the change to add to the active one if that is unknown."""
+    """Offset to enter, [unit]: `best`, or the active one where the offsets stay as they are; the
+    change to add to the active one if that is unknown."""
     std: SizeOrNaN
-    """Standard deviation of `enter` from noise, priors and unmodelled errors, [unit]."""
+    """Standard deviation of `best` from noise, priors and unmodelled errors, [unit]."""
     std_scatter: SizeOrNaN
     """The part of it that is due to the noise of the readings, [unit]."""
     held: Literal["known", "lower bound", "upper bound"] | None
@@ -185,8 +188,18 @@ class ControllerEntry(InUnit):
 
     @property
     def change(self) -> float:
-        """Value to enter less the active one, [unit]."""
+        """Value to enter less the active one, [unit]: 0 where the offsets stay as they are."""
         return self.enter - (0.0 if self.active is None else self.active)
+
+    @property
+    def best_change(self) -> float:
+        """Best value less the active one, [unit]."""
+        return self.best - (0.0 if self.active is None else self.active)
+
+    @property
+    def kept(self) -> ControllerEntry:
+        """The entry that leaves the offset as it is."""
+        return replace(self, enter=0.0 if self.active is None else self.active)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import hashlib
 import io
 import os
 import re
@@ -28,8 +29,15 @@ from orthocal.cli.options import (
     read_vector,
 )
 from orthocal.cli.printing import put_note, put_part
-from orthocal.errors import GcodeError, OutputError, ParameterError
-from orthocal.io.files import read_parts, require_writable_file, write_file
+from orthocal.errors import CalibrationFileError, GcodeError, OutputError, ParameterError
+from orthocal.io.files import (
+    is_folder,
+    read_file,
+    read_parts,
+    require_writable_file,
+    write_file,
+)
+from orthocal.text import comment_safe, shorten
 from orthocal.units import DRIVE_UNITS, MM, UM, format_fixed
 
 if TYPE_CHECKING:
@@ -42,8 +50,14 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
+MARK = "Corrected by orthocal"
+"""Beginning of the comment that marks a corrected program."""
+
 BLOCK = 2**16
 """Characters or bytes that are read or written together."""
+
+LONGEST_COMMENT = 240
+"""Largest number of characters of a comment; LinuxCNC reads lines of 252 bytes."""
 
 PROGRESS_VARIABLE = "AXIS_PROGRESS_BAR"
 """Environment variable with which LinuxCNC's window requests progress from a filter."""
@@ -82,6 +96,7 @@ def correct(
 
     The program is for a controller with nominal kinematics. Lines and arcs are divided into chords
     that stay near the corrected path. The feed along the path and all other words are preserved.
+    Comments at the top mark the program as corrected; such a program is refused.
     With --tool the program may use one tool only. If a line cannot be corrected, its number and
     the reason are reported, and nothing is written. A note names the first line that leaves the
     workspace.
@@ -96,8 +111,8 @@ def correct(
         backlash: Who takes up identified backlash: the program, or the controller (LinuxCNC:
             BACKLASH).
         work_offset_mm ([G54=]X,Y,Z): Zero of the program in machine coordinates; repeat for G55 ...
-        start_mm (X,Y,Z): Position that the controller displays before the program; needed if the
-            first motion does not have X, Y and Z.
+        start_mm (X,Y,Z): Position that the controller displays before the program. Without it,
+            rapid motions before the first position in X, Y and Z are not corrected.
         out (FILE): File for the corrected program; default: standard output.
     """
     from orthocal.assessment.controller_entries import offsets_to_enter
@@ -133,20 +148,25 @@ def correct(
     taken_up = backlash is Backlash.PROGRAM and bool(lags.any())
     sides = ApproachSides(result.robot, lags) if taken_up else None
     corrector = ProgramCorrector(interpreter, field, within=tolerance, region=region, sides=sides)
+    controller = _describe_controller(result, values, active=active)
+    mark = f"{MARK}: calibration {_identify(calibration)}. Do not correct again."
+    comments = [mark, controller, _describe_tip(tip), warning]
+    source = _lines(program, file)
     with tempfile.TemporaryFile() as spool:  # nothing is written before all lines are corrected
         with _frozen():
-            texts = corrector.run(_lines(program, file))
-            _spool(_with_comment(texts, warning) if warning else texts, spool)
+            texts = corrector.run(source if anyway else _refuse_corrected(source, file))
+            _spool(_with_comments(texts, [c for c in comments if c]), spool)
         if not corrector.summary.lines:
             raise GcodeError("is empty; expected a program", where=file)
         _put_program(spool, out)
     notes = [
         _describe(corrector.summary, field, tolerance),
-        _describe_controller(result, values, active=active),
-        _describe_tool(tip, interpreter.tools.used),
+        controller,
+        _describe_tip(tip) or _describe_tools(interpreter.tools.used),
         describe_assumed(result, conditions, fields=("temperature", "payload")),
         _describe_backlash(result, lags, taken_up=taken_up),
         warning,
+        _describe_uncorrected(interpreter.uncorrected, file),
         _describe_outside(corrector.summary, file, words),
         "" if zeros else "The program's coordinates are read as machine coordinates.",
     ]
@@ -209,8 +229,31 @@ def _report_progress(parts: Iterable[bytes], source: Path) -> Iterator[bytes]:
         yield part
 
 
-def _with_comment(texts: Iterable[str], comment: str) -> Iterator[str]:
-    """A program with a comment as its first line, or after the % that begins it."""
+def _identify(calibration: Path) -> str:
+    """Name of a calibration and the beginning of the SHA-256 of its file."""
+    file = calibration / "calibration.json" if is_folder(calibration) else calibration
+    digest = hashlib.sha256(read_file(file, error=CalibrationFileError)).hexdigest()
+    return f"{comment_safe(file.resolve().parent.name)}, SHA-256 {digest[:12]}"
+
+
+def _refuse_corrected(texts: Iterable[str], file: str) -> Iterator[str]:
+    """Lines of a program that is not corrected yet.
+
+    Raises:
+        GcodeError: At the comment that marks a corrected program.
+    """
+    for number, text in enumerate(texts, start=1):
+        if MARK in text:
+            raise GcodeError(
+                f"found '{shorten(text.strip().lstrip('; '))}': the program is corrected already; "
+                "expected the original program (--anyway corrects it a second time)",
+                where=f"{file}:{number}",
+            )
+        yield text
+
+
+def _with_comments(texts: Iterable[str], comments: Sequence[str]) -> Iterator[str]:
+    """A program with comments as its first lines, or after the % that begins it."""
     commented = False
     for text in texts:
         if commented or not text:
@@ -221,7 +264,8 @@ def _with_comment(texts: Iterable[str], comment: str) -> Iterator[str]:
         at = mark.end() if mark else 0
         end = "\r\n" if "\r\n" in text else "\n"
         head = text[:at] if text[:at].endswith("\n") or not at else text[:at] + end
-        yield f"{head}; {comment}{end}{text[at:]}"
+        lines = "".join(f"; {comment[:LONGEST_COMMENT]}{end}" for comment in comments)
+        yield f"{head}{lines}{text[at:]}"
 
 
 def _spool(texts: Iterable[str], spool: IO[bytes]) -> None:
@@ -292,10 +336,22 @@ def _describe_outside(summary: Summary, file: str, region: str) -> str:
     )
 
 
-def _describe_tool(tip: Vector | None, tools: Sequence[str]) -> str:
-    if tip is not None:
-        at = ", ".join(f"{v / MM:g}" for v in tip)
-        return f"For a tip at {at} mm from the tool centre point."
+def _describe_uncorrected(line: int | None, file: str) -> str:
+    if line is None:
+        return ""
+    return (
+        f"{file}:{line}: this rapid motion comes before the first position in X, Y and Z and is "
+        "not corrected: the tool may be off by the largest correction. --start-mm corrects it."
+    )
+
+
+def _describe_tip(tip: Vector | None) -> str:
+    if tip is None:
+        return ""
+    return f"For a tip at {', '.join(f'{v / MM:g}' for v in tip)} mm from the tool centre point."
+
+
+def _describe_tools(tools: Sequence[str]) -> str:
     if len(tools) < 2:
         return ""
     return (
@@ -320,11 +376,14 @@ def _describe_backlash(result: orthocal.Calibration, lags: Array, *, taken_up: b
 def _describe_controller(
     result: orthocal.Calibration, values: Iterable[float], *, active: bool
 ) -> str:
+    from orthocal.assessment.assess import assessment_of
+
     listed = []
     for drive, value in zip(result.robot.drives, values, strict=True):
         unit, size = DRIVE_UNITS[drive.unit]
         listed.append(f"{drive.name} {format_fixed(float(value) / size, 3, sign=True)} {unit}")
-    state = "active during the measurement" if active else "to enter"
+    keep = assessment_of(result).keeps_offsets
+    state = "active during the measurement" if active else "that stay" if keep else "to enter"
     if result.session.controller_offsets is None:
         state += " (in addition to those that were active during the measurement)"
     return f"For a controller with the offsets {state}: {', '.join(listed)}."

@@ -262,6 +262,8 @@ class Interpreter:
         self._letters = {k: AXES[k] for k in self.axes}
         self._accepted = _ACCEPTED.union(self._letters.values())
         self._moved = False
+        self.uncorrected: int | None = None
+        """First line with a rapid motion that is unchanged: other axes have no position yet."""
 
     def read(self, line: Line) -> Step:
         """Apply a line to modes, tools and position.
@@ -430,6 +432,8 @@ class Interpreter:
                 "change of unit",
                 where=where,
             )
+        if self._is_unknown_after(words):
+            return self._pass(line, words, where)
         end = self._end(words, where)
         start = self.position
         first, self._moved = not self._moved, True
@@ -448,13 +452,36 @@ class Interpreter:
         arc = None if modes.motion < 2 else self._arc(begin, end, words, where)
         return Step(line, modes, self.offset, Motion(begin, end, arc), has_feed)
 
+    def _is_unknown_after(self, words: Mapping[str, float]) -> bool:
+        """True for a rapid motion at the start after which the position is not yet known."""
+        return (
+            (self.modes.motion, self.modes.absolute, self._moved) == (0, True, False)
+            and not _COORDINATES.isdisjoint(words)
+            and any(
+                self.position[k] is None and letter not in words
+                for k, letter in self._letters.items()
+            )
+        )
+
+    def _pass(self, line: Line, words: Mapping[str, float], where: str) -> Step:
+        """Unchanged rapid motion, such as the first one to a safe height."""
+        for k, letter in self._letters.items():
+            if letter in words:
+                self.position[k] = self._coordinate(
+                    letter, words[letter] * self.modes.unit + self.offset[k], where
+                )
+        self.tools.move(feed=False)
+        if self.uncorrected is None:
+            self.uncorrected = line.number
+        return Step(line, self.modes, self.offset)
+
     def _end(self, words: Mapping[str, float], where: str) -> Vector:
         absolute, unit, offset = self.modes.absolute, self.modes.unit, self.offset
         end: list[float] = [0.0, 0.0, 0.0]
         for k, letter in self._letters.items():
             value, position = words.get(letter), self.position[k]
             if value is not None and absolute:
-                end[k] = coordinate = value * unit + offset[k]
+                coordinate = value * unit + offset[k]
             elif position is None:
                 names = ", ".join(self._letters.values())
                 raise GcodeError(
@@ -463,14 +490,20 @@ class Interpreter:
                     where=where,
                 )
             else:
-                end[k] = coordinate = position + (value or 0.0) * unit
-            if not -LARGEST_COORDINATE <= coordinate <= LARGEST_COORDINATE:
-                raise GcodeError(
-                    f"found {letter} at {coordinate / MM:.6g} mm; expected at most "
-                    f"{LARGEST_COORDINATE / MM:g} mm",
-                    where=where,
-                )
+                coordinate = position + (value or 0.0) * unit
+            end[k] = self._coordinate(letter, coordinate, where)
         return (end[0], end[1], end[2])
+
+    @staticmethod
+    def _coordinate(letter: str, value: float, where: str) -> float:
+        """Refuse a coordinate that no machine has."""
+        if not -LARGEST_COORDINATE <= value <= LARGEST_COORDINATE:
+            raise GcodeError(
+                f"found {letter} at {value / MM:.6g} mm; expected at most "
+                f"{LARGEST_COORDINATE / MM:g} mm",
+                where=where,
+            )
+        return value
 
     def _arc(self, start: Vector, end: Vector, words: Mapping[str, float], where: str) -> Arc:
         modes = self.modes

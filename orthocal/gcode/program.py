@@ -12,11 +12,11 @@ from orthocal.arrays import Array
 from orthocal.errors import GcodeError
 from orthocal.gcode.interpreter import Interpreter, Step
 from orthocal.gcode.lines import CONTROL, Line, split_line, split_point_line
-from orthocal.gcode.path import Motion, Paths
+from orthocal.gcode.path import AXES, Motion, Paths
 from orthocal.gcode.reversals import Sides
 from orthocal.gcode.segmentation import LONGEST_SEGMENT, Correction, Refused, segment_motions
 from orthocal.gcode.writer import Writer
-from orthocal.units import UM
+from orthocal.units import MM, UM
 
 LINES_AT_ONCE = 2000
 """Largest number of lines in memory."""
@@ -163,7 +163,8 @@ class ProgramCorrector:
                 segments = next(results)
                 if isinstance(segments, Refused):
                     raise GcodeError(
-                        f"the machine cannot make this motion: it {segments.reason}",
+                        f"the machine cannot make this motion: {_subject(step, segments)} "
+                        f"{segments.reason}",
                         where=f"{self._file}:{step.line.number}",
                     )
                 summary.motions += 1
@@ -190,6 +191,15 @@ class ProgramCorrector:
                     "as LinuxCNC reads: shorten its comments",
                     where=f"{self._file}:{number}",
                 )
+
+
+def _subject(step: Step, refused: Refused) -> str:
+    """Point that is out of reach, in the program's coordinates; "it" for a whole motion."""
+    if refused.point is None:
+        return "it"
+    values = zip(AXES, refused.point, step.offset, strict=True)
+    coordinates = (f"{letter}{(v - zero) / MM + 0.0:.4g}" for letter, v, zero in values)
+    return f"{' '.join(coordinates)} mm"
 
 
 def _estimate(motion: Motion) -> float:

@@ -75,6 +75,8 @@ class Refused:
     """A motion without segments."""
 
     reason: str
+    point: tuple[float, ...] | None = None
+    """x, y, z of the first point out of reach, [m]; None if there is another reason."""
 
 
 def segment_motions(
@@ -193,9 +195,9 @@ def _segment_group(
     points = paths.points(group[member], step / (4.0 * n[member]))
     corrected, refused = correct(points, group[member])
     corrections = np.maximum.reduceat(np.linalg.norm(corrected - points, axis=1), first)
-    reasons: dict[int, str] = {}
+    reasons: dict[int, Refused] = {}
     for k, reason in refused.items():
-        reasons.setdefault(int(member[k]), reason)
+        reasons.setdefault(int(member[k]), Refused(reason, tuple(points[k].tolist())))
     starts = np.flatnonzero((step % 4 == 0) & (step < 4 * n[member]))
     a, b = corrected[starts], corrected[starts + 4]
     deviation = np.zeros(starts.size)
@@ -214,7 +216,7 @@ def _segment_group(
         part_of = slice(last, last + count)
         last += count
         if k in reasons:
-            results[i] = Refused(reasons[k])
+            results[i] = reasons[k]
         elif largest > EVALUATED * tolerance:
             # the deviation of a chord grows with the square of its length
             yield i, max(count + 1.0, math.ceil(count * math.sqrt(largest / tolerance) * 1.05))

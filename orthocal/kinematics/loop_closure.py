@@ -156,6 +156,15 @@ class System:
         steps = -(inverses @ residuals[..., None])[..., 0]
         return steps, np.asarray(size * inverse_size < SAFETY / SINGULAR_BELOW)
 
+    def describe_beyond(self, j: int, value: float) -> str:
+        """Position and limits of a joint in words; a drive's as the controller counts."""
+        drives = {d.name: d for d in self.robot.drives}
+        if self.names[j] in drives:
+            return drives[self.names[j]].describe_beyond(value)
+        unit, size = DRIVE_UNITS["m" if self.units[j] == 1.0 else "rad"]
+        low, high = self.lower[j] / size, self.upper[j] / size
+        return f"at {value / size:.4g} {unit}, outside its limits {low:g} ... {high:g} {unit}"
+
     def describe(self, x: Array, p: Array, geometry: MachineGeometry) -> str:
         """Openings of the loops of one posture, in words."""
         residuals, _ = self.evaluate(x[None], p[None], geometry)
@@ -326,12 +335,8 @@ class _Path:
         outside = ~(beyond <= LIMIT_TOLERANCE).all(axis=1)
         for i in np.flatnonzero(outside & ~self._refused).tolist():
             j = int(beyond[i].argmax())
-            unit, size = DRIVE_UNITS["m" if system.units[j] == 1.0 else "rad"]
-            reason = (
-                f"cannot be reached: joint '{system.names[j]}' would be at "
-                f"{x[i][j] / size:.4g} {unit}, outside its limits "
-                f"{system.lower[j] / size:g} ... {system.upper[j] / size:g} {unit}"
-            )
+            where = system.describe_beyond(j, float(x[i][j]))
+            reason = f"cannot be reached: joint '{system.names[j]}' would be {where}"
             self._refuse(i, reason, 0.0)
 
     def _refuse_singular(self, x: Array, rows: NDArray[np.intp]) -> None:

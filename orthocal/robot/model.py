@@ -16,7 +16,7 @@ from orthocal.io.fields import read_only
 from orthocal.robot.closing import Closing, close_loops, describe_opening
 from orthocal.robot.frames import Placement, find_frame, place_frames
 from orthocal.robot.parameters import DeclaredErrors, ElementaryError, ParameterSet
-from orthocal.units import InUnit, Unit
+from orthocal.units import DRIVE_UNITS, InUnit, Unit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +54,13 @@ class Drive(InUnit):
         """Lower and upper limit of the controller's joint coordinate, [unit]."""
         ends = (float(self.to_joint(self.lower)), float(self.to_joint(self.upper)))
         return min(ends), max(ends)
+
+    def describe_beyond(self, coordinate: float) -> str:
+        """Position of a drive, [unit], and its limits in words, as the controller counts."""
+        unit, size = DRIVE_UNITS[self.unit]
+        low, high = (v / size for v in self.joint_limits)
+        value = float(self.to_joint(coordinate)) / size
+        return f"at {value:.4g} {unit}, outside its limits {low:g} ... {high:g} {unit}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -53,7 +53,7 @@ def t_quantile(dof: float, share: float) -> float:
     def exceeds(t: float) -> bool:
         return 1.0 - 0.5 * beta_share(0.5 * dof, 0.5, dof / (dof + t * t)) >= share
 
-    return _least(exceeds)
+    return least_number(exceeds)
 
 
 def beta_share(a: float, b: float, x: float) -> float:
@@ -87,7 +87,7 @@ def _continued_fraction(first: float, terms: Iterable[tuple[float, float]]) -> f
     return value
 
 
-def _least(exceeds: Callable[[float], bool]) -> float:
+def least_number(exceeds: Callable[[float], bool]) -> float:
     """Smallest positive number with a property that all larger ones have, by bisection."""
     low, high = 0.0, 1.0
     while not exceeds(high):

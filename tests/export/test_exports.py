@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import re
 import shutil
@@ -116,10 +117,33 @@ def test_against_the_verdict_nothing_is_written_by_command(turned, tmp_path):
         assert not out.exists()
         assert run_orthocal(tmp_path, *words, "--anyway").returncode == 0
         if words[0] == "correct":
-            first, second, *_ = (out / "part.ngc").read_text().splitlines()
+            first, *comments = (out / "part.ngc").read_text().splitlines()[:4]
             assert first == "%"
-            assert second.startswith("; Written against the verdict 'review'")
+            assert comments[-1].startswith("; Written against the verdict 'review'")
         shutil.rmtree(out)
+
+
+def test_a_corrected_program_is_marked_and_not_corrected_again(full, tmp_path):
+    """With the calibration, the offsets and the tool, in comments that a controller skips."""
+    file = write_calibration(full, tmp_path / "calibration.json")
+    (tmp_path / "part.ngc").write_text(PROGRAM)
+    words = ["correct", file, "part.ngc", "--tool", "0,0,-50", "--offsets", "active"]
+    once = run_orthocal(tmp_path, *words)
+    assert once.returncode == 0, once.stderr
+    first, *comments = once.stdout.splitlines()[:4]
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()[:12]
+    assert (first, all(c.startswith("; ") for c in comments)) == ("%", True)
+    assert tmp_path.name[:60] in comments[0]
+    assert digest in comments[0]
+    assert "offsets active during the measurement" in comments[1]
+    assert "tip at 0, 0, -50 mm" in comments[2]
+    (tmp_path / "once.ngc").write_text(once.stdout)
+    words[2] = "once.ngc"
+    again = run_orthocal(tmp_path, *words, "--out", "twice.ngc")
+    assert again.returncode == 2
+    assert again.stderr.startswith("orthocal: once.ngc:2: found 'Corrected by orthocal")
+    assert not (tmp_path / "twice.ngc").exists()
+    assert run_orthocal(tmp_path, *words, "--anyway").returncode == 0
 
 
 def test_unknown_format_is_refused(experiment_2):

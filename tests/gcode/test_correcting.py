@@ -289,7 +289,7 @@ REFUSED = {
     "G20 G1 X1": "found G1 without a feed; expected F before it, and again after a change",
     "G4 P1 X1": "found a dwell and coordinates; expected one of them",
     "G1 X1e3": "found e3, a word of splines",
-    "G1 X600": "the machine cannot make this motion: it is too far",
+    "G1 X600": "the machine cannot make this motion: X502.5 Y0 Z0 mm is too far",
     "G1 X99999999": "found X at 1e+08 mm; expected at most 1e+06 mm",
     "F-1": "found a feed of -1",
     "(\x1b[31m)": "a comment holds the control character '\\x1b'",
@@ -350,6 +350,33 @@ def test_position_and_first_motion_must_be_known():
     ):
         with pytest.raises(GcodeError, match=message):
             corrected(text)
+
+
+def test_a_rapid_motion_to_a_safe_height_may_come_first():
+    """As it is, up to the first position in x, y and z, which begins the corrected path."""
+    text = ["G21 G90 M3 S900", "N5 G0 Z20 (up)", "X1.5", "Y-2 (over)", "G1 Z3 F100", "G0 Z20"]
+    lines, _ = corrected(text)
+    assert lines[:3] == text[:3]
+    for line, point in ((lines[3], (1.5, -2.0, 20.0)), (lines[-1], (1.5, -2.0, 20.0))):
+        found = [float(re.search(rf"{k}(-?[\d.]+)", line)[1]) for k in "XYZ"]
+        assert found == pytest.approx(bend([point])[0], abs=1e-3)
+    assert lines[3].endswith("(over)")
+    interpreter = Interpreter("p.ngc", axes=(0, 1, 2), offsets={})
+    list(ProgramCorrector(interpreter, Bent(), within=WITHIN).run(f"{t}\n" for t in text))
+    assert interpreter.uncorrected == 2
+    both, summary = corrected(["G21 G90", "G0 Z20", "X1 Y2"], start=(0.0, 0.0, 0.0))
+    assert (len(both), summary.motions) == (3, 2)
+    assert both[1].startswith("G0 X")
+    with pytest.raises(GcodeError, match=r"^p\.ngc:1: found Z at 2e\+06 mm"):
+        corrected(["G21 G90 G0 Z2000000"])
+    with pytest.raises(GcodeError, match=r"^p\.ngc:2: the position along X is unknown"):
+        corrected(["G21 G90 G0 Z20", "G91 X1 Y1"])
+
+
+def test_a_point_out_of_reach_is_stated_in_the_programs_coordinates():
+    offsets = {"G54": (0.1, 0.0, 0.0)}  # the first sample beyond 500 mm is at 502 mm
+    with pytest.raises(GcodeError, match=r"motion: X402 Y0 Z0 mm is too far"):
+        corrected(["G20 G90 G54 G0 X0 Y0 Z0", "G0 X19.6850393701"], offsets=offsets)
 
 
 def test_first_bad_line_is_named():

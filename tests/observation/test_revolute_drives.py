@@ -10,7 +10,7 @@ from tolerances import KINEMATICS, TRUTH_BACK
 
 from orthocal import calibrate, load_plan, load_session, write_session
 from orthocal.assessment.controller_entries import find_entries
-from orthocal.assessment.predictive import chance_of_deviations, expect_rms
+from orthocal.assessment.predictive import expect_rms, judge_deviations
 from orthocal.assessment.validation import validate_calibration
 from orthocal.calibration.refit import repeat_calibration, repeat_fit
 from orthocal.errors import SessionError
@@ -137,7 +137,7 @@ def test_what_was_identified_is_validated(tmp_path, robot):
         confirmed.append(result.confirmed)
         # another dial, as it is predicted
         fit = repeat_fit(found, second.session)
-        chances.append(chance_of_deviations(found, fit))
+        chances.append(judge_deviations(found, fit).chance)
         achieved = repeat_calibration(found, second.session).rms_before
         sizes.append((expect_rms(found, fit), achieved))
     # one in a hundred is refused for its deviations

@@ -57,26 +57,23 @@ def no_offset() -> Finding:
     return note("no offset", "No offset was identified.")
 
 
-def no_change_needed(drives: Sequence[str], ratio: float, tool: ToolErrorSummary | None) -> Finding:
-    """Finding that no offset, and if known no tool error, changes by more than its uncertainty.
+def no_change_needed(
+    drives: Sequence[str], ratio: float, best: ToolErrorSummary | None, *, share: float
+) -> Finding:
+    """Finding that the offsets stay as they are.
 
     Args:
-        drives: Drives whose offsets the readings determine.
+        drives: Drives with an offset that could be entered.
         ratio: Largest |change| of these offsets, in standard deviations.
-        tool: Expected tool error; None if unknown.
+        best: Expected tool error with the best offsets; None if unknown.
+        share: Share by which they would have to lower it.
     """
     numbers = {"largest_change_over_std": ratio}
-    too = ""
-    if tool is not None:
-        numbers |= {"now_um": tool.now / UM, "entered_um": tool.entered / UM}
-        too = ", and the expected tool error would change by less than its uncertainty"
-    return note(
-        "no change needed",
-        f"No offset changes by more than its uncertainty{too}.",
-        "",
-        named(*drives),
-        **numbers,
-    )
+    text = "No offset changes by more than its uncertainty."
+    if best is not None:
+        numbers |= {"now_um": best.now / UM, "best_um": best.entered / UM}
+        text = f"Other offsets would lower the expected tool error by less than {share:.0%}."
+    return note("no change needed", text, "", named(*drives), **numbers)
 
 
 def must_change(drives: Sequence[str]) -> Finding:
@@ -86,9 +83,7 @@ def must_change(drives: Sequence[str]) -> Finding:
 
 def not_significant(drives: Sequence[str]) -> Finding:
     """Finding about offsets that change by less than their uncertainty."""
-    them = "it" if len(drives) == 1 else "them"
-    text = f"{_describe_change(drives, 'less')} Entering {them} does no harm."
-    return note("not significant", text, "", named(*drives))
+    return note("not significant", _describe_change(drives, "less"), "", named(*drives))
 
 
 def _describe_change(drives: Sequence[str], compared: str) -> str:

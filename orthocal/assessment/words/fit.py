@@ -44,6 +44,15 @@ def noise_as_stated(sigma: float) -> Finding:
     )
 
 
+def noise_from_cycles(scatter: float) -> Finding:
+    """Uncertainties rest on the scatter of repeated readings alone."""
+    return note(
+        "noise as stated",
+        "The uncertainty rests on the scatter of repeated readings.",
+        scatter_mm=scatter / MM,
+    )
+
+
 def fits_stated_noise(sigma: float) -> Finding:
     """Residuals agree with the stated noise."""
     return note(

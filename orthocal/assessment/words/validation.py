@@ -27,7 +27,7 @@ def nothing_predicted(numbers: Mapping[str, float]) -> Finding:
 
 def larger_than_predicted(
     achieved: float,
-    expected: float,
+    limit: float,
     refit: float | None,
     *,
     removed: bool,
@@ -38,15 +38,15 @@ def larger_than_predicted(
 
     Args:
         achieved: RMS of the deviations, [m].
-        expected: RMS as predicted, [m].
+        limit: RMS of such deviations from which the calibration does not explain them, [m].
         refit: RMS residual of a fit of the new readings, [m]; None if an anomaly explains them.
         removed: Whether that fit removes the deviations.
         numbers: Numbers of the finding.
         place: Reading with the largest deviation.
     """
     text = (
-        f"The deviations of the new readings are {mm(achieved)} mm RMS. The calibration predicts "
-        f"{mm(expected)} mm."
+        f"The new readings deviate from the predictions by {mm(achieved)} mm RMS, more than their "
+        f"uncertainty (limit {mm(limit)} mm)."
     )
     action = ""
     if refit is not None:
@@ -62,12 +62,12 @@ def larger_than_predicted(
     return review("larger than predicted", text, action, (place,), **numbers)
 
 
-def as_predicted(achieved: float, expected: float, numbers: Mapping[str, float]) -> Finding:
-    """Deviations are as the calibration predicts."""
+def as_predicted(achieved: float, limit: float, numbers: Mapping[str, float]) -> Finding:
+    """Deviations are as the calibration predicts; arguments as for `larger_than_predicted`."""
     return note(
         "as predicted",
-        f"The new readings agree with the predictions. They deviate by {mm(achieved)} mm RMS; "
-        f"{mm(expected)} mm are expected.",
+        f"The new readings agree with the predictions: they deviate by {mm(achieved)} mm RMS, "
+        f"within their uncertainty (limit {mm(limit)} mm).",
         **numbers,
     )
 

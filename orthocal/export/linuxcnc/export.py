@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
+from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import find_entries, offsets_to_enter
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError, ParameterError
 from orthocal.export.linuxcnc.approximation import approximate
 from orthocal.export.linuxcnc.c_source import write_component, write_core
-from orthocal.export.linuxcnc.drive_compensation import find_compensation, tabulate, write_table
+from orthocal.export.linuxcnc.drive_compensation import (
+    JointCompensation,
+    find_compensation,
+    tabulate,
+    write_table,
+)
 from orthocal.export.linuxcnc.home_offsets import find_homes
 from orthocal.export.linuxcnc.instructions import (
     write_home_lines,
@@ -112,6 +119,7 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         compensation = tabulate(
             calibration, compensation, offsets_to_enter(calibration), latched=options.latched
         )
+        _require_change(calibration, compensation)
         tables = {
             f"joint_{i}.comp": write_table(joint)
             for i, joint in enumerate(compensation)
@@ -141,3 +149,17 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         **write_component(approximation),
         **write_core(calibration, approximation, compensation),
     }
+
+
+def _require_change(calibration: Calibration, compensation: Sequence[JointCompensation]) -> None:
+    """Refuse lines for the INI file that would change nothing.
+
+    Raises:
+        ExportError: If the offsets stay as they are and nothing else is compensated.
+    """
+    assessment = assessment_of(calibration)
+    if assessment.keeps_offsets and not any(
+        c.backlash or c.table is not None for c in compensation
+    ):
+        more = "" if calibration.only_offsets else " --module writes a correction of all errors."
+        raise ExportError(f"{assessment.decision.words} HOME_OFFSET does not change.{more}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from orthocal.assessment.assess import expanded_uncertainty
+from orthocal.assessment.assess import assessment_of, expanded_uncertainty
 from orthocal.assessment.controller_entries import (
     ENTERED_DECIMALS,
     find_entries,
@@ -161,6 +161,8 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str
             "The calibration identified more than offsets. These offsets minimise the tool error\n"
             "while nothing else is corrected."
         )
+    if assessment_of(calibration).keeps_offsets:
+        scope = "The offsets stay as they are."
     values = {
         "robot": comment_safe(calibration.robot.name),
         "scope": scope,

@@ -30,6 +30,7 @@ from orthocal.output.scene.drawing import draw_scene
 from orthocal.output.text.accuracy import render_tool
 from orthocal.output.text.adjustment import render_adjustments
 from orthocal.output.text.answer import (
+    name_values,
     render_answer,
     render_method,
     render_subject,
@@ -140,7 +141,7 @@ def _verdict(calibration: Calibration, saved: Path | None) -> str:
     )
     return (
         to_markup(render_answer(calibration, heading=False, saved=saved))
-        + heading("Values to enter", level=3)
+        + heading(name_values(calibration), level=3)
         + to_markup(render_values(calibration))
         + paragraph(fit)
         + heading("Findings", level=3)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import RectBivariateSpline
 
 from orthocal.arrays import Array
-from orthocal.assessment.controller_entries import find_entries
+from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.tool_error import ToolAccuracy, assess_remaining
 from orthocal.calibration.calibration import Calibration
 from orthocal.output.report.figure import Plot, open_figure
@@ -101,7 +101,7 @@ def _draw_tool_map(calibration: Calibration, accuracy: ToolAccuracy, which: Fiel
     lines = _find_grid(accuracy.points)
     shown = {
         "now": True,
-        "entered": not calibration.only_offsets and bool(find_entries(calibration)),
+        "entered": not calibration.only_offsets and not assessment_of(calibration).keeps_offsets,
         "uncertainty": accuracy.after is not None,
     }
     if lines is None or not shown[which]:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocal.arrays import Array
+from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, ParameterError
@@ -32,7 +33,7 @@ from orthocal.output.text.layout import counted, typeset
 from orthocal.robot.model import Robot, coordinate_units
 from orthocal.robot.reference_posture import count_free_motions
 from orthocal.session.session import Session
-from orthocal.units import MM
+from orthocal.units import DRIVE_UNITS, MM
 from orthocal.viewer.machine import MachineScene
 from orthocal.viewer.motion import (
     Timeline,
@@ -151,10 +152,11 @@ def _draw_robot(robot: Robot, posture: str | None) -> Scene:
 
 
 def _state_zero(robot: Robot) -> list[str]:
-    """Facts about the mechanical zero and about free motions there."""
+    """Facts about the mechanical zero, as the controller counts, and about free motions there."""
     drives = ", ".join(
-        f"{d.name} {d.zero * (1e3 if d.unit == 'm' else 1.0):g} {'mm' if d.unit == 'm' else 'rad'}"
+        f"{d.name} {float(d.to_joint(d.zero)) / size + 0.0:.6g} {unit}"
         for d in robot.drives
+        for unit, size in [DRIVE_UNITS[d.unit]]
     )
     facts = [f"Mechanical zero: {drives}."]
     computed = [d.name for d in robot.drives if d.zero_computed]
@@ -240,9 +242,9 @@ def _draw_calibration(
         for e in find_entries(calibration)
     )
     if entries:
-        scene.facts.insert(
-            0, f"Offsets to enter: {entries}. Each leg leans by the offsets of all drives."
-        )
+        keep = assessment_of(calibration).keeps_offsets
+        which = "Offsets that stay as they are" if keep else "Offsets to enter"
+        scene.facts.insert(0, f"{which}: {entries}. Each leg leans by the offsets of all drives.")
     _finish(scene, calibration.session.source, stops, left_out)
     return scene
 

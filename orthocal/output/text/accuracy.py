@@ -11,7 +11,6 @@ from rich.text import Text
 
 from orthocal.arrays import Array
 from orthocal.assessment.assess import assessment_of
-from orthocal.assessment.controller_entries import find_entries
 from orthocal.assessment.remaining_errors import RemainingError, find_remaining_errors
 from orthocal.assessment.tool_error import (
     ErrorSizes,
@@ -73,7 +72,8 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
         accuracy: Its tool errors.
     """
     rows = [("identified error, now", accuracy.measure(accuracy.deviation))]
-    if not calibration.only_offsets and find_entries(calibration):
+    keep = assessment_of(calibration).keeps_offsets
+    if not calibration.only_offsets and not keep:
         entered = accuracy.measure(accuracy.error_after_offsets)
         rows.append(("identified error, offsets entered", entered))
     rows.append(("uncertainty before calibration", accuracy.before.sizes))
@@ -100,7 +100,6 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
         notes.append(UNCERTAINTY_NOTE)
         summary = summarise_tool(calibration, accuracy)
         if summary is not None:
-            keep = assessment_of(calibration).keeps_offsets
             notes.append(describe_tool_error(summary, keep=keep))
             if not calibration.only_offsets:
                 notes.append(describe_compensated(summary.compensated))

@@ -11,7 +11,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from orthocal.assessment.assess import assessment_of, expanded_uncertainty
+from orthocal.assessment.assess import assessment_of, expanded_uncertainty, lowers
 from orthocal.assessment.plausibility import describe_legs
 from orthocal.assessment.wording import joined
 from orthocal.assessment.words.anomalies import describe_evidence
@@ -22,7 +22,6 @@ from orthocal.assessment.words.entries import (
 )
 from orthocal.calibration.assessment_record import (
     Assessment,
-    ControllerEntry,
     Decision,
     Finding,
     FindingKind,
@@ -90,7 +89,7 @@ def render_answer(
         ]
     parts += _tool(calibration, assessment)
     parts.append(bullets([f.words for f in _listed(calibration, assessment)]))
-    return Group(*parts, render_next(*_next_step(assessment, saved)))
+    return Group(*parts, render_next(*_next_step(calibration, assessment, saved)))
 
 
 def render_next(words: str, commands: Sequence[str] = ()) -> RenderableType:
@@ -135,7 +134,7 @@ def _entry_notes(calibration: Calibration, assessment: Assessment) -> list[Rende
     if unstated:
         return [_indented(Text(unstated[0].words))]
     down = [d.name for d in calibration.robot.drives if d.direction < 0]
-    if not down or assessment.of_kind("no change needed"):
+    if not down or assessment.keeps_offsets:
         return []
     verb = "counts" if len(down) == 1 else "count"
     text = f"joint: change of the controller's joint, with its sign; {joined(down)} {verb} down."
@@ -167,21 +166,34 @@ def _listed(calibration: Calibration, assessment: Assessment) -> Sequence[Findin
         for f in assessment.findings
         if (f.severity != "note" or f.kind in LISTED) and f.text != assessment.decision.reason
     ]
-    if assessment.of_kind("no change needed"):
-        listed = [f for f in listed if f.kind != "not significant"]
+    if assessment.keeps_offsets:
+        listed = [f for f in listed if f.kind not in ("must change", "not significant")]
     if calibration.only_offsets:  # legs and axes are left out, which matters more
         listed = [f for f in listed if f.kind != "line assumed"]
     return listed[:MOST_LISTED]
 
 
-def _next_step(assessment: Assessment, saved: Path | None) -> tuple[str, tuple[str, ...]]:
+def _next_step(
+    calibration: Calibration, assessment: Assessment, saved: Path | None
+) -> tuple[str, tuple[str, ...]]:
     """The next action, and the commands for it."""
-    decision = assessment.decision
-    if decision.verdict != "enter" or assessment.keeps_offsets:
+    decision, tool = assessment.decision, assessment.tool
+    correct = (
+        assessment.keeps_offsets
+        and not calibration.only_offsets
+        and tool is not None
+        and lowers(tool.now, tool.compensated)
+    )
+    if decision.verdict != "enter" or (assessment.keeps_offsets and not correct):
         return decision.action or "none.", ()
     if saved is None:
         return "keep the result by adding `--out DIRECTORY` to this command.", ()
-    directory, new = (quote_path(p) for p in (saved, f"{saved}-again"))
+    directory, new, module = (quote_path(p) for p in (saved, f"{saved}-again", f"{saved}-linuxcnc"))
+    if correct:
+        return "correct the other errors, in LinuxCNC or in programs.", (
+            f"orthocal export {directory} --to linuxcnc --out {module}",
+            f"orthocal correct {directory} PROGRAM.ngc --out CORRECTED.ngc",
+        )
     return "enter the offsets, home the machine and measure again.", (
         f"orthocal again {directory} --out {new}",
         f"orthocal record {new}",
@@ -267,6 +279,11 @@ def describe_machine(calibration: Calibration) -> str:
     return ", ".join(words)
 
 
+def name_values(calibration: Calibration) -> str:
+    """Heading of `render_values`: what happens to the offsets."""
+    return "Offsets" if assessment_of(calibration).keeps_offsets else "Values to enter"
+
+
 def render_values(calibration: Calibration) -> RenderableType:
     """Meaning of the values to enter, and those that the short answer does not list."""
     assessment = assessment_of(calibration)
@@ -274,14 +291,17 @@ def render_values(calibration: Calibration) -> RenderableType:
         return noted(Text("None: no offset was identified."), EXPANDED)
     complete = assessment.decision.verdict != "reject" and calibration.only_offsets
     table = entry_table(calibration, identified=not calibration.only_offsets)
-    notes = [_example(calibration, assessment.entries[0])]
+    keep, stated = assessment.keeps_offsets, assessment.entries[0].active is not None
+    meaning = "Slide coordinate = encoder coordinate + offset."
+    replaced = "Enter the complete offset in place of the active one."
+    notes = [f"{meaning} {replaced}" if stated and not keep else meaning]
     notes += [f.words for f in assessment.of_kind("controller not stated")]
     notes.append(EXPANDED)
     if not calibration.only_offsets:
         notes.append(
-            "enter: best value for a controller that corrects nothing else; it compensates a part "
-            "of the other errors. identified: offset of the slide, for a controller that corrects "
-            "all identified errors."
+            f"{'best' if keep else 'enter'}: best value for a controller that corrects nothing "
+            "else; it compensates a part of the other errors. identified: offset of the slide, for "
+            "a controller that corrects all identified errors."
         )
     return noted(Group() if complete else table, *notes)
 
@@ -294,7 +314,7 @@ def entry_table(calibration: Calibration, *, identified: bool = False) -> Table:
         identified: Whether to list the identified offsets, too.
     """
     assessment = assessment_of(calibration)
-    enter = "estimate" if assessment.of_kind("no change needed") else "enter"
+    enter = "best" if assessment.keeps_offsets else "enter"
     stated = any(e.active is not None for e in assessment.entries)
     columns = ["now", enter] if stated else ["add" if enter == "enter" else enter]
     directions = {d.name: d.direction for d in calibration.robot.drives}
@@ -306,25 +326,7 @@ def entry_table(calibration: Calibration, *, identified: bool = False) -> Table:
         joint = [signed(directions[e.drive] * e.change * factor)] if counts_down else []
         estimate = [signed(e.identified * factor)] if identified else []
         half = e.held or plain(expanded_uncertainty(calibration, e) * factor)
-        rows.append((e.drive, *now, signed(e.enter * factor), half, *joint, *estimate, e.edge_unit))
+        rows.append((e.drive, *now, signed(e.best * factor), half, *joint, *estimate, e.edge_unit))
     further = [*(["joint"] if counts_down else []), *(["identified"] if identified else [])]
     headers = ("drive", *columns, "±", *further, "unit")
     return table_of(headers, rows)
-
-
-def _example(calibration: Calibration, entry: ControllerEntry) -> str:
-    """Meaning of an offset, by the first drive at its mechanical zero."""
-    drive = next(d for d in calibration.robot.drives if d.name == entry.drive)
-    factor, unit = drive.edge_factor, drive.edge_unit
-    meaning = "Slide coordinate = encoder coordinate + offset"
-    if entry.active is None:
-        return f"{meaning}."
-    at, actual = drive.zero * factor, (drive.zero + entry.identified) * factor
-    shown = ""
-    if drive.direction < 0 or drive.joint_zero is not None:
-        joint = float(drive.to_joint(drive.zero)) * factor
-        shown = f" (the controller's joint shows {joint:.3f} {unit})"
-    return (
-        f"{meaning}. With {drive.name}'s encoder at {at:.3f} {unit}{shown}, its slide is at "
-        f"{actual:.3f} {unit}. Enter the complete offset in place of the active one."
-    )

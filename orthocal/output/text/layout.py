@@ -48,7 +48,7 @@ EXPANDED = (
 NOISE_SOURCES = {
     "cycles": "from repeated cycles",
     "residuals": "from the residuals",
-    "gauge": "as stated for the gauge",
+    "gauge": "as stated for the gauge, with rounding to its resolution",
     "unknown": "unknown",
 }
 """Source of the noise of a reading, in words."""

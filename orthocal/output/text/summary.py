@@ -13,7 +13,13 @@ from orthocal.arguments import require_kind
 from orthocal.assessment.assess import assessment_of
 from orthocal.calibration.assessment_record import Assessment
 from orthocal.calibration.calibration import Calibration
-from orthocal.output.text.answer import MORE, render_answer, render_method, render_values
+from orthocal.output.text.answer import (
+    MORE,
+    name_values,
+    render_answer,
+    render_method,
+    render_values,
+)
 from orthocal.output.text.layout import print_rich, section, to_markup, to_text
 
 if TYPE_CHECKING:
@@ -107,7 +113,7 @@ def render_calibration(
         "Gauges and sensors": tables.render_sensors(calibration),
         "Tool error": render_tool(calibration),
         "Findings": tables.render_findings(calibration),
-        "Values to enter": render_values(calibration),
+        name_values(calibration): render_values(calibration),
         "For research": tables.render_identifiability(calibration, all_rows=all_rows),
     }
     return Group(answer, *(section(name, part) for name, part in sections.items() if part))

@@ -96,7 +96,7 @@ def _parameter_notes(c: Calibration, *, omitted: int, by_noise: bool) -> list[st
     """Sentences under the table of the parameters."""
     notes = []
     if not c.only_offsets and assessment_of(c).entries:
-        notes.append("Offsets are those of the slides; the values to enter differ (see there).")
+        notes.append("Offsets are those of the slides; the best ones to enter differ (see there).")
     if omitted:
         notes.append(f"{omitted} more are resolved by less than half; --all lists them.")
     held = [p for p in c.parameters if not p.free]
@@ -242,7 +242,7 @@ def render_fit(calibration: Calibration) -> RenderableType:
             f"σ of a reading from repeated cycles: {mm(noise.cycles_sigma)} mm, "
             f"{noise.cycles_dof} degrees of freedom"
         )
-    if c.session.gauge_sigma is not None:
+    if c.session.gauge_sigma is not None and noise.source != "gauge":
         text = f"σ stated for the gauge: {mm(c.session.gauge_sigma)} mm a reading"
         if c.rows_are_differences:
             text += f", {mm(c.session.gauge_sigma * math.sqrt(2.0))} mm a difference"
