@@ -148,6 +148,20 @@ class BallBar:
         centre = ", ".join(f"{v / MM:g}" for v in self.centre)
         return f"ball bar of {self.length / MM:g} mm about ({centre}) mm"
 
+    @property
+    def mounting_steps(self) -> tuple[str, ...]:
+        """Steps that mount the bar."""
+        x, y, z = (f"{v / MM:g}" for v in self.centre)
+        length = f"{self.length / MM:g} mm"
+        known = "It is known" if not self.length_std else "Its true length need not be known"
+        return (
+            "Mount one ball at the tool and the other on the table, at about "
+            f"X{x} Y{y} Z{z} mm from the tool's mechanical zero. The places need not be exact.",
+            f"Put the bar between the balls. Its dial shows 0 at a length of {length}. {known}.",
+            "Make the bar longer by hand. The dial must grow. If it falls, write every reading of "
+            "this setup with reversed sign.",
+        )
+
     def frames(self, robot: Robot) -> Frames:
         """The tool's frame."""
         return Frames((require_tcp(robot).frame,))

@@ -111,6 +111,14 @@ class Probe(ToolIndicator):
         return f"probe towards {self.direction}"
 
     @property
+    def mounting_steps(self) -> tuple[str, ...]:
+        """Steps of the operator."""
+        return (
+            f"Move the probe towards {self.direction} in each posture until it triggers. Write the "
+            "coordinates at the trigger as the posture, and 0 as the reading.",
+        )
+
+    @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
         """Direction and form of the surface, height of the trigger."""
         surface = ToolIndicator.nuisance_parameters.fget(self)  # type: ignore[attr-defined]

@@ -129,6 +129,9 @@ class Sensor(Protocol):
     # conditions: ClassVar[tuple[Condition, ...]], optional: conditions of a reading on which its
     # expression depends (`sensor_conditions`)
 
+    # mounting_steps: tuple[str, ...], optional: steps that mount it in the alignment posture, for
+    # the operator (`mounting_steps`)
+
     # zero: ClassVar[GaugeZero], optional: gauge zero of its setups unless they state another one;
     # "free" by default (`default_zero`)
 
@@ -187,6 +190,12 @@ def sensor_conditions(sensor: Sensor) -> tuple[Condition, ...]:
     """Conditions of a reading on which a sensor's expression depends."""
     conditions: tuple[Condition, ...] = getattr(sensor, "conditions", ())
     return conditions
+
+
+def mounting_steps(sensor: Sensor) -> tuple[str, ...] | None:
+    """Steps that mount it in the alignment posture; None for an indicator on the base."""
+    steps: tuple[str, ...] | None = getattr(sensor, "mounting_steps", None)
+    return steps
 
 
 def default_zero(sensor: Sensor) -> GaugeZero:

@@ -269,6 +269,29 @@ class ToolIndicator:
         turned = ", turned over" if a.reversed else ""
         return f"indicator at the tool towards {self.direction}, {words}{along}{turned}"
 
+    @property
+    def mounting_steps(self) -> tuple[str, ...]:
+        """Steps that mount the indicator and its artefact."""
+        a = self.artefact
+        words = a.kind.replace("_", " ")
+        if a.kind == "gauge_block":
+            place = (
+                "Prepare a flat surface on the table. Where the posture is higher, put the gauge "
+                f"block of {a.height / MM:g} mm under the tip."
+            )
+        elif a.along is None:
+            place = f"Put the {words} on the table, square to the plunger by eye."
+        else:
+            place = f"Put the {words} on the table, along {a.along} of the machine by eye."
+        over = " Turn it over since its other setup." if a.reversed else ""
+        return (
+            place + over + " Clamp it: it must stay until all its readings are taken.",
+            f"Mount the indicator at the tool. Its plunger points to {self.direction} and touches "
+            f"the {words}.",
+            "Push the plunger in by hand. The dial must grow. If it falls, write every reading of "
+            "this setup with reversed sign.",
+        )
+
     def frames(self, robot: Robot) -> Frames:
         """The tool's frame."""
         return Frames((require_tcp(robot).frame,))

@@ -32,6 +32,7 @@ from orthocal.output.sheet.gauge_position import (
 from orthocal.output.sheet.pictures import draw_machine, draw_section
 from orthocal.output.text.layout import counted, true_minus
 from orthocal.robot.model import Robot
+from orthocal.sensors.protocol import mounting_steps
 from orthocal.session.session import Gauge, Session
 from orthocal.units import DRIVE_UNITS, LIMIT, MM, format_fixed
 from orthocal.viewer.visuals import load_visuals
@@ -226,12 +227,15 @@ def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[
     align = "Move to the alignment posture"
     if gauge.alignment == first.posture:
         align, go = f"{align}, which is also the first posture", []
-    return [
-        f"{align}, {gauge.alignment}: {_joint_list(session.robot, gauge.drives)}.",
+    mounting = mounting_steps(gauge.setup.sensor) or (
         f"Mount the gauge on the base, on the {side} side of {target}. Point its plunger to "
         f"{opposite}. {contact}Contact point, from the tool's mechanical zero: {place} mm.",
         f"Push the plunger in by hand, towards {side}. The dial must grow. If it falls, write "
         "every reading of this setup with reversed sign.",
+    )
+    return [
+        f"{align}, {gauge.alignment}: {_joint_list(session.robot, gauge.drives)}.",
+        *mounting,
         *go,
         _gauge_zero(session.gauges[gauge.setup.gauge], first),
         "Take the readings in the order below. The line numbers are those of readings.csv.",

@@ -21,6 +21,7 @@ from orthocal.measurement.motion.motion import guide, set_dial
 from orthocal.measurement.recording import Recording
 from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
+from orthocal.sensors.protocol import mounting_steps
 from orthocal.session.session import Conditions, Reading, Session, Setup
 from orthocal.text import printable
 from orthocal.units import DRIVE_UNITS, MM, format_fixed, to_mm, trim_zeros
@@ -189,6 +190,9 @@ class RecordingText:
         return "\n".join(lines)
 
     def _stand(self, setup: str) -> str:
+        steps = mounting_steps(self._session.setups[setup].sensor)
+        if steps is not None:
+            return " ".join(steps)
         guidance = self._guidance
         aligned = guidance.aligned_at[setup]
         at = ", ".join(f"{format_fixed(v / MM, 1)}" for v in guidance.touched(setup, aligned))
