@@ -287,11 +287,11 @@ def _residual_rows(
         residual = project_out_zeros(measured - prediction, o, weights=fit.robust_weights)
         return session.values - noise * o.rows(residual)
 
-    n = problem.n_machine
-    at_reference = nominal_theta is None
-    machine = problem.active_theta[:n] if nominal_theta is None else nominal_theta
-    theta = np.append(machine, fit.solution.theta[n:])  # the mounting of the gauges is the same
-    nominal = fitted(problem.predict(theta, problem.active_passive if at_reference else None))
+    mounting = fit.solution.theta[problem.n_machine :]  # that of the calibrated machine
+    if nominal_theta is None:
+        nominal = fitted(problem.predict_nominal(mounting))
+    else:
+        nominal = fitted(problem.predict(np.append(nominal_theta, mounting), None))
     try:
         closed = problem.close(fit.linearised_theta, start=fit.solution.passive)
         by_linear = fitted(problem.predict(fit.linearised_theta, closed))

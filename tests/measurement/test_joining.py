@@ -85,6 +85,20 @@ def test_offsets_that_were_active_may_differ(root):
     assert calibrate([monday, wrong]).rms_after > 5e-5 > 1e-8 > found.rms_after
 
 
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_deviations_before_are_with_the_offsets_of_each_session(root, order):
+    """Of a joined calibration as of that of the session alone, whatever its place."""
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    entered = plan.with_controller([1.1e-3, -0.7e-3, 0.4e-3])
+    parts = [simulate_session(p, TRUTH, seed=k).session for k, p in enumerate((plan, entered))]
+    alone = [[r.deviation for r in calibrate(part, "offsets").residuals] for part in parts]
+    largest = [np.abs(deviations).max() for deviations in alone]
+    assert largest[0] > 3.0 * largest[1]
+    joined = calibrate([parts[k] for k in order], "offsets")
+    expected = [d for k in order for d in alone[k]]
+    assert [r.deviation for r in joined.residuals] == pytest.approx(expected, abs=1e-9)
+
+
 def test_noise_is_told_for_each_session(root):
     """A dial of 5 µm and one of 40: as each alone is found, and the better one counts more."""
     plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
