@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -20,7 +21,7 @@ from orthocal.cli.options import (
     read_conditions,
     require_between,
 )
-from orthocal.cli.printing import deliver, print_rows
+from orthocal.cli.printing import deliver, print_rows, put_note
 from orthocal.errors import ClosureError, SessionError
 from orthocal.units import MM
 
@@ -37,7 +38,8 @@ def accuracy(
 ) -> None:
     """Print the tool error over the workspace, or at points.
 
-    With points it prints CSV: the deviation of the tool at each, and its standard deviation.
+    With points it prints CSV: the absolute error of the tool at each, without alignment of the
+    workpiece, and its standard deviation.
     Without --approach, --temperature and --payload a tool error is that under the conditions of
     use that the robot's YAML states.
 
@@ -65,6 +67,7 @@ def accuracy(
         if not json:
             rows = accuracy_rows(result, targets, names=names, conditions=conditions)
             put_assumed(result, conditions)
+            put_note(text.ABSOLUTE_NOTE.format(shlex.quote(str(calibration))))
             print_rows(text.POINT_COLUMNS, text.format_points, rows)
             return
         if len(targets) > MOST_POINTS:

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from gauges import exact
 
-from orthocal import SolverOptions, calibrate, load_calibration, load_plan, simulate_session
+from orthocal import (
+    SolverOptions,
+    calibrate,
+    load_calibration,
+    load_plan,
+    simulate_session,
+    summarize,
+)
 from orthocal.calibration.file import calibration_document, write_calibration
 from orthocal.errors import SessionError
 from orthocal.estimation import fit as fit_module
@@ -95,6 +102,9 @@ def test_deviations_before_are_with_the_offsets_of_each_session(root, order):
     largest = [np.abs(deviations).max() for deviations in alone]
     assert largest[0] > 3.0 * largest[1]
     joined = calibrate([parts[k] for k in order], "offsets")
+    postures = len(parts[0].postures)
+    count = f"{2 * len(parts[0].readings)} readings of 2 sessions in {postures} postures, "
+    assert count in " ".join(summarize(joined).split())
     expected = [d for k in order for d in alone[k]]
     assert [r.deviation for r in joined.residuals] == pytest.approx(expected, abs=1e-9)
 

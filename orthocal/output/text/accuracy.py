@@ -33,10 +33,17 @@ from orthocal.units import MM, UM, read_limit
 
 POINT_COLUMNS = (
     *("x_mm", "y_mm", "z_mm"),
-    *("deviation_x_um", "deviation_y_um", "deviation_z_um"),
+    *("absolute_x_um", "absolute_y_um", "absolute_z_um"),
     *("std_x_um", "std_y_um", "std_z_um"),
 )
-"""Commanded tool position; actual less commanded position; standard deviation of the actual one."""
+"""Commanded tool position; absolute error, actual less commanded; its standard deviation."""
+
+ABSOLUTE_NOTE = (
+    "Errors are absolute: actual less commanded position, without alignment of the workpiece on "
+    "the machine. The tool error over the workspace, after this alignment:\n"
+    "  orthocal accuracy {}"
+)
+"""Note beside the errors at points; {} is the calibration."""
 
 COLUMNS_NOTE = (
     "RMS, 95 % and worst point: workpiece aligned on the machine (translation and rotation "
@@ -126,7 +133,7 @@ def describe_remaining(errors: Iterable[RemainingError]) -> list[str]:
 
 
 def format_points(rows: Array) -> str:
-    """Deviation and standard deviation at points as lines of CSV with POINT_COLUMNS, µm.
+    """Absolute error and standard deviation at points as lines of CSV with POINT_COLUMNS, µm.
 
     Args:
         rows: Commanded position, deviation and its standard deviation, shape (K, 9), [m]; NaN for
