@@ -118,7 +118,7 @@ def test_a_session_with_other_offsets_is_no_validation(table1):
 def test_offsets_that_were_not_identified_need_not_be_the_controllers(table1):
     calibration = calibrate(table1[2], Choice(free=["x_slide.offset", "z_slide.offset"]))
     # y_slide alone may have another value
-    entered = entered_offsets(calibration) + [0.0, 0.3e-3, 0.0]
+    entered = np.add(entered_offsets(calibration), [0.0, 0.3e-3, 0.0])
     stated = with_offsets(table1[3], entered)
     assert validate_calibration(calibration, stated).offsets_stated
     entered[2] += 1e-3

@@ -122,8 +122,8 @@ def _front(
         "Check each rod and each hinge for play. The calibration does not remove play.",
     ]
     rules = [
-        _approach_rule(robot, motions),
-        "Keep the tip on its rod from the first reading of a setup to the last.",
+        _approach_rule(session, motions),
+        _contact_rule(motions),
         "After you have set the gauge zero, do not touch the bezel, the stand or the arm of the "
         "gauge. If the gauge was bumped, start that setup again.",
         "Write down what the dial shows, with its sign. Estimate the last digit. If you took no "
@@ -406,9 +406,20 @@ def _count_outwards(robot: Robot) -> str:
     return ", ".join(f"{verbs[d.direction]} for {d.name}" for d in robot.drives)
 
 
-def _approach_rule(robot: Robot, motions: Sequence[SetupMotion]) -> str:
+def _contact_rule(motions: Sequence[SetupMotion]) -> str:
+    """Rule for the tip between the readings of a setup."""
+    rule = "Keep the tip on its rod from the first reading of a setup to the last"
+    if not any(stop.lift for m in motions for stop in m.stops):
+        return f"{rule}."
+    return (
+        f"{rule}, except on the ways that the setup names: hold the plunger up there, and let it "
+        "down on the rod in the posture. The stand and the bezel stay as they are."
+    )
+
+
+def _approach_rule(session: Session, motions: Sequence[SetupMotion]) -> str:
     """Rule for the last motion to a posture, in joint numbers."""
-    length = approach_length(robot)
+    robot, length = session.robot, approach_length(session)
     arrows = {describe_approach(robot, s.approach) for m in motions for s in m.stops}
     jog = (
         f"If you jog, go {length} past the posture with every joint first, and come back to it in "

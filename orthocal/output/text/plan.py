@@ -126,8 +126,7 @@ def _describe_limits(effect: EffectLimits) -> str:
 
 def _how_to_measure(plan: MeasuringPlan) -> list[str]:
     """Instructions for the operator."""
-    robot = plan.session.robot
-    length = approach_length(robot)
+    length = approach_length(plan.session)
     approach = f"Approach every posture from the same side: the last {length} in one direction."
     if any(r.approach for r in plan.session.readings):
         approach = (

@@ -145,7 +145,7 @@ class RecordingText:
             "Type the reading of the dial in mm. It is on disk before the next question. `help` "
             "lists the commands. Lines are those of the sheet and of readings.csv."
         )
-        length = approach_length(session.robot)
+        length = approach_length(session)
         parts.append(
             f"Approach each posture as its line states, in the last {length}: ↑ with growing "
             "numbers of the joints, ↓ with falling ones."
@@ -212,7 +212,7 @@ class RecordingText:
         lines = [self.wrap(f"Line {row.line}: {row.label_with_cycle}{left}")]
         if row.approach is not None:
             arrow = describe_approach(self._session.robot, row.approach)
-            length = approach_length(self._session.robot)
+            length = approach_length(self._session)
             lines.append(self.wrap(f"approach {arrow} in the last {length}", indent="  "))
         for posture in (row.posture, *([row.minus] if row.minus else [])):
             name = f"{posture}: " if row.minus else ""
