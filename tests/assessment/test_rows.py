@@ -114,7 +114,7 @@ def test_the_command_line_leaves_empty_cells_and_says_where(orthocal):
         lines = [line for line in err.splitlines() if line.startswith("orthocal: ")]
         assert lines[0].startswith("orthocal: /table.csv:21: cannot be reached: the loops stay")
         assert lines[1].startswith("orthocal: /table.csv:41: cannot be reached: joint 'x_slide'")
-        assert lines[2] == "orthocal: 2 of the rows cannot be reached; their cells are empty"
+        assert lines[2] == "orthocal: 2 rows cannot be reached; their cells are empty"
 
 
 def test_a_table_of_which_no_row_can_be_reached_is_bad_input(orthocal):
