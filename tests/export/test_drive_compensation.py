@@ -219,9 +219,8 @@ DENSE = 0.02
 """Distance of the points at which a corrected program is followed, [mm]."""
 
 
-def run_corrected(calibration, *, backlash):
+def run_corrected(calibration, field, *, backlash):
     """Tool of the calibrated machine along a corrected program, shape (K, 3), [mm]."""
-    field = CorrectionField(calibration, ACTIVE, within=WITHIN)
     lags = find_lags(calibration.robot, calibration.errors)
     sides = ApproachSides(calibration.robot, lags) if backlash else None
     interpreter = Interpreter("p", axes=field.axes, offsets={})
@@ -249,10 +248,11 @@ WITHIN = 1e-6
 
 
 def test_a_corrected_program_takes_up_backlash(calibration):
-    off = from_pieces(run_corrected(calibration, backlash=True), *PATH)
+    field = CorrectionField(calibration, ACTIVE, within=WITHIN)
+    off = from_pieces(run_corrected(calibration, field, backlash=True), *PATH)
     assert off.min(axis=0).max() < WITHIN
     assert (np.count_nonzero(off < WITHIN, axis=1) > COUNTS).all()
-    ignored = from_pieces(run_corrected(calibration, backlash=False), *PATH)
+    ignored = from_pieces(run_corrected(calibration, field, backlash=False), *PATH)
     assert ignored.min(axis=0).max() > 20 * WITHIN
 
 
