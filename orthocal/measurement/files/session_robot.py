@@ -107,13 +107,14 @@ def _read_posture(keys: PostureKeys, robot: Robot, where: str) -> tuple[PostureF
 
 
 def _check_travel(robot: Robot, drives: Array, key: str, file: Path) -> None:
-    """Refuse drive coordinates beyond a drive's travel."""
+    """Refuse drive coordinates beyond a drive's travel, in the numbers of the controller."""
     for drive, value in zip(robot.drives, drives, strict=True):
         if not drive.lower - 1e-9 <= value <= drive.upper + 1e-9:
             unit, size = DRIVE_UNITS[drive.unit]
+            number, low, high = (v / size for v in (drive.to_joint(value), *drive.joint_limits))
             raise SessionError(
-                f"{key}{drive.name} would be at {value / size:.2f} {unit}; it reaches from "
-                f"{drive.lower / size:g} to {drive.upper / size:g} {unit}",
+                f"{key}{drive.name} would be at {number:.2f} {unit}; it reaches from {low:g} to "
+                f"{high:g} {unit}",
                 where=str(file),
             )
 
