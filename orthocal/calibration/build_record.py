@@ -271,6 +271,7 @@ def _session_record(session: Session) -> SessionRecord:
         controller_offsets=None if offsets is None else tuple(offsets.tolist()),
         purpose=session.purpose,
         seed=session.seed,
+        compensation=session.compensation,
         adjusted=tuple(session.adjusted.items()),
         parts=tuple(_session_record(part) for part in session.parts),
     )
@@ -356,6 +357,7 @@ def _setup_records(fit: Fit) -> tuple[SetupRecord, ...]:
             aligned_at=aligned_at[s.name],
             zero_kind=s.zero,
             payload=s.payload,
+            compensation=s.compensation,
             adjusted=None if s.adjusted is None else tuple(s.adjusted.items()),
         )
         for s in fit.problem.session.setups.values()

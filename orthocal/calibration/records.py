@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from orthocal.calibration.assessment_record import Assessment
+from orthocal.effects.compensation import JointTrim
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.diagnostics.unmodelled import UnmodelledEffect
 from orthocal.estimation.loss import LossKind
@@ -113,6 +114,8 @@ class SessionRecord:
     """Model and free errors that the session states."""
     seed: Count | None
     """Seed of simulated readings; None for measured readings."""
+    compensation: Many[JointTrim] = ()
+    """What the controller compensated in the joint of each drive; empty for nothing."""
     adjusted: Many[tuple[str, Number]] = ()
     """Mechanical adjustments since the machine was built and their amounts, [m]."""
     parts: Many[SessionRecord] = ()
@@ -247,6 +250,8 @@ class SetupRecord:
     """Whether the zero was estimated or known to be 0."""
     payload: Annotated[Number, Field(ge=0.0, le=HEAVIEST_KG)] = 0.0
     """Mass on the tool, [kg]."""
+    compensation: Many[JointTrim] | None = None
+    """What the controller compensated, where it was not that of the session."""
     adjusted: Many[tuple[str, Number]] | None = None
     """Mechanical adjustments and their amounts, [m], where they were not those of the session."""
 

@@ -110,6 +110,7 @@ def restore_session(calibration: Calibration) -> Session:
                 s.zero_kind,
                 s.payload,
                 None if s.adjusted is None else dict(s.adjusted),
+                s.compensation,
             )
             for s in calibration.setups
         },
@@ -127,6 +128,7 @@ def restore_session(calibration: Calibration) -> Session:
             for r in calibration.residuals
         ),
         controller_offsets=None if offsets is None else read_only(offsets),
+        compensation=record.compensation,
         adjusted=dict(record.adjusted),
         path=None if record.path is None else Path(record.path),
         readings_path=None if record.readings_path is None else Path(record.readings_path),

@@ -2,18 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from orthocal.arrays import Array
+from orthocal.effects.compensation import Compensation, JointTrim
 from orthocal.errors import ClosureError, SessionError
+from orthocal.io.documents import parse_number, read_text
 from orthocal.io.fields import read_only
+from orthocal.io.files import content_withheld_outside
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.measurement.files.schema import OFFSET_KEYS, ControllerKeys, PostureKeys, SessionKeys
-from orthocal.robot.model import Robot
+from orthocal.measurement.files.schema import (
+    BACKLASH_KEYS,
+    LARGEST_TRIM,
+    OFFSET_KEYS,
+    ControllerKeys,
+    PostureKeys,
+    SessionKeys,
+)
+from orthocal.robot.model import Drive, Robot
 from orthocal.session.session import Posture, PostureForm
-from orthocal.units import DRIVE_UNITS, MM
+from orthocal.units import DRIVE_UNITS, MM, Unit
+
+TABLE_COLUMNS = ("position", "forward trim", "reverse trim")
+"""Columns of a COMP_FILE of type 1."""
+
+MOST_TABLE_ROWS = 256
+"""Largest number of lines of a COMP_FILE."""
 
 
 def require_given_zero(robot: Robot, where: str) -> None:
@@ -120,29 +137,120 @@ def _check_travel(robot: Robot, drives: Array, key: str, file: Path) -> None:
 
 
 def build_offsets(keys: ControllerKeys | None, robot: Robot, where: str) -> Array | None:
-    """Offsets that are active in the controller; each key has those of the drives of its kind.
+    """Offsets that are active in the controller; None where not stated.
+
+    Arguments, result and errors are those of `_read_drive_values`.
+    """
+    return None if keys is None else _read_drive_values(keys, OFFSET_KEYS, robot, where)
+
+
+def build_compensation(
+    keys: ControllerKeys | None, robot: Robot, *, folder: Path, where: str
+) -> Compensation:
+    """Backlash and errors of screws that the controller compensates; empty for none.
 
     Args:
         keys: What the session says, None for nothing.
         robot: The robot.
+        folder: Directory of the session, from which names of tables count.
+        where: File and key, for messages.
+
+    Raises:
+        SessionError: If there are not as many numbers or tables as drives, or a table is wrong.
+    """
+    if keys is None:
+        return ()
+    backlash = _read_drive_values(keys, BACKLASH_KEYS, robot, where)
+    if backlash is None and keys.comp_file is None:
+        return ()
+    names = keys.comp_file or [None] * len(robot.drives)
+    if len(names) != len(robot.drives):
+        drives = ", ".join(d.name for d in robot.drives)
+        raise SessionError(
+            f"has {len(names)} names; expected {len(robot.drives)}, one a drive ({drives}), with "
+            "null for a drive without a table",
+            where=f"{where}.comp_file",
+        )
+    values = np.zeros(len(names)) if backlash is None else backlash
+    return tuple(
+        JointTrim(float(value), None if name is None else _read_table(folder, name, drive, where))
+        for value, name, drive in zip(values, names, robot.drives, strict=True)
+    )
+
+
+def _read_table(folder: Path, name: str, drive: Drive, where: str) -> Array:
+    """Table of a COMP_FILE of type 1: positions and trims, shape (n, 3), [m, rad].
+
+    Raises:
+        SessionError: Naming the file and the line.
+    """
+    if not name.strip() or "\0" in name:
+        raise SessionError(
+            f"found {name!r}; expected the name of a file", where=f"{where}.comp_file"
+        )
+    file, (unit, size) = folder / name, DRIVE_UNITS[drive.unit]
+    with content_withheld_outside(folder, file):
+        text = read_text(file, error=SessionError)
+        rows = list[list[float]]()
+        for number, line in enumerate(text.splitlines(), start=1):
+            at = f"{file}:{number}"
+            if not (cells := line.split()):
+                continue
+            if len(cells) != len(TABLE_COLUMNS):
+                raise SessionError(
+                    f"has {len(cells)} numbers; expected {', '.join(TABLE_COLUMNS)}", where=at
+                )
+            row = [
+                parse_number(cell, where=at, name=column, error=SessionError)
+                for cell, column in zip(cells, TABLE_COLUMNS, strict=True)
+            ]
+            if rows and not row[0] > rows[-1][0]:
+                raise SessionError(
+                    f"the position {row[0]:g} {unit} does not exceed that of the line before",
+                    where=at,
+                )
+            if max(map(abs, row[1:])) > LARGEST_TRIM:
+                raise SessionError(
+                    f"found a trim of {max(row[1:], key=abs):g} {unit}; expected at most "
+                    f"{LARGEST_TRIM:g}, as in a table of COMP_FILE_TYPE = 1",
+                    where=at,
+                )
+            rows.append(row)
+        if not 1 < len(rows) <= MOST_TABLE_ROWS:
+            raise SessionError(
+                f"has {len(rows)} lines; expected 2 to {MOST_TABLE_ROWS}", where=str(file)
+            )
+    return read_only(np.array(rows) * size)
+
+
+def _read_drive_values(
+    keys: ControllerKeys, kinds: Mapping[str, tuple[Unit, float]], robot: Robot, where: str
+) -> Array | None:
+    """Numbers for all drives from keys of which each has those of the drives of its kind.
+
+    Args:
+        keys: What the session says.
+        kinds: Keys with the unit of their drives and the factor to it.
+        robot: The robot.
         where: File and key, for messages.
 
     Returns:
-        Shape (n_drives,), [m, rad], or None.
+        Shape (n_drives,), [m, rad], or None where none of the keys is stated.
 
     Raises:
-        SessionError: If a drive has no offset, or an offset no drive.
+        SessionError: If a drive has no number, or a number no drive.
     """
-    if keys is None:
+    stated = [key for key in kinds if getattr(keys, key) is not None]
+    if not stated:
         return None
-    offsets = np.zeros(len(robot.drives))
+    result = np.zeros(len(robot.drives))
     units: set[str] = set()
-    for key in keys.stated:
-        values, (unit, factor) = getattr(keys, key), OFFSET_KEYS[key]
+    for key in stated:
+        values, (unit, factor) = getattr(keys, key), kinds[key]
         drives = [i for i, d in enumerate(robot.drives) if d.unit == unit]
         kind = "prismatic" if unit == "m" else "revolute"
         if not drives:
-            fitting = "offsets_deg or offsets_mrad" if unit == "m" else "offsets_mm"
+            fitting = " or ".join(k for k, (u, _) in kinds.items() if u != unit)
             raise SessionError(
                 f"{robot.name} has no {kind} drive; expected {fitting}", where=f"{where}.{key}"
             )
@@ -153,12 +261,13 @@ def build_offsets(keys: ControllerKeys | None, robot: Robot, where: str) -> Arra
                 f"has {len(values)} numbers; expected {len(drives)}, one a {one}: {names}",
                 where=f"{where}.{key}",
             )
-        offsets[drives] = np.array(values) * factor
+        result[drives] = np.array(values) * factor
         units.add(unit)
     for drive in robot.drives:
         if drive.unit not in units:
-            expected = " or ".join(k for k, (unit, _) in OFFSET_KEYS.items() if unit == drive.unit)
+            expected = " or ".join(k for k, (unit, _) in kinds.items() if unit == drive.unit)
+            what = stated[0].partition("_")[0].removesuffix("s")
             raise SessionError(
-                f"states no offset of {drive.name}; expected {expected}, too", where=where
+                f"states no {what} of {drive.name}; expected {expected}, too", where=where
             )
-    return read_only(offsets)
+    return read_only(result)
