@@ -10,11 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array
 from orthocal.calibration.machine import Machine
 from orthocal.calibration.records import CalibrationRecord, ParameterEstimate
+from orthocal.effects.compensation import displace_drives
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow, root_mean_square
+from orthocal.kinematics.conditions import APPROACH
 from orthocal.robot.model import Robot
 from orthocal.statistics.chance import expanded_uncertainty
 
@@ -153,6 +156,25 @@ class Calibration(CalibrationRecord):
         """Offsets in the controller while measuring, 0 where not stated, (n_drives,), [m, rad]."""
         stated = self.session.controller_offsets
         return np.zeros(len(self.robot.drives)) if stated is None else np.array(stated)
+
+    def displacement(self, displayed: ArrayLike, approach: str | None = None) -> Array:
+        """Displacement of the drives by what the controller compensated while measuring.
+
+        Args:
+            displayed: Commanded drive coordinates with the active offsets, shape (K, n_drives),
+                [m, rad].
+            approach: As for `UseConditions`.
+
+        Returns:
+            Shape (K, n_drives), [m, rad]; see `orthocal.effects.compensation`.
+        """
+        at = np.asarray(displayed, dtype=np.float64)
+        if not self.session.compensation:
+            return np.zeros(at.shape)
+        sides = [APPROACH[letter] for letter in approach or "u" * at.shape[1]]
+        return displace_drives(
+            self.robot, self.session.compensation, at, np.tile(sides, (len(at), 1))
+        )
 
     @property
     def only_offsets(self) -> bool:

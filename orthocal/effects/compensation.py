@@ -44,6 +44,21 @@ class JointTrim:
 Compensation = tuple[JointTrim, ...]
 """Trim of the joint of each drive, in the robot's order."""
 
+NEGLIGIBLE = 1e-9
+"""Difference of trims that does not count, [m, rad]: tables are written to 1e-6 mm."""
+
+
+def compensates_alike(one: Sequence[JointTrim], other: Sequence[JointTrim]) -> bool:
+    """True if two controllers compensate the same; an empty compensation is none."""
+    if not (one and other):
+        return not any(t.backlash or t.table is not None for t in one or other)
+    for a, b in zip(one, other, strict=True):
+        at = [t.table[:, 0] for t in (a, b) if t.table is not None]
+        joints = np.concatenate([*at, np.zeros(1)])
+        if np.abs(a(joints) - b(joints)).max() > NEGLIGIBLE:
+            return False
+    return True
+
 
 def displace_drives(
     robot: Robot, trims: Sequence[JointTrim], displayed: Array, sides: Array
@@ -76,6 +91,18 @@ def displace_drives(
         if periodic:
             result[:, i] += drive.direction * both.mean(axis=1)
     return result
+
+
+def describe_trims(robot: Robot, trims: Sequence[JointTrim]) -> str:
+    """What a controller compensates in each drive, in words; empty for nothing."""
+    texts = []
+    for drive, trim in zip(robot.drives, trims, strict=False):
+        unit, size = DRIVE_UNITS[drive.unit]
+        if trim.table is not None:
+            texts.append(f"{drive.name} by a table")
+        elif trim.backlash:
+            texts.append(f"{drive.name} {trim.backlash / size:.3f} {unit}")
+    return ", ".join(texts)
 
 
 def table_name(joint: int) -> str:

@@ -10,27 +10,19 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.effects.compensation import Compensation, JointTrim
 from orthocal.errors import ClosureError, SessionError
-from orthocal.io.documents import parse_number, read_text
 from orthocal.io.fields import read_only
-from orthocal.io.files import content_withheld_outside
 from orthocal.kinematics.loop_closure import nominal_closure
+from orthocal.measurement.files.linuxcnc_ini import read_trims
 from orthocal.measurement.files.schema import (
     BACKLASH_KEYS,
-    LARGEST_TRIM,
     OFFSET_KEYS,
     ControllerKeys,
     PostureKeys,
     SessionKeys,
 )
-from orthocal.robot.model import Drive, Robot
+from orthocal.robot.model import Robot
 from orthocal.session.session import Posture, PostureForm
 from orthocal.units import DRIVE_UNITS, MM, Unit
-
-TABLE_COLUMNS = ("position", "forward trim", "reverse trim")
-"""Columns of a COMP_FILE of type 1."""
-
-MOST_TABLE_ROWS = 256
-"""Largest number of lines of a COMP_FILE."""
 
 
 def require_given_zero(robot: Robot, where: str) -> None:
@@ -172,55 +164,12 @@ def build_compensation(
             where=f"{where}.comp_file",
         )
     values = np.zeros(len(names)) if backlash is None else backlash
-    return tuple(
-        JointTrim(float(value), None if name is None else _read_table(folder, name, drive, where))
-        for value, name, drive in zip(values, names, robot.drives, strict=True)
+    where = f"{where}.comp_file"
+    tables = (
+        None if name is None else read_trims(folder, name, drive, where)
+        for name, drive in zip(names, robot.drives, strict=True)
     )
-
-
-def _read_table(folder: Path, name: str, drive: Drive, where: str) -> Array:
-    """Table of a COMP_FILE of type 1: positions and trims, shape (n, 3), [m, rad].
-
-    Raises:
-        SessionError: Naming the file and the line.
-    """
-    if not name.strip() or "\0" in name:
-        raise SessionError(
-            f"found {name!r}; expected the name of a file", where=f"{where}.comp_file"
-        )
-    file, (unit, size) = folder / name, DRIVE_UNITS[drive.unit]
-    with content_withheld_outside(folder, file):
-        text = read_text(file, error=SessionError)
-        rows = list[list[float]]()
-        for number, line in enumerate(text.splitlines(), start=1):
-            at = f"{file}:{number}"
-            if not (cells := line.split()):
-                continue
-            if len(cells) != len(TABLE_COLUMNS):
-                raise SessionError(
-                    f"has {len(cells)} numbers; expected {', '.join(TABLE_COLUMNS)}", where=at
-                )
-            row = [
-                parse_number(cell, where=at, name=column, error=SessionError)
-                for cell, column in zip(cells, TABLE_COLUMNS, strict=True)
-            ]
-            if rows and not row[0] > rows[-1][0]:
-                raise SessionError(
-                    f"the position {row[0]:g} {unit} does not exceed that of the line before",
-                    where=at,
-                )
-            if max(map(abs, row[1:])) > LARGEST_TRIM:
-                raise SessionError(
-                    f"found a trim of {max(row[1:], key=abs):g} {unit}; expected at most "
-                    f"{LARGEST_TRIM:g}, as in a table of COMP_FILE_TYPE = 1",
-                    where=at,
-                )
-            rows.append(row)
-        if not 1 < len(rows) <= MOST_TABLE_ROWS:
-            raise SessionError(
-                f"has {len(rows)} lines; expected 2 to {MOST_TABLE_ROWS}", where=str(file)
-            )
-    return read_only(np.array(rows) * size)
+    return tuple(JointTrim(float(v), table) for v, table in zip(values, tables, strict=True))
 
 
 def _read_drive_values(

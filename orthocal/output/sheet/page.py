@@ -11,6 +11,7 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.assessment.wording import name_direction
+from orthocal.effects.compensation import describe_trims
 from orthocal.io.html import escape, heading, page, paragraph, prose, table
 from orthocal.measurement.motion.approach import approach_length, describe_approach
 from orthocal.measurement.motion.motion import (
@@ -119,6 +120,7 @@ def _front(
         f"the robot's YAML. Travel of the joints: {'; '.join(_travel(session))}.",
         f"Jog each slide a little outwards. Its number must {_count_outwards(robot)}.",
         _active_offsets(session),
+        *([text] if (text := _compensation(session)) else []),
         "Check each rod and each hinge for play. The calibration does not remove play.",
     ]
     rules = [
@@ -395,6 +397,22 @@ def _active_offsets(session: Session) -> str:
     return (
         "Check that these offsets of the slides are active in the controller, as session.yaml "
         f"states: {active}. Do not change them until all readings are taken."
+    )
+
+
+def _compensation(session: Session) -> str:
+    """The backlash that the controller must compensate; empty where that does not matter."""
+    stated = describe_trims(session.robot, session.compensation)
+    if stated:
+        return (
+            f"Check that the controller compensates backlash, as session.yaml states: {stated} "
+            "(LinuxCNC: BACKLASH, COMP_FILE)."
+        )
+    if "approach" not in needed_conditions(session.robot):
+        return ""
+    return (
+        "session.yaml states that the controller compensates no backlash. If it does (LinuxCNC: "
+        "BACKLASH, COMP_FILE), write it into session.yaml: controller: {backlash_mm: [...]}."
     )
 
 
