@@ -466,7 +466,7 @@ def days(root, tmp_path_factory, without_plots):
 def test_several_sessions_are_fitted_together(days):
     folder, (code, out, _) = days
     assert code == 0
-    assert "108 readings in 14 postures, 12 setups on legs x, y, z" in out
+    assert "108 readings of 2 sessions in 7 postures, 12 setups on legs" in out
     for day in ("monday", "tuesday"):
         row = next(line.split() for line in out.splitlines() if f" {day} " in line)
         assert row[1:3] == ["54", "0.010"]
