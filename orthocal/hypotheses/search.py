@@ -185,41 +185,33 @@ class _Search:
         return state, near
 
     def evaluate(self, terms: Sequence[Term], start: ModelLinearisation) -> HypothesisSet:
-        """Score a set of hypotheses, linearised where it leads."""
+        """Score a set of hypotheses, linearised where it leads.
+
+        The linearisation is about the most likely machine with the tolerances as they are stated:
+        larger errors would explain what is not linear. The first step may lead beyond FURTHEST, as
+        readings are not linear over offsets of some mm; if the next one does not lead back, it does
+        not count.
+        """
         model = self.model
-        rows = self.values + sum((t.change for t in terms if t.change is not None), 0.0)
-        entries = model.entries(rows[None])[0]
         known = [t.shift for t in terms if t.shift is not None and t.known]
         free = [t.shift for t in terms if t.shift is not None and not t.known]
-        priors = [
-            None if t.systematic is None else _prior_of(t.systematic)
-            for t in terms
-            if t.effects is not None or (t.shift is not None and not t.known)
-        ]
-        applied, about = np.zeros(len(free)), start
+        about, applied = start, np.zeros(len(free))
         if known or free:
             base = self.sound.about
             about = model.linearise(base.theta, known, base.passive, slopes=True)
-        last = about.theta
-        for k in range(MOST_ROUNDS + 1):
-            groups, silent, steps = self._vectors(terms, about)
-            deviation = entries - about.expected + applied @ steps
-            score = about.likelihood.score_set(deviation, groups, silent, priors=priors)
-            every = [*groups, *([] if silent is None else [silent])]
-            remaining = deviation - (score.amounts @ np.concatenate(every) if every else 0.0)
-            errors = about.errors_for(
-                remaining, tolerance_scale=score.tolerance_scale, noise_scale=score.noise_scale
-            )
-            amounts, stds = (split_amounts(terms, a) for a in (score.amounts, score.stds))
-            if k == MOST_ROUNDS or np.abs(errors - last).max(initial=0.0) < NEAR:
+        states = [self._evaluate_about(terms, about, applied)]
+        for k in range(MOST_ROUNDS):
+            state, about = states[-1], states[-1].about
+            errors = about.errors_for(state.remaining, noise_scale=state.score.noise_scale)
+            if np.abs(errors - about.theta).max(initial=0.0) < NEAR:
                 break
-            if not np.abs(errors).max(initial=0.0) < FURTHEST:
+            if k and not _is_near(errors):
                 break
-            step = np.array(
-                [a[0] for t, a in zip(terms, amounts, strict=True) if t.shift and not t.known]
+            applied = np.array(
+                [a[0] for t, a in zip(terms, state.amounts, strict=True) if t.shift and not t.known]
             )
             shifts = [
-                replace(s, direction=s.direction * a) for s, a in zip(free, step, strict=True)
+                replace(s, direction=s.direction * a) for s, a in zip(free, applied, strict=True)
             ]
             try:
                 about = model.linearise(
@@ -227,7 +219,31 @@ class _Search:
                 )
             except (ClosureError, np.linalg.LinAlgError):
                 break
-            last, applied = errors, step
+            states.append(self._evaluate_about(terms, about, applied))
+        return next((s for s in reversed(states[1:]) if _is_near(s.about.theta)), states[0])
+
+    def _evaluate_about(
+        self, terms: Sequence[Term], about: ModelLinearisation, applied: Array
+    ) -> HypothesisSet:
+        """Score a set of hypotheses about one linearisation.
+
+        Args:
+            terms: The hypotheses.
+            about: The linearisation.
+            applied: Amounts of the unknown machine shifts that are in it.
+        """
+        rows = self.values + sum((t.change for t in terms if t.change is not None), 0.0)
+        groups, silent, steps = self._vectors(terms, about)
+        priors = [
+            None if t.systematic is None else _prior_of(t.systematic)
+            for t in terms
+            if t.effects is not None or (t.shift is not None and not t.known)
+        ]
+        deviation = self.model.entries(rows[None])[0] - about.expected + applied @ steps
+        score = about.likelihood.score_set(deviation, groups, silent, priors=priors)
+        every = [*groups, *([] if silent is None else [silent])]
+        remaining = deviation - (score.amounts @ np.concatenate(every) if every else 0.0)
+        amounts, stds = (split_amounts(terms, a) for a in (score.amounts, score.stds))
         changes = [
             abs(a[0]) * np.abs(t.shift.direction).max()
             for t, a in zip(terms, amounts, strict=True)
@@ -562,6 +578,11 @@ class _Search:
             state.score.tolerance_scale,
             state.score.noise_scale,
         )
+
+
+def _is_near(errors: Array) -> bool:
+    """True if errors, in prior std, are those of a machine that is linearised about."""
+    return bool(np.abs(errors).max(initial=0.0) < FURTHEST)
 
 
 def _is_clear(found: HypothesisSet, state: HypothesisSet) -> bool:

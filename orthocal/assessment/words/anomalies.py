@@ -101,8 +101,8 @@ def _unexplained(session: Session, result: Anomalies) -> Finding:
         f"{which} not fit one machine. {what} "
         f"{'only a part' if result.found else 'it'}: several parts may have changed, or several "
         "readings are wrong.",
-        "Calibrate the last session alone: the values to enter must belong to the machine as it "
-        "is now."
+        "Calibrate the session that was measured last alone: the values to enter must belong to "
+        "the machine as it is now."
         if session.joined
         else "Measure again.",
         before_rms_um=result.rms_before / UM,
@@ -290,8 +290,8 @@ def _text(session: Session, e: Explanation) -> str:
         ),
         "machine changed": lambda: _changed(session, e),
         "offset of one drive": lambda: (
-            f"the controller's offset of {joined(e.drives)} in session {e.sessions[0]} is not "
-            f"the stated one{_by(session, e)}"
+            f"the controller's offset of {joined(e.drives)} in session {joined(e.sessions)} is "
+            f"not the stated one{_by(session, e)}"
         ),
         "offsets not entered": lambda: _entered(e, "was not entered", "were not entered"),
         "offsets reversed": lambda: _entered(
@@ -367,7 +367,10 @@ def _swapped(session: Session, e: Explanation) -> str:
 def _changed(session: Session, e: Explanation) -> str:
     what = joined(e.drives) or joined(e.parameters)
     verb = "moved" if e.drives else "changed"
-    return f"the machine changed: {what} {verb}{_by(session, e)} before session {e.sessions[0]}"
+    when = f"before session {e.sessions[0]}"
+    if e.apart:
+        when = f"for session{'s' * (len(e.sessions) > 1)} {joined(e.sessions)} only"
+    return f"the machine changed: {what} {verb}{_by(session, e)} {when}"
 
 
 def _by(session: Session, e: Explanation) -> str:
@@ -427,6 +430,11 @@ def _session_remedy(session: Session, e: Explanation) -> str:
             f"Compare the offsets in the controller with `controller.offsets_mm` of session "
             f"{since}. If the session states the wrong ones, correct them there; otherwise enter "
             "the right ones and measure again."
+        )
+    if e.apart:
+        since = f"{joined(e.sessions)} and the others"
+        return (
+            f"Make sure that the sessions state when they were measured. Calibrate {since} apart."
         )
     apart = (
         f"Calibrate session {since} and later ones without the earlier ones: the values to enter "
