@@ -58,8 +58,9 @@ def run(monkeypatch):
 
 
 def rows_of(folder):
+    """Rows of the readings.csv; a blank line, left by a deleted row, is none."""
     head, *rows = (folder / "readings.csv").read_text().splitlines()
-    return [dict(zip(head.split(","), row.split(","), strict=True)) for row in rows]
+    return [dict(zip(head.split(","), row.split(","), strict=True)) for row in rows if row]
 
 
 def cells(folder):
@@ -163,15 +164,24 @@ TURNS = {
     "back to a word": (["back to"], [], "Not recorded: 'to' is not a line; expected 2 to 7."),
     "again": (
         ["0.1", "again", "0.11"],
-        ["0.10", "0.11"],
-        "Line 3: yx zero, cycle 2 (6 of 7 missing)",
+        ["0.10", "", "", "", "", "", "0.11"],
+        "Line 8: yx zero, cycle 2 (6 of 7 missing)",
     ),
-    "again of a row": (["0.1", "0.2", "again 2", "0.11"], ["0.10", "0.11", "0.20"], "cycle 2"),
+    "again of a row": (
+        ["0.1", "0.2", "again 2", "0.11", "0.3"],
+        ["0.10", "0.20", "0.30", "", "", "", "0.11"],
+        "Added: line 8, which repeats line 2. Line 8: yx zero, cycle 2",
+    ),
+    "again of an earlier setup": (
+        ["0.1", "0.2", "0.3", "0.4", "again 2"],
+        ["0.10", "0.20", "0.30", "0.40"],
+        "The stand has been moved since yx was read: read it once more only if",
+    ),
     "again of nothing": (["again"], [], "Not recorded: nothing was read yet."),
     "again of an empty row": (["again 3"], [], "Not recorded: line 3 was not read yet."),
     "skip": (["skip", "0.2"], ["", "0.20"], "Skipped: line 2"),
-    "drop": (["0.1", "drop", "0.3"], ["0.10", "0.30"], "Deleted: line 3, yx x_max"),
-    "drop a row": (["0.1", "drop 2", "0.3"], ["0.30"], "Deleted: line 2, yx zero"),
+    "drop": (["0.1", "drop", "0.3"], ["0.10", "0.30"], "Line 4: yx x_min (4 of 5 missing)"),
+    "drop a row": (["0.1", "drop 2", "0.3"], ["0.30"], "Line 4: yx x_min (4 of 5 missing)"),
     "restart": (["0.1", "0.2", "restart", "0.3"], ["0.30"], "Deleted: all readings of yx"),
     "list": (["0.1", "list"], ["0.10"], "3 yx x_max: not read"),
     "show": (["show"], [], "Setup yx, 1 of 2"),

@@ -126,8 +126,8 @@ class Finding:
 
     @property
     def words(self) -> str:
-        """Text and action."""
-        return f"{self.text} {self.action}".strip()
+        """Text and action; after a list the action has a line of its own."""
+        return ("\n" if "\n" in self.text else " ").join((self.text, self.action)).strip()
 
     def to_document(self) -> dict[str, Any]:
         """Plain data for JSON; null for what is unknown."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable, Sequence
 
 from orthocal.assessment.wording import joined, mm, note, plain, review, signed, spans, um
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.hypotheses.anomaly import EFFECT_KINDS, Anomalies, Anomaly, Explanation
 from orthocal.session.session import Session
+from orthocal.text import printable
 from orthocal.units import EDGE_UNITS, MM, UM, Unit
 
 MOST_PLACES = 20
@@ -55,7 +57,7 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
             "expected_mm": anomaly.expected / MM,
             "cycle": float(first.cycle),
         }
-    action = "Read it again, or leave it out." if anomaly.causes else _remedy(session, e)
+    action = _repeat(session, e) if anomaly.causes else _remedy(session, e)
     return review(e.kind, text, action, _places(session, e), **numbers)
 
 
@@ -87,7 +89,7 @@ def _ambiguous(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding
     return review(
         "ambiguous",
         f"The readings contradict each other. One of these may have happened:\n{ways}.",
-        "Look at these readings, and read again what may be wrong.",
+        _repeat(session, *every),
         tuple(p for e in every for p in _places(session, e)[:1]),
         **_numbers(result, anomaly),
     )
@@ -419,7 +421,22 @@ def _remedy(session: Session, e: Explanation) -> str:
         "posture at the end of the setup. Or calibrate with `--effects "
         f"{','.join((*session.robot.effect_names, 'drift'))}`.",
     }
-    return remedies.get(e.kind, "Read it again, or leave it out.")
+    return remedies.get(e.kind) or _repeat(session, e)
+
+
+def _repeat(session: Session, *found: Explanation) -> str:
+    """Repetition or omission of readings, with the command for the first of them."""
+    rows = [session.readings[i] for e in found for i in e.rows]
+    words = "Read it again" if len(rows) == 1 else "Look at these readings, read them again"
+    file = rows[0].file or session.readings_path
+    if file is None or rows[0].line is None:
+        return f"{words}, or leave out what is wrong."
+    line, path = rows[0].line, printable(shlex.quote(str(file.parent)))
+    which = "" if len(rows) == 1 else ", and so on for each that is wrong"
+    return (
+        f"{words}, or leave out what is wrong: `orthocal record {path}`, then "
+        f"`again {line}`, `back {line}` to correct it, or `drop {line}`{which}."
+    )
 
 
 def _session_remedy(session: Session, e: Explanation) -> str:

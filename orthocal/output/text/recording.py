@@ -253,9 +253,10 @@ class RecordingText:
             return ""
         row = self._recording.rows[index]
         text = f"The other readings predict {format_fixed(mean / MM, 3)} ± {mm(2.0 * std)} mm."
-        if is_far(row.value, mean, std):
-            text += f" Line {row.line} differs by {mm(abs(row.value - mean))} mm: check the dial."
-        return self.wrap(text, indent="  ")
+        if not is_far(row.value, mean, std):
+            return self.wrap(text, indent="  ")
+        text += f" Line {row.line} differs by {mm(abs(row.value - mean))} mm: check the dial."
+        return self.wrap(text, indent="  ", first="! ")
 
     def warning(self, finding: Finding, *, last: int | None = None) -> str:
         """A finding about the readings so far, in the words of `check`.
@@ -274,9 +275,11 @@ class RecordingText:
         else:
             where = f" ({spans(parts[-1], 'line')})" if parts else ""
         kind = finding.kind.capitalize()
-        head, *causes = f"{kind}{where}: {finding.words}".split("\n")
+        head, *others = f"{kind}{where}: {finding.words}".split("\n")
         lines = [self.wrap(head, indent="  ", first="! ")]
-        lines += [self.wrap(cause.strip(), indent="      ", first="    ") for cause in causes]
+        for other in others:  # causes, and what to do
+            margin = "    " if other.startswith(" ") else ""
+            lines.append(self.wrap(other.strip(), indent=f"  {margin}", first=margin or "  "))
         return "\n".join(lines)
 
     def resolved(self, findings: Sequence[Finding]) -> str:
