@@ -19,6 +19,9 @@ from commands import orthocal
 from made_mistakes import sound_session
 
 from orthocal import check_session, load_session, write_session
+from orthocal.assessment.wording import review
+from orthocal.calibration.assessment_record import Place
+from orthocal.cli import recording
 from orthocal.measurement.files.session_file import load_plan
 from orthocal.measurement.motion.motion import guide
 from orthocal.measurement.recording import SUFFIX, open_recording
@@ -222,7 +225,7 @@ def test_what_can_be_typed_on_a_narrow_terminal(folder, run, name):
     assert command == f"  orthocal record {folder}"  # to be copied
 
 
-WARNING = re.compile(r"^! ([^(:]+)(?: \((lines? [^)]*)\))?:(?= |$)", re.MULTILINE)
+WARNING = re.compile(r"^! ([^(:\n]+)(?: \((lines? [^)]*)\))?:(?= |$)", re.MULTILINE)
 """Kind of a warning, and its lines."""
 
 
@@ -290,6 +293,24 @@ def test_a_corrected_mistake_is_resolved(root, run, tmp_path):
     _, out, _ = run(folder, *values[:14], "back", *sound[13:18])
     assert [kind for kind, _ in WARNING.findall(out)] == ["Reversed sign"]
     assert out.count("Resolved: reversed sign zx x_max.") == 1
+
+
+def test_a_doubt_that_another_mistake_hides_is_not_resolved(root, run, tmp_path, monkeypatch):
+    """The search finds a mistake in the second setup while no later reading is far off."""
+    folder, wrong = tmp_path / "typed", 24
+    values = blank(root / "examples/raw-cycles", folder)
+    sound, values[wrong] = values[wrong], "4.00"
+    doubt = review("reversed sign", "Reversed.", "", (Place(setup="zx"),))
+
+    def search(session):
+        hidden = len(session.readings) < 18 or session.values.max() > 3.9 * MM
+        return () if hidden else (doubt,)
+
+    monkeypatch.setattr(recording, "find_warnings", search)
+    _, out, _ = run(folder, *values[: wrong + 1], "back", sound)
+    assert [kind for kind, _ in WARNING.findall(out)] == ["Reversed sign"]
+    assert f"! Line {wrong + 2} differs by" in out
+    assert "Resolved" not in out
 
 
 def test_readings_with_a_warning_do_not_take_part_in_predictions(root, run, tmp_path):

@@ -9,6 +9,7 @@ where the others explain them (backward elimination). The best ones are linearis
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -544,6 +545,11 @@ class _Search:
         chosen = found.members[evidence > WORTH_REFITTING - NEARLY][:MOST_PAIRS_REFITTED]
         return [(term(a), term(b)) for a, b in chosen.tolist()], float(log_of_sum(evidence))
 
+    def _expected(self, state: HypothesisSet, row: int) -> float:
+        """Prediction of a row by the others, corrected, as a recording prints it, [m]."""
+        mean, _ = self.model.predict_row(state.corrected, row)
+        return float(state.corrected[row]) if math.isnan(mean) else mean
+
     def _result(
         self, state: HypothesisSet, near: list[tuple[HypothesisSet, HypothesisSet]]
     ) -> Anomalies:
@@ -563,7 +569,7 @@ class _Search:
                 Anomaly(
                     e,
                     state.log_posterior - fewer.log_posterior,
-                    None if row is None else float(state.corrected[row]),
+                    None if row is None else self._expected(state, row),
                     causes,
                     alternatives,
                 )

@@ -253,10 +253,11 @@ class RecordingText:
             return ""
         row = self._recording.rows[index]
         text = f"The other readings predict {format_fixed(mean / MM, 3)} ± {mm(2.0 * std)} mm."
-        if not is_far(row.value, mean, std):
-            return self.wrap(text, indent="  ")
-        text += f" Line {row.line} differs by {mm(abs(row.value - mean))} mm: check the dial."
-        return self.wrap(text, indent="  ", first="! ")
+        lines = [self.wrap(text, indent="  ")]
+        if is_far(row.value, mean, std):
+            differs = f"Line {row.line} differs by {mm(abs(row.value - mean))} mm. Check the dial."
+            lines.append(self.wrap(differs, indent="  ", first="! "))
+        return "\n".join(lines)
 
     def warning(self, finding: Finding, *, last: int | None = None) -> str:
         """A finding about the readings so far, in the words of `check`.
