@@ -188,10 +188,9 @@ class _Search:
     def evaluate(self, terms: Sequence[Term], start: ModelLinearisation) -> HypothesisSet:
         """Score a set of hypotheses, linearised where it leads.
 
-        The linearisation is about the most likely machine with the tolerances as they are stated:
-        larger errors would explain what is not linear. The first step may lead beyond FURTHEST, as
-        readings are not linear over offsets of some mm; if the next one does not lead back, it does
-        not count.
+        The first step may lead beyond FURTHEST, as readings are not linear over offsets of some mm:
+        what is not linear looks like errors far beyond their tolerances. If the next step does not
+        lead back, it does not count.
         """
         model = self.model
         known = [t.shift for t in terms if t.shift is not None and t.known]
@@ -203,7 +202,11 @@ class _Search:
         states = [self._evaluate_about(terms, about, applied)]
         for k in range(MOST_ROUNDS):
             state, about = states[-1], states[-1].about
-            errors = about.errors_for(state.remaining, noise_scale=state.score.noise_scale)
+            errors = about.errors_for(
+                state.remaining,
+                noise_scale=state.score.noise_scale,
+                tolerance_scale=state.score.tolerance_scale,
+            )
             if np.abs(errors - about.theta).max(initial=0.0) < NEAR:
                 break
             if k and not _is_near(errors):
