@@ -196,17 +196,13 @@ def _require_travel(robot: Robot, drives: Array) -> None:
             raise ClosureError(f"is beyond the travel of {drive.name}", posture="a corner")
 
 
-def error_covariance(calibration: Calibration, *, excess: float = 1.0) -> Array:
+def error_covariance(calibration: Calibration) -> Array:
     """Covariance of what the estimate has wrong, free and unmodelled parameters in turn, [SI].
 
     With e = θ − θ̂ it is −L θᵤ and the estimate's own scatter for the free ones, θᵤ for the others.
-
-    Args:
-        calibration: The calibration.
-        excess: Factor of the priors of unmodelled errors.
     """
     unmodelled = calibration.unmodelled
-    variance = (excess * unmodelled.prior_stds) ** 2
+    variance = unmodelled.prior_stds**2
     taken_on = unmodelled.leakage * variance
     return np.block(
         [

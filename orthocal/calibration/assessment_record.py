@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from orthocal.hypotheses.anomaly import AnomalyKind
-from orthocal.io.documents import Number, PositiveInSI, write_plain
+from orthocal.io.documents import Number, write_plain
 from orthocal.io.fields import CLOSED, Many, NumberOrNaN, SizeOrNaN
 from orthocal.kinematics.conditions import StatedUse, UseCondition
 from orthocal.kinematics.workspace import describe_box
@@ -290,9 +290,6 @@ class Assessment:
     """What to enter, drive by drive; empty if no offset was identified."""
     tool: ToolErrorSummary | None
     """None if the robot has no tool, or nothing determines the noise."""
-    tolerance_scale: PositiveInSI
-    """Factor on the priors of unmodelled errors in the tool error; 1 if the readings are possible
-    within the tolerances."""
 
     @property
     def keeps_offsets(self) -> bool:

@@ -76,12 +76,13 @@ def assemble_calibration(
     """
     problem = fit.problem
     session, n = problem.session, problem.n_machine
-    covariance, noise_covariance = fit.covariance(), fit.noise_covariance()
     # a base parameter stands for all errors of its combination
     others = find_unmodelled_errors(
         fit, represented=() if full_problem is None else full_problem.machine_selection.names
     )
     unmodelled, taken_on = propagate_unmodelled(fit, others)
+    noise = _separate_noise(fit) if others.names else None
+    covariance, noise_covariance = fit.covariance(noise=noise), fit.noise_covariance(noise=noise)
     bias = np.append(np.sqrt(np.diag(unmodelled.bias_covariance)), taken_on)
     estimates = _estimates(
         fit,
@@ -112,11 +113,23 @@ def assemble_calibration(
         residuals=_residual_rows(fit, diagnostics, nominal),
         critical=diagnostics.outlier_threshold,
         postures=_posture_records(fit),
+        tolerance_scale=problem.machine_selection.tolerance_scale,
         setups=_setup_records(fit),
         gauges=_gauge_records(fit),
         versions=_versions(),
         robot=session.robot,
     )
+
+
+def _separate_noise(fit: Fit) -> float | None:
+    """Noise of a reading where unmodelled errors explain the residuals, [m]; else None.
+
+    With tolerances that are scaled so that they do, residuals as noise would count them twice.
+    """
+    gauge, scale = fit.problem.session.gauge, fit.problem.machine_selection.tolerance_scale
+    if scale.factor == 1.0 or fit.noise.source != "residuals":
+        return None
+    return fit.noise.apart_from_residuals(gauge.sigma, gauge.resolution)[0]
 
 
 def _require_possible(estimates: Sequence[ParameterEstimate], iterations: int) -> None:
@@ -179,7 +192,8 @@ def _widen(
     fit: Fit, unmodelled: UnmodelledEffect, intervals: Mapping[str, tuple[float, float]]
 ) -> dict[str, tuple[float, float]]:
     """Profile-likelihood intervals, widened by the errors of the machine that were not free."""
-    spread = confidence_factor(np.inf) * np.sqrt(np.diag(unmodelled.bias_covariance))
+    contrasts = fit.problem.machine_selection.tolerance_scale.contrasts
+    spread = confidence_factor(contrasts) * np.sqrt(np.diag(unmodelled.bias_covariance))
     result = {}
     for name, ends in intervals.items():
         i = fit.problem.free.index(name)

@@ -14,6 +14,7 @@ from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.diagnostics.unmodelled import UnmodelledEffect
 from orthocal.estimation.loss import LossKind
 from orthocal.estimation.options import SolverKind
+from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
 from orthocal.io.documents import Count, Number, PositiveInSI, PositiveNumber
 from orthocal.io.fields import CLOSED, Many, Matrix, SizeOrInf, SizeOrNaN, Vector
 from orthocal.robot.description import HEAVIEST_KG
@@ -297,5 +298,8 @@ class CalibrationRecord:
     postures: Many[PostureRecord]
     setups: Many[SetupRecord]
     gauges: Many[GaugeRecord]
+    tolerance_scale: ToleranceScale = AS_STATED
+    """Factor on the tolerances of all errors of the geometry except offsets, which prior standard
+    deviations, covariances and everything that follows from them contain."""
     assessment: Assessment | None = None
     """Verdict, findings, what to enter and the tool error; None if it was not assessed."""

@@ -82,6 +82,7 @@ def _repeat_problem(calibration: Calibration, session: Session) -> CalibrationPr
         lower=read_only([-np.inf if p.lower is None else p.lower for p in free]),
         upper=read_only([np.inf if p.upper is None else p.upper for p in free]),
         fixed={p.name: p.value for p in calibration.parameters if not p.free},
+        tolerance_scale=calibration.tolerance_scale,
     )
     return CalibrationProblem(session, selection)
 

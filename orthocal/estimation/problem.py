@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from orthocal.arrays import Array, Mask
 from orthocal.errors import ClosureError, RobotError
 from orthocal.estimation.selection import KnownWithStd, Selection, select_parameters
+from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import Failures, LoopClosure
 from orthocal.kinematics.robot_functions import RobotFunctions
@@ -401,6 +402,7 @@ def build_problem(
     known: Mapping[str, KnownWithStd] | None = None,
     prior_stds: Mapping[str, float] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
+    tolerance_scale: ToleranceScale = AS_STATED,
 ) -> CalibrationProblem:
     """The problem of a model of the robot; arguments as for `select_parameters`."""
     selection = select_parameters(
@@ -411,6 +413,7 @@ def build_problem(
         known=known,
         prior_stds=prior_stds,
         bounds=bounds,
+        tolerance_scale=tolerance_scale,
     )
     return CalibrationProblem(session, selection)
 

@@ -15,7 +15,6 @@ from orthocal.assessment.remaining_errors import RemainingError, find_remaining_
 from orthocal.assessment.tool_error import (
     ErrorSizes,
     ToolAccuracy,
-    assess_remaining,
     assess_tool,
     summarise_tool,
 )
@@ -84,11 +83,10 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
         entered = accuracy.measure(accuracy.error_after_offsets)
         rows.append(("identified error, offsets entered", entered))
     rows.append(("uncertainty before calibration", accuracy.before.sizes))
-    remaining, scale = assess_remaining(calibration, accuracy), calibration.tolerance_scale
+    scale = calibration.tolerance_scale.factor
+    scaled = f" (tolerances × {scale:.1f})" if scale > 1.0 else ""
     if accuracy.after is not None:
-        rows.append(("uncertainty after calibration", accuracy.after.sizes))
-    if remaining is not None and scale > 1.0:
-        rows.append((f"  with tolerances × {scale:.1f}", remaining.sizes))
+        rows.append((f"uncertainty after calibration{scaled}", accuracy.after.sizes))
     cells = []
     for name, sizes in rows:
         a = sizes.aligned
