@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 from typing import Annotated
 
-from typer import Argument
+from typer import Argument, Exit
 
 import orthocal
 from orthocal.cli.forward import put_assumed
@@ -67,8 +67,13 @@ def accuracy(
         if not json:
             rows = accuracy_rows(result, targets, names=names, conditions=conditions)
             put_assumed(result, conditions)
-            put_note(text.ABSOLUTE_NOTE.format(shlex.quote(str(calibration))))
-            print_rows(text.POINT_COLUMNS, text.format_points, rows)
+            note = text.ABSOLUTE_NOTE.format(shlex.quote(str(calibration)))
+            try:
+                print_rows(text.POINT_COLUMNS, text.format_points, rows)
+            except Exit:  # some rows are empty
+                put_note(note)
+                raise
+            put_note(note)
             return
         if len(targets) > MOST_POINTS:
             raise SessionError(
