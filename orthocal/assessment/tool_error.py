@@ -39,6 +39,7 @@ from orthocal.kinematics.conditions import (
     UseConditions,
     UseSamples,
     effects_by_condition,
+    sample_use,
     stated_use,
 )
 from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
@@ -214,8 +215,8 @@ def assess_tool(
         calibration: The calibration.
         workspace: Tool positions that are commanded; by default the workspace.
         names: What to call the points in messages.
-        conditions: Conditions of use; by default those that the robot's YAML states, over which
-            squared errors are averaged.
+        conditions: Conditions of use in place of those that the robot's YAML states. Squared errors
+            are averaged over all that remain.
 
     Raises:
         RobotError: If the robot has no tool centre point, or its drives do not command it.
@@ -226,7 +227,8 @@ def assess_tool(
     use = None
     if conditions is not None:
         conditions.require_valid(calibration.robot)
-        use = UseSamples((conditions,))
+        use = sample_use(calibration.robot, conditions)
+        use = use if use.varying else UseSamples((conditions,))
     if workspace is None:
         return assess_placed(calibration, require_tool(calibration, find_tool(calibration, use)))
     placed = place_tool(calibration, workspace, use, names=names)
@@ -316,8 +318,9 @@ def _summarise_use(
     the mean square is that of the mean conditions and of the change by each condition, which no
     alignment removes.
     """
-    stated, effects = stated_use(calibration.robot), effects_by_condition(calibration.robot)
-    if accuracy.use.declared is None or stated is None:
+    use, effects = accuracy.use.declared, effects_by_condition(calibration.robot)
+    stated = stated_use(calibration.robot, use)
+    if use is None or stated is None:
         return None
     covariance = error_covariance(calibration)
     weights = accuracy.use.size * accuracy.workspace.weights[: len(accuracy.points)]
