@@ -89,7 +89,7 @@ def test_compare_refits_and_files_have_the_same_factor(session, full, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.0, 2.83])
 def test_intervals_contain_the_truth_at_any_factor(session, factor):
-    """A sample; `tests/benchmarks/tolerances.py` has more machines, and the full model."""
+    """A sample; `tests/benchmarks/worse_machines.py` has more machines, and the full model."""
     count = 30
     outcome = calibrate_machines(session, "offsets", factor=factor, count=count)
     # three offsets of a machine are wrong together

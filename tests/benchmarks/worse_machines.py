@@ -1,7 +1,7 @@
 """Print whether ± and tool error hold on machines whose errors exceed their tolerances.
 
-python tests/benchmarks/tolerances.py                  30 machines of every factor and model
-python tests/benchmarks/tolerances.py --machines 300   the long form
+python tests/benchmarks/worse_machines.py                  30 machines of every factor and model
+python tests/benchmarks/worse_machines.py --machines 300   the long form
 
 Machines are read as the paper's second experiment. Exit code 1 if ± contains too few offsets, or if
 the tool error exceeds its prediction: of all machines at a factor of 1, else of those whose factor
