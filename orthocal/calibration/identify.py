@@ -83,6 +83,8 @@ def identify(
             raise ValueError(f"expected {n} finite numbers to start from")
         start = np.append(start[0], np.zeros(problem.n_free - n))
     scale = AS_STATED if find_scale is None else find_scale(session)
+    if chosen.base:  # without priors
+        scale = AS_STATED
     if scale.factor != 1.0:
         selection = chosen.select(session.robot.parameters, tolerance_scale=scale)
         problem = CalibrationProblem(session, selection)

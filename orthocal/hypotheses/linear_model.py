@@ -11,8 +11,9 @@ from functools import cached_property
 import numpy as np
 
 from orthocal.arrays import Array, Indices
-from orthocal.errors import ClosureError
+from orthocal.errors import ClosureError, SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
+from orthocal.estimation.linear import require_finite
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import select_parameters
 from orthocal.estimation.weighting import DEFAULT_SIGMA, initial_noise_ratio
@@ -196,6 +197,7 @@ class LinearModel:
 
         Raises:
             ClosureError: If the machine cannot reach a posture.
+            SessionError: If a predicted reading is not finite.
         """
         problem, o = self.problem, self.problem.observations
         n = len(self.labels)
@@ -217,6 +219,7 @@ class LinearModel:
             else:
                 entries = which[self.session_of_entry] == m
                 expected[entries], jacobian[entries] = prediction[entries], slope[entries]
+        require_finite(problem, expected, jacobian)
         jacobian = project_out_zeros(jacobian, o)
         likelihood, vectors, sizes = build_likelihood(
             jacobian, sigma=self.sigma, dof=self.dof, stated=self.stated
@@ -309,7 +312,7 @@ class LinearModel:
                 break
             try:
                 about = self.linearise(errors, (), about.passive, slopes=False)
-            except (ClosureError, np.linalg.LinAlgError):
+            except (ClosureError, SessionError, np.linalg.LinAlgError):
                 break
         return about
 

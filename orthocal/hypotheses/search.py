@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.arrays import Array
-from orthocal.errors import ClosureError
+from orthocal.errors import ClosureError, SessionError
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, AnomalyKind
 from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
 from orthocal.hypotheses.families.effects import find_effects, unmodelled_effects
@@ -221,7 +221,7 @@ class _Search:
                 about = model.linearise(
                     errors, [*known, *shifts], about.passive, slopes=self.slopes
                 )
-            except (ClosureError, np.linalg.LinAlgError):
+            except (ClosureError, SessionError, np.linalg.LinAlgError):
                 break
             states.append(self._evaluate_about(terms, about, applied))
         return next((s for s in reversed(states[1:]) if _is_near(s.about.theta)), states[0])

@@ -100,7 +100,8 @@ def test_a_turned_reading_is_named_with_its_line_and_what_it_should_be(cycles):
     assert (found.kind, found.severity) == ("reversed sign", "review")
     assert [p.line for p in found.places] == [cycles.readings[row].line]
     n = found.numbers
-    assert n["expected_mm"] == pytest.approx(cycles.values[row] * 1e3, abs=1e-9)
+    # the prediction by the other readings, with the noise of the gauge
+    assert n["expected_mm"] == pytest.approx(cycles.values[row] * 1e3, abs=0.02)
     assert n["after_rms_um"] < 0.2 * n["before_rms_um"]
 
 
