@@ -51,10 +51,10 @@ from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.statistics import chance
 
 LEAST_GAIN = 0.04
-"""Reduction of the expected tool error below which a further adjustment is left out."""
+"""Reduction of the expected tool error that a further adjustment must bring."""
 
 WORTHWHILE = 0.15
-"""Reduction of the expected tool error below which the machine is better left alone."""
+"""Reduction of the expected tool error below which no adjustment is advised."""
 
 MOST_ROUNDS = 5
 """Corrections of the amounts on the nonlinear machine."""

@@ -88,8 +88,8 @@ COARSE = 2.0
 over the full grid of scales may exceed its largest term by that and `WORTH_REFITTING`."""
 
 FAR_BEHIND = CLEARLY + NEARLY
-"""Logarithm of the Bayes factor by which a pair is left out that explains less than a single
-hypothesis."""
+"""Logarithm of the Bayes factor beyond which a pair that explains less than a single hypothesis is
+omitted."""
 
 MOST_COMBINED = 5
 """Most likely single hypotheses that are combined in pairs where none by itself leaves readings

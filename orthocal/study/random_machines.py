@@ -128,7 +128,7 @@ class MachineModel:
         return np.asarray(self.translate(errors, names) @ (columns / (columns**2).sum(axis=0)))
 
     def explains(self, truth: CalibrationProblem) -> bool:
-        """Whether the identified errors are all errors of the machines."""
+        """True if all errors of the machines are identified."""
         if not set(truth.robot.effect_names) <= set(self.robot.effect_names):
             return False
         own = self.columns

@@ -10,11 +10,13 @@ import pytest
 from calibrated import calibrated, session_of
 from machines import write_orthoglide
 from rich.console import Group
+from scipy.stats import t as student
 
 from orthocal import (
     Choice,
     Loss,
     SolverOptions,
+    assess_tool,
     calibrate,
     load_plan,
     simulate_session,
@@ -170,10 +172,11 @@ def test_values_to_enter_have_their_expanded_uncertainty(answers, name):
 
 
 def test_few_contrasts_widen_all_but_the_noise(answers):
-    """Six differences and three offsets: Student's factor 3.18 of the scaled tolerances."""
+    """Six differences and three offsets: Student's factor, 3.18 of three contrasts, for the scaled
+    tolerances."""
     calibration = answers["table1/experiment-2"]
     factor = coverage_factor(calibration.tolerance_scale.contrasts)
-    assert factor == pytest.approx(3.18, abs=0.05)
+    assert factor == pytest.approx(student.ppf(0.975, calibration.tolerance_scale.contrasts))
     for e in calibration.assessment.entries:
         rest = e.std**2 - e.std_scatter**2
         expected = np.sqrt(4.0 * e.std_scatter**2 + factor**2 * rest)
@@ -210,7 +213,10 @@ def test_offsets_that_need_no_change_are_left_as_they_are(answers):
     found = answers["table1/experiment-3"].assessment
     assert found.keeps_offsets
     assert found.decision.verdict == "enter"
-    assert found.tool.now == pytest.approx(139.7e-6, rel=0.02)
+    accuracy = assess_tool(answers["table1/experiment-3"])
+    identified = accuracy.measure(accuracy.deviation).aligned.rms
+    expected = np.hypot(identified, accuracy.after.sizes.aligned.rms)
+    assert found.tool.now == pytest.approx(expected)
     assert not found.of_kind("must change")
     entered = answers["table1/experiment-2"].assessment
     assert not entered.keeps_offsets

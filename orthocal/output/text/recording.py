@@ -93,7 +93,7 @@ class RecordingText:
         return f"Noted with the next readings: {', '.join(noted) or 'no temperature'}."
 
     def clock(self, *, on: bool) -> str:
-        """Whether the time of each reading is noted."""
+        """True if the time of each reading is noted."""
         if on:
             return "The time of each reading is noted."
         return "The time is not noted; lines count as read in their order, a minute apart."
