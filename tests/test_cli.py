@@ -247,6 +247,7 @@ def test_compare_has_the_verdict_of_the_readings_as_exit_code(experiment, root):
     code, out, err = orthocal("compare", experiment, "--repeat", repeat)
     assert (code, err) == (0, "")
     assert "Recommended model: full." in out
+    assert "Whether the residuals repeat in 'Experiment 3" in " ".join(out.split())
     code, out, _ = orthocal(
         "compare", root / "examples/raw-cycles", "--models", "offsets,lengths", "--json"
     )
@@ -263,12 +264,14 @@ def test_accuracy_over_a_cube_and_at_points(calibrated, tmp_path):
     assert "Over the workspace ±40 mm" in out
     points = tmp_path / "points.csv"
     points.write_text("x_mm,y_mm,z_mm\n0,0,0\n10,20,-30.5\n")
-    code, out, _ = orthocal("accuracy", calibrated, points)
+    code, out, err = orthocal("accuracy", calibrated, points)
     assert code == 0
+    assert "Errors are absolute" in err
+    assert err.endswith(f"  orthocal accuracy {calibrated}\n")
     rows = list(csv.DictReader(io.StringIO(out)))
     assert [r["z_mm"] for r in rows] == ["0", "-30.5"]
     # at the zero an offset moves the tool by itself
-    assert float(rows[0]["deviation_z_um"]) == pytest.approx(-1760, abs=5)
+    assert float(rows[0]["absolute_z_um"]) == pytest.approx(-1760, abs=5)
     assert float(rows[0]["std_x_um"]) > 387
     code, out, _ = orthocal("accuracy", calibrated, points, "--json")
     assert json.loads(out)["points"] == 2
@@ -463,7 +466,7 @@ def days(root, tmp_path_factory, without_plots):
 def test_several_sessions_are_fitted_together(days):
     folder, (code, out, _) = days
     assert code == 0
-    assert "108 readings in 14 postures, 12 setups on legs x, y, z" in out
+    assert "108 readings of 2 sessions in 7 postures, 12 setups on legs" in out
     for day in ("monday", "tuesday"):
         row = next(line.split() for line in out.splitlines() if f" {day} " in line)
         assert row[1:3] == ["54", "0.010"]

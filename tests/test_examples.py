@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from functools import cache
@@ -124,6 +125,13 @@ def test_what_the_tutorial_shows_is_what_its_commands_print(root, tmp_path):
         shown += 1
         assert [line for line in block.splitlines() if line.rstrip() not in printed] == []
     assert shown >= 4
+    # the smallest tool error alone leaves ±17 µm here, tips nearer to the rods as much
+    plan = json.loads((tmp_path / "mill/first/plan.json").read_text())
+    (backlash,) = plan["effects"]
+    assert backlash["effect"] == "backlash"
+    assert backlash["after"] <= 16e-6
+    assert f"the backlash to ±{backlash['after'] * 1e3:.3f} mm" in " ".join(text.split())
+    assert plan["readings"] + plan["closing_readings"] <= 28
 
 
 def test_the_reference_has_every_name(root):
@@ -188,7 +196,7 @@ def test_what_is_said_of_the_papers_readings_is_what_the_example_prints(run_exam
     assert f"| the paper's 18 readings | {first} |" in text
     assert f"| 18 more, with these offsets entered | {again} |" in text
     promised, left = rows["as of a line, exactly"]
-    assert promised == pytest.approx(2.0 / 3.0 * left, rel=0.1)  # a wrong gauge promises too much
+    assert left > 1.4 * promised  # a wrong gauge promises too much
     for label in ("first round, full", "offsets entered, full"):
         promised, left = rows[label]
         assert left < 1.15 * promised  # as promised

@@ -28,6 +28,7 @@ from orthocal.robot.model import joint_axis
 from orthocal.robot.parameters import AXES
 from orthocal.sensors.leg_indicator import Section
 from orthocal.statistics.distributions import t_quantile
+from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 
 EXPERIMENT = ROOT / "examples/table1/experiment-2"
@@ -40,7 +41,9 @@ def experiment() -> tuple[Calibration, Fit]:
     problem = CalibrationProblem(
         session, orthocal.Choice("offsets").select(session.robot.parameters)
     )
-    return orthocal.calibrate(session, "offsets"), fit_problem(problem)
+    calibration = orthocal.calibrate(session, "offsets")
+    selection = replace(problem.machine_selection, tolerance_scale=calibration.tolerance_scale)
+    return calibration, fit_problem(CalibrationProblem(session, selection))
 
 
 def without_zeros(problem, jacobian):
@@ -58,17 +61,19 @@ def test_covariance_bias_and_expanded_uncertainty():
     prior = np.diag(problem.prior_precision)
     scaled = np.linalg.inv(jacobian.T @ jacobian / sigma**2 + prior)
     units = np.outer(problem.theta_scale, problem.theta_scale)
-    c = (scaled * units)[:n, :n]
+    stated = noise_floor(problem.session.gauge.sigma, problem.session.gauge.resolution)
+    noise = scaled @ jacobian.T @ jacobian @ scaled * stated**2 / sigma**4 * units
+    c = (noise + scaled @ prior @ scaled * units)[:n, :n]
     np.testing.assert_allclose(c, calibration.model_covariance, rtol=SAME_NUMBER)
-    by_one_std = error_jacobian(fit, calibration.unmodelled.names)
+    eta = calibration.tolerance_scale
+    by_one_std = eta.factor * error_jacobian(fit, calibration.unmodelled.names)
     bias = (scaled @ jacobian.T @ by_one_std / sigma**2 * problem.theta_scale[:, None])[:n]
     np.testing.assert_allclose(c + bias @ bias.T, calibration.total_covariance, rtol=SAME_NUMBER)
 
-    noise = scaled @ jacobian.T @ jacobian @ scaled / sigma**2 * units
     u, s = np.sqrt(np.diag(calibration.total_covariance)), np.sqrt(np.diag(noise)[:n])
-    t = max(2.0, t_quantile(calibration.dof, 0.975))
-    assert t == pytest.approx(3.18, abs=0.005)
-    expanded = np.sqrt((t * s) ** 2 + 4.0 * (u**2 - s**2))
+    t = t_quantile(eta.contrasts, 0.975)
+    assert f"$t_\\eta = {t:.2f}$" in PAGE
+    expanded = np.sqrt(4.0 * s**2 + t**2 * (u**2 - s**2))
     np.testing.assert_allclose(expanded, calibration.expanded_uncertainties, rtol=SAME_NUMBER)
     effective = problem.n_free - np.trace(prior @ scaled)
     dof = problem.observations.size - problem.observations.n_free_zeros - effective
@@ -88,21 +93,18 @@ def test_covariance_at_the_tool():
     def mean(covariance):
         return float(space.weights @ np.trace(covariance, axis1=1, axis2=2))
 
-    def square(scale):
-        direct = (e_u - e @ out.leakage) * (scale * out.prior_stds)
-        c = e @ calibration.model_covariance @ e.transpose(0, 2, 1)
-        return mean(c + direct @ direct.transpose(0, 2, 1))
-
-    assert math.sqrt(square(1.0)) == pytest.approx(
-        accuracy.after.sizes.aligned.rms, rel=SAME_NUMBER
-    )
+    direct = (e_u - e @ out.leakage) * out.prior_stds
+    c = e @ calibration.model_covariance @ e.transpose(0, 2, 1)
+    square = mean(c + direct @ direct.transpose(0, 2, 1))
+    assert math.sqrt(square) == pytest.approx(accuracy.after.sizes.aligned.rms, rel=SAME_NUMBER)
     eta, known = calibration.tolerance_scale, accuracy.measure(accuracy.error_after_offsets)
-    total = math.sqrt(square(eta) + known.aligned.rms**2)
+    total = math.sqrt(square + known.aligned.rms**2)
     assert total == pytest.approx(calibration.assessment.tool.entered, rel=SAME_NUMBER)
     without = math.sqrt(mean(e @ calibration.total_covariance @ e.transpose(0, 2, 1)))
-    text = f"gives {without * 1e6:.0f} µm instead of {math.sqrt(square(1.0)) * 1e6:.0f} µm"
+    text = f"gives {without * 1e6:.0f} µm instead of {math.sqrt(square) * 1e6:.0f} µm"
     assert text in PAGE
-    assert f"$\\eta = {eta:.1f}$. Its tool error is {total * 1e6:.0f} µm with it" in PAGE
+    text = f"from {eta.contrasts:.1f} contrasts. Its tool error is {total * 1e6:.0f} µm with it"
+    assert f"$\\eta = {eta.factor:.1f}$ {text}" in PAGE
 
 
 def test_singular_values_with_the_mounting_marginalised():

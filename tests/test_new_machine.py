@@ -133,6 +133,16 @@ def test_numbers_of_drives_are_those_of_the_controller(made):
         assert place in str(refused.value)
 
 
+def test_a_posture_beyond_the_travel_is_named_with_the_controllers_number(copied):
+    file = copied / "first/session.yaml"
+    text = file.read_text()
+    assert "y_max:\n    tcp_mm: [0.0, 60.0, 0.0]" in text
+    file.write_text(text.replace("tcp_mm: [0.0, 60.0, 0.0]", "joints_mm: [250.0, 330.0, 250.0]"))
+    code, _, err = orthocal("check", copied / "first")
+    assert code == 2
+    assert "y_slide would be at -80.00 mm; it reaches from -70 to 150 mm" in err
+
+
 def test_what_is_read_on_it_calibrates_it(made, tmp_path):
     """1.5 mm in one drive's zero come back, the controller counting down or not."""
     out = tmp_path / "try"

@@ -51,10 +51,10 @@ from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.statistics import chance
 
 LEAST_GAIN = 0.04
-"""Reduction of the expected tool error below which a further adjustment is left out."""
+"""Reduction of the expected tool error that a further adjustment must bring."""
 
 WORTHWHILE = 0.15
-"""Reduction of the expected tool error below which the machine is better left alone."""
+"""Reduction of the expected tool error below which no adjustment is advised."""
 
 MOST_ROUNDS = 5
 """Corrections of the amounts on the nonlinear machine."""
@@ -160,7 +160,7 @@ def plan_adjustments(
         placed = place_tool(adjusted, tool.workspace.once(tool.use.size))
         entries = compute_entries(adjusted, placed)
         accuracy = assess_placed(adjusted, placed, entries)
-        summary = summarise_tool(adjusted, accuracy, scale=calibration.tolerance_scale)
+        summary = summarise_tool(adjusted, accuracy)
         after = summary or before
         search.correct(amounts, accuracy.error_after_offsets)
     return AdjustmentPlan(
@@ -312,7 +312,7 @@ class _Search:
         return np.asarray(-np.linalg.solve(normal, effects.T @ by_errors))
 
     def _covariance(self) -> Array:
-        return error_covariance(self.calibration, excess=self.calibration.tolerance_scale)
+        return error_covariance(self.calibration)
 
     def uncertainties(self, chosen: Sequence[int]) -> Array:
         """Expanded uncertainty of the best amount of each adjustment, shape (n_chosen,), [m]."""
@@ -325,7 +325,7 @@ class _Search:
                 (scatter, self.calibration.noise_covariance),
             )
         )
-        return np.asarray(chance.expanded_uncertainty(total, of_noise, dof=self.calibration.dof))
+        return self.calibration.expand(total, of_noise)
 
     def moved_uncertainty(self, chosen: Sequence[int]) -> float:
         """Standard deviation of the field by which the tool moves, RMS after alignment, [m]."""

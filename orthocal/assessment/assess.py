@@ -33,9 +33,9 @@ from orthocal.errors import ClosureError, RobotError
 from orthocal.estimation.choice import Choice
 from orthocal.estimation.loss import Loss, LossKind
 from orthocal.estimation.options import SolverKind, SolverOptions
+from orthocal.estimation.tolerance_scale import ToleranceScale
 from orthocal.measurement.joining import Given
 from orthocal.session.session import Session
-from orthocal.statistics import chance
 
 EXPLANATIONS: tuple[FindingKind, ...] = (
     "no redundancy",
@@ -93,10 +93,22 @@ def calibrate(
         TypeError: If an argument is of another kind.
         ValueError: If `start` does not have one number for each free error of the machine.
     """
+    judged = []
+
+    def find_scale(session: Session) -> ToleranceScale:
+        judged.append(judge_session(session))
+        return judged[0].tolerance_scale
+
     calibration, session = identify(
-        sessions, choice, loss=loss, solver=solver, profile=profile, start=start
+        sessions,
+        choice,
+        loss=loss,
+        solver=solver,
+        profile=profile,
+        start=start,
+        find_scale=find_scale,
     )
-    return replace(calibration, assessment=assess(calibration, session))
+    return replace(calibration, assessment=assess(calibration, session, judgement=judged[0]))
 
 
 def assess(
@@ -124,11 +136,11 @@ def assess(
         judgement = judge_session(measured)
     placed = find_tool(calibration)
     entries = compute_entries(calibration, placed)
-    tool, unreached = _tool(calibration, judgement, placed, entries)
+    tool, unreached = _tool(calibration, placed, entries)
     keep, best = _keeps(calibration, entries, tool), tool
     if keep:
         entries = tuple(e.kept for e in entries)
-        tool, _ = _tool(calibration, judgement, placed, entries)
+        tool, _ = _tool(calibration, placed, entries)
     notes = [
         *find_fit_findings(calibration),
         *([_no_change_needed(calibration, entries, best)] if keep else []),
@@ -144,7 +156,6 @@ def assess(
         findings=findings,
         entries=entries,
         tool=tool,
-        tolerance_scale=judgement.tolerance_scale,
     )
 
 
@@ -160,7 +171,7 @@ def check_session(session: Session) -> Assessment:
     found = judge_session(session)
     findings = found.findings
     if found.verdict == "enter":
-        within = found.tolerance_scale == 1.0
+        within = found.tolerance_scale.factor == 1.0
         findings = rank(
             [*findings, words.no_anomaly(len(session.readings), within_tolerances=within)]
         )
@@ -168,12 +179,11 @@ def check_session(session: Session) -> Assessment:
     decision = Decision(
         found.verdict, words.SESSION_HEADLINES[found.verdict], lead.text, lead.action
     )
-    return Assessment(decision, findings, (), None, found.tolerance_scale)
+    return Assessment(decision, findings, (), None)
 
 
 def _tool(
     calibration: Calibration,
-    judgement: Judgement,
     placed: CalibratedTool | None,
     entries: Sequence[ControllerEntry],
 ) -> tuple[ToolErrorSummary | None, list[Finding]]:
@@ -182,7 +192,7 @@ def _tool(
         accuracy = assess_placed(calibration, require_tool(calibration, placed), entries)
     except (ClosureError, RobotError) as e:
         return None, [words.out_of_reach(str(e))]
-    return summarise_tool(calibration, accuracy, scale=judgement.tolerance_scale), []
+    return summarise_tool(calibration, accuracy), []
 
 
 def _keeps(
@@ -256,12 +266,8 @@ def is_significant(calibration: Calibration, entry: ControllerEntry) -> bool:
 
 
 def expanded_uncertainty(calibration: Calibration, entry: ControllerEntry) -> float:
-    """Expanded uncertainty of a value to enter, [unit]: k = 2, Student's factor for few readings.
-
-    The part that is due to the scatter of the readings has Student's factor for 95 % where the
-    noise was estimated from few degrees of freedom; the rest has k = 2.
-    """
-    return float(chance.expanded_uncertainty(entry.std, entry.std_scatter, dof=calibration.dof))
+    """Expanded uncertainty of the best value to enter, [unit]; see `Calibration.expand`."""
+    return float(calibration.expand(entry.std, entry.std_scatter))
 
 
 def _decide(findings: Sequence[Finding]) -> Decision:

@@ -38,6 +38,10 @@ class CalibratedTool:
     """Its passive coordinates, shape (K, n_passive), [m, rad]: others are near."""
     sensitivities: tuple[ToolSensitivity, ...]
     """Under each of the conditions."""
+    trims: Array
+    """Displacement of the drives by what the controller compensates, (C, K, n_drives), [m, rad]."""
+    trims_unstated: Array
+    """The same where the side of approach is not stated, shape (K, n_drives), [m, rad]."""
     jacobian: Array
     """∂p/∂θ there, with the offsets active while measuring, shape (C K, 3, n), [m per unit]."""
 
@@ -54,7 +58,7 @@ class CalibratedTool:
             names: What to call the points in messages.
         """
         commanded = self.drives - np.asarray(offsets, dtype=np.float64)
-        return self._place(commanded, names) - self.targets
+        return self._place(commanded + self.trims, names) - self.targets
 
     def deviation_unless_stated(self) -> Array:
         """Error of a controller that corrects all errors for the conditions of `UseConditions()`.
@@ -64,6 +68,7 @@ class CalibratedTool:
         closure, points = self.middle, self.workspace.points[: len(self.drives)]
         commanded, passive = closure.reach(points)
         reached = closure.tcp(commanded, passive)
+        commanded = commanded + self.trims - self.trims_unstated
         return self._place(commanded, None) - np.tile(reached, (self.use.size, 1))
 
     @property
@@ -73,9 +78,17 @@ class CalibratedTool:
         return LoopClosure(closure.robot, fixed=closure.fixed, conditions=UseConditions())
 
     def _place(self, commanded: Array, names: Sequence[str] | None) -> Array:
-        """Tool under each of the conditions at drive coordinates, shape (C K, 3), [m]."""
+        """Tool under each of the conditions at its drive coordinates, shape (C K, 3), [m].
+
+        Args:
+            commanded: Shape (C, K, n_drives), [m, rad].
+            names: What to call the points in messages.
+        """
         closures = (s.closure for s in self.sensitivities)
-        found = [c.forward(commanded, start=self.passive, names=names) for c in closures]
+        found = [
+            c.forward(drives, start=self.passive, names=names)
+            for c, drives in zip(closures, commanded, strict=True)
+        ]
         return np.concatenate(found)
 
 
@@ -169,6 +182,8 @@ def _place(
         targets=read_only(np.tile(nominal.tcp(drives, passive), (use.size, 1))),
         drives=read_only(drives),
         passive=read_only(passive),
+        trims=read_only([calibration.displacement(drives, c.approach) for c in use.conditions]),
+        trims_unstated=read_only(calibration.displacement(drives)),
         sensitivities=sensitivities,
         jacobian=read_only(np.concatenate(jacobians)),
     )
@@ -181,17 +196,13 @@ def _require_travel(robot: Robot, drives: Array) -> None:
             raise ClosureError(f"is beyond the travel of {drive.name}", posture="a corner")
 
 
-def error_covariance(calibration: Calibration, *, excess: float = 1.0) -> Array:
+def error_covariance(calibration: Calibration) -> Array:
     """Covariance of what the estimate has wrong, free and unmodelled parameters in turn, [SI].
 
     With e = θ − θ̂ it is −L θᵤ and the estimate's own scatter for the free ones, θᵤ for the others.
-
-    Args:
-        calibration: The calibration.
-        excess: Factor of the priors of unmodelled errors.
     """
     unmodelled = calibration.unmodelled
-    variance = (excess * unmodelled.prior_stds) ** 2
+    variance = unmodelled.prior_stds**2
     taken_on = unmodelled.leakage * variance
     return np.block(
         [

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, get_args
 
 from orthocal.arguments import require_names
@@ -23,9 +24,10 @@ from orthocal.calibration.assessment_record import Assessment, Decision, Finding
 from orthocal.calibration.refit import repeat_calibration
 from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.estimation.options import SolverOptions
-from orthocal.estimation.problem import build_problem
+from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.io.fields import finite_or_none
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
+from orthocal.robot.model import Robot
 from orthocal.session.session import Session
 from orthocal.statistics.noise import KnownNoise, estimate_repeatability
 
@@ -134,8 +136,12 @@ def compare_models(
         _require_another(other, chosen)
     noise = find_known_noise(session)
     cycles = len({r.cycle for r in session.readings}) > 1
-    results, undetermined = _score_models(session, models, tolerances or {}, noise.sigma, options)
-    recommendation, judgement = recommend_model(session, models), judge_session(session)
+    judgement = judge_session(session)
+    build = partial(build_problem, session, tolerance_scale=judgement.tolerance_scale)
+    results, undetermined = _score_models(
+        build, session.robot, models, tolerances or {}, noise.sigma, options
+    )
+    recommendation = recommend_model(session, models)
     compared = Comparison(
         title=session.title,
         labels=tuple(r.label + (f", cycle {r.cycle}" if cycles else "") for r in session.readings),
@@ -161,20 +167,21 @@ def compare_models(
 
 
 def _score_models(
-    session: Session,
+    build: Callable[..., CalibrationProblem],
+    robot: Robot,
     models: Sequence[str],
     tolerances: Mapping[str, float],
     noise: float,
     options: SolverOptions | None,
 ) -> tuple[tuple[ModelResult, ...], tuple[Undetermined, ...]]:
     """Results of the models, the smallest first, and those that are not identifiable."""
-    parameters = session.robot.parameters
+    parameters = robot.parameters
     given = parameters.read_tolerances(tolerances)
     results, undetermined = [], []
     for model in dict.fromkeys(models or parameters.models):
         free = set(parameters.select_model(model))
         stds = {g: v for g, v in given.items() if free & set(parameters.select([g]))}
-        score = _score_with_prior(session, model, stds, noise, options)
+        score = _score_with_prior(partial(build, model=model, prior_stds=stds), noise, options)
         if isinstance(score, Undetermined):
             undetermined.append(score)
         else:
@@ -183,25 +190,21 @@ def _score_models(
 
 
 def _score_with_prior(
-    session: Session,
-    model: str,
-    prior_stds: Mapping[str, float],
-    noise: float,
-    options: SolverOptions | None,
+    build: Callable[..., CalibrationProblem], noise: float, options: SolverOptions | None
 ) -> ModelResult | Undetermined:
     """Score a model; with its tolerances as a prior if the readings alone do not determine it.
 
     Larger models always have a prior, so a small one without would be at a disadvantage.
     """
-    problem = build_problem(session, model=model, prior_stds=prior_stds)
+    problem = build()
     try:
         return score_model(problem, noise=noise, options=options)
     except NotIdentifiableError:
-        held = build_problem(session, model=model, prior_stds=prior_stds, prior=True)
+        held = build(prior=True)
     try:
         return score_model(held, noise=noise, by_choice=False, options=options)
     except NotIdentifiableError as e:
-        return Undetermined(model, problem.n_machine, e.problem)
+        return Undetermined(problem.selection.label, problem.n_machine, e.problem)
 
 
 def _assess(comparison: Comparison) -> Assessment:
@@ -229,7 +232,6 @@ def _assess(comparison: Comparison) -> Assessment:
         findings,
         (),
         tool,
-        judged.tolerance_scale,
     )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from orthocal.assessment.plausibility import (
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import describe_anomalies, describe_no_change
 from orthocal.calibration.assessment_record import Finding, Severity, Verdict
+from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
 from orthocal.hypotheses.families.sessions import detectable_changes
 from orthocal.hypotheses.linear_model import LinearModel, ModelLinearisation
 from orthocal.hypotheses.search import find_anomalies
@@ -47,6 +49,9 @@ SCALES = np.geomspace(1.0, 30.0, 86)
 LARGEST_DEVIATION = 3.0
 """Standard deviations from its prediction beyond which a reading is doubtful."""
 
+KEPT = 4
+"""Sessions whose judgements are kept."""
+
 EXPLAINED = ("finer than the gauge", "residuals too small", "scattered repeats", "sigma too large")
 """Kinds that an anomaly with a name explains."""
 
@@ -59,7 +64,7 @@ class Judgement:
 
     findings: tuple[Finding, ...]
     """The gravest first."""
-    tolerance_scale: float
+    tolerance_scale: ToleranceScale
     """Factor by which the machine's errors exceed their tolerances; 1 if they do not."""
 
     @property
@@ -79,8 +84,11 @@ def rank(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     return tuple(sorted(findings, key=lambda f: _GRAVITY[f.severity]))
 
 
+@lru_cache(maxsize=KEPT)
 def judge_session(session: Session) -> Judgement:
     """Judge the readings of a session, or of several that were joined.
+
+    The last judgements are kept: several models are calibrated from one session, or compared.
 
     Raises:
         ClosureError: If the machine cannot reach a posture.
@@ -88,13 +96,13 @@ def judge_session(session: Session) -> Judgement:
     """
     anomalies = _find_mistakes(session)
     implausible = [f for f in find_implausible(session) if not (anomalies and f.kind in EXPLAINED)]
-    scale, beyond = 1.0, []
+    scale, beyond = AS_STATED, []
     if verdict_of([*anomalies, *implausible]) == "enter":
         scale = find_tolerance_scale(session)
-        if scale > LARGEST_SCALE:
-            beyond = [words.beyond_tolerances(scale, LARGEST_SCALE)]
-        elif scale > 1.0:
-            beyond = [words.above_tolerances(scale)]
+        if scale.factor > LARGEST_SCALE:
+            beyond = [words.beyond_tolerances(scale.factor, LARGEST_SCALE)]
+        elif scale.factor > 1.0:
+            beyond = [words.above_tolerances(scale.factor)]
     unchanged = [] if anomalies or not session.joined else [_describe_detectable(session)]
     unshown = find_unshown_effects(session)
     return Judgement(rank([*implausible, *anomalies, *unchanged, *beyond, *unshown]), scale)
@@ -150,15 +158,17 @@ def _find_mistakes(session: Session) -> list[Finding]:
     return anomalies or list(find_scattered(session))
 
 
-def find_tolerance_scale(session: Session) -> float:
+def find_tolerance_scale(session: Session) -> ToleranceScale:
     """Factor by which the machine's errors exceed their tolerances, by maximum likelihood.
 
-    Readings are y ~ N(h, e² J P Jᵀ + G + σ²) with P of all errors but offsets, G of how gauges are
-    mounted. Offsets and gauge zeros are free: home switches are as far off as they are. σ is the
-    stated noise, or the scatter of repeated readings if that is larger. 1 where one in a thousand
-    machines within tolerances shows as much, or nothing is stated of the noise.
+    Readings are y ~ N(h, e² J P Jᵀ + G + σ²) with P of all errors of the geometry but offsets, G of
+    how gauges are mounted and of other effects. Offsets and gauge zeros are free: home switches are
+    as far off as they are. σ is the stated noise, or the scatter of repeated readings if that is
+    larger. 1 where one in a thousand machines within tolerances shows as much, or nothing is stated
+    of the noise. Each independent contrast of the readings counts by the share of its variance that
+    the machine's errors have.
     """
-    scales = [1.0]
+    scales = [AS_STATED]
     for part in split_sessions(session):
         if any(g.sigma is None for g in part.gauges.values()) or len(part.readings) < 2:
             continue
@@ -173,8 +183,10 @@ def find_tolerance_scale(session: Session) -> float:
             continue
         spread = 1.0 + SCALES[:, None] ** 2 * excess
         logs = (within**2 / spread + np.log(spread)).sum(axis=1)
-        scales.append(float(SCALES[int(np.argmin(logs))]))
-    return max(scales)
+        factor = float(SCALES[int(np.argmin(logs))])
+        share = factor**2 * excess / (1.0 + factor**2 * excess)
+        scales.append(ToleranceScale(factor, float((share**2).sum())))
+    return max(scales, key=lambda s: s.factor)
 
 
 def _parts(
@@ -193,11 +205,14 @@ def _parts(
     slopes = about.sizes[:, None] * about.errors.T / noise  # along each direction, by each error
     known, n = problem.robot.parameters, problem.n_machine
     machine = slopes[:, :n]
-    offset = np.array([known.are_offsets(name) for name in problem.free[:n]], dtype=bool)
+    names = problem.free[:n]
+    offset = np.array([known.are_offsets(name) for name in names], dtype=bool)
+    scaled = np.array([known.are_scaled(name) for name in names], dtype=bool)
     basis, sizes, _ = np.linalg.svd(machine[:, offset])
     rank = int((sizes > RESOLVED).sum())
     kept = basis[:, rank:].T
-    gauges, errors = kept @ slopes[:, n:], kept @ machine[:, ~offset]
+    unscaled = np.column_stack([slopes[:, n:], machine[:, ~(offset | scaled)]])
+    gauges, errors = kept @ unscaled, kept @ machine[:, scaled]
     root = np.linalg.cholesky(np.eye(len(kept)) + gauges @ gauges.T)
     white = np.linalg.solve(root, np.column_stack([kept @ along / noise, errors]))
     variances, turned = np.linalg.eigh(white[:, 1:] @ white[:, 1:].T)

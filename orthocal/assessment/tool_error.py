@@ -39,6 +39,7 @@ from orthocal.kinematics.conditions import (
     UseConditions,
     UseSamples,
     effects_by_condition,
+    sample_use,
     stated_use,
 )
 from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
@@ -207,14 +208,15 @@ def assess_tool(
     """Deviation and uncertainty of the tool position, before and after a calibration.
 
     Unmodelled errors contribute with their prior standard deviations, and with the bias that they
-    cause in the estimate. The tolerance scale is not applied.
+    cause in the estimate. The uncertainty before is at the stated tolerances, that after it at the
+    scaled ones.
 
     Args:
         calibration: The calibration.
         workspace: Tool positions that are commanded; by default the workspace.
         names: What to call the points in messages.
-        conditions: Conditions of use; by default those that the robot's YAML states, over which
-            squared errors are averaged.
+        conditions: Conditions of use in place of those that the robot's YAML states. Squared errors
+            are averaged over all that remain.
 
     Raises:
         RobotError: If the robot has no tool centre point, or its drives do not command it.
@@ -225,7 +227,8 @@ def assess_tool(
     use = None
     if conditions is not None:
         conditions.require_valid(calibration.robot)
-        use = UseSamples((conditions,))
+        use = sample_use(calibration.robot, conditions)
+        use = use if use.varying else UseSamples((conditions,))
     if workspace is None:
         return assess_placed(calibration, require_tool(calibration, find_tool(calibration, use)))
     placed = place_tool(calibration, workspace, use, names=names)
@@ -259,6 +262,8 @@ def assess_placed(
     """`assess_tool` over points whose tool is known, with offsets to enter that may be known."""
     unmodelled = calibration.unmodelled
     prior_stds = np.r_[[p.prior_std for p in calibration.free], unmodelled.prior_stds]
+    free = tuple(tool.free[: len(prior_stds)])
+    prior_stds /= calibration.tolerance_scale.factors(calibration.robot.parameters, free)
     jacobian = tool.jacobian[:, :, : len(prior_stds)]
     space, where = tool.workspace, tool.targets
     after = None
@@ -269,7 +274,7 @@ def assess_placed(
         workspace=space,
         use=tool.use,
         targets=where,
-        names=tool.free[: len(prior_stds)],
+        names=free,
         jacobian=jacobian,
         deviation=read_only(tool.deviation(calibration.active_offsets, names=names)),
         error_after_offsets=read_only(left),
@@ -279,29 +284,7 @@ def assess_placed(
     )
 
 
-def assess_remaining(
-    calibration: Calibration, accuracy: ToolAccuracy, *, scale: float | None = None
-) -> ToolUncertainty | None:
-    """Uncertainty after a calibration, unmodelled errors at their tolerances times a factor.
-
-    Args:
-        calibration: The calibration.
-        accuracy: Its errors at the tool.
-        scale: That factor; by default as it was assessed.
-
-    Returns:
-        None if nothing determines the noise.
-    """
-    factor = calibration.tolerance_scale if scale is None else scale
-    if accuracy.after is None or factor == 1.0:
-        return accuracy.after
-    covariance = error_covariance(calibration, excess=factor)
-    return measure_uncertainty(accuracy.jacobian, covariance, accuracy.workspace, accuracy.targets)
-
-
-def summarise_tool(
-    calibration: Calibration, accuracy: ToolAccuracy, *, scale: float | None = None
-) -> ToolErrorSummary | None:
+def summarise_tool(calibration: Calibration, accuracy: ToolAccuracy) -> ToolErrorSummary | None:
     """Expected tool error now, with the offsets entered, and with all errors compensated.
 
     Each is the root of the sum of squares of the known deviation and of the uncertainty.
@@ -309,10 +292,9 @@ def summarise_tool(
     Returns:
         None if nothing determines the noise.
     """
-    remaining = assess_remaining(calibration, accuracy, scale=scale)
-    if remaining is None:
+    if accuracy.after is None:
         return None
-    known = remaining.sizes
+    known = accuracy.after.sizes
     compensated = known.reported.rms
     now, entered = (accuracy.measure(d) for d in (accuracy.deviation, accuracy.error_after_offsets))
     return ToolErrorSummary(
@@ -323,12 +305,12 @@ def summarise_tool(
         compensated=compensated,
         now_absolute=math.hypot(now.absolute.rms, known.absolute.rms),
         entered_absolute=math.hypot(entered.absolute.rms, known.absolute.rms),
-        use=_summarise_use(calibration, accuracy, compensated, scale=scale),
+        use=_summarise_use(calibration, accuracy, compensated),
     )
 
 
 def _summarise_use(
-    calibration: Calibration, accuracy: ToolAccuracy, compensated: float, *, scale: float | None
+    calibration: Calibration, accuracy: ToolAccuracy, compensated: float
 ) -> ToolUse | None:
     """Conditions of use of the tool error, and what each that varies contributes.
 
@@ -336,11 +318,11 @@ def _summarise_use(
     the mean square is that of the mean conditions and of the change by each condition, which no
     alignment removes.
     """
-    stated, effects = stated_use(calibration.robot), effects_by_condition(calibration.robot)
-    if accuracy.use.declared is None or stated is None:
+    use, effects = accuracy.use.declared, effects_by_condition(calibration.robot)
+    stated = stated_use(calibration.robot, use)
+    if use is None or stated is None:
         return None
-    factor = calibration.tolerance_scale if scale is None else scale
-    covariance = error_covariance(calibration, excess=factor)
+    covariance = error_covariance(calibration)
     weights = accuracy.use.size * accuracy.workspace.weights[: len(accuracy.points)]
     known, unknown = (
         accuracy.use.changes(v) for v in (accuracy.error_after_offsets, accuracy.jacobian)

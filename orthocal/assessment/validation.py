@@ -223,7 +223,6 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
             findings=rank([*judgement.findings, lead, *changes, *notes]),
             entries=entries,
             tool=assessment_of(refit).tool,
-            tolerance_scale=judgement.tolerance_scale,
         ),
     )
 

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from orthocal.hypotheses.anomaly import AnomalyKind
-from orthocal.io.documents import Number, PositiveInSI, write_plain
+from orthocal.io.documents import Number, write_plain
 from orthocal.io.fields import CLOSED, Many, NumberOrNaN, SizeOrNaN
 from orthocal.kinematics.conditions import StatedUse, UseCondition
 from orthocal.kinematics.workspace import describe_box
@@ -126,8 +126,8 @@ class Finding:
 
     @property
     def words(self) -> str:
-        """Text and action."""
-        return f"{self.text} {self.action}".strip()
+        """Text and action; after a list the action has a line of its own."""
+        return ("\n" if "\n" in self.text else " ").join((self.text, self.action)).strip()
 
     def to_document(self) -> dict[str, Any]:
         """Plain data for JSON; null for what is unknown."""
@@ -290,9 +290,6 @@ class Assessment:
     """What to enter, drive by drive; empty if no offset was identified."""
     tool: ToolErrorSummary | None
     """None if the robot has no tool, or nothing determines the noise."""
-    tolerance_scale: PositiveInSI
-    """Factor on the priors of unmodelled errors in the tool error; 1 if the readings are possible
-    within the tolerances."""
 
     @property
     def keeps_offsets(self) -> bool:

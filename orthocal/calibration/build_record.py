@@ -76,12 +76,13 @@ def assemble_calibration(
     """
     problem = fit.problem
     session, n = problem.session, problem.n_machine
-    covariance, noise_covariance = fit.covariance(), fit.noise_covariance()
     # a base parameter stands for all errors of its combination
     others = find_unmodelled_errors(
         fit, represented=() if full_problem is None else full_problem.machine_selection.names
     )
     unmodelled, taken_on = propagate_unmodelled(fit, others)
+    noise = _separate_noise(fit) if others.names else None
+    covariance, noise_covariance = fit.covariance(noise=noise), fit.noise_covariance(noise=noise)
     bias = np.append(np.sqrt(np.diag(unmodelled.bias_covariance)), taken_on)
     estimates = _estimates(
         fit,
@@ -112,11 +113,23 @@ def assemble_calibration(
         residuals=_residual_rows(fit, diagnostics, nominal),
         critical=diagnostics.outlier_threshold,
         postures=_posture_records(fit),
+        tolerance_scale=problem.machine_selection.tolerance_scale,
         setups=_setup_records(fit),
         gauges=_gauge_records(fit),
         versions=_versions(),
         robot=session.robot,
     )
+
+
+def _separate_noise(fit: Fit) -> float | None:
+    """Noise of a reading where unmodelled errors explain the residuals, [m]; else None.
+
+    With tolerances that are scaled so that they do, residuals as noise would count them twice.
+    """
+    gauge, scale = fit.problem.session.gauge, fit.problem.machine_selection.tolerance_scale
+    if scale.factor == 1.0 or fit.noise.source != "residuals":
+        return None
+    return fit.noise.apart_from_residuals(gauge.sigma, gauge.resolution)[0]
 
 
 def _require_possible(estimates: Sequence[ParameterEstimate], iterations: int) -> None:
@@ -179,7 +192,8 @@ def _widen(
     fit: Fit, unmodelled: UnmodelledEffect, intervals: Mapping[str, tuple[float, float]]
 ) -> dict[str, tuple[float, float]]:
     """Profile-likelihood intervals, widened by the errors of the machine that were not free."""
-    spread = confidence_factor(np.inf) * np.sqrt(np.diag(unmodelled.bias_covariance))
+    contrasts = fit.problem.machine_selection.tolerance_scale.contrasts
+    spread = confidence_factor(contrasts) * np.sqrt(np.diag(unmodelled.bias_covariance))
     result = {}
     for name, ends in intervals.items():
         i = fit.problem.free.index(name)
@@ -271,6 +285,7 @@ def _session_record(session: Session) -> SessionRecord:
         controller_offsets=None if offsets is None else tuple(offsets.tolist()),
         purpose=session.purpose,
         seed=session.seed,
+        compensation=session.compensation,
         adjusted=tuple(session.adjusted.items()),
         parts=tuple(_session_record(part) for part in session.parts),
     )
@@ -287,11 +302,11 @@ def _residual_rows(
         residual = project_out_zeros(measured - prediction, o, weights=fit.robust_weights)
         return session.values - noise * o.rows(residual)
 
-    n = problem.n_machine
-    at_reference = nominal_theta is None
-    machine = problem.active_theta[:n] if nominal_theta is None else nominal_theta
-    theta = np.append(machine, fit.solution.theta[n:])  # the mounting of the gauges is the same
-    nominal = fitted(problem.predict(theta, problem.active_passive if at_reference else None))
+    mounting = fit.solution.theta[problem.n_machine :]  # that of the calibrated machine
+    if nominal_theta is None:
+        nominal = fitted(problem.predict_nominal(mounting))
+    else:
+        nominal = fitted(problem.predict(np.append(nominal_theta, mounting), None))
     try:
         closed = problem.close(fit.linearised_theta, start=fit.solution.passive)
         by_linear = fitted(problem.predict(fit.linearised_theta, closed))
@@ -356,6 +371,7 @@ def _setup_records(fit: Fit) -> tuple[SetupRecord, ...]:
             aligned_at=aligned_at[s.name],
             zero_kind=s.zero,
             payload=s.payload,
+            compensation=s.compensation,
             adjusted=None if s.adjusted is None else tuple(s.adjusted.items()),
         )
         for s in fit.problem.session.setups.values()

@@ -10,11 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array
 from orthocal.calibration.machine import Machine
 from orthocal.calibration.records import CalibrationRecord, ParameterEstimate
+from orthocal.effects.compensation import displace_drives
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow, root_mean_square
+from orthocal.kinematics.conditions import APPROACH
 from orthocal.robot.model import Robot
 from orthocal.statistics.chance import expanded_uncertainty
 
@@ -128,7 +131,7 @@ class Calibration(CalibrationRecord):
         """Total covariance of `free`, shape (n_machine, n_machine), [SI].
 
         From noise and priors (`model_covariance`) and from unmodelled errors with their stated
-        priors (`unmodelled.bias_covariance`), without the tolerance scale.
+        priors (`unmodelled.bias_covariance`).
         """
         return np.asarray(self.model_covariance + self.unmodelled.bias_covariance)
 
@@ -136,11 +139,24 @@ class Calibration(CalibrationRecord):
     def expanded_uncertainties(self) -> Array:
         """Expanded uncertainties of `free`, shape (n_machine,), [SI].
 
-        k = 2, but Student's 95 % factor for the part from noise where few degrees of freedom
-        determine it: U² = (t s)² + 4 (u² − s²) with u = `std` and s = `std_scatter`.
+        k = 2, but Student's 95 % factor where few degrees of freedom determine the noise, or few
+        contrasts the tolerance scale; see `statistics.chance.expanded_uncertainty`.
         """
-        scatter = [p.std_scatter for p in self.free]
-        return expanded_uncertainty(self.standard_deviations, scatter, dof=self.dof)
+        return self.expand(self.standard_deviations, [p.std_scatter for p in self.free])
+
+    def expand(self, std: ArrayLike, std_scatter: ArrayLike) -> Array:
+        """Expanded uncertainties of quantities that follow from `free`, of any shape.
+
+        Args:
+            std: Their standard deviations.
+            std_scatter: The parts that are due to the noise of the readings.
+        """
+        scale, noise = self.tolerance_scale, self.noise
+        dof = self.dof
+        if scale.factor != 1.0 and self.unmodelled.names and noise.source == "residuals":
+            session = self.session
+            _, dof = noise.apart_from_residuals(session.gauge_sigma, session.gauge_resolution)
+        return expanded_uncertainty(std, std_scatter, dof=dof, other_dof=scale.contrasts)
 
     @property
     def intervals(self) -> tuple[tuple[float, float], ...]:
@@ -153,6 +169,25 @@ class Calibration(CalibrationRecord):
         """Offsets in the controller while measuring, 0 where not stated, (n_drives,), [m, rad]."""
         stated = self.session.controller_offsets
         return np.zeros(len(self.robot.drives)) if stated is None else np.array(stated)
+
+    def displacement(self, displayed: ArrayLike, approach: str | None = None) -> Array:
+        """Displacement of the drives by what the controller compensated while measuring.
+
+        Args:
+            displayed: Commanded drive coordinates with the active offsets, shape (K, n_drives),
+                [m, rad].
+            approach: As for `UseConditions`.
+
+        Returns:
+            Shape (K, n_drives), [m, rad]; see `orthocal.effects.compensation`.
+        """
+        at = np.asarray(displayed, dtype=np.float64)
+        if not self.session.compensation:
+            return np.zeros(at.shape)
+        sides = [APPROACH[letter] for letter in approach or "u" * at.shape[1]]
+        return displace_drives(
+            self.robot, self.session.compensation, at, np.tile(sides, (len(at), 1))
+        )
 
     @property
     def only_offsets(self) -> bool:
@@ -170,11 +205,6 @@ class Calibration(CalibrationRecord):
     def offsets(self) -> Array:
         """Offsets of the identified machine's drives, shape (n_drives,), [m, rad]."""
         return np.asarray(self.offset_weights @ np.array([p.value for p in self.parameters]))
-
-    @property
-    def tolerance_scale(self) -> float:
-        """Tolerance scale: factor on the priors of unmodelled errors in the expected tool error."""
-        return 1.0 if self.assessment is None else self.assessment.tolerance_scale
 
     @property
     def machine(self) -> Machine:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from orthocal.estimation.linear import linearise_problem
 from orthocal.estimation.loss import Loss, LossKind
 from orthocal.estimation.options import SolverKind, SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
 from orthocal.estimation.weighting import initial_sigma
 from orthocal.kinematics.loop_closure import as_rows
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
@@ -38,6 +39,7 @@ def identify(
     solver: SolverOptions | SolverKind = "ipopt",
     profile: Sequence[str] = (),
     start: ArrayLike | None = None,
+    find_scale: Callable[[Session], ToleranceScale] | None = None,
 ) -> tuple[Calibration, Session]:
     """Identify the errors of a machine from a session, with their uncertainty; not assessed.
 
@@ -52,6 +54,8 @@ def identify(
         profile: Names or globs of free parameters whose profile-likelihood intervals are wanted.
         start: Initial values of the free errors of the machine, shape (n_machine,), [SI]; by
             default the linearised solution.
+        find_scale: Function that finds the scale of the tolerances from the session; by default
+            the tolerances are as stated.
 
     Returns:
         The calibration, and the session (or the joined sessions) that it is of.
@@ -78,6 +82,12 @@ def identify(
         if start.shape != (1, n) or not np.isfinite(start).all():
             raise ValueError(f"expected {n} finite numbers to start from")
         start = np.append(start[0], np.zeros(problem.n_free - n))
+    scale = AS_STATED if find_scale is None else find_scale(session)
+    if chosen.base:  # without priors
+        scale = AS_STATED
+    if scale.factor != 1.0:
+        selection = chosen.select(session.robot.parameters, tolerance_scale=scale)
+        problem = CalibrationProblem(session, selection)
     full_problem = problem if chosen.base else None
     solve = _fit_base if chosen.base else fit_problem
     fit = solve(problem, options=options, start=start)

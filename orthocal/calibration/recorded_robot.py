@@ -245,9 +245,23 @@ def _wrong_counts(record: CalibrationRecord, robot: Robot) -> Iterator[tuple[str
             expected = f"expected {passive}, one a passive joint"
             yield f"postures[{i}].passive", f"has {len(p.passive)} numbers; {expected}"
     offsets, names = record.session.controller_offsets, [d.name for d in robot.drives]
+    expected = f"expected {len(names)}, one a drive: {', '.join(names)}"
     if offsets is not None and len(offsets) != len(names):
-        expected = f"expected {len(names)}, one a drive: {', '.join(names)}"
         yield "session.controller_offsets", f"has {len(offsets)} numbers; {expected}"
+    compensations = [("session", record.session.compensation)]
+    compensations += [(f"setups[{i}]", s.compensation or ()) for i, s in enumerate(record.setups)]
+    for key, joints in compensations:
+        if joints and len(joints) != len(names):
+            yield f"{key}.compensation", f"has {len(joints)} items; {expected}"
+        for i, joint in enumerate(joints):
+            table = joint.table
+            if table is not None and not (
+                table.ndim == 2 and table.shape[1] == 3 and (table[1:, 0] > table[:-1, 0]).all()
+            ):
+                yield (
+                    f"{key}.compensation[{i}].table",
+                    "expected rising positions, each with two trims",
+                )
 
 
 def _unknown_names(record: CalibrationRecord) -> Iterator[tuple[str, str]]:

@@ -9,10 +9,12 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from orthocal.calibration.assessment_record import Assessment
+from orthocal.effects.compensation import JointTrim
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.diagnostics.unmodelled import UnmodelledEffect
 from orthocal.estimation.loss import LossKind
 from orthocal.estimation.options import SolverKind
+from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
 from orthocal.io.documents import Count, Number, PositiveInSI, PositiveNumber
 from orthocal.io.fields import CLOSED, Many, Matrix, SizeOrInf, SizeOrNaN, Vector
 from orthocal.robot.description import HEAVIEST_KG
@@ -113,6 +115,8 @@ class SessionRecord:
     """Model and free errors that the session states."""
     seed: Count | None
     """Seed of simulated readings; None for measured readings."""
+    compensation: Many[JointTrim] = ()
+    """What the controller compensated in the joint of each drive; empty for nothing."""
     adjusted: Many[tuple[str, Number]] = ()
     """Mechanical adjustments since the machine was built and their amounts, [m]."""
     parts: Many[SessionRecord] = ()
@@ -247,6 +251,8 @@ class SetupRecord:
     """Whether the zero was estimated or known to be 0."""
     payload: Annotated[Number, Field(ge=0.0, le=HEAVIEST_KG)] = 0.0
     """Mass on the tool, [kg]."""
+    compensation: Many[JointTrim] | None = None
+    """What the controller compensated, where it was not that of the session."""
     adjusted: Many[tuple[str, Number]] | None = None
     """Mechanical adjustments and their amounts, [m], where they were not those of the session."""
 
@@ -292,5 +298,8 @@ class CalibrationRecord:
     postures: Many[PostureRecord]
     setups: Many[SetupRecord]
     gauges: Many[GaugeRecord]
+    tolerance_scale: ToleranceScale = AS_STATED
+    """Factor on the tolerances of all errors of the geometry except offsets, which prior standard
+    deviations, covariances and everything that follows from them contain."""
     assessment: Assessment | None = None
     """Verdict, findings, what to enter and the tool error; None if it was not assessed."""

@@ -82,6 +82,7 @@ def _repeat_problem(calibration: Calibration, session: Session) -> CalibrationPr
         lower=read_only([-np.inf if p.lower is None else p.lower for p in free]),
         upper=read_only([np.inf if p.upper is None else p.upper for p in free]),
         fixed={p.name: p.value for p in calibration.parameters if not p.free},
+        tolerance_scale=calibration.tolerance_scale,
     )
     return CalibrationProblem(session, selection)
 
@@ -110,6 +111,7 @@ def restore_session(calibration: Calibration) -> Session:
                 s.zero_kind,
                 s.payload,
                 None if s.adjusted is None else dict(s.adjusted),
+                s.compensation,
             )
             for s in calibration.setups
         },
@@ -127,6 +129,7 @@ def restore_session(calibration: Calibration) -> Session:
             for r in calibration.residuals
         ),
         controller_offsets=None if offsets is None else read_only(offsets),
+        compensation=record.compensation,
         adjusted=dict(record.adjusted),
         path=None if record.path is None else Path(record.path),
         readings_path=None if record.readings_path is None else Path(record.readings_path),

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
-from typer import Argument
+from typer import Argument, Exit
 
 import orthocal
 from orthocal.cli.forward import put_assumed
@@ -20,7 +21,7 @@ from orthocal.cli.options import (
     read_conditions,
     require_between,
 )
-from orthocal.cli.printing import deliver, print_rows
+from orthocal.cli.printing import deliver, print_rows, put_note
 from orthocal.errors import ClosureError, SessionError
 from orthocal.units import MM
 
@@ -37,7 +38,8 @@ def accuracy(
 ) -> None:
     """Print the tool error over the workspace, or at points.
 
-    With points it prints CSV: the deviation of the tool at each, and its standard deviation.
+    With points it prints CSV: the absolute error of the tool at each, without alignment of the
+    workpiece, and its standard deviation.
     Without --approach, --temperature and --payload a tool error is that under the conditions of
     use that the robot's YAML states.
 
@@ -65,7 +67,13 @@ def accuracy(
         if not json:
             rows = accuracy_rows(result, targets, names=names, conditions=conditions)
             put_assumed(result, conditions)
-            print_rows(text.POINT_COLUMNS, text.format_points, rows)
+            note = text.ABSOLUTE_NOTE.format(shlex.quote(str(calibration)))
+            try:
+                print_rows(text.POINT_COLUMNS, text.format_points, rows)
+            except Exit:  # some rows are empty
+                put_note(note)
+                raise
+            put_note(note)
             return
         if len(targets) > MOST_POINTS:
             raise SessionError(

@@ -33,6 +33,7 @@ def again(
     out: OutDirectory,
     session: Path | None = None,
     adjusted: str | None = None,
+    ini: Path | None = None,
     anyway: Anyway = False,
 ) -> None:
     """Plan the same readings again, with the offsets to enter.
@@ -46,7 +47,10 @@ def again(
             of several the last.
         adjusted (NAME=MM,...): Mechanical adjustments since the calibration and their amounts, such
             as x_outer_foot_y=0.12; or plan, for those that `orthocal adjust` prints.
+        ini (FILE): INI file of LinuxCNC with the entered lines, or joints.ini of an export, whose
+            BACKLASH and COMP_FILE the session then states; default: those of the last session.
     """
+    from orthocal.effects.compensation import describe_trims
     from orthocal.export.formats import require_entering
 
     require_new_files(out, FILES, remedy="expected a new directory")
@@ -55,6 +59,10 @@ def again(
         require_entering(result)
     amounts = _read_amounts(result, adjusted)
     new = _plan_again(result, session, amounts)
+    if ini is not None:
+        from orthocal.measurement.files.linuxcnc_ini import read_ini
+
+        new = replace(new, compensation=read_ini(ini, result.robot).compensation)
     comment = (
         "A plan: enter these offsets, then run `orthocal record .` in this directory, or fill in\n"
         "readings.csv. Compare the readings with the calibration by `orthocal validate`."
@@ -72,6 +80,8 @@ def again(
     if amounts:
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
         put_out(f"The machine is expected with these adjustments: {settings}.")
+    if trims := describe_trims(new.robot, new.compensation):
+        put_out(f"The controller compensates backlash, as session.yaml states: {trims}.")
     put_out(
         f"Enter these offsets of the slides, home, and measure again: {offsets}.{sign}\n"
         f"  orthocal record {out}\n"

@@ -144,7 +144,7 @@ def correct(
         file, axes=field.axes, offsets=zeros, start=position, one_tool=tip is not None
     )
     region, words = _find_region(result)
-    lags = find_lags(result.robot, result.errors)
+    lags = find_lags(result.robot, result.errors) - _compensated_lags(result)
     taken_up = backlash is Backlash.PROGRAM and bool(lags.any())
     sides = ApproachSides(result.robot, lags) if taken_up else None
     corrector = ProgramCorrector(interpreter, field, within=tolerance, region=region, sides=sides)
@@ -367,10 +367,21 @@ def _describe_backlash(result: orthocal.Calibration, lags: Array, *, taken_up: b
     for drive, lag in zip(result.robot.drives, lags.tolist(), strict=True):
         unit, size = DRIVE_UNITS[drive.unit]
         listed.append(f"{drive.name} {format_fixed(2.0 * lag / size, 3)} {unit}")
+    if taken_up and result.session.compensation:
+        text = "Where drives reverse, the program takes up what the controller, as stated in the"
+        return f"{text} session, leaves of the backlash: {', '.join(listed)}."
     if taken_up:
         text = "The program takes up the backlash of the drives where they reverse; the controller"
         return f"{text} must not: {', '.join(listed)}."
     return f"For a controller that takes up the backlash of the drives: {', '.join(listed)}."
+
+
+def _compensated_lags(result: orthocal.Calibration) -> Array:
+    """Lags that the controller takes up itself, as the session states, (n_drives,), [m, rad]."""
+    zero = result.robot.drive_zero[None]
+    ahead, behind = (result.displacement(zero, side * zero.size)[0] for side in "pn")
+    half: Array = 0.5 * (ahead - behind)
+    return half
 
 
 def _describe_controller(

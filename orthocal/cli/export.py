@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 from typer import Option
 
@@ -17,10 +18,13 @@ from orthocal.cli.options import (
     read_numbers,
     read_vector,
 )
-from orthocal.cli.printing import write_results
+from orthocal.cli.printing import put_note, write_results
 from orthocal.errors import ParameterError
 from orthocal.io.files import exists
 from orthocal.units import DRIVE_UNITS, MM, UM
+
+if TYPE_CHECKING:
+    from orthocal.measurement.files.linuxcnc_ini import ControllerJoints
 
 ALTERNATIVES = ("joints.ini", "kinematics.ini")
 """Lines with new HOME_OFFSET, and lines of a module that contains the offsets."""
@@ -37,6 +41,7 @@ def export(
     tool: ToolTip = None,
     home_offset: str | None = None,
     latched: str | None = None,
+    ini: Path | None = None,
     anyway: Anyway = False,
 ) -> None:
     """Write a calibration for a controller or another program.
@@ -55,15 +60,24 @@ def export(
             `correct`: of the written path.)
         home_offset (VALUES): linuxcnc: HOME_OFFSET of each joint during the measurement, separated
             by commas, mm or degrees; without it the files contain changes only.
-        latched (SIGNS): linuxcnc: sign of HOME_LATCH_VEL of each joint, such as +,+,-; needed for
-            drives with backlash.
+        latched (SIGNS): linuxcnc: sign of HOME_LATCH_VEL of each joint, such as +,+,-; it matters
+            for drives with backlash. Default: + for all joints.
+        ini (FILE): linuxcnc: INI file during the measurement, instead of --home-offset and
+            --latched.
     """
+    from orthocal.export.linuxcnc.export import assumes_latching
+
     result = orthocal.load_calibration(calibration)
+    joints = None if ini is None else _read_joints(ini, result)
+    if joints is not None:
+        for option, value in (("--home-offset", home_offset), ("--latched", latched)):
+            if value is not None:
+                raise ParameterError("is stated by --ini, too; give one of them", where=option)
     options = orthocal.ExportOptions(
         within=None if within is None else within * UM,
         tool=None if tool is None else read_vector(tool, "--tool"),
-        home_offsets=None if home_offset is None else _home_offsets(home_offset, result),
-        latched=None if latched is None else _signs(latched),
+        home_offsets=_home_offsets(home_offset, result) if joints is None else joints.home_offsets,
+        latched=_signs(latched) if joints is None else joints.latched,
         half_side=None if half_side_mm is None else half_side_mm * MM,
         module=module,
     )
@@ -76,21 +90,49 @@ def export(
                 where=str(out / other),
             )
     write_results(out, files)
+    if to == "linuxcnc" and assumes_latching(result, options):
+        put_note(
+            "Assumed: HOME_LATCH_VEL of all joints is positive. If not, use --ini FILE or "
+            "--latched: HOME_OFFSET contains half of the backlash with this sign."
+        )
 
 
-def _home_offsets(text: str, calibration: orthocal.Calibration) -> tuple[float, ...]:
-    """HOME_OFFSET of each joint, [m, rad]."""
+def _read_joints(path: Path, calibration: orthocal.Calibration) -> ControllerJoints:
+    """Joints of an INI file, which compensate what the session of a calibration states.
+
+    Raises:
+        ParameterError: If they compensate something else.
+    """
+    from orthocal.effects.compensation import compensates_alike
+    from orthocal.measurement.files.linuxcnc_ini import read_ini
+
+    joints = read_ini(path, calibration.robot)
+    if not compensates_alike(joints.compensation, calibration.session.compensation):
+        raise ParameterError(
+            "has other BACKLASH or COMP_FILE than the session states under `controller` "
+            "(backlash_mm, comp_file); expected the INI file of the measurement",
+            where=str(path),
+        )
+    return joints
+
+
+def _home_offsets(text: str | None, calibration: orthocal.Calibration) -> tuple[float, ...] | None:
+    """HOME_OFFSET of each joint, [m, rad]; None where not stated."""
+    if text is None:
+        return None
     drives = calibration.robot.drives
     values = read_numbers(text, "--home-offset", [d.name for d in drives])
     return tuple(v * DRIVE_UNITS[d.unit][1] for v, d in zip(values, drives, strict=True))
 
 
-def _signs(text: str) -> tuple[int, ...]:
-    """Signs of an option, such as +,+,-.
+def _signs(text: str | None) -> tuple[int, ...] | None:
+    """Signs of an option, such as +,+,-; None where not stated.
 
     Raises:
         ParameterError: If a part is no sign.
     """
+    if text is None:
+        return None
     signs = {"+": 1, "-": -1}
     parts = [part.strip() for part in text.split(",")]
     if not set(parts) <= signs.keys():

@@ -111,3 +111,22 @@ def require_no_readings(directory: Path) -> None:
             f"contains {count} readings, which --force does not overwrite; move them first",
             where=str(session.readings_path or directory),
         )
+
+
+def state_conditions(
+    plan: orthocal.Session, temperatures: tuple[float, float] | None
+) -> orthocal.Session:
+    """Plan whose readings state what the effects of its machine need.
+
+    Args:
+        plan: The plan.
+        temperatures: At the first and the last reading, [°C]; those of the plan by default.
+    """
+    from orthocal.measurement.motion.approach import state_common_approach
+    from orthocal.observation.conditions import in_course, needed_conditions
+
+    needed = {"temperature", "time"} & set(needed_conditions(plan.robot))
+    stated = any(getattr(r.conditions, name, None) for r in plan.readings for name in needed)
+    if temperatures is not None or (needed and not stated):
+        plan = in_course(plan, temperatures=temperatures)
+    return state_common_approach(plan)

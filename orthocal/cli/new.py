@@ -292,7 +292,7 @@ def _report(
         "Next: look at the machine, print the sheet, measure and calibrate:",
         f"  orthocal view {folder}",
         f"  orthocal record {folder / FIRST}",
-        f"  orthocal calibrate {folder / FIRST}",
+        f"  orthocal calibrate {folder / FIRST} --out {folder / 'one'}",
     ]
     put_out("\n".join(lines))
 

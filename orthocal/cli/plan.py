@@ -163,6 +163,8 @@ def plan(
     if out is not None:
         with worker_budget(count):
             _write(chosen, out)
+    elif not json:
+        put_note("Nothing was written; --out DIRECTORY writes session, sheet and programs.")
 
 
 def _write(plan: orthocal.MeasuringPlan, directory: Path) -> None:

@@ -158,5 +158,6 @@ def print_rows(columns: Iterable[str], form: Callable[[Any], str], chunks: Itera
     if first is not None and header:
         raise SessionError(first[1], where=first[0])
     if refused:
-        put_note(f"orthocal: {refused} of the rows cannot be reached; their cells are empty")
+        rows, cells = ("1 row", "its") if refused == 1 else (f"{refused} rows", "their")
+        put_note(f"orthocal: {rows} cannot be reached; {cells} cells are empty")
         raise typer.Exit(3)

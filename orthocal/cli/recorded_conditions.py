@@ -36,7 +36,7 @@ class RecordedConditions:
 
     @property
     def needs_time(self) -> bool:
-        """Whether an effect depends on the time."""
+        """True if an effect depends on the time."""
         return "time" in self._needed
 
     def question(self, row: Reading) -> str | None:

@@ -9,7 +9,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from orthocal.assessment.judgement import find_warnings, is_doubtful, judge_session
+from orthocal.assessment.judgement import find_warnings, is_doubtful, is_far, judge_session
 from orthocal.calibration.assessment_record import Finding
 from orthocal.cli.printing import put_out
 from orthocal.cli.recorded_conditions import RecordedConditions
@@ -40,6 +40,10 @@ class Dialogue:
         self._conditions = RecordedConditions(recording, self._text.programmed_approach)
         self._warnings: tuple[Finding, ...] = ()
         """Findings about the readings so far."""
+        self._open: tuple[Finding, ...] = ()
+        """Earlier findings that only later doubtful readings hide."""
+        self._far: set[ReadingKey] = set()
+        """Rows that contradicted their prediction when they were read."""
         self._can_judge = True
         """Whether readings are judged: the robot can be calibrated."""
         self._skipped: set[ReadingKey] = set()
@@ -210,7 +214,8 @@ class Dialogue:
         if not self._can_judge:
             return False
         rows = self._recording.rows
-        doubted = {i for f in self._warnings for i in find_rows(f, rows)} - {index}
+        doubts = (*self._warnings, *self._open)
+        doubted = {i for f in doubts for i in find_rows(f, rows)} - {index}
         session = self._recording.measured(without=doubted)
         position = sum(r.is_read and i not in doubted for i, r in enumerate(rows[:index]))
         try:
@@ -220,6 +225,9 @@ class Dialogue:
             return False
         if prediction := self._text.prediction(index, mean, std):
             self._say(prediction)
+        self._far.discard(rows[index].key)
+        if is_far(rows[index].value, mean, std):
+            self._far.add(rows[index].key)
         return is_doubtful(session, position, mean, std)
 
     def _judge(self, *, last: int | None = None) -> None:
@@ -232,7 +240,7 @@ class Dialogue:
         """
         recording = self._recording
         if not self._can_judge or len(recording.missing) == len(recording.rows):
-            self._warnings = ()
+            self._warnings = self._open = ()
             return
         try:
             if recording.missing:
@@ -240,16 +248,35 @@ class Dialogue:
             else:
                 findings = judge_session(recording.measured()).findings
                 warnings = tuple(f for f in findings if f.severity != "note")
+            new, gone = _compare((*self._warnings, *self._open), warnings)
+            hidden = [f for f in gone if self._is_hidden(f, warnings)]
         except (OrthocalError, np.linalg.LinAlgError) as e:
             self._stop_judging(e)
             return
-        new, resolved = _compare(self._warnings, warnings)
-        self._warnings = warnings
+        resolved = [f for f in gone if f not in hidden]
+        self._warnings, self._open = warnings, tuple(hidden)
         if recording.missing:
             for finding in new:
                 self._say(self._text.warning(finding, last=last))
         if resolved:
             self._say(self._text.resolved(resolved))
+
+    def _is_hidden(self, finding: Finding, warnings: Sequence[Finding]) -> bool:
+        """True if a finding is made again once all other doubtful readings are left out.
+
+        Args:
+            finding: An earlier finding that is none of the present ones.
+            warnings: The present findings.
+        """
+        rows = self._recording.rows
+        concerned = set(find_rows(finding, rows))
+        aside = {i for f in warnings for i in find_rows(f, rows)}
+        aside |= {i for i, row in enumerate(rows) if row.key in self._far}
+        aside -= concerned
+        if not aside or not concerned:
+            return False
+        found = find_warnings(self._recording.measured(without=aside))
+        return any(concerned & set(find_rows(f, rows)) for f in found)
 
     def _stop_judging(self, error: Exception) -> None:
         """Print once why readings cannot be judged; they are recorded all the same."""
@@ -310,13 +337,18 @@ class Dialogue:
             index = (len(rows) if self._asked is None else self._asked) - 1
         if index < 0:
             raise SessionError("this is the first line")
-        setup = rows[index].setup
-        if self._last is not None and rows[self._last].setup != setup and rows[index].is_read:
-            self._note(
-                f"The stand has been moved since {setup} was read: correct only what was "
-                "mistyped. To read there again, `restart` the setup."
-            )
+        if rows[index].is_read:
+            self._note_moved(index, "correct only what was mistyped")
         self._ask_for(index)
+
+    def _note_moved(self, index: int, what: str) -> None:
+        """Print what is still possible with the setup of a row, if another one was read since."""
+        setup = self._recording.rows[index].setup
+        if self._last is not None and self._recording.rows[self._last].setup != setup:
+            self._note(
+                f"The stand has been moved since {setup} was read: {what}. To read there again, "
+                "`restart` the setup."
+            )
 
     def _again(self, index: int | None) -> None:
         rows = self._recording.rows
@@ -327,13 +359,10 @@ class Dialogue:
             raise SessionError("nothing was read yet")
         if not rows[index].is_read:
             raise SessionError(f"line {rows[index].line} was not read yet")
+        self._note_moved(index, "read it once more only if the stand is still there")
+        line = rows[index].line
         index = self._recording.repeat(index)
-        self._note(
-            f"Added: line {self._recording.rows[index].line}. The lines after it "
-            "move down by one against the sheet."
-        )
-        if self._warnings:  # their lines have changed
-            self._judge()
+        self._note(f"Added: line {self._recording.rows[index].line}, which repeats line {line}.")
         self._ask_for(index)
 
     def _skip(self) -> None:
@@ -350,8 +379,7 @@ class Dialogue:
         if self._last is not None and self._last >= index:
             self._last = None if self._last == index else self._last - 1
         self._note(
-            f"Deleted: line {row.line}, {row.label_with_cycle}. The lines after it "
-            "move up by one against the sheet."
+            f"Deleted: line {row.line}, {row.label_with_cycle}. The other lines keep their numbers."
         )
         self._judge()
         self._ask_for_next()
@@ -382,7 +410,7 @@ def _compare(
 ) -> tuple[list[Finding], list[Finding]]:
     """New findings, and resolved ones, whose setups have no finding any more."""
 
-    def identify(finding: Finding) -> tuple[object, ...]:  # lines shift where rows are added
+    def identify(finding: Finding) -> tuple[object, ...]:
         places = [(p.setup, p.posture) for p in finding.places[:1]]
         return finding.kind, *places, finding.numbers.get("cycle")
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import os
 import sys
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from importlib import import_module
 from typing import Annotated
 
@@ -17,6 +19,7 @@ from orthocal.cli.options import app
 from orthocal.cli.printing import put_note, put_out
 from orthocal.errors import OrthocalError
 from orthocal.runtime.interrupts import INTERRUPTED, ending_at_interrupt
+from orthocal.runtime.slow_commands import announced_if_slow
 from orthocal.runtime.streams import ReaderGoneError, guarded_streams
 from orthocal.text import printable
 
@@ -31,6 +34,13 @@ PANELS = {
 
 MODULES = {"import": "import_"}
 """Modules of commands with other names, because Python reserves those of the commands."""
+
+
+SLOW = frozenset(
+    "check simulate calibrate compare report validate again accuracy adjust correct export "
+    "view".split()
+)
+"""Commands that may take longer than some seconds and print no progress."""
 
 
 def main() -> None:
@@ -71,7 +81,8 @@ def _run() -> int | str | None:
     code: int | str | None = 0
     try:
         try:
-            make_program(*sys.argv[1:2])()
+            with _announced(sys.argv[1:]):
+                make_program(*sys.argv[1:2])()
         except SystemExit as e:
             code = e.code
         sys.stdout.flush()
@@ -95,6 +106,14 @@ def _run() -> int | str | None:
         )
         code = 70
     return code
+
+
+def _announced(words: Sequence[str]) -> AbstractContextManager[None]:
+    """A line on the terminal if the command of these words takes long."""
+    serves = words[:1] == ["view"] and not {"--html", "--png"} & set(words)
+    if serves or not words or words[0] not in SLOW:
+        return nullcontext()
+    return announced_if_slow(f"orthocal: {words[0]} is working; this may take half a minute")
 
 
 @app.callback(invoke_without_command=True)

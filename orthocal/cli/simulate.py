@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import orthocal
-from orthocal.cli.files import require_new_files
+from orthocal.cli.files import require_new_files, state_conditions
 from orthocal.cli.options import (
     Day,
     Effects,
@@ -57,7 +57,7 @@ def simulate(
     if effects is not None:
         with errors_at("--effects"):
             planned = planned.with_effects(split_effects(effects))
-    planned = _with_conditions(planned, read_temperatures(temperature))
+    planned = state_conditions(planned, read_temperatures(temperature))
     tolerances = read_tolerances(tolerance, planned.robot)
     if tolerances and draw is None:
         raise ParameterError("has no effect without --draw", where="--tolerance")
@@ -74,17 +74,3 @@ def simulate(
     comment = "Simulated readings, not measured. The true errors are in truth.yaml."
     path = orthocal.write_session(simulated.session, out, comment=comment, extra=truth)
     put_note(f"Wrote {path}, {len(simulated.session.readings)} simulated readings, and truth.yaml")
-
-
-def _with_conditions(
-    plan: orthocal.Session, temperatures: tuple[float, float] | None
-) -> orthocal.Session:
-    """Plan whose readings state what the effects of its machine need, and a day's temperatures."""
-    from orthocal.measurement.motion.approach import state_common_approach
-    from orthocal.observation.conditions import in_course, needed_conditions
-
-    needed = {"temperature", "time"} & set(needed_conditions(plan.robot))
-    stated = any(getattr(r.conditions, name, None) for r in plan.readings for name in needed)
-    if temperatures is not None or (needed and not stated):
-        plan = in_course(plan, temperatures=temperatures)
-    return state_common_approach(plan)

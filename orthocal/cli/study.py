@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Argument, Option
 
 import orthocal
+from orthocal.cli.files import state_conditions
 from orthocal.cli.options import (
     LARGEST_MM,
     AllRows,
+    Day,
     Error,
     Errors,
     Force,
@@ -32,9 +34,11 @@ from orthocal.cli.options import (
     load_robot_or_session,
     make_group,
     read_numbers,
+    read_temperatures,
     read_tolerances,
     read_workspace,
     require_between,
+    split_effects,
     split_globs,
 )
 from orthocal.cli.printing import deliver, put_note
@@ -81,6 +85,9 @@ def accuracy(
     draw: list[str] | None = None,
     error: Error = None,
     errors: Errors = None,
+    effects: str | None = None,
+    ignore: str | None = None,
+    temperature: Day = None,
     tolerance: Tolerances = None,
     half_side_mm: HalfSideMm = None,
     seed: Seed = 0,
@@ -98,9 +105,14 @@ def accuracy(
     Args:
         machines (N): Number of machines.
         draw (MODEL|GLOBS): Errors that are random, within their tolerances; default: all.
+        effects (EFFECTS): Effects beside geometry that the machines have, such as backlash,thermal,
+            or none; default: those of the plan.
+        ignore (EFFECTS): Those of them that the calibration ignores; the answer says what that
+            costs.
     """
     from orthocal.observation.simulate import collect_errors
     from orthocal.robot.loading import packaged_robots
+    from orthocal.robot.parameters import errors_at
 
     if not exists(plan) and str(plan) in packaged_robots():
         raise ParameterError(
@@ -108,7 +120,11 @@ def accuracy(
             where=str(plan),
         )
     session = orthocal.load_plan(plan)
-    robot = session.robot
+    if effects is not None:
+        with errors_at("--effects"):
+            session = session.with_effects(split_effects(effects))
+    session = state_conditions(session, read_temperatures(temperature))
+    robot, has = session.robot, session.robot.effect_names
     fixed = {}
     if error or errors is not None:
         fixed = collect_errors(robot, file=errors, single=error or [])
@@ -117,7 +133,13 @@ def accuracy(
         read_workspace(f"{half_side_mm:g}", robot, where="--half-side-mm")
     study = orthocal.build_accuracy_study(
         session,
-        orthocal.Choice(model, free=split_globs(free), tolerances=tolerances),
+        orthocal.Choice(
+            model,
+            free=split_globs(free),
+            tolerances=tolerances,
+            effects=_without(has, ignore) if ignore else None,
+        ),
+        effects=has,
         drawn=_parameter_globs(draw, robot),
         fixed=fixed,
         machines=machines,
@@ -125,6 +147,24 @@ def accuracy(
         half_side=None if half_side_mm is None else half_side_mm * MM,
     )
     _run(study, out, workers, dask, json=json, all_rows=all_rows, force=force)
+
+
+def _without(effects: Sequence[str], ignored: str) -> list[str]:
+    """Effects that are not ignored.
+
+    Raises:
+        ParameterError: If the machines lack an ignored effect.
+    """
+    names = split_effects(ignored) or []
+    for name in names:
+        if name not in effects:
+            having = ", ".join(effects) or "none"
+            raise ParameterError(
+                f"found '{name}'; expected effects of the machines ({having}), which --effects "
+                "chooses",
+                where="--ignore",
+            )
+    return [name for name in effects if name not in names]
 
 
 @command(studies)

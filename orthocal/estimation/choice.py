@@ -16,6 +16,7 @@ from orthocal.estimation.selection import (
     label_choice,
     select_parameters,
 )
+from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
 from orthocal.robot.parameters import ParameterSet, errors_at
 from orthocal.session.session import Purpose, Session
 from orthocal.units import read_limit
@@ -78,8 +79,14 @@ class Choice:
         """Plain data of the choice."""
         return asdict(self)
 
-    def select(self, parameters: ParameterSet) -> Selection:
+    def select(
+        self, parameters: ParameterSet, *, tolerance_scale: ToleranceScale = AS_STATED
+    ) -> Selection:
         """The free parameters among those of a robot, in SI.
+
+        Args:
+            parameters: Parameters of the robot.
+            tolerance_scale: Factor on their tolerances.
 
         Raises:
             ParameterError: If a name, unit, glob or model is unknown, one is stated twice, or a
@@ -99,6 +106,7 @@ class Choice:
             known=_known_in_si(self.known, parameters),
             prior_stds=parameters.read_tolerances(self.tolerances),
             bounds=_bounds_in_si(self.bounds, parameters),
+            tolerance_scale=tolerance_scale,
         )
 
 

@@ -116,18 +116,22 @@ class Fit:
         """Mask of the parameters at a bound, shape (n_free,); see `Selection.held_at_bound`."""
         return self.problem.selection.held_at_bound(self.solution.at_bound)
 
-    def covariance(self) -> Array:
+    def covariance(self, *, noise: float | None = None) -> Array:
         """Covariance of the free parameters by noise and priors, (n_free, n_free), [SI].
 
         NaN where nothing determines the noise.
+
+        Args:
+            noise: Standard deviation of a reading, [m of the first gauge]; by default `sigma`, with
+                which the parameters were estimated.
         """
-        return self._to_si(self.information.covariance)
+        return self._to_si(self.information.covariance, noise)
 
-    def noise_covariance(self) -> Array:
+    def noise_covariance(self, *, noise: float | None = None) -> Array:
         """Part of `covariance` that is due to noise, shape (n_free, n_free), [SI]."""
-        return self._to_si(self.information.noise_covariance)
+        return self._to_si(self.information.noise_covariance, noise)
 
-    def _to_si(self, compute: Callable[..., Array]) -> Array:
+    def _to_si(self, compute: Callable[..., Array], noise: float | None) -> Array:
         """Covariance from `compute`, which returns that of θ̂, shape (n_free, n_free), [SI]."""
         scale = np.outer(self.problem.theta_scale, self.problem.theta_scale)
         if not math.isfinite(self.noise.sigma):
@@ -137,6 +141,8 @@ class Fit:
             used = self.problem.observations.size - self.noise.residual_dof
             gain = self.loss.gain(self.residual / self.sigma, used=used)
             factors = (gain, self.loss.normal_square)
+        if noise is not None:
+            factors = (factors[0], factors[1] * (noise / self.sigma) ** 2)
         return scale * compute(
             sigma=self.sigma,  # above 0, also for readings without scatter
             precision=self.problem.prior_precision,

@@ -201,7 +201,7 @@ def linearise_problem(problem: CalibrationProblem) -> LinearProblem:
     prediction, jacobian = problem.predict_and_jacobian(
         problem.active_theta, problem.active_passive
     )
-    _require_finite(problem, prediction, jacobian)
+    require_finite(problem, prediction, jacobian)
     return LinearProblem(
         problem,
         project_out_zeros(problem.values - prediction, problem.observations),
@@ -210,8 +210,12 @@ def linearise_problem(problem: CalibrationProblem) -> LinearProblem:
     )
 
 
-def _require_finite(problem: CalibrationProblem, prediction: Array, jacobian: Array) -> None:
-    """Refuse predictions that are not finite, such as of a tip that does not touch its rod."""
+def require_finite(problem: CalibrationProblem, prediction: Array, jacobian: Array) -> None:
+    """Refuse predictions that are not finite, such as of a tip that does not touch its rod.
+
+    Raises:
+        SessionError: Naming setup and posture.
+    """
     bad = np.flatnonzero(~(np.isfinite(prediction) & np.isfinite(jacobian).all(axis=1)))
     if not bad.size:
         return

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from orthocal.arrays import Array, Mask
 from orthocal.errors import ClosureError, RobotError
 from orthocal.estimation.selection import KnownWithStd, Selection, select_parameters
+from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import Failures, LoopClosure
 from orthocal.kinematics.robot_functions import RobotFunctions
@@ -142,15 +143,34 @@ class CalibrationProblem:
 
         All others are 0. Clipped to the bounds. The point of linearisation and the default start.
         """
-        active = dict(
-            zip(
-                (f"{d.name}.offset" for d in self.robot.drives),
-                self.session.active_offsets,
-                strict=True,
-            )
-        )
+        return self._theta_at(self.session.active_offsets)
+
+    def _theta_at(self, offsets: Array) -> Array:
+        """Free parameters of the nominal machine with offsets, within their bounds, (n_free,)."""
+        names = (f"{d.name}.offset" for d in self.robot.drives)
+        active = dict(zip(names, offsets, strict=True))
         at = np.array([active.get(name, 0.0) for name in self.free])
         return np.asarray(np.clip(at, self.selection.lower, self.selection.upper))
+
+    def predict_nominal(self, deviations: Array) -> Array:
+        """Readings of the nominal machine, each with the offsets that were active when it was read.
+
+        Args:
+            deviations: Deviations of the mounting of the gauges, shape (n_nuisance,), [SI].
+
+        Returns:
+            Shape (n_entries,), [m of the first gauge]; NaN out of reach.
+        """
+        n = self.n_machine
+        active = (self.robot.drive_zero - self.session.zero_drives)[self.observations.setup]
+        result = np.empty(self.observations.size)
+        for offsets in np.unique(active, axis=0):
+            theta = self._theta_at(offsets)
+            of_session = np.array_equal(theta, self.active_theta)
+            passive = self.active_passive if of_session else self.close(theta, failures={})
+            own = (active == offsets).all(axis=1)
+            result[own] = self.predict(np.append(theta[:n], deviations), passive)[own]
+        return result
 
     @cached_property
     def values(self) -> Array:
@@ -382,6 +402,7 @@ def build_problem(
     known: Mapping[str, KnownWithStd] | None = None,
     prior_stds: Mapping[str, float] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
+    tolerance_scale: ToleranceScale = AS_STATED,
 ) -> CalibrationProblem:
     """The problem of a model of the robot; arguments as for `select_parameters`."""
     selection = select_parameters(
@@ -392,6 +413,7 @@ def build_problem(
         known=known,
         prior_stds=prior_stds,
         bounds=bounds,
+        tolerance_scale=tolerance_scale,
     )
     return CalibrationProblem(session, selection)
 

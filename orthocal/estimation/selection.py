@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from orthocal.arrays import Array, Mask
 from orthocal.errors import ParameterError
+from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
 from orthocal.io.documents import parse_number
 from orthocal.io.fields import read_only
 from orthocal.robot.parameters import Parameter, ParameterSet, errors_at, require_prior_std
@@ -57,6 +58,8 @@ class Selection:
     """Upper bounds, shape (n_free,), [SI]."""
     fixed: Mapping[str, float]
     """Known values of parameters that are not free, [SI]."""
+    tolerance_scale: ToleranceScale = AS_STATED
+    """Factor on tolerances, which the priors contain."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -114,6 +117,7 @@ def select_parameters(
     known: Mapping[str, KnownWithStd] | None = None,
     prior_stds: Mapping[str, float] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
+    tolerance_scale: ToleranceScale = AS_STATED,
 ) -> Selection:
     """Select the free parameters of a robot.
 
@@ -127,6 +131,8 @@ def select_parameters(
             deviation, which then act as prior of a free parameter, [SI].
         prior_stds: Name or glob to another prior standard deviation than the robot's, [SI].
         bounds: Name or glob to lowest and highest value, ±inf for open, [SI].
+        tolerance_scale: Factor on the tolerances of all errors of the geometry except offsets;
+            standard deviations of `known` are not scaled.
 
     Raises:
         ParameterError: If a name, glob or model is unknown, no parameter is free, two
@@ -150,6 +156,8 @@ def select_parameters(
         with errors_at("tolerances"):
             for name in _match_free(parameters, glob, names):
                 stds[name] = require_prior_std(value, parameters.defaults[name])
+    factors = tolerance_scale.factors(parameters, tuple(names)).tolist()
+    stds = {n: std * factor for (n, std), factor in zip(stds.items(), factors, strict=True)}
     stds.update({n: s for n, (_, s) in priors.items()})
     lower, upper = _find_bounds(parameters, names, bounds or {})
     priors_only = {*priors, *parameters.of_effects}
@@ -163,6 +171,7 @@ def select_parameters(
         lower=read_only(lower),
         upper=read_only(upper),
         fixed=fixed,
+        tolerance_scale=tolerance_scale,
     )
 
 

@@ -2,7 +2,8 @@
 
 A nominal controller with offsets o sends the drives to ρ(p) − o for a point p. They must be at
 c(p), where the tip of the calibrated machine is right (`tool_tip.py`). The point to command is
-therefore f(c(p) + o), with f the nominal forward kinematics.
+therefore f(c(p) + o), with f the nominal forward kinematics. A controller that displaces the drives
+itself (tables of trims) receives as much less.
 
 This exact correction takes up to a millisecond per point, and it is smooth. So it is interpolated
 by a polynomial in each box of a grid, made when the first point falls into the box and checked
@@ -109,6 +110,7 @@ class CorrectionField:
         self.bound = ERROR_PART * within
         """Largest error of a point, [m]."""
         self._offsets = np.array(offsets, dtype=np.float64)
+        self._displacement = calibration.displacement
         self._nominal = nominal_closure(robot)
         self._side = BOX * robot.characteristic_length
         self._boxes: dict[Key, _Box | Fallback] = {}
@@ -164,7 +166,9 @@ class CorrectionField:
         for first in range(0, len(points), POINTS_AT_ONCE):
             part = points[first : first + POINTS_AT_ONCE]
             failures: Failures = {}
-            drives = self._tip.reach(part, failures=failures)[0] + self._offsets
+            motors = self._tip.reach(part, failures=failures)[0] + self._offsets
+            drives = motors - self._displacement(motors)
+            drives = motors - self._displacement(drives)
             reached = np.array([i for i in range(len(part)) if i not in failures], dtype=np.int64)
             nominal: Failures = {}
             commanded = self._nominal.forward(drives[reached], failures=nominal)

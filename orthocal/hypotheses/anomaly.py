@@ -102,6 +102,8 @@ class Explanation:
     """Their units."""
     sessions: tuple[str, ...] = ()
     """Sessions that are concerned, or the first session after a change; empty for a single one."""
+    apart: bool = False
+    """Whether the machine changed for these sessions only, and not from the first of them on."""
 
     def agrees_with(self, other: Explanation) -> bool:
         """True if both concern the same rows up to one at an end, or drives of the same session."""

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from functools import cached_property
 
 import numpy as np
 
 from orthocal.arrays import Array, Indices
-from orthocal.errors import ClosureError
+from orthocal.errors import ClosureError, SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
+from orthocal.estimation.linear import require_finite
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import select_parameters
 from orthocal.estimation.weighting import DEFAULT_SIGMA, initial_noise_ratio
@@ -94,6 +96,7 @@ class LinearModel:
     """
 
     def __init__(self, session: Session, model: str | None = None) -> None:
+        session = _refer_to_most_corrected(session)
         parameters = session.robot.parameters
         names = machine_errors(session.robot) if model is None else parameters.select_model(model)
         selection = select_parameters(parameters, free=names, prior=True)
@@ -129,6 +132,26 @@ class LinearModel:
             int(setups[np.argmax(self.session_of_entry == k)]) for k in range(len(self.labels))
         ]
         return np.array([indices[i] for i in first])
+
+    @property
+    def order(self) -> Indices:
+        """Sessions in the order of measuring, shape (n_sessions,).
+
+        By the times of their readings where all state them. Otherwise those without active offsets
+        come first, the others in the order in which they were joined.
+        """
+        session = self.problem.session
+        keys: list[datetime | bool] = [bool(a.any()) for a in self.active]
+        times: dict[str, list[datetime | None]] = {}
+        for r in session.readings:
+            time = None if r.conditions is None else r.conditions.time
+            times.setdefault(r.setup.partition("/")[0], []).append(time)
+        if session.joined and None not in (t for several in times.values() for t in several):
+            firsts = {
+                k: min(t.replace(tzinfo=t.tzinfo or UTC) for t in v if t) for k, v in times.items()
+            }
+            keys = [firsts[label] for label in self.labels]
+        return np.array(sorted(range(len(self.labels)), key=keys.__getitem__))
 
     @cached_property
     def to_entries(self) -> Sparse:
@@ -174,6 +197,7 @@ class LinearModel:
 
         Raises:
             ClosureError: If the machine cannot reach a posture.
+            SessionError: If a predicted reading is not finite.
         """
         problem, o = self.problem, self.problem.observations
         n = len(self.labels)
@@ -195,6 +219,7 @@ class LinearModel:
             else:
                 entries = which[self.session_of_entry] == m
                 expected[entries], jacobian[entries] = prediction[entries], slope[entries]
+        require_finite(problem, expected, jacobian)
         jacobian = project_out_zeros(jacobian, o)
         likelihood, vectors, sizes = build_likelihood(
             jacobian, sigma=self.sigma, dof=self.dof, stated=self.stated
@@ -287,7 +312,7 @@ class LinearModel:
                 break
             try:
                 about = self.linearise(errors, (), about.passive, slopes=False)
-            except (ClosureError, np.linalg.LinAlgError):
+            except (ClosureError, SessionError, np.linalg.LinAlgError):
                 break
         return about
 
@@ -389,6 +414,20 @@ class LinearModel:
         along = about.sizes * (about.errors.T @ errors)
         residuals = (deviation - along @ about.likelihood.directions) * self.problem.noise_ratio
         return float(np.sqrt(np.mean(self.problem.observations.rows(residuals) ** 2)))
+
+
+def _refer_to_most_corrected(session: Session) -> Session:
+    """Joined sessions with the largest active offsets of them as the reference of the errors.
+
+    The reference, at which the prior is centred, does not depend on the order of the sessions.
+    """
+    if not session.joined:
+        return session
+    active = [
+        session.active_offsets if s.active is None else s.active for s in session.setups.values()
+    ]
+    largest = max(active, key=lambda offsets: (float(np.abs(offsets).max()), *offsets.tolist()))
+    return replace(session, controller_offsets=largest)
 
 
 def label_sessions(session: Session, setup: Indices) -> tuple[tuple[str, ...], Indices]:

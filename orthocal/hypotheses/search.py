@@ -9,6 +9,7 @@ where the others explain them (backward elimination). The best ones are linearis
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.arrays import Array
-from orthocal.errors import ClosureError
+from orthocal.errors import ClosureError, SessionError
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, AnomalyKind
 from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
 from orthocal.hypotheses.families.effects import find_effects, unmodelled_effects
@@ -87,8 +88,8 @@ COARSE = 2.0
 over the full grid of scales may exceed its largest term by that and `WORTH_REFITTING`."""
 
 FAR_BEHIND = CLEARLY + NEARLY
-"""Logarithm of the Bayes factor by which a pair is left out that explains less than a single
-hypothesis."""
+"""Logarithm of the Bayes factor beyond which a pair that explains less than a single hypothesis is
+omitted."""
 
 MOST_COMBINED = 5
 """Most likely single hypotheses that are combined in pairs where none by itself leaves readings
@@ -185,49 +186,68 @@ class _Search:
         return state, near
 
     def evaluate(self, terms: Sequence[Term], start: ModelLinearisation) -> HypothesisSet:
-        """Score a set of hypotheses, linearised where it leads."""
+        """Score a set of hypotheses, linearised where it leads.
+
+        The first step may lead beyond FURTHEST, as readings are not linear over offsets of some mm:
+        what is not linear looks like errors far beyond their tolerances. If the next step does not
+        lead back, it does not count.
+        """
         model = self.model
-        rows = self.values + sum((t.change for t in terms if t.change is not None), 0.0)
-        entries = model.entries(rows[None])[0]
         known = [t.shift for t in terms if t.shift is not None and t.known]
         free = [t.shift for t in terms if t.shift is not None and not t.known]
-        priors = [
-            None if t.systematic is None else _prior_of(t.systematic)
-            for t in terms
-            if t.effects is not None or (t.shift is not None and not t.known)
-        ]
-        applied, about = np.zeros(len(free)), start
+        about, applied = start, np.zeros(len(free))
         if known or free:
             base = self.sound.about
             about = model.linearise(base.theta, known, base.passive, slopes=True)
-        last = about.theta
-        for k in range(MOST_ROUNDS + 1):
-            groups, silent, steps = self._vectors(terms, about)
-            deviation = entries - about.expected + applied @ steps
-            score = about.likelihood.score_set(deviation, groups, silent, priors=priors)
-            every = [*groups, *([] if silent is None else [silent])]
-            remaining = deviation - (score.amounts @ np.concatenate(every) if every else 0.0)
+        states = [self._evaluate_about(terms, about, applied)]
+        for k in range(MOST_ROUNDS):
+            state, about = states[-1], states[-1].about
             errors = about.errors_for(
-                remaining, tolerance_scale=score.tolerance_scale, noise_scale=score.noise_scale
+                state.remaining,
+                noise_scale=state.score.noise_scale,
+                tolerance_scale=state.score.tolerance_scale,
             )
-            amounts, stds = (split_amounts(terms, a) for a in (score.amounts, score.stds))
-            if k == MOST_ROUNDS or np.abs(errors - last).max(initial=0.0) < NEAR:
+            if np.abs(errors - about.theta).max(initial=0.0) < NEAR:
                 break
-            if not np.abs(errors).max(initial=0.0) < FURTHEST:
+            if k and not _is_near(errors):
                 break
-            step = np.array(
-                [a[0] for t, a in zip(terms, amounts, strict=True) if t.shift and not t.known]
+            applied = np.array(
+                [a[0] for t, a in zip(terms, state.amounts, strict=True) if t.shift and not t.known]
             )
             shifts = [
-                replace(s, direction=s.direction * a) for s, a in zip(free, step, strict=True)
+                replace(s, direction=s.direction * a) for s, a in zip(free, applied, strict=True)
             ]
             try:
                 about = model.linearise(
                     errors, [*known, *shifts], about.passive, slopes=self.slopes
                 )
-            except (ClosureError, np.linalg.LinAlgError):
+            except (ClosureError, SessionError, np.linalg.LinAlgError):
                 break
-            last, applied = errors, step
+            states.append(self._evaluate_about(terms, about, applied))
+        return next((s for s in reversed(states[1:]) if _is_near(s.about.theta)), states[0])
+
+    def _evaluate_about(
+        self, terms: Sequence[Term], about: ModelLinearisation, applied: Array
+    ) -> HypothesisSet:
+        """Score a set of hypotheses about one linearisation.
+
+        Args:
+            terms: The hypotheses.
+            about: The linearisation.
+            applied: Amounts of the unknown machine shifts that are in it.
+        """
+        rows = self.values + sum((t.change for t in terms if t.change is not None), 0.0)
+        groups, silent, steps = self._vectors(terms, about)
+        priors = [
+            None if t.systematic is None else _prior_of(t.systematic)
+            for t in terms
+            if t.effects is not None or (t.shift is not None and not t.known)
+        ]
+        deviation = self.model.entries(rows[None])[0] - about.expected + applied @ steps
+        score = about.likelihood.score_set(deviation, groups, silent, priors=priors)
+        every = [*groups, *([] if silent is None else [silent])]
+        remaining = deviation - (score.amounts @ np.concatenate(every) if every else 0.0)
+        amounts, stds = (split_amounts(terms, a) for a in (score.amounts, score.stds))
         changes = [
             abs(a[0]) * np.abs(t.shift.direction).max()
             for t, a in zip(terms, amounts, strict=True)
@@ -528,6 +548,11 @@ class _Search:
         chosen = found.members[evidence > WORTH_REFITTING - NEARLY][:MOST_PAIRS_REFITTED]
         return [(term(a), term(b)) for a, b in chosen.tolist()], float(log_of_sum(evidence))
 
+    def _expected(self, state: HypothesisSet, row: int) -> float:
+        """Prediction of a row by the others, corrected, as a recording prints it, [m]."""
+        mean, _ = self.model.predict_row(state.corrected, row)
+        return float(state.corrected[row]) if math.isnan(mean) else mean
+
     def _result(
         self, state: HypothesisSet, near: list[tuple[HypothesisSet, HypothesisSet]]
     ) -> Anomalies:
@@ -547,7 +572,7 @@ class _Search:
                 Anomaly(
                     e,
                     state.log_posterior - fewer.log_posterior,
-                    None if row is None else float(state.corrected[row]),
+                    None if row is None else self._expected(state, row),
                     causes,
                     alternatives,
                 )
@@ -562,6 +587,11 @@ class _Search:
             state.score.tolerance_scale,
             state.score.noise_scale,
         )
+
+
+def _is_near(errors: Array) -> bool:
+    """True if errors, in prior std, are those of a machine that is linearised about."""
+    return bool(np.abs(errors).max(initial=0.0) < FURTHEST)
 
 
 def _is_clear(found: HypothesisSet, state: HypothesisSet) -> bool:

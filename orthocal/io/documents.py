@@ -364,6 +364,10 @@ UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
 """Pydantic's error types for an unknown key, of a model and of a dataclass."""
 
 
+PARSED = {"float_parsing": "a number", "int_parsing": "a whole number"}
+"""Pydantic's error types for texts that are no numbers, and what is expected instead."""
+
+
 def explain_validation_error(exception: ValidationError, schema: type[Any]) -> tuple[str, str]:
     """Key and problem of the first error in a pydantic ValidationError."""
     # an unknown key may be a misspelled one that is missing: name it first
@@ -386,7 +390,10 @@ def explain_validation_error(exception: ValidationError, schema: type[Any]) -> t
         inner, separator, problem = message.partition("|")
         return (_join([*path, inner] if inner else path), problem) if separator else (key, message)
     shown = "nothing" if value is None else f"'{_show(value)}'"
-    return key, f"found {shown}; expected {_expectation(kind, message, first.get('ctx') or {})}"
+    comma = kind in PARSED and isinstance(value, str) and re.fullmatch(r"\s*[-+]?\d+,\d+\s*", value)
+    hint = " (a decimal comma? write a point)" if comma else ""
+    expected = _expectation(kind, message, first.get("ctx") or {})
+    return key, f"found {shown}; expected {expected}{hint}"
 
 
 def _show(value: object) -> str:
@@ -398,6 +405,8 @@ def _show(value: object) -> str:
 
 def _expectation(kind: str, message: str, context: Mapping[str, Any]) -> str:
     """The expected input, from pydantic's error type and message."""
+    if kind in PARSED:
+        return PARSED[kind]
     if kind in ("dict_type", "model_type", "dataclass_type", "mapping_type"):
         return "keys and values"
     if kind == "string_pattern_mismatch":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypedDict
 
 import numpy as np
@@ -130,9 +130,15 @@ class UseSamples:
         return {name: halves[names == name] for name in dict.fromkeys(self.varying)}
 
 
-def sample_use(robot: Robot) -> UseSamples:
-    """Conditions of use that the robot's YAML states, as far as its effects depend on them."""
-    use, used = robot.use, effects_by_condition(robot)
+def sample_use(robot: Robot, conditions: UseConditions | None = None) -> UseSamples:
+    """Conditions of use that the robot's YAML states, as far as its effects depend on them.
+
+    Args:
+        robot: The robot.
+        conditions: Conditions that replace those of the YAML; an approach that is unknown is from
+            both sides.
+    """
+    use, used = _narrow(robot.use, conditions), effects_by_condition(robot)
     varying, widths = list[UseCondition](), dict[UseCondition, float]()
     if "approach" in used:
         varying += ["approach"] * use.approach.count("u")
@@ -161,6 +167,16 @@ def sample_use(robot: Robot) -> UseSamples:
     return UseSamples(tuple(samples), tuple(varying), signs, use)
 
 
+def _narrow(use: Use, conditions: UseConditions | None) -> Use:
+    """Use in which stated conditions do not vary."""
+    if conditions is None:
+        return use
+    values: dict[str, Any] = {name: getattr(conditions, name) for name in conditions.stated}
+    for name in values.keys() - {"approach"}:
+        values[name] = (values[name], values[name])
+    return replace(use, **values)
+
+
 def effects_by_condition(robot: Robot) -> dict[UseCondition, tuple[str, ...]]:
     """Fields of `UseConditions` on which a machine depends, with the effects that need each."""
     conditions, effects = error_map(robot).conditions, robot_effects(robot)
@@ -182,9 +198,9 @@ class StatedUse(TypedDict):
     """Lightest and heaviest, [kg]."""
 
 
-def stated_use(robot: Robot) -> StatedUse | None:
-    """Conditions of use that a robot's YAML states; None if no effect depends on any."""
-    use, effects = robot.use, effects_by_condition(robot)
+def stated_use(robot: Robot, use: Use | None = None) -> StatedUse | None:
+    """Conditions of use, by default of a robot's YAML; None if no effect depends on any."""
+    use, effects = use or robot.use, effects_by_condition(robot)
     if not effects:
         return None
     reference = neutral_values(robot)["temperature"]

@@ -184,6 +184,7 @@ def _rename(session: Session, labels: Mapping[str, str]) -> Session:
             active=active if s.active is None else s.active,
             aligned_at=named(aligned_at[s.name]),
             adjusted=session.adjusted if s.adjusted is None else s.adjusted,
+            compensation=session.compensation if s.compensation is None else s.compensation,
         )
 
     def posture(p: Posture) -> Posture:

@@ -1,4 +1,6 @@
-"""Recording of readings: rows in the order of measuring, each change on disk before it counts.
+"""Recording of readings: rows in the order of the sheet, each change on disk before it counts.
+
+No change renumbers a row: added rows come last, and a blank line stays where a row was deleted.
 
 A change is appended to a journal beside the readings.csv and synced; then the CSV is replaced. Each
 line of the journal holds the digests of the CSV before and after its change. If the process is
@@ -58,8 +60,8 @@ class Change(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     done: Literal["read", "emptied", "added", "dropped"]
-    """A value was read for a row; all rows of its setup were emptied; a row was added after it; it
-    was deleted."""
+    """A value was read for a row; all rows of its setup were emptied; a row that repeats it was
+    added at the end; it was deleted."""
     rows: Annotated[list[ReadingKey], Field(min_length=1, max_length=2)]
     """The row, and the added one."""
     reading_mm: Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)] | None = (
@@ -106,8 +108,8 @@ def change_rows(rows: Sequence[Reading], change: Change) -> tuple[Reading, ...]:
         setup, posture, minus, cycle, *approach = added[0]
         conditions = Conditions(approach[0]) if approach else None
         new = Reading(setup, posture, minus, cycle, math.nan, conditions=conditions)
-        changed.insert(index + 1, new)
-    return tuple(replace(row, line=i) for i, row in enumerate(changed, FIRST_LINE))
+        changed.append(replace(new, line=1 + max(r.line or 0 for r in rows)))
+    return tuple(changed)
 
 
 def _merge_conditions(planned: Conditions | None, stated: Conditions | None) -> Conditions | None:
@@ -177,8 +179,13 @@ class Recording:
         return session if len(read) == len(self.rows) else session.select(read)
 
     def next_empty(self, skipped: frozenset[ReadingKey] = frozenset()) -> int | None:
-        """Index of the first row without a reading, except those that are skipped."""
-        return next((i for i in self.missing if self.rows[i].key not in skipped), None)
+        """Index of the next row without a reading, except those that are skipped.
+
+        The rows of a setup follow each other, also those that were added.
+        """
+        setups = list(dict.fromkeys(row.setup for row in self.rows))
+        empty = [i for i in self.missing if self.rows[i].key not in skipped]
+        return min(empty, key=lambda i: (setups.index(self.rows[i].setup), i), default=None)
 
     def read(self, index: int, value: float, conditions: Conditions | None = None) -> None:
         """Record a reading; it is on disk when this returns.
@@ -204,7 +211,7 @@ class Recording:
         self._apply(Change(done="read", rows=[row.key], reading_mm=reading, conditions=conditions))
 
     def repeat(self, index: int) -> int:
-        """Add another cycle of a row after it, and return its index.
+        """Add another cycle of a row after the last one, and return its index.
 
         A repeated difference must not follow from others of its cycle, nor share the cycle with
         readings of another form. It gets a new cycle.
@@ -221,7 +228,7 @@ class Recording:
         if any(r.cycle == cycle and (r.minus is None) != (row.minus is None) for r in of_setup):
             cycle = 1 + max(r.cycle for r in of_setup)
         self._apply(Change(done="added", rows=[row.key, replace(_emptied(row), cycle=cycle).key]))
-        return index + 1
+        return len(self.rows) - 1
 
     def drop(self, index: int) -> None:
         """Delete a row.
@@ -367,8 +374,13 @@ def _csv_of(session: Session) -> Path:
 
 
 def _table(rows: Sequence[Reading]) -> bytes:
-    """Content of the readings.csv."""
-    return readings_table(rows, decimals=DECIMALS).encode()
+    """Content of the readings.csv, each row in its line; rows of a new plan follow each other."""
+    header, *texts = readings_table(rows, decimals=DECIMALS).splitlines(keepends=True)
+    lines = [header]
+    for row, text in zip(rows, texts, strict=True):
+        lines += ["\n"] * ((row.line or 0) - FIRST_LINE + 1 - len(lines))
+        lines.append(text)
+    return "".join(lines).encode()
 
 
 def _digest(content: bytes) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from orthocal.arrays import Array, Indices, Mask
 from orthocal.effects.adjustment import subtract_amounts
+from orthocal.effects.compensation import displace_drives
 from orthocal.effects.loading import neutral_values, robot_effects
 from orthocal.effects.protocol import Condition, condition_size
 from orthocal.errors import SessionError
@@ -190,7 +191,8 @@ def build_observations(session: Session) -> Observations:
     if "load" in error_map(session.robot).conditions:
         values["load"] = _find_loads(session, table[:, 0], table[:, 1])
     values["adjustment"] = adjustment_table(session)[table[:, 0]]
-    states, state = _find_states(session, table[:, 1], values)
+    trims = _find_trims(session, table[:, 0], table[:, 1], values["approach"])
+    states, state = _find_states(session, table[:, 1], values, trims)
     places = np.hstack([table[:, :2], values["approach"]])
     zero_setup, zero_real = tuple(k[0] for k in zeros), tuple(len(k) == 1 for k in zeros)
     absolute = [len(k) == 1 and session.setups[k[0]].zero == "known" for k in zeros]
@@ -271,23 +273,46 @@ def adjustment_table(session: Session) -> Array:
     return result
 
 
+def _find_trims(session: Session, setup: Indices, posture: Indices, approach: Array) -> Array:
+    """Displacement of the drives by the controller at entries, shape (n, n_drives), [m, rad]."""
+    result, drives = np.zeros(approach.shape), drive_table(session)
+    active = session.robot.drive_zero - session.zero_drives
+    for i, of_setup in enumerate(session.setups.values()):
+        stated = of_setup.compensation
+        trims = session.compensation if stated is None else stated
+        rows = np.flatnonzero(setup == i)
+        if trims and rows.size:
+            displayed = drives[posture[rows]] + active[i]
+            result[rows] = displace_drives(session.robot, trims, displayed, approach[rows])
+    return result
+
+
 def _find_states(
-    session: Session, posture: Indices, conditions: Mapping[Condition, Array]
+    session: Session, posture: Indices, conditions: Mapping[Condition, Array], trims: Array
 ) -> tuple[States, Indices]:
-    """Loop closures of a session, and the one of each entry."""
+    """Loop closures of a session, and the one of each entry.
+
+    Args:
+        session: The session.
+        posture: Posture of each entry, shape (n,).
+        conditions: Conditions of the entries.
+        trims: Displacement of the drives by the controller, shape (n, n_drives), [m, rad].
+    """
     map_, drives, names = error_map(session.robot), drive_table(session), list(session.postures)
     count = np.arange(len(names))
-    if not map_.conditions:
+    if not map_.conditions and not trims.any():
         one = map_.command(session.robot.drive_zero)[None]
         return States(count, drives, np.zeros_like(count), one, tuple(names)), posture
-    read = np.hstack([posture[:, None], *(conditions[c] for c in map_.conditions)])
+    read = np.hstack([posture[:, None], trims, *(conditions[c] for c in map_.conditions)])
     unread = np.setdiff1d(count, posture)
     payload = max(s.payload for s in session.setups.values())
     loaded = LoopClosure(session.robot, conditions=UseConditions(payload=payload))
-    others = np.column_stack([unread, loaded.commands(drives[unread])[:, drives.shape[1] :]])
+    neutral = loaded.commands(drives[unread])[:, drives.shape[1] :]
+    others = np.column_stack([unread, np.zeros_like(drives[unread]), neutral])
     rows, place = np.unique(np.vstack([read, others]), axis=0, return_inverse=True)
     of_state = rows[:, 0].astype(np.int64)
-    commands = np.hstack([drives[of_state], rows[:, 1:]])
+    moved = drives[of_state] + rows[:, 1 : 1 + drives.shape[1]]
+    commands = np.hstack([moved, rows[:, 1 + drives.shape[1] :]])
     first, variant = np.zeros(1, dtype=np.int64), np.zeros(len(rows), dtype=np.int64)
     if map_.of_placements.any():
         values = commands[:, map_.of_placements]

@@ -154,7 +154,8 @@ def _require_readable(plan: Session, rows: Array) -> None:
             beyond = limits[0] if value < limits[0] else limits[1]
             raise SessionError(
                 f"the simulated reading {reading.label} is {value / MM:.3f} mm; the gauge's "
-                f"range ends at {beyond / MM:g} mm",
+                f"range ends at {beyond / MM:g} mm. Such a machine needs a gauge with more range, "
+                "or offsets that are entered before; use smaller errors or another seed",
                 where=_where(plan, gauge_name, "range_mm") if plan.path is not None else None,
             )
 
@@ -278,6 +279,12 @@ def collect_errors(
         models = robot.parameters.models
         is_model = draw in models
         patterns = robot.parameters.patterns(draw) if is_model else tuple(draw.split(","))
+        if all(p.startswith("!") for p in patterns):
+            raise ParameterError(
+                f"found '{draw}', which only excludes errors; expected those to draw before it, "
+                f"such as '*,{draw}'",
+                where="--draw",
+            )
         try:
             errors.update(draw_errors(robot, patterns, seed=seed, tolerances=tolerances))
         except ParameterError:

@@ -374,7 +374,10 @@ def build_session(
         readings=tuple(readings),
         postures={n: p for n, p in source.postures.items() if n in used},
     )
-    if measured is None or measured.controller_offsets is None:
+    if measured is None:
+        return plan
+    plan = replace(plan, compensation=measured.compensation)
+    if measured.controller_offsets is None:
         return plan
     return plan.with_controller(measured.controller_offsets)
 

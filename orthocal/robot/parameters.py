@@ -212,6 +212,14 @@ class ParameterSet:
         """
         return all(self.elementary[term].kind == "offset" for term, _ in self[name].terms)
 
+    def are_scaled(self, name: str) -> bool:
+        """True for errors of the geometry except offsets: one factor scales their tolerances.
+
+        Raises:
+            ParameterError: If the name is unknown.
+        """
+        return self.are_rigid(name) and not self.are_offsets(name)
+
     def are_rigid(self, name: str) -> bool:
         """True if placement errors, drive offsets and drive scales can express a parameter.
 

@@ -268,7 +268,10 @@ class LegIndicator:
         if self.rod is not None:
             words += f", {self.tip.form} on rod {self.rod}"
         if any(self.beside):
-            words += f", ({', '.join(f'{v / MM:g}' for v in self.beside)}) mm beside its zero"
+            offset = " ".join(
+                f"{axis}{v / MM:+g}" for axis, v in zip("xyz", self.beside, strict=True) if v
+            )
+            words += f", {offset} mm from the rod in the mechanical zero"
         return words
 
     def frames(self, robot: Robot) -> Frames:

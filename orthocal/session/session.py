@@ -19,6 +19,7 @@ from pydantic import Field
 
 from orthocal.arguments import require_array
 from orthocal.arrays import Array
+from orthocal.effects.compensation import Compensation
 from orthocal.effects.loading import with_effects
 from orthocal.io.documents import Number
 from orthocal.io.fields import CLOSED, read_only
@@ -102,6 +103,8 @@ class Setup:
         payload: Mass on the tool while the setup was read, [kg].
         adjusted: Mechanical adjustments during this setup, name to amount, [m]; by default those of
             the session.
+        compensation: What the controller compensated in the drives during this setup; by default
+            that of the session.
     """
 
     name: str
@@ -112,6 +115,7 @@ class Setup:
     zero: GaugeZero = "free"
     payload: float = 0.0
     adjusted: Mapping[str, float] | None = None
+    compensation: Compensation | None = None
 
 
 CycleNumber = Annotated[int, Field(ge=1, lt=10**9)]
@@ -233,6 +237,8 @@ class Session:
     readings: tuple[Reading, ...]
     controller_offsets: Array | None = None
     """Offsets active in the controller, shape (n_drives,), [m, rad]; None where not stated."""
+    compensation: Compensation = ()
+    """Backlash and errors of screws that the controller compensates; empty for none."""
     adjusted: Mapping[str, float] = field(default_factory=dict)
     """Mechanical adjustments since the machine was built, name to amount, [m]; 0 where absent. The
     errors of the machine are those under these adjustments."""

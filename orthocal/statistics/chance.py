@@ -51,17 +51,21 @@ def coverage_factor(dof: float) -> float:
     return max(COVERAGE, factor) if math.isfinite(factor) else math.nan
 
 
-def expanded_uncertainty(std: ArrayLike, std_scatter: ArrayLike, *, dof: float) -> Array:
+def expanded_uncertainty(
+    std: ArrayLike, std_scatter: ArrayLike, *, dof: float, other_dof: float = math.inf
+) -> Array:
     """Expanded uncertainty U of estimates, of any shape, in their unit.
 
-    U² = (k_ν s)² + k² (u² − s²), k = 2, with Student's factor k_ν for the part s that is due to
-    noise estimated with ν degrees of freedom.
+    U² = (k_ν s)² + k_n² (u² − s²), with Student's factor k_ν for the part s that is due to noise
+    estimated with ν degrees of freedom. For the rest k_n = 2, or Student's factor where a scale of
+    the tolerances was estimated from n contrasts.
 
     Args:
         std: Standard deviations u from all contributions.
         std_scatter: Parts s of them that are due to the noise of the readings.
         dof: Degrees of freedom ν of the noise.
+        other_dof: Number n of contrasts.
     """
     total, scatter = np.asarray(std, dtype=np.float64), np.asarray(std_scatter, dtype=np.float64)
     other = np.sqrt(np.maximum(total**2 - scatter**2, 0.0))
-    return np.asarray(np.hypot(coverage_factor(dof) * scatter, COVERAGE * other))
+    return np.asarray(np.hypot(coverage_factor(dof) * scatter, coverage_factor(other_dof) * other))

@@ -45,6 +45,20 @@ class Noise:
     """√(Σ r²/(m − n)), [m]; NaN without degrees of freedom."""
     residual_dof: Size
 
+    def apart_from_residuals(
+        self, gauge: float | None, resolution: float | None
+    ) -> tuple[float, float]:
+        """Standard deviation that is stated or that repeated readings show, and its dof.
+
+        Args:
+            gauge: Stated standard deviation of a reading, [m].
+            resolution: Resolution of the gauge, [m].
+        """
+        floor = noise_floor(gauge, resolution)
+        if self.cycles_dof > 0 and self.cycles_sigma > floor:
+            return self.cycles_sigma, float(self.cycles_dof)
+        return floor, math.inf
+
     def leaves_more(self, gauge: float | None) -> bool | None:
         """Test for residuals larger than noise, which means a model discrepancy.
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from orthocal import __version__
-from orthocal.effects.loading import load_robot_content
+from orthocal.effects.loading import load_robot_content, with_adjustments, with_effects
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.measurement.files.write_session import session_document
 from orthocal.robot.model import Robot
@@ -88,13 +88,15 @@ class Study(ABC):
 
     def __getstate__(self) -> dict[str, Any]:
         robot, nothing = self.session.robot, cast(Robot, None)
-        files = robot.name, dict(robot.content), robot.folder, dict(robot.parameters.stated)
+        content, tolerances = dict(robot.content), dict(robot.parameters.stated)
+        files = robot.name, content, robot.folder, tolerances, robot.chosen_effects, robot.adjusted
         session = replace(self.session, robot=nothing, parts=())
         return {**self.__dict__, "session": session, "files": files}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        name, content, folder, tolerances = state.pop("files")
-        robot = load_robot_content(name, content, folder=folder).with_tolerances(tolerances)
+        name, content, folder, tolerances, effects, adjusted = state.pop("files")
+        robot = with_effects(load_robot_content(name, content, folder=folder), effects)
+        robot = (with_adjustments(robot) if adjusted else robot).with_tolerances(tolerances)
         self.__dict__.update(state, session=replace(state["session"], robot=robot))
 
     def __eq__(self, other: object) -> bool:

@@ -93,7 +93,8 @@ def test_what_is_promised_with_the_offsets_entered_is_kept(quarter):
         errors = machines.machine.error_values(drawn)
         session = simulate_session(quarter, errors, seed=seed).session
         (full, _), (alone, _) = (
-            identify(session, m, solver="variable-projection") for m in ("full", "offsets")
+            identify(session, m, solver="variable-projection", find_scale=find_tolerance_scale)
+            for m in ("full", "offsets")
         )
         tool = find_tool(full)
         entries = compute_entries(full, tool)
@@ -104,7 +105,7 @@ def test_what_is_promised_with_the_offsets_entered_is_kept(quarter):
         ):
             left[name].append(error_left(quarter, errors, np.array(offsets), tool.workspace))
         accuracy = assess_placed(full, tool, entries)
-        promised = summarise_tool(full, accuracy, scale=find_tolerance_scale(session))
+        promised = summarise_tool(full, accuracy)
         left["promised"].append(promised.entered)
     rms = {name: np.sqrt(np.mean(np.square(values))) for name, values in left.items()}
     assert rms["chosen"] < 0.9 * rms["identified"]

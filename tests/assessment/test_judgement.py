@@ -145,7 +145,8 @@ def calibrated(cases):
 
     @cache
     def made(case, model):
-        return calibrate(cases[case][0], model, solver="variable-projection")
+        # a copy is judged by itself
+        return calibrate(replace(cases[case][0]), model, solver="variable-projection")
 
     return made
 
@@ -184,6 +185,16 @@ def test_the_judgement_does_not_depend_on_the_model(cases, calibrated, case):
         own = [f for f in assessment.findings if f.severity != "note"]
         assert [f.to_document() for f in own] == [f.to_document() for f in found]
         assert assessment.decision.verdict == expected
+
+
+def test_readings_are_judged_once(cycles):
+    """Not again for another model; other values are other readings."""
+    assert calibrate(cycles).assessment.decision.verdict == "enter"
+    before = judge_session.cache_info()
+    assert calibrate(cycles, "full").assessment.decision.verdict == "enter"
+    assert judge_session.cache_info().misses == before.misses
+    assert judge_session(reverse(cycles, "zx")).verdict == "review"
+    assert judge_session(cycles).verdict == "enter"
 
 
 def test_findings_have_known_kinds_units_and_load_again(calibrated, tmp_path):

@@ -56,7 +56,7 @@ def test_rows_out_of_reach_are_named_and_the_others_served(orthocal):
     assert code == 3
     assert [i for i, line in enumerate(out.splitlines()) if line == ",,"] == [6]
     assert err.startswith("orthocal: standard input:7: cannot be reached")
-    assert "1 of the rows cannot be reached" in err
+    assert "1 row cannot be reached; its cells are empty" in err
 
 
 def test_a_wrong_line_of_a_pipe_is_named_and_what_came_before_is_served(orthocal, tmp_path):

@@ -359,6 +359,21 @@ def test_accuracy_is_over_the_use_or_under_stated_conditions(folder, assessed):
     )
 
 
+def test_a_stated_condition_leaves_the_others_as_they_are(assessed):
+    """The middle of a range alone hides what the other conditions do: between no and all of it."""
+    both, at_25, from_one_side = (
+        assess_tool(assessed, conditions=c)
+        for c in (None, UseConditions(None, 25.0), UseConditions("ppp", 25.0, 2.0))
+    )
+    assert [set(a.use.varying) for a in (both, at_25, from_one_side)] == [
+        {"approach", "temperature", "payload"},
+        {"approach", "payload"},
+        set(),
+    ]
+    sizes = [a.measure(a.error_after_offsets).aligned.rms for a in (from_one_side, at_25, both)]
+    assert sizes[0] < sizes[1] < sizes[2]
+
+
 def test_a_corrected_program_is_that_of_its_temperature_and_payload(folder, assessed):
     (folder / "part.ngc").write_text("G21\nG0 X0 Y0 Z0\nG0 X10 Y-20 Z5\n")
     words = ("correct", ".", "part.ngc", "--anyway", "--offsets", "active")

@@ -24,7 +24,7 @@ def test_programs_are_corrected_faster_than_the_machine_is_asked(
     orthoglide, record_property, monkeypatch
 ):
     errors = {"x_slide.offset": 1e-3, "y_slide.offset": -1e-3, "z_slide.offset": 2e-3}
-    machine = SimpleNamespace(robot=orthoglide, errors=errors)
+    machine = SimpleNamespace(robot=orthoglide, errors=errors, displacement=np.zeros_like)
     field = CorrectionField(machine, np.zeros(3), within=1e-6)
     t = np.linspace(0.0, 60.0, LINES)
     points = np.stack([40.0 * np.cos(t), 40.0 * np.sin(t), 10.0 * np.sin(0.1 * t)], axis=1)

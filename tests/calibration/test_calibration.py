@@ -194,7 +194,7 @@ def test_an_offset_has_one_standard_deviation_everywhere(experiment_2):
     in_file = {p["name"]: p for p in document["parameters"]}
     entries = {e["drive"]: e for e in document["assessment"]["entries"]}
     printed = {cells[0]: cells for cells in map(str.split, summarize(result).splitlines()) if cells}
-    factor = confidence_factor(result.dof)
+    factor = confidence_factor(result.tolerance_scale.contrasts)
     for i, drive in enumerate(("x_slide", "y_slide", "z_slide")):
         found = table[f"{drive}.offset"]
         std, scatter = found["std"], found["std_scatter"]
@@ -203,7 +203,7 @@ def test_an_offset_has_one_standard_deviation_everywhere(experiment_2):
         for other in (in_file[f"{drive}.offset"], entries[drive]):
             assert other["std"] == pytest.approx(std, rel=1e-12)
             assert other["std_scatter"] == pytest.approx(scatter, rel=1e-12)
-        half = math.hypot(factor * scatter, COVERAGE * math.sqrt(std**2 - scatter**2))
+        half = math.hypot(COVERAGE * scatter, factor * math.sqrt(std**2 - scatter**2))
         assert float(printed[drive][-2]) == pytest.approx(half * 1e3, abs=0.5e-3)
         assert (found["high"] - found["low"]) / 2 == pytest.approx(half, rel=1e-9)
 
@@ -224,14 +224,15 @@ def test_what_a_bound_or_a_known_value_holds_is_not_proved(experiment_2):
 
 
 def test_students_factor_counts_for_what_the_readings_told(experiment_2):
-    """Three degrees of freedom say nothing of a length that only its prior tells."""
+    """Three contrasts determine the scale of a prior; the noise is as stated."""
     result = calibrate(experiment_2, "lengths")
     half = dict(zip([p.name for p in result.free], result.expanded_uncertainties, strict=True))
-    assert half["x_leg.length"] == pytest.approx(2.0 * result["x_leg.length"].std, rel=0.02)
+    factor = confidence_factor(result.tolerance_scale.contrasts)
+    assert half["x_leg.length"] == pytest.approx(factor * result["x_leg.length"].std, rel=0.02)
     offset = result["x_slide.offset"]
     rest = math.sqrt(offset.std**2 - offset.std_scatter**2)
     assert offset.std_scatter > 0.0
-    expected = math.hypot(confidence_factor(result.dof) * offset.std_scatter, 2.0 * rest)
+    expected = math.hypot(2.0 * offset.std_scatter, factor * rest)
     assert half["x_slide.offset"] == pytest.approx(expected, rel=1e-12)
 
 

@@ -95,10 +95,11 @@ class IndependentMachine:
         errors: Parameter name to its value, or to values of M machines, [SI].
         lead: Lead of the screws, [m].
         expansion: Stated thermal expansion, None for machines that do not expand.
+        active: Offsets active in the controller while the gauges were mounted, [m].
     """
 
-    def __init__(self, folder, errors, *, lead=5e-3, expansion=None):
-        self.folder = folder
+    def __init__(self, folder, errors, *, lead=5e-3, expansion=None, active=0.0):
+        self.folder, self.active = folder, active
         (urdf,) = folder.glob("*.urdf")
         (about,) = (yaml.safe_load(f.read_text()) for f in folder.glob("*.yaml"))
         self.about, self.lead, self.expansion = about["orthocal"], lead, expansion
@@ -302,7 +303,7 @@ class IndependentMachine:
         The stand is on the base, at the section as the operator measured it from the slide at the
         mechanical zero. It stays there when the machine gets warmer.
         """
-        k, zero = gauge.leg, np.full((1, 3), self.length)
+        k, zero = gauge.leg, np.full((1, 3), self.length) - self.active
         still = States(zero, np.zeros((1, 3)), np.full(1, self._reference))
         straight = np.zeros((self.count, 1, len(self.passive)))
         poses = self.frames(self.actual_drives(still), straight, np.zeros((1, 1, 6)))

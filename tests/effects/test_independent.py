@@ -52,7 +52,12 @@ class Measured:
         self.gauges = [describe(s.sensor, plan.robot) for s in plan.setups.values()]
 
     def read(self, errors, *, states=None, expansion=None, **others):
-        machine = IndependentMachine(self.folder, errors, expansion=expansion or Expansion())
+        machine = IndependentMachine(
+            self.folder,
+            errors,
+            expansion=expansion or Expansion(),
+            active=self.plan.active_offsets,
+        )
         o, states = self.observations, states or self.states
         return machine.read(states, self.gauges, o.setup, np.arange(o.size), **others)
 

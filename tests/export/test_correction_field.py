@@ -27,7 +27,7 @@ def real(orthoglide):
     """A machine with all errors drawn from their priors, and offsets."""
     errors = draw_errors(orthoglide, ["*", "!*.offset"], seed=3)
     errors |= {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
-    return SimpleNamespace(robot=orthoglide, errors=errors)
+    return SimpleNamespace(robot=orthoglide, errors=errors, displacement=np.zeros_like)
 
 
 OFFSETS = np.array([1.1e-3, -0.7e-3, 0.6e-3])
@@ -169,7 +169,9 @@ def test_real_tool_follows_lines_and_arcs(real, field):
 
 def test_planar_robots_and_robots_without_a_tool(biglide, orthoglide):
     drives = [d.name for d in biglide.drives]
-    machine = SimpleNamespace(robot=biglide, errors={f"{drives[0]}.offset": 1e-3})
+    machine = SimpleNamespace(
+        robot=biglide, errors={f"{drives[0]}.offset": 1e-3}, displacement=np.zeros_like
+    )
     field = CorrectionField(machine, np.zeros(2), within=WITHIN)
     middle = nominal_closure(biglide).forward(biglide.drive_zero)
     points = middle + np.random.default_rng(0).uniform(-5e-3, 5e-3, (50, 3))
@@ -182,7 +184,9 @@ def test_planar_robots_and_robots_without_a_tool(biglide, orthoglide):
     assert np.abs(sent[:, chosen] - expected).max() < field.error
     with pytest.raises(ExportError, match="has no tool that its drives command"):
         CorrectionField(
-            SimpleNamespace(robot=SimpleNamespace(tcp=None), errors={}), OFFSETS, within=WITHIN
+            SimpleNamespace(robot=SimpleNamespace(tcp=None), errors={}, displacement=None),
+            OFFSETS,
+            within=WITHIN,
         )
 
 

@@ -7,6 +7,7 @@ formulas: a slide follows its screw with a hysteresis, whatever the direction is
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from orthocal import (
     load_robot,
     simulate_session,
 )
+from orthocal.assessment.controller_entries import offsets_to_enter
 from orthocal.export.approach_sides import ApproachSides, find_lags
 from orthocal.export.correction_field import CorrectionField
 from orthocal.export.linuxcnc.drive_compensation import PeriodicErrors
@@ -33,6 +35,7 @@ from orthocal.gcode.interpreter import Interpreter
 from orthocal.gcode.path import Motion, Paths, arc_about
 from orthocal.gcode.program import ProgramCorrector
 from orthocal.gcode.reversals import split_at_reversals
+from orthocal.measurement.files.linuxcnc_ini import read_ini
 
 MM = 1e-3
 
@@ -194,8 +197,6 @@ def test_tables_and_home_offset_keep_the_path(calibration, tmp_path):
 @pytest.mark.parametrize(
     ("options", "where"),
     [
-        ({"module": True}, "--latched"),
-        ({"module": False}, "--latched"),
         ({"module": True, "latched": (1, 1)}, "--latched"),
         ({"module": False, "latched": LATCHED}, "--home-offset"),
     ],
@@ -204,6 +205,64 @@ def test_what_homing_does_must_be_stated(calibration, options, where):
     with pytest.raises(ParameterError) as caught:
         export_calibration(calibration, "linuxcnc", anyway=True, options=ExportOptions(**options))
     assert caught.value.where == where
+
+
+def home_offsets(lines):
+    return [float(v) for v in re.findall(r"^HOME_OFFSET = (\S+)", lines, re.M)]
+
+
+def test_switches_are_latched_in_positive_direction_unless_stated(calibration):
+    """The lines then also have HOME_OFFSET for the other direction."""
+
+    def export(**options):
+        options = ExportOptions(home_offsets=(0.3, 0.3, 0.3), **options)
+        return export_calibration(calibration, "linuxcnc", anyway=True, options=options)
+
+    for module in (False, True):
+        default, stated = (export(module=module, latched=s) for s in (None, (1, 1, 1)))
+        for name in {"joints.ini", "orthocal_core.c"} & default.keys():
+            bare = "".join(
+                line
+                for line in default[name].splitlines(keepends=True)
+                if not line.startswith("# if HOME_LATCH_VEL")
+            )
+            assert bare == stated[name]
+        assert "assumed" in default["README.md"]
+        assert "assumed" not in stated["README.md"]
+    lines = export(module=False)["joints.ini"]
+    other = [float(v) for v in re.findall(r"negative: HOME_OFFSET = (\S+)", lines)]
+    opposite = home_offsets(export(module=False, latched=(-1, -1, -1))["joints.ini"])
+    assert other == opposite
+    backlash = [TRUTH[f"{d.name}.backlash"] / MM for d in calibration.robot.drives]
+    assert np.abs(np.array(opposite) - home_offsets(lines) - backlash).max() < 5e-3
+
+
+def test_an_export_under_its_own_compensation_changes_nothing(calibration, tmp_path):
+    """A session under the exported tables: HOME_OFFSET then contains their trims already."""
+    old = (0.35, 0.28, 0.02)
+    options = ExportOptions(module=False, latched=LATCHED, home_offsets=old)
+    files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    trims = read_ini(tmp_path / "joints.ini", calibration.robot).compensation
+    entered = np.array(home_offsets(files["joints.ini"])) * MM
+    record = replace(
+        calibration.session,
+        compensation=trims,
+        controller_offsets=tuple(offsets_to_enter(calibration).tolist()),
+    )
+    under = replace(calibration, session=record)
+    options = ExportOptions(module=False, latched=LATCHED, home_offsets=tuple(entered))
+    again = export_calibration(under, "linuxcnc", anyway=True, options=options)
+    assert np.abs(np.array(home_offsets(again["joints.ini"])) * MM - entered).max() < 2e-7
+    core = export_calibration(
+        under,
+        "linuxcnc",
+        anyway=True,
+        options=ExportOptions(module=True, latched=LATCHED, home_offsets=tuple(entered)),
+    )
+    assert "delete COMP_FILE" in core["kinematics.ini"]
+    assert "BACKLASH" in core["kinematics.ini"]
 
 
 def test_screws_are_inverted_exactly():
@@ -219,9 +278,8 @@ DENSE = 0.02
 """Distance of the points at which a corrected program is followed, [mm]."""
 
 
-def run_corrected(calibration, *, backlash):
+def run_corrected(calibration, field, *, backlash):
     """Tool of the calibrated machine along a corrected program, shape (K, 3), [mm]."""
-    field = CorrectionField(calibration, ACTIVE, within=WITHIN)
     lags = find_lags(calibration.robot, calibration.errors)
     sides = ApproachSides(calibration.robot, lags) if backlash else None
     interpreter = Interpreter("p", axes=field.axes, offsets={})
@@ -249,10 +307,11 @@ WITHIN = 1e-6
 
 
 def test_a_corrected_program_takes_up_backlash(calibration):
-    off = from_pieces(run_corrected(calibration, backlash=True), *PATH)
+    field = CorrectionField(calibration, ACTIVE, within=WITHIN)
+    off = from_pieces(run_corrected(calibration, field, backlash=True), *PATH)
     assert off.min(axis=0).max() < WITHIN
     assert (np.count_nonzero(off < WITHIN, axis=1) > COUNTS).all()
-    ignored = from_pieces(run_corrected(calibration, backlash=False), *PATH)
+    ignored = from_pieces(run_corrected(calibration, field, backlash=False), *PATH)
     assert ignored.min(axis=0).max() > 20 * WITHIN
 
 

@@ -40,7 +40,7 @@ from orthocal.assessment.controller_entries import offsets_to_enter
 from orthocal.calibration.machine import Machine
 from orthocal.export.linuxcnc.approximation import approximate, rounded_up
 from orthocal.export.linuxcnc.c_source import braced, write_core
-from orthocal.export.linuxcnc.drive_compensation import find_compensation
+from orthocal.export.linuxcnc.drive_compensation import find_compensation, find_old_compensation
 from orthocal.export.linuxcnc.export import ExportOptions
 from orthocal.export.linuxcnc.home_offsets import find_homes
 from orthocal.export.linuxcnc.nominal_form import SlidesWithRods, Tangent, find_nominal_form
@@ -129,11 +129,12 @@ def machine_of(robot, errors):
     """A stand-in for the calibration of a machine with known errors."""
     n = len(robot.drives)
     return SimpleNamespace(
+        assessment=SimpleNamespace(entries=()),
         robot=robot,
         errors=errors,
         active_offsets=np.zeros(n),
         machine=Machine(robot, errors),
-        session=SimpleNamespace(title="*/ known", controller_offsets=None),
+        session=SimpleNamespace(title="*/ known", controller_offsets=None, compensation=()),
     )
 
 
@@ -209,7 +210,7 @@ def test_core_reaches_the_targets_of_the_tip(full, core):
 def test_core_without_a_tool_equals_the_calibrated_machine(full, tmp_path):
     """At 10,000 points that were neither fitted nor checked."""
     approximation = approximate(full, within=WITHIN)
-    core = Core(tmp_path, write_core(full, approximation, find_compensation(full, None)))
+    core = Core(tmp_path, write_core(full, approximation, homes_of(full)))
     points = np.random.default_rng(8).uniform(-0.06, 0.06, (10_000, 3))
     joints = drives_of(full, core.inverse(points / MM))
     off = full.machine.forward(joints) - points
@@ -288,7 +289,7 @@ def test_core_of_planar_robots(root, tmp_path, name):
     assert isinstance(
         approximation.inverse.nominal, Tangent if name == "fivebar" else SlidesWithRods
     )
-    files = write_core(known, approximation, find_compensation(known, None))
+    files = write_core(known, approximation, homes_of(known))
     assert "*/ known" not in files["orthocal_core.c"]
     core = Core(tmp_path, files)
     points = tool_at_zero(robot) + np.random.default_rng(1).uniform(-0.02, 0.02, (500, 2))
@@ -379,7 +380,7 @@ def test_bad_options_are_named(offsets, tmp_path, words, code, message):
 def test_home_offset_follows_direction_and_active_offsets(offsets):
     """Hand calculation of HOME_OFFSET and limits."""
     old = (0.35, 0.3, 0.02)
-    homes = find_homes(offsets, find_compensation(offsets, None), old=old)
+    homes = homes_of(offsets, old=old)
     change = (np.array(list(OFFSETS.values())) - ACTIVE) * [1, -1, -1]
     assert [h.change for h in homes] == pytest.approx(change, abs=1e-9)
     assert [h.new for h in homes] == pytest.approx(np.array(old) + change, abs=1e-9)
@@ -469,6 +470,11 @@ def test_offsets_of_a_complete_model(full):
 
 
 # ---- LinuxCNC itself
+
+
+def homes_of(calibration, old=None):
+    new, before = (f(calibration, None) for f in (find_compensation, find_old_compensation))
+    return find_homes(calibration, new, before, old=old)
 
 
 def from_pieces(points, centre, radius, corners):
@@ -576,7 +582,7 @@ def test_linuxcnc_follows_a_path_with_a_filtered_program(root, mixed, full, filt
     for name, content in files.items():
         (tmp_path / name).write_text(content)
     slides = run_program(
-        text.splitlines(),
+        [line for line in text.splitlines() if not line.startswith("; ")],  # the first one moves
         joints_of(full, joints_at_switch(full, SWITCH)),
         lines=files["kinematics.ini"],
         module=tmp_path,

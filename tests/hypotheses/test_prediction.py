@@ -12,6 +12,7 @@ from orthocal import load_plan, load_session
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import build_problem
 from orthocal.hypotheses.linear_model import MOST_STEPS, SETTLED, LinearModel
+from orthocal.hypotheses.search import find_anomalies
 from orthocal.observation.simulate import limits_of, show_readings
 from orthocal.session.session import Reading
 from orthocal.units import MM
@@ -156,3 +157,14 @@ def test_readings_scatter_about_their_predictions_as_stated(root):
     assert len(scores) >= 60
     assert CHANCE[0] < np.std(scores) < CHANCE[1]
     assert abs(np.mean(scores)) < 0.3
+
+
+def test_an_outlier_is_accused_by_the_prediction_that_a_recording_prints(root):
+    session = load_session(root / "examples/raw-cycles")
+    values = session.values.copy()
+    values[9] += 0.13 * MM
+    wrong = session.with_values(values)
+    (anomaly,) = find_anomalies(wrong).found
+    mean, _ = LinearModel(wrong).predict_row(values, 9)
+    assert (anomaly.explanation.kind, anomaly.explanation.rows) == ("outlier", (9,))
+    assert anomaly.expected == pytest.approx(mean, abs=1e-9)

@@ -14,8 +14,17 @@ import pytest
 from made_mistakes import Sheet, is_named, make_mistakes, plain_mistakes, sound_session
 from typer.testing import CliRunner
 
-from orthocal import calibrate, check_session, join_sessions, load_plan, load_session
+from orthocal import (
+    calibrate,
+    check_session,
+    draw_errors,
+    join_sessions,
+    load_plan,
+    load_session,
+    simulate_session,
+)
 from orthocal.cli import make_program
+from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.hypotheses.anomaly import AnomalyKind
 from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
 from orthocal.hypotheses.families.row_offset import row_offsets
@@ -23,7 +32,7 @@ from orthocal.hypotheses.families.single_reading import wrong_readings
 from orthocal.hypotheses.families.swapped_rows import swapped_rows
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
 from orthocal.hypotheses.hypothesis import MOST_DENSE, Rows, to_dense
-from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.hypotheses.linear_model import FURTHEST, LinearModel
 from orthocal.hypotheses.search import find_anomalies
 
 TOLD = 40
@@ -91,7 +100,9 @@ def test_a_turned_reading_is_named_with_its_line_and_what_it_should_be(cycles):
     assert (found.kind, found.severity) == ("reversed sign", "review")
     assert [p.line for p in found.places] == [cycles.readings[row].line]
     n = found.numbers
-    assert n["expected_mm"] == pytest.approx(cycles.values[row] * 1e3, abs=1e-9)
+    mean, std = LinearModel(cycles).predict_row(cycles.values, row)
+    assert n["expected_mm"] == pytest.approx(mean * 1e3, abs=1e-9)
+    assert abs(mean - cycles.values[row]) < 3.0 * std
     assert n["after_rms_um"] < 0.2 * n["before_rms_um"]
 
 
@@ -255,3 +266,30 @@ def test_tails_by_cumulative_sums_equal_those_written_out(cycles):
             )
             assert inner == pytest.approx((one * other).sum(axis=1), rel=1e-9, abs=1e-12)
     assert tested > 100
+
+
+@pytest.fixture(scope="module")
+def large_machine(tmp_path_factory):
+    """Plan of a machine with legs of 400 mm and zeros known to 4 mm."""
+    directory = tmp_path_factory.mktemp("large") / "mill"
+    words = (
+        "--leg-mm 400 --travel-mm 200:520 --attachment-mm 40 --rods-apart-mm 80 --rod-radius-mm 5"
+    )
+    more = "--counts up,down,up --at-zero-mm 0 --tolerance *.offset_mm=4 --effects none"
+    done = CliRunner().invoke(
+        make_program(), ["new", str(directory), *words.split(), *more.split()]
+    )
+    assert done.exit_code == 0, done.output
+    return load_plan(directory / "first")
+
+
+def test_large_offsets_are_no_mistakes(large_machine):
+    """Readings are not linear over offsets of 0.8 to 1.3 times their limit."""
+    robot, offsets = large_machine.robot, (3.4e-3, -5.1e-3, 4.2e-3)
+    for seed in (7, 11, 16, 22, 27, 28):
+        errors = draw_errors(robot, machine_errors(robot), seed=seed)
+        errors.update(zip((f"{d.name}.offset" for d in robot.drives), offsets, strict=True))
+        session = simulate_session(large_machine, errors, seed=seed).session
+        assert not find_anomalies(session).found
+        sizes = LinearModel(session).most_likely(session.values).theta
+        assert np.abs(sizes).max() < FURTHEST

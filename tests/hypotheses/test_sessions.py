@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from dataclasses import replace
+from datetime import datetime
 
 import numpy as np
 import pytest
@@ -11,9 +12,11 @@ from made_mistakes import Sheet, plain_mistakes, sound_machine, sound_session
 
 from orthocal import draw_errors, load_plan, load_session, simulate_session, write_session
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
-from orthocal.hypotheses.families.sessions import enter_wrongly
+from orthocal.hypotheses.families.sessions import divide_sessions, enter_wrongly
+from orthocal.hypotheses.linear_model import LinearModel
 from orthocal.hypotheses.search import find_anomalies
 from orthocal.measurement.joining import join_sessions
+from orthocal.session.session import Conditions
 
 ENTERED = np.array([0.63e-3, 1.66e-3, -3.22e-3])
 """Offsets that the second session states, [m]."""
@@ -259,3 +262,43 @@ def test_no_machine_changes_by_a_hundred_tolerances(root, tmp_path):
     assert changes
     largest = max(p.prior_std for p in plan.robot.parameters)
     assert max(changes) < 100.0 * largest
+
+
+def test_the_order_in_which_sessions_are_named_does_not_matter(plan):
+    """Offsets of 5 mm, entered and corrected; a slide that moved before the last session."""
+    large = np.array([3.4e-3, -5.1e-3, 4.2e-3])
+    wide = plan.with_tolerances({"*.offset_mm": 4.0})
+    errors = draw_errors(wide.robot, machine_errors(wide.robot), seed=0)
+    errors.update(zip((f"{d.name}.offset" for d in wide.robot.drives), large, strict=True))
+    moved = errors | {"y_slide.offset": large[1] + 0.6e-3}
+    first, second, third, last = (
+        simulate_session(wide.with_controller(active), machine, seed=seed).session
+        for seed, (active, machine) in enumerate(
+            ((0.0 * large, errors), (0.97 * large, errors), (large, errors), (large, moved))
+        )
+    )
+    for sound in ((first, second), (second, first)):
+        assert not find_anomalies(join_sessions(sound)).found
+    for several in ((first, third, last), (last, first, third)):
+        (anomaly,) = find_anomalies(join_sessions(several)).found
+        assert anomaly.explanation.sessions == (f"session-{several.index(last) + 1}",)
+        assert anomaly.explanation.amount == pytest.approx(0.6e-3, abs=0.1e-3)
+
+
+def test_sessions_are_in_the_order_of_their_times(plan):
+    """Otherwise those without active offsets come first."""
+    sessions = [plan.with_controller(v) for v in (ENTERED, 0.0 * ENTERED, ENTERED)]
+    assert LinearModel(join_sessions(sessions)).order.tolist() == [1, 0, 2]
+    timed = [
+        s.select(
+            [replace(r, conditions=Conditions(time=datetime(2026, 1, day))) for r in s.readings]
+        )
+        for s, day in zip(sessions, (3, 2, 1), strict=True)
+    ]
+    assert LinearModel(join_sessions(timed)).order.tolist() == [2, 1, 0]
+
+
+def test_few_sessions_are_divided_in_every_way():
+    steps = [(later, apart) for later, apart in divide_sessions(np.array([0, 1, 2, 3]))]
+    assert [later for later, apart in steps if not apart] == [[1, 2, 3], [2, 3], [3]]
+    assert [later for later, apart in steps if apart] == [[1], [2], [0, 2], [0, 3]]

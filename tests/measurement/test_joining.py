@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from gauges import exact
 
-from orthocal import SolverOptions, calibrate, load_calibration, load_plan, simulate_session
+from orthocal import (
+    SolverOptions,
+    calibrate,
+    load_calibration,
+    load_plan,
+    simulate_session,
+    summarize,
+)
 from orthocal.calibration.file import calibration_document, write_calibration
 from orthocal.errors import SessionError
 from orthocal.estimation import fit as fit_module
@@ -83,6 +90,23 @@ def test_offsets_that_were_active_may_differ(root):
     assert found.active_offsets.tolist() == [1.1e-3, -0.7e-3, 0.4e-3]
     wrong = tuesday.with_controller(np.zeros(3))  # the readings contradict that
     assert calibrate([monday, wrong]).rms_after > 5e-5 > 1e-8 > found.rms_after
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_deviations_before_are_with_the_offsets_of_each_session(root, order):
+    """Of a joined calibration as of that of the session alone, whatever its place."""
+    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+    entered = plan.with_controller([1.1e-3, -0.7e-3, 0.4e-3])
+    parts = [simulate_session(p, TRUTH, seed=k).session for k, p in enumerate((plan, entered))]
+    alone = [[r.deviation for r in calibrate(part, "offsets").residuals] for part in parts]
+    largest = [np.abs(deviations).max() for deviations in alone]
+    assert largest[0] > 3.0 * largest[1]
+    joined = calibrate([parts[k] for k in order], "offsets")
+    postures = len(parts[0].postures)
+    count = f"{2 * len(parts[0].readings)} readings of 2 sessions in {postures} postures, "
+    assert count in " ".join(summarize(joined).split())
+    expected = [d for k in order for d in alone[k]]
+    assert [r.deviation for r in joined.residuals] == pytest.approx(expected, abs=1e-9)
 
 
 def test_noise_is_told_for_each_session(root):

@@ -20,10 +20,11 @@ from machines import place
 from orthocal import calibrate, export_calibration, load_plan, simulate_session
 from orthocal.builder.build import make_robot
 from orthocal.builder.machine_file import Counting, Dimensions
+from orthocal.effects.loading import with_effects
 from orthocal.errors import ParameterError, SessionError
 from orthocal.export.linuxcnc.export import ExportOptions
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.measurement.motion.approach import APPROACH
+from orthocal.measurement.motion.approach import APPROACH, approach_length
 from orthocal.measurement.motion.motion import plan_motion, shown_joints
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
 from orthocal.session.session import Conditions, Reading
@@ -161,6 +162,27 @@ def test_approach_from_the_other_side_at_the_end_of_travel(small):
     robot = replace(small.robot, drives=(both, *small.robot.drives[1:]))
     with pytest.raises(SessionError, match="neither from below nor from above by 2 mm: x_slide"):
         plan_motion(replace(small, robot=robot))
+
+
+@pytest.mark.parametrize(
+    ("half", "backlash", "length"),
+    [
+        (5e-3, 40e-6, 2e-3),
+        (0.4e-3, 40e-6, 0.4e-3),
+        (50e-6, 40e-6, 0.2e-3),
+        (0.4e-3, 0.3e-3, 0.6e-3),
+    ],
+)
+def test_an_approach_is_no_longer_than_the_dial_allows(small, half, backlash, length):
+    """Half the range, unless the backlash needs more; the sheet and `record` name this length."""
+    robot = with_effects(small.robot, ["backlash"])
+    tolerances = {"*.backlash_mm": backlash / MM}
+    gauge = replace(small.gauge, range=(-half, half))
+    session = replace(small, robot=robot).with_tolerances(tolerances).with_gauge(gauge)
+    assert approach_length(session) == f"{length / MM:g} mm"
+    for motion in plan_motion(session):
+        for stop in motion.stops:
+            assert stop.drives - stop.approach_drives == pytest.approx([length] * 3)
 
 
 @pytest.fixture(scope="module")

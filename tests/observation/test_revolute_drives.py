@@ -101,7 +101,7 @@ def test_offsets_in_the_controller_lead_to_the_same_truth(tmp_path, robot, unit)
     for name, value in OFFSETS.items():
         assert abs(one.errors[name] - value) < TRUTH_BACK
         assert abs(other.errors[name] - value) < TRUTH_BACK
-    changes = [e.change for e in find_entries(other)]
+    changes = [e.best_change for e in find_entries(other)]
     assert np.abs(np.array(changes) - (np.array([*OFFSETS.values()]) - ACTIVE)).max() < TRUTH_BACK
 
 

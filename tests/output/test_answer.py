@@ -10,11 +10,13 @@ import pytest
 from calibrated import calibrated, session_of
 from machines import write_orthoglide
 from rich.console import Group
+from scipy.stats import t as student
 
 from orthocal import (
     Choice,
     Loss,
     SolverOptions,
+    assess_tool,
     calibrate,
     load_plan,
     simulate_session,
@@ -169,14 +171,15 @@ def test_values_to_enter_have_their_expanded_uncertainty(answers, name):
         assert row[-3:] == [f"{e.enter * 1e3:+.3f}", f"{half * 1e3:.3f}", "mm"]
 
 
-def test_few_degrees_of_freedom_widen_the_noise_alone(answers):
-    """Six differences and three offsets: Student's factor 3.18, of the scatter only."""
+def test_few_contrasts_widen_all_but_the_noise(answers):
+    """Six differences and three offsets: Student's factor, 3.18 of three contrasts, for the scaled
+    tolerances."""
     calibration = answers["table1/experiment-2"]
-    factor = coverage_factor(calibration.dof)
-    assert factor == pytest.approx(3.18, abs=0.01)
+    factor = coverage_factor(calibration.tolerance_scale.contrasts)
+    assert factor == pytest.approx(student.ppf(0.975, calibration.tolerance_scale.contrasts))
     for e in calibration.assessment.entries:
         rest = e.std**2 - e.std_scatter**2
-        expected = np.sqrt((factor * e.std_scatter) ** 2 + 4.0 * rest)
+        expected = np.sqrt(4.0 * e.std_scatter**2 + factor**2 * rest)
         assert expanded_uncertainty(calibration, e) == pytest.approx(expected, rel=1e-3)
 
 
@@ -210,7 +213,10 @@ def test_offsets_that_need_no_change_are_left_as_they_are(answers):
     found = answers["table1/experiment-3"].assessment
     assert found.keeps_offsets
     assert found.decision.verdict == "enter"
-    assert found.tool.now == pytest.approx(156.6e-6, rel=0.02)
+    accuracy = assess_tool(answers["table1/experiment-3"])
+    identified = accuracy.measure(accuracy.deviation).aligned.rms
+    expected = np.hypot(identified, accuracy.after.sizes.aligned.rms)
+    assert found.tool.now == pytest.approx(expected)
     assert not found.of_kind("must change")
     entered = answers["table1/experiment-2"].assessment
     assert not entered.keeps_offsets
@@ -220,7 +226,7 @@ def test_offsets_that_need_no_change_are_left_as_they_are(answers):
 def test_the_scale_of_the_tolerances_is_listed(answers):
     calibration = answers["table1/experiment-2"]
     (found,) = calibration.assessment.of_kind("above tolerances")
-    assert found.numbers["tolerance_scale"] == calibration.tolerance_scale > 1.0
+    assert found.numbers["tolerance_scale"] == calibration.tolerance_scale.factor > 1.0
     assert found.kind in LISTED
     assert " ".join(found.text.split()) in words_of(calibration)
 

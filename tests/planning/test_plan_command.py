@@ -117,6 +117,16 @@ def test_a_dial_without_a_tip_is_named(tmp_path):
     assert f"orthocal: {dial} states no tip: the plan is for the line between the rods" in err
 
 
+def test_offsets_that_too_few_readings_leave_are_named():
+    code, text, err = run_orthocal(".", "plan", "orthoglide", *QUICK, "--hours", "0.2")
+    assert code == 0
+    leg, direction = re.search(r"leg ([xyz]), gauge in -?([xyz])", text).groups()
+    (other,) = {"x", "y", "z"} - {leg, direction}
+    words = " ".join(text.split())
+    assert f"These readings do not determine the offset of {other}_slide." in words
+    assert err.endswith("--out DIRECTORY writes session, sheet and programs.\n")
+
+
 def test_further_setups_of_a_session_are_planned(root):
     session = root / "examples/workshop"
     code, text, _ = run_orthocal(".", "plan", session, "--add", 2, "--json", *QUICK)

@@ -215,13 +215,13 @@ def test_a_recording_keeps_what_is_planned_and_takes_what_is_stated(tmp_path):
     assert rows_of(folder) == [
         "yx,zero,1,0.01,ppp,20.5,2025-03-14T09:30:00",
         "yx,zero,1,0.02,nnn,,",
-        "yx,zero,2,,nnn,,",
         "yx,x_max,1,0.03,pnu,21.5,",
+        "yx,zero,2,,nnn,,",
     ]
     with open_recording(folder) as recording:
         recording.empty(0)  # what was measured goes, what is planned stays
     assert rows_of(folder) == [
-        *("yx,zero,1,,ppp", "yx,zero,1,,nnn", "yx,zero,2,,nnn", "yx,x_max,1,,pnu")
+        *("yx,zero,1,,ppp", "yx,zero,1,,nnn", "yx,x_max,1,,pnu", "yx,zero,2,,nnn")
     ]
 
 

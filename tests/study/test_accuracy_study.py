@@ -16,12 +16,8 @@ from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import cube, gauss_box
 from orthocal.planning.first_plan import Displacements, build_paper_plan
 from orthocal.session.session import Gauge
-from orthocal.study.accuracy import (
-    CALIBRATED,
-    OUT_OF_RANGE,
-    build_accuracy_study,
-    summarise_accuracy,
-)
+from orthocal.study.accuracy import build_accuracy_study, summarise_accuracy
+from orthocal.study.random_machines import CALIBRATED, OUT_OF_RANGE
 from orthocal.study.runner import StudyTable, run_study
 from orthocal.study.study import run_task
 
@@ -57,10 +53,10 @@ def test_standard_errors_of_the_papers_plan():
     choice = Choice("offsets", tolerances={"*.offset_mm": 0.1})
     study = build_accuracy_study(plan, choice, drawn=["*.offset"], machines=2000)
     prepared = study.prepare()  # without the tool errors of `run_study`
-    measured = prepared.measure(study, range(2000))
-    theta, converged = prepared.estimate(measured.values)
+    measured = prepared.measure(range(2000))
+    theta, converged = prepared.model.estimate(measured.values)
     assert converged.all()
-    errors = theta - prepared.identified_part(measured.errors)
+    errors = theta - prepared.model.identified_part(measured.errors, prepared.error_names)
     spread = np.sqrt((errors**2).mean(axis=0)) / SIGMA
     doubt = 1.942 / np.sqrt(2.0 * 2000)
     assert np.abs(spread - 1.942).max() < 3.0 * doubt + 0.0005
@@ -85,10 +81,10 @@ def test_tool_error_of_one_machine_agrees_with_pinocchio(workshop):
     robot, prepared = workshop.robot, study.prepare()
     space = gauss_box(robot, [[-0.05, 0.05]] * 3)
     drives = LoopClosure(robot).inverse(space.points)
-    drawn, _ = study.draw(prepared, 2)
+    drawn, _ = prepared.draw(2)
     truth = dict(zip(study.drawn, drawn * prepared.truth.theta_scale, strict=False))
     found = {}
-    for p in prepared.problem.machine_selection.parameters:
+    for p in prepared.model.problem.machine_selection.parameters:
         true, error = (rows[f"{kind}.{p.name}_{p.edge_unit}"][2] for kind in ("true", "error"))
         found[p.name] = (true + error) / p.edge_factor
     real, known, nominal = (

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable, Sequence
 
 from orthocal.assessment.wording import joined, mm, note, plain, review, signed, spans, um
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.hypotheses.anomaly import EFFECT_KINDS, Anomalies, Anomaly, Explanation
 from orthocal.session.session import Session
+from orthocal.text import printable
 from orthocal.units import EDGE_UNITS, MM, UM, Unit
 
 MOST_PLACES = 20
@@ -55,7 +57,7 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
             "expected_mm": anomaly.expected / MM,
             "cycle": float(first.cycle),
         }
-    action = "Read it again, or leave it out." if anomaly.causes else _remedy(session, e)
+    action = _repeat(session, e) if anomaly.causes else _remedy(session, e)
     return review(e.kind, text, action, _places(session, e), **numbers)
 
 
@@ -87,7 +89,7 @@ def _ambiguous(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding
     return review(
         "ambiguous",
         f"The readings contradict each other. One of these may have happened:\n{ways}.",
-        "Look at these readings, and read again what may be wrong.",
+        _repeat(session, *every),
         tuple(p for e in every for p in _places(session, e)[:1]),
         **_numbers(result, anomaly),
     )
@@ -101,8 +103,8 @@ def _unexplained(session: Session, result: Anomalies) -> Finding:
         f"{which} not fit one machine. {what} "
         f"{'only a part' if result.found else 'it'}: several parts may have changed, or several "
         "readings are wrong.",
-        "Calibrate the last session alone: the values to enter must belong to the machine as it "
-        "is now."
+        "Calibrate the session that was measured last alone: the values to enter must belong to "
+        "the machine as it is now."
         if session.joined
         else "Measure again.",
         before_rms_um=result.rms_before / UM,
@@ -290,8 +292,8 @@ def _text(session: Session, e: Explanation) -> str:
         ),
         "machine changed": lambda: _changed(session, e),
         "offset of one drive": lambda: (
-            f"the controller's offset of {joined(e.drives)} in session {e.sessions[0]} is not "
-            f"the stated one{_by(session, e)}"
+            f"the controller's offset of {joined(e.drives)} in session {joined(e.sessions)} is "
+            f"not the stated one{_by(session, e)}"
         ),
         "offsets not entered": lambda: _entered(e, "was not entered", "were not entered"),
         "offsets reversed": lambda: _entered(
@@ -367,7 +369,10 @@ def _swapped(session: Session, e: Explanation) -> str:
 def _changed(session: Session, e: Explanation) -> str:
     what = joined(e.drives) or joined(e.parameters)
     verb = "moved" if e.drives else "changed"
-    return f"the machine changed: {what} {verb}{_by(session, e)} before session {e.sessions[0]}"
+    when = f"before session {e.sessions[0]}"
+    if e.apart:
+        when = f"for session{'s' * (len(e.sessions) > 1)} {joined(e.sessions)} only"
+    return f"the machine changed: {what} {verb}{_by(session, e)} {when}"
 
 
 def _by(session: Session, e: Explanation) -> str:
@@ -416,7 +421,22 @@ def _remedy(session: Session, e: Explanation) -> str:
         "posture at the end of the setup. Or calibrate with `--effects "
         f"{','.join((*session.robot.effect_names, 'drift'))}`.",
     }
-    return remedies.get(e.kind, "Read it again, or leave it out.")
+    return remedies.get(e.kind) or _repeat(session, e)
+
+
+def _repeat(session: Session, *found: Explanation) -> str:
+    """Repetition or omission of readings, with the command for the first of them."""
+    rows = [session.readings[i] for e in found for i in e.rows]
+    words = "Read it again" if len(rows) == 1 else "Look at these readings, read them again"
+    file = rows[0].file or session.readings_path
+    if file is None or rows[0].line is None:
+        return f"{words}, or leave out what is wrong."
+    line, path = rows[0].line, printable(shlex.quote(str(file.parent)))
+    which = "" if len(rows) == 1 else ", and so on for each that is wrong"
+    return (
+        f"{words}, or leave out what is wrong: `orthocal record {path}`, then "
+        f"`again {line}`, `back {line}` to correct it, or `drop {line}`{which}."
+    )
 
 
 def _session_remedy(session: Session, e: Explanation) -> str:
@@ -427,6 +447,11 @@ def _session_remedy(session: Session, e: Explanation) -> str:
             f"Compare the offsets in the controller with `controller.offsets_mm` of session "
             f"{since}. If the session states the wrong ones, correct them there; otherwise enter "
             "the right ones and measure again."
+        )
+    if e.apart:
+        since = f"{joined(e.sessions)} and the others"
+        return (
+            f"Make sure that the sessions state when they were measured. Calibrate {since} apart."
         )
     apart = (
         f"Calibrate session {since} and later ones without the earlier ones: the values to enter "

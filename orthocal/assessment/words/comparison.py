@@ -75,9 +75,10 @@ def describe_effects(found: EffectComparison | None, readings: int) -> list[Find
     else:
         names = found.recommended
         text = (
-            f"Recommended effects: {joined(names)}. With "
-            f"{'it' if len(names) == 1 else 'them'} left-out setups are "
-            f"predicted to {mm(best.unseen_rms)} mm, without to {mm(none.unseen_rms)} mm."
+            f"Recommended effects: {joined(names)}. The readings are much more likely with "
+            f"{'it' if len(names) == 1 else 'them'} (ln evidence {best.log_evidence:+.1f}). "
+            f"Left-out setups are predicted to {mm(best.unseen_rms)} mm, without to "
+            f"{mm(none.unseen_rms)} mm."
         )
         action = f"Calibrate with `--effects {','.join(names)}`."
     numbers = {"log_evidence": best.log_evidence, "unseen_rms_mm": best.unseen_rms / MM}

@@ -170,11 +170,13 @@ def describe_use_parts(tool: ToolErrorSummary) -> list[str]:
     for part in tool.use.parts:
         without = math.sqrt(max(tool.entered**2 - part.size**2, 0.0))
         added = tool.entered - without
-        amount = "less than 0.001 mm" if added < 0.5 * UM else tool_mm(added)
+        little = added < 0.5 * UM
+        amount = "less than 0.001 mm" if little else tool_mm(added)
         if part.condition == "approach":
             what = joined([*part.effects]).capitalize()
             verb = "adds" if len(part.effects) == 1 else "add"
-            how = " if the tool is used from both sides; approach from one side avoids it"
+            how = " if the tool is used from both sides"
+            how += "" if little else "; approach from one side avoids it"
             lines.append(f"{what} {verb} {amount}{how}.")
         elif part.condition == "temperature" and tool.use.temperature is not None:
             lines.append(

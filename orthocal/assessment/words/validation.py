@@ -106,7 +106,8 @@ def describe_repetition(repetition: Repetition, *, new: bool = False, title: str
     """
     r, where = repetition, f" in '{title}'" if title else ""
     numbers = {"rows": float(r.matched), "correlation": r.correlation, "chance": r.chance}
-    size = f"(correlation {r.correlation:.3f} over {r.matched} rows, by chance {r.chance:.2g})"
+    size = f"(correlation {r.correlation:.3f} over {r.matched} rows; chance "
+    size += f"gives as much in {100.0 * r.chance:.2g} % of cases)"
     if r.repeats is None:
         why = f"the fit absorbs nearly all of the {r.matched} shared rows"
         why = "too few rows are shared" if r.matched < FEWEST else why

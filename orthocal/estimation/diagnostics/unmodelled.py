@@ -35,7 +35,7 @@ class UnmodelledEffect:
 
     names: Many[str]
     prior_stds: Sizes
-    """Prior standard deviation of each, shape (n_unmodelled,), [SI]."""
+    """Prior standard deviation of each, tolerance scale included, shape (n_unmodelled,), [SI]."""
     leakage: Matrix
     """Matrix B above and in docs/mathematics.md: bias of the machine's free parameters per unit of
     each unmodelled error, shape (n_machine, n_unmodelled), [SI per SI]."""
@@ -61,7 +61,7 @@ class UnmodelledErrors:
 
     names: tuple[str, ...]
     prior_stds: Array
-    """Prior standard deviation of each, shape (n_unmodelled,), [SI]."""
+    """Prior standard deviation of each, tolerance scale included, shape (n_unmodelled,), [SI]."""
     jacobian: Array
     """∂h/∂θ̂ᵤ: change of the readings by one prior standard deviation of each error, zeros
     eliminated, shape (n_entries, n_unmodelled), [m of the first gauge]."""
@@ -105,8 +105,12 @@ def find_unmodelled_errors(fit: Fit, *, represented: Collection[str] = ()) -> Un
     o = problem.observations
     if not names:
         return UnmodelledErrors((), read_only([]), read_only(np.zeros((o.size, 0))))
-    prior_stds = read_only([parameters[n].prior_std for n in names])
-    return UnmodelledErrors(tuple(names), prior_stds, read_only(error_jacobian(fit, names)))
+    factors = problem.machine_selection.tolerance_scale.factors(parameters, tuple(names))
+    return UnmodelledErrors(
+        tuple(names),
+        read_only(factors * [parameters[n].prior_std for n in names]),
+        read_only(error_jacobian(fit, names) * factors),
+    )
 
 
 def error_jacobian(fit: Fit, names: Sequence[str]) -> Array:
@@ -117,8 +121,8 @@ def error_jacobian(fit: Fit, names: Sequence[str]) -> Array:
         names: Names of the errors.
 
     Returns:
-        ∂h/∂θ̂ᵤ per prior standard deviation of each, zeros eliminated, shape (n_entries, n_names),
-        [m of the first gauge].
+        ∂h/∂θ̂ᵤ per stated prior standard deviation of each, zeros eliminated, shape (n_entries,
+        n_names), [m of the first gauge].
     """
     problem, parameters = fit.problem, fit.problem.robot.parameters
     prior_stds = np.array([parameters[n].prior_std for n in names])

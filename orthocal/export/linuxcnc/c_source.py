@@ -21,7 +21,8 @@ from orthocal.export.linuxcnc.approximation import (
     millimetres,
     rounded_up,
 )
-from orthocal.export.linuxcnc.drive_compensation import JointCompensation, find_periodic_errors
+from orthocal.export.linuxcnc.drive_compensation import find_periodic_errors
+from orthocal.export.linuxcnc.home_offsets import JointHome
 from orthocal.export.linuxcnc.nominal_form import NominalForm, Tangent
 from orthocal.robot.model import Drive
 from orthocal.text import comment_safe
@@ -33,14 +34,14 @@ LONGEST_LINE = 90
 def write_core(
     calibration: Calibration,
     approximation: Approximation,
-    compensation: Sequence[JointCompensation],
+    homes: Sequence[JointHome],
 ) -> dict[str, str]:
     """Texts of orthocal_core.c and orthocal_core.h, which need no LinuxCNC.
 
     Args:
         calibration: The calibration.
         approximation: Inverse kinematics without periodic errors of screws.
-        compensation: Compensation of backlash by the controller.
+        homes: Joints with their compensation by the controller.
     """
     drives, inverse = calibration.robot.drives, approximation.inverse
     polynomial = inverse.correction
@@ -51,7 +52,7 @@ def write_core(
         "joint_units": " and ".join(dict.fromkeys(DRIVE_UNITS[d.unit][0] for d in drives)),
         "drives": len(drives),
     }
-    screws = _write_screws(calibration, compensation)
+    screws = _write_screws(calibration, homes)
     common["functions"] = "sqrt, sin and cos" if screws["periodic"] else "sqrt"
     core = {
         **common,
@@ -82,15 +83,13 @@ def write_component(approximation: Approximation) -> dict[str, str]:
     return {"orthocal_kins.c": fill_template("orthocal_kins.c", values)}
 
 
-def _write_screws(
-    calibration: Calibration, compensation: Sequence[JointCompensation]
-) -> dict[str, object]:
+def _write_screws(calibration: Calibration, homes: Sequence[JointHome]) -> dict[str, object]:
     """Periodic errors of the screws, and what homing with backlash adds to each joint."""
     drives, active = calibration.robot.drives, calibration.active_offsets
     sizes = np.array([DRIVE_UNITS[d.unit][1] for d in drives])
     directions = np.array([d.direction for d in drives])
     at_zero = np.array([d.to_joint(v) for d, v in zip(drives, active, strict=True)])
-    home = [joint.trim_at_home(None) for joint in compensation]
+    home = [h.compensation.trim_at_home(h.old) - h.was.trim_at_home(h.old) for h in homes]
     periodic = find_periodic_errors(calibration.robot, calibration.errors)
     sine, cosine = (
         np.zeros((2, len(drives)))

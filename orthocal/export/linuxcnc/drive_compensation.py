@@ -9,7 +9,9 @@ Homing latches the switch in the direction l and displays HOME_OFFSET h there, s
 that direction does not change the motor's position at the switch. With the wanted displacement Δ of
 the display HOME_OFFSET is therefore
 
-    h_new = h_old + Δ − T_l(h_new).
+    h_new = h_old + Δ + T_l(h_old) − T_l(h_new),
+
+where T_l(h_old) is that of the compensation that was active while measuring.
 
 A table of COMP_FILE (type 1) lists T₊ and T₋ over the travel and replaces BACKLASH.
 """
@@ -25,12 +27,13 @@ from numpy.typing import ArrayLike
 from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
 from orthocal.effects.backlash import Backlash
+from orthocal.effects.compensation import JointTrim
 from orthocal.effects.loading import robot_effects
 from orthocal.effects.screw import KINDS, Screw
 from orthocal.errors import ExportError, ParameterError
 from orthocal.io.fields import read_only
 from orthocal.robot.model import Robot
-from orthocal.units import DRIVE_UNITS, UM
+from orthocal.units import UM
 
 SMALLEST = 0.1 * UM
 """Smallest backlash and amplitude that is compensated, [m or rad]."""
@@ -102,59 +105,60 @@ def find_backlash(robot: Robot, errors: Mapping[str, float]) -> Array:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class JointCompensation:
-    """Compensation of one joint."""
+class JointCompensation(JointTrim):
+    """Compensation of one joint, with the direction in which homing latches its switch."""
 
-    backlash: float
-    """BACKLASH, [m, rad]; with a table the part of its columns."""
-    latched: int
-    """Sign of HOME_LATCH_VEL; 0 where it does not matter."""
-    table: Array | None = None
-    """Position, forward trim and reverse trim, shape (n, 3), [m]."""
+    latched: int = 1
+    """Sign of HOME_LATCH_VEL."""
     error: float = 0.0
     """Largest error of the table between its entries, [m]."""
 
-    def trim_at_home(self, home: float | None) -> float:
+    def trim_at_home(self, home: float | None, *, opposite: bool = False) -> float:
         """T_l: trim in the latching direction at HOME_OFFSET, [m, rad].
 
         Args:
-            home: HOME_OFFSET, [m, rad]; it only matters for a table.
+            home: HOME_OFFSET, [m, rad]; it only matters for a table, whose trim is 0 without it.
+            opposite: Latch in the other direction.
         """
-        if self.table is None or home is None:
-            return 0.5 * self.backlash * self.latched
-        column = 1 if self.latched > 0 else 2
-        return float(np.interp(home, self.table[:, 0], self.table[:, column]))
+        if self.table is not None and home is None:
+            return 0.0
+        grew = (self.latched > 0) != opposite
+        return float(self(np.array([home or 0.0]))[0, 0 if grew else 1])
 
 
-def require_latched(
-    robot: Robot, backlash: Array, latched: Sequence[int] | None
-) -> tuple[int, ...]:
-    """Directions in which homing latches the switches, where backlash needs them.
-
-    Args:
-        robot: The robot.
-        backlash: Backlash of each drive, [m, rad].
-        latched: Stated directions, 1 or -1.
+def require_latched(robot: Robot, latched: Sequence[int] | None) -> tuple[int, ...]:
+    """Directions in which homing latches the switches, 1 or -1; 1 where they are not stated.
 
     Raises:
-        ParameterError: If they are missing, or not as many as the drives.
+        ParameterError: If they are not as many as the drives.
     """
     drives = robot.drives
-    if latched is None and not backlash.any():
-        return (0,) * len(drives)
-    names = ", ".join(d.name for d in drives)
-    expected = f"expected the sign of HOME_LATCH_VEL of each joint ({names}), such as +,+,-"
     if latched is None:
-        unit, size = DRIVE_UNITS[drives[0].unit]
-        listed = ", ".join(f"{v / size:.3f}" for v in backlash)
+        return (1,) * len(drives)
+    if len(latched) != len(drives):
+        names = ", ".join(d.name for d in drives)
         raise ParameterError(
-            f"is missing; the drives have backlash ({listed} {unit}), and HOME_OFFSET depends on "
-            f"the direction in which homing latches the switch; {expected}",
+            f"found {len(latched)} signs; expected the sign of HOME_LATCH_VEL of each joint "
+            f"({names}), such as +,+,-",
             where="--latched",
         )
-    if len(latched) != len(drives):
-        raise ParameterError(f"found {len(latched)} signs; {expected}", where="--latched")
     return tuple(latched)
+
+
+def find_old_compensation(
+    calibration: Calibration, latched: Sequence[int] | None
+) -> tuple[JointCompensation, ...]:
+    """Compensation that was active while measuring, in the order of the drives.
+
+    Raises:
+        ParameterError: As `require_latched`.
+    """
+    signs = require_latched(calibration.robot, latched)
+    trims = calibration.session.compensation or (JointTrim(),) * len(signs)
+    return tuple(
+        JointCompensation(trim.backlash, trim.table, sign)
+        for trim, sign in zip(trims, signs, strict=True)
+    )
 
 
 def find_compensation(
@@ -162,15 +166,27 @@ def find_compensation(
 ) -> tuple[JointCompensation, ...]:
     """Compensation of backlash alone, in the order of the drives.
 
+    If the model has neither backlash nor periodic errors, it is that which was active.
+
     Raises:
         ParameterError: As `require_latched`.
+        ExportError: If tables were active, and the model has only one of both.
     """
-    robot = calibration.robot
+    robot, old = calibration.robot, find_old_compensation(calibration, latched)
+    modelled = {type(e) for e in robot_effects(robot)} & {Backlash, Screw}
+    if not modelled:
+        return old
+    if len(modelled) < 2 and any(joint.table is not None for joint in old):
+        raise ExportError(
+            "the controller has tables (comp_file) of backlash and periodic errors; identify both, "
+            "with --effects backlash,screw"
+        )
+    if Backlash not in modelled:
+        return old
     backlash = find_backlash(robot, calibration.errors)
-    signs = require_latched(robot, backlash, latched)
     return tuple(
-        JointCompensation(float(b), sign if b else 0)
-        for b, sign in zip(backlash, signs, strict=True)
+        JointCompensation(float(b), None, joint.latched)
+        for b, joint in zip(backlash, old, strict=True)
     )
 
 
@@ -178,8 +194,6 @@ def tabulate(
     calibration: Calibration,
     compensation: Sequence[JointCompensation],
     offsets: Array,
-    *,
-    latched: Sequence[int] | None,
 ) -> tuple[JointCompensation, ...]:
     """Tables of backlash and periodic errors, for joints whose screws have periodic errors.
 
@@ -187,17 +201,14 @@ def tabulate(
         calibration: The calibration.
         compensation: Compensation of backlash.
         offsets: Offsets in the controller with which the tables are used, (n_drives,), [m, rad].
-        latched: Stated latching directions.
 
     Raises:
-        ParameterError: If these are missing.
         ExportError: If a drive with a periodic error has no limits of travel.
     """
     robot = calibration.robot
     periodic = find_periodic_errors(robot, calibration.errors)
     if periodic is None:
         return tuple(compensation)
-    signs = require_latched(robot, np.hypot(periodic.sine, periodic.cosine), latched)
     result = []
     for i, (d, joint) in enumerate(zip(robot.drives, compensation, strict=True)):
         if not (periodic.sine[i] or periodic.cosine[i]):
@@ -228,13 +239,5 @@ def tabulate(
         exact = trims(between)
         linear = np.stack([np.interp(between, places, table[:, k]) for k in (1, 2)], axis=1)
         error = float(np.abs(linear - exact).max())
-        result.append(JointCompensation(joint.backlash, signs[i], read_only(table), error))
+        result.append(JointCompensation(joint.backlash, read_only(table), joint.latched, error))
     return tuple(result)
-
-
-def write_table(joint: JointCompensation) -> str:
-    """Text of a COMP_FILE of type 1: position, forward and reverse trim, in mm."""
-    if joint.table is None:
-        return ""
-    rows = (" ".join(f"{v / DRIVE_UNITS['m'][1]:.6f}" for v in row) for row in joint.table)
-    return "".join(f"{row}\n" for row in rows)

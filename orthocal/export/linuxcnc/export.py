@@ -9,14 +9,16 @@ from dataclasses import dataclass, fields
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import find_entries, offsets_to_enter
 from orthocal.calibration.calibration import Calibration
+from orthocal.effects.compensation import compensates_alike, format_table, table_name
 from orthocal.errors import ExportError, ParameterError
 from orthocal.export.linuxcnc.approximation import approximate
 from orthocal.export.linuxcnc.c_source import write_component, write_core
 from orthocal.export.linuxcnc.drive_compensation import (
     JointCompensation,
     find_compensation,
+    find_old_compensation,
+    find_periodic_errors,
     tabulate,
-    write_table,
 )
 from orthocal.export.linuxcnc.home_offsets import find_homes
 from orthocal.export.linuxcnc.instructions import (
@@ -60,7 +62,7 @@ class ExportOptions:
     home_offsets: tuple[float, ...] | None = None
     """HOME_OFFSET of each joint during the measurement, [m, rad]."""
     latched: tuple[int, ...] | None = None
-    """Sign of HOME_LATCH_VEL of each joint, 1 or -1; needed for drives with backlash."""
+    """Sign of HOME_LATCH_VEL of each joint, 1 or -1; 1 by default. It matters with backlash."""
     half_side: float | None = None
     """Half the side of the module's region around the mechanical zero, [m]."""
     module: bool | None = None
@@ -101,6 +103,8 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         ParameterError: If an option of a module is given for HOME_OFFSET, or values are missing.
     """
     compensation = find_compensation(calibration, options.latched)
+    before = find_old_compensation(calibration, options.latched)
+    stated = options.latched is not None
     module = not calibration.only_offsets if options.module is None else options.module
     if not module:
         unused = [OPTIONS[name] for name in options.requested if name in MODULE_OPTIONS]
@@ -116,27 +120,25 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
             )
         if not find_entries(calibration):
             raise ExportError("the calibration identified no offset: there is nothing to enter")
-        compensation = tabulate(
-            calibration, compensation, offsets_to_enter(calibration), latched=options.latched
-        )
-        _require_change(calibration, compensation)
+        compensation = tabulate(calibration, compensation, offsets_to_enter(calibration))
+        _require_change(calibration, compensation, before)
         tables = {
-            f"joint_{i}.comp": write_table(joint)
-            for i, joint in enumerate(compensation)
+            table_name(i): format_table(joint, drive)
+            for i, (joint, drive) in enumerate(
+                zip(compensation, calibration.robot.drives, strict=True)
+            )
             if joint.table is not None
         }
-        if tables and options.home_offsets is None:
-            raise ParameterError(
-                "is missing; the trim of a table at the home switch depends on it",
-                where="--home-offset",
-            )
-        homes = find_homes(calibration, compensation, old=options.home_offsets)
+        _require_home_offsets(options, [*before, *compensation])
+        homes = find_homes(calibration, compensation, before, old=options.home_offsets)
         return {
-            "README.md": write_home_page(calibration, homes),
-            "joints.ini": write_home_lines(homes),
+            "README.md": write_home_page(calibration, homes, stated=stated),
+            "joints.ini": write_home_lines(homes, stated=stated),
             **tables,
         }
-    homes = find_homes(calibration, compensation, old=options.home_offsets)
+    if not compensates_alike(compensation, before):
+        _require_home_offsets(options, before)
+    homes = find_homes(calibration, compensation, before, old=options.home_offsets)
     approximation = approximate(
         calibration,
         within=WITHIN if options.within is None else options.within,
@@ -144,22 +146,43 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         half_side=options.half_side,
     )
     return {
-        "README.md": write_module_page(calibration, approximation, homes),
+        "README.md": write_module_page(calibration, approximation, homes, stated=stated),
         "kinematics.ini": write_module_lines(approximation, homes),
         **write_component(approximation),
-        **write_core(calibration, approximation, compensation),
+        **write_core(calibration, approximation, homes),
     }
 
 
-def _require_change(calibration: Calibration, compensation: Sequence[JointCompensation]) -> None:
+def _require_change(
+    calibration: Calibration,
+    compensation: Sequence[JointCompensation],
+    before: Sequence[JointCompensation],
+) -> None:
     """Refuse lines for the INI file that would change nothing.
 
     Raises:
-        ExportError: If the offsets stay as they are and nothing else is compensated.
+        ExportError: If the offsets and what is compensated stay as they are.
     """
     assessment = assessment_of(calibration)
-    if assessment.keeps_offsets and not any(
-        c.backlash or c.table is not None for c in compensation
-    ):
+    if assessment.keeps_offsets and compensates_alike(compensation, before):
         more = "" if calibration.only_offsets else " --module writes a correction of all errors."
         raise ExportError(f"{assessment.decision.words} HOME_OFFSET does not change.{more}")
+
+
+def _require_home_offsets(options: ExportOptions, joints: Sequence[JointCompensation]) -> None:
+    """Refuse tables of trims without HOME_OFFSET, on which the trim at the home switch depends."""
+    if options.home_offsets is None and any(joint.table is not None for joint in joints):
+        raise ParameterError(
+            "is missing; the trim of a table at the home switch depends on it",
+            where="--home-offset",
+        )
+
+
+def assumes_latching(calibration: Calibration, options: ExportOptions) -> bool:
+    """True if files depend on signs of HOME_LATCH_VEL that the options do not state."""
+    if options.latched is not None:
+        return False
+    old, new = (f(calibration, None) for f in (find_old_compensation, find_compensation))
+    if find_periodic_errors(calibration.robot, calibration.errors) is not None:
+        return True
+    return not compensates_alike(old, new)

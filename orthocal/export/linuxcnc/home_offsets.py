@@ -5,9 +5,9 @@ drive's coordinate and the one that the joint displays. With the direction s of 
 
     HOME_OFFSET_new = HOME_OFFSET_old + s (o_new − o_active),
 
-less the trim with which the controller compensates backlash and periodic errors in the direction in
-which it latches the home switch (`drive_compensation.py`). Soft limits belong to positions of the
-slide and change by s (o_new − o_active).
+less the change of the trim with which the controller compensates backlash and periodic errors in
+the direction in which it latches the home switch (`drive_compensation.py`). Soft limits belong to
+positions of the slide and change by s (o_new − o_active).
 """
 
 from __future__ import annotations
@@ -38,7 +38,11 @@ class JointHome:
     """Change of MIN_LIMIT and MAX_LIMIT, [unit]."""
     old: float | None
     """HOME_OFFSET during the measurement, [unit]; None if unknown."""
+    opposite: float
+    """Change of HOME_OFFSET if homing latches the switch in the other direction, [unit]."""
     compensation: JointCompensation
+    was: JointCompensation
+    """Compensation during the measurement."""
     limits: tuple[float, float] | None
     """Soft limits during the measurement, [unit]; infinite without a limit. None if the session
     does not state the active offsets."""
@@ -75,6 +79,7 @@ class JointHome:
 def find_homes(
     calibration: Calibration,
     compensation: Sequence[JointCompensation],
+    before: Sequence[JointCompensation],
     *,
     old: Sequence[float] | None = None,
 ) -> tuple[JointHome, ...]:
@@ -83,6 +88,7 @@ def find_homes(
     Args:
         calibration: The calibration.
         compensation: Compensation of each joint by the controller.
+        before: Compensation during the measurement.
         old: HOME_OFFSET of each joint during the measurement, [m, rad].
 
     Raises:
@@ -105,10 +111,25 @@ def find_homes(
             limits = float(lowest), float(highest)
         change = d.direction * float(changes[i]) if d.name in entered else 0.0
         home, joint = None if old is None else old[i], compensation[i]
-        trim = 0.0
-        for _ in range(2):  # a table is nearly constant over a trim
-            trim = joint.trim_at_home(None if home is None else home + change - trim)
+        by_trim = [0.0, 0.0]
+        for k, opposite in enumerate((False, True)):
+            trim = was = before[i].trim_at_home(home, opposite=opposite)
+            for _ in range(2):  # a table is nearly constant over a trim
+                place = None if home is None else home + change + was - trim
+                trim = joint.trim_at_home(place, opposite=opposite)
+            by_trim[k] = change + was - trim
         homes.append(
-            JointHome(d.name, d.unit, d.direction, change - trim, change, home, joint, limits)
+            JointHome(
+                drive=d.name,
+                unit=d.unit,
+                direction=d.direction,
+                change=by_trim[0],
+                limit_change=change,
+                old=home,
+                opposite=by_trim[1],
+                compensation=joint,
+                was=before[i],
+                limits=limits,
+            )
         )
     return tuple(homes)

@@ -12,6 +12,7 @@ from orthocal.assessment.controller_entries import (
     offsets_to_enter,
 )
 from orthocal.calibration.calibration import Calibration
+from orthocal.effects.compensation import table_name
 from orthocal.export.linuxcnc.approximation import (
     BEYOND,
     LETTERS,
@@ -30,8 +31,13 @@ SMALLEST_ERROR = 1e-9
 """Smallest error that a page states, [m]."""
 
 
-def write_home_lines(homes: Sequence[JointHome]) -> str:
-    """INI lines with HOME_OFFSET, MIN_LIMIT and MAX_LIMIT of each joint."""
+def write_home_lines(homes: Sequence[JointHome], *, stated: bool) -> str:
+    """INI lines with HOME_OFFSET, MIN_LIMIT and MAX_LIMIT of each joint.
+
+    Args:
+        homes: The joints.
+        stated: Whether the directions in which homing latches the switches were stated.
+    """
     lines = ["# HOME_OFFSET and soft limits with the calibrated offsets. Keep all other lines."]
     for i, home in enumerate(homes):
         lines += [
@@ -40,6 +46,7 @@ def write_home_lines(homes: Sequence[JointHome]) -> str:
             f"# {comment_safe(home.drive)}, counts {home.counting}: "
             f"{home.show(home.change, sign=True)} {home.joint_unit}",
             _line("HOME_OFFSET", home, home.new, home.change),
+            *([] if stated else _opposite_line(home)),
             *_limit_lines(home, None if home.new is None else home.new_limits),
             *_compensation_lines(i, home),
         ]
@@ -79,6 +86,21 @@ def write_module_lines(approximation: Approximation, homes: Sequence[JointHome])
     return "\n".join(lines) + "\n"
 
 
+def _opposite_line(home: JointHome) -> list[str]:
+    """Comment with HOME_OFFSET for the other sign of HOME_LATCH_VEL, where it matters."""
+    if not _depends_on_latching(home):
+        return []
+    other = f"present value {home.show(home.opposite, sign=True)}"
+    if home.old is not None:
+        other = home.show(home.old + home.opposite)
+    return [f"# if HOME_LATCH_VEL of this joint is negative: HOME_OFFSET = {other}"]
+
+
+def _depends_on_latching(home: JointHome) -> bool:
+    """True if HOME_OFFSET depends on the direction of latching, to its last digit."""
+    return home.show(home.change) != home.show(home.opposite)
+
+
 def _limit_lines(home: JointHome, limits: tuple[float, float] | None) -> list[str]:
     names = ("MIN_LIMIT", "MAX_LIMIT")
     values = (None, None) if limits is None else limits
@@ -98,12 +120,17 @@ def _line(name: str, home: JointHome, value: float | None, change: float) -> str
 def _compensation_lines(joint: int, home: JointHome) -> list[str]:
     """BACKLASH of a joint, or COMP_FILE, which replaces it."""
     if home.compensation.table is not None:
-        return [f"COMP_FILE = joint_{joint}.comp", "COMP_FILE_TYPE = 1"]
+        if home.compensation.table is home.was.table:
+            return []
+        return [f"COMP_FILE = {table_name(joint)}", "COMP_FILE_TYPE = 1"]
+    lines = ["# delete COMP_FILE and COMP_FILE_TYPE"] if home.was.table is not None else []
     backlash = home.compensation.backlash
-    return [f"BACKLASH = {home.show(backlash)}"] if backlash else []
+    if backlash or home.was.backlash:
+        lines.append(f"BACKLASH = {home.show(backlash)}")
+    return lines
 
 
-def _describe_compensation(homes: Sequence[JointHome]) -> str:
+def _describe_compensation(homes: Sequence[JointHome], *, stated: bool) -> str:
     """Paragraph about BACKLASH and COMP_FILE; empty without them."""
     texts = []
     with_backlash = [(i, h) for i, h in enumerate(homes) if h.compensation.backlash]
@@ -116,11 +143,14 @@ def _describe_compensation(homes: Sequence[JointHome]) -> str:
         texts.append(
             f"**Backlash:** {listed}. LinuxCNC compensates it\nby the lines BACKLASH, or by the "
             "columns of COMP_FILE. The sign of HOME_LATCH_VEL must be as stated here, and that of\n"
-            "HOME_SEARCH_VEL the same: half of the backlash, with this sign, is part of the zero.\n"
-            "**Take readings for orthocal with the old INI lines:** it knows no controller that\n"
-            "takes up backlash."
+            "HOME_SEARCH_VEL the same: half of the backlash, with this sign, is part of the zero."
         )
-    errors = [h.compensation.error for h in homes if h.compensation.table is not None]
+        if not stated and any(map(_depends_on_latching, homes)):
+            texts[-1] += (
+                "\nThe + is assumed: no option stated the signs. `--ini FILE` takes them from your "
+                "INI file,\n`--latched` states them."
+            )
+    errors = [h.compensation.error for h in homes if h.compensation.error]
     if errors:
         error = rounded_up(max(errors) / UM)
         texts.append(
@@ -131,8 +161,8 @@ def _describe_compensation(homes: Sequence[JointHome]) -> str:
     return "".join(f"\n{text}\n" for text in texts)
 
 
-def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str:
-    """README.md for offsets that are entered as HOME_OFFSET."""
+def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, stated: bool) -> str:
+    """README.md for offsets that are entered as HOME_OFFSET; `stated` as for the lines."""
     half = {e.drive: expanded_uncertainty(calibration, e) for e in find_entries(calibration)}
     rows = []
     for i, home in enumerate(homes):
@@ -169,13 +199,17 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome]) -> str
         "table": "\n".join(rows),
         "unit": unit,
         "active": active,
-        "compensation": _describe_compensation(homes),
+        "compensation": _describe_compensation(homes, stated=stated),
     }
     return fill_template("home_offset.md", values)
 
 
 def write_module_page(
-    calibration: Calibration, approximation: Approximation, homes: Sequence[JointHome]
+    calibration: Calibration,
+    approximation: Approximation,
+    homes: Sequence[JointHome],
+    *,
+    stated: bool,
 ) -> str:
     """README.md of a kinematics module: how to build and enter it, its errors and its limits."""
     inverse = approximation.inverse
@@ -207,7 +241,7 @@ def write_module_page(
         "tool": millimetres(approximation.tool),
         "checked": approximation.checked,
         "nominal": nominal,
-        "compensation": _describe_compensation(homes),
+        "compensation": _describe_compensation(homes, stated=stated),
         "old_values": f" ({', '.join(old)})" if old else "",
         "last": len(homes) - 1,
         "drives": ", ".join(comment_safe(h.drive) for h in homes),

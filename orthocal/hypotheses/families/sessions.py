@@ -10,7 +10,7 @@ from itertools import combinations, permutations
 
 import numpy as np
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Indices
 from orthocal.hypotheses.anomaly import AnomalyKind, Explanation
 from orthocal.hypotheses.hypothesis import Family, MachineShift
 from orthocal.hypotheses.linear_model import LinearModel
@@ -18,6 +18,9 @@ from orthocal.session.session import Session
 
 MOST_DRIVES = 6
 """Drives up to which all choices among them are considered."""
+
+MOST_DIVIDED = 5
+"""Sessions up to which all divisions in two are considered, in whatever order they were joined."""
 
 DETECTED = 5.5
 """Change, over its standard deviation, from which on its evidence is clear."""
@@ -41,8 +44,8 @@ def _wrong_offsets(model: LinearModel) -> Family | None:
     place, active, labels = model.offsets, model.active, model.labels
     scale = model.problem.theta_scale
     tried: list[tuple[AnomalyKind, int, tuple[int, ...], Array]] = []
-    for k in range(len(labels)):
-        before = active[k - 1] if k else np.zeros(len(drives))
+    befores = [np.zeros(len(drives)), *active[model.order]]
+    for before, k in zip(befores, model.order.tolist(), strict=False):
         tried += [(kind, k, moved, c) for kind, moved, c in enter_wrongly(before, active[k])]
     if not tried or len(place) < len(drives):
         return None
@@ -143,8 +146,11 @@ def _steps(
 ) -> Family:
     labels, active = model.labels, model.active
     found, shifts = [], []
-    for k in range(1, len(labels)):
-        entered = bool(np.abs(active[k] - active[k - 1]).max() > ROUNDING)
+    for later, apart in divide_sessions(model.order):
+        sessions = np.isin(np.arange(len(labels)), later)
+        named = tuple(labels[k] for k in (later if apart else later[:1]))
+        between = np.abs(active[sessions][:, None] - active[~sessions]).max(axis=2)
+        entered = bool(between.min() > ROUNDING)
         for name, direction in directions:
             drive = drive_of.get(place.get(name, -1))
             found.append(
@@ -153,11 +159,37 @@ def _steps(
                     "session",
                     drives=() if drive is None else (drive,),
                     parameters=(name,),
-                    sessions=(labels[k],),
+                    sessions=named,
+                    apart=apart,
                 )
             )
-            shifts.append(MachineShift(np.arange(len(labels)) >= k, direction))
+            shifts.append(MachineShift(sessions, direction))
     return Family.of(found, shifts=shifts, known=False)
+
+
+def divide_sessions(order: Indices) -> Iterator[tuple[list[int], bool]]:
+    """Sessions in which a machine may differ from the others.
+
+    Args:
+        order: Sessions in the order of measuring, shape (n_sessions,).
+
+    Yields:
+        Those from one on, in the order of measuring. Of few sessions also any others, not more than
+        half of them, as their order may have been stated wrongly; and whether they are such.
+    """
+    sessions, n = order.tolist(), len(order)
+    for k in range(1, n):
+        yield sessions[k:], False
+    if n > MOST_DIVIDED:
+        return
+    steps = [set(sessions[k:]) for k in range(1, n)] + [set(sessions[:k]) for k in range(1, n)]
+    seen: list[set[int]] = []
+    for size in range(1, n // 2 + 1):
+        for some in map(list, combinations(sessions, size)):
+            rest = set(sessions) - set(some)
+            if set(some) not in steps and rest not in seen:
+                seen.append(set(some))
+                yield some, True
 
 
 def detectable_changes(session: Session) -> dict[str, float]:
@@ -179,10 +211,11 @@ def detectable_changes(session: Session) -> dict[str, float]:
     about = model.linearise(np.zeros(problem.n_free), (), None, slopes=True)
     sizes = dict.fromkeys(offsets, 0.0)
     sessions = np.arange(len(model.labels))
+    steps = [np.isin(sessions, later) for later, apart in divide_sessions(model.order) if not apart]
     for drive, i in offsets.items():
         direction = np.zeros(problem.n_free)
         direction[i] = 1.0 / problem.theta_scale[i]
-        shifts = [MachineShift(sessions >= k, direction) for k in sessions[1:]]
+        shifts = [MachineShift(later, direction) for later in steps]
         effects = np.array([model.shift_entries(about, s) for s in shifts])
         _, stds = about.likelihood.estimate_amounts(np.zeros_like(about.expected), effects)
         sizes[drive] = DETECTED * float(stds.max())

@@ -106,8 +106,21 @@ class PostureKeys(_Keys):
         return key, values
 
 
+BACKLASH_KEYS: dict[str, tuple[Unit, float]] = {
+    "backlash_mm": ("m", MM),
+    "backlash_deg": ("rad", DEG),
+}
+"""Keys of `controller` for the compensated backlash, likewise."""
+
+LARGEST_TRIM = 5.0
+"""Largest backlash or trim that a controller compensates, mm or degrees."""
+
+Trim = Annotated[Number, Field(ge=0.0, le=LARGEST_TRIM)]
+Trims = Annotated[list[Trim], Field(min_length=1, max_length=12)]
+
+
 class ControllerKeys(_Keys):
-    """Offsets active in the controller: one number per drive of the kind, in their order."""
+    """What the controller corrects: one number per drive of the kind, in their order."""
 
     offsets_mm: Vector | None = None
     """Of prismatic drives."""
@@ -115,16 +128,22 @@ class ControllerKeys(_Keys):
     """Of revolute drives."""
     offsets_mrad: Vector | None = None
     """The same."""
+    backlash_mm: Trims | None = None
+    """Backlash that it takes up, of prismatic drives."""
+    backlash_deg: Trims | None = None
+    """Of revolute drives."""
+    comp_file: Annotated[list[str | None], Field(min_length=1, max_length=12)] | None = None
+    """Table of trims for each drive (COMP_FILE of LinuxCNC, type 1); null for none."""
 
     @property
     def stated(self) -> list[str]:
-        """The keys that are given."""
+        """The keys of offsets that are given."""
         return [key for key in OFFSET_KEYS if getattr(self, key) is not None]
 
     @model_validator(mode="after")
     def _one_form_a_kind(self) -> ControllerKeys:
-        if not self.stated:
-            raise ValueError(f"found none; expected {', '.join(OFFSET_KEYS)}")
+        if not self.model_dump(exclude_none=True):
+            raise ValueError(f"found none; expected {', '.join(type(self).model_fields)}")
         if {"offsets_deg", "offsets_mrad"} <= set(self.stated):
             raise ValueError("found offsets_deg and offsets_mrad; expected one of them")
         return self

@@ -29,6 +29,7 @@ from orthocal.measurement.files.readings_checks import check_readings, require_n
 from orthocal.measurement.files.readings_file import read_rows
 from orthocal.measurement.files.schema import MOST_READINGS, CalibrationKeys, GaugeKeys, SessionKeys
 from orthocal.measurement.files.session_robot import (
+    build_compensation,
     build_offsets,
     build_postures,
     require_given_zero,
@@ -75,8 +76,12 @@ def _load_session(
     with content_withheld_outside(file.parent, readings_path):
         rows = read_rows(readings_path, table)
         readings = check_readings(rows, plan, file=readings_path, partial=partial)
-    digest = hashlib.sha256(content + b"\0" + table).hexdigest()
-    session = replace(plan, readings=readings, readings_path=readings_path, sha256=digest)
+    digest = hashlib.sha256(content + b"\0" + table)
+    for joint in plan.compensation:
+        digest.update(b"" if joint.table is None else joint.table.tobytes())
+    session = replace(
+        plan, readings=readings, readings_path=readings_path, sha256=digest.hexdigest()
+    )
     check_contacts(session)
     return session
 
@@ -276,7 +281,9 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
         raise
     require_given_zero(robot, f"{file}: robot")
     purpose, robot = read_purpose(keys.calibration, robot, where=f"{file}: calibration")
-    offsets = build_offsets(keys.controller, robot, f"{file}: controller")
+    where = f"{file}: controller"
+    offsets = build_offsets(keys.controller, robot, where)
+    compensation = build_compensation(keys.controller, robot, folder=file.parent, where=where)
     for name in keys.adjusted_mm:
         require_adjustment(robot, name, where=f"{file}: adjusted_mm", error=SessionError)
     gauges = {name: g.to_gauge() for name, g in keys.named_gauges.items()}
@@ -305,6 +312,7 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
         setups=setups,
         readings=(),
         controller_offsets=offsets,
+        compensation=compensation,
         adjusted={name: amount * MM for name, amount in keys.adjusted_mm.items()},
         path=file,
         purpose=purpose,

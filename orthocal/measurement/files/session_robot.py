@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from orthocal.arrays import Array
+from orthocal.effects.compensation import Compensation, JointTrim
 from orthocal.errors import ClosureError, SessionError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.measurement.files.schema import OFFSET_KEYS, ControllerKeys, PostureKeys, SessionKeys
+from orthocal.measurement.files.linuxcnc_ini import read_trims
+from orthocal.measurement.files.schema import (
+    BACKLASH_KEYS,
+    OFFSET_KEYS,
+    ControllerKeys,
+    PostureKeys,
+    SessionKeys,
+)
 from orthocal.robot.model import Robot
 from orthocal.session.session import Posture, PostureForm
-from orthocal.units import DRIVE_UNITS, MM
+from orthocal.units import DRIVE_UNITS, MM, Unit
 
 
 def require_given_zero(robot: Robot, where: str) -> None:
@@ -107,41 +116,90 @@ def _read_posture(keys: PostureKeys, robot: Robot, where: str) -> tuple[PostureF
 
 
 def _check_travel(robot: Robot, drives: Array, key: str, file: Path) -> None:
-    """Refuse drive coordinates beyond a drive's travel."""
+    """Refuse drive coordinates beyond a drive's travel, in the numbers of the controller."""
     for drive, value in zip(robot.drives, drives, strict=True):
         if not drive.lower - 1e-9 <= value <= drive.upper + 1e-9:
             unit, size = DRIVE_UNITS[drive.unit]
+            number, low, high = (v / size for v in (drive.to_joint(value), *drive.joint_limits))
             raise SessionError(
-                f"{key}{drive.name} would be at {value / size:.2f} {unit}; it reaches from "
-                f"{drive.lower / size:g} to {drive.upper / size:g} {unit}",
+                f"{key}{drive.name} would be at {number:.2f} {unit}; it reaches from {low:g} to "
+                f"{high:g} {unit}",
                 where=str(file),
             )
 
 
 def build_offsets(keys: ControllerKeys | None, robot: Robot, where: str) -> Array | None:
-    """Offsets that are active in the controller; each key has those of the drives of its kind.
+    """Offsets that are active in the controller; None where not stated.
+
+    Arguments, result and errors are those of `_read_drive_values`.
+    """
+    return None if keys is None else _read_drive_values(keys, OFFSET_KEYS, robot, where)
+
+
+def build_compensation(
+    keys: ControllerKeys | None, robot: Robot, *, folder: Path, where: str
+) -> Compensation:
+    """Backlash and errors of screws that the controller compensates; empty for none.
 
     Args:
         keys: What the session says, None for nothing.
         robot: The robot.
+        folder: Directory of the session, from which names of tables count.
+        where: File and key, for messages.
+
+    Raises:
+        SessionError: If there are not as many numbers or tables as drives, or a table is wrong.
+    """
+    if keys is None:
+        return ()
+    backlash = _read_drive_values(keys, BACKLASH_KEYS, robot, where)
+    if backlash is None and keys.comp_file is None:
+        return ()
+    names = keys.comp_file or [None] * len(robot.drives)
+    if len(names) != len(robot.drives):
+        drives = ", ".join(d.name for d in robot.drives)
+        raise SessionError(
+            f"has {len(names)} names; expected {len(robot.drives)}, one a drive ({drives}), with "
+            "null for a drive without a table",
+            where=f"{where}.comp_file",
+        )
+    values = np.zeros(len(names)) if backlash is None else backlash
+    where = f"{where}.comp_file"
+    tables = (
+        None if name is None else read_trims(folder, name, drive, where)
+        for name, drive in zip(names, robot.drives, strict=True)
+    )
+    return tuple(JointTrim(float(v), table) for v, table in zip(values, tables, strict=True))
+
+
+def _read_drive_values(
+    keys: ControllerKeys, kinds: Mapping[str, tuple[Unit, float]], robot: Robot, where: str
+) -> Array | None:
+    """Numbers for all drives from keys of which each has those of the drives of its kind.
+
+    Args:
+        keys: What the session says.
+        kinds: Keys with the unit of their drives and the factor to it.
+        robot: The robot.
         where: File and key, for messages.
 
     Returns:
-        Shape (n_drives,), [m, rad], or None.
+        Shape (n_drives,), [m, rad], or None where none of the keys is stated.
 
     Raises:
-        SessionError: If a drive has no offset, or an offset no drive.
+        SessionError: If a drive has no number, or a number no drive.
     """
-    if keys is None:
+    stated = [key for key in kinds if getattr(keys, key) is not None]
+    if not stated:
         return None
-    offsets = np.zeros(len(robot.drives))
+    result = np.zeros(len(robot.drives))
     units: set[str] = set()
-    for key in keys.stated:
-        values, (unit, factor) = getattr(keys, key), OFFSET_KEYS[key]
+    for key in stated:
+        values, (unit, factor) = getattr(keys, key), kinds[key]
         drives = [i for i, d in enumerate(robot.drives) if d.unit == unit]
         kind = "prismatic" if unit == "m" else "revolute"
         if not drives:
-            fitting = "offsets_deg or offsets_mrad" if unit == "m" else "offsets_mm"
+            fitting = " or ".join(k for k, (u, _) in kinds.items() if u != unit)
             raise SessionError(
                 f"{robot.name} has no {kind} drive; expected {fitting}", where=f"{where}.{key}"
             )
@@ -152,12 +210,13 @@ def build_offsets(keys: ControllerKeys | None, robot: Robot, where: str) -> Arra
                 f"has {len(values)} numbers; expected {len(drives)}, one a {one}: {names}",
                 where=f"{where}.{key}",
             )
-        offsets[drives] = np.array(values) * factor
+        result[drives] = np.array(values) * factor
         units.add(unit)
     for drive in robot.drives:
         if drive.unit not in units:
-            expected = " or ".join(k for k, (unit, _) in OFFSET_KEYS.items() if unit == drive.unit)
+            expected = " or ".join(k for k, (unit, _) in kinds.items() if unit == drive.unit)
+            what = stated[0].partition("_")[0].removesuffix("s")
             raise SessionError(
-                f"states no offset of {drive.name}; expected {expected}, too", where=where
+                f"states no {what} of {drive.name}; expected {expected}, too", where=where
             )
-    return read_only(offsets)
+    return read_only(result)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from orthocal.effects.compensation import format_table, table_name
 from orthocal.errors import SessionError
 from orthocal.io.files import exists, write_file, write_files
 from orthocal.measurement.files.readings_file import (
@@ -23,7 +24,7 @@ from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import default_zero
 from orthocal.sensors.registry import write_sensor
 from orthocal.session.session import Conditions, Gauge, Posture, Purpose, Reading, Session
-from orthocal.units import MM, tidy, to_mm, trim_zeros
+from orthocal.units import DRIVE_UNITS, MM, tidy, to_mm, trim_zeros
 
 
 def session_document(session: Session) -> dict[str, Any]:
@@ -45,8 +46,8 @@ def session_document(session: Session) -> dict[str, Any]:
     }
     if payload := _payload(session):
         document["payload_kg"] = payload
-    if session.controller_offsets is not None:
-        document["controller"] = _offsets_document(session)
+    if session.controller_offsets is not None or session.compensation:
+        document["controller"] = _controller_document(session)
     if session.adjusted:
         document["adjusted_mm"] = {n: tidy(v / MM) for n, v in session.adjusted.items()}
     if calibration := _calibration_document(session):
@@ -106,13 +107,33 @@ def _calibration_document(session: Session) -> dict[str, Any]:
     return document if chosen is None else document | {"effects": list(chosen)}
 
 
-def _offsets_document(session: Session) -> dict[str, list[float]]:
-    """Offsets of prismatic drives in mm, of revolute ones in mrad."""
-    document: dict[str, list[float]] = {}
-    for drive, offset in zip(session.robot.drives, session.active_offsets, strict=True):
-        key = "offsets_mm" if drive.unit == "m" else "offsets_mrad"
-        document.setdefault(key, []).append(tidy(float(offset) / MM))
+def _controller_document(session: Session) -> dict[str, list[Any]]:
+    """Offsets of prismatic drives in mm, of revolute ones in mrad, and what is compensated."""
+    document: dict[str, list[Any]] = {}
+    if session.controller_offsets is not None:
+        for drive, offset in zip(session.robot.drives, session.active_offsets, strict=True):
+            key = "offsets_mm" if drive.unit == "m" else "offsets_mrad"
+            document.setdefault(key, []).append(tidy(float(offset) / MM))
+    if any(joint.backlash for joint in session.compensation):
+        for drive, joint in zip(session.robot.drives, session.compensation, strict=True):
+            unit, size = DRIVE_UNITS[drive.unit]
+            document.setdefault(f"backlash_{unit}", []).append(tidy(joint.backlash / size))
+    if any(joint.table is not None for joint in session.compensation):
+        document["comp_file"] = [
+            None if joint.table is None else table_name(i)
+            for i, joint in enumerate(session.compensation)
+        ]
     return document
+
+
+def _tables(session: Session) -> dict[str, str]:
+    """Tables of trims of a session, file name to text."""
+    drives = zip(session.robot.drives, session.compensation, strict=False)
+    return {
+        table_name(i): format_table(joint, drive)
+        for i, (drive, joint) in enumerate(drives)
+        if joint.table is not None
+    }
 
 
 def write_session(
@@ -152,7 +173,7 @@ def write_session(
     conditions = needed_conditions(session.robot) if blank else ()
     needed = [COLUMN_OF_ROLE.get(c, c) for c in conditions]
     table = readings_table(session.readings, decimals=decimals, blank=blank, needed=needed)
-    files = {"session.yaml": text, "readings.csv": table, **(extra or {})}
+    files = {"session.yaml": text, "readings.csv": table, **_tables(session), **(extra or {})}
     write_files(folder, files)
     return folder / "session.yaml"
 

@@ -6,6 +6,7 @@ it falls, u if it does not matter.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from orthocal.kinematics.conditions import APPROACH as DIRECTIONS
 from orthocal.kinematics.loop_closure import Failures, find_beyond_travel, nominal_closure
 from orthocal.robot.model import Robot
 from orthocal.session.session import Conditions, Session
-from orthocal.units import DEG, MM
+from orthocal.units import DEG, LIMIT, MM
 
 APPROACH = 2e-3
 """Length of the approach of a sliding drive, [m]."""
@@ -24,6 +25,14 @@ APPROACH = 2e-3
 APPROACH_TURN = 0.5 * DEG
 """Angle of the approach of a turning drive, [rad]."""
 
+SHORTEST = 0.2e-3
+"""Least length of the approach of a sliding drive: five times a usual backlash, [m]."""
+
+STEP = 0.1e-3
+"""Shortened approaches are multiples of this, [m]."""
+
+TAKEN_UP = 2.0
+"""Least length of an approach, in the limit of the backlash."""
 
 ARROWS = {1.0: "↑", -1.0: "↓", 0.0: "·"}
 """Sign of the change of a joint's number to its arrow."""
@@ -36,11 +45,34 @@ def usual_approaches(robot: Robot) -> tuple[str, ...]:
     return tuple(letter * len(robot.drives) for letter in "pn")
 
 
-def approach_length(robot: Robot) -> str:
-    """Length of an approach with its unit."""
-    if any(d.unit == "m" for d in robot.drives):
-        return f"{APPROACH / MM:g} mm"
-    return f"{APPROACH_TURN / DEG:g}°"
+def approach_share(session: Session) -> float:
+    """Length of the approaches of a session, as a share of the usual one.
+
+    At most half the range of its gauges, so that the tip stays in contact; the backlash is taken
+    up all the same.
+    """
+    ranges = [g.range for g in session.gauges.values() if g.range is not None]
+    room = min((0.5 * (high - low) for low, high in ranges), default=APPROACH)
+    backlash = max(
+        (
+            LIMIT * session.robot.parameters[error.name].prior_std
+            for effect in robot_effects(session.robot)
+            if "approach" in effect.conditions
+            for error in effect.errors
+            if error.unit == "m"
+        ),
+        default=0.0,
+    )
+    length = max(math.floor(room / STEP + 1e-6) * STEP, SHORTEST, TAKEN_UP * backlash)
+    return min(length / APPROACH, 1.0)
+
+
+def approach_length(session: Session) -> str:
+    """Length of the approaches of a session with its unit."""
+    share = approach_share(session)
+    if any(d.unit == "m" for d in session.robot.drives):
+        return f"{share * APPROACH / MM:.3g} mm"
+    return f"{share * APPROACH_TURN / DEG:.3g}°"
 
 
 def describe_approach(robot: Robot, approach: str) -> str:
@@ -55,15 +87,16 @@ def describe_approach(robot: Robot, approach: str) -> str:
     return arrows[0] if len(set(arrows)) == 1 else "".join(arrows)
 
 
-def approach_steps(robot: Robot, approach: str, other: str = "p") -> Array:
+def approach_steps(robot: Robot, approach: str, other: str = "p", *, share: float = 1.0) -> Array:
     """Motion of each drive in an approach, shape (n_drives,), [m, rad].
 
     Args:
         robot: The robot.
         approach: A letter for each drive.
         other: Letter in place of u.
+        share: Length as a share of the usual one.
     """
-    lengths = np.array([APPROACH if d.unit == "m" else APPROACH_TURN for d in robot.drives])
+    lengths = share * np.array([APPROACH if d.unit == "m" else APPROACH_TURN for d in robot.drives])
     return lengths * [DIRECTIONS[letter] or DIRECTIONS[other] for letter in approach]
 
 

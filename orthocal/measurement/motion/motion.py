@@ -21,7 +21,12 @@ from orthocal.arrays import Array
 from orthocal.errors import ClosureError, SessionError
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
-from orthocal.measurement.motion.approach import approach_length, approach_steps, fill_approach
+from orthocal.measurement.motion.approach import (
+    approach_length,
+    approach_share,
+    approach_steps,
+    fill_approach,
+)
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations, drive_table
@@ -238,14 +243,14 @@ def _find_approaches(session: Session, alignment: set[str]) -> Approaches:
             continue
         for (name, stated), error in failures.items():
             raise SessionError(
-                f"cannot be approached as stated ({stated}) by {approach_length(session.robot)}: "
+                f"cannot be approached as stated ({stated}) by {approach_length(session)}: "
                 f"{error.reason}",
                 where=f"{session.path or 'session'}: postures.{name}",
             )
         return stops
     raise SessionError(
         "can be approached neither from below nor from above by "
-        f"{approach_length(session.robot)}: {refused[0].reason}",
+        f"{approach_length(session)}: {refused[0].reason}",
         where=f"{session.path or 'session'}: postures.{refused[0].posture}",
     )
 
@@ -263,7 +268,8 @@ def _begin_approaches(
     robot, names = session.robot, [name for name, _ in places]
     closure, unknown = nominal_closure(robot), "u" * len(robot.drives)
     nominal = np.array([session.postures[n].drives + session.active_offsets for n in names])
-    steps = [approach_steps(robot, stated or unknown, letter) for _, stated in places]
+    share = approach_share(session)
+    steps = [approach_steps(robot, stated or unknown, letter, share=share) for _, stated in places]
     drives = nominal - np.array(steps)
     failures = find_beyond_travel(robot, drives, names)
     if not failures:

@@ -166,7 +166,7 @@ def _adjustments(calibration: Calibration, saved: Path | None) -> list[tuple[str
 
 
 def _maps(calibration: Calibration, accuracy: ToolAccuracy) -> str:
-    scale = calibration.tolerance_scale
+    scale = calibration.tolerance_scale.factor
     times = f"{scale:.1f} times " if scale > 1.0 else ""
     captions: dict[Field, str] = {
         "now": "Actual less commanded position of the tool, with the offsets that were active "
@@ -298,6 +298,7 @@ def _provenance(calibration: Calibration) -> str:
 def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
     """Tolerances, known values and bounds that the user stated."""
     usual = calibration.robot.parameters.defaults
+    factor = calibration.tolerance_scale.factor
     tolerances, known, bounds = [], [], []
     for p in calibration.parameters:
         f, unit = p.edge_factor, p.edge_unit
@@ -306,7 +307,7 @@ def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
             continue
         if p.prior and (p.mean != 0.0 or not calibration.prior):
             known.append(f"{p.name} {p.mean * f:g} ± {show_limit(p.prior_std) * f:g} {unit}")
-        elif p.prior_std != usual[p.name].prior_std:
+        elif p.prior_std not in (usual[p.name].prior_std, factor * usual[p.name].prior_std):
             limit, usually = (show_limit(q.prior_std) * f for q in (p, usual[p.name]))
             tolerances.append(f"{p.name} {limit:g} {unit} instead of {usually:g}")
         if p.lower is not None or p.upper is not None:
@@ -317,6 +318,8 @@ def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
         for name, texts in (("Tolerances", tolerances), ("Known values", known), ("Bounds", bounds))
         if texts
     ]
+    if factor != 1.0:
+        rows.append(("Tolerance scale", f"{factor:.2f}, all tolerances except those of offsets"))
     return rows or [("Assumptions", "the tolerances of the robot")]
 
 

@@ -17,7 +17,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from orthocal.arrays import Array
 from orthocal.assessment.assess import assessment_of
-from orthocal.assessment.tool_error import ToolAccuracy, assess_remaining
+from orthocal.assessment.tool_error import ToolAccuracy
 from orthocal.calibration.calibration import Calibration
 from orthocal.output.report.figure import Plot, open_figure
 from orthocal.units import MM, UM
@@ -68,14 +68,14 @@ def _find_grid(points: Array) -> list[Array] | None:
     return lines if np.array_equal(grid, points) else None
 
 
-def _error_parts(calibration: Calibration, accuracy: ToolAccuracy, which: Field) -> Array:
+def _error_parts(accuracy: ToolAccuracy, which: Field) -> Array:
     """Tool errors after alignment, shape (K, 3), or their uncertainty, shape (K, 1), [µm].
 
     Means over the conditions of use.
     """
     if which == "now":
         return accuracy.average(accuracy.align(accuracy.deviation)) / UM
-    remaining = assess_remaining(calibration, accuracy)
+    remaining = accuracy.after
     if which == "entered" or remaining is None:
         return accuracy.average(accuracy.align(accuracy.error_after_offsets)) / UM
     variance = accuracy.average(np.trace(remaining.aligned_covariance, axis1=1, axis2=2))
@@ -109,7 +109,7 @@ def _draw_tool_map(calibration: Calibration, accuracy: ToolAccuracy, which: Fiel
     planes = list(combinations(range(len(lines)), 2))
     tcp = calibration.robot.tcp
     world = tuple(range(len(lines))) if tcp is None else tcp.coordinates
-    grid = _error_parts(calibration, accuracy, which).reshape(*(line.size for line in lines), -1)
+    grid = _error_parts(accuracy, which).reshape(*(line.size for line in lines), -1)
     maps = []
     for plane in planes:
         sides = [lines[k] for k in plane]
@@ -130,7 +130,7 @@ def _draw_tool_map(calibration: Calibration, accuracy: ToolAccuracy, which: Fiel
     label = "size of the tool error [µm]; arrows: its part in the plane"
     if which == "uncertainty":
         label = "RMS uncertainty in space [µm]"
-        scale = calibration.tolerance_scale
+        scale = calibration.tolerance_scale.factor
         if scale > 1.0:
             label += f", tolerances × {scale:.1f}"
     figure.colorbar(

@@ -20,7 +20,7 @@ from orthocal.statistics.zeros import project_out_zeros
 Place = tuple[str, str]
 """Kind and name of the part of the machine that a sensor measures, such as ("leg", "x")."""
 
-FEW_NAMES = 12
+FEW_NAMES = 24
 """Largest number of postures that a message lists."""
 
 MOST_STOPS = 150

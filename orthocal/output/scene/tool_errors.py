@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.arrays import Array
-from orthocal.assessment.tool_error import ToolAccuracy, assess_remaining, assess_tool
+from orthocal.assessment.tool_error import ToolAccuracy, assess_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
 from orthocal.output.text.layout import um
@@ -59,7 +59,7 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
     )
     now_largest, entered_largest = (_largest(d) for d in (now, entered))
     # RMS in space, as in all tables; axes of an ellipsoid are shorter
-    after, excess = assess_remaining(calibration, accuracy), calibration.tolerance_scale
+    after, excess = accuracy.after, calibration.tolerance_scale.factor
     spread = 0.0 if after is None else after.sizes.reported.largest
     largest = max(now_largest, entered_largest, spread)
     if largest < VANISHING:

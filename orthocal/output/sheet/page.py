@@ -11,6 +11,7 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.assessment.wording import name_direction
+from orthocal.effects.compensation import describe_trims
 from orthocal.io.html import escape, heading, page, paragraph, prose, table
 from orthocal.measurement.motion.approach import approach_length, describe_approach
 from orthocal.measurement.motion.motion import (
@@ -120,11 +121,12 @@ def _front(
         f"the robot's YAML. Travel of the joints: {'; '.join(_travel(session))}.",
         f"Jog each slide a little outwards. Its number must {_count_outwards(robot)}.",
         _active_offsets(session),
+        *([text] if (text := _compensation(session)) else []),
         "Check each rod and each hinge for play. The calibration does not remove play.",
     ]
     rules = [
-        _approach_rule(robot, motions),
-        "Keep the tip on its rod from the first reading of a setup to the last.",
+        _approach_rule(session, motions),
+        _contact_rule(motions),
         "After you have set the gauge zero, do not touch the bezel, the stand or the arm of the "
         "gauge. If the gauge was bumped, start that setup again.",
         "Write down what the dial shows, with its sign. Estimate the last digit. If you took no "
@@ -402,6 +404,22 @@ def _active_offsets(session: Session) -> str:
     )
 
 
+def _compensation(session: Session) -> str:
+    """The backlash that the controller must compensate; empty where that does not matter."""
+    stated = describe_trims(session.robot, session.compensation)
+    if stated:
+        return (
+            f"Check that the controller compensates backlash, as session.yaml states: {stated} "
+            "(LinuxCNC: BACKLASH, COMP_FILE)."
+        )
+    if "approach" not in needed_conditions(session.robot):
+        return ""
+    return (
+        "session.yaml states that the controller compensates no backlash. If it does (LinuxCNC: "
+        "BACKLASH, COMP_FILE), write it into session.yaml: controller: {backlash_mm: [...]}."
+    )
+
+
 def _count_outwards(robot: Robot) -> str:
     """Direction in which the joint numbers change if the slides move outwards."""
     verbs = {1: "grow", -1: "fall"}
@@ -410,9 +428,20 @@ def _count_outwards(robot: Robot) -> str:
     return ", ".join(f"{verbs[d.direction]} for {d.name}" for d in robot.drives)
 
 
-def _approach_rule(robot: Robot, motions: Sequence[SetupMotion]) -> str:
+def _contact_rule(motions: Sequence[SetupMotion]) -> str:
+    """Rule for the tip between the readings of a setup."""
+    rule = "Keep the tip on its rod from the first reading of a setup to the last"
+    if not any(stop.lift for m in motions for stop in m.stops):
+        return f"{rule}."
+    return (
+        f"{rule}, except on the ways that the setup names: hold the plunger up there, and let it "
+        "down on the rod in the posture. The stand and the bezel stay as they are."
+    )
+
+
+def _approach_rule(session: Session, motions: Sequence[SetupMotion]) -> str:
     """Rule for the last motion to a posture, in joint numbers."""
-    length = approach_length(robot)
+    robot, length = session.robot, approach_length(session)
     arrows = {describe_approach(robot, s.approach) for m in motions for s in m.stops}
     jog = (
         f"If you jog, go {length} past the posture with every joint first, and come back to it in "

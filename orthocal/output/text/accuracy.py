@@ -15,7 +15,6 @@ from orthocal.assessment.remaining_errors import RemainingError, find_remaining_
 from orthocal.assessment.tool_error import (
     ErrorSizes,
     ToolAccuracy,
-    assess_remaining,
     assess_tool,
     summarise_tool,
 )
@@ -33,10 +32,17 @@ from orthocal.units import MM, UM, read_limit
 
 POINT_COLUMNS = (
     *("x_mm", "y_mm", "z_mm"),
-    *("deviation_x_um", "deviation_y_um", "deviation_z_um"),
+    *("absolute_x_um", "absolute_y_um", "absolute_z_um"),
     *("std_x_um", "std_y_um", "std_z_um"),
 )
-"""Commanded tool position; actual less commanded position; standard deviation of the actual one."""
+"""Commanded tool position; absolute error, actual less commanded; its standard deviation."""
+
+ABSOLUTE_NOTE = (
+    "Errors are absolute: actual less commanded position, without alignment of the workpiece on "
+    "the machine. The tool error over the workspace, after this alignment:\n"
+    "  orthocal accuracy {}"
+)
+"""Note beside the errors at points; {} is the calibration."""
 
 COLUMNS_NOTE = (
     "RMS, 95 % and worst point: workpiece aligned on the machine (translation and rotation "
@@ -77,11 +83,10 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
         entered = accuracy.measure(accuracy.error_after_offsets)
         rows.append(("identified error, offsets entered", entered))
     rows.append(("uncertainty before calibration", accuracy.before.sizes))
-    remaining, scale = assess_remaining(calibration, accuracy), calibration.tolerance_scale
+    scale = calibration.tolerance_scale.factor
+    scaled = f" (tolerances × {scale:.1f})" if scale > 1.0 else ""
     if accuracy.after is not None:
-        rows.append(("uncertainty after calibration", accuracy.after.sizes))
-    if remaining is not None and scale > 1.0:
-        rows.append((f"  with tolerances × {scale:.1f}", remaining.sizes))
+        rows.append((f"uncertainty after calibration{scaled}", accuracy.after.sizes))
     cells = []
     for name, sizes in rows:
         a = sizes.aligned
@@ -126,7 +131,7 @@ def describe_remaining(errors: Iterable[RemainingError]) -> list[str]:
 
 
 def format_points(rows: Array) -> str:
-    """Deviation and standard deviation at points as lines of CSV with POINT_COLUMNS, µm.
+    """Absolute error and standard deviation at points as lines of CSV with POINT_COLUMNS, µm.
 
     Args:
         rows: Commanded position, deviation and its standard deviation, shape (K, 9), [m]; NaN for

@@ -28,6 +28,7 @@ from orthocal.calibration.assessment_record import (
     Verdict,
 )
 from orthocal.calibration.calibration import Calibration
+from orthocal.measurement.joining import name_within
 from orthocal.output.text.layout import (
     EXPANDED,
     bullets,
@@ -254,9 +255,16 @@ def _measured(calibration: Calibration) -> str:
     setups = [s for s in calibration.setups if s.name in read]
     unread = [s.name for s in calibration.setups if s.name not in read]
     places = list_places(s.sensor.place for s in setups)
-    used = {name for r in calibration.residuals for name in (r.posture, r.minus) if name}
+    sessions = len(calibration.session.parts)
+    used = {
+        name_within(name, joined=sessions > 0)
+        for r in calibration.residuals
+        for name in (r.posture, r.minus)
+        if name
+    }
+    of_sessions = f" of {counted(sessions, 'session')}" if sessions else ""
     return (
-        f"Measured: {counted(len(calibration.residuals), kind)} in "
+        f"Measured: {counted(len(calibration.residuals), kind)}{of_sessions} in "
         f"{counted(len(used), 'posture')}, {counted(len(setups), 'setup')} on {places}"
         + (f"; no reading of {', '.join(unread)}" if unread else "")
     )

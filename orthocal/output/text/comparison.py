@@ -35,7 +35,7 @@ MORE = "--details prints scores, estimates and residuals of each model."
 
 RESEARCH: tuple[FindingKind, ...] = (
     *("recommended", "not recommended", "tool error", "linearisation error"),
-    *("noise as stated", "repetition unknown"),
+    "noise as stated",
 )
 """Kinds of findings that the short answer replaces, or that only the details list."""
 

@@ -40,8 +40,8 @@ WIDTH = 100
 """Columns of plain text."""
 
 EXPANDED = (
-    "±: expanded uncertainty (k = 2; Student's factor for 95 % if the noise was estimated from few "
-    "readings), including all errors that were not identified."
+    "±: expanded uncertainty (k = 2; Student's factor for 95 % if noise or tolerance scale were "
+    "estimated from few readings), including all errors that were not identified."
 )
 """Meaning of ± in tables of values."""
 

@@ -11,7 +11,7 @@ from rich.console import Group, RenderableType
 from rich.padding import Padding
 from rich.text import Text
 
-from orthocal.assessment.wording import tool_mm
+from orthocal.assessment.wording import joined, tool_mm
 from orthocal.assessment.words.entries import describe_aligned
 from orthocal.kinematics.conditions import stated_use
 from orthocal.kinematics.workspace import find_workspace
@@ -54,7 +54,7 @@ MOST_LISTED = 24
 """Largest number of setups that are listed one by one."""
 
 DETERMINED = 0.9
-"""Ratio of the limits of an effect after and before the readings below which they determine it."""
+"""Ratio of limits after and before the readings below which they determine a parameter."""
 
 EVENLY = "evenly spaced"
 
@@ -107,7 +107,21 @@ def describe_expected(plan: MeasuringPlan) -> list[str]:
             f"With offsets within their tolerances the tip misses the rod in {first.lost:.0%} of "
             "the readings. Enter offsets from a few readings first, or use a blade."
         )
+    if undetermined := _undetermined_offsets(plan):
+        lines.append(
+            f"These readings do not determine the offset of {joined(undetermined)}. Plan more time "
+            "or setups."
+        )
     return [*lines, *map(_describe_limits, plan.effects)]
+
+
+def _undetermined_offsets(plan: MeasuringPlan) -> list[str]:
+    """Drives whose offset is as uncertain after the readings as before."""
+    after = plan.expected
+    stds = np.sqrt(np.diag(after.covariance))
+    ratios = dict(zip(after.names, (stds / after.prior_stds).tolist(), strict=True))
+    drives = (d.name for d in plan.session.robot.drives)
+    return [name for name in drives if ratios.get(f"{name}.offset", 0.0) > DETERMINED]
 
 
 def _describe_limits(effect: EffectLimits) -> str:
@@ -126,8 +140,7 @@ def _describe_limits(effect: EffectLimits) -> str:
 
 def _how_to_measure(plan: MeasuringPlan) -> list[str]:
     """Instructions for the operator."""
-    robot = plan.session.robot
-    length = approach_length(robot)
+    length = approach_length(plan.session)
     approach = f"Approach every posture from the same side: the last {length} in one direction."
     if any(r.approach for r in plan.session.readings):
         approach = (

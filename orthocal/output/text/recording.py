@@ -94,7 +94,7 @@ class RecordingText:
         return f"Noted with the next readings: {', '.join(noted) or 'no temperature'}."
 
     def clock(self, *, on: bool) -> str:
-        """Whether the time of each reading is noted."""
+        """True if the time of each reading is noted."""
         if on:
             return "The time of each reading is noted."
         return "The time is not noted; lines count as read in their order, a minute apart."
@@ -146,7 +146,7 @@ class RecordingText:
             "Type the reading of the dial in mm. It is on disk before the next question. `help` "
             "lists the commands. Lines are those of the sheet and of readings.csv."
         )
-        length = approach_length(session.robot)
+        length = approach_length(session)
         parts.append(
             f"Approach each posture as its line states, in the last {length}: ↑ with growing "
             "numbers of the joints, ↓ with falling ones."
@@ -216,7 +216,7 @@ class RecordingText:
         lines = [self.wrap(f"Line {row.line}: {row.label_with_cycle}{left}")]
         if row.approach is not None:
             arrow = describe_approach(self._session.robot, row.approach)
-            length = approach_length(self._session.robot)
+            length = approach_length(self._session)
             lines.append(self.wrap(f"approach {arrow} in the last {length}", indent="  "))
         for posture in (row.posture, *([row.minus] if row.minus else [])):
             name = f"{posture}: " if row.minus else ""
@@ -257,9 +257,11 @@ class RecordingText:
             return ""
         row = self._recording.rows[index]
         text = f"The other readings predict {format_fixed(mean / MM, 3)} ± {mm(2.0 * std)} mm."
+        lines = [self.wrap(text, indent="  ")]
         if is_far(row.value, mean, std):
-            text += f" Line {row.line} differs by {mm(abs(row.value - mean))} mm: check the dial."
-        return self.wrap(text, indent="  ")
+            differs = f"Line {row.line} differs by {mm(abs(row.value - mean))} mm. Check the dial."
+            lines.append(self.wrap(differs, indent="  ", first="! "))
+        return "\n".join(lines)
 
     def warning(self, finding: Finding, *, last: int | None = None) -> str:
         """A finding about the readings so far, in the words of `check`.
@@ -278,9 +280,11 @@ class RecordingText:
         else:
             where = f" ({spans(parts[-1], 'line')})" if parts else ""
         kind = finding.kind.capitalize()
-        head, *causes = f"{kind}{where}: {finding.words}".split("\n")
+        head, *others = f"{kind}{where}: {finding.words}".split("\n")
         lines = [self.wrap(head, indent="  ", first="! ")]
-        lines += [self.wrap(cause.strip(), indent="      ", first="    ") for cause in causes]
+        for other in others:  # causes, and what to do
+            margin = "    " if other.startswith(" ") else ""
+            lines.append(self.wrap(other.strip(), indent=f"  {margin}", first=margin or "  "))
         return "\n".join(lines)
 
     def resolved(self, findings: Sequence[Finding]) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
+from orthocal.assessment.wording import joined, tool_mm
 from orthocal.kinematics.workspace import describe_box
 from orthocal.output.text.layout import counted, noted, plain, section, table_of
 from orthocal.study.accuracy import (
@@ -41,6 +42,9 @@ SIGNIFICANT = 3.0
 
 LINEAR_PREDICTION_ERROR = 0.1
 """Relative error that a first-order prediction may have."""
+
+LEAST_COST = 0.02
+"""Share of the tool error below which ignoring an effect costs nothing that matters."""
 
 METHOD_NAMES = {
     "six": "paper, six equations",
@@ -143,6 +147,10 @@ def _accuracy(table: StudyTable, all_rows: bool) -> StudyReport:
         "worst_point_um": s.worst_point / UM,
         "shift_out_um": s.shift_removed / UM,
         "absolute_um": s.absolute / UM,
+        "effects": list(study.effects),
+        "ignored": list(study.ignored),
+        "after_all_effects_um": None if s.all_effects is None else s.all_effects / UM,
+        "cost_standard_error_um": s.cost_standard_error / UM,
         "predicted": None if s.predicted is None else predicted,
         "parameters": parameters,
     }
@@ -161,12 +169,13 @@ def _accuracy_answer(study: AccuracyStudy, s: AccuracySummary, predicted: float)
     if not s.machines:
         reasons = ", ".join(f"{n}: {reason}" for reason, n in s.failed.items())
         return f"None of the machines could be calibrated ({reasons})."
-    sentences = [
-        f"Expected tool error after calibration: {_um(s.after)} µm RMS (before: {_um(s.before)} "
-        f"µm), over the workspace {describe_box(np.array(study.box))} after aligning the "
-        "workpiece.",
+    sentences = [] if s.all_effects is None else [_cost_sentence(study, s, s.all_effects)]
+    sentences += [
+        f"Expected tool error after calibration: {tool_mm(s.after)} RMS (before: "
+        f"{tool_mm(s.before)}), over the workspace {describe_box(np.array(study.box))} after "
+        "aligning the workpiece.",
         f"Mean of {counted(s.machines, 'machine')}, standard error {_um(s.standard_error)} µm; "
-        f"95 % of the machines are below {_um(s.percentile_95)} µm.",
+        f"95 % of the machines are below {tool_mm(s.percentile_95)}.",
         "The controller corrects all identified errors.",
     ]
     if math.isfinite(predicted):
@@ -174,8 +183,19 @@ def _accuracy_answer(study: AccuracyStudy, s: AccuracySummary, predicted: float)
         limit = max(SIGNIFICANT * s.standard_error, LINEAR_PREDICTION_ERROR * predicted)
         worse = ", significantly less" if difference > limit and not study.fixed else ""
         kind = " for machines within their tolerances" if study.fixed else ""
-        sentences.append(f"The covariance predicts {_um(predicted)} µm{kind}{worse}.")
+        sentences.append(f"The covariance predicts {tool_mm(predicted)}{kind}{worse}.")
     return " ".join(sentences)
+
+
+def _cost_sentence(study: AccuracyStudy, s: AccuracySummary, identified: float) -> str:
+    """Cost of ignoring effects that the machines have."""
+    named = joined(study.ignored)
+    sizes = f"{tool_mm(s.after)} RMS at the tool, {tool_mm(identified)} if"
+    which = "it is" if len(study.ignored) == 1 else "they are"
+    cost = s.after - identified
+    if cost > max(SIGNIFICANT * s.cost_standard_error, LEAST_COST * identified):
+        return f"Ignoring {named} costs {tool_mm(cost)}: {sizes} {which} identified."
+    return f"Ignoring {named} costs nothing noticeable: {sizes} {which} identified."
 
 
 def _tool_table(s: AccuracySummary, predicted: dict[str, float]) -> RenderableType:

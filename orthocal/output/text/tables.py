@@ -26,7 +26,6 @@ from orthocal.output.text.layout import (
     signed,
     table_of,
 )
-from orthocal.statistics.chance import expanded_uncertainty
 from orthocal.units import MM, UM, show_limit
 
 MANY_PARAMETERS = 12
@@ -73,7 +72,7 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
         if not (few or _is_listed(p)):
             continue
         f, shift = p.edge_factor, p.value - p.linear
-        noise = float(expanded_uncertainty(p.std_scatter, p.std_scatter, dof=c.dof))
+        noise = float(c.expand(p.std_scatter, p.std_scatter))
         resolved = f"{p.data_share:.0%}" if math.isfinite(p.data_share) else ""
         row = (
             p.name,
@@ -264,7 +263,7 @@ def render_sensors(calibration: Calibration) -> RenderableType | None:
     if calibration.sensors:
         rows = []
         for p in calibration.sensors:
-            half = float(expanded_uncertainty(p.std, p.std_scatter, dof=calibration.dof))
+            half = float(calibration.expand(p.std, p.std_scatter))
             f = p.edge_factor
             limits = (plain(half * f), plain(show_limit(p.prior_std) * f))
             rows.append((p.name, signed(p.value * f), *limits, p.edge_unit))

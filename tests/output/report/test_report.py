@@ -119,7 +119,7 @@ def test_provenance_has_check_sums_of_files(calibration, page):
 
 def test_provenance_lists_stated_assumptions(root, read, calibration, page):
     assert _provenance(calibration) in page
-    assert ["Assumptions", "the tolerances of the robot"] in read.rows
+    assert ["Tolerance scale", "2.83, all tolerances except those of offsets"] in read.rows
     found = calibrate(
         root / "examples/raw-cycles",
         Choice(

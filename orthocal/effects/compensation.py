@@ -1,0 +1,118 @@
+"""Displacement of the motors by a controller that compensates backlash and errors of screws.
+
+A controller adds a trim T to the commanded position j of a joint, on the side s = ±1 of its last
+motion. With a stated backlash b it is T = s b/2. A table lists the trims T₊ and T₋ over positions
+of the joint; they are linear between its rows, constant beyond them, and replace the backlash.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from orthocal.arrays import Array
+from orthocal.effects.loading import robot_effects
+from orthocal.io.documents import Number
+from orthocal.io.fields import CLOSED, Matrix
+from orthocal.robot.model import Drive, Robot
+from orthocal.units import DRIVE_UNITS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointTrim:
+    """Trim of one joint."""
+
+    __pydantic_config__ = CLOSED
+
+    backlash: Annotated[Number, Field(ge=0.0)] = 0.0
+    """Backlash that the controller takes up, [m, rad]; without effect beside a table."""
+    table: Matrix | None = None
+    """Position of the joint, trim after it grew and after it fell, shape (n, 3), [m, rad]."""
+
+    def __call__(self, joints: Array) -> Array:
+        """Trims on both sides, shape (n, 2) of positions (n,), [m, rad]."""
+        if self.table is None:
+            return np.tile([0.5 * self.backlash, -0.5 * self.backlash], (len(joints), 1))
+        columns = [np.interp(joints, self.table[:, 0], self.table[:, k]) for k in (1, 2)]
+        return np.stack(columns, axis=1)
+
+
+Compensation = tuple[JointTrim, ...]
+"""Trim of the joint of each drive, in the robot's order."""
+
+NEGLIGIBLE = 1e-9
+"""Difference of trims that does not count, [m, rad]: tables are written to 1e-6 mm."""
+
+
+def compensates_alike(one: Sequence[JointTrim], other: Sequence[JointTrim]) -> bool:
+    """True if two controllers compensate the same; an empty compensation is none."""
+    if not (one and other):
+        return not any(t.backlash or t.table is not None for t in one or other)
+    for a, b in zip(one, other, strict=True):
+        at = [t.table[:, 0] for t in (a, b) if t.table is not None]
+        joints = np.concatenate([*at, np.zeros(1)])
+        if np.abs(a(joints) - b(joints)).max() > NEGLIGIBLE:
+            return False
+    return True
+
+
+def displace_drives(
+    robot: Robot, trims: Sequence[JointTrim], displayed: Array, sides: Array
+) -> Array:
+    """Displacement of the drives by the controller.
+
+    A trim is applied as far as the robot's effects describe what it corrects: the difference of
+    both sides if one depends on the approach, the mean of both if one is periodic. What they do not
+    describe is taken as corrected.
+
+    Args:
+        robot: The robot with its effects.
+        trims: Trim of the joint of each drive.
+        displayed: Commanded drive coordinates with the active offsets, as the controller displays
+            them, shape (n, n_drives), [m, rad].
+        sides: 1 where the coordinate grew in the last motion, -1 where it fell, 0 for the mean of
+            both sides, shape (n, n_drives).
+
+    Returns:
+        Shape (n, n_drives), [m, rad].
+    """
+    effects = robot_effects(robot)
+    sided = any("approach" in e.conditions for e in effects)
+    periodic = any(e.period is not None for e in effects)
+    result = np.zeros(displayed.shape)
+    for i, (drive, trim) in enumerate(zip(robot.drives, trims, strict=True)):
+        both = trim(drive.to_joint(displayed[:, i]))
+        half = 0.5 * (both[:, 0] - both[:, 1])
+        result[:, i] = sided * sides[:, i] * half
+        if periodic:
+            result[:, i] += drive.direction * both.mean(axis=1)
+    return result
+
+
+def describe_trims(robot: Robot, trims: Sequence[JointTrim]) -> str:
+    """What a controller compensates in each drive, in words; empty for nothing."""
+    texts = []
+    for drive, trim in zip(robot.drives, trims, strict=False):
+        unit, size = DRIVE_UNITS[drive.unit]
+        if trim.table is not None:
+            texts.append(f"{drive.name} by a table")
+        elif trim.backlash:
+            texts.append(f"{drive.name} {trim.backlash / size:.3f} {unit}")
+    return ", ".join(texts)
+
+
+def table_name(joint: int) -> str:
+    """File name of the table of a joint (COMP_FILE of LinuxCNC)."""
+    return f"joint_{joint}.comp"
+
+
+def format_table(trim: JointTrim, drive: Drive) -> str:
+    """Text of a table: position, trim after the joint grew and after it fell, in mm or degrees."""
+    if trim.table is None:
+        return ""
+    size = DRIVE_UNITS[drive.unit][1]
+    return "".join(" ".join(f"{v / size:.6f}" for v in row) + "\n" for row in trim.table)

@@ -1,0 +1,362 @@
+"""Random machines, their readings of a plan, and the models that identify them.
+
+A model may lack effects beside geometry that the machines have. Errors of a machine are elementary
+errors in the order of its own robot (`ErrorMap.names`), those of an estimate in the order of the
+model's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.arrays import Array, Mask
+from orthocal.errors import ClosureError, SolverError
+from orthocal.estimation.choice import Choice
+from orthocal.estimation.fit import fit_problem
+from orthocal.estimation.options import SolverOptions
+from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.selection import Selection
+from orthocal.estimation.solvers.batch import BatchSolver
+from orthocal.kinematics.conditions import UseSamples, effects_by_condition, sample_use
+from orthocal.kinematics.loop_closure import Failures, LoopClosure
+from orthocal.kinematics.workspace import Workspace, gauss_box
+from orthocal.observation.simulate import limits_of, show_readings
+from orthocal.planning.expected_error import noise_of, weigh_readings
+from orthocal.robot.model import Robot
+from orthocal.session.session import Session
+
+PILOT_MACHINES = 9
+"""Machines whose residuals give the weight of a reading where the model omits errors."""
+
+NEGLIGIBLE = 1e-9
+"""Difference of readings or tool positions that does not matter, [m]."""
+
+CALIBRATED = "calibrated"
+NO_CONTACT = "a tip misses the part it should touch"
+OUT_OF_RANGE = "a reading exceeds the gauge's range"
+NOT_ASSEMBLED = "the machine cannot be assembled in every posture"
+NOT_CONVERGED = "the calibration does not converge"
+
+Status = NDArray[np.object_]
+"""CALIBRATED, or the reason why a machine cannot be calibrated, shape (n_sets,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class MachineModel:
+    """A model by which machines are identified."""
+
+    problem: CalibrationProblem
+    """Of the identified errors."""
+    program: BatchSolver
+    sigma: float
+    """Standard deviation that weights a reading, [m]."""
+
+    @staticmethod
+    def of(session: Session, choice: Choice, *, sigma: float) -> MachineModel:
+        """The model of a choice of errors."""
+        problem = CalibrationProblem(session, choice.select(session.robot.parameters))
+        problem = weigh_readings(problem)
+        return MachineModel(problem, BatchSolver(problem), sigma)
+
+    @property
+    def robot(self) -> Robot:
+        """The nominal robot, with the effects of the model."""
+        return self.problem.robot
+
+    def estimate(self, values: Array) -> tuple[Array, Mask]:
+        """Estimates of machines, and whether each calibration converges.
+
+        Args:
+            values: Readings, shape (n_sets, n_entries), [m of the first gauge].
+
+        Returns:
+            Free parameters, shape (n_sets, n_free), [SI], NaN where the calibration fails.
+        """
+        theta = np.full((len(values), self.problem.n_free), np.nan)
+        converged = np.ones(len(values), dtype=np.bool_)
+        try:
+            return self.program.solve(values, sigma=self.sigma).theta, converged
+        except (SolverError, ClosureError):  # one by one, to find the machines that fail
+            for i in range(len(values)):
+                try:
+                    program = BatchSolver(self.problem)
+                    theta[i] = program.solve(values[i : i + 1], sigma=self.sigma).theta[0]
+                except (SolverError, ClosureError):
+                    converged[i] = False
+            return theta, converged
+
+    @property
+    def columns(self) -> Array:
+        """Elementary errors of one unit of each identified parameter, (n_errors, n_machine)."""
+        return self.problem.functions.errors.columns(self.problem.machine_selection.names)
+
+    def errors(self, theta: Array) -> Array:
+        """Elementary errors of estimates, shape (n_sets, n_errors) of (n_sets, n_free), [SI]."""
+        estimated = theta[:, : self.problem.n_machine] @ self.columns.T
+        return np.asarray(self.problem.closure.errors() + estimated)
+
+    def translate(self, errors: Array, names: Sequence[str]) -> Array:
+        """Errors of a robot with other effects in the order of this one, 0 where it lacks them.
+
+        Args:
+            errors: Shape (n_sets, n), [SI].
+            names: Names of the errors, shape (n,).
+        """
+        place = {name: i for i, name in enumerate(names)}
+        own = self.problem.functions.errors.names
+        result = np.zeros((len(errors), len(own)))
+        known = [i for i, name in enumerate(own) if name in place]
+        result[:, known] = errors[:, [place[own[i]] for i in known]]
+        return result
+
+    def identified_part(self, errors: Array, names: Sequence[str]) -> Array:
+        """True values of the identified parameters, shape (n_sets, n_machine), [SI].
+
+        A parameter that moves several elementary errors has their least-squares value.
+
+        Args:
+            errors: All elementary errors, shape (n_sets, n), [SI].
+            names: Their names, shape (n,).
+        """
+        columns = self.columns
+        return np.asarray(self.translate(errors, names) @ (columns / (columns**2).sum(axis=0)))
+
+    def explains(self, truth: CalibrationProblem) -> bool:
+        """True if all errors of the machines are identified."""
+        if not set(truth.robot.effect_names) <= set(self.robot.effect_names):
+            return False
+        own = self.columns
+        moved = self.translate(truth.errors_per_theta.T, truth.functions.errors.names).T
+        return np.allclose(own @ (np.linalg.pinv(own) @ moved), moved, atol=1e-12)
+
+
+@dataclass(frozen=True, eq=False)
+class Tool:
+    """Tool positions over a workspace, under the conditions in which machines are used."""
+
+    workspace: Workspace
+    """The points, once for each condition."""
+    use: UseSamples
+    drives: Array
+    """Commanded for the points, shape (K, n_drives), [m, rad]."""
+    passive: Array
+    """Passive coordinates of the nominal machine there, shape (K, n_passive), [m, rad]."""
+    positions: Array
+    """Tool positions of the nominal machine, for each of C conditions, shape (C K, 3), [m]."""
+
+    @staticmethod
+    def of(session: Session, box: Sequence[tuple[float, float]]) -> Tool:
+        """The tool of a session's machine with the offsets that are active in its controller."""
+        robot = session.robot
+        workspace, use = gauss_box(robot, box), sample_use(robot)
+        closure = LoopClosure(robot)
+        nominal = closure.inverse(workspace.points)
+        drives = nominal - session.active_offsets
+        positions = closure.tcp(nominal, closure.close(nominal))
+        return Tool(
+            workspace.repeat(use.size),
+            use,
+            drives,
+            closure.close(drives),
+            np.tile(positions, (use.size, 1)),
+        )
+
+    def __call__(self, robot: Robot, errors: Array) -> tuple[Array, Mask]:
+        """Tool positions of machines, shape (C K, 3, n_sets), [m], and whether their loops close.
+
+        Args:
+            robot: The nominal robot with the effects of the machines.
+            errors: All elementary errors of each machine, shape (n_sets, n_errors), [SI].
+        """
+        conditions = self.use.conditions if effects_by_condition(robot) else (None,)
+        closed, positions = np.ones(len(errors), dtype=np.bool_), []
+        for stated in conditions:
+            closure, failures = LoopClosure(robot, conditions=stated), Failures()
+            q = closure.close(self.drives, errors=errors, start=self.passive, failures=failures)
+            closed[[i // len(self.drives) for i in failures]] = False
+            positions.append(closure.tcp(self.drives, q, errors=errors))
+        fields = np.concatenate(positions * (self.use.size // len(positions)), axis=1)
+        return np.moveaxis(fields, 0, -1), closed
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Random machines and their readings."""
+
+    errors: Array
+    """All elementary errors, shape (n_sets, n_errors), [SI]."""
+    values: Array
+    """Single readings, shape (n_sets, n_entries), [m of the first gauge]."""
+    rows: Array
+    """Rows of the session, shape (n_sets, n_rows), [m]."""
+    status: Status
+
+
+@dataclass(frozen=True, eq=False)
+class RandomMachines:
+    """Machines of a study, shared by all of its tasks."""
+
+    seed: int
+    truth: CalibrationProblem
+    """Of all errors that machines have."""
+    models: tuple[MachineModel, ...]
+    """The model of the study, then the one with all effects of the machines if it is another."""
+    tool: Tool
+    limits: Array
+    """Smallest and largest value of each row, shape (2, n_rows), [m]."""
+
+    @staticmethod
+    def of(
+        session: Session,
+        truth: Selection,
+        models: Sequence[tuple[Session, Choice]],
+        *,
+        box: Sequence[tuple[float, float]],
+        seed: int,
+        count: int,
+    ) -> RandomMachines:
+        """Machines that are measured by a plan, with the weights of their readings.
+
+        Args:
+            session: The plan, of the robot with all effects of the machines.
+            truth: All errors of the machines.
+            models: The plan of the robot with the effects of each model, and its identified errors.
+            box: As for `AccuracyStudy`.
+            seed: Seed of errors, gauges and noise.
+            count: Number of machines.
+        """
+        sigma = noise_of(session)
+        identified = [MachineModel.of(s, c, sigma=sigma) for s, c in models]
+        limits = [limits_of(session, r) or (-np.inf, np.inf) for r in session.readings]
+        machines = RandomMachines(
+            seed,
+            CalibrationProblem(session, truth, noise_ratio=identified[0].problem.noise_ratio),
+            tuple(identified),
+            Tool.of(session, box),
+            np.array(limits).T,
+        )
+        weighted = [replace(m, sigma=machines.weighting_sigma(m, count)) for m in identified]
+        return replace(machines, models=tuple(weighted))
+
+    @property
+    def model(self) -> MachineModel:
+        """The model of the study."""
+        return self.models[0]
+
+    @property
+    def error_names(self) -> tuple[str, ...]:
+        """Names of the elementary errors of the machines."""
+        return self.truth.functions.errors.names
+
+    @property
+    def alike_without_errors(self) -> bool:
+        """Whether model and machines without errors have the same readings and the same tool."""
+        readings, tools = [], []
+        for problem in (self.truth, self.model.problem):
+            none = np.zeros((1, len(problem.functions.errors.names)))
+            readings.append(problem.predict(np.zeros(problem.n_free)))
+            tools.append(self.tool(problem.robot, none)[0])
+        return all(np.abs(one - other).max() < NEGLIGIBLE for one, other in (readings, tools))
+
+    def draw(self, number: int) -> tuple[Array, np.random.Generator]:
+        """Scaled true errors of a machine and its gauges, and the generator of its noise."""
+        rng = np.random.default_rng((self.seed, number))
+        drawn = rng.normal(size=self.truth.n_free)
+        positive = [p.positive for p in self.truth.parameters]
+        return np.where(positive, np.abs(drawn), drawn), rng
+
+    def true_values(self, number: int, names: Sequence[str]) -> Array:
+        """True values of identified parameters and of nuisance parameters of a machine, [SI].
+
+        Args:
+            number: Number of the machine.
+            names: Names of the parameters; nuisance parameters that machines lack are 0.
+        """
+        truth, n = self.truth, self.truth.n_machine
+        scaled = self.draw(number)[0] * truth.theta_scale
+        errors = truth.closure.errors(scaled[:n])
+        part = self.model.identified_part(errors[None], self.error_names)[0]
+        values = dict(zip(truth.free[n:], scaled[n:].tolist(), strict=True))
+        values |= dict(zip(self.model.problem.machine_selection.names, part.tolist(), strict=True))
+        return np.array([values.get(name, 0.0) for name in names])
+
+    def measure(self, numbers: Sequence[int]) -> Measured:
+        """Random machines and their readings."""
+        draws, generators = zip(*(self.draw(n) for n in numbers), strict=True)
+        theta, truth = np.array(draws), self.truth
+        o = truth.observations
+        predicted, _, closed = truth.simulate(theta * truth.theta_scale)
+        status = np.where(closed, CALIBRATED, NOT_ASSEMBLED).astype(object)
+        entries = predicted * truth.noise_ratio
+        for i, rng in enumerate(generators):
+            entries[i], _ = show_readings(truth.session, o, entries[i], rng=rng)
+        set_reason(status, np.asarray(~np.isfinite(entries).all(axis=1)), NO_CONTACT)
+        rows = np.array([o.rows(v) for v in entries])
+        beyond = (rows < self.limits[0]) | (rows > self.limits[1])
+        set_reason(status, np.asarray(beyond.any(axis=1)), OUT_OF_RANGE)
+        errors = truth.closure.errors() + theta[:, : truth.n_machine] @ truth.errors_per_theta.T
+        return Measured(errors, entries / truth.noise_ratio, rows, status)
+
+    def estimate(self, measured: Measured) -> list[Array]:
+        """Estimates by each model, shape (n_sets, n_free), [SI].
+
+        NaN where a machine cannot be calibrated by one of them; `measured.status` says why.
+        """
+        status = measured.status
+        good = np.flatnonzero(status == CALIBRATED)
+        estimates = []
+        for model in self.models:
+            theta = np.full((len(status), model.problem.n_free), np.nan)
+            if good.size:
+                theta[good], converged = model.estimate(measured.values[good])
+                set_reason(status, good[~converged], NOT_CONVERGED)
+            estimates.append(theta)
+        return estimates
+
+    def tool_errors(self, measured: Measured, estimates: Sequence[Array]) -> list[Array]:
+        """Tool errors before a calibration and after that by each model, (C K, 3, n_sets), [m].
+
+        Args:
+            measured: The machines; `status` is changed where the loops of one do not close.
+            estimates: Estimates by each model, shape (n_sets, n_free), [SI].
+        """
+        status = measured.status
+        good = np.flatnonzero(status == CALIBRATED)
+        machines = [(self.truth.robot, measured.errors)]
+        machines += [(m.robot, m.errors(t)) for m, t in zip(self.models, estimates, strict=True)]
+        tools = np.full((len(machines), *self.tool.positions.shape, len(status)), np.nan)
+        for tool, (robot, errors) in zip(tools, machines, strict=True):
+            if good.size:
+                positions, closed = self.tool(robot, errors[good])
+                set_reason(status, good[~closed], NOT_ASSEMBLED)
+                tool[..., good] = positions
+        tools[..., status != CALIBRATED] = np.nan
+        return [tools[0] - self.tool.positions[..., None], *(tools[0] - t for t in tools[1:])]
+
+    def weighting_sigma(self, model: MachineModel, count: int) -> float:
+        """Standard deviation that weights a reading, [m].
+
+        It is the stated noise, unless machines have errors that the model does not identify. Then
+        the residuals give it, as in a calibration: the median of a few pilot machines.
+        """
+        if model.explains(self.truth):
+            return model.sigma
+        measured = self.measure(range(min(PILOT_MACHINES, count)))
+        options, sigmas = SolverOptions(solver="variable-projection"), []
+        for rows in measured.rows[measured.status == CALIBRATED]:
+            with suppress(SolverError, ClosureError):
+                sigmas.append(fit_problem(model.problem.with_values(rows), options=options).sigma)
+        return max(float(np.median(sigmas)), model.sigma) if sigmas else model.sigma
+
+
+def set_reason(status: Status, which: NDArray[Any], reason: str) -> None:
+    """Record why machines, by flag or index, have no result; an earlier reason stays."""
+    selected = np.zeros(len(status), dtype=np.bool_)
+    selected[which] = True
+    status[selected & (status == CALIBRATED)] = reason
