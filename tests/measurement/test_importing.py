@@ -233,6 +233,14 @@ FORMS = [
          "`orthocal import --separator comma`, for one number save the table with semicolons"),
     text("three-and-five-with-option", "setup,posture,Wert_um,Zyklus\nxy,zero,3,5\n",
          (("xy", "zero", "", 5, "0.003"),), separator="comma"),
+    text("thousands-or-two-cycles", "setup,posture,cycle 1 [mm],cycle 2 [mm]\nxy,zero,1,000.000\n",
+         "{}:2: '1,000.000' may be two cells or one number with a comma between thousands; for two "
+         "cells use `orthocal import --separator comma`, for one number save the table with "
+         "semicolons"),
+    text("two-cycles-by-another-row",
+         "setup,posture,cycle 1 [um],cycle 2 [um]\nxy,zero,1,100.0\nxy,x_max,0.5,0.4\n",
+         (("xy", "zero", "", 1, "0.001"), ("xy", "zero", "", 2, "0.1"),
+          ("xy", "x_max", "", 1, "0.0005"), ("xy", "x_max", "", 2, "0.0004"))),
     text("decimal-comma-between-commas", "setup,posture,reading_mm\nxy,zero,0,5\n",
          "{}:2: has 4 fields; expected 3; a decimal comma between commas? Save the table with "
          "semicolons, or its numbers in quotes"),

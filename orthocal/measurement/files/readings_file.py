@@ -18,6 +18,7 @@ from pathlib import Path
 
 from orthocal.errors import SessionError
 from orthocal.io.documents import MOST_CSV_ROWS, csv_rows, read_text
+from orthocal.io.tables.cell import Row
 from orthocal.io.tables.delimited import SEPARATORS, decode, stated_separator
 from orthocal.io.tables.numerals import (
     DecimalSign,
@@ -281,15 +282,23 @@ def _table_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
         yield RawReading(where, row.line, **cells)
 
 
+def _is_grouped(row: Row, pairs: Collection[tuple[int, int]]) -> bool:
+    """True if two cells of a row may be one number with a comma between thousands."""
+    cells = [(row.cell(i).text.strip(), row.cell(j).text.strip()) for i, j in pairs]
+    return any(_WHOLE.fullmatch(a) and _GROUP.fullmatch(b) for a, b in cells)
+
+
 _WHOLE = re.compile(r"[-+\u2212\u2013]?[0-9]+")
 _DIGITS = re.compile(r"[0-9]+")
+_GROUP = re.compile(r"[0-9]{3}(\.[0-9]*)?")
 
 
 def require_whole_cells(table: Table, columns: Columns, *, sure: bool = False) -> None:
     """Refuse a table with commas as separators in which a comma may be a decimal sign as well.
 
     Who writes 3,5 without quotes between commas makes two cells of a number: the row has a cell
-    more than the headings, or, where nothing followed, looks like two whole numbers.
+    more than the headings, or, where nothing followed, looks like two whole numbers. 1,000.0 does
+    the same: a row alone does not decide, but another row with other cells does.
 
     Args:
         table: The table.
@@ -303,9 +312,11 @@ def require_whole_cells(table: Table, columns: Columns, *, sure: bool = False) -
         return
     readings = list(columns.readings)
     texts = [row.cell(i).text for row in table.rows for i in readings]
-    certain = sure or is_house(table.header) or any("." in t or "," in t for t in texts)
+    sure = sure or is_house(table.header)
+    certain = sure or any("." in t or "," in t for t in texts)
     pairs = {(i, i + 1) for i in readings} | {(i - 1, i) for i in readings if i}
     pairs -= {(i - 1, i) for i in readings if i - 1 in columns.keys}
+    grouped = not sure and all(_is_grouped(row, pairs) for row in table.rows)
     for row in table.rows:
         if row.width > table.header_width:
             raise SessionError(
@@ -313,14 +324,15 @@ def require_whole_cells(table: Table, columns: Columns, *, sure: bool = False) -
                 "between commas? Save the table with semicolons, or its numbers in quotes",
                 where=table.place(row.line),
             )
-        if certain:
+        if certain and not grouped:
             continue
         for first, second in sorted(pairs):
             a, b = row.cell(first).text.strip(), row.cell(second).text.strip()
-            if _WHOLE.fullmatch(a) and _DIGITS.fullmatch(b):
+            if _WHOLE.fullmatch(a) and (_GROUP if grouped else _DIGITS).fullmatch(b):
+                sign = "comma between thousands" if grouped else "decimal comma"
                 raise SessionError(
-                    f"'{shorten(a)},{shorten(b)}' may be two cells or one number with a decimal "
-                    "comma; for two cells use `orthocal import --separator comma`, for one number "
-                    "save the table with semicolons",
+                    f"'{shorten(a)},{shorten(b)}' may be two cells or one number with a {sign}; "
+                    "for two cells use `orthocal import --separator comma`, for one number save "
+                    "the table with semicolons",
                     where=table.place(row.line),
                 )
