@@ -19,7 +19,7 @@ from orthocal.assessment.plausibility import (
     are_finer,
     find_finer,
     find_implausible,
-    find_overstated,
+    find_impossible_gauges,
     find_scattered,
 )
 from orthocal.assessment.words import plausibility as words
@@ -150,10 +150,10 @@ def is_far(value: float, mean: float, std: float) -> bool:
 def _find_mistakes(session: Session) -> list[Finding]:
     """Anomalies of a session; without any, gauges whose repeated readings scatter too much.
 
-    Nothing is sought if the stated noise of a gauge, which all evidence rests on, is impossible.
+    Nothing is sought if a gauge is impossible as stated.
     """
-    if overstated := list(find_overstated(session)):
-        return overstated
+    if impossible := list(find_impossible_gauges(session)):
+        return impossible
     anomalies = describe_anomalies(session, find_anomalies(session))
     return anomalies or list(find_scattered(session))
 

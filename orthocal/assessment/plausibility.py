@@ -12,7 +12,7 @@ from orthocal.arrays import Array
 from orthocal.assessment.wording import signed
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import MOST_PLACES, place_of
-from orthocal.calibration.assessment_record import Finding
+from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.errors import OrthocalError
 from orthocal.estimation.fit import Fit, fit_problem
 from orthocal.estimation.options import SolverOptions
@@ -41,6 +41,12 @@ FEWEST = 5.0
 
 TOO_COARSE = 30.0
 """Ratio of stated noise to scatter that no gauge has in the right unit."""
+
+FEWEST_STEPS = 10
+"""Steps within a gauge's range below which its resolution is in another unit."""
+
+FEW_STEPS = 3
+"""Steps that readings span below which they are not of such a gauge."""
 
 COMPUTED = 1e-7
 """Scatter below which no dial showed the readings, [m]."""
@@ -82,31 +88,55 @@ def find_scattered(session: Session) -> tuple[Finding, ...]:
     return tuple(f for f in found if f is not None)
 
 
-def find_overstated(session: Session) -> Iterator[Finding]:
-    """Gauges whose stated noise is many times their resolution: it is in another unit."""
-    for gauge in session.gauges.values():
-        if gauge.sigma and gauge.resolution and gauge.sigma > TOO_COARSE * gauge.resolution:
-            yield words.sigma_too_large(gauge.sigma, step=gauge.resolution)
+def find_impossible_gauges(session: Session) -> Iterator[Finding]:
+    """Gauges whose stated noise or resolution is impossible, which all evidence rests on.
+
+    A noise of many times the resolution is in another unit. So is a resolution of which the range
+    has only a few steps; or of many times the noise, or of which the readings span only a few
+    steps, with readings between the steps.
+    """
+    for name, gauge in session.gauges.items():
+        step, sigma = gauge.resolution, gauge.sigma
+        if not step:
+            continue
+        if sigma and sigma > TOO_COARSE * step:
+            yield words.sigma_too_large(sigma, step=step)
+        if gauge.range and np.ptp(gauge.range) < FEWEST_STEPS * step:
+            yield words.coarser_than_range(step, gauge.range)
+            continue
+        rows = _rows_of(session, name)
+        finer = _finer_rows(session, rows, gauge)
+        if finer and (
+            step > TOO_COARSE * sigma if sigma else np.ptp(session.values[rows]) < FEW_STEPS * step
+        ):
+            yield words.coarser_than_readings(len(finer), len(rows), step, *_first(session, finer))
 
 
 def find_finer(session: Session) -> Iterator[Finding]:
     """Gauges of which at least half of the readings lie between the steps."""
     for name, gauge in session.gauges.items():
-        rows_of_gauge = [
-            i for i, r in enumerate(session.readings) if session.setups[r.setup].gauge == name
-        ]
-        finer = np.flatnonzero(are_finer(session.values[rows_of_gauge], gauge))
-        if finer.size * 2 < len(rows_of_gauge) or not finer.size:
-            continue
-        first = rows_of_gauge[int(finer[0])]
-        yield words.finer_than_gauge(
-            finer.size,
-            len(rows_of_gauge),
-            gauge.resolution or 0.0,
-            session.where(session.readings[first]),
-            session.readings[first].value,
-            [place_of(session, rows_of_gauge[int(i)]) for i in finer[:MOST_PLACES]],
-        )
+        rows = _rows_of(session, name)
+        if finer := _finer_rows(session, rows, gauge):
+            yield words.finer_than_gauge(
+                len(finer), len(rows), gauge.resolution or 0.0, *_first(session, finer)
+            )
+
+
+def _rows_of(session: Session, gauge: str) -> list[int]:
+    """Rows that a gauge reads."""
+    return [i for i, r in enumerate(session.readings) if session.setups[r.setup].gauge == gauge]
+
+
+def _finer_rows(session: Session, rows: list[int], gauge: Gauge) -> list[int]:
+    """Rows between the steps of a gauge, if they are at least half of its rows; else none."""
+    finer = np.flatnonzero(are_finer(session.values[rows], gauge)).tolist()
+    return [rows[i] for i in finer] if finer and len(finer) * 2 >= len(rows) else []
+
+
+def _first(session: Session, rows: Sequence[int]) -> tuple[str, float, list[Place]]:
+    """File and line of the first of some rows, its value [m], and the places of the rows."""
+    first = session.readings[rows[0]]
+    return session.where(first), first.value, [place_of(session, i) for i in rows[:MOST_PLACES]]
 
 
 def are_finer(values: ArrayLike, gauge: Gauge) -> NDArray[np.bool_]:

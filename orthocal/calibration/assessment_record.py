@@ -54,6 +54,7 @@ FindingKind = Literal[
     "finer than the gauge",
     "residuals too small",
     "sigma too large",
+    "resolution too coarse",
     "postures too near",
     "legs differ",
     # of a fit

@@ -108,6 +108,7 @@ def with_backlash(folder):
 def spoilt(cycles, workshop, table1, folder):
     """Sessions by what is wrong with them, with the verdict that they deserve."""
     largest, backlash = int(np.abs(cycles.values).argmax()), with_backlash(folder)
+    coarse = replace(cycles.gauge, resolution=10e-3)
     return {
         "sound": (cycles, "enter"),
         "workshop": (workshop, "enter"),
@@ -119,6 +120,7 @@ def spoilt(cycles, workshop, table1, folder):
         "reversed sign": (change(cycles, largest, -cycles.values[largest]), "review"),
         "decimal point": (change(cycles, largest, 0.1 * cycles.values[largest]), "review"),
         "inches": (cycles.with_values(np.round(cycles.values / 25.4, 7)), "review"),
+        "resolution": (cycles.with_gauge(coarse), "review"),
         "swapped rows": (swap(cycles, 1, 2), "review"),
         "displaced gauge": (displace(cycles, "yx", 0.2e-3), "review"),
         "drift": (drift(cycles, 0.1e-3), "review"),
@@ -130,7 +132,14 @@ def spoilt(cycles, workshop, table1, folder):
 CASES = [
     *("sound", "workshop", "experiment 2", "experiment 3", "experiment 1 as printed"),
     *("experiment 1 corrected", "reversed setup", "reversed sign", "decimal point", "inches"),
-    *("swapped rows", "displaced gauge", "drift", "backlash", "backlash in the model"),
+    *(
+        "resolution",
+        "swapped rows",
+        "displaced gauge",
+        "drift",
+        "backlash",
+        "backlash in the model",
+    ),
 ]
 
 

@@ -21,7 +21,7 @@ from orthocal import (
     summarize,
 )
 from orthocal.assessment.judgement import judge_session
-from orthocal.assessment.plausibility import find_implausible
+from orthocal.assessment.plausibility import find_implausible, find_impossible_gauges
 from orthocal.calibration.file import calibration_json
 from orthocal.errors import RobotError
 from orthocal.output.text.answer import describe_machine
@@ -129,6 +129,36 @@ def test_legs_of_different_lengths_are_noticed(tmp_path):
     session = simulate_session(load_plan(plans.write(tmp_path, plan)), TRUTH, seed=1).session
     (found,) = [f for f in find_implausible(session) if f.kind == "legs differ"]
     assert found.numbers == pytest.approx({"x_mm": 308.3, "y_mm": 310.25, "z_mm": 310.25})
+
+
+@pytest.mark.parametrize(
+    ("gauge", "number"),
+    [
+        ({"resolution": 10e-3, "range": (-0.4e-3, 0.4e-3)}, {"range_mm": 0.8}),
+        ({"resolution": 10e-3, "range": None}, {"finer": 49.0}),  # nearly all miss such steps
+        ({"resolution": 0.5e-3}, {"finer": 51.0}),  # of ±5 mm, but 50 times the noise
+        ({"resolution": 0.5e-3, "sigma": None, "range": None}, {"finer": 51.0}),
+    ],
+)
+def test_a_resolution_that_the_gauge_or_its_readings_contradict_is_the_only_cause(
+    root, gauge, number
+):
+    """Not decimal points or inches, which such steps would explain as well."""
+    session = load_session(root / "examples/raw-cycles")
+    wrong = session.with_gauge(replace(session.gauge, **gauge))
+    (found,) = [f for f in judge_session(wrong).findings if f.severity != "note"]
+    assert found.kind == "resolution too coarse"
+    expected = {"resolution_mm": gauge["resolution"] * 1e3} | number
+    assert found.numbers == pytest.approx(expected)
+    assert all(p.line for p in found.places)
+
+
+@pytest.mark.parametrize("resolution", [1e-6, 5e-6, 10e-6, None])
+def test_a_resolution_that_suits_the_gauge_is_not_contradicted(root, resolution):
+    session = load_session(root / "examples/raw-cycles")
+    for limits in (session.gauge.range, None):
+        known = replace(session.gauge, resolution=resolution, range=limits)
+        assert list(find_impossible_gauges(session.with_gauge(known))) == []
 
 
 def test_a_leg_of_250_metres_is_refused(tmp_path):

@@ -56,6 +56,34 @@ def finer_than_gauge(
     )
 
 
+def coarser_than_range(step: float, limits: tuple[float, float]) -> Finding:
+    """The stated range of the gauge has only a few of its steps."""
+    low, high = (limit / MM for limit in limits)
+    return review(
+        "resolution too coarse",
+        f"The session states a resolution of {step / MM:g} mm (gauge.resolution_mm) for a gauge "
+        f"that shows {low:g} … {high:g} mm.",
+        "Make sure that gauge.resolution_mm and gauge.range_mm are in mm.",
+        resolution_mm=step / MM,
+        range_mm=high - low,
+    )
+
+
+def coarser_than_readings(
+    count: int, total: int, step: float, where: str, value: float, places: Sequence[Place]
+) -> Finding:
+    """Readings contradict the stated resolution of the gauge."""
+    return review(
+        "resolution too coarse",
+        f"The session states a resolution of {step / MM:g} mm (gauge.resolution_mm), but {count} "
+        f"of {total} readings lie between such steps. The first is {value / MM:.6g} mm in {where}.",
+        "Make sure that gauge.resolution_mm is right, and that the readings are in mm.",
+        places,
+        finer=float(count),
+        resolution_mm=step / MM,
+    )
+
+
 def residuals_too_small(left: float, rounding: float, step: float) -> Finding:
     """Residuals are smaller than rounding to the gauge's steps leaves."""
     return review(
