@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import orthocal
-from orthocal.cli.options import Anyway, CalibrationPath, Json, command, split_globs
+from orthocal.cli.options import Anyway, CalibrationPath, Details, Json, command, split_globs
 from orthocal.cli.printing import deliver
 from orthocal.errors import ParameterError
 
@@ -13,6 +13,7 @@ def adjust(
     calibration: CalibrationPath,
     among: str | None = None,
     json: Json = False,
+    details: Details = False,
     anyway: Anyway = False,
 ) -> None:
     """Plan mechanical adjustments of feet, shims and threads.
@@ -38,6 +39,6 @@ def adjust(
     plan = orthocal.plan_adjustments(result, among=names)
     deliver(
         lambda: text.plan_json(result, plan),
-        lambda: text.print_plan(result, plan, saved=calibration),
+        lambda: text.print_plan(result, plan, saved=calibration, details=details),
         json=json,
     )

@@ -24,6 +24,8 @@ from orthocal.assessment.controller_entries import offsets_to_enter
 from orthocal.calibration.adjusting import adjust_calibration
 from orthocal.effects.adjustment import find_adjustments
 from orthocal.errors import RobotError
+from orthocal.output.text.adjustment import render_plan
+from orthocal.output.text.layout import to_text
 
 QUICK = {"solver": "variable-projection"}
 SEEDS = (2, 4)
@@ -161,6 +163,22 @@ def test_a_machine_of_right_angles_is_left_alone(plan):
     planned = plan_adjustments(calibrate(session, **QUICK))
     assert planned.judgement == "small gain"
     assert planned.gain < 0.05
+
+
+def test_adjustments_that_are_not_worth_doing_are_details(machines, plans):
+    _, calibration = machines[4]
+    assert plans[4].judgement == "worthwhile"
+    uncertain = replace(plans[4], moved_uncertainty=1.0)
+    assert uncertain.judgement == "uncertain gain"
+
+    def show(plan, **options):
+        return to_text(render_plan(calibration, plan, saved=None, **options))
+
+    names = [p.adjustment.name for p in plans[4].adjustments]
+    assert all(name in show(plans[4]) for name in names)
+    assert not any(name in show(uncertain) for name in names)
+    assert "--details" in show(uncertain)
+    assert all(name in show(uncertain, details=True) for name in names)
 
 
 def test_a_robot_without_adjustments_is_refused(orthoglide, root):

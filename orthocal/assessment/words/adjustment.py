@@ -42,8 +42,9 @@ def describe_gain(plan: AdjustmentPlan) -> list[str]:
     """Expected tool error before and after, and the least that any adjustment can reach."""
     lines = []
     if plan.adjustments:
+        which = "these" if plan.judgement == "worthwhile" else "the best"
         lines.append(
-            "Expected tool error with these adjustments and offsets: "
+            f"Expected tool error with {which} adjustments and offsets: "
             f"{tool_mm(plan.after.entered)} RMS (offsets alone: {tool_mm(plan.before.entered)})."
         )
     else:

@@ -29,6 +29,8 @@ from orthocal.units import MM
 
 SCHEMA = "orthocal/adjustment/1"
 
+MORE = "--details lists these adjustments."
+
 
 def render_adjustments(calibration: Calibration, *, saved: Path | None = None) -> RenderableType:
     """The plan of adjustments of a calibration, or why there is none.
@@ -46,19 +48,31 @@ def render_adjustments(calibration: Calibration, *, saved: Path | None = None) -
         return Text(f"The adjustments cannot be planned: {e}.")
 
 
-def print_plan(calibration: Calibration, plan: AdjustmentPlan, *, saved: Path) -> None:
-    """Print a plan of adjustments."""
+def print_plan(
+    calibration: Calibration, plan: AdjustmentPlan, *, saved: Path, details: bool
+) -> None:
+    """Print a plan of adjustments; arguments as for `render_plan`."""
     head = f"Mechanical adjustment of {calibration.robot_record.name}, model '{calibration.model}'"
-    print_rich(Group(Text(head), Text(), render_plan(calibration, plan, saved=saved)))
+    shown = render_plan(calibration, plan, saved=saved, details=details)
+    print_rich(Group(Text(head), Text(), shown))
 
 
 def render_plan(
-    calibration: Calibration, plan: AdjustmentPlan, *, saved: Path | None
+    calibration: Calibration, plan: AdjustmentPlan, *, saved: Path | None, details: bool = False
 ) -> RenderableType:
-    """A plan of adjustments; arguments as for `render_adjustments`."""
+    """A plan of adjustments.
+
+    Args:
+        calibration: The calibration.
+        plan: Its plan.
+        saved: Its directory, for the next command.
+        details: Whether to list adjustments that are not worth doing.
+    """
     parts: list[RenderableType] = [Text(HEADLINES[plan.judgement]), Text()]
-    notes = describe_limits(plan)
-    if plan.adjustments:
+    worthwhile = plan.judgement == "worthwhile"
+    listed = bool(plan.adjustments) and (worthwhile or details)
+    notes = describe_limits(plan) if listed else []
+    if listed:
         rows = [
             (
                 str(i),
@@ -80,13 +94,15 @@ def render_plan(
         ]
     parts += [Text(line) for line in describe_gain(plan)]
     parts.append(Text(describe_region(plan.before)))
-    if plan.adjustments and plan.judgement == "worthwhile":
+    if plan.adjustments and worthwhile:
         offsets = ", ".join(
             f"{e.drive} {signed(e.enter * e.edge_factor)} {e.edge_unit}" for e in plan.entries
         )
         parts.append(Text(f"Offsets to enter afterwards: {offsets}."))
     parts.append(bullets(notes))
-    if plan.adjustments and saved is not None and plan.judgement == "worthwhile":
+    if plan.adjustments and not listed:
+        parts.append(Text(MORE))
+    if plan.adjustments and saved is not None and worthwhile:
         new = quote_path(f"{saved}-adjusted")
         parts.append(
             render_next(
