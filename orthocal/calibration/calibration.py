@@ -170,6 +170,12 @@ class Calibration(CalibrationRecord):
         stated = self.session.controller_offsets
         return np.zeros(len(self.robot.drives)) if stated is None else np.array(stated)
 
+    @property
+    def measured_again(self) -> bool:
+        """True if sessions with other offsets in the controller were joined."""
+        active = tuple(self.active_offsets.tolist())
+        return any(s.active is not None and s.active != active for s in self.setups)
+
     def displacement(self, displayed: ArrayLike, approach: str | None = None) -> Array:
         """Displacement of the drives by what the controller compensated while measuring.
 

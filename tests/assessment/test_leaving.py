@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthocal import calibrate, load_session, simulate_session
+from orthocal import calibrate, load_session, restore_session, simulate_session
 from orthocal.assessment.assess import WORTH_ENTERING, assess, is_significant, lowers
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.controller_entries import entered_offsets, find_entries, offsets_to_enter
@@ -93,3 +93,25 @@ def test_the_next_step_corrects_the_other_errors(entered):
     assert "orthocal correct out PROGRAM.ngc" in answer
     assert "orthocal again" not in answer
     assert "orthocal again out" in to_text(render_answer(first, saved=Path("out")))
+
+
+def test_sessions_before_and_after_entering_end_with_the_correction(entered):
+    """Their offsets may be entered or not; a correction of all errors contains them."""
+    first, kept = entered
+    assert not first.measured_again
+    before, after = restore_session(first), restore_session(kept)
+    joint = calibrate([before, after], solver="variable-projection")
+    assert joint.measured_again
+    assert not calibrate([after, after], solver="variable-projection").measured_again
+    assert lowers(joint.assessment.tool.entered, joint.assessment.tool.compensated)
+    keep = joint.assessment.keeps_offsets
+    answer = to_text(render_answer(joint, saved=Path("out")))
+    assert "orthocal export out --to linuxcnc --out out-linuxcnc" in answer
+    assert ("orthocal correct out PROGRAM.ngc --offsets active" in answer) is not keep
+    assert "orthocal again" not in answer
+
+
+def test_there_is_a_next_step_where_nothing_is_entered(root):
+    kept = calibrate(load_session(root / "examples/table1/experiment-3"), "offsets")
+    assert kept.assessment.keeps_offsets
+    assert "orthocal again out" in to_text(render_answer(kept, saved=Path("out")))

@@ -178,24 +178,31 @@ def _next_step(
     calibration: Calibration, assessment: Assessment, saved: Path | None
 ) -> tuple[str, tuple[str, ...]]:
     """The next action, and the commands for it."""
-    decision, tool = assessment.decision, assessment.tool
-    correct = (
-        assessment.keeps_offsets
-        and not calibration.only_offsets
-        and tool is not None
-        and lowers(tool.now, tool.compensated)
-    )
-    if decision.verdict != "enter" or (assessment.keeps_offsets and not correct):
+    decision, tool, kept = assessment.decision, assessment.tool, assessment.keeps_offsets
+    if decision.verdict != "enter":
         return decision.action or "none.", ()
     if saved is None:
         return "keep the result by adding `--out DIRECTORY` to this command.", ()
     directory, new, module = (quote_path(p) for p in (saved, f"{saved}-again", f"{saved}-linuxcnc"))
-    if correct:
-        return "correct the other errors, in LinuxCNC or in programs.", (
+    correct = (
+        not calibration.only_offsets and tool is not None and lowers(tool.entered, tool.compensated)
+    )
+    if correct and (kept or calibration.measured_again):
+        words = "correct the other errors, in LinuxCNC or in programs."
+        if not kept:
+            words = (
+                "correct all identified errors, in LinuxCNC or in programs, without entering these "
+                "offsets. If the controller corrects offsets only, enter them."
+            )
+        active = "" if kept else " --offsets active"
+        return words, (
             f"orthocal export {directory} --to linuxcnc --out {module}",
-            f"orthocal correct {directory} PROGRAM.ngc --out CORRECTED.ngc",
+            f"orthocal correct {directory} PROGRAM.ngc{active} --out CORRECTED.ngc",
         )
-    return "enter the offsets, home the machine and measure again.", (
+    words = "enter the offsets, home the machine and measure again."
+    if kept:
+        words = "nothing to enter. After a crash or a change of the machine measure again."
+    return words, (
         f"orthocal again {directory} --out {new}",
         f"orthocal record {new}",
         f"orthocal validate {directory} {new}",
