@@ -176,13 +176,15 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
             adjustments that the sessions state change the predicted readings.
 
     Raises:
-        SessionError: If a session is of another robot, or states offsets of another calibration.
+        SessionError: If a session is of another robot, states offsets of another calibration, or is
+            one that the calibration was made from.
         NotIdentifiableError: If the sessions do not determine the parameters.
         SolverError: If the fit of the new readings does not converge.
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     given = gather_sessions(sessions)
     calibration = _as_adjusted(calibration, given)
+    _require_new(calibration, given)
     measured = [_with_active_offsets(calibration, one) for one in given]
     session = join_sessions(measured)
     judgement = judge_session(session)
@@ -225,6 +227,23 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
             tool=assessment_of(refit).tool,
         ),
     )
+
+
+def _require_new(calibration: Calibration, sessions: Sequence[Session]) -> None:
+    """Refuse sessions that the calibration was made from: their readings confirm nothing.
+
+    Raises:
+        SessionError: Naming the session.
+    """
+    record = calibration.session
+    used = {part.sha256 for part in (record, *record.parts)} - {""}
+    for session in sessions:
+        if session.sha256 in used:
+            raise SessionError(
+                "is a session that the calibration was made from, which is no validation; expected "
+                "readings taken afterwards",
+                where=str(session.path or "session"),
+            )
 
 
 def _as_adjusted(calibration: Calibration, sessions: Sequence[Session]) -> Calibration:
@@ -322,7 +341,7 @@ def _agreement(
         "expected_rms_mm": expected / MM,
         "achieved_rms_mm": achieved / MM,
         "refit_rms_mm": refit.rms_after / MM,
-        "limit_rms_mm": test.limit * achieved / MM,
+        "limit_of_pattern_mm": test.limit * achieved / MM,
         "chance": test.chance,
     }
     as_expected = _is_expected(test.chance)

@@ -126,6 +126,13 @@ def test_offsets_that_were_not_identified_need_not_be_the_controllers(table1):
         validate_calibration(calibration, with_offsets(table1[3], entered))
 
 
+@pytest.mark.parametrize("number", [2, 3])
+def test_the_readings_of_a_calibration_do_not_validate_it(table1, number):
+    both = calibrate([table1[2], table1[3]])
+    with pytest.raises(SessionError, match="no validation"):
+        validate_calibration(both, table1[number])
+
+
 def test_another_robot_is_refused(table1, biglide):
     calibration = calibrate(table1[2])
     with pytest.raises(SessionError, match="is of robot 'biglide'"):

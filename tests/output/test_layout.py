@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from calibrated import EXPERIMENT_2, calibrated
 
-from orthocal import validate_calibration
+from orthocal import load_session, validate_calibration
 from orthocal.assessment.comparison import compare_models
 from orthocal.output.text.layout import table_of, to_text
 from orthocal.output.text.summary import render_result
@@ -17,9 +17,10 @@ NUMBER = re.compile(r"[-+−]?\d+(?:\.\d+)?")
 
 
 @pytest.fixture(scope="module")
-def results(experiment_2):
+def results(root, experiment_2):
     calibration = calibrated(EXPERIMENT_2, "full")
-    unstated = replace(experiment_2, controller_offsets=None)
+    afterwards = load_session(root / "examples/table1/experiment-3")
+    unstated = replace(afterwards, controller_offsets=None)
     return {
         "offsets": calibrated(EXPERIMENT_2),
         "full": calibration,

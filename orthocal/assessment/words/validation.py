@@ -38,7 +38,8 @@ def larger_than_predicted(
 
     Args:
         achieved: RMS of the deviations, [m].
-        limit: RMS of such deviations from which the calibration does not explain them, [m].
+        limit: RMS of deviations of the same pattern from which the calibration does not explain
+            them, [m]. The expected RMS is a mean over all patterns and may be larger.
         refit: RMS residual of a fit of the new readings, [m]; None if an anomaly explains them.
         removed: Whether that fit removes the deviations.
         numbers: Numbers of the finding.
@@ -46,7 +47,7 @@ def larger_than_predicted(
     """
     text = (
         f"The new readings deviate from the predictions by {mm(achieved)} mm RMS, more than their "
-        f"uncertainty (limit {mm(limit)} mm)."
+        f"uncertainty (limit for deviations of this pattern: {mm(limit)} mm)."
     )
     action = ""
     if refit is not None:
@@ -67,7 +68,7 @@ def as_predicted(achieved: float, limit: float, numbers: Mapping[str, float]) ->
     return note(
         "as predicted",
         f"The new readings agree with the predictions: they deviate by {mm(achieved)} mm RMS, "
-        f"within their uncertainty (limit {mm(limit)} mm).",
+        f"within their uncertainty (limit for deviations of this pattern: {mm(limit)} mm).",
         **numbers,
     )
 
