@@ -11,22 +11,27 @@ are nearly combinations of those of b: R² = A_ab A_bb⁻¹ A_ba / A_aa, as in a
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import combinations_with_replacement
 
 import numpy as np
 
 from orthocal.arrays import Array, Indices
+from orthocal.assessment.effect_limits import find_limits
 from orthocal.assessment.words import effects as words
 from orthocal.calibration.assessment_record import Finding
-from orthocal.effects.loading import robot_effects
+from orthocal.effects.loading import neutral_values, robot_effects
 from orthocal.hypotheses.anomaly import EFFECT_KINDS
 from orthocal.hypotheses.linear_model import LinearModel
 from orthocal.observation.observations import drive_table
-from orthocal.session.session import Session
+from orthocal.session.session import Conditions, Session
 
 ALIKE = 0.95
 """Part R² of a parameter's information that another effect shares, from which on the readings do
 not separate them: the standard deviation is more than four times as large as without the other."""
+
+WARMER = 5.0
+"""Change of the temperature at which a setup is supposed to be read again: that of a day, [K]."""
 
 LEAST_INFORMATION = 1e-2
 """Information about a parameter, over that of its prior, below which readings do not show it."""
@@ -70,7 +75,30 @@ def _unshown_expansion(session: Session) -> Iterator[Finding]:
         return
     stated = {r.conditions.temperature for r in session.readings if r.conditions} - {None}
     if len(stated) < 2:
-        yield words.one_temperature(next(iter(stated), None), next(iter(session.setups)))
+        setup = session.readings[0].setup
+        helps = _shows_expansion(_read_warmer(session, setup))
+        yield words.one_temperature(next(iter(stated), None), setup if helps else "")
+
+
+def _read_warmer(session: Session, setup: str) -> Session:
+    """Session in which one setup is read once more, after the machine has become warmer."""
+    reference = neutral_values(session.robot)["temperature"]
+    readings = []
+    for r in session.readings:
+        known = r.conditions or Conditions()
+        cool = reference if known.temperature is None else known.temperature
+        readings.append(replace(r, conditions=replace(known, temperature=cool)))
+        if r.setup == setup:
+            warm = replace(known, temperature=cool + WARMER)
+            readings.append(replace(r, conditions=warm))
+    return replace(session, readings=tuple(readings), parts=(), sha256="")
+
+
+def _shows_expansion(session: Session) -> bool:
+    """True if readings determine coefficients of expansion, as a plan states it."""
+    model = LinearModel(session)
+    limits = find_limits(model.problem, model.sigma)
+    return any(limit.determined for limit in limits if limit.effect == "thermal")
 
 
 def _alike(session: Session) -> Iterator[Finding]:

@@ -36,7 +36,7 @@ from orthocal.observation.observations import build_observations
 from orthocal.robot.model import Robot
 from orthocal.runtime.worker_pool import call_in_parallel, current_worker_budget
 from orthocal.session.session import Session
-from orthocal.statistics.information import Information
+from orthocal.statistics.information import VAGUE, Information
 from orthocal.statistics.noise import estimate_repeatability, noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -55,9 +55,6 @@ MACHINES = 12
 
 ENTERED = 0.1
 """Standard deviation of offsets after they were entered, in prior std."""
-
-VAGUE = 1e-8
-"""Inverse variance of a parameter without a prior, [1 per prior std²]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

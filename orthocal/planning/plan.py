@@ -12,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from orthocal.arrays import Array
+from orthocal.assessment.effect_limits import EffectLimits, find_limits
 from orthocal.assessment.remaining_errors import RemainingError, rank_errors
 from orthocal.effects.loading import robot_effects, with_effects
 from orthocal.errors import ParameterError
@@ -35,10 +36,8 @@ from orthocal.planning.cost_curve import (
     find_enough,
     scale_curve,
 )
-from orthocal.planning.effect_limits import EffectLimits, find_limits
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import (
-    VAGUE,
     Criterion,
     Expected,
     ToolForecast,
@@ -51,6 +50,7 @@ from orthocal.robot.model import Robot
 from orthocal.runtime.worker_pool import call_in_parallel, run_in_parallel, worker_budget
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.session.session import Posture, Purpose, Reading, Session, Setup
+from orthocal.statistics.information import VAGUE
 from orthocal.statistics.zeros import project_out_zeros
 
 MODEL = "full"

@@ -18,6 +18,9 @@ from orthocal.statistics.zeros import project_out_zeros
 RANK_THRESHOLD = 1e-10
 """Singular values below this part of the largest count as zero."""
 
+VAGUE = 1e-8
+"""Inverse variance of a parameter without a prior, [1 per prior std²]."""
+
 MOST_NAMED = 6
 """Largest number of parameters that a message lists."""
 

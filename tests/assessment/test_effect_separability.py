@@ -10,7 +10,8 @@ import pytest
 from effect_plans import FIRST, write_plan
 
 from orthocal import check_session, load_plan, simulate_session
-from orthocal.assessment.effect_separability import ALIKE, find_unshown_effects
+from orthocal.assessment.effect_limits import DETERMINED
+from orthocal.assessment.effect_separability import ALIKE, WARMER, find_unshown_effects
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import select_parameters
 from orthocal.statistics.zeros import project_out_zeros
@@ -55,6 +56,30 @@ def test_conditions_that_nobody_stated_are_named(plan):
     bare = replace(plan, readings=tuple(replace(r, conditions=None) for r in plan.readings[::2]))
     kinds = [f.kind for f in find(bare, ["backlash", "thermal"])]
     assert kinds[:2] == ["effect not shown"] * 2
+
+
+@pytest.mark.parametrize(("sigma", "helps"), [(20e-6, False), (1e-6, True)])
+def test_another_temperature_is_asked_for_only_where_it_shows_more(plan, sigma, helps):
+    """Decided by the posterior limit of the coefficients over their tolerance, as in a plan."""
+    session = under(plan, lambda _, c: replace(c, temperature=22.0)).with_gauge(
+        replace(plan.gauge, sigma=sigma)
+    )
+    (found,) = (f for f in find(session, ["thermal"]) if f.kind == "effect not shown")
+    assert bool(found.action) is bool(found.places) is helps
+    setup = session.readings[0].setup
+    again = [
+        replace(r, cycle=9, conditions=replace(r.conditions, temperature=22.0 + WARMER))
+        for r in session.readings
+        if r.setup == setup
+    ]
+    both = replace(session, readings=(*session.readings, *again)).with_effects(["thermal"])
+    selection = select_parameters(both.robot.parameters, model="full", prior=True)
+    problem = CalibrationProblem(both, selection)
+    _, jacobian = problem.predict_and_jacobian(problem.active_theta)
+    slopes = project_out_zeros(jacobian, problem.observations)
+    covariance = np.linalg.inv(slopes.T @ slopes / sigma**2 + np.diag(problem.prior_precision))
+    grown = [problem.free.index(n) for n in ("legs.expansion", "screws.expansion")]
+    assert bool(max(np.sqrt(np.diag(covariance)[grown])) < DETERMINED) is helps
 
 
 def test_temperature_and_drift_that_grow_together_are_not_separated(plan):

@@ -17,13 +17,13 @@ from orthocal import (
     simulate_session,
     write_session,
 )
+from orthocal.assessment.effect_limits import find_limits
 from orthocal.effects.loading import with_effects
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.measurement.motion.approach import can_approach, describe_approach
 from orthocal.observation.conditions import MORNING, in_course
 from orthocal.planning.candidates import list_candidates
-from orthocal.planning.effect_limits import find_limits
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import noise_of
 from orthocal.planning.first_plan import first_equipment, paper_plan

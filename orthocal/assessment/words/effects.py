@@ -43,7 +43,12 @@ def approached_from_one_side(drives: Mapping[str, str]) -> Finding:
 
 
 def one_temperature(temperature: float | None, setup: str) -> Finding:
-    """All readings were taken at one temperature, or none states it."""
+    """All readings were taken at one temperature, or none states it.
+
+    Args:
+        temperature: The temperature, [°C]; None if none states it.
+        setup: Setup that would show more at another temperature; empty if none would.
+    """
     text = (
         "No reading states its temperature"
         if temperature is None
@@ -52,9 +57,11 @@ def one_temperature(temperature: float | None, setup: str) -> Finding:
     return note(
         "effect not shown",
         f"{text}. The readings do not show how legs and screws expand: the stated coefficients are "
-        "assumed.",
-        f"Read setup {setup} again at another temperature, and state it in `temperature_C`.",
-        (Place(setup=setup),),
+        f"assumed.{'' if setup else ' At other temperatures these readings would not show it.'}",
+        f"Read setup {setup} again at another temperature, and state it in `temperature_C`."
+        if setup
+        else "",
+        (Place(setup=setup),) if setup else (),
     )
 
 

@@ -11,6 +11,7 @@ from rich.console import Group, RenderableType
 from rich.padding import Padding
 from rich.text import Text
 
+from orthocal.assessment.effect_limits import DETERMINED, EffectLimits
 from orthocal.assessment.wording import joined, tool_mm
 from orthocal.assessment.words.entries import describe_aligned
 from orthocal.kinematics.conditions import stated_use
@@ -19,7 +20,6 @@ from orthocal.measurement.motion.approach import approach_length, describe_appro
 from orthocal.output.text.accuracy import describe_remaining
 from orthocal.output.text.layout import bullets, counted, plain, section, table_of
 from orthocal.planning.cost_curve import ENOUGH, HOUR, Stage
-from orthocal.planning.effect_limits import EffectLimits
 from orthocal.planning.expected_error import Criterion, Expected
 from orthocal.planning.plan import MeasuringPlan
 from orthocal.planning.plan_comparison import Alternative
@@ -52,9 +52,6 @@ NOTICEABLE = 0.02
 
 MOST_LISTED = 24
 """Largest number of setups that are listed one by one."""
-
-DETERMINED = 0.9
-"""Ratio of limits after and before the readings below which they determine a parameter."""
 
 EVENLY = "evenly spaced"
 
@@ -133,7 +130,7 @@ def _describe_limits(effect: EffectLimits) -> str:
     else:
         before, after = (f"{v / factor:.2g} {words}" for v in (effect.before, effect.after))
     name = f"{effect.words[:1].upper()}{effect.words[1:]}"
-    if effect.after < DETERMINED * effect.before:
+    if effect.determined:
         return f"{name}: known to ±{after} after these readings (tolerance ±{before})."
     return f"{name}: these readings do not determine it; it keeps its tolerance of ±{before}."
 

@@ -1,4 +1,4 @@
-"""Limits of effects, such as backlash, that planned readings reach."""
+"""Limits of effects, such as backlash, that readings or planned readings reach."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ import numpy as np
 from orthocal.effects.loading import robot_effects
 from orthocal.effects.protocol import Effect
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.planning.expected_error import VAGUE
 from orthocal.robot.model import Robot
-from orthocal.statistics.information import Information
+from orthocal.statistics.information import VAGUE, Information
 from orthocal.statistics.zeros import project_out_zeros
 from orthocal.units import LIMIT, Unit
+
+DETERMINED = 0.9
+"""Ratio of limits after and before the readings below which they determine a parameter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +33,11 @@ class EffectLimits:
     """Limit from their tolerances, [SI]."""
     after: float
     """Limit after the readings, the largest of them, [SI]."""
+
+    @property
+    def determined(self) -> bool:
+        """True if the readings determine the parameters."""
+        return self.after < DETERMINED * self.before
 
 
 def added_effects(robot: Robot) -> tuple[Effect, ...]:
