@@ -27,7 +27,6 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.io.fields import finite_or_none
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
-from orthocal.robot.model import Robot
 from orthocal.session.session import Session
 from orthocal.statistics.noise import KnownNoise, estimate_repeatability
 
@@ -117,8 +116,7 @@ def compare_models(
     Args:
         sessions: The session, or several, or paths to them.
         models: Models of the robot's YAML; all by default.
-        tolerances: Name or glob with its unit, such as `*.offset_mm`, to another tolerance
-            than the robot's.
+        tolerances: As in `Choice`, for all models and the judgement of the readings.
         repeat: Another session of the same rows, or several, to compare the residuals with.
         options: Which solver, and how it is run.
 
@@ -128,19 +126,19 @@ def compare_models(
         SolverError: If the solver does not converge.
         ClosureError: If the machine cannot reach a posture.
     """
-    chosen = gather_sessions(sessions)
+    chosen = [s.with_tolerances(tolerances or {}) for s in gather_sessions(sessions)]
     require_names(models or (), argument="models")
     session = join_sessions(chosen)
     others = [] if repeat is None else gather_sessions(repeat)
+    others = [s.with_tolerances(tolerances or {}) for s in others]
     for other in others:
         _require_another(other, chosen)
     noise = find_known_noise(session)
     cycles = len({r.cycle for r in session.readings}) > 1
     judgement = judge_session(session)
     build = partial(build_problem, session, tolerance_scale=judgement.tolerance_scale)
-    results, undetermined = _score_models(
-        build, session.robot, models, tolerances or {}, noise.sigma, options
-    )
+    names = models or session.robot.parameters.models
+    results, undetermined = _score_models(build, names, noise.sigma, options)
     recommendation = recommend_model(session, models)
     compared = Comparison(
         title=session.title,
@@ -168,20 +166,14 @@ def compare_models(
 
 def _score_models(
     build: Callable[..., CalibrationProblem],
-    robot: Robot,
     models: Sequence[str],
-    tolerances: Mapping[str, float],
     noise: float,
     options: SolverOptions | None,
 ) -> tuple[tuple[ModelResult, ...], tuple[Undetermined, ...]]:
     """Results of the models, the smallest first, and those that are not identifiable."""
-    parameters = robot.parameters
-    given = parameters.read_tolerances(tolerances)
     results, undetermined = [], []
-    for model in dict.fromkeys(models or parameters.models):
-        free = set(parameters.select_model(model))
-        stds = {g: v for g, v in given.items() if free & set(parameters.select([g]))}
-        score = _score_with_prior(partial(build, model=model, prior_stds=stds), noise, options)
+    for model in dict.fromkeys(models):
+        score = _score_with_prior(partial(build, model=model), noise, options)
         if isinstance(score, Undetermined):
             undetermined.append(score)
         else:

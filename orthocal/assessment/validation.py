@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -166,7 +166,12 @@ def _is_expected(probability: float) -> bool | None:
     return None if math.isnan(probability) else probability >= BY_CHANCE
 
 
-def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Given]) -> Validation:
+def validate_calibration(
+    calibration: Calibration,
+    sessions: Given | Sequence[Given],
+    *,
+    tolerances: Mapping[str, float] | None = None,
+) -> Validation:
     """Compare a new session, or several, with the predictions of a calibration.
 
     Args:
@@ -174,6 +179,8 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
         sessions: Measured afterwards, with its offsets active in the controller. A session that
             does not state the offsets of its controller is assumed to have them. Mechanical
             adjustments that the sessions state change the predicted readings.
+        tolerances: As in `Choice`, for the judgement of the new sessions and of changes. The
+            predictions are those of the calibration, with the tolerances that it was made with.
 
     Raises:
         SessionError: If a session is of another robot, states offsets of another calibration, or is
@@ -182,7 +189,9 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
         SolverError: If the fit of the new readings does not converge.
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
-    given = gather_sessions(sessions)
+    stated = tolerances or {}
+    given = [one.with_tolerances(stated) for one in gather_sessions(sessions)]
+    calibration = replace(calibration, robot=calibration.robot.with_tolerances(stated))
     calibration = _as_adjusted(calibration, given)
     _require_new(calibration, given)
     measured = [_with_active_offsets(calibration, one) for one in given]
@@ -203,16 +212,16 @@ def validate_calibration(calibration: Calibration, sessions: Given | Sequence[Gi
     keep = wrongly_entered or (confirmed is not False and not further)
     entries = find_entries(calibration) if keep else assessment_of(refit).entries
     repetition = measure_repetition(calibration, refit)
-    stated = all(one.controller_offsets is not None for one in given)
+    offsets_stated = all(one.controller_offsets is not None for one in given)
     notes = [
         *further,
         *([] if wrongly_entered else assessment_of(refit).of_kind(*ENTRY_KINDS)),
         words.describe_repetition(repetition, new=_is_expected(excess) is False),
-        *([] if stated else [words.controller_assumed()]),
+        *([] if offsets_stated else [words.controller_assumed()]),
     ]
     return Validation(
         confirmed=confirmed,
-        offsets_stated=stated,
+        offsets_stated=offsets_stated,
         expected_rms=expected_rms,
         expected_largest=_expect_largest(calibration, expected_rms),
         excess_probability=excess,

@@ -69,8 +69,10 @@ def identify(
         TypeError: If an argument is of another kind.
         ValueError: If `start` does not have one number for each free error of the machine.
     """
-    effects = choice.effects if isinstance(choice, Choice) else None
-    session = join_sessions(gather_sessions(sessions), effects=effects)
+    given = gather_sessions(sessions)
+    if isinstance(choice, Choice):
+        given = [choice.applied_to(one) for one in given]
+    session = join_sessions(given)
     require_names(profile, argument="profile")
     chosen = resolve_choice(choice, session)
     options = _solver_options(solver, loss)

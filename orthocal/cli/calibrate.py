@@ -73,7 +73,7 @@ def calibrate(
 
     if out is not None:
         require_writable(out, FILES)
-    session = load_joined(sessions, effects=split_effects(effects))
+    session = load_joined(sessions, effects=split_effects(effects), tolerance=tolerance)
     parameters = session.robot.parameters
     with judgement_on_failure(session, json=json):
         result = orthocal.calibrate(

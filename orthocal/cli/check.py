@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import orthocal
 from orthocal.cli.files import load_joined
-from orthocal.cli.options import Details, Effects, Json, SessionPaths, command, split_effects
+from orthocal.cli.options import (
+    Details,
+    Effects,
+    Json,
+    SessionPaths,
+    Tolerances,
+    command,
+    split_effects,
+)
 from orthocal.cli.printing import deliver_judged
 
 
@@ -12,6 +20,7 @@ from orthocal.cli.printing import deliver_judged
 def check(
     sessions: SessionPaths,
     effects: Effects = None,
+    tolerance: Tolerances = None,
     json: Json = False,
     details: Details = False,
 ) -> None:
@@ -21,5 +30,5 @@ def check(
 
     Exit code 0: no anomaly. 3: check the readings before you continue.
     """
-    found = orthocal.check_session(load_joined(sessions, effects=split_effects(effects)))
-    deliver_judged(found, json=json, details=details)
+    session = load_joined(sessions, effects=split_effects(effects), tolerance=tolerance)
+    deliver_judged(orthocal.check_session(session), json=json, details=details)

@@ -14,7 +14,6 @@ from orthocal.cli.options import (
     SessionPaths,
     Tolerances,
     command,
-    read_tolerances,
     split_effects,
     split_globs,
 )
@@ -42,12 +41,12 @@ def compare(
             times.
     """
     chosen = split_effects(effects)
-    loaded = load_each_once(sessions, effects=chosen)
+    loaded = load_each_once(sessions, effects=chosen, tolerance=tolerance)
+    others = load_each_once(repeat, effects=chosen, tolerance=tolerance) if repeat else None
     with judgement_on_failure(orthocal.join_sessions(loaded), json=json):
         comparison = orthocal.compare_models(
             loaded,
             models=split_globs([models] if models else None),
-            tolerances=read_tolerances(tolerance, loaded[0].robot),
-            repeat=load_each_once(repeat, effects=chosen) if repeat else None,
+            repeat=others,
         )
     deliver_judged(comparison, json=json, details=details, all_rows=all_rows)

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import orthocal
+from orthocal.cli.options import state_tolerances
 from orthocal.errors import OrthocalError, SessionError
 from orthocal.io.files import exists, require_writable
 
@@ -17,17 +18,21 @@ FEWEST_DIFFERENT = 4
 
 
 def load_each_once(
-    paths: Sequence[Path], *, effects: Sequence[str] | None = None
+    paths: Sequence[Path],
+    *,
+    effects: Sequence[str] | None = None,
+    tolerance: Sequence[str] | None = None,
 ) -> list[orthocal.Session]:
     """Load sessions, and refuse those whose readings would count twice.
 
     Args:
         paths: Their paths.
         effects: Effects beside geometry instead of those that the sessions state.
+        tolerance: Values of `--tolerance`, instead of tolerances that the sessions state.
 
     Raises:
         SessionError: If two sessions are the same, or have the same readings.
-        ParameterError: If an effect does not exist.
+        ParameterError: If an effect does not exist, or a tolerance does not fit.
     """
     sessions: list[orthocal.Session] = []
     for path in paths:
@@ -44,17 +49,22 @@ def load_each_once(
                 where=str(session.readings_path or path),
             )
         sessions.append(session)
-    if effects is None:
-        return sessions
-    from orthocal.robot.parameters import errors_at
+    if effects is not None:
+        from orthocal.robot.parameters import errors_at
 
-    with errors_at("--effects"):
-        return [session.with_effects(effects) for session in sessions]
+        with errors_at("--effects"):
+            sessions = [session.with_effects(effects) for session in sessions]
+    return [state_tolerances(session, tolerance) for session in sessions]
 
 
-def load_joined(paths: Sequence[Path], *, effects: Sequence[str] | None = None) -> orthocal.Session:
+def load_joined(
+    paths: Sequence[Path],
+    *,
+    effects: Sequence[str] | None = None,
+    tolerance: Sequence[str] | None = None,
+) -> orthocal.Session:
     """Load sessions as one; arguments and errors as for `load_each_once`."""
-    return orthocal.join_sessions(load_each_once(paths, effects=effects))
+    return orthocal.join_sessions(load_each_once(paths, effects=effects, tolerance=tolerance))
 
 
 def _same_readings(one: orthocal.Session, other: orthocal.Session) -> bool:

@@ -299,6 +299,18 @@ def read_tolerances(texts: Sequence[str] | None, robot: orthocal.Robot) -> dict[
     return selection.read_tolerances(texts or [], robot.parameters, where="--tolerance")
 
 
+def state_tolerances(session: orthocal.Session, texts: Sequence[str] | None) -> orthocal.Session:
+    """Session whose robot has the tolerances of `--tolerance`, in place of those that it states.
+
+    Raises:
+        ParameterError: As `read_tolerances`, or if a tolerance is implausible.
+    """
+    from orthocal.robot.parameters import errors_at
+
+    with errors_at("--tolerance"):
+        return session.with_tolerances(read_tolerances(texts, session.robot))
+
+
 def read_number(text: str, option: str, name: str = "it") -> float:
     """Number of an option.
 

@@ -16,11 +16,10 @@ from orthocal.cli.options import (
     Tolerances,
     command,
     read_temperatures,
-    read_tolerances,
     split_effects,
+    state_tolerances,
 )
 from orthocal.cli.printing import put_note
-from orthocal.errors import ParameterError
 
 FILES = ("session.yaml", "readings.csv", "truth.yaml")
 
@@ -58,15 +57,12 @@ def simulate(
         with errors_at("--effects"):
             planned = planned.with_effects(split_effects(effects))
     planned = state_conditions(planned, read_temperatures(temperature))
-    tolerances = read_tolerances(tolerance, planned.robot)
-    if tolerances and draw is None:
-        raise ParameterError("has no effect without --draw", where="--tolerance")
+    planned = state_tolerances(planned, tolerance)
     true_errors = collect_errors(
         planned.robot,
         file=errors,
         single=error or [],
         draw=draw,
-        tolerances=tolerances,
         seed=seed,
     )
     simulated = orthocal.simulate_session(planned, true_errors, seed=seed, exact=exact)

@@ -6,7 +6,14 @@ from pathlib import Path
 
 import orthocal
 from orthocal.cli.files import load_each_once
-from orthocal.cli.options import AllRows, CalibrationPath, Json, command
+from orthocal.cli.options import (
+    AllRows,
+    CalibrationPath,
+    Json,
+    Tolerances,
+    command,
+    read_tolerances,
+)
 from orthocal.cli.printing import deliver_judged, judgement_on_failure
 
 
@@ -14,6 +21,7 @@ from orthocal.cli.printing import deliver_judged, judgement_on_failure
 def validate(
     calibration: CalibrationPath,
     sessions: list[Path],
+    tolerance: Tolerances = None,
     json: Json = False,
     all_rows: AllRows = False,
 ) -> None:
@@ -25,7 +33,9 @@ def validate(
     Args:
         sessions (NEW_SESSION...): Measured with the entered offsets in the controller.
     """
-    before, loaded = orthocal.load_calibration(calibration), load_each_once(sessions)
+    before = orthocal.load_calibration(calibration)
+    loaded = load_each_once(sessions, tolerance=tolerance)
+    tolerances = read_tolerances(tolerance, before.robot)
     with judgement_on_failure(orthocal.join_sessions(loaded), json=json):
-        validation = orthocal.validate_calibration(before, loaded)
+        validation = orthocal.validate_calibration(before, loaded, tolerances=tolerances)
     deliver_judged(validation, json=json, all_rows=all_rows)

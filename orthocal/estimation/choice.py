@@ -36,8 +36,8 @@ class Choice:
         prior: Use priors; by default True, unless only offsets are free.
         known: Name with its unit to a known value, which is then fixed, or to a value and its
             tolerance, a limit of ±2 prior standard deviations, which then act as prior.
-        tolerances: Name or glob with its unit to another tolerance than the robot's, a limit of
-            ±2 prior standard deviations.
+        tolerances: Name or glob with its unit to another tolerance than that of the session or the
+            robot, a limit of ±2 prior standard deviations, wherever tolerances are used.
         bounds: Name or glob with its unit to lowest and highest value, ±inf for open.
         base: Identify base parameters without priors: of each indistinguishable combination one
             parameter remains free and represents the combination.
@@ -79,6 +79,16 @@ class Choice:
         """Plain data of the choice."""
         return asdict(self)
 
+    def applied_to(self, session: Session) -> Session:
+        """Session whose robot has the chosen effects and tolerances.
+
+        Raises:
+            ParameterError, RobotError: As `Session.with_effects` and `Session.with_tolerances`.
+        """
+        if self.effects is not None:
+            session = session.with_effects(self.effects)
+        return session.with_tolerances(self.tolerances)
+
     def select(
         self, parameters: ParameterSet, *, tolerance_scale: ToleranceScale = AS_STATED
     ) -> Selection:
@@ -89,25 +99,27 @@ class Choice:
             tolerance_scale: Factor on their tolerances.
 
         Raises:
-            ParameterError: If a name, unit, glob or model is unknown, one is stated twice, or a
-                known value, tolerance or bound is invalid.
+            ParameterError: If a name, unit, glob or model is unknown, one is stated twice, a known
+                value, tolerance or bound is invalid, or a tolerance has no effect.
         """
+        parameters = parameters.with_tolerances(self.tolerances)
         as_prior = [key for key, value in self.known.items() if isinstance(value, tuple)]
         if self.base and (self.prior or as_prior):
             raise ParameterError(
                 "base parameters are identified without any prior"
                 + (f"; give {', '.join(as_prior)} as known without ±" if as_prior else "")
             )
-        return select_parameters(
+        selection = select_parameters(
             parameters,
             model=self.model,
             free=self.free,
             prior=self.prior,
             known=_known_in_si(self.known, parameters),
-            prior_stds=parameters.read_tolerances(self.tolerances),
             bounds=_bounds_in_si(self.bounds, parameters),
             tolerance_scale=tolerance_scale,
         )
+        _require_used(self.tolerances, parameters, selection)
+        return selection
 
 
 def resolve_choice(
@@ -139,6 +151,17 @@ def resolve_choice(
         default_model = complete_model(session.robot.parameters)
     purpose = next(iter(purposes), Purpose(default_model))
     return replace(chosen, model=purpose.model, free=purpose.free)
+
+
+def _require_used(
+    tolerances: Mapping[str, float], parameters: ParameterSet, selection: Selection
+) -> None:
+    """Refuse tolerances of sums that are not free: their terms have tolerances of their own."""
+    used = {*selection.names, *parameters.elementary}
+    for key in tolerances:
+        glob, _ = parameters.read_glob(key)
+        if used.isdisjoint(parameters.select([glob])):
+            raise ParameterError(f"'{glob}' matches no free parameter", where="tolerances")
 
 
 def _known_in_si(

@@ -35,7 +35,7 @@ def gather_sessions(given: Given | Sequence[Given]) -> list[Session]:
     return [one if isinstance(one, Session) else load_session(one) for one in several]
 
 
-def join_sessions(sessions: Sequence[Session], *, effects: Sequence[str] | None = None) -> Session:
+def join_sessions(sessions: Sequence[Session]) -> Session:
     """One session of all readings of several on the same robot.
 
     Setups, postures and gauges are named after their session. The active offsets and the mechanical
@@ -44,17 +44,12 @@ def join_sessions(sessions: Sequence[Session], *, effects: Sequence[str] | None 
     Args:
         sessions: In the order in which they were measured, joined ones among them or not; a single
             one is returned unchanged.
-        effects: Effects beside geometry that the machine has; by default those that the sessions
-            and the robot's YAML state.
 
     Raises:
         SessionError: If there are none, or of different robots or effects.
-        ParameterError, RobotError: If an effect does not exist, or lacks a key.
     """
     if not sessions:
         raise SessionError("there is no session to join")
-    if effects is not None:
-        sessions = [s.with_effects(effects) for s in sessions]
     if len(sessions) == 1:
         return sessions[0]
     last = sessions[-1]

@@ -258,7 +258,6 @@ def collect_errors(
     file: Path | None = None,
     single: Sequence[str] = (),
     draw: str | None = None,
-    tolerances: Mapping[str, float] | None = None,
     seed: int = 0,
 ) -> dict[str, float]:
     """Errors drawn from priors, from a file and from single values; later ones win.
@@ -268,7 +267,6 @@ def collect_errors(
         file: As for `load_errors`.
         single: Texts such as x_slide.offset_mm=1.2.
         draw: Model of the robot, or names and globs separated by commas, to draw.
-        tolerances: For drawing, as for `draw_errors`.
         seed: Seed of the random numbers.
 
     Raises:
@@ -286,7 +284,7 @@ def collect_errors(
                 where="--draw",
             )
         try:
-            errors.update(draw_errors(robot, patterns, seed=seed, tolerances=tolerances))
+            errors.update(draw_errors(robot, patterns, seed=seed))
         except ParameterError:
             raise ParameterError(
                 f"'{draw}' is neither a model ({', '.join(models)}) nor the name of an error "

@@ -214,9 +214,7 @@ def _with_choice(
 ) -> tuple[Robot, Session | None]:
     """Robot and measured session with the chosen effects and tolerances."""
     if measured is not None:
-        if choice.effects is not None:
-            measured = measured.with_effects(choice.effects)
-        measured = measured.with_tolerances(choice.tolerances)
+        measured = choice.applied_to(measured)
         return measured.robot, measured
     if choice.effects is not None:
         robot = with_effects(robot, choice.effects)

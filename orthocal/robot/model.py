@@ -376,9 +376,8 @@ class Robot:
         Raises:
             ParameterError: If a name or unit is unknown, or a number is implausible.
         """
-        if not given:
-            return self
-        return replace(self, parameters=self.parameters.with_tolerances(given))
+        parameters = self.parameters.with_tolerances(given)
+        return self if parameters is self.parameters else replace(self, parameters=parameters)
 
     def with_errors(self, values: Mapping[str, float]) -> Robot:
         """Robot with errors written into its Pinocchio placements.

@@ -266,14 +266,20 @@ class ParameterSet:
 
         Args:
             given: Name or glob with its unit, such as `*.offset_mm`, to a limit of ±2 prior
-                standard deviations in that unit. They are added to those that are stated already;
-                later ones win.
+                standard deviations in that unit. They are added to those that are stated already,
+                and replace what they match; later ones win.
 
         Raises:
             ParameterError: If a name or unit is unknown, or a number is implausible.
         """
-        stated = {k: v for k, v in self.stated.items() if k not in given} | dict(given)
-        if not stated:
+        matched = {name for glob in self.read_tolerances(given) for name in self.select([glob])}
+        kept = {
+            key: value
+            for key, value in self.stated.items()
+            if not matched.issuperset(self.select([self.read_glob(key)[0]]))
+        }
+        stated = kept | dict(given)
+        if stated == self.stated:
             return self
         parameters = {p.name: p for p in self.defaults}
         for glob, value in self.defaults.read_tolerances(stated).items():

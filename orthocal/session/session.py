@@ -379,7 +379,8 @@ class Session:
         Raises:
             ParameterError: If a name or unit is unknown, or a number makes no sense.
         """
-        return replace(self, robot=self.robot.with_tolerances(given)) if given else self
+        robot = self.robot.with_tolerances(given)
+        return self if robot is self.robot else replace(self, robot=robot)
 
     def with_effects(self, names: Sequence[str] | None) -> Session:
         """Session of the robot with chosen effects beside those of geometry and drives.

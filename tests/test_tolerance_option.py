@@ -1,0 +1,126 @@
+"""`--tolerance` means the same as the key of session.yaml, in every command that uses priors."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import yaml
+from commands import run_orthocal
+
+from orthocal import (
+    Choice,
+    calibrate,
+    check_session,
+    compare_models,
+    load_calibration,
+    load_session,
+    write_session,
+)
+
+OF_JOINTS = {"*.[xyz]_mm": 0.02, "*.r?_mrad": 0.2}
+STATED = OF_JOINTS | {"x_slide.offset_mm": 8.0}
+OPTION = [word for key, value in STATED.items() for word in ("--tolerance", f"{key}={value:g}")]
+QUICK = ["--along", 3, "--across-mm", 0, "--setups", 3, "--starts", 1, "--seed", 1]
+
+
+@pytest.fixture(scope="module")
+def folder(root, tmp_path_factory):
+    """Experiments 2 and 3 without and with the key, and a calibration of each."""
+    folder = tmp_path_factory.mktemp("tolerances")
+    for number in (2, 3):
+        session = load_session(root / f"examples/table1/experiment-{number}")
+        write_session(session, folder / f"plain/{number}")
+        write_session(session.with_tolerances(STATED), folder / f"stated/{number}")
+    for words in (["plain", *OPTION], ["stated"]):
+        out = ["--out", f"{words[0]}/calibration"]
+        assert run_orthocal(folder, "calibrate", f"{words[0]}/2", *words[1:], *out).returncode == 3
+    return folder
+
+
+def compared(text):
+    """What a document says of the machine, without names of files."""
+    document = json.loads(text)
+    findings = [(f["kind"], f["severity"], f["numbers"]) for f in document.get("findings", ())]
+    kept = ("parameters", "recommendation", "models", "excess_probability", "expected", "known")
+    return document.get("decision", {}).get("verdict"), findings, [document.get(k) for k in kept]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["check", "2"],
+        ["calibrate", "2"],
+        ["calibrate", "2", "--model", "full", "--solver", "variable-projection"],
+        ["compare", "2", "--models", "offsets", "--repeat", "3"],
+        ["validate", "calibration", "3"],
+        ["plan", "2", *QUICK],
+    ],
+    ids=lambda words: " ".join(map(str, words[:4])),
+)
+def test_the_option_is_the_key(folder, words):
+    plain, stated, unlike = (
+        run_orthocal(folder / of, *words, "--json", *more)
+        for of, more in (("plain", OPTION), ("stated", []), ("plain", []))
+    )
+    assert plain.returncode == stated.returncode
+    assert compared(plain.stdout) == compared(stated.stdout)
+    assert compared(plain.stdout) != compared(unlike.stdout)
+
+
+def test_a_calibration_keeps_the_option(folder):
+    """Its verdict, and that of its readings judged again, are those of the key."""
+    by_option, by_key = (
+        load_calibration(folder / of / "calibration") for of in ("plain", "stated")
+    )
+    assert by_option.robot.parameters.stated == by_key.robot.parameters.stated == STATED
+    assert by_option.assessment.decision.verdict == "reject"
+    assert by_option.assessment.of_kind("beyond tolerances")
+
+
+def test_simulate_draws_by_the_option_and_states_it(folder):
+    """Also where nothing is drawn: the key would be kept, too."""
+    words = ["--draw", "*_slide.offset", "--seed", 4]
+    truths = []
+    for of, more in (("plain", OPTION), ("stated", [])):
+        out = ["--out", "simulated", "--force"]
+        done = run_orthocal(folder / of, "simulate", "2", *words, *more, *out)
+        assert done.returncode == 0, done.stderr
+        truths.append((folder / of / "simulated/truth.yaml").read_text())
+        text = (folder / of / "simulated/session.yaml").read_text()
+        assert yaml.safe_load(text)["calibration"]["tolerances"] == STATED
+    assert truths[0] == truths[1]
+    assert load_session(folder / "plain/simulated").robot.parameters.stated == STATED
+
+
+def test_the_option_replaces_what_it_matches(folder):
+    """Whatever unit and glob the session states it with; what it does not match stays."""
+    session = load_session(folder / "stated/2")
+    stated = session.with_tolerances({"*.offset_m": 1e-3}).robot.parameters
+    assert stated.stated == OF_JOINTS | {"*.offset_m": 1e-3}
+    assert stated["x_slide.offset"].prior_std == 0.5e-3
+    narrow = session.with_tolerances({"x_fork.rx_mrad": 1.0}).robot.parameters
+    assert narrow.stated == STATED | {"x_fork.rx_mrad": 1.0}
+    assert narrow["x_fork.rx"].prior_std == 0.5e-3
+    assert narrow["y_fork.rx"].prior_std == 0.1e-3
+
+
+def test_sessions_that_state_different_tolerances_join_by_the_option(folder):
+    write_session(
+        load_session(folder / "stated/3").with_tolerances({"x_slide.offset_mm": 1.0}),
+        folder / "stated/other",
+    )
+    words = ["check", "stated/2", "stated/other"]
+    assert run_orthocal(folder, *words).returncode == 2
+    assert run_orthocal(folder, *words, "--tolerance", "*.offset_mm=8").returncode != 2
+
+
+def test_in_python_the_argument_is_the_key(folder):
+    plain, stated = (load_session(folder / of / "2") for of in ("plain", "stated"))
+    expected = [f.to_document()["numbers"] for f in check_session(stated).findings]
+    found = calibrate(plain, Choice("offsets", tolerances=STATED)).assessment
+    judged = [f.to_document()["numbers"] for f in found.findings]
+    assert all(numbers in judged for numbers in expected)
+    assert (
+        compare_models(plain, models=["offsets"], tolerances=STATED).judgement.verdict == "reject"
+    )
