@@ -63,7 +63,7 @@ reported that the model lacks: such effects are usual. By chance in at most one 
 far less often in simulated ones (`tests/benchmarks/checking.py --effects 1000`)."""
 
 EFFECT_SCALES = np.array([1.0, 4.0])
-"""Grid of factors between the parameters of an effect and their tolerances."""
+"""Grid of amplitudes of the parameters of an effect, [prior std]."""
 
 NEARLY = 3.0
 """Logarithm of the Bayes factor up to which another explanation is nearly as likely."""
