@@ -26,6 +26,7 @@ from orthocal.errors import OrthocalError, OutputError, SessionError
 from orthocal.io.documents import Number, read_yaml, validate
 from orthocal.io.files import exists, read_file, sync_folder, write_file
 from orthocal.io.journal import Journal, open_journal_file
+from orthocal.measurement.files.point_rows import require_no_points
 from orthocal.measurement.files.readings_checks import check_conditions, check_range
 from orthocal.measurement.files.schema import LARGEST_READING_MM, MOST_READINGS
 from orthocal.measurement.files.session_file import load_rows
@@ -256,7 +257,7 @@ class Recording:
 
     def _apply(self, change: Change) -> None:
         rows = change_rows(self.rows, change)
-        content = _table(rows)
+        content = _table(rows, self.session)
         with postponed_interrupt():
             line = change.model_dump(mode="json", exclude_none=True, by_alias=True) | {
                 "rows": [list(key) for key in change.rows],
@@ -282,6 +283,7 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
         OutputError: If its directory cannot be written to.
     """
     session = load_rows(path)
+    require_no_points(session)
     csv = _csv_of(session)
     _files_to_add(session)  # refused before anything is written
     with open_journal_file(
@@ -303,7 +305,7 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
             except SessionError as e:
                 raise OrthocalError(f"does not fit {csv.name}: {e.problem}", where=where) from None
         if pending:
-            table = _table(rows)
+            table = _table(rows, session)
             _write(csv, table)
             session = load_rows(path)
         recording = Recording(
@@ -319,7 +321,7 @@ def _files_to_add(session: Session) -> dict[Path, bytes]:
     """Files that make a plan a session: its rows, then the YAML that names them."""
     if session.readings_path is not None or session.path is None:
         return {}
-    csv, table = _csv_of(session), _table(session.readings)
+    csv, table = _csv_of(session), _table(session.readings, session)
     return {csv: table, session.path: _yaml_with_readings(session.path, csv, table)}
 
 
@@ -373,9 +375,11 @@ def _csv_of(session: Session) -> Path:
     return (session.path or Path("session.yaml")).parent / "readings.csv"
 
 
-def _table(rows: Sequence[Reading]) -> bytes:
+def _table(rows: Sequence[Reading], session: Session) -> bytes:
     """Content of the readings.csv, each row in its line; rows of a new plan follow each other."""
-    header, *texts = readings_table(rows, decimals=DECIMALS).splitlines(keepends=True)
+    header, *texts = readings_table(rows, session.setups, decimals=DECIMALS).splitlines(
+        keepends=True
+    )
     lines = [header]
     for row, text in zip(rows, texts, strict=True):
         lines += ["\n"] * ((row.line or 0) - FIRST_LINE + 1 - len(lines))

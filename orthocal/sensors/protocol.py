@@ -25,6 +25,9 @@ GaugeZero = Literal["free", "known"]
 """Gauge zero of a setup: estimated from its readings, or known to be 0, so that its readings are
 absolute."""
 
+LARGEST_READING = 0.3
+"""Largest reading of an indicator; no leg is as far from parallel, [m]."""
+
 
 @dataclass(frozen=True, slots=True)
 class NuisanceParameter:
@@ -135,6 +138,9 @@ class Sensor(Protocol):
     # zero: ClassVar[GaugeZero], optional: gauge zero of its setups unless they state another one;
     # "free" by default (`default_zero`)
 
+    # largest_reading: ClassVar[float], optional: largest reading that it shows, [m]; 300 mm by
+    # default (`largest_reading`)
+
     @classmethod
     def from_keys(cls, keys: Any) -> Self:  # noqa: ANN401 - an instance of `keys`
         """Build the sensor from the keys of a session.yaml."""
@@ -196,6 +202,12 @@ def mounting_steps(sensor: Sensor) -> tuple[str, ...] | None:
     """Steps that mount it in the alignment posture; None for an indicator on the base."""
     steps: tuple[str, ...] | None = getattr(sensor, "mounting_steps", None)
     return steps
+
+
+def largest_reading(sensor: Sensor) -> float:
+    """Largest reading that a sensor shows; a larger one has a wrong unit, [m]."""
+    largest: float = getattr(sensor, "largest_reading", LARGEST_READING)
+    return largest
 
 
 def default_zero(sensor: Sensor) -> GaugeZero:

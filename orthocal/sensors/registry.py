@@ -18,6 +18,7 @@ from orthocal.io.fields import As
 from orthocal.runtime.registry import Registry
 from orthocal.sensors.ball_bar import BallBar, BallBarKeys
 from orthocal.sensors.leg_indicator import LegIndicator, LegKeys
+from orthocal.sensors.points import PointKeys, Points
 from orthocal.sensors.probe import Probe, ProbeKeys
 from orthocal.sensors.protocol import Sensor, SetupKeys
 from orthocal.sensors.tool_indicator import ToolIndicator, ToolIndicatorKeys
@@ -41,6 +42,7 @@ _PACKAGED: dict[str, Kind] = {
     DEFAULT: (LegKeys, LegIndicator.from_keys),
     BallBar.kind: (BallBarKeys, BallBar.from_keys),
     ToolIndicator.kind: (ToolIndicatorKeys, ToolIndicator.from_keys),
+    Points.kind: (PointKeys, Points.from_keys),
     Probe.kind: (ProbeKeys, Probe.from_keys),
 }
 _KINDS = Registry[Kind](GROUP, "sensor", _read_kind, _PACKAGED)

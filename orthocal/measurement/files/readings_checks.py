@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
 from orthocal.errors import SessionError
 from orthocal.io.documents import parse_number
 from orthocal.kinematics.conditions import find_approach_problem
-from orthocal.measurement.files.readings_file import CONDITIONS, RawReading
-from orthocal.measurement.files.schema import LARGEST_READING_MM, MOST_READINGS
+from orthocal.measurement.files.point_rows import PointRows
+from orthocal.measurement.files.readings_file import CONDITIONS, COORDINATES, RawReading
+from orthocal.measurement.files.schema import MOST_READINGS
 from orthocal.robot.description import HIGHEST_C, LOWEST_C
 from orthocal.robot.model import Robot
+from orthocal.sensors.protocol import LARGEST_READING, largest_reading
 from orthocal.session.session import Conditions, Gauge, Reading, ReadingKey, Session
 from orthocal.text import shorten
 from orthocal.units import MM
@@ -27,8 +30,10 @@ FAR = 5.0
 
 def check_readings(
     rows: Iterable[RawReading], plan: Session, *, file: Path, partial: bool = False
-) -> tuple[Reading, ...]:
+) -> tuple[tuple[Reading, ...], PointRows]:
     """Readings of a table, checked against their session and against each other.
+
+    Rows of points may have covariances of their own, and with them setups beside the planned ones.
 
     Args:
         rows: The rows.
@@ -40,11 +45,11 @@ def check_readings(
         SessionError: Naming file and line.
     """
     rows = iter(rows)
-    checked = _CheckedReadings(file)
+    checked, points = _CheckedReadings(file), PointRows(plan)
     for row in rows:
-        reading = parse_reading(row, plan)
-        if not (reading.is_read or partial):
-            if not checked.readings and not any(r.reading_mm for r in rows):
+        of_row = parse_row(row, plan, points)
+        if not (all(r.is_read for r in of_row) or partial):
+            if not checked.readings and not any(r.reading_mm or r.x_mm for r in rows):
                 raise SessionError(
                     "nothing was read yet; `orthocal record` takes the readings", where=str(file)
                 )
@@ -53,34 +58,42 @@ def check_readings(
                 "both)",
                 where=row.where,
             )
-        checked.add(row, reading)
+        for reading in of_row:
+            checked.add(row, reading)
     if not checked.readings:
         raise SessionError("holds no readings", where=str(file))
-    return tuple(checked.readings)
+    return tuple(checked.readings), points
 
 
-def parse_reading(row: RawReading, plan: Session) -> Reading:
-    """Reading of a row, checked against its session; NaN for an empty cell.
+def parse_row(row: RawReading, plan: Session, points: PointRows) -> list[Reading]:
+    """Reading of a row, or the three of a point, checked against its session; NaN if empty.
 
     Raises:
         SessionError: Naming file and line.
     """
-    _check_names(row, plan)
-    cycle = parse_cycle(row.cycle, row.where)
-    value = math.nan
-    if row.reading_mm:
-        value = parse_number(row.reading_mm, where=row.where, name="reading_mm", error=SessionError)
-    conditions = read_conditions(row, plan.robot)
-    check_range(value, plan.gauges[plan.setups[row.setup].gauge], bool(row.minus), row.where)
-    return Reading(
-        row.setup,
-        row.posture,
-        row.minus or None,
-        cycle,
-        value * MM,
-        row.line,
-        conditions=conditions,
-    )
+    _check_names(row, plan, points)
+    columns = COORDINATES if points.is_point(row) else ("reading_mm",)
+    values = [_parse_value(row, column) * MM for column in columns]
+    missing = [c for c, v in zip(columns, values, strict=True) if math.isnan(v)]
+    if missing and len(missing) < len(values):
+        raise SessionError(f"{missing[0]} is empty; expected all of a point", where=row.where)
+    cycle, conditions = parse_cycle(row.cycle, row.where), read_conditions(row, plan.robot)
+    of_setups = points.split(row, values) if points.is_point(row) else {row.setup: values[0]}
+    readings = []
+    for name, value in of_setups.items():
+        setup = points.setups[name]
+        largest = largest_reading(setup.sensor)
+        check_range(value / MM, points.gauges[setup.gauge], bool(row.minus), row.where, largest)
+        reading = Reading(name, row.posture, row.minus or None, cycle, value, row.line)
+        readings.append(replace(reading, conditions=conditions))
+    return readings
+
+
+def _parse_value(row: RawReading, column: str) -> float:
+    text = getattr(row, column)
+    if not text:
+        return math.nan
+    return parse_number(text, where=row.where, name=column, error=SessionError)
 
 
 class _CheckedReadings:
@@ -173,9 +186,10 @@ def require_name(name: str, names: Collection[str], noun: str, *, where: str) ->
         raise SessionError(f"'{name}' is not a {noun}; {noun}s: {', '.join(names)}", where=where)
 
 
-def _check_names(row: RawReading, plan: Session) -> None:
+def _check_names(row: RawReading, plan: Session, points: PointRows) -> None:
     """Refuse a setup or postures that the session does not have."""
-    require_name(row.setup, plan.setups, "setup", where=row.where)
+    require_name(row.setup, points.names, "setup", where=row.where)
+    points.check_columns(row)
     for name in (row.posture, row.minus) if row.minus else (row.posture,):
         require_name(name, plan.postures, "posture", where=row.where)
     if row.minus == row.posture:
@@ -280,15 +294,21 @@ def parse_cycle(text: str, where: str) -> int:
     return int(text)
 
 
-def check_range(value_mm: float, gauge: Gauge, difference: bool, where: str) -> None:
+def check_range(
+    value_mm: float,
+    gauge: Gauge,
+    difference: bool,
+    where: str,
+    largest: float = LARGEST_READING,
+) -> None:
     """Refuse a reading that no indicator shows, or not this one; accept NaN.
 
     Raises:
         SessionError: At `where`.
     """
-    if abs(value_mm) > LARGEST_READING_MM:
+    if abs(value_mm) > largest / MM:
         raise SessionError(
-            f"reading_mm is {value_mm:g}; expected a number within ±{LARGEST_READING_MM:g}: no "
+            f"reading_mm is {value_mm:g}; expected a number within ±{largest / MM:g}: no "
             f"indicator reaches further{IN_UM}",
             where=where,
         )

@@ -50,6 +50,17 @@ class RawReading:
     cycle: str = ""
     reading_mm: str = ""
     """With a decimal point."""
+    x_mm: str = ""
+    """Coordinates of a point, likewise."""
+    y_mm: str = ""
+    z_mm: str = ""
+    cov_xx_um2: str = ""
+    """Covariance of a point, where rows differ, likewise."""
+    cov_yy_um2: str = ""
+    cov_zz_um2: str = ""
+    cov_xy_um2: str = ""
+    cov_xz_um2: str = ""
+    cov_yz_um2: str = ""
     approach: str = ""
     temperature_C: str = ""
     """With a decimal point."""
@@ -59,10 +70,16 @@ class RawReading:
 COLUMNS = tuple(field.name for field in fields(RawReading))[2:]
 """Columns of a readings.csv, in order."""
 
-REQUIRED = ("setup", "posture", "reading_mm")
-OPTIONAL = tuple(name for name in COLUMNS if name not in REQUIRED)
+COORDINATES = ("x_mm", "y_mm", "z_mm")
+COVARIANCES = tuple(name for name in COLUMNS if name.startswith("cov_"))
 
-NUMBERS = ("reading_mm", "temperature_C")
+REQUIRED = ("setup", "posture", "reading_mm")
+OPTIONAL = tuple(name for name in COLUMNS if name not in (*REQUIRED, *COORDINATES, *COVARIANCES))
+
+OF_POINTS = ("setup", "posture", *COORDINATES)
+"""Required columns of a table with points; the others are optional."""
+
+NUMBERS = ("reading_mm", *COORDINATES, *COVARIANCES, "temperature_C")
 """Columns of numbers that may have a decimal sign."""
 
 COLUMN_OF_ROLE = {"reading": "reading_mm", "temperature": "temperature_C"}
@@ -79,7 +96,11 @@ UNSTATED = {"cycle": "1"}
 
 
 def format_readings(
-    rows: Sequence[RawReading], *, blank: bool = False, needed: Collection[str] = ()
+    rows: Sequence[RawReading],
+    *,
+    blank: bool = False,
+    needed: Collection[str] = (),
+    required: Collection[str] = REQUIRED,
 ) -> str:
     """Text of a readings.csv without the optional columns that no row needs.
 
@@ -87,11 +108,12 @@ def format_readings(
         rows: The rows.
         blank: Leave the cells of measured conditions empty.
         needed: Optional columns to be filled in, with or without content.
+        required: Columns that the table has in any case.
     """
     columns = [
         c
         for c in COLUMNS
-        if c in (*REQUIRED, *needed)
+        if c in (*required, *needed)
         or any(getattr(r, c) not in ("", UNSTATED.get(c)) for r in rows)
     ]
     cells = [
@@ -110,7 +132,15 @@ def mm_text(value: Decimal) -> str:
 def is_house(header: Iterable[str]) -> bool:
     """True for the exact headings of a readings.csv."""
     names = [composed(name.strip()) for name in header]
-    return set(REQUIRED) <= set(names) <= {*REQUIRED, *OPTIONAL} and len(set(names)) == len(names)
+    required, optional = _schema(names)
+    return set(required) <= set(names) <= {*required, *optional} and len(set(names)) == len(names)
+
+
+def _schema(header: Collection[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Required and optional columns of a table, with points or without."""
+    if not set(COORDINATES) & set(header):
+        return REQUIRED, OPTIONAL
+    return OF_POINTS, tuple(name for name in COLUMNS if name not in OF_POINTS)
 
 
 def decide_sign(
@@ -186,13 +216,15 @@ def read_rows(path: Path, content: bytes) -> Iterator[RawReading]:
 def _plain_rows(path: Path, content: bytes) -> Iterator[RawReading]:
     """Rows below the headings of a readings.csv."""
     text = read_text(path, error=SessionError, content=content)
+    header = text.partition("\n")[0].replace(";", ",").split(",")
+    required, optional = _schema([composed(name.strip()) for name in header])
 
     def rows() -> Iterator[tuple[int, dict[str, str]]]:
         return csv_rows(
             io.StringIO(text, newline=None),
             name=str(path),
-            required=REQUIRED,
-            optional=OPTIONAL,
+            required=required,
+            optional=optional,
             error=SessionError,
             most=MOST_CSV_ROWS,
         )
@@ -203,7 +235,8 @@ def _plain_rows(path: Path, content: bytes) -> Iterator[RawReading]:
         # what is wrong with a row is told when it is read
         with suppress(SessionError):
             for line, row in islice(rows(), MOST_READINGS + 1):
-                numerals.append(Numeral(row["reading_mm"], line))
+                names = ("reading_mm", *COORDINATES)
+                numerals += [Numeral(row[name], line) for name in names if row.get(name)]
         sign = _plain_sign(numerals, path)
     for line, cells in rows():
         if sign is not None:

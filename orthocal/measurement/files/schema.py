@@ -10,14 +10,14 @@ from orthocal.effects.adjustment import LARGEST_AMOUNT_MM
 from orthocal.io.documents import Count, Name, Number, PositiveNumber
 from orthocal.robot.description import HEAVIEST_KG
 from orthocal.sensors.mounting import LARGEST_SCALE
+from orthocal.sensors.protocol import LARGEST_READING
 from orthocal.sensors.tips import TipKeys
 from orthocal.session.session import Gauge
 from orthocal.units import DEG, MM, MRAD, Unit
 
 Vector = Annotated[list[Number], Field(min_length=1, max_length=12)]
 
-LARGEST_READING_MM = 300.0
-"""No indicator reaches further, and no leg is as far from parallel: it is a wrong unit."""
+LARGEST_READING_MM = LARGEST_READING / MM
 
 COARSEST_MM = 10.0
 """No resolution and no standard deviation of an indicator is larger; a ruler's is 1 mm."""

@@ -25,6 +25,7 @@ from orthocal.io.files import (
     read_file,
     require_plain_name,
 )
+from orthocal.measurement.files.point_rows import base_name, locate_stations, split_points
 from orthocal.measurement.files.readings_checks import check_readings, require_name
 from orthocal.measurement.files.readings_file import read_rows
 from orthocal.measurement.files.schema import MOST_READINGS, CalibrationKeys, GaugeKeys, SessionKeys
@@ -75,15 +76,20 @@ def _load_session(
     table = read_file(readings_path, error=SessionError)
     with content_withheld_outside(file.parent, readings_path):
         rows = read_rows(readings_path, table)
-        readings = check_readings(rows, plan, file=readings_path, partial=partial)
+        readings, points = check_readings(rows, plan, file=readings_path, partial=partial)
     digest = hashlib.sha256(content + b"\0" + table)
     for joint in plan.compensation:
         digest.update(b"" if joint.table is None else joint.table.tobytes())
     session = replace(
-        plan, readings=readings, readings_path=readings_path, sha256=digest.hexdigest()
+        plan,
+        setups=points.setups,
+        gauges=points.gauges,
+        readings=readings,
+        readings_path=readings_path,
+        sha256=digest.hexdigest(),
     )
     check_contacts(session)
-    return session
+    return locate_stations(session)
 
 
 def load_unread(path: str | Path) -> tuple[Session, Path]:
@@ -150,11 +156,15 @@ def load_rows(path: str | Path) -> Session:
             where=f"{file}: cycles",
         )
     plan = _build_plan(file, keys, read)
+    parts: dict[str, list[str]] = {}
+    for name in plan.setups:
+        parts.setdefault(name if name in read else base_name(name), []).append(name)
     readings = tuple(
-        Reading(name, posture, None, cycle, math.nan)
+        Reading(part, posture, None, cycle, math.nan)
         for name, (setup, _) in read.items()
         for cycle in range(1, keys.cycles + 1)
         for posture in setup.postures or plan.postures
+        for part in parts[name]
     )
     session = replace(plan, readings=readings)
     check_contacts(session)
@@ -302,7 +312,7 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
             payload=keys.payload_kg,
         )
     _check_shared(setups, str(file))
-    return Session(
+    session = Session(
         robot=robot,
         robot_reference=keys.robot,
         title=keys.title,
@@ -318,6 +328,7 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
         purpose=purpose,
         seed=keys.seed,
     )
+    return split_points(session)
 
 
 def _check_shared(setups: Mapping[str, Setup], file: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +14,26 @@ import yaml
 from orthocal.effects.compensation import format_table, table_name
 from orthocal.errors import SessionError
 from orthocal.io.files import exists, write_file, write_files
+from orthocal.measurement.files.point_rows import (
+    base_name,
+    gather_points,
+    is_of_row,
+    point_cells,
+)
 from orthocal.measurement.files.readings_file import (
     COLUMN_OF_ROLE,
+    OF_POINTS,
+    REQUIRED,
     RawReading,
     format_readings,
 )
 from orthocal.observation.conditions import needed_conditions
 from orthocal.robot.loading import packaged_robots, robot_digest
 from orthocal.robot.model import Robot
+from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import default_zero
 from orthocal.sensors.registry import write_sensor
-from orthocal.session.session import Conditions, Gauge, Posture, Purpose, Reading, Session
+from orthocal.session.session import Conditions, Gauge, Posture, Purpose, Reading, Session, Setup
 from orthocal.units import DRIVE_UNITS, MM, tidy, to_mm, trim_zeros
 
 
@@ -36,7 +46,9 @@ def session_document(session: Session) -> dict[str, Any]:
         document["source"] = session.source
     if session.seed is not None:
         document["seed"] = session.seed
-    gauges = {name: _gauge_document(g) for name, g in session.gauges.items()}
+    gauges = {
+        name: _gauge_document(g) for name, g in session.gauges.items() if base_name(name) == name
+    }
     if "" not in gauges:
         document["gauges"] = gauges
     elif gauges[""]:
@@ -53,15 +65,23 @@ def session_document(session: Session) -> dict[str, Any]:
     if calibration := _calibration_document(session):
         document["calibration"] = calibration
     aligned_at = session.alignment_postures
-    document["setups"] = {
-        s.name: {
-            **write_sensor(s.sensor),
-            **({"gauge": s.gauge} if s.gauge else {}),
-            "aligned_at": aligned_at[s.name],
-            **({"zero": s.zero} if s.zero != default_zero(s.sensor) else {}),
-        }
-        for s in session.setups.values()
-    }
+    setups: dict[str, Any] = {}
+    for setup in session.setups.values():
+        name, sensor, gauge = setup.name, setup.sensor, setup.gauge
+        if isinstance(sensor, Points):
+            name, gauge, sensor = base_name(name), "" if gauge == name else gauge, sensor.in_file
+            if is_of_row(setup.name):
+                sensor = replace(sensor, covariance=None)
+        setups.setdefault(
+            name,
+            {
+                **write_sensor(sensor),
+                **({"gauge": gauge} if gauge else {}),
+                "aligned_at": aligned_at[setup.name],
+                **({"zero": setup.zero} if setup.zero != default_zero(sensor) else {}),
+            },
+        )
+    document["setups"] = setups
     document["readings"] = "readings.csv"
     return document
 
@@ -172,7 +192,9 @@ def write_session(
     )
     conditions = needed_conditions(session.robot) if blank else ()
     needed = [COLUMN_OF_ROLE.get(c, c) for c in conditions]
-    table = readings_table(session.readings, decimals=decimals, blank=blank, needed=needed)
+    table = readings_table(
+        session.readings, session.setups, decimals=decimals, blank=blank, needed=needed
+    )
     files = {"session.yaml": text, "readings.csv": table, **_tables(session), **(extra or {})}
     write_files(folder, files)
     return folder / "session.yaml"
@@ -199,6 +221,7 @@ def _place_robot(session: Session, folder: Path) -> str:
 
 def readings_table(
     readings: Sequence[Reading],
+    setups: Mapping[str, Setup],
     *,
     decimals: int = 6,
     blank: bool = False,
@@ -208,21 +231,25 @@ def readings_table(
 
     Args:
         readings: The readings, in order.
+        setups: Their setups.
         decimals: Decimals of a reading in mm.
         blank: Leave readings and measured conditions empty.
         needed: Optional columns to be filled in.
     """
-    rows = []
-    for r in readings:
+    rows, required = [], set[str]()
+    for part in gather_points(readings, setups):
+        r, point = part[0], isinstance(setups[part[0].setup].sensor, Points)
         conditions, value, temperature = r.conditions or Conditions(), "", ""
-        if r.is_read and not blank:
+        cells = point_cells(part, setups, decimals) if point and not blank else {}
+        required |= set(OF_POINTS if point else REQUIRED)
+        if r.is_read and not blank and not point:
             value = trim_zeros(f"{r.value / MM:.{decimals}f}")
         if conditions.temperature is not None:
             temperature = f"{conditions.temperature:.12g}"
         row = RawReading(
             where="",
             line=0,
-            setup=r.setup,
+            setup=base_name(r.setup) if point else r.setup,
             posture=r.posture,
             minus=r.minus or "",
             cycle=str(r.cycle),
@@ -230,6 +257,7 @@ def readings_table(
             approach=conditions.approach or "",
             temperature_C=temperature,
             time="" if conditions.time is None else conditions.time.isoformat(),
+            **cells,
         )
         rows.append(row)
-    return format_readings(rows, blank=blank, needed=needed)
+    return format_readings(rows, blank=blank, needed=needed, required=required or REQUIRED)

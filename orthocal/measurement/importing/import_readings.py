@@ -13,7 +13,8 @@ from orthocal.errors import SessionError
 from orthocal.io.files import content_withheld_outside, exists, read_file, write_file
 from orthocal.io.tables.numerals import Sign
 from orthocal.io.tables.table import Table, read_table
-from orthocal.measurement.files.readings_checks import check_readings, parse_reading, parse_time
+from orthocal.measurement.files.point_rows import require_no_points
+from orthocal.measurement.files.readings_checks import check_readings, parse_row, parse_time
 from orthocal.measurement.files.readings_file import (
     CONDITIONS,
     RawReading,
@@ -114,16 +115,17 @@ def import_readings(
     _check_options(options)
     path = Path(table)
     plan, readings_path = load_unread(session)
+    require_no_points(plan)
     content, columns, long_table = _read_long_table(path, plan, options)
-    readings = check_readings(long_table.rows, plan, file=path)
+    readings, points = check_readings(long_table.rows, plan, file=path)
     new = list(zip(long_table.rows, readings, strict=True))
     with content_withheld_outside((plan.path or Path(session)).parent, readings_path):
         existing = [
-            (row, parse_reading(row, plan))
+            (row, parse_row(row, plan, points)[0])
             for row in _read_existing(readings_path, path, long_table, overwrite)
         ]
     merged, counts = _merge(existing, new, overwrite)
-    readings = check_readings(merged, plan, file=readings_path, partial=True)
+    readings, _ = check_readings(merged, plan, file=readings_path, partial=True)
     check_contacts(replace(plan, readings=readings))
     return TableImport(
         options=options,

@@ -1,0 +1,346 @@
+"""Points: coordinates of a target at the tool, from a tracker, an arm, a camera or a microscope.
+
+The instrument shows the target's position in its own frame, the station. With q the target in the
+world, t and R the pose of the station, and s the error of its scale, the reading along a unit
+vector a of the station is
+
+    h = (1 + s) aᵀ Rᵀ (Eᵀ (q − e) − t)
+
+Its errors E, e turn and displace the station about the origin of the world, near the machine.
+
+A reading is one number here, so a setup of points is read as three sensors with orthogonal a: the
+axes of the station, or the principal axes of the covariance of a point, along which its errors are
+independent. They share the station. Its pose is a nuisance parameter: about the best fit of the
+points to the nominal machine if the frame is unknown, and about the world's frame otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from pydantic import BaseModel, ConfigDict, Field
+
+from orthocal.arrays import Array
+from orthocal.errors import SessionError
+from orthocal.io.documents import Name, Number
+from orthocal.robot.model import Robot, require_tcp
+from orthocal.sensors.mounting import rotate
+from orthocal.sensors.protocol import (
+    Contact,
+    Frames,
+    GaugeZero,
+    NuisanceParameter,
+    Sensor,
+    SetupKeys,
+    View,
+)
+from orthocal.units import MM, MRAD, UM, read_limit, show_limit, tidy, to_mm
+
+LARGEST_MM = 100_000.0
+"""Largest coordinate: the reach of a laser tracker."""
+
+ABOUT_FIT = 20 * MM, 50 * MRAD
+"""Prior standard deviations of an unknown frame about the best fit, [m] and [rad]: ten times what
+errors of the machine change in it."""
+
+AXES = "xyz"
+
+Coordinate = Annotated[Number, Field(ge=-LARGEST_MM, le=LARGEST_MM)]
+Vector3 = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
+Covariance = Annotated[
+    list[Annotated[list[Number], Field(min_length=3, max_length=3)]],
+    Field(min_length=3, max_length=3),
+]
+Triple = tuple[float, float, float]
+
+
+class _Keys(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+
+class FrameKeys(_Keys):
+    """Station at the world's frame, with tolerances."""
+
+    tolerance_mm: Annotated[Number, Field(ge=0.0, le=1000.0)] = 0.0
+    tolerance_mrad: Annotated[Number, Field(ge=0.0, le=400.0)] = 0.0
+
+
+class AxisKeys(_Keys):
+    """One of the three sensors of a setup: what a calibration records."""
+
+    along: Annotated[list[Number], Field(min_length=3, max_length=3)]
+    """Unit vector in the station."""
+    station_mm: Vector3
+    """Position of the station's origin in the world."""
+    station_rad: Annotated[list[Number], Field(min_length=3, max_length=3)]
+    """Rotation vector of the station."""
+
+
+class PointKeys(SetupKeys):
+    """Keys of a setup of points, as in a session.yaml."""
+
+    target_mm: Vector3 = Field(default_factory=lambda: [0.0, 0.0, 0.0])
+    """The target, from the tool centre point, in the tool's frame."""
+    frame: Literal["unknown"] | FrameKeys = "unknown"
+    station: Name | None = None
+    """Name of the station, if several setups share its pose."""
+    scale_tolerance: Annotated[Number, Field(ge=0.0, le=0.4)] = 0.0
+    covariance_um2: Covariance | None = None
+    """Covariance of the coordinates of a point in the station; by default that of the gauge's
+    sigma_mm along each axis."""
+    axis: AxisKeys | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """Coordinates of a target at the tool, or the coordinate along one axis of the station."""
+
+    target: Triple = (0.0, 0.0, 0.0)
+    """Target, from the tool centre point, in the tool's frame, [m]."""
+    frame_std: tuple[float, float] = ABOUT_FIT
+    """Prior standard deviations of the station's position and rotation, [m] and [rad]."""
+    station: str | None = None
+    scale_std: float = 0.0
+    covariance: tuple[Triple, Triple, Triple] | None = None
+    """Covariance of the coordinates of a point, [m²]; None for that of the gauge."""
+    along: Triple | None = None
+    """Unit vector of the coordinate, in the station; None for all three."""
+    position: Triple = (0.0, 0.0, 0.0)
+    """Position of the station in the world, [m]."""
+    rotation: Triple = (0.0, 0.0, 0.0)
+    """Rotation vector of the station, [rad]."""
+
+    kind: ClassVar[str] = "points"
+    keys: ClassVar[type[SetupKeys]] = PointKeys
+    ideal: ClassVar[str] = "where the nominal machine has it"
+    zero: ClassVar[GaugeZero] = "known"
+    largest_reading: ClassVar[float] = LARGEST_MM * MM
+
+    @classmethod
+    def from_keys(cls, keys: PointKeys) -> Points:
+        """Build from the keys of a session.yaml.
+
+        Raises:
+            SessionError: If the covariance is none.
+        """
+        frame_std = ABOUT_FIT
+        if isinstance(keys.frame, FrameKeys):
+            frame_std = (
+                tidy(read_limit(keys.frame.tolerance_mm) * MM),
+                tidy(read_limit(keys.frame.tolerance_mrad) * MRAD),
+            )
+        points = cls(
+            target=_triple(keys.target_mm, MM),
+            frame_std=frame_std,
+            station=keys.station,
+            scale_std=read_limit(keys.scale_tolerance),
+            covariance=None
+            if keys.covariance_um2 is None
+            else read_covariance(keys.covariance_um2),
+        )
+        if keys.axis is None:
+            return points
+        return replace(
+            points,
+            along=_triple(keys.axis.along),
+            position=_triple(keys.axis.station_mm, MM),
+            rotation=_triple(keys.axis.station_rad),
+        )
+
+    def to_keys(self) -> dict[str, Any]:
+        """Keys for a session.yaml; with `axis` for one of the three sensors of a setup."""
+        keys: dict[str, Any] = {"target_mm": [to_mm(v) for v in self.target]}
+        if self.frame_std != ABOUT_FIT:
+            units = zip(self.frame_std, (MM, MRAD), strict=True)
+            limits = [tidy(show_limit(std) / unit) for std, unit in units]
+            keys["frame"] = {"tolerance_mm": limits[0], "tolerance_mrad": limits[1]}
+        if self.station is not None:
+            keys["station"] = self.station
+        if self.scale_std:
+            keys["scale_tolerance"] = show_limit(self.scale_std)
+        if self.covariance is not None:
+            keys["covariance_um2"] = [[tidy(v / UM**2) for v in row] for row in self.covariance]
+        if self.along is not None:
+            keys["axis"] = {
+                "along": list(self.along),
+                "station_mm": [v / MM for v in self.position],
+                "station_rad": list(self.rotation),
+            }
+        return keys
+
+    @property
+    def in_file(self) -> Points:
+        """All three coordinates, as a session.yaml states them."""
+        none = (0.0, 0.0, 0.0)
+        return replace(self, along=None, position=none, rotation=none)
+
+    def split(self) -> dict[str, tuple[Points, float | None]]:
+        """The three sensors by label, each with the standard deviation of its reading.
+
+        None stands for that of the gauge. Without correlation they read the axes of the station.
+        """
+        if self.covariance is None:
+            return {k: (replace(self, along=_unit(i)), None) for i, k in enumerate(AXES)}
+        covariance = np.array(self.covariance)
+        if not np.any(covariance - np.diag(np.diag(covariance))):
+            stds, axes, labels = np.sqrt(np.diag(covariance)), np.eye(3), AXES
+        else:
+            variances, axes = np.linalg.eigh(covariance)
+            stds, labels = np.sqrt(variances), "123"
+        return {
+            label: (replace(self, along=_triple(axes[:, i].tolist())), float(stds[i]))
+            for i, label in enumerate(labels)
+        }
+
+    def require_fit(self, robot: Robot, *, where: str) -> None:
+        """Refuse a robot without a tool.
+
+        Raises:
+            SessionError: Naming the key.
+        """
+        if robot.tcp is None:
+            raise SessionError(
+                f"'{robot.name}' has no tool for a target; add orthocal.tcp to {robot.yaml}",
+                where=f"{where}.sensor",
+            )
+
+    @property
+    def place(self) -> tuple[str, str]:
+        """The tool."""
+        return "tool", ""
+
+    def describe(self) -> str:
+        """Coordinate and target."""
+        target = ", ".join(f"{v / MM:g}" for v in self.target)
+        at = f"target at ({target}) mm" if any(self.target) else "target at the tool"
+        if self.along is None:
+            return f"position of a {at}"
+        axis = next((k for i, k in enumerate(AXES) if self.along == _unit(i)), None)
+        if axis is not None:
+            return f"{axis} coordinate of a {at}"
+        return f"coordinate of a {at} along ({', '.join(f'{v:.3g}' for v in self.along)})"
+
+    @property
+    def mounting_steps(self) -> tuple[str, ...]:
+        """Steps that mount the target."""
+        target = ", ".join(f"{v / MM:g}" for v in self.target)
+        return (
+            "Set up the instrument. It must not move until all points of its setups are taken.",
+            f"Mount the target at the tool, ({target}) mm from the tool centre point.",
+            "Export the points as a table with columns setup, posture, x_mm, y_mm, z_mm.",
+        )
+
+    def frames(self, robot: Robot) -> Frames:
+        """The tool's frame."""
+        return Frames((require_tcp(robot).frame,))
+
+    def constants(self, robot: Robot) -> Array:
+        """Coordinate axis in the world (3), station (3), target (3)."""
+        del robot
+        along = rotation_matrix(self.rotation) @ np.array(self.along or (0.0, 0.0, 0.0))
+        return np.array([*along, *self.position, *self.target])
+
+    @property
+    def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
+        """Pose and scale of the station; those with a standard deviation above 0."""
+        owner = f"station.{self.station}" if self.station else None
+        length, angle = self.frame_std
+        parameters = (
+            *(NuisanceParameter(k, "m", length, owner) for k in AXES),
+            *(NuisanceParameter(f"r{k}", "rad", angle, owner) for k in AXES),
+            NuisanceParameter("scale", "1", self.scale_std, owner),
+        )
+        return tuple(p for p in parameters if p.prior_std > 0.0)
+
+    def aligned_to(self, robot: Robot) -> Mapping[str, Sensor]:
+        """No parameter depends on the machine."""
+        del robot
+        return {}
+
+    def expression(self, view: View, robot: Robot) -> ca.SX:
+        """Coordinate along its axis, [m]."""
+        del robot
+        errors = {p.name: view.nuisance[i] for i, p in enumerate(self.nuisance_parameters)}
+        along, station, target = (view.constants[i : i + 3] for i in (0, 3, 6))
+        shift = ca.vertcat(*(errors.get(k, 0.0) for k in AXES))
+        (tool,) = view.frames
+        seen = tool.position + tool.rotation @ target - shift
+        for i in (2, 1, 0):
+            seen = rotate(seen, ca.SX(np.eye(3)[i]), -ca.SX(errors.get(f"r{AXES[i]}", 0.0)))
+        return ca.SX((1.0 + errors.get("scale", 0.0)) * ca.dot(along, seen - station))
+
+    def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
+        """Targets in K postures."""
+        del at_zero
+        poses = frames[0]
+        targets = poses[:, :3, 3] + poses[:, :3, :3] @ np.array(self.target)
+        direction = self.constants(robot)[:3]
+        across = np.linalg.svd(direction[None])[2][-1]
+        return Contact(targets, direction, across, [""] * len(targets), "target_mm")
+
+
+def read_covariance(rows: Sequence[Sequence[float]]) -> tuple[Triple, Triple, Triple]:
+    """Covariance of a point, [m²], from rows in µm².
+
+    Raises:
+        SessionError: If it is not symmetric and positive definite.
+    """
+    matrix = np.array(rows, dtype=np.float64)
+    if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0):
+        raise SessionError("is not symmetric", where="covariance_um2")
+    if not np.linalg.eigvalsh(matrix).min() > 0.0:
+        raise SessionError(
+            "is not positive definite; expected variances in µm² on its diagonal",
+            where="covariance_um2",
+        )
+    a, b, c = (_triple(row, UM**2) for row in matrix.tolist())
+    return a, b, c
+
+
+def fit_station(points: Array, targets: Array) -> tuple[Triple, Triple]:
+    """Station in which points fit targets in the world best (Kabsch, 1976).
+
+    Args:
+        points: In the station, shape (n, 3), [m].
+        targets: In the world, shape (n, 3), [m].
+
+    Returns:
+        Position [m] and rotation vector [rad] of the station.
+
+    Raises:
+        SessionError: If the points do not determine it.
+    """
+    seen, true = points - points.mean(axis=0), targets - targets.mean(axis=0)
+    sizes = np.linalg.svd(seen, compute_uv=False)
+    if len(points) < 3 or not sizes[1] > 1e-3 * sizes[0]:
+        raise SessionError(
+            "unknown, but the points lie on a line; expected three or more points that do not",
+            where="frame",
+        )
+    u, _, vh = np.linalg.svd(seen.T @ true)
+    rotation = vh.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(vh.T @ u.T))]) @ u.T
+    position = targets.mean(axis=0) - rotation @ points.mean(axis=0)
+    return _triple(position.tolist()), _triple(_rotation_vector(rotation).tolist())
+
+
+def rotation_matrix(vector: Sequence[float]) -> Array:
+    """Rotation matrix of a rotation vector, shape (3, 3)."""
+    return np.asarray(pin.exp3(np.array(vector)))
+
+
+def _rotation_vector(matrix: Array) -> Array:
+    return np.asarray(pin.log3(matrix))
+
+
+def _unit(i: int) -> Triple:
+    return _triple(np.eye(3)[i].tolist())
+
+
+def _triple(values: Sequence[float], unit: float = 1.0) -> Triple:
+    x, y, z = (float(v) * unit + 0.0 for v in values)
+    return x, y, z

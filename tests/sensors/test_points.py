@@ -1,0 +1,218 @@
+"""Points: readings against Pinocchio and SciPy, unknown frames, covariances, a tracker alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bounds import bound_um
+from machines import frame_pose
+from scipy.spatial.transform import Rotation
+from tolerances import CLOSED_FORM, SAME_NUMBER
+
+from orthocal import calibrate, draw_errors, load_plan, load_session, write_session
+from orthocal.assessment.tool_error import measure_uncertainty
+from orthocal.errors import SessionError
+from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.variable_projection import VariableProjection
+from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.kinematics.sensitivity import ToolSensitivity
+from orthocal.kinematics.workspace import cube
+from orthocal.observation.model import predict_readings
+from orthocal.observation.sensor_groups import nuisance_parameters
+from orthocal.observation.simulate import simulate_session
+from orthocal.sensors.points import fit_station
+from orthocal.statistics.chance import confidence_factor
+
+SIGMA = 10e-6
+TARGET_MM = (3.0, -4.0, -40.0)
+ERRORS = {"x_slide.offset": 0.7e-3, "y_slide.offset": -0.4e-3, "z_swivel.rx": 1.5e-3}
+COVARIANCE_UM2 = [[90.0, 40.0, -10.0], [40.0, 60.0, 5.0], [-10.0, 5.0, 400.0]]
+
+
+def grid(folder, keys="", *, side=3):
+    """Plan of a tracker that sees the target in a grid of postures."""
+    values = np.linspace(-50.0, 50.0, side)
+    points = np.array(np.meshgrid(values, values, values)).reshape(3, -1).T
+    postures = "".join(f"  p{i}: {{tcp_mm: {p.tolist()}}}\n" for i, p in enumerate(points))
+    folder.mkdir(exist_ok=True)
+    (folder / "plan.yaml").write_text(
+        f"robot: orthoglide\ncontroller: {{offsets_mm: [0, 0, 0]}}\ngauge: {{sigma_mm: 0.01}}\n"
+        f"postures:\n{postures}"
+        f"setups:\n  track: {{sensor: points, target_mm: {list(TARGET_MM)}{keys}}}\n"
+    )
+    return load_plan(folder / "plan.yaml")
+
+
+def test_readings_are_coordinates_of_the_target_in_the_station(tmp_path):
+    """Machine by Pinocchio; a station anywhere, with errors of its pose and scale."""
+    plan = grid(tmp_path, ", scale_tolerance: 0.001", side=2)
+    names = [p.name for p in nuisance_parameters(plan).parameters]
+    assert names == [f"station.track.{k}" for k in ("x", "y", "z", "rx", "ry", "rz", "scale")]
+    position, rotation = np.array([2.1, -3.4, 0.7]), np.array([0.3, -1.1, 0.5])
+    setups = {
+        n: replace(s, sensor=replace(s.sensor, position=tuple(position), rotation=tuple(rotation)))
+        for n, s in plan.setups.items()
+    }
+    plan = replace(plan, setups=setups)
+    nuisance = np.array([4e-3, -2e-3, 1e-3, 0.02, -0.01, 0.03, 5e-4])
+    found = predict_readings(plan, ERRORS, nuisance=nuisance)
+    machine = plan.robot.with_errors(ERRORS)
+    turned = Rotation.from_euler("xyz", nuisance[3:6])
+    for row, reading in enumerate(plan.readings):
+        pose = frame_pose(machine, plan.postures[reading.posture].drives, plan.robot.tcp.frame)
+        target = pose.act(1e-3 * np.array(TARGET_MM))
+        seen = turned.inv().apply(target - nuisance[:3])
+        seen = Rotation.from_rotvec(rotation).inv().apply(seen - position)
+        expected = (1.0 + nuisance[6]) * seen["xyz".index(reading.setup[-2])]
+        assert abs(found[row] - expected) < CLOSED_FORM
+
+
+def test_the_station_is_that_of_scipy():
+    rng = np.random.default_rng(0)
+    points, turned = rng.normal(size=(7, 3)), Rotation.from_rotvec([2.0, -0.4, 1.0])
+    targets = turned.apply(points) + [1.0, -2.0, 3.0] + 0.01 * rng.normal(size=(7, 3))
+    position, rotation = fit_station(points, targets)
+    middle = points.mean(axis=0), targets.mean(axis=0)
+    expected, _ = Rotation.align_vectors(targets - middle[1], points - middle[0])
+    np.testing.assert_allclose(rotation, expected.as_rotvec(), atol=SAME_NUMBER)
+    np.testing.assert_allclose(position, middle[1] - expected.apply(middle[0]), atol=SAME_NUMBER)
+    with pytest.raises(SessionError, match="line"):
+        fit_station(np.outer(np.arange(4.0), [1.0, 2.0, 0.5]), targets[:4])
+
+
+def test_principal_axes_weigh_points_by_their_covariance(tmp_path):
+    """r' C⁻¹ r of each point is the sum of the squared residuals of its three sensors."""
+    plan = grid(tmp_path, f", covariance_um2: {COVARIANCE_UM2}", side=2)
+    assert list(plan.setups) == ["track[1]", "track[2]", "track[3]"]
+    r = 1e-5 * np.random.default_rng(1).normal(size=3)
+    expected = r @ np.linalg.solve(1e-12 * np.array(COVARIANCE_UM2), r)
+    sensors = [(s.sensor, plan.gauges[s.gauge].sigma) for s in plan.setups.values()]
+    found = sum((np.dot(sensor.along, r) / sigma) ** 2 for sensor, sigma in sensors)
+    assert found == pytest.approx(expected, rel=SAME_NUMBER)
+
+
+@pytest.mark.parametrize("keys", ["", f", covariance_um2: {COVARIANCE_UM2}", ", station: left"])
+def test_a_simulated_session_comes_back_from_its_files(tmp_path, keys):
+    session = simulate_session(grid(tmp_path, keys, side=2), ERRORS, seed=3).session
+    write_session(session, tmp_path / "session", decimals=9)
+    header = (tmp_path / "session" / "readings.csv").read_text().partition("\n")[0]
+    assert header == "setup,posture,x_mm,y_mm,z_mm"
+    again = load_session(tmp_path / "session")
+    np.testing.assert_allclose(again.values, session.values, atol=2e-12)
+    assert {n: s.sensor.in_file for n, s in again.setups.items()} == {
+        n: replace(s.sensor, station=keys[11:] or "track").in_file
+        for n, s in session.setups.items()
+    } or keys.startswith(", cov")
+    assert [g.sigma for g in again.gauges.values()] == pytest.approx(
+        [g.sigma for g in session.gauges.values()]
+    )
+
+
+def test_a_row_may_have_a_covariance_of_its_own(tmp_path):
+    session = simulate_session(grid(tmp_path, side=2), ERRORS, seed=3).session
+    write_session(session, tmp_path / "session")
+    file = tmp_path / "session" / "readings.csv"
+    head, *rows = file.read_text().splitlines()
+    head += ",cov_xx_um2,cov_yy_um2,cov_zz_um2,cov_xy_um2,cov_xz_um2,cov_yz_um2"
+    rows = [rows[0] + ",90,60,400,40,-10,5", rows[1] + ",25,36,49,0,0,0"] + [
+        f"{row},,,,,," for row in rows[2:]
+    ]
+    file.write_text("\n".join([head, *rows]) + "\n")
+    found = load_session(tmp_path / "session")
+    assert [n for n in found.setups if not n.endswith("]") or len(n) > len("track[x]")] == [
+        *("track[12]", "track[22]", "track[32]"),
+        *("track[x3]", "track[y3]", "track[z3]"),
+    ]
+    assert [found.gauges[f"track[{k}3]"].sigma for k in "xyz"] == [5e-6, 6e-6, 7e-6]
+    write_session(found, tmp_path / "again")
+    again = load_session(tmp_path / "again")
+    np.testing.assert_allclose(again.values, found.values, atol=2e-9)
+    assert list(again.setups) == list(found.setups)
+
+
+@pytest.mark.slow
+def test_a_tracker_alone_identifies_the_complete_model(tmp_path, orthoglide):
+    """40 machines with all errors, seen from an arbitrary station; closed loops."""
+    plan = grid(tmp_path)
+    robot, space = plan.robot, cube(orthoglide, points_a_side=5)
+    problem = build_problem(plan, model="full", prior_stds={"*.offset": 0.5e-3})
+    n, scale = problem.n_machine, problem.theta_scale
+    names = problem.free[:n]
+    closure, drives = LoopClosure(robot, free=names), LoopClosure(robot).inverse(space.points)
+    program, tool = VariableProjection(problem), ToolSensitivity(robot, free=names)(drives)
+    squares, promised, hits = [], [], []
+    for seed in range(40):
+        errors = draw_errors(robot, names, seed=seed, tolerances={"*.offset_mm": 1.0})
+        truth = np.array([errors[name] for name in names])
+        shown = simulate_session(plan, errors, seed=seed, sigma=SIGMA).session
+        values = problem.observations.values(shown.values)
+        found = program.solve(sigma=SIGMA, values=values)
+        _, jacobian = problem.predict_and_jacobian(found.theta)
+        information = jacobian.T @ jacobian / SIGMA**2 + np.diag(problem.prior_precision)
+        covariance = np.linalg.inv(information)[:n, :n] * np.outer(scale[:n], scale[:n])
+        missed = closure.forward(drives, theta=found.theta[:n])
+        missed = missed - closure.forward(drives, theta=truth)
+        missed = space.remove_motion(missed, space.points)
+        squares.append(space.weights @ (missed**2).sum(axis=1))
+        promised.append(
+            measure_uncertainty(tool, covariance, space, space.points).sizes.aligned.rms ** 2
+        )
+        std = np.sqrt(np.diag(covariance))
+        hits.append(np.abs(found.theta[:n] - truth) < confidence_factor(np.inf) * std)
+    achieved, expected = (float(np.sqrt(np.mean(v))) for v in (squares, promised))
+    assert expected < SIGMA
+    assert 0.75 * expected < achieved < 1.15 * expected
+    assert 0.93 < np.mean(hits) < 0.97
+    assert bound_um(plan, space) == pytest.approx(1e6 * expected, rel=0.05)
+
+
+def test_a_session_of_points_is_calibrated(tmp_path):
+    plan = grid(tmp_path)
+    errors = draw_errors(plan.robot, plan.robot.parameters.select_model("full"), seed=3)
+    session = simulate_session(plan, errors, seed=1).session
+    write_session(session, tmp_path / "session")
+    calibration = calibrate(tmp_path / "session")
+    assert calibration.assessment.decision.verdict == "enter"
+    for name in ("x_slide.offset", "y_slide.offset", "z_slide.offset"):
+        parameter = next(p for p in calibration.free if p.name == name)
+        assert abs(parameter.value - errors[name]) < 4.0 * parameter.std
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "place"),
+    [
+        ("target_mm: [3.0, -4.0, -40.0]", "target_mm: [3.0]", "target_mm"),
+        ("sensor: points", "sensor: points, frame: known", "frame"),
+        ("sensor: points", "sensor: points, covariance_um2: [[1,0,0],[0,1,0],[0,0,-1]]",
+         "covariance_um2"),
+        ("track:", "tr[a]ck:", "tr[a]ck"),
+    ],
+)  # fmt: skip
+def test_a_wrong_key_is_refused_by_name(tmp_path, old, new, place):
+    grid(tmp_path, side=2)
+    file = tmp_path / "plan.yaml"
+    file.write_text(file.read_text().replace(old, new, 1))
+    with pytest.raises(SessionError) as caught:
+        load_plan(file)
+    assert place in str(caught.value.where)
+
+
+@pytest.mark.parametrize(
+    ("row", "problem"),
+    [
+        ("track,p0,1,2,", "z_mm is empty"),
+        ("track,p0,1,2,x", "z_mm"),
+        ("track[x],p0,1,2,3", "is not a setup; setups: track"),
+    ],
+)
+def test_a_wrong_row_is_refused_by_its_line(tmp_path, row, problem):
+    session = simulate_session(grid(tmp_path, side=2), ERRORS, seed=3).session
+    write_session(session, tmp_path / "session")
+    file = tmp_path / "session" / "readings.csv"
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join([lines[0], row, *lines[2:]]) + "\n")
+    with pytest.raises(SessionError, match=problem) as caught:
+        load_session(tmp_path / "session")
+    assert str(caught.value.where).endswith(":2")
