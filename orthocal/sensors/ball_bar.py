@@ -13,6 +13,7 @@ each setup, or share an unknown length.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
@@ -42,6 +43,9 @@ CENTRE = 1.0 * MM
 
 UNKNOWN = 1.0 * MM
 """Prior standard deviation of a length that nobody measured but with a ruler, [m]."""
+
+SAGITTA = 5e-6
+"""Deviation of a chord from the arc between two readings, [m]."""
 
 LARGEST_MM = 5000.0
 """Largest length and coordinate; a larger one has a wrong unit."""
@@ -161,6 +165,30 @@ class BallBar:
             "Make the bar longer by hand. The dial must grow. If it falls, write every reading of "
             "this setup with reversed sign.",
         )
+
+    def path(self, start: Array, end: Array) -> Array:
+        """Corners of a great arc about the fixed ball, on which the bar keeps its length.
+
+        Args:
+            start: Tool centre point, shape (3,), [m].
+            end: The same.
+
+        Returns:
+            Shape (n, 3), [m]; chords deviate from the arc by at most `SAGITTA`.
+        """
+        offset = np.array(self.tool) - np.array(self.centre)
+        ends = np.array([start + offset, end + offset])
+        radii = np.linalg.norm(ends, axis=1)
+        first, last = ends / np.maximum(radii, 1e-12)[:, None]
+        across = last - (first @ last) * first
+        if np.linalg.norm(across) < 1e-9:  # the same direction, or the opposite one
+            across = np.linalg.svd(first[None])[2][-1]
+        across /= np.linalg.norm(across)
+        angle = np.arctan2(last @ across, first @ last)
+        step = 2.0 * np.arccos(1.0 - min(SAGITTA / radii.max(), 1.0))
+        share = np.linspace(0.0, 1.0, max(math.ceil(angle / step), 1) + 1)[:, None]
+        unit = np.cos(share * angle) * first + np.sin(share * angle) * across
+        return np.asarray((radii[0] + share * (radii[1] - radii[0])) * unit - offset)
 
     def frames(self, robot: Robot) -> Frames:
         """The tool's frame."""

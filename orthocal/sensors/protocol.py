@@ -7,7 +7,7 @@ The gauge zero of the setup is added, unless it is known to be 0.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
 
@@ -24,6 +24,10 @@ from orthocal.units import Unit
 GaugeZero = Literal["free", "known"]
 """Gauge zero of a setup: estimated from its readings, or known to be 0, so that its readings are
 absolute."""
+
+ToolPath = Callable[[Array, Array], Array]
+"""Corners of the path of the tool from one position to another, shape (n, n_coordinates), [m], with
+both ends."""
 
 LARGEST_READING = 0.3
 """Largest reading of an indicator; no leg is as far from parallel, [m]."""
@@ -132,6 +136,9 @@ class Sensor(Protocol):
     # conditions: ClassVar[tuple[Condition, ...]], optional: conditions of a reading on which its
     # expression depends (`sensor_conditions`)
 
+    # path: ToolPath, optional: path of the tool between two of its readings; straight by default
+    # (`tool_path`)
+
     # mounting_steps: tuple[str, ...], optional: steps that mount it in the alignment posture, for
     # the operator (`mounting_steps`)
 
@@ -196,6 +203,12 @@ def sensor_conditions(sensor: Sensor) -> tuple[Condition, ...]:
     """Conditions of a reading on which a sensor's expression depends."""
     conditions: tuple[Condition, ...] = getattr(sensor, "conditions", ())
     return conditions
+
+
+def tool_path(sensor: Sensor) -> ToolPath | None:
+    """Path of the tool that a sensor prescribes; None for a straight one."""
+    path: ToolPath | None = getattr(sensor, "path", None)
+    return path
 
 
 def mounting_steps(sensor: Sensor) -> tuple[str, ...] | None:

@@ -303,10 +303,10 @@ def test_path_that_leaves_the_travel_passes_through_the_mechanical_zero(small):
     }
     readings = tuple(replace(small.readings[0], posture=n, cycle=i) for i, n in enumerate("ab"))
     session = replace(small, postures=postures, readings=readings)
-    assert not any(s.via_zero for s in plan_motion(session)[0].stops)
+    assert not any(s.via for s in plan_motion(session)[0].stops)
     session = replace(session, robot=replace(robot, drives=(*robot.drives[:2], z)))
     motion = plan_motion(session)[0]
-    assert [s.via_zero for s in motion.stops] == [False, True, True]
+    assert [len(s.via) for s in motion.stops] == [0, 1, 1]
     points, _ = read_program(write_program(session, motion), robot)
     assert np.flatnonzero(np.abs(points).max(axis=1) == 0.0).tolist() == [2, 5]
     for start, end in pairwise(points * MM):
@@ -432,3 +432,62 @@ def test_linuxcnc_takes_up_backlash_from_the_stated_side(small, sided, tmp_path)
         actual[k] = follows
     sides = np.array([directions(stop.approach) for stop in motion.stops])
     assert actual[at] - slides[at] == pytest.approx(-backlash / 2.0 * sides, abs=1e-6)
+
+
+BAR = """robot: orthoglide
+gauge: {sigma_mm: 0.002, range_mm: [-0.5, 0.5]}
+postures:
+  a: {tcp_mm: [54, -3, -40]}
+  b: {tcp_mm: [4, 47, -40]}
+  c: {tcp_mm: [-46, -3, -40]}
+  d: {tcp_mm: [4, -3, 10]}
+setups:
+  bar: {sensor: ball_bar, centre_mm: [4, -3, -80], tool_mm: [0, 0, -40], length_mm: 50}
+"""
+
+
+@pytest.fixture
+def bar(tmp_path):
+    """Plan of a ball bar: quarters of circles, and half a circle over the pole."""
+    (tmp_path / "plan.yaml").write_text(BAR)
+    session = load_plan(tmp_path / "plan.yaml")
+    rows = [Reading("bar", name) for name in "abcadb"]
+    return replace(session, readings=tuple(replace(r, cycle=i + 1) for i, r in enumerate(rows)))
+
+
+def test_a_ball_bar_keeps_its_length_between_its_readings(bar):
+    (motion,) = plan_motion(bar)
+    points, pauses = read_program(write_program(bar, motion), bar.robot)
+    balls = points - np.array([4.0, -3.0, -40.0])  # ball at the tool and fixed ball
+    first = next(i for i, p in enumerate(points) if np.array_equal(p, pauses[0][0]))
+    lengths = np.linalg.norm(balls[first:], axis=1)
+    assert np.abs(lengths - 50.0).max() < 0.005 + ROUNDED  # `SAGITTA` in the approach of 0.5 mm
+    chords = np.diff(balls[first:], axis=0)
+    assert 50.0 * (1.0 - np.cos(np.linalg.norm(chords, axis=1).max() / 100.0)) < 0.006
+    assert not any(s.lift for s in motion.stops)
+    robot = bar.robot
+    for stop, before in zip(motion.stops[1:], motion.stops, strict=False):
+        change = stop.drives - nominal_closure(robot).inverse(np.array([stop.approach_point]))[0]
+        signs = {"p": 1.0, "n": -1.0, "u": 0.0}
+        known = np.abs(change) > 1e-6
+        assert [signs[k] for k in stop.approach] == np.where(known, np.sign(change), 0.0).tolist()
+        assert np.linalg.norm(stop.approach_point - stop.point) == pytest.approx(0.5 * MM, rel=1e-4)
+        assert stop.posture != before.posture
+
+
+def test_a_posture_is_passed_where_its_approach_has_the_other_direction(bar):
+    (motion,) = plan_motion(bar)
+    natural = motion.stops[1].approach
+    other = natural.translate(str.maketrans("pn", "np"))
+    rows = list(bar.readings)
+    rows[1] = replace(rows[1], conditions=Conditions(other))
+    (turned,) = plan_motion(replace(bar, readings=tuple(rows)))
+    stop = turned.stops[1]
+    assert stop.approach == other
+    passed = np.linalg.norm(np.array(stop.via) - stop.point, axis=1)
+    assert passed[-1] < 1e-9  # through the posture, and back to it
+    middle = 0.5 * (stop.approach_point + motion.stops[1].approach_point)
+    np.testing.assert_allclose(middle, stop.point, atol=1e-9)
+    rows[1] = replace(rows[1], conditions=Conditions("ppp"))
+    with pytest.raises(SessionError, match="along the path of setup 'bar'"):
+        plan_motion(replace(bar, readings=tuple(rows)))

@@ -3,8 +3,10 @@
 A setup begins in its alignment posture, where the operator mounts and aligns the gauge. Every
 posture is approached as its reading states, by the last motion of each drive. Where nothing is
 stated, all postures are approached from one side, so that backlash acts alike in all readings: the
-drives pass the posture and come back to it. Each segment of the path is sampled to check that the
-drives reach it, that the tip stays on the rod and that the dial stays in its range.
+drives pass the posture and come back to it. A sensor may prescribe the path of the tool between its
+readings, such as a ball bar, which stays on a sphere: approaches then follow from it. Each segment
+of the path is sampled to check that the drives reach it, that the tip stays on the rod and that the
+dial stays in its range.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from orthocal.errors import ClosureError, SessionError
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import (
+    APPROACH,
     approach_length,
     approach_share,
     approach_steps,
@@ -30,8 +33,8 @@ from orthocal.measurement.motion.approach import (
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations, drive_table
-from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import Contact
+from orthocal.robot.model import Robot, require_tcp
+from orthocal.sensors.protocol import Contact, ToolPath, tool_path
 from orthocal.session.session import Gauge, Posture, Reading, Session
 from orthocal.units import MM
 
@@ -39,6 +42,9 @@ Role = Literal["alignment", "reading", "subtracted", "return"]
 
 STEP = 5e-3
 """Largest distance between samples of a segment, [m]."""
+
+TURNING = 1e-6
+"""Motion of a drive in an approach below which it has no direction, [m, rad]."""
 
 MOST_STOPS = 2000
 """Largest number of readings in one plan: two weeks of work."""
@@ -117,8 +123,9 @@ class Stop:
     drives do not command the tool."""
     approach_point: Array | None
     """Tool coordinates at the start of the approach, [m]."""
-    via_zero: bool = False
-    """Whether the path passes through the mechanical zero, the direct one being out of reach."""
+    via: tuple[Array, ...] = ()
+    """Tool coordinates on the way to the start of the approach, [m]: the mechanical zero if the
+    direct way is out of reach, or the corners of a path that the sensor prescribes."""
     lift: str = ""
     """Reason to hold the plunger up on this path; empty where it may stay on the rod."""
     expected: float = 0.0
@@ -172,13 +179,23 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
         rows.setdefault(reading.setup, []).append((line, reading))
     aligned_at = session.alignment_postures
     first = {setup: of_setup[0][1] for setup, of_setup in rows.items()}
-    apart = {aligned_at[s] for s, r in first.items() if aligned_at[s] != (r.minus or r.posture)}
-    stop_at = _find_approaches(session, apart)
+    guided = _guided_setups(session)
+    apart = {
+        aligned_at[s]
+        for s, r in first.items()
+        if s not in guided and aligned_at[s] != (r.minus or r.posture)
+    }
+    free_rows = [r for r in session.readings if r.setup not in guided]
+    stop_at = _find_approaches(session, free_rows, apart) if free_rows else {}
     motions = []
     for number, (setup, rows_of_setup) in enumerate(rows.items(), 1):
-        stops = _list_stops(rows_of_setup, aligned_at[setup], stop_at)
-        if _commands_tool(session.robot):
-            stops = _follow_stops(session, setup, stops)
+        if setup in guided:
+            of_setup = _list_stops(rows_of_setup, aligned_at[setup], _stops_on_path(session, setup))
+            stops = _follow_path(session, setup, of_setup, guided[setup])
+        else:
+            stops = _list_stops(rows_of_setup, aligned_at[setup], stop_at)
+            if _commands_tool(session.robot):
+                stops = _follow_stops(session, setup, stops)
         alignment = stops.pop(0) if stops[0].role == "alignment" else None
         motions.append(SetupMotion(setup, number, len(rows), alignment, tuple(stops)))
     return tuple(motions)
@@ -216,7 +233,39 @@ Approaches = dict[tuple[str, str | None], Stop]
 """Posture and its stated approach, or None where none is stated, to the stop that reads it."""
 
 
-def _find_approaches(session: Session, alignment: set[str]) -> Approaches:
+def _guided_setups(session: Session) -> dict[str, ToolPath]:
+    """Setups whose sensor prescribes the path of the tool between its readings."""
+    if not _commands_tool(session.robot):
+        return {}
+    paths = {name: tool_path(s.sensor) for name, s in session.setups.items()}
+    return {name: path for name, path in paths.items() if path is not None}
+
+
+def _stops_on_path(session: Session, setup: str) -> Approaches:
+    """Stops of a setup whose approaches follow from its path."""
+    robot = session.robot
+    names = list(session.postures)
+    nominal = drive_table(session) + session.active_offsets
+    tool = nominal_closure(robot).forward(nominal, names=names)
+    points = tool[:, list(require_tcp(robot).coordinates)]
+    unknown = "u" * len(robot.drives)
+    of_setup = [r for r in session.readings if r.setup == setup]
+    read = {(r.posture, r.approach) for r in of_setup}
+    read |= {(r.minus, None) for r in of_setup if r.minus is not None}
+    read |= {(session.alignment_postures[setup], None)}
+    at = {name: i for i, name in enumerate(names)}
+    return {
+        (name, approach): Stop(
+            *(name, "reading", None, None, 1, approach or unknown),
+            *(nominal[at[name]], nominal[at[name]], points[at[name]], points[at[name]]),
+        )
+        for name, approach in read
+    }
+
+
+def _find_approaches(
+    session: Session, readings: Sequence[Reading], alignment: set[str]
+) -> Approaches:
     """Stops to read, or to align a gauge, each at the end of its approach.
 
     Postures without a stated approach are all approached from one side; so are drives whose
@@ -224,14 +273,15 @@ def _find_approaches(session: Session, alignment: set[str]) -> Approaches:
 
     Args:
         session: The session.
+        readings: The readings to approach.
         alignment: Names of the alignment postures.
 
     Raises:
         SessionError: If no side serves all these postures, or one cannot be approached as stated.
     """
     wanted: set[tuple[str, str | None]] = {(name, None) for name in alignment}
-    wanted |= {(r.posture, r.approach) for r in session.readings}
-    wanted |= {(r.minus, None) for r in session.readings if r.minus is not None}
+    wanted |= {(r.posture, r.approach) for r in readings}
+    wanted |= {(r.minus, None) for r in readings if r.minus is not None}
     order = {name: i for i, name in enumerate(session.postures)}
     places = sorted(wanted, key=lambda place: (order[place[0]], place[1] or ""))
     refused: list[ClosureError] = []
@@ -323,7 +373,7 @@ def _follow_stops(session: Session, setup: str, stops: Sequence[Stop]) -> list[S
         path = _sample_path(robot, [position, *corners])
         if path is None:
             path = _sample_path(robot, [position, zero, *corners])
-            stop = replace(stop, via_zero=True)
+            stop = replace(stop, via=(zero,))
         if path is None:
             raise SessionError(
                 f"the path to posture '{stop.posture}' of setup '{setup}' leaves the workspace, "
@@ -334,6 +384,93 @@ def _follow_stops(session: Session, setup: str, stops: Sequence[Stop]) -> list[S
         paths.append(path)
         position = corners[-1]
     return _predict(session, setup, checked, paths)
+
+
+def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: ToolPath) -> list[Stop]:
+    """Stops on the path that a sensor prescribes, with their approaches and predicted readings.
+
+    A reading whose stated approach has the opposite direction is passed first, and approached on
+    the way back.
+
+    Raises:
+        SessionError: If the path leaves the workspace, or no direction has the stated approach.
+    """
+    robot, length = session.robot, approach_share(session) * APPROACH
+    first = np.asarray(stops[0].point)
+    others = [s.point for s in stops if s.point is not None and not np.allclose(s.point, first)]
+    ahead = path(first, np.asarray(others[0])) if others else np.array([first, first + length])
+    begin = 2.0 * first - _walk(ahead, length)  # nothing is mounted yet
+    position, checked, paths = begin, list[Stop](), []
+    for stop in stops:
+        point = np.asarray(stop.point)
+        corners = np.vstack([begin, point]) if not checked else path(position, point)
+        if checked and np.allclose(position, point):  # out and back again
+            corners = np.vstack([point, begin, point])
+        arrival = _arrive(session, setup, stop, corners, length)
+        checked.append(arrival)
+        begin = np.asarray(arrival.approach_point)
+        sampled = _sample_path(robot, [position, *arrival.via, begin, point])
+        if sampled is None:
+            raise SessionError(
+                f"the path to posture '{stop.posture}' of setup '{setup}' leaves the workspace",
+                where=str(session.path or "session"),
+            )
+        paths.append(sampled)
+        position = point
+    return _predict(session, setup, checked, paths)
+
+
+def _arrive(session: Session, setup: str, stop: Stop, corners: Array, length: float) -> Stop:
+    """Stop that is approached along a path, forwards, or backwards after passing it.
+
+    Args:
+        session: The session.
+        setup: Name of the setup.
+        stop: The stop, with its stated approach.
+        corners: Path to it, shape (n, n_coordinates), [m].
+        length: Length of the approach, [m].
+
+    Raises:
+        SessionError: If neither direction has the stated approach.
+    """
+    point, closure = corners[-1], nominal_closure(session.robot)
+    before = _walk(corners[::-1], length)
+    beyond = 2.0 * point - before
+    found = []
+    for begin in (before, beyond):
+        drives = closure.inverse(begin[None])[0]
+        approach = _letters(stop.drives - drives)
+        found.append(approach)
+        if all(a == b or "u" in (a, b) for a, b in zip(stop.approach, approach, strict=True)):
+            break
+    else:
+        raise SessionError(
+            f"cannot be approached as stated ({stop.approach}): along the path of setup "
+            f"'{setup}' the drives arrive with {' or '.join(found)}",
+            where=f"{session.path or 'session'}: postures.{stop.posture}",
+        )
+    via = corners[1:]
+    if begin is before:
+        rest = np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1)[::-1])[::-1]
+        via = corners[1:-1][rest[1:] > length]
+    return replace(
+        stop, approach=approach, approach_drives=drives, approach_point=begin, via=tuple(via)
+    )
+
+
+def _walk(corners: Array, length: float) -> Array:
+    """Point of a polyline at a distance from its start, or its end if it is shorter."""
+    for start, end in pairwise(corners):
+        step = float(np.linalg.norm(end - start))
+        if step >= length:
+            return np.asarray(start + length / step * (end - start))
+        length -= step
+    return np.asarray(corners[-1])
+
+
+def _letters(motion: Array) -> str:
+    """Approach by the last motion of each drive; u for a drive that hardly moves."""
+    return "".join("u" if abs(v) < TURNING else "p" if v > 0.0 else "n" for v in motion.tolist())
 
 
 def _sample_path(robot: Robot, corners: Sequence[Array]) -> _Path | None:

@@ -21,6 +21,7 @@ from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.motion import SetupMotion, Stop, dial_zero, shown_joints
 from orthocal.robot.model import Robot
 from orthocal.sensors.leg_indicator import BallIndicator
+from orthocal.sensors.protocol import mounting_steps
 from orthocal.session.session import Session
 from orthocal.text import comment_safe
 from orthocal.units import DRIVE_UNITS, MM, format_fixed
@@ -110,6 +111,8 @@ def write_program(
     sensor, gauge = of_setup.sensor, session.gauges[of_setup.gauge]
     ball = isinstance(sensor, BallIndicator)
     mount = f"mount the gauge, {'centre its ball on the rod' if ball else 'align it'}"
+    if mounting_steps(sensor) is not None:
+        mount = "mount the gauge as the sheet shows"
     stated = any(r.approach for r in session.readings)
     stops = motion.stops if motion.alignment is None else (motion.alignment, *motion.stops)
     for i, stop in enumerate(stops):
@@ -137,9 +140,7 @@ def write_program(
 
 def _moves(robot: Robot, stop: Stop, options: ProgramOptions) -> list[str]:
     """Motion to the start of the approach, and the approach."""
-    targets: list[tuple[Array | None, float]] = []
-    if stop.via_zero:
-        targets.append((tool_at_zero(robot), options.feed))
+    targets: list[tuple[Array | None, float]] = [(point, options.feed) for point in stop.via]
     targets += [(stop.approach_point, options.feed), (stop.point, options.approach_feed)]
     return [f"G53 G1 {_words(robot, point, options)} F{feed:g}" for point, feed in targets]
 
