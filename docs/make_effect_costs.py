@@ -18,8 +18,7 @@ from orthocal.output.text.study import report_study
 
 MACHINES = 100
 NEAR = {"*.offset_mm": 0.4}
-"""Offsets have been entered once. From offsets of 4 mm one calibration of a hundred ended beside
-the optimum (1.7 mm at the tool), which decides the mean of them all."""
+"""Offsets have been entered once."""
 
 EFFECTS = "{backlash: {}, thermal: {}, screw: {lead_mm: 5}, drift: {}, compliance: {STIFFNESS}}"
 STEEL, LIGHT = "rod_N_per_um: 64", "rod_N_per_um: 5"

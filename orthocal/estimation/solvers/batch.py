@@ -1,8 +1,9 @@
 """Batch solver: the optimum of each of many sets of readings of one problem.
 
 Gauss-Newton runs on all sets at once, from the linearised solutions, with the Jacobian of each set.
-Sets that do not converge or that reach a bound are solved one by one by variable projection, so
-that every set has the optimum that it has alone.
+Steps end at the bounds, by an active set for each set of readings that meets one. Sets that do not
+converge or that end far from their prior are solved one by one by variable projection, so that
+every set has the optimum that it has alone.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.arrays import Array, Mask
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.estimation.solvers.subproblem import RANK_TOLERANCE
+from orthocal.estimation.solvers.subproblem import RANK_TOLERANCE, are_far, bounded_step
 from orthocal.estimation.solvers.variable_projection import VariableProjection, are_settled
 
 MAX_STEPS = 30
@@ -107,6 +108,7 @@ class BatchSolver:
         passive = problem.active_passive + shared.linear.follow(theta - shared.start)
         active, converged = np.arange(len(y)), np.zeros(len(y), dtype=np.bool_)
         sizes, reading = np.full((3, len(y)), np.inf), np.empty_like(y)
+        at_bound = solution.at_bound[part]
         for _ in range(MAX_STEPS):
             try:
                 linear = problem.linearise(theta[active] * problem.theta_scale, passive[active])
@@ -114,9 +116,9 @@ class BatchSolver:
                 break
             closed = linear.reading + linear.opening
             residual, _, _ = shared.residual((y[active] - closed) / sigma)
-            step = shared.step(theta[active], residual, linear.jacobian)
+            step, at_bound[active] = shared.step(theta[active], residual, linear.jacobian)
             reading[active] = closed + (linear.jacobian @ step[..., None])[..., 0]
-            theta[active] += step
+            theta[active] = np.clip(theta[active] + step, shared.low, shared.high)
             passive[active] += linear.follow(step)
             sizes = np.roll(sizes, 1, axis=0)
             sizes[0, active] = np.abs(step).max(axis=1)
@@ -140,7 +142,7 @@ class _BatchTask:
     def __init__(self, problem: CalibrationProblem, options: SolverOptions, sigma: float) -> None:
         self.problem, self.loss, self.sigma = problem, options.loss, sigma
         o, scale = problem.observations, problem.theta_scale
-        self._low, self._high = problem.selection.lower / scale, problem.selection.upper / scale
+        self.low, self.high = problem.selection.lower / scale, problem.selection.upper / scale
         self._mean = problem.prior_mean / scale
         self._precision = problem.prior_precision
         self.start = problem.active_theta / scale
@@ -156,7 +158,7 @@ class _BatchTask:
         """First-order solutions, clipped to the bounds, to start from, shape (S, n_free)."""
         residual = self._centre(((y - self.linear.reading) / self.sigma).T).T
         gradient = residual @ self._jacobian - self._precision * (self.start - self._mean)
-        return np.asarray(np.clip(self.start + gradient @ self._inverse, self._low, self._high))
+        return np.asarray(np.clip(self.start + gradient @ self._inverse, self.low, self.high))
 
     def residual(self, deviation: Array) -> tuple[Array, Array, Array]:
         """Residuals (S, n_entries) and zeros (S, n_zeros), [σ], and Σ ρ, (S,), of deviations."""
@@ -172,8 +174,10 @@ class _BatchTask:
         residual = deviation - zeros[:, o.zero]
         return residual, zeros, self.loss.value(residual).sum(axis=1)
 
-    def step(self, theta: Array, residual: Array, jacobian: Array) -> Array:
-        """Gauss-Newton steps s = (JᵀWJ + P⁻¹)⁻¹ (Jᵀρ' − P⁻¹ (θ̂ − mean)), shape (S, n_free).
+    def step(
+        self, theta: Array, residual: Array, jacobian: Array
+    ) -> tuple[Array, NDArray[np.int8]]:
+        """Gauss-Newton steps s = (JᵀWJ + P⁻¹)⁻¹ (Jᵀρ' − P⁻¹ (θ̂ − mean)) within the bounds.
 
         W holds the weights ρ'(r)/r, J the rows minus the weighted mean of those with the same
         free zero.
@@ -182,6 +186,9 @@ class _BatchTask:
             theta: θ̂, shape (S, n_free).
             residual: Shape (S, n_entries), [σ].
             jacobian: Shape (S, n_entries, n_free), [m per prior std].
+
+        Returns:
+            Steps, shape (S, n_free), and the bounds at which they end as in `Solution.at_bound`.
         """
         rows = jacobian / self.sigma
         gradient = (self.loss.influence(residual)[:, None] @ rows)[:, 0]
@@ -199,17 +206,25 @@ class _BatchTask:
             steps = (
                 np.linalg.pinv(normal, rcond=RANK_TOLERANCE, hermitian=True) @ gradient[..., None]
             )
-        return np.asarray(steps[..., 0])
+        result: Array = np.asarray(steps[..., 0])
+        low, high = self.low - theta, self.high - theta
+        at_bound: NDArray[np.int8] = np.zeros(theta.shape, dtype=np.int8)
+        for i in np.flatnonzero(((result < low) | (result > high)).any(axis=1)):
+            result[i] = bounded_step(normal[i], gradient[i], low[i], high[i])
+            slope = normal[i] @ result[i] - gradient[i]
+            at_bound[i, (result[i] <= low[i]) & (slope > 0.0)] = -1
+            at_bound[i, (result[i] >= high[i]) & (slope < 0.0)] = 1
+        return result, at_bound
 
     def evaluate(self, y: Array, theta: Array, reading: Array) -> tuple[Array, Array, Mask]:
         """Zeros (S, n_zeros), [m of the first gauge], objective (S,), and a mask (S,).
 
-        The mask is True for sets that are finite and within the bounds.
+        The mask is True for sets that are finite and not far from the prior.
         """
         _, zeros, cost = self.residual((y - reading) / self.sigma)
         objective = cost + 0.5 * (self._precision * (theta - self._mean) ** 2).sum(axis=1)
-        within = ((theta > self._low) & (theta < self._high)).all(axis=1)
-        return zeros * self.sigma, objective, within & np.isfinite(objective)
+        good = np.isfinite(objective) & ~are_far(self.problem, theta)
+        return zeros * self.sigma, objective, good
 
     def _centre(self, values: Array) -> Array:
         """Rows minus the mean of those with the same free zero, shape as given."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Mask
 from orthocal.errors import SolverError
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import CalibrationProblem
@@ -25,6 +25,10 @@ MOST_STEPS_WITHIN = 100
 
 RANK_TOLERANCE = 1e-13
 """Eigenvalues of the normal matrix below this part of the largest count as zero."""
+
+FAR = 8.0
+"""Deviation of a parameter from the mean of its prior at which an optimum is doubted, [prior std].
+Machines within their tolerances have none: it is a local minimum, or readings are wrong."""
 
 FEW = 50
 """Size of systems that NumPy solves faster than SciPy's triangular solver is imported."""
@@ -182,7 +186,8 @@ class Task:
         """Newton step with weights of the entries, within the bounds, shape (n_free,)."""
         square = self._square(jacobian, weights)
         square[np.diag_indices_from(square)] += self.problem.prior_precision
-        return self._solve(square, -self.gradient(at, jacobian), at.theta)
+        limits = self.low - at.theta, self.high - at.theta
+        return bounded_step(square, -self.gradient(at, jacobian), *limits)
 
     def gradient(self, state: Iterate, jacobian: Array) -> Array:
         """Gradient of the objective by θ̂, shape (n_free,)."""
@@ -198,29 +203,6 @@ class Task:
         cost = float(self.weights @ self.loss.value(deviation - zeros[o.zero]))
         return Iterate(theta, passive, deviation, zeros, cost + prior)
 
-    def _solve(self, square: Array, gradient: Array, theta: Array) -> Array:
-        """Step s that minimises ½ sᵀ A s − bᵀ s within the bounds, shape (n_free,)."""
-        low, high = self.low - theta, self.high - theta
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
-        scaled, target = square * np.outer(scale, scale), gradient * scale
-        limited = np.isfinite(low) | np.isfinite(high)
-        order = np.argsort(limited, kind="stable")  # parameters with bounds come last
-        if limited.any():
-            scaled, target, scale = scaled[np.ix_(order, order)], target[order], scale[order]
-        try:
-            factor: Array = np.asarray(np.linalg.cholesky(scaled).T, dtype=np.float64)
-        except np.linalg.LinAlgError:  # undetermined parameters: the smallest change
-            values, vectors = np.linalg.eigh(scaled)
-            large = values > RANK_TOLERANCE * values.max(initial=0.0)
-            step = vectors[:, large] @ ((vectors[:, large].T @ target) / values[large])
-        else:
-            target = _solve_triangular(factor, target, transposed=True)
-            limits = low[order] / scale, high[order] / scale
-            step = _bounded(factor, target, *limits, n_limited=int(limited.sum()))
-        result = np.empty_like(step)
-        result[order] = step * scale
-        return np.asarray(np.clip(result, low, high))
-
     def _off(self, theta: Array) -> Array:
         """Deviation of θ̂ from the mean of its prior, shape (n_free,)."""
         return np.asarray(theta - self.problem.prior_mean / self.problem.theta_scale)
@@ -233,6 +215,47 @@ class Task:
         counts = np.bincount(o.zero, weights, minlength=o.n_zeros)
         weighted = jacobian if (weights == 1.0).all() else jacobian * weights[:, None]
         return np.asarray(jacobian.T @ weighted - sums.T @ (sums / counts[:, None]))
+
+
+def are_far(problem: CalibrationProblem, theta: Array) -> Mask:
+    """Mask of the solutions with a parameter `FAR` from the mean of its prior.
+
+    Args:
+        problem: The problem.
+        theta: θ̂, shape (..., n_free).
+    """
+    off = theta - problem.prior_mean / problem.theta_scale
+    return np.asarray((np.abs(off * problem.prior_precision) > FAR).any(axis=-1))
+
+
+def bounded_step(square: Array, gradient: Array, low: Array, high: Array) -> Array:
+    """Step s that minimises ½ sᵀ A s − bᵀ s within bounds, shape (n_free,).
+
+    Args:
+        square: A, positive semidefinite, shape (n_free, n_free).
+        gradient: b, shape (n_free,).
+        low: Lower bounds of s, shape (n_free,).
+        high: Upper bounds of s, shape (n_free,).
+    """
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
+    scaled, target = square * np.outer(scale, scale), gradient * scale
+    limited = np.isfinite(low) | np.isfinite(high)
+    order = np.argsort(limited, kind="stable")  # parameters with bounds come last
+    if limited.any():
+        scaled, target, scale = scaled[np.ix_(order, order)], target[order], scale[order]
+    try:
+        factor: Array = np.asarray(np.linalg.cholesky(scaled).T, dtype=np.float64)
+    except np.linalg.LinAlgError:  # undetermined parameters: the smallest change
+        values, vectors = np.linalg.eigh(scaled)
+        large = values > RANK_TOLERANCE * values.max(initial=0.0)
+        step = vectors[:, large] @ ((vectors[:, large].T @ target) / values[large])
+    else:
+        target = _solve_triangular(factor, target, transposed=True)
+        limits = low[order] / scale, high[order] / scale
+        step = _bounded(factor, target, *limits, n_limited=int(limited.sum()))
+    result = np.empty_like(step)
+    result[order] = step * scale
+    return np.asarray(np.clip(result, low, high))
 
 
 def _solve_triangular(factor: Array, target: Array, *, transposed: bool = False) -> Array:

