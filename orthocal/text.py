@@ -1,9 +1,14 @@
-"""Safe display of text: escapes for characters that control a terminal or the text direction."""
+"""Safe display of text: escapes for characters that control a terminal or the text direction.
+
+And lists of numbers.
+"""
 
 from __future__ import annotations
 
 import re
 import unicodedata
+from collections.abc import Sequence
+from itertools import groupby
 
 _ESCAPED = frozenset({"Cc", "Cf", "Co", "Cs", "Zl", "Zp"})
 """Unicode categories of control, format, private-use and surrogate characters and of line and
@@ -17,6 +22,9 @@ _NO_TEXT = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 """Control characters except newline and tab, and half surrogate pairs."""
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9 _.,:;=+-]")
+
+MOST_RUNS = 12
+"""Runs of numbers that are listed."""
 
 LONGEST_SHOWN = 58
 """Largest number of characters of a value in a message."""
@@ -62,6 +70,23 @@ def composed(text: str) -> str:
 def shorten(text: str) -> str:
     """A value, shortened for a message."""
     return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN - 3]}..."
+
+
+def runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
+    """First and last of each run of consecutive numbers in an ascending sequence."""
+    by_run = groupby(enumerate(numbers), key=lambda place: place[1] - place[0])
+    found = [[number for _, number in run] for _, run in by_run]
+    return [(run[0], run[-1]) for run in found]
+
+
+def spans(numbers: Sequence[int], noun: str) -> str:
+    """Numbers as runs, such as lines 3, 5 to 8; runs beyond MOST_RUNS as `and more`."""
+    every = runs(numbers)
+    words = [
+        str(a) if a == b else f"{a}{' to' if b > a + 1 else ','} {b}" for a, b in every[:MOST_RUNS]
+    ]
+    more = " and more" if len(every) > MOST_RUNS else ""
+    return f"{noun if len(numbers) == 1 else f'{noun}s'} {', '.join(words)}{more}"
 
 
 def comment_safe(text: str, longest: int = 60) -> str:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arguments import require_kind
@@ -34,6 +35,7 @@ from orthocal.estimation.choice import Choice
 from orthocal.estimation.loss import Loss, LossKind
 from orthocal.estimation.options import SolverKind, SolverOptions
 from orthocal.estimation.tolerance_scale import ToleranceScale
+from orthocal.measurement.files.readings_checks import require_read
 from orthocal.measurement.joining import Given
 from orthocal.session.session import Session
 
@@ -166,10 +168,21 @@ def assessment_of(calibration: Calibration) -> Assessment:
 
 
 def check_session(session: Session) -> Assessment:
-    """The assessment of readings before anything is calibrated from them."""
+    """The assessment of readings before anything is calibrated from them.
+
+    Args:
+        session: The session; readings that are missing (NaN) are counted, and the others judged.
+
+    Raises:
+        SessionError: If all are missing.
+    """
     require_kind(session, Session, expected="a Session, such as load_session(...)")
+    missing = [words.readings_missing(session)] if np.isnan(session.values).any() else []
+    if missing:
+        require_read(session, partial=True)
+        session = session.select([r for r in session.readings if r.is_read])
     found = judge_session(session)
-    findings = found.findings
+    findings = rank([*found.findings, *missing])
     if found.verdict == "enter":
         within = found.tolerance_scale.factor == 1.0
         findings = rank(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import groupby
 
 import numpy as np
 
@@ -84,21 +83,6 @@ def times(ratio: float) -> str:
 def joined(names: Sequence[str], word: str = "and") -> str:
     """Names as a list in a sentence: a, b and c."""
     return f" {word} ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
-
-
-def runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
-    """First and last of each run of consecutive numbers in an ascending sequence."""
-    by_run = groupby(enumerate(numbers), key=lambda place: place[1] - place[0])
-    found = [[number for _, number in run] for _, run in by_run]
-    return [(run[0], run[-1]) for run in found]
-
-
-def spans(numbers: Sequence[int], noun: str) -> str:
-    """Numbers as runs, such as lines 3, 5 to 8."""
-    words = [
-        str(a) if a == b else f"{a}{' to' if b > a + 1 else ','} {b}" for a, b in runs(numbers)
-    ]
-    return f"{noun if len(numbers) == 1 else f'{noun}s'} {', '.join(words)}"
 
 
 def count_of(value: int) -> str:

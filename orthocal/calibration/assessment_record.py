@@ -47,6 +47,7 @@ FindingKind = Literal[
     "no change",
     "change unknown",
     "scattered repeats",
+    "readings missing",
     # what no machine or gauge shows
     "wrong dimensions",
     "beyond tolerances",

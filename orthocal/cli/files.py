@@ -22,6 +22,7 @@ def load_each_once(
     *,
     effects: Sequence[str] | None = None,
     tolerance: Sequence[str] | None = None,
+    partial: bool = False,
 ) -> list[orthocal.Session]:
     """Load sessions, and refuse those whose readings would count twice.
 
@@ -29,6 +30,7 @@ def load_each_once(
         paths: Their paths.
         effects: Effects beside geometry instead of those that the sessions state.
         tolerance: Values of `--tolerance`, instead of tolerances that the sessions state.
+        partial: Whether some of the readings may be missing.
 
     Raises:
         SessionError: If two sessions are the same, or have the same readings.
@@ -36,7 +38,7 @@ def load_each_once(
     """
     sessions: list[orthocal.Session] = []
     for path in paths:
-        session = orthocal.load_session(path)
+        session = orthocal.load_session(path, partial=partial)
         if any(session.sha256 == other.sha256 for other in sessions):
             raise SessionError(
                 "is the same session as one before it; its readings would count twice",
@@ -62,9 +64,12 @@ def load_joined(
     *,
     effects: Sequence[str] | None = None,
     tolerance: Sequence[str] | None = None,
+    partial: bool = False,
 ) -> orthocal.Session:
     """Load sessions as one; arguments and errors as for `load_each_once`."""
-    return orthocal.join_sessions(load_each_once(paths, effects=effects, tolerance=tolerance))
+    return orthocal.join_sessions(
+        load_each_once(paths, effects=effects, tolerance=tolerance, partial=partial)
+    )
 
 
 def _same_readings(one: orthocal.Session, other: orthocal.Session) -> bool:

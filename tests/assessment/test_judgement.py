@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -37,7 +38,7 @@ UNITS = ("_mm", "_um", "_mrad", "_deg")
 PURE = {
     *("cycle", "finer", "ratio", "tolerance_scale", "log_likelihood_ratio", "log_evidence"),
     "log_evidence_against_chosen",
-    *("independent_readings", "parameters", "chance", "part_of_std", "readings"),
+    *("independent_readings", "parameters", "chance", "part_of_std", "readings", "missing"),
     *("largest_change_over_std",),
 }
 """Numbers of findings without a unit."""
@@ -194,6 +195,42 @@ def test_the_judgement_does_not_depend_on_the_model(cases, calibrated, case):
         own = [f for f in assessment.findings if f.severity != "note"]
         assert [f.to_document() for f in own] == [f.to_document() for f in found]
         assert assessment.decision.verdict == expected
+
+
+def test_an_unfinished_session_is_checked_as_far_as_it_was_read(cycles, root, tmp_path):
+    """The verdict is that of the readings that are there; calibrate refuses and names the lines."""
+    wrong = reverse(cycles, "yx")
+    read = [i for i, r in enumerate(wrong.readings) if r.setup in ("yx", "xy") or r.cycle == 1]
+    missing = sorted(set(range(len(wrong.readings))) - set(read))
+    rows = [
+        replace(r, value=r.value if i in read else math.nan) for i, r in enumerate(wrong.readings)
+    ]
+    expected = check_session(wrong.select([wrong.readings[i] for i in read]))
+    found = check_session(replace(wrong, readings=tuple(rows)))
+    (count,) = found.of_kind("readings missing")
+    assert count.numbers == {"readings": len(rows), "missing": len(missing)}
+    assert [p.line for p in count.places] == [i + 2 for i in missing][: len(count.places)]
+    other = [f.to_document() for f in found.findings if f is not count]
+    assert other == [f.to_document() for f in expected.findings]
+    assert found.decision.verdict == expected.decision.verdict == "review"
+
+    path = tmp_path / "readings.csv"
+    shutil.copytree(root / "examples/raw-cycles", tmp_path, dirs_exist_ok=True)
+    lines = path.read_text().splitlines()
+    for line in (5, 7, 8, 9):
+        lines[line - 1] = lines[line - 1].rpartition(",")[0] + ","
+    path.write_text("\n".join(lines) + "\n")
+    done = run_orthocal(tmp_path, "check", ".")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "4 of 54 readings are missing (lines 5, 7 to 9)." in done.stdout
+    for command in (["calibrate", "."], ["compare", "."]):
+        done = run_orthocal(tmp_path, *command)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert "readings.csv: 4 of 54 readings are missing (lines 5, 7 to 9); " in done.stderr
+    path.write_text("\n".join([lines[0], *(x.rpartition(",")[0] + "," for x in lines[1:])]) + "\n")
+    done = run_orthocal(tmp_path, "check", ".")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "nothing was read yet" in done.stderr
 
 
 def test_readings_are_judged_once(cycles):

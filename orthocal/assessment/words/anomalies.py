@@ -6,11 +6,11 @@ import math
 import shlex
 from collections.abc import Callable, Sequence
 
-from orthocal.assessment.wording import joined, mm, note, plain, review, signed, spans, um
+from orthocal.assessment.wording import joined, mm, note, plain, review, signed, um
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.hypotheses.anomaly import EFFECT_KINDS, Anomalies, Anomaly, Explanation
 from orthocal.session.session import Session
-from orthocal.text import printable
+from orthocal.text import printable, spans
 from orthocal.units import EDGE_UNITS, MM, UM, Unit
 
 MOST_PLACES = 20

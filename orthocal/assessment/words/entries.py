@@ -6,8 +6,11 @@ import math
 from collections.abc import Sequence
 
 from orthocal.assessment.wording import counted, joined, named, note, tool_mm
+from orthocal.assessment.words.anomalies import MOST_PLACES, place_of
 from orthocal.calibration.assessment_record import Finding, ToolErrorSummary, Verdict
 from orthocal.kinematics.conditions import StatedUse
+from orthocal.measurement.files.readings_checks import describe_missing
+from orthocal.session.session import Session
 from orthocal.units import UM
 
 HEADLINES: dict[Verdict, str] = {
@@ -50,6 +53,19 @@ def no_anomaly(readings: int, *, within_tolerances: bool) -> Finding:
     else:
         text = "There is no second reading to compare the reading with."
     return note("fits", text, readings=float(readings))
+
+
+def readings_missing(session: Session) -> Finding:
+    """Finding that some readings are missing."""
+    missing = [i for i, r in enumerate(session.readings) if not r.is_read]
+    return note(
+        "readings missing",
+        f"{describe_missing(session)}.",
+        "",
+        [place_of(session, i) for i in missing[:MOST_PLACES]],
+        readings=float(len(session.readings)),
+        missing=float(len(missing)),
+    )
 
 
 def no_offset() -> Finding:

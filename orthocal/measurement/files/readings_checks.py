@@ -18,7 +18,7 @@ from orthocal.robot.description import HIGHEST_C, LOWEST_C
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import LARGEST_READING, largest_reading
 from orthocal.session.session import Conditions, Gauge, Reading, ReadingKey, Session
-from orthocal.text import shorten
+from orthocal.text import shorten, spans
 from orthocal.units import MM
 
 IN_UM = "; for readings in µm use `orthocal import --unit um`"
@@ -29,9 +29,9 @@ FAR = 5.0
 
 
 def check_readings(
-    rows: Iterable[RawReading], plan: Session, *, file: Path, partial: bool = False
+    rows: Iterable[RawReading], plan: Session, *, file: Path
 ) -> tuple[tuple[Reading, ...], PointRows]:
-    """Readings of a table, checked against their session and against each other.
+    """Readings of a table, checked against their session and each other; NaN for empty cells.
 
     Rows of points may have covariances of their own, and with them setups beside the planned ones.
 
@@ -39,30 +39,46 @@ def check_readings(
         rows: The rows.
         plan: The session, for its setups, postures and gauges.
         file: File of the rows, for messages.
-        partial: Whether cells may be empty; their readings are NaN.
 
     Raises:
         SessionError: Naming file and line.
     """
-    rows = iter(rows)
     checked, points = _CheckedReadings(file), PointRows(plan)
     for row in rows:
-        of_row = parse_row(row, plan, points)
-        if not (all(r.is_read for r in of_row) or partial):
-            if not checked.readings and not any(r.reading_mm or r.x_mm for r in rows):
-                raise SessionError(
-                    "nothing was read yet; `orthocal record` takes the readings", where=str(file)
-                )
-            raise SessionError(
-                "reading_mm is empty; type the reading, or delete the line (`orthocal record` does "
-                "both)",
-                where=row.where,
-            )
-        for reading in of_row:
+        for reading in parse_row(row, plan, points):
             checked.add(row, reading)
     if not checked.readings:
         raise SessionError("holds no readings", where=str(file))
     return tuple(checked.readings), points
+
+
+def require_read(session: Session, *, partial: bool = False) -> None:
+    """Refuse a session with readings that are missing; with `partial`, one without any reading.
+
+    Raises:
+        SessionError: Naming file, number and lines.
+    """
+    missing = [r for r in session.readings if not r.is_read]
+    if len(missing) == len(session.readings):
+        raise SessionError(
+            "nothing was read yet; `orthocal record` takes the readings",
+            where=str(session.readings_path),
+        )
+    if missing and not partial:
+        raise SessionError(
+            f"{describe_missing(session)}; `orthocal record` takes them or drops their lines, and "
+            "`orthocal check` looks at the others",
+            where=str(session.readings_path),
+        )
+
+
+def describe_missing(session: Session) -> str:
+    """Number and lines of missing readings: 9 of 24 readings are missing (lines 14, 17 to 24)."""
+    missing = [r for r in session.readings if not r.is_read]
+    lines = sorted({r.line for r in missing if r.line is not None})
+    where = f" ({spans(lines, 'line')})" if lines else ""
+    verb = "is" if len(missing) == 1 else "are"
+    return f"{len(missing)} of {len(session.readings)} readings {verb} missing{where}"
 
 
 def parse_row(row: RawReading, plan: Session, points: PointRows) -> list[Reading]:

@@ -26,7 +26,7 @@ from orthocal.io.files import (
     require_plain_name,
 )
 from orthocal.measurement.files.point_rows import base_name, locate_stations, split_points
-from orthocal.measurement.files.readings_checks import check_readings, require_name
+from orthocal.measurement.files.readings_checks import check_readings, require_name, require_read
 from orthocal.measurement.files.readings_file import read_rows
 from orthocal.measurement.files.schema import MOST_READINGS, CalibrationKeys, GaugeKeys, SessionKeys
 from orthocal.measurement.files.session_robot import (
@@ -54,29 +54,30 @@ OTHER_KINDS = (".csv", ".json", ".urdf")
 """Suffixes of files of other kinds."""
 
 
-def load_session(path: str | Path) -> Session:
+def load_session(path: str | Path, *, partial: bool = False) -> Session:
     """Read a session: its YAML, its CSV and its robot, checked against each other.
 
     Args:
         path: The session.yaml, or the folder that holds it.
+        partial: Whether some of the readings may be missing: their values are NaN.
 
     Raises:
         SessionError: Naming file and line or key, what was found and what was expected.
         RobotError: If the robot does not load.
     """
     file, content, keys = _read_keys(Path(path))
-    return _load_session(file, content, keys)
+    session = _load_session(file, content, keys)
+    require_read(session, partial=partial)
+    return locate_stations(session)
 
 
-def _load_session(
-    file: Path, content: bytes, keys: SessionKeys, *, partial: bool = False
-) -> Session:
-    """A session with readings; with `partial`, those of empty cells are NaN."""
+def _load_session(file: Path, content: bytes, keys: SessionKeys) -> Session:
+    """A session with readings, stations not located; readings of empty cells are NaN."""
     plan, readings_path = _build_unread(file, keys)
     table = read_file(readings_path, error=SessionError)
     with content_withheld_outside(file.parent, readings_path):
         rows = read_rows(readings_path, table)
-        readings, points = check_readings(rows, plan, file=readings_path, partial=partial)
+        readings, points = check_readings(rows, plan, file=readings_path)
     digest = hashlib.sha256(content + b"\0" + table)
     for joint in plan.compensation:
         digest.update(b"" if joint.table is None else joint.table.tobytes())
@@ -89,7 +90,7 @@ def _load_session(
         sha256=digest.hexdigest(),
     )
     check_contacts(session)
-    return locate_stations(session)
+    return session
 
 
 def load_unread(path: str | Path) -> tuple[Session, Path]:
@@ -146,7 +147,7 @@ def load_rows(path: str | Path) -> Session:
     """
     file, content, keys = _read_keys(Path(path))
     if keys.readings is not None:
-        return _load_session(file, content, keys, partial=True)
+        return locate_stations(_load_session(file, content, keys))
     read = _read_setups(file, keys)
     count = keys.cycles * sum(len(s.postures or keys.postures) for s, _ in read.values())
     if count > MOST_READINGS:

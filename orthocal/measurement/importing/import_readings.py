@@ -125,7 +125,7 @@ def import_readings(
             for row in _read_existing(readings_path, path, long_table, overwrite)
         ]
     merged, counts = _merge(existing, new, overwrite)
-    readings, _ = check_readings(merged, plan, file=readings_path, partial=True)
+    readings, _ = check_readings(merged, plan, file=readings_path)
     check_contacts(replace(plan, readings=readings))
     return TableImport(
         options=options,

@@ -6,11 +6,12 @@ import json
 from collections.abc import Iterable
 from typing import Any
 
-from orthocal.assessment.wording import counted, runs
+from orthocal.assessment.wording import counted
 from orthocal.io.tables.cell import column_letters
 from orthocal.io.tables.table import Table
 from orthocal.measurement.files.readings_file import RawReading, is_house
 from orthocal.measurement.importing.import_readings import TableImport
+from orthocal.text import runs
 
 UNIT_SYMBOLS = {"um": "µm"}
 """Symbols of units that have another symbol than their name."""

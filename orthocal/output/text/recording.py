@@ -9,7 +9,7 @@ import textwrap
 from collections.abc import Sequence
 
 from orthocal.assessment.judgement import is_far
-from orthocal.assessment.wording import counted, joined, mm, name_direction, spans
+from orthocal.assessment.wording import counted, joined, mm, name_direction
 from orthocal.calibration.assessment_record import Finding
 from orthocal.measurement.motion.approach import (
     approach_length,
@@ -23,7 +23,7 @@ from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
 from orthocal.sensors.protocol import mounting_steps
 from orthocal.session.session import Conditions, Reading, Session, Setup
-from orthocal.text import printable
+from orthocal.text import printable, spans
 from orthocal.units import DRIVE_UNITS, MM, format_fixed, to_mm, trim_zeros
 
 WIDEST = 100
