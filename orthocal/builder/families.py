@@ -182,7 +182,6 @@ def machine_yaml(
     """
     names = [leg.name for leg in legs]
     others = names[1:]
-    radius = in_mm(rod_radius)
     loops = [f"  - [{k}_crossbar_end, {k}_rod_b_tip]" for k in names]
     loops += [f"  - [platform, {k}_foot_end]" for k in others]
     kinds = ["3d"] * len(names) + ["6d"] * len(others)
@@ -205,17 +204,7 @@ def machine_yaml(
         "  drives:",
         *(f"    {leg.name}_slide: {{zero_mm: {in_mm(leg.zero)}}}" for leg in legs),
         "  legs:",
-    ]
-    for k in names:
-        lines += [
-            f"    {k}:",
-            f"      root: {k}_leg_root",
-            f"      tip: {k}_leg_tip",
-            "      rods:",
-            f"        a: {{root: {k}_bar_a, tip: {k}_coupler, radius_mm: {radius}}}",
-            f"        b: {{root: {k}_bar_b, tip: {k}_rod_b_tip, radius_mm: {radius}}}",
-        ]
-    lines += [
+        *(line for k in names for line in _leg_lines(k, in_mm(rod_radius))),
         "  tcp: {frame: tcp, coordinates: [x, y, z]}",
         "  parameters:",
         *(f"    {name}: [{', '.join(members)}]" for name, members in sums.items()),
@@ -226,6 +215,18 @@ def machine_yaml(
         "    full: complete",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _leg_lines(name: str, radius: str) -> list[str]:
+    """YAML of a leg with two rods of a radius, in mm."""
+    return [
+        f"    {name}:",
+        f"      root: {name}_leg_root",
+        f"      tip: {name}_leg_tip",
+        "      rods:",
+        f"        a: {{root: {name}_bar_a, tip: {name}_coupler, radius_mm: {radius}}}",
+        f"        b: {{root: {name}_bar_b, tip: {name}_rod_b_tip, radius_mm: {radius}}}",
+    ]
 
 
 def _box(limits: Sequence[tuple[float, float]], size: float) -> str:

@@ -77,9 +77,8 @@ def assemble_calibration(
     problem = fit.problem
     session, n = problem.session, problem.n_machine
     # a base parameter stands for all errors of its combination
-    others = find_unmodelled_errors(
-        fit, represented=() if full_problem is None else full_problem.machine_selection.names
-    )
+    represented = () if full_problem is None else full_problem.machine_selection.names
+    others = find_unmodelled_errors(fit, represented=represented)
     unmodelled, taken_on = propagate_unmodelled(fit, others)
     noise = _separate_noise(fit) if others.names else None
     covariance, noise_covariance = fit.covariance(noise=noise), fit.noise_covariance(noise=noise)
@@ -98,10 +97,7 @@ def assemble_calibration(
         model=problem.selection.label,
         prior=bool(problem.machine_selection.prior.any()),
         solver=_solver_record(fit),
-        parameters=(
-            *estimates[:n],
-            *(hold_parameter(session.robot, *known) for known in problem.fixed.items()),
-        ),
+        parameters=(*estimates[:n], *_held_parameters(problem)),
         sensors=estimates[n:],
         model_covariance=read_only(covariance[:n, :n]),
         noise_covariance=read_only(noise_covariance[:n, :n]),
@@ -119,6 +115,12 @@ def assemble_calibration(
         versions=_versions(),
         robot=session.robot,
     )
+
+
+def _held_parameters(problem: CalibrationProblem) -> list[ParameterEstimate]:
+    """Records of the known parameters, which are not estimated."""
+    robot = problem.session.robot
+    return [hold_parameter(robot, name, value) for name, value in problem.fixed.items()]
 
 
 def _separate_noise(fit: Fit) -> float | None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arguments import require_kind, require_names
+from orthocal.arrays import Array
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import NotIdentifiableError, ParameterError
@@ -78,12 +79,7 @@ def identify(
     options = _solver_options(solver, loss)
     problem = CalibrationProblem(session, chosen.select(session.robot.parameters))
     require_conditions(session, problem.machine_selection.names)
-    if start is not None:
-        n = problem.n_machine
-        start, _ = as_rows(start, n, "free parameters to start from")
-        if start.shape != (1, n) or not np.isfinite(start).all():
-            raise ValueError(f"expected {n} finite numbers to start from")
-        start = np.append(start[0], np.zeros(problem.n_free - n))
+    theta = None if start is None else _read_start(start, problem)
     scale = AS_STATED if find_scale is None else find_scale(session)
     if chosen.base:  # without priors
         scale = AS_STATED
@@ -92,10 +88,23 @@ def identify(
         problem = CalibrationProblem(session, selection)
     full_problem = problem if chosen.base else None
     solve = _fit_base if chosen.base else fit_problem
-    fit = solve(problem, options=options, start=start)
+    fit = solve(problem, options=options, start=theta)
     profiled = _match_profiled(fit.problem, profile)
     intervals = {name: profile_interval(fit, name) for name in profiled}
     return assemble_calibration(fit, full_problem=full_problem, intervals=intervals), session
+
+
+def _read_start(start: ArrayLike, problem: CalibrationProblem) -> Array:
+    """Free parameters to start from, with exact mounting, shape (n_free,), [SI].
+
+    Raises:
+        ValueError: If there is not one finite number for each free error of the machine.
+    """
+    n = problem.n_machine
+    rows, _ = as_rows(start, n, "free parameters to start from")
+    if rows.shape != (1, n) or not np.isfinite(rows).all():
+        raise ValueError(f"expected {n} finite numbers to start from")
+    return np.append(rows[0], np.zeros(problem.n_free - n))
 
 
 def _solver_options(

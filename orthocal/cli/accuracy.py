@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument, Exit
 
@@ -24,6 +26,9 @@ from orthocal.cli.options import (
 from orthocal.cli.printing import deliver, print_rows, put_note
 from orthocal.errors import ClosureError, SessionError
 from orthocal.units import MM
+
+if TYPE_CHECKING:
+    from orthocal.cli.options import Array
 
 
 @command()
@@ -48,11 +53,9 @@ def accuracy(
     Args:
         points (TARGETS.csv): Columns of the tool: x_mm, y_mm, z_mm.
     """
-    from orthocal.assessment.tool_error import MOST_POINTS
-    from orthocal.assessment.tool_tables import accuracy_rows
-    from orthocal.kinematics.workspace import cube, describe_box
+    from orthocal.kinematics.workspace import cube
     from orthocal.measurement.files.coordinate_tables import read_points
-    from orthocal.output.text import accuracy as text
+    from orthocal.output.text.accuracy import accuracy_json, print_accuracy
 
     if half_side_mm is not None:
         require_between(half_side_mm, 0.0, 1e5, "--half-side-mm")
@@ -60,32 +63,79 @@ def accuracy(
     conditions = read_conditions(
         result.robot, approach=approach, temperature=temperature, payload=payload
     )
-    stated = conditions if conditions.stated else None
     names, workspace = None, None
     if points is not None:
         names, targets = read_points(points, result.robot)
         if not json:
-            rows = accuracy_rows(result, targets, names=names, conditions=conditions)
-            put_assumed(result, conditions)
-            note = text.ABSOLUTE_NOTE.format(shlex.quote(str(calibration)))
-            try:
-                print_rows(text.POINT_COLUMNS, text.format_points, rows)
-            except Exit:  # some rows are empty
-                put_note(note)
-                raise
-            put_note(note)
+            _print_points(result, targets, names, conditions, calibration)
             return
-        if len(targets) > MOST_POINTS:
-            raise SessionError(
-                f"contains {len(targets)} points; expected at most {MOST_POINTS} with --json, "
-                "which evaluates all together",
-                where=str(points),
-            )
+        _require_few(targets, points)
         workspace = orthocal.Workspace.even(targets)
     elif half_side_mm is not None:
         workspace = cube(result.robot, half_side=half_side_mm * MM)
-    try:
+    stated = conditions if conditions.stated else None
+    with _cube_reached(result, half_side_mm):
         assessment = orthocal.assess_tool(result, workspace, names=names, conditions=stated)
+    deliver(
+        lambda: accuracy_json(result, assessment),
+        lambda: print_accuracy(result, assessment),
+        json=json,
+    )
+
+
+def _print_points(
+    result: orthocal.Calibration,
+    targets: Array,
+    names: Sequence[str],
+    conditions: orthocal.UseConditions,
+    path: Path,
+) -> None:
+    """Print the tool error at points as CSV.
+
+    Raises:
+        typer.Exit: With code 3 if the machine does not reach some points.
+    """
+    from orthocal.assessment.tool_tables import accuracy_rows
+    from orthocal.output.text.accuracy import ABSOLUTE_NOTE, POINT_COLUMNS, format_points
+
+    rows = accuracy_rows(result, targets, names=names, conditions=conditions)
+    put_assumed(result, conditions)
+    note = ABSOLUTE_NOTE.format(shlex.quote(str(path)))
+    try:
+        print_rows(POINT_COLUMNS, format_points, rows)
+    except Exit:  # some rows are empty
+        put_note(note)
+        raise
+    put_note(note)
+
+
+def _require_few(targets: Array, path: Path) -> None:
+    """Refuse points that are too many to be evaluated together.
+
+    Raises:
+        SessionError: Naming their file.
+    """
+    from orthocal.assessment.tool_error import MOST_POINTS
+
+    if len(targets) > MOST_POINTS:
+        raise SessionError(
+            f"contains {len(targets)} points; expected at most {MOST_POINTS} with --json, "
+            "which evaluates all together",
+            where=str(path),
+        )
+
+
+@contextmanager
+def _cube_reached(result: orthocal.Calibration, half_side_mm: float | None) -> Iterator[None]:
+    """Explain a posture that the machine does not reach, by the cube if one is stated.
+
+    Raises:
+        SessionError: In place of `ClosureError`.
+    """
+    from orthocal.kinematics.workspace import describe_box
+
+    try:
+        yield
     except ClosureError as e:
         if half_side_mm is None:
             raise SessionError(e.reason, where=e.posture) from None
@@ -95,8 +145,3 @@ def accuracy(
             f"{reached} ({e.reason})",
             where="--half-side-mm",
         ) from None
-    deliver(
-        lambda: text.accuracy_json(result, assessment),
-        lambda: text.print_accuracy(result, assessment),
-        json=json,
-    )

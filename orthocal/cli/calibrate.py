@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -30,17 +31,52 @@ from orthocal.io.files import require_writable
 FILES = ("calibration.json", "report.html")
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChoiceOptions:
+    """Options about the errors to identify and what is known of them.
+
+    Args:
+        known (NAME=VALUE[±TOL]): Known error, fixed or with a tolerance as prior:
+            x_leg.length_mm=0.12±0.02 (or +-).
+        prior: Use the tolerances in the fit; default: yes, except where only offsets are
+            identified.
+        bound (PATTERN=LOW:HIGH): Bounds such as 'x_slide.offset_mm=-2:2', or of one side '=-2:'.
+        base: For research: estimate one of several redundant errors, without tolerances.
+    """
+
+    model: Model = None
+    free: Free = None
+    effects: Effects = None
+    known: list[str] | None = None
+    tolerance: Tolerances = None
+    prior: Annotated[bool | None, Option("--prior/--no-prior")] = None
+    bound: list[str] | None = None
+    base: bool = False
+
+    def read(self, robot: orthocal.Robot) -> orthocal.Choice:
+        """Choice for a robot with the effects.
+
+        Raises:
+            ParameterError: If an option is malformed, or selects no error of the robot.
+        """
+        from orthocal.estimation.selection import read_bounds, read_known
+
+        return orthocal.Choice(
+            model=self.model,
+            free=split_globs(self.free),
+            prior=self.prior,
+            known=read_known(self.known or [], robot.parameters, where="--known"),
+            tolerances=read_tolerances(self.tolerance, robot),
+            bounds=read_bounds(self.bound or [], robot.parameters, where="--bound"),
+            base=self.base,
+        )
+
+
 @command()
 def calibrate(
     sessions: SessionPaths,
-    model: Model = None,
-    free: Free = None,
-    effects: Effects = None,
-    known: list[str] | None = None,
-    tolerance: Tolerances = None,
-    prior: Annotated[bool | None, Option("--prior/--no-prior")] = None,
-    bound: list[str] | None = None,
-    base: bool = False,
+    *,
+    choice: ChoiceOptions,
     loss: str = "squares",
     solver: str = "ipopt",
     profile: list[str] | None = None,
@@ -57,36 +93,20 @@ def calibrate(
     nevertheless, unless the solver fails.
 
     Args:
-        known (NAME=VALUE[±TOL]): Known error, fixed or with a tolerance as prior:
-            x_leg.length_mm=0.12±0.02 (or +-).
-        prior: Use the tolerances in the fit; default: yes, except where only offsets are
-            identified.
-        bound (PATTERN=LOW:HIGH): Bounds such as 'x_slide.offset_mm=-2:2', or of one side '=-2:'.
-        base: For research: estimate one of several redundant errors, without tolerances.
         loss (squares|huber): For research: loss function of the residuals; huber reduces the
             weight of outliers.
         solver (ipopt|variable-projection|linearised): For research: reference, variable projection
             (faster), or first order as in the paper.
         profile (PATTERNS): For research: profile-likelihood intervals of these errors (slow).
     """
-    from orthocal.estimation.selection import read_bounds, read_known
-
     if out is not None:
         require_writable(out, FILES)
-    session = load_joined(sessions, effects=split_effects(effects), tolerance=tolerance)
-    parameters = session.robot.parameters
+    effects = split_effects(choice.effects)
+    session = load_joined(sessions, effects=effects, tolerance=choice.tolerance)
     with judgement_on_failure(session, json=json):
         result = orthocal.calibrate(
             session,
-            orthocal.Choice(
-                model=model,
-                free=split_globs(free),
-                prior=prior,
-                known=read_known(known or [], parameters, where="--known"),
-                tolerances=read_tolerances(tolerance, session.robot),
-                bounds=read_bounds(bound or [], parameters, where="--bound"),
-                base=base,
-            ),
+            choice.read(session.robot),
             loss=loss,  # type: ignore[arg-type] # checked there
             solver=solver,  # type: ignore[arg-type] # likewise
             profile=split_globs(profile),

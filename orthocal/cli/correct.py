@@ -11,9 +11,10 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Annotated, BinaryIO
+from typing import IO, TYPE_CHECKING, Annotated, BinaryIO, NamedTuple
 
 from typer import Option
 
@@ -44,9 +45,11 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from orthocal.export.approach_sides import ApproachSides
     from orthocal.export.correction_field import CorrectionField
+    from orthocal.gcode.interpreter import Interpreter
     from orthocal.gcode.path import Vector
-    from orthocal.gcode.program import Summary
+    from orthocal.gcode.program import ProgramCorrector, Summary
 
     Array = NDArray[np.float64]
 
@@ -77,18 +80,37 @@ class Backlash(StrEnum):
     CONTROLLER = "controller"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CorrectionOptions:
+    """Options about controller, tool and machine.
+
+    Args:
+        within (UM): Largest distance of the written path from the corrected path, µm.
+        offsets: Offsets in the controller when the program runs: those that `calibrate` says to
+            enter, or those that were active during the measurement.
+        backlash: Who takes up identified backlash: the program, or the controller (LinuxCNC:
+            BACKLASH).
+        work_offset_mm ([G54=]X,Y,Z): Zero of the program in machine coordinates; repeat for G55 ...
+        start_mm (X,Y,Z): Position that the controller displays before the program. Without it,
+            rapid motions before the first position in X, Y and Z are not corrected.
+    """
+
+    within: Annotated[float, Option(min=0.01, max=1000.0)] = 1.0
+    offsets: Offsets = Offsets.ENTERED
+    backlash: Backlash = Backlash.PROGRAM
+    work_offset_mm: list[str] | None = None
+    start_mm: str | None = None
+    tool: ToolTip = None
+    temperature: Temperature = None
+    payload: Payload = None
+
+
 @command()
 def correct(
     calibration: CalibrationPath,
     program: Path,
-    within: Annotated[float, Option(min=0.01, max=1000.0)] = 1.0,
-    offsets: Offsets = Offsets.ENTERED,
-    backlash: Backlash = Backlash.PROGRAM,
-    work_offset_mm: list[str] | None = None,
-    start_mm: str | None = None,
-    tool: ToolTip = None,
-    temperature: Temperature = None,
-    payload: Payload = None,
+    *,
+    options: CorrectionOptions,
     out: Path | None = None,
     anyway: Anyway = False,
 ) -> None:
@@ -105,74 +127,148 @@ def correct(
 
     Args:
         program (PROGRAM): G-code file; - for standard input.
-        within (UM): Largest distance of the written path from the corrected path, µm.
-        offsets: Offsets in the controller when the program runs: those that `calibrate` says to
-            enter, or those that were active during the measurement.
-        backlash: Who takes up identified backlash: the program, or the controller (LinuxCNC:
-            BACKLASH).
-        work_offset_mm ([G54=]X,Y,Z): Zero of the program in machine coordinates; repeat for G55 ...
-        start_mm (X,Y,Z): Position that the controller displays before the program. Without it,
-            rapid motions before the first position in X, Y and Z are not corrected.
         out (FILE): File for the corrected program; default: standard output.
     """
-    from orthocal.assessment.controller_entries import offsets_to_enter
-    from orthocal.export.approach_sides import ApproachSides, find_lags
-    from orthocal.export.correction_field import CorrectionField
     from orthocal.export.formats import require_entering, warn_against_verdict
-    from orthocal.gcode.interpreter import Interpreter
-    from orthocal.gcode.program import ProgramCorrector
-    from orthocal.output.text.conditions import describe_assumed
 
-    zeros = _read_offsets(work_offset_mm or [])
-    position = None if start_mm is None else read_vector(start_mm, "--start-mm")
-    tip = orthocal.ExportOptions(tool=None if tool is None else read_vector(tool, "--tool")).tool
+    controller = _read_controller(options)
     if out is not None:
         require_writable_file(out)
     result = orthocal.load_calibration(calibration)
     if not anyway:
         require_entering(result)
-    warning = warn_against_verdict(result)
-    active = offsets is Offsets.ACTIVE
-    values = result.active_offsets if active else offsets_to_enter(result)
-    tolerance = within * UM
-    conditions = read_conditions(result.robot, temperature=temperature, payload=payload)
-    field = CorrectionField(
-        result, values, within=tolerance, tool=tip or (0.0, 0.0, 0.0), conditions=conditions
-    )
     file = "standard input" if str(program) == "-" else str(program)
-    interpreter = Interpreter(
-        file, axes=field.axes, offsets=zeros, start=position, one_tool=tip is not None
-    )
-    region, words = _find_region(result)
-    lags = find_lags(result.robot, result.errors) - _compensated_lags(result)
-    taken_up = backlash is Backlash.PROGRAM and bool(lags.any())
-    sides = ApproachSides(result.robot, lags) if taken_up else None
-    corrector = ProgramCorrector(interpreter, field, within=tolerance, region=region, sides=sides)
-    controller = _describe_controller(result, values, active=active)
+    correction = _prepare(result, options, controller, file)
+    warning = warn_against_verdict(result)
     mark = f"{MARK}: calibration {_identify(calibration)}. Do not correct again."
-    comments = [mark, controller, _describe_tip(tip), warning]
+    comments = [mark, correction.for_controller, _describe_tip(controller.tip), warning]
     source = _lines(program, file)
     with tempfile.TemporaryFile() as spool:  # nothing is written before all lines are corrected
         with _frozen():
-            texts = corrector.run(source if anyway else _refuse_corrected(source, file))
+            texts = correction.corrector.run(source if anyway else _refuse_corrected(source, file))
             _spool(_with_comments(texts, [c for c in comments if c]), spool)
-        if not corrector.summary.lines:
+        if not correction.corrector.summary.lines:
             raise GcodeError("is empty; expected a program", where=file)
         _put_program(spool, out)
-    notes = [
-        _describe(corrector.summary, field, tolerance),
-        controller,
-        _describe_tip(tip) or _describe_tools(interpreter.tools.used),
-        describe_assumed(result, conditions, fields=("temperature", "payload")),
-        _describe_backlash(result, lags, taken_up=taken_up),
-        warning,
-        _describe_uncorrected(interpreter.uncorrected, file),
-        _describe_outside(corrector.summary, file, words),
-        "" if zeros else "The program's coordinates are read as machine coordinates.",
-    ]
-    if corrector.summary.unit_assumed:
-        notes.append("No G20 or G21 before the first coordinates: read as mm.")
-    put_note("\n".join(note for note in notes if note))
+    put_note("\n".join(note for note in correction.list_notes(warning) if note))
+
+
+class _Controller(NamedTuple):
+    """Stated controller and tool."""
+
+    work_offsets: dict[str, Vector]
+    start: Vector | None
+    tip: Vector | None
+
+
+def _read_controller(options: CorrectionOptions) -> _Controller:
+    """Controller and tool of the options.
+
+    Raises:
+        ParameterError: If an option is malformed.
+    """
+    start, tool = options.start_mm, options.tool
+    return _Controller(
+        _read_offsets(options.work_offset_mm or []),
+        None if start is None else read_vector(start, "--start-mm"),
+        orthocal.ExportOptions(tool=None if tool is None else read_vector(tool, "--tool")).tool,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Correction:
+    """Correction of one program, and what the notes say about it."""
+
+    result: orthocal.Calibration
+    controller: _Controller
+    file: str
+    conditions: orthocal.UseConditions
+    field: CorrectionField
+    tolerance: float
+    """Largest distance of the written path from the corrected path, [m]."""
+    lags: Array
+    """Half of the backlash that the program or the controller takes up, (n_drives,), [m, rad]."""
+    sides: ApproachSides | None
+    """None where the controller takes up the backlash, or there is none."""
+    interpreter: Interpreter
+    corrector: ProgramCorrector
+    region: str
+    """Workspace in words."""
+    for_controller: str
+    """Offsets in the controller in words."""
+
+    def list_notes(self, warning: str) -> list[str]:
+        """Notes about the corrected program; empty ones do not apply."""
+        from orthocal.output.text.conditions import describe_assumed
+
+        summary, tools = self.corrector.summary, self.interpreter.tools.used
+        notes = [
+            _describe(summary, self.field, self.tolerance),
+            self.for_controller,
+            _describe_tip(self.controller.tip) or _describe_tools(tools),
+            describe_assumed(self.result, self.conditions, fields=("temperature", "payload")),
+            _describe_backlash(self.result, self.lags, taken_up=self.sides is not None),
+            warning,
+            _describe_uncorrected(self.interpreter.uncorrected, self.file),
+            _describe_outside(summary, self.file, self.region),
+        ]
+        if not self.controller.work_offsets:
+            notes.append("The program's coordinates are read as machine coordinates.")
+        if summary.unit_assumed:
+            notes.append("No G20 or G21 before the first coordinates: read as mm.")
+        return notes
+
+
+def _prepare(
+    result: orthocal.Calibration, options: CorrectionOptions, controller: _Controller, file: str
+) -> _Correction:
+    """Correction of a program by a calibration.
+
+    Raises:
+        OrthocalError: If a condition of use is invalid, or the correction cannot be computed.
+    """
+    from orthocal.assessment.controller_entries import offsets_to_enter
+    from orthocal.export.approach_sides import ApproachSides, find_lags
+    from orthocal.export.correction_field import CorrectionField
+    from orthocal.gcode.interpreter import Interpreter
+    from orthocal.gcode.program import ProgramCorrector
+
+    active, tip = options.offsets is Offsets.ACTIVE, controller.tip
+    values = result.active_offsets if active else offsets_to_enter(result)
+    tolerance = options.within * UM
+    conditions = read_conditions(
+        result.robot, temperature=options.temperature, payload=options.payload
+    )
+    field = CorrectionField(
+        result, values, within=tolerance, tool=tip or (0.0, 0.0, 0.0), conditions=conditions
+    )
+    interpreter = Interpreter(
+        file,
+        axes=field.axes,
+        offsets=controller.work_offsets,
+        start=controller.start,
+        one_tool=tip is not None,
+    )
+    region, words = _find_region(result)
+    lags = find_lags(result.robot, result.errors) - _compensated_lags(result)
+    taken_up = options.backlash is Backlash.PROGRAM and bool(lags.any())
+    sides = ApproachSides(result.robot, lags) if taken_up else None
+    return _Correction(
+        result=result,
+        controller=controller,
+        file=file,
+        conditions=conditions,
+        field=field,
+        tolerance=tolerance,
+        lags=lags,
+        sides=sides,
+        interpreter=interpreter,
+        corrector=ProgramCorrector(
+            interpreter, field, within=tolerance, region=region, sides=sides
+        ),
+        region=words,
+        for_controller=_describe_controller(result, values, active=active),
+    )
 
 
 def _put_program(spool: IO[bytes], out: Path | None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -82,6 +83,21 @@ def export(
         module=module,
     )
     files = orthocal.export_calibration(result, to, anyway=anyway, options=options)
+    _refuse_both(out, files)
+    write_results(out, files)
+    if to == "linuxcnc" and assumes_latching(result, options):
+        put_note(
+            "Assumed: HOME_LATCH_VEL of all joints is positive. If not, use --ini FILE or "
+            "--latched: HOME_OFFSET contains half of the backlash with this sign."
+        )
+
+
+def _refuse_both(out: Path, files: Iterable[str]) -> None:
+    """Refuse a directory with the export that these files are an alternative to.
+
+    Raises:
+        ParameterError: Naming the file of the other export.
+    """
     for mine, other in (ALTERNATIVES, ALTERNATIVES[::-1]):
         if mine in files and exists(out / other):
             raise ParameterError(
@@ -89,12 +105,6 @@ def export(
                 "would correct offsets twice: choose another directory",
                 where=str(out / other),
             )
-    write_results(out, files)
-    if to == "linuxcnc" and assumes_latching(result, options):
-        put_note(
-            "Assumed: HOME_LATCH_VEL of all joints is positive. If not, use --ini FILE or "
-            "--latched: HOME_OFFSET contains half of the backlash with this sign."
-        )
 
 
 def _read_joints(path: Path, calibration: orthocal.Calibration) -> ControllerJoints:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -52,24 +52,64 @@ COMMENT = (
 """Comment at the top of the first session's session.yaml."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DimensionOptions:
+    """Dimensions of a machine; `find_answers` reads them.
+
+    Args:
+        leg_mm (MM): Length of a leg, from hinge to hinge of a rod.
+        travel_mm (LEAST:LARGEST): Travel of a slide; its coordinate is the leg length where the
+            legs are parallel to their axes, and more further out.
+        attachment_mm (MM): Distance from the tool centre point to the hinges on the platform, along
+            the axis.
+        rods_apart_mm (MM): Distance of the axes of a leg's two rods.
+        rod_radius_mm (MM): Radius of a rod.
+        counts (up|down[,...]): Direction in which a joint of the controller counts as its slide
+            moves outwards: one for all, or x,y,z.
+        at_zero_mm (MM[,...]): Coordinate that the controller shows where the legs are parallel to
+            their axes: one for all, or x,y,z.
+    """
+
+    leg_mm: str | None = None
+    travel_mm: str | None = None
+    attachment_mm: str | None = None
+    rods_apart_mm: str | None = None
+    rod_radius_mm: str | None = None
+    counts: str | None = None
+    at_zero_mm: str | None = None
+
+    @property
+    def by_option(self) -> dict[str, str | None]:
+        """Values by the names of their options."""
+        return {f"--{k.replace('_', '-')}": value for k, value in asdict(self).items()}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FirstPlanOptions:
+    """Options about the first plan of a machine.
+
+    Args:
+        effects (EFFECTS): Effects beside geometry that the machine has, such as
+            backlash,thermal, or none.
+        paper: Use the paper's seven postures and six setups; no search.
+    """
+
+    workspace_mm: WorkspaceMm = None
+    paper: bool = False
+    hours: Hours = None
+    gauge: Gauge = None
+    model: Model = None
+    effects: str = EFFECTS
+    temperature: Day = None
+    tolerance: Tolerances = None
+
+
 @command()
 def new(
     folder: Path,
-    leg_mm: str | None = None,
-    travel_mm: str | None = None,
-    attachment_mm: str | None = None,
-    rods_apart_mm: str | None = None,
-    rod_radius_mm: str | None = None,
-    counts: str | None = None,
-    at_zero_mm: str | None = None,
-    workspace_mm: WorkspaceMm = None,
-    paper: bool = False,
-    hours: Hours = None,
-    gauge: Gauge = None,
-    model: Model = None,
-    effects: str = EFFECTS,
-    temperature: Day = None,
-    tolerance: Tolerances = None,
+    *,
+    dimensions: DimensionOptions,
+    options: FirstPlanOptions,
     again: bool = False,
     force: Force = False,
 ) -> None:
@@ -82,75 +122,95 @@ def new(
 
     Args:
         folder (DIRECTORY): Directory of the machine; it is created.
-        leg_mm (MM): Length of a leg, from hinge to hinge of a rod.
-        travel_mm (LEAST:LARGEST): Travel of a slide; its coordinate is the leg length where the
-            legs are parallel to their axes, and more further out.
-        attachment_mm (MM): Distance from the tool centre point to the hinges on the platform, along
-            the axis.
-        rods_apart_mm (MM): Distance of the axes of a leg's two rods.
-        rod_radius_mm (MM): Radius of a rod.
-        counts (up|down[,...]): Direction in which a joint of the controller counts as its slide
-            moves outwards: one for all, or x,y,z.
-        at_zero_mm (MM[,...]): Coordinate that the controller shows where the legs are parallel to
-            their axes: one for all, or x,y,z.
-        effects (EFFECTS): Effects beside geometry that the machine has, such as
-            backlash,thermal, or none.
-        paper: Use the paper's seven postures and six setups; no search.
         again: Make URDF, YAML and sheets again from DIRECTORY/machine.yaml.
     """
-    dimensions = {
-        "--leg-mm": leg_mm,
-        "--travel-mm": travel_mm,
-        "--attachment-mm": attachment_mm,
-        "--rods-apart-mm": rods_apart_mm,
-        "--rod-radius-mm": rod_radius_mm,
-        "--counts": counts,
-        "--at-zero-mm": at_zero_mm,
-    }
     if again:
-        _require_none({**dimensions, "--workspace-mm": workspace_mm})
+        _require_none({**dimensions.by_option, "--workspace-mm": options.workspace_mm})
         _make_again(folder)
         return
-    if paper and hours is not None:
+    if options.paper and options.hours is not None:
         raise ParameterError("found with --paper, whose setups are fixed", where="--hours")
-    from orthocal.builder.build import describe_machine
+    name = _require_new(folder, force=force)
+    design = _design(name, dimensions.by_option, options)
+    _write(folder, name, design)
+    _report(folder, design)
+    if not design.tolerance_stated:
+        put_note(
+            f"The zeros of the joints are assumed to be within ±{USUAL_OFFSET:g} mm. Otherwise: "
+            "--tolerance '*.offset_mm=10'"
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Design:
+    """A new machine and its first plan, before they are written."""
+
+    machine: Dimensions
+    counting: tuple[Counting, ...]
+    effects: Sequence[str]
+    tolerance_stated: bool
+    """Whether the tolerance of the zeros of the joints was stated."""
+    plan: orthocal.MeasuringPlan | None
+    """None for the paper's readings."""
+    session: orthocal.Session
+    files: dict[str, str]
+    """Files beside session.yaml and readings.csv."""
+
+
+def _design(name: str, dimensions: Mapping[str, str | None], options: FirstPlanOptions) -> _Design:
+    """Machine of the options and answers, with its first plan.
+
+    Raises:
+        OrthocalError: If an option or answer is invalid, or there is no such plan.
+    """
     from orthocal.cli.dialogue import ask_tolerance, find_answers
     from orthocal.planning.equipment import load_dial
 
-    name = _require_new(folder, force=force)
-    equipment = orthocal.Equipment(temperatures=read_temperatures(temperature))
-    if gauge is not None:
-        equipment = load_dial(gauge, equipment)
-    chosen = split_effects(effects) or []
+    equipment = orthocal.Equipment(temperatures=read_temperatures(options.temperature))
+    if options.gauge is not None:
+        equipment = load_dial(options.gauge, equipment)
+    effects = split_effects(options.effects) or []
     machine, counting = find_answers(dimensions)
-    asked = None in dimensions.values()
+    asked, tolerance = None in dimensions.values(), options.tolerance
     with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
-        robot = _make_trial(machine, Path(trial) / name, counting, chosen)
-        if asked or workspace_mm is not None:
-            robot = _with_workspace(robot, workspace_mm)
+        robot = _make_trial(machine, Path(trial) / name, counting, effects)
+        if asked or options.workspace_mm is not None:
+            robot = _with_workspace(robot, options.workspace_mm)
         if asked and tolerance is None:
             tolerance = ask_tolerance(USUAL_OFFSET)
         if robot.workspace is not None:
             box = tuple((low, high) for low, high in robot.workspace.tolist())
             machine = replace(machine, workspace=box)
         tolerances = {"*.offset_mm": USUAL_OFFSET} | read_tolerances(tolerance, robot)
-        plan, session = _plan(robot, equipment, tolerances, paper=paper, hours=hours, model=model)
+        plan, session = _plan(robot, equipment, tolerances, options)
         put_note("orthocal: drawing the measuring sheet")
-        files = _draw(plan, session)
-    stated = session.robot.parameters.stated
+        return _Design(
+            machine=machine,
+            counting=counting,
+            effects=effects,
+            tolerance_stated=tolerance is not None,
+            plan=plan,
+            session=session,
+            files=_draw(plan, session),
+        )
+
+
+def _write(folder: Path, name: str, design: _Design) -> None:
+    """Write a machine, and its first session with the sheet."""
+    from orthocal.builder.build import describe_machine
+
+    stated = design.session.robot.parameters.stated
     described = describe_machine(
-        machine, name=name, counting=counting, tolerances=stated, effects=chosen
+        design.machine,
+        name=name,
+        counting=design.counting,
+        tolerances=stated,
+        effects=design.effects,
     )
     write_files(folder, described)
     robot = orthocal.load_robot(folder).with_tolerances(stated)
-    session = replace(session, robot=robot, robot_reference=str(folder.resolve()))
-    orthocal.write_session(session, folder / FIRST, comment=COMMENT, extra=files, blank=True)
-    _report(folder, machine.words, plan, session, files)
-    if tolerance is None:
-        put_note(
-            f"The zeros of the joints are assumed to be within ±{USUAL_OFFSET:g} mm. Otherwise: "
-            "--tolerance '*.offset_mm=10'"
-        )
+    session = replace(design.session, robot=robot, robot_reference=str(folder.resolve()))
+    orthocal.write_session(session, folder / FIRST, comment=COMMENT, extra=design.files, blank=True)
 
 
 def _make_trial(
@@ -229,26 +289,24 @@ def _plan(
     robot: orthocal.Robot,
     equipment: orthocal.Equipment,
     tolerances: Mapping[str, float],
-    *,
-    paper: bool,
-    hours: float | None,
-    model: str | None,
+    options: FirstPlanOptions,
 ) -> tuple[orthocal.MeasuringPlan | None, orthocal.Session]:
     """Plan, and its session with no active offsets; no plan for the paper's readings."""
     from orthocal.planning.first_plan import first_equipment, paper_plan
     from orthocal.planning.plan import MODEL
     from orthocal.session.session import Purpose
 
-    choice = orthocal.Choice(model or MODEL, tolerances=tolerances)
+    model = options.model or MODEL
+    choice = orthocal.Choice(model, tolerances=tolerances)
     choice.select(robot.parameters)
     zeros = [0.0] * len(robot.drives)
-    if paper:
+    if options.paper:
         session = paper_plan(robot, equipment).with_tolerances(tolerances).with_controller(zeros)
-        return None, replace(session, purpose=Purpose(model or MODEL))
+        return None, replace(session, purpose=Purpose(model))
     plan = orthocal.plan_readings(
         robot,
         choice,
-        hours=hours,
+        hours=options.hours,
         equipment=first_equipment(robot, equipment),
         report=lambda text: put_note(f"orthocal: {text}"),
     )
@@ -264,27 +322,21 @@ def _draw(plan: orthocal.MeasuringPlan | None, session: orthocal.Session) -> dic
     return {**sheet_files(session), **drawn}
 
 
-def _report(
-    folder: Path,
-    dimensions: str,
-    plan: orthocal.MeasuringPlan | None,
-    session: orthocal.Session,
-    files: dict[str, str],
-) -> None:
+def _report(folder: Path, design: _Design) -> None:
     """Print the expected tool error, the files and the next commands."""
     from orthocal.output.text.layout import counted
     from orthocal.output.text.plan import describe_expected, describe_size, show_duration
 
-    size = describe_size(session)
+    plan, size = design.plan, describe_size(design.session)
     lines = [f"Plan: {size}."]
     if plan is not None:
         lines = [
             f"Plan: {size}, about {show_duration(plan.minutes)}.",
             *describe_expected(plan),
         ]
-    programs = sum(name.endswith(".ngc") for name in files)
+    programs = sum(name.endswith(".ngc") for name in design.files)
     lines += [
-        f"Wrote {folder}: {dimensions}.",
+        f"Wrote {folder}: {design.machine.words}.",
         f"To change a dimension, edit {folder / 'machine.yaml'}, then run",
         f"  orthocal new {folder} --again",
         f"Wrote {folder / FIRST}: session.yaml, readings.csv, sheet.html and "

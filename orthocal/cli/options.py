@@ -6,8 +6,9 @@ import inspect
 import re
 from collections.abc import Callable, Sequence
 from copy import copy
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, get_args, get_type_hints
 
 import typer
 from typer import Argument, Option
@@ -76,6 +77,7 @@ def command(group: typer.Typer = app, *, name: str | None = None) -> Callable[[C
 
     An entry under Args is `name (METAVAR): help`. A parameter without a default is an argument,
     every other an option. An `Option` in its annotation states limits and other names.
+    The fields of a parameter that is a dataclass are options, described in its docstring alike.
 
     Args:
         group: Group of the command.
@@ -83,26 +85,56 @@ def command(group: typer.Typer = app, *, name: str | None = None) -> Callable[[C
     """
 
     def register(function: Command) -> Command:
-        text, _, entries = (inspect.getdoc(function) or "").partition("\n\nArgs:\n")
-        hints: dict[str, Any] = get_type_hints(function, include_extras=True)
-        parameters = inspect.signature(function).parameters
-        for parameter, metavar, words in _ENTRY.findall(entries):
-            default = parameters[parameter].default
-            if hasattr(hints[parameter], "__metadata__"):
-                kind, info = get_args(hints[parameter])
-                info = copy(info)
-            elif default is inspect.Parameter.empty:
-                kind, info = hints[parameter], Argument()
-            else:  # a flag has no negative form
-                flag = [f"--{parameter.replace('_', '-')}"] if default is False else []
-                kind, info = hints[parameter], Option(*flag)
-            info.metavar, info.help = metavar or None, " ".join(words.split())
-            hints[parameter] = Annotated[kind, info]
-        function.__annotations__ = hints
-        group.command(name, help=text)(function)
+        hints: dict[str, Any] = get_type_hints(function)
+        records = {name: kind for name, kind in hints.items() if is_dataclass(kind)}
+
+        def call(**values: Any) -> None:  # noqa: ANN401 - values of the options
+            for name, kind in records.items():
+                values[name] = cast("type", kind)(
+                    **{f.name: values.pop(f.name) for f in fields(kind)}
+                )
+            function(**values)
+
+        parameters = _list_parameters(function)
+        call.__name__ = function.__name__
+        call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        call.__annotations__ = {p.name: p.annotation for p in parameters}
+        text, _, _ = (inspect.getdoc(function) or "").partition("\n\nArgs:\n")
+        group.command(name, help=text)(call)
         return function
 
     return register
+
+
+def _list_parameters(source: Callable[..., Any]) -> list[inspect.Parameter]:
+    """Parameters of a command or fields of a record, annotated with their descriptions."""
+    entries = (inspect.getdoc(source) or "").partition("\n\nArgs:\n")[2]
+    described = {name: (metavar, words) for name, metavar, words in _ENTRY.findall(entries)}
+    hints: dict[str, Any] = get_type_hints(source, include_extras=True)
+    result = []
+    for parameter in inspect.signature(source).parameters.values():
+        hint = hints[parameter.name]
+        if is_dataclass(hint):
+            result += _list_parameters(cast("type", hint))
+            continue
+        if parameter.name in described:
+            hint = _describe(parameter, hint, *described[parameter.name])
+        result.append(parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY))
+    return result
+
+
+def _describe(parameter: inspect.Parameter, hint: Any, metavar: str, words: str) -> Any:  # noqa: ANN401
+    """Annotation of a parameter with its metavar and help."""
+    if hasattr(hint, "__metadata__"):
+        kind, info = get_args(hint)
+        info = copy(info)
+    elif parameter.default is inspect.Parameter.empty:
+        kind, info = hint, Argument()
+    else:  # a flag has no negative form
+        flag = [f"--{parameter.name.replace('_', '-')}"] if parameter.default is False else []
+        kind, info = hint, Option(*flag)
+    info.metavar, info.help = metavar or None, " ".join(words.split())
+    return Annotated[kind, info]
 
 
 SessionPath = Annotated[

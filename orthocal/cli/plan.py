@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from typer import Option
 
@@ -43,41 +44,11 @@ from orthocal.units import MM
 FILES = ("session.yaml", "readings.csv", "plan.json", "plan.svg", "sheet.html")
 
 
-@command()
-def plan(
-    subject: str,
-    model: Model = None,
-    setups: Positive = None,
-    readings: Annotated[int | None, Option(min=2)] = None,
-    hours: Hours = None,
-    add: Positive = None,
-    gauge: Gauge = None,
-    touches: str | None = None,
-    sections: str | None = None,
-    box: str | None = None,
-    along: Annotated[int, Option(min=2, max=50)] = 9,
-    across_mm: float = 20.0,
-    minutes_a_setup: float = 10.0,
-    minutes_a_reading: float = 0.5,
-    workspace_mm: WorkspaceMm = None,
-    criterion: str = "aligned",
-    effects: Effects = None,
-    temperature: Day = None,
-    tolerance: Tolerances = None,
-    starts: Annotated[int | None, Option(min=1, max=100)] = None,
-    seed: Seed = 0,
-    workers: Workers = None,
-    out: OptionalOutDirectory = None,
-    json: Json = False,
-    details: Details = False,
-    force: Force = False,
-) -> None:
-    """Choose setups and postures for the smallest tool error.
-
-    With --out the directory receives session.yaml, an empty readings.csv and a measuring sheet.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanOptions:
+    """Options about readings, equipment and search.
 
     Args:
-        subject (ROBOT|SESSION): A robot, or a measured session that the plan complements.
         setups (N): Number of setups; default: 6.
         readings (N): Number of readings in all setups; default: 3 per setup, and 4 more in six
             setups with backlash.
@@ -97,74 +68,115 @@ def plan(
         starts (N): For research: number of starts of the search; default: 20000 divided by the
             number of candidate readings, at least 3 and at most 30.
     """
-    from orthocal.effects.loading import with_effects
-    from orthocal.kinematics.workspace import box_workspace, coordinate_letters
+
+    model: Model = None
+    setups: Positive = None
+    readings: Annotated[int | None, Option(min=2)] = None
+    hours: Hours = None
+    add: Positive = None
+    gauge: Gauge = None
+    touches: str | None = None
+    sections: str | None = None
+    box: str | None = None
+    along: Annotated[int, Option(min=2, max=50)] = 9
+    across_mm: float = 20.0
+    minutes_a_setup: float = 10.0
+    minutes_a_reading: float = 0.5
+    workspace_mm: WorkspaceMm = None
+    criterion: str = "aligned"
+    effects: Effects = None
+    temperature: Day = None
+    tolerance: Tolerances = None
+    starts: Annotated[int | None, Option(min=1, max=100)] = None
+    seed: Seed = 0
+    workers: Workers = None
+
+
+@command()
+def plan(
+    subject: str,
+    *,
+    options: PlanOptions,
+    out: OptionalOutDirectory = None,
+    json: Json = False,
+    details: Details = False,
+    force: Force = False,
+) -> None:
+    """Choose setups and postures for the smallest tool error.
+
+    With --out the directory receives session.yaml, an empty readings.csv and a measuring sheet.
+
+    Args:
+        subject (ROBOT|SESSION): A robot, or a measured session that the plan complements.
+    """
     from orthocal.output.text.plan import plan_json
     from orthocal.output.text.summary import print_summary
     from orthocal.planning.expected_error import CRITERIA
-    from orthocal.robot.parameters import errors_at
     from orthocal.runtime.worker_pool import available_cores, worker_budget
 
-    if criterion not in CRITERIA:
+    if options.criterion not in CRITERIA:
         raise ParameterError(
-            f"found '{criterion}'; expected one of {', '.join(CRITERIA)}", where="--criterion"
+            f"found '{options.criterion}'; expected one of {', '.join(CRITERIA)}",
+            where="--criterion",
         )
     if out is not None:
         require_new_files(out, FILES, force=force)
         require_no_readings(out)
-    session, robot = load_robot_or_session(subject)
-    measured = None if session is None else orthocal.load_session(subject)
-    reference = subject if measured is None else measured.robot_reference
-    if add is not None and measured is None:
-        raise ParameterError("needs a session; found a robot", where="--add")
-    if add is not None and setups is not None:
-        raise ParameterError("found with --setups; expected one", where="--add")
-    equipment = _equipment(
-        gauge,
-        measured,
-        rods=split_globs([touches] if touches else None),
-        sections=sections,
-        box=None if box is None else read_box(box, coordinate_letters(robot), where="--box"),
-        along=along,
-        across_mm=across_mm,
-        minutes_a_setup=minutes_a_setup,
-        minutes_a_reading=minutes_a_reading,
-        temperatures=read_temperatures(temperature),
-    )
-    workspace = None
-    if workspace_mm is not None:
-        workspace = box_workspace(robot, read_workspace(workspace_mm, robot))
-    count = workers or available_cores()
-    names = split_effects(effects)
-    with errors_at("--effects"):
-        robot = robot if names is None else with_effects(robot, names)
-    chosen = orthocal.plan_readings(
-        robot,
-        orthocal.Choice(model, tolerances=read_tolerances(tolerance, robot), effects=names),
-        setups=setups if add is None else add,
-        readings=readings,
-        hours=hours,
-        equipment=equipment,
-        measured=measured,
-        workspace=workspace,
-        criterion=criterion,
-        seed=seed,
-        starts=starts,
-        reference=reference,
-        workers=count,
-        report=lambda text: put_note(f"orthocal: {text}"),
-    )
+    workers = options.workers or available_cores()
+    chosen = _choose(subject, options, workers=workers)
     deliver(lambda: plan_json(chosen), lambda: print_summary(chosen, details=details), json=json)
-    if gauge is not None and equipment.tip is None:
+    if options.gauge is not None and chosen.equipment.tip is None:
         put_note(
-            f"orthocal: {gauge} states no tip: the plan is for the line between the rods, which "
-            "no dial touches; for a ball add tip: {ball: {radius_mm: 1.5}}"
+            f"orthocal: {options.gauge} states no tip: the plan is for the line between the rods, "
+            "which no dial touches; for a ball add tip: {ball: {radius_mm: 1.5}}"
         )
     if out is not None:
-        with worker_budget(count):
+        with worker_budget(workers):
             _write(chosen, out)
     elif not json:
         put_note("Nothing was written; --out DIRECTORY writes session, sheet and programs.")
+
+
+def _choose(subject: str, options: PlanOptions, *, workers: int) -> orthocal.MeasuringPlan:
+    """Plan for a robot, or further readings for a session.
+
+    Raises:
+        OrthocalError: If an option is invalid, or the subject does not load.
+    """
+    from orthocal.effects.loading import with_effects
+    from orthocal.kinematics.workspace import box_workspace
+    from orthocal.robot.parameters import errors_at
+
+    session, robot = load_robot_or_session(subject)
+    measured = None if session is None else orthocal.load_session(subject)
+    if options.add is not None and measured is None:
+        raise ParameterError("needs a session; found a robot", where="--add")
+    if options.add is not None and options.setups is not None:
+        raise ParameterError("found with --setups; expected one", where="--add")
+    equipment = _read_equipment(options, robot, measured)
+    workspace = None
+    if options.workspace_mm is not None:
+        workspace = box_workspace(robot, read_workspace(options.workspace_mm, robot))
+    names = split_effects(options.effects)
+    with errors_at("--effects"):
+        robot = robot if names is None else with_effects(robot, names)
+    tolerances = read_tolerances(options.tolerance, robot)
+    return orthocal.plan_readings(
+        robot,
+        orthocal.Choice(options.model, tolerances=tolerances, effects=names),
+        setups=options.setups if options.add is None else options.add,
+        readings=options.readings,
+        hours=options.hours,
+        equipment=equipment,
+        measured=measured,
+        workspace=workspace,
+        criterion=options.criterion,  # type: ignore[arg-type] # checked
+        seed=options.seed,
+        starts=options.starts,
+        reference=subject if measured is None else measured.robot_reference,
+        workers=workers,
+        report=lambda text: put_note(f"orthocal: {text}"),
+    )
 
 
 def _write(plan: orthocal.MeasuringPlan, directory: Path) -> None:
@@ -195,22 +207,21 @@ def _write(plan: orthocal.MeasuringPlan, directory: Path) -> None:
     put_note(f"Wrote {path}, an empty readings.csv, plan.json, plan.svg{paper}")
 
 
-def _equipment(
-    gauge: Path | None,
-    measured: orthocal.Session | None,
-    *,
-    rods: list[str],
-    sections: str | None,
-    across_mm: float,
-    **others: Any,  # noqa: ANN401 - fields of the equipment
+def _read_equipment(
+    options: PlanOptions, robot: orthocal.Robot, measured: orthocal.Session | None
 ) -> orthocal.Equipment:
     """Equipment of the options, with the gauge of a file or of a measured session."""
+    from orthocal.kinematics.workspace import coordinate_letters
     from orthocal.planning.equipment import SECTIONS, equipment_of, load_dial
 
-    for name in ("minutes_a_setup", "minutes_a_reading"):
-        require_between(others[name], 0.0, 1e4, f"--{name.replace('_', '-')}")
-    if not 0.0 <= across_mm < 1000.0:
+    box = options.box
+    limits = None if box is None else read_box(box, coordinate_letters(robot), where="--box")
+    temperatures = read_temperatures(options.temperature)
+    require_between(options.minutes_a_setup, 0.0, 1e4, "--minutes-a-setup")
+    require_between(options.minutes_a_reading, 0.0, 1e4, "--minutes-a-reading")
+    if not 0.0 <= options.across_mm < 1000.0:
         raise ParameterError("expected 0 or more, and less than 1000 mm", where="--across-mm")
+    sections = options.sections
     fractions = SECTIONS if sections is None else read_numbers(sections, "--sections")
     for value in fractions:
         if not 0.0 <= value <= 1.0:
@@ -218,8 +229,15 @@ def _equipment(
                 f"found {value:g}; expected 0 (root) to 1 (tip)", where="--sections"
             )
     equipment = orthocal.Equipment(
-        rods=tuple(rods), sections=fractions, across=across_mm * MM, **others
+        rods=tuple(split_globs([options.touches] if options.touches else None)),
+        sections=fractions,
+        box=limits,
+        along=options.along,
+        across=options.across_mm * MM,
+        minutes_a_setup=options.minutes_a_setup,
+        minutes_a_reading=options.minutes_a_reading,
+        temperatures=temperatures,
     )
-    if gauge is not None:
-        return load_dial(gauge, equipment)
+    if options.gauge is not None:
+        return load_dial(options.gauge, equipment)
     return equipment if measured is None else equipment_of(measured, equipment)

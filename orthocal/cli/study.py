@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -76,9 +77,22 @@ LegMm = Annotated[
 ]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunOptions:
+    """Options about the run of a study and its results."""
+
+    workers: Workers = None
+    dask: Dask = None
+    out: OptionalOutDirectory = None
+    json: Json = False
+    all_rows: AllRows = False
+    force: Force = False
+
+
 @command(studies)
 def accuracy(
     plan: PlanPath,
+    *,
     model: Model = None,
     free: Free = None,
     machines: Count = 1000,
@@ -91,12 +105,7 @@ def accuracy(
     tolerance: Tolerances = None,
     half_side_mm: HalfSideMm = None,
     seed: Seed = 0,
-    workers: Workers = None,
-    dask: Dask = None,
-    out: OptionalOutDirectory = None,
-    json: Json = False,
-    all_rows: AllRows = False,
-    force: Force = False,
+    run: RunOptions,
 ) -> None:
     """Predict the tool error of many machines after calibration.
 
@@ -111,19 +120,8 @@ def accuracy(
             costs.
     """
     from orthocal.observation.simulate import collect_errors
-    from orthocal.robot.loading import packaged_robots
-    from orthocal.robot.parameters import errors_at
 
-    if not exists(plan) and str(plan) in packaged_robots():
-        raise ParameterError(
-            f"is a robot; expected a session.yaml, which `orthocal plan {plan} --out ...` writes",
-            where=str(plan),
-        )
-    session = orthocal.load_plan(plan)
-    if effects is not None:
-        with errors_at("--effects"):
-            session = session.with_effects(split_effects(effects))
-    session = state_conditions(session, read_temperatures(temperature))
+    session = _load_plan(plan, effects, temperature)
     robot, has = session.robot, session.robot.effect_names
     fixed = {}
     if error or errors is not None:
@@ -146,7 +144,28 @@ def accuracy(
         seed=seed,
         half_side=None if half_side_mm is None else half_side_mm * MM,
     )
-    _run(study, out, workers, dask, json=json, all_rows=all_rows, force=force)
+    _run(study, run)
+
+
+def _load_plan(plan: Path, effects: str | None, temperature: str | None) -> orthocal.Session:
+    """Plan with the stated effects and conditions.
+
+    Raises:
+        OrthocalError: If it does not load, or an option is invalid.
+    """
+    from orthocal.robot.loading import packaged_robots
+    from orthocal.robot.parameters import errors_at
+
+    if not exists(plan) and str(plan) in packaged_robots():
+        raise ParameterError(
+            f"is a robot; expected a session.yaml, which `orthocal plan {plan} --out ...` writes",
+            where=str(plan),
+        )
+    session = orthocal.load_plan(plan)
+    if effects is not None:
+        with errors_at("--effects"):
+            session = session.with_effects(split_effects(effects))
+    return state_conditions(session, read_temperatures(temperature))
 
 
 def _without(effects: Sequence[str], ignored: str) -> list[str]:
@@ -224,7 +243,7 @@ def linearisation(
             ),
             seed=seed,
         )
-    _run(study, out, workers, dask, json=json, all_rows=False, force=force)
+    _run(study, RunOptions(workers=workers, dask=dask, out=out, json=json, force=force))
 
 
 def _read_displacements(
@@ -272,24 +291,20 @@ def sensitivity(
         study = orthocal.build_sensitivity_study(
             session or robot, _parameter_globs(free, robot), points=points or None
         )
-    _run(study, out, 1, None, json=json, all_rows=all_rows, force=force)
+    _run(study, RunOptions(workers=1, out=out, json=json, all_rows=all_rows, force=force))
 
 
 @command(studies)
 def bootstrap(
     session: SessionPath,
+    *,
     model: Model = None,
     free: Free = None,
     by: str = "residuals",
     draws: Count = 1000,
     tolerance: Tolerances = None,
     seed: Seed = 0,
-    workers: Workers = None,
-    dask: Dask = None,
-    out: OptionalOutDirectory = None,
-    json: Json = False,
-    all_rows: AllRows = False,
-    force: Force = False,
+    run: RunOptions,
 ) -> None:
     """Estimate the scatter of errors by resampling a session.
 
@@ -308,19 +323,10 @@ def bootstrap(
         draws=draws,
         seed=seed,
     )
-    _run(study, out, workers, dask, json=json, all_rows=all_rows, force=force)
+    _run(study, run)
 
 
-def _run(
-    study: orthocal.Study,
-    out: Path | None,
-    workers: int | None,
-    dask: str | None,
-    *,
-    json: bool,
-    all_rows: bool,
-    force: bool,
-) -> None:
+def _run(study: orthocal.Study, options: RunOptions) -> None:
     """Run a study, print its report and write its files."""
     from orthocal.output.text.layout import print_rich
     from orthocal.output.text.study import render_report, report_study, study_json
@@ -332,26 +338,32 @@ def _run(
         calls = [lambda: to_parquet(table), report.draw]
         return dict(zip(FILES, (document, *call_in_parallel(calls)), strict=True))
 
-    if dask is not None and workers is not None:
+    out, dask = options.out, options.dask
+    if dask is not None and options.workers is not None:
         raise ParameterError(
             "cannot be combined with --dask, whose workers are counted by the scheduler",
             where="--workers",
         )
     if out is not None:
         require_writable(out, [JOURNAL, *FILES])
-    count = workers or available_cores()
+    count = options.workers or available_cores()
     resume = "with --out it can be resumed" if out is None else "the same command resumes it"
     with message_at_interrupt(f"orthocal: stopped; {resume}"):
         table = run_study(
-            study, folder=out, workers=count, dask=dask, anew=force, report=_progress_lines(study)
+            study,
+            folder=out,
+            workers=count,
+            dask=dask,
+            anew=options.force,
+            report=_progress_lines(study),
         )
     with worker_budget(1 if dask is not None else count):
-        report = report_study(table, all_rows=all_rows)
+        report = report_study(table, all_rows=options.all_rows)
         document = study_json(table, report)
         deliver(
             lambda: document,
             lambda: print_rich(render_report(report)),
-            json=json,
+            json=options.json,
             out=out,
             files=files,
         )

@@ -191,9 +191,51 @@ def fit_problem(
         problem = problem.with_noise_ratio(ratio)
     linear = linearise_problem(problem)
     require_determined(problem, linear.information)
-    repeatability = estimate_repeatability(problem.values, problem.observations)
     program = build_program(problem, options) if program is None else program.with_problem(problem)
     built = time.perf_counter()
+    solved = _solve_until_settled(program, linear, groups, start)
+    program, linear, noise = solved.program, solved.linear, solved.at.noise
+    require_assembly(program.problem, solved.solution, options=program.options)
+    sigma = floored_sigma(noise)
+    return Fit(
+        problem=program.problem,
+        program=program,
+        seconds_build=built - began,
+        seconds_solve=time.perf_counter() - built,
+        iterations=solved.iterations,
+        linearisation=linear,
+        linearised_theta=linear.solve(sigma=sigma if math.isfinite(sigma) else solved.sigma),
+        solution=solved.solution,
+        noise=noise,
+        prediction=solved.at.prediction,
+        jacobian=solved.at.jacobian,
+        information=solved.at.information,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solved:
+    """Solution of a program whose sigma and ratios of noise agree with its residuals."""
+
+    program: Program
+    linear: LinearProblem
+    solution: Solution
+    at: _Evaluation
+    sigma: float
+    """Sigma of the last solve, [m]."""
+    iterations: int
+    """Iterations of all solves."""
+
+
+def _solve_until_settled(
+    program: Program,
+    linear: LinearProblem,
+    groups: Sequence[GaugeReadings],
+    start: ArrayLike | None,
+) -> _Solved:
+    """Solve again until sigma and the ratios of the gauges' noise agree with the residuals."""
+    problem = program.problem
+    repeatability = estimate_repeatability(problem.values, problem.observations)
     solution, sigma = _solve_first(program, linear, repeatability, start)
     iterations = solution.iterations
     for remaining in reversed(range(MAX_SIGMA_ROUNDS)):
@@ -211,22 +253,7 @@ def fit_problem(
         start_theta, start_passive = solution.theta, solution.passive
         solution = program.solve(sigma=sigma, start=start_theta, start_passive=start_passive)
         iterations += solution.iterations
-    require_assembly(problem, solution, options=program.options)
-    final_sigma = floored_sigma(at.noise)
-    return Fit(
-        problem=problem,
-        program=program,
-        seconds_build=built - began,
-        seconds_solve=time.perf_counter() - built,
-        iterations=iterations,
-        linearisation=linear,
-        linearised_theta=linear.solve(sigma=final_sigma if math.isfinite(final_sigma) else sigma),
-        solution=solution,
-        noise=at.noise,
-        prediction=at.prediction,
-        jacobian=at.jacobian,
-        information=at.information,
-    )
+    return _Solved(program, linear, solution, at, sigma, iterations)
 
 
 def _solve_first(

@@ -151,13 +151,7 @@ def select_parameters(
         raise ParameterError("no free parameters: there is nothing to identify")
     _refuse_overlap(parameters, [*names, *(n for n, v in fixed.items() if v != 0.0)])
 
-    stds = {n: parameters[n].prior_std for n in names}
-    for glob, value in (prior_stds or {}).items():
-        with errors_at("tolerances"):
-            for name in _match_free(parameters, glob, names):
-                stds[name] = require_prior_std(value, parameters.defaults[name])
-    factors = tolerance_scale.factors(parameters, tuple(names)).tolist()
-    stds = {n: std * factor for (n, std), factor in zip(stds.items(), factors, strict=True)}
+    stds = _find_stds(parameters, names, prior_stds or {}, tolerance_scale)
     stds.update({n: s for n, (_, s) in priors.items()})
     lower, upper = _find_bounds(parameters, names, bounds or {})
     priors_only = {*priors, *parameters.of_effects}
@@ -173,6 +167,22 @@ def select_parameters(
         fixed=fixed,
         tolerance_scale=tolerance_scale,
     )
+
+
+def _find_stds(
+    parameters: ParameterSet,
+    names: Sequence[str],
+    prior_stds: Mapping[str, float],
+    tolerance_scale: ToleranceScale,
+) -> dict[str, float]:
+    """Scaled prior standard deviations of free parameters, those of the robot by default, [SI]."""
+    stds = {n: parameters[n].prior_std for n in names}
+    for glob, value in prior_stds.items():
+        with errors_at("tolerances"):
+            for name in _match_free(parameters, glob, names):
+                stds[name] = require_prior_std(value, parameters.defaults[name])
+    factors = tolerance_scale.factors(parameters, tuple(names)).tolist()
+    return {n: std * factor for (n, std), factor in zip(stds.items(), factors, strict=True)}
 
 
 def _split_known(

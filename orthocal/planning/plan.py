@@ -146,18 +146,15 @@ def plan_readings(
 
     Args:
         robot: The robot.
-        choice: Parameters to identify, or the name of a model; by default those of the measured
-            session, or "full". The plan's session states it.
+        choice: Parameters to identify, or a model; by default as `measured` states, or "full".
         setups: Number of setups; by default 6, or as many as `hours` allow.
-        readings: Number of readings, at least 2 per setup; by default 3 per setup, and 4 more in
-            six setups if the machine has backlash, or as many as `hours` allow. The first posture
-            of each setup is read again at its end in addition.
+        readings: Number of readings, at least 2 per setup, beside the first postures that are read
+            again; by default 3 per setup, and 4 more in six with backlash, or as `hours` allow.
         hours: Available time; not with numbers.
         equipment: Available gauge, tip and region.
         measured: Existing readings, which the plan complements.
         workspace: Region over which the tool error is computed; by default the robot's.
-        criterion: Criterion to minimise: "aligned", "relative", "absolute", "worst", "A", "D" or
-            "E"; see `planning.expected_error.Criterion`.
+        criterion: Figure to minimise; see `planning.expected_error.Criterion`.
         seed: Seed of the random starts; the plan depends on nothing else that is random.
         starts: Number of starts of the search; by default 3, or more for few candidates.
         reference: Name of the robot in the session; by default its own.
@@ -169,44 +166,86 @@ def plan_readings(
         RobotError: If the drives do not command the tool.
         SessionError: If the repeatability of the existing readings is unknown.
     """
-    say = report or (lambda text: None)
-    equipment = equipment or Equipment()
+    work = _Work(criterion, seed, starts, workers, report or (lambda text: None))
     measured = None if measured is None else state_noise(measured)
     chosen = resolve_choice(choice, measured, default_model=MODEL)
     robot, measured = _with_choice(robot, measured, chosen)
-    each = READINGS_A_SETUP[0] + (MORE_FOR_APPROACH if usual_approaches(robot) else 0.0)
-    options = _list_counts(setups, readings, hours, equipment, each)
+    equipment = equipment or Equipment()
+    counts = _list_counts(setups, readings, hours, equipment, robot)
     forecast = ToolForecast(robot, chosen.select(robot.parameters), workspace)
     session = list_candidates(robot, equipment, reference=reference)
-    say(f"computing {len(session.readings)} candidate readings")
+    session = replace(session, purpose=Purpose(chosen.model, tuple(chosen.free)))
+    return _plan(session, counts, forecast, equipment, measured, work)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Work:
+    """Criterion and course of a search; fields as in `plan_readings`."""
+
+    criterion: Criterion
+    seed: int
+    starts: int | None
+    workers: int
+    report: Callable[[str], None]
+
+
+def _plan(
+    session: Session,
+    options: Sequence[list[int]],
+    forecast: ToolForecast,
+    equipment: Equipment,
+    measured: Session | None,
+    work: _Work,
+) -> MeasuringPlan:
+    """Plan with the smallest expected error.
+
+    Args:
+        session: All candidate readings.
+        options: Possible numbers of readings of each setup.
+        forecast: Expected errors of the robot.
+        equipment: Gauge, tip and region.
+        measured: Existing readings.
+        work: Criterion and course of the search.
+    """
+    work.report(f"computing {len(session.readings)} candidate readings")
     candidates = measure_candidates(
         session, forecast.problem(session), spare_range=equipment.spare_range
     )
     search = SetupSearch.of(
         candidates,
         _prior(candidates, forecast, measured),
-        forecast.weigh(criterion, len(candidates.state)),
+        forecast.weigh(work.criterion, len(candidates.state)),
     )
-    counts = options[0] if len(options) == 1 else _choose_counts(search, seed, workers, options)
-    say(f"choosing readings of {len(counts)} setup{'s' * (len(counts) > 1)}")
-    sides = _find_sides(candidates, robot)
+    planned = _search_setups(search, candidates, options, work)
+    plan = build_session(candidates, planned.setups, measured)
+    work.report("comparing the plan with others")
+    comparison = Comparison(candidates, plan, equipment, forecast, measured)
+    return _evaluate(search, planned, comparison, work)
+
+
+def _search_setups(
+    search: SetupSearch, candidates: Candidates, options: Sequence[list[int]], work: _Work
+) -> PlannedSetups:
+    """Setups with the smallest error for one of the possible numbers of readings."""
+    counts = (
+        options[0]
+        if len(options) == 1
+        else _choose_counts(search, work.seed, work.workers, options)
+    )
+    work.report(f"choosing readings of {len(counts)} setup{'s' * (len(counts) > 1)}")
+    sides = _find_sides(candidates, candidates.session.robot)
     planned = _choose_setups(
         search,
         sides,
         lambda weighted: weighted.choose(
             counts,
-            seed=seed,
-            starts=starts,
-            workers=workers,
-            report=lambda start, _: say(f"search {start} finished"),
+            seed=work.seed,
+            starts=work.starts,
+            workers=work.workers,
+            report=lambda start, _: work.report(f"search {start} finished"),
         ),
     )
-    planned = _simplify(candidates, planned, search, sides)
-    plan = build_session(candidates, planned.setups, measured)
-    plan = replace(plan, purpose=Purpose(chosen.model, tuple(chosen.free)))
-    say("comparing the plan with others")
-    comparison = Comparison(candidates, plan, equipment, forecast, measured)
-    return _evaluate(search, planned, comparison, criterion, workers)
+    return _simplify(candidates, planned, search, sides)
 
 
 def _with_choice(
@@ -267,8 +306,7 @@ def _evaluate(
     search: SetupSearch,
     planned: PlannedSetups,
     comparison: Comparison,
-    criterion: Criterion,
-    workers: int,
+    work: _Work,
 ) -> MeasuringPlan:
     """Plan with its expected errors, and those of others."""
     plan, measured, forecast = comparison.plan, comparison.measured, comparison.forecast
@@ -277,7 +315,7 @@ def _evaluate(
     setups, readings = len(planned.setups), sum(len(s.chosen) for s in planned.setups)
     minutes = comparison.equipment.minutes(setups, len(plan.readings))
     each = round(readings / setups)
-    with worker_budget(workers):
+    with worker_budget(work.workers):
         curve, helps, compared, expected, first_round, nominal, known, limits = call_in_parallel(
             (
                 lambda: compute_curve(search, each, setups, comparison.equipment),
@@ -296,11 +334,11 @@ def _evaluate(
             killed=KILLED,
         )
     stage = Stage(setups, readings, minutes, planned.error)
-    factor, remainder = _scale(stage, expected, nominal, criterion)
+    factor, remainder = _scale(stage, expected, nominal, work.criterion)
     return MeasuringPlan(
         session=plan,
         forecast=forecast,
-        criterion=criterion,
+        criterion=work.criterion,
         minutes=minutes,
         known=known,
         expected=expected,
@@ -455,9 +493,9 @@ def _list_counts(
     readings: int | None,
     hours: float | None,
     equipment: Equipment,
-    each: float,
+    robot: Robot,
 ) -> list[list[int]]:
-    """Possible numbers of readings of each setup; `each` is the usual mean."""
+    """Possible numbers of readings of each setup; arguments as for `plan_readings`."""
     if hours is not None:
         if setups is not None or readings is not None:
             raise ParameterError("found with --setups or --readings; expected one", where="--hours")
@@ -475,6 +513,7 @@ def _list_counts(
             )
         return options
     count = USUAL_SETUPS if setups is None else setups
+    each = READINGS_A_SETUP[0] + (MORE_FOR_APPROACH if usual_approaches(robot) else 0.0)
     total = math.ceil(each * count - 1e-9) if readings is None else readings
     if not 1 <= count <= MOST_SETUPS:
         raise ParameterError(f"found {count}; expected 1 to {MOST_SETUPS}", where="--setups")

@@ -188,20 +188,15 @@ def build_accuracy_study(
         session = session.with_effects(chosen.effects)
     has = session.robot.effect_names if effects is None else order_effects(effects)
     measured = session.with_effects(has)
-    parameters = measured.robot.parameters
-    fixed = dict(fixed or {})
-    if drawn is None:
-        drawn = () if fixed else parameters.patterns("full")
-    names = _without_sums(parameters.select(drawn), parameters) if drawn else ()
-    fixed_terms = {term for n in fixed for term, _ in parameters[n].terms}
-    names = tuple(n for n in names if not fixed_terms & {t for t, _ in parameters[n].terms})
+    robot, fixed = measured.robot, dict(fixed or {})
+    parameters = robot.parameters
+    names = _select_drawn(drawn, fixed, parameters)
     stated = parameters.read_tolerances(chosen.tolerances)
     stated = {n: std for glob, std in stated.items() for n in parameters.select([glob])}
     chosen = replace(chosen, effects=None, tolerances=_known_tolerances(chosen, session, measured))
     chosen.select(session.robot.parameters)
     _require_noise(session)
     require_conditions(measured, names)
-    robot = measured.robot
     box = find_workspace(robot).limits if half_side is None else cube_limits(robot, half_side)
     return AccuracyStudy(
         session=session.with_values(np.zeros(len(session.readings))),
@@ -235,6 +230,17 @@ def _known_tolerances(choice: Choice, session: Session, measured: Session) -> di
         if not set(measured.robot.parameters.select([glob])) <= ignored:
             result[key] = value
     return result
+
+
+def _select_drawn(
+    drawn: Sequence[str] | None, fixed: Mapping[str, float], parameters: ParameterSet
+) -> tuple[str, ...]:
+    """Names of the random errors, without sums of others and without fixed ones."""
+    if drawn is None:
+        drawn = () if fixed else parameters.patterns("full")
+    names = _without_sums(parameters.select(drawn), parameters) if drawn else ()
+    fixed_terms = {term for n in fixed for term, _ in parameters[n].terms}
+    return tuple(n for n in names if not fixed_terms & {t for t, _ in parameters[n].terms})
 
 
 def _without_sums(names: Sequence[str], parameters: ParameterSet) -> tuple[str, ...]:

@@ -300,14 +300,12 @@ def build_linearisation_study(
     names = robot.parameters.select(free)
     if not {robot.parameters[n].unit for n in names} <= {"m", "rad"}:
         raise ParameterError("expected lengths and angles; a scale has no mm", where="--free")
+    paper = None
     if isinstance(source, Robot):
         used = displacements or Displacements()
-        session = build_paper_plan(source, used, gauge or PAPER_GAUGE)
-        offsets = tuple(f"{d.name}.offset" for d in robot.drives)
-        paper = used if names == offsets else None
-    else:
-        session, paper = source, None
-    gauge = gauge or session.gauge
+        source = build_paper_plan(source, used, gauge or PAPER_GAUGE)
+        paper = used if names == tuple(f"{d.name}.offset" for d in robot.drives) else None
+    gauge = gauge or source.gauge
     if along is None:
         vectors = np.random.default_rng(seed).normal(size=(directions, len(names)))
     else:
@@ -317,7 +315,7 @@ def build_linearisation_study(
     if sizes is None:
         sizes = np.geomspace(min(SMALLEST_SIZE, largest), largest, count).tolist()
     return LinearisationStudy(
-        session=_idealise(session),
+        session=_idealise(source),
         free=tuple(names),
         sizes=tuple(float(f"{v:.4g}") for v in sizes),
         directions=tuple(tuple(v.tolist()) for v in unit),

@@ -11,7 +11,8 @@ compared with the commanded point.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -149,15 +150,12 @@ def approximate(
     most = MOST_DEGREE[n]
     nodes = grid_points(chebyshev_line(most + EXTRA_NODES), n)
     checks = middle + half * check_points(n)
-    try:
+    with _reached(box):
         tip.reach(middle + half * corners(n))  # fails fast
         drives, _ = tip.reach(middle + half * nodes)
         for failure in find_beyond_travel(robot, drives, ["a point"] * len(drives)).values():
             raise failure
         expected, passive = tip.reach(checks)
-    except ClosureError as e:
-        reason = f"the machine does not reach {describe_box(box)} ({e.reason})"
-        raise ExportError(f"{reason}; give a smaller --half-side-mm") from None
     form = find_nominal_form(robot, middle, half)
     corrections = drives - form(middle + half * nodes)
     best = math.inf
@@ -168,16 +166,13 @@ def approximate(
         error = math.inf if error is None else RESERVE * error
         best = min(best, error)
         if error <= within:
-            nominal = None
-            if not isinstance(form, Tangent):
-                nominal = _tip_error(tip, checks, form(checks) - calibration.active_offsets)
             return Approximation(
                 inverse=inverse,
                 tool=tip.tool,
                 coordinates=tuple(tip.coordinates),
                 achieved=error,
                 checked=len(checks),
-                nominal=nominal,
+                nominal=_nominal_error(tip, form, checks, calibration.active_offsets),
                 beyond=_error_beyond(tip, inverse, calibration),
                 longer=_error_of_longer_tool(tip, expected, passive),
             )
@@ -216,6 +211,20 @@ def _find_box(calibration: Calibration, half_side: float | None) -> Array:
     return tool.workspace.limits
 
 
+@contextmanager
+def _reached(box: Array) -> Iterator[None]:
+    """Name the region if the machine does not reach it.
+
+    Raises:
+        ExportError: In place of `ClosureError`.
+    """
+    try:
+        yield
+    except ClosureError as e:
+        reason = f"the machine does not reach {describe_box(box)} ({e.reason})"
+        raise ExportError(f"{reason}; give a smaller --half-side-mm") from None
+
+
 def _tip_error(
     tip: ToolTip, points: Array, drives: Array, *, start: Array | None = None
 ) -> float | None:
@@ -225,6 +234,11 @@ def _tip_error(
     except ClosureError:
         return None
     return float(np.linalg.norm(off, axis=1).max())
+
+
+def _nominal_error(tip: ToolTip, form: NominalForm, points: Array, offsets: Array) -> float | None:
+    """Largest error with nominal kinematics and offsets, [m]; None without a closed form."""
+    return None if isinstance(form, Tangent) else _tip_error(tip, points, form(points) - offsets)
 
 
 def _error_beyond(

@@ -107,17 +107,7 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
     stated = options.latched is not None
     module = not calibration.only_offsets if options.module is None else options.module
     if not module:
-        unused = [OPTIONS[name] for name in options.requested if name in MODULE_OPTIONS]
-        if unused:
-            reason = (
-                "the calibration identified offsets only, which are entered as HOME_OFFSET; "
-                "--module requests a module with nominal legs and axes"
-                if options.module is None
-                else "--offsets requests HOME_OFFSET"
-            )
-            raise ParameterError(
-                f"is an option of a kinematics module, and {reason}", where=unused[0]
-            )
+        _refuse_module_options(options)
         if not find_entries(calibration):
             raise ExportError("the calibration identified no offset: there is nothing to enter")
         compensation = tabulate(calibration, compensation, offsets_to_enter(calibration))
@@ -151,6 +141,23 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         **write_component(approximation),
         **write_core(calibration, approximation, homes),
     }
+
+
+def _refuse_module_options(options: ExportOptions) -> None:
+    """Refuse options of a module for HOME_OFFSET.
+
+    Raises:
+        ParameterError: Naming the first such option.
+    """
+    unused = [OPTIONS[name] for name in options.requested if name in MODULE_OPTIONS]
+    if unused:
+        reason = (
+            "the calibration identified offsets only, which are entered as HOME_OFFSET; "
+            "--module requests a module with nominal legs and axes"
+            if options.module is None
+            else "--offsets requests HOME_OFFSET"
+        )
+        raise ParameterError(f"is an option of a kinematics module, and {reason}", where=unused[0])
 
 
 def _require_change(
