@@ -111,6 +111,17 @@ def test_nothing_prints_outside_the_edges():
     assert printing == []
 
 
+def test_functions_have_at_most_60_lines():
+    longer = {
+        f"{path.relative_to(ROOT)}:{node.lineno} {node.name}"
+        for path in MODULES
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and node.end_lineno - node.lineno >= 60
+    }
+    assert not longer
+
+
 def test_everything_exported_is_there():
     for name in orthocal.__all__:
         assert getattr(orthocal, name) is not None
