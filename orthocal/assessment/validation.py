@@ -49,6 +49,7 @@ from orthocal.calibration.recorded_robot import require_calibrated_robot
 from orthocal.calibration.refit import repeat_fit, restore_session
 from orthocal.effects.adjustment import subtract_amounts
 from orthocal.errors import SessionError
+from orthocal.estimation.fit import Fit
 from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomaly
 from orthocal.hypotheses.search import find_anomalies
 from orthocal.io.fields import finite_or_none
@@ -189,36 +190,26 @@ def validate_calibration(
         SolverError: If the fit of the new readings does not converge.
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
-    stated = tolerances or {}
-    given = [one.with_tolerances(stated) for one in gather_sessions(sessions)]
-    calibration = replace(calibration, robot=calibration.robot.with_tolerances(stated))
-    calibration = _as_adjusted(calibration, given)
-    _require_new(calibration, given)
+    calibration, given = _restate(calibration, gather_sessions(sessions), tolerances or {})
     measured = [_with_active_offsets(calibration, one) for one in given]
     session = join_sessions(measured)
     judgement = judge_session(session)
     fit = repeat_fit(calibration, session)
-    refit = assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
-    refit = replace(refit, assessment=assess(refit, session, judgement=judgement))
+    refit = _assess_refit(fit, calibration, judgement)
     mistake, changes, wrongly_entered = _find_changes(calibration, measured, judgement)
     expected_rms, test = expect_rms(calibration, fit), judge_deviations(calibration, fit)
     excess = test.chance
     lead = _agreement(refit, test, expected_rms, explained=bool(changes))
-    confirmed = None
-    if not math.isnan(excess):
-        confirmed = lead.severity == "note" and not changes
-        confirmed = None if confirmed and judgement.verdict != "enter" else confirmed
+    confirmed = None if math.isnan(excess) else _is_confirmed(lead, changes, judgement)
     further = [] if lead.kind != "as predicted" else _find_further_change(refit)
     keep = wrongly_entered or (confirmed is not False and not further)
-    entries = find_entries(calibration) if keep else assessment_of(refit).entries
+    assessed = assessment_of(refit)
+    entries = find_entries(calibration) if keep else assessed.entries
     repetition = measure_repetition(calibration, refit)
     offsets_stated = all(one.controller_offsets is not None for one in given)
-    notes = [
-        *further,
-        *([] if wrongly_entered else assessment_of(refit).of_kind(*ENTRY_KINDS)),
-        words.describe_repetition(repetition, new=_is_expected(excess) is False),
-        *([] if offsets_stated else [words.controller_assumed()]),
-    ]
+    notes = [*further, *([] if wrongly_entered else assessed.of_kind(*ENTRY_KINDS))]
+    notes.append(words.describe_repetition(repetition, new=_is_expected(excess) is False))
+    notes += [] if offsets_stated else [words.controller_assumed()]
     return Validation(
         confirmed=confirmed,
         offsets_stated=offsets_stated,
@@ -233,9 +224,36 @@ def validate_calibration(
             decision=_decide(confirmed, judgement, lead, changes),
             findings=rank([*judgement.findings, lead, *changes, *notes]),
             entries=entries,
-            tool=assessment_of(refit).tool,
+            tool=assessed.tool,
         ),
     )
+
+
+def _restate(
+    calibration: Calibration, sessions: Sequence[Session], tolerances: Mapping[str, float]
+) -> tuple[Calibration, list[Session]]:
+    """Calibration and new sessions of the machine with stated tolerances and adjustments.
+
+    Raises:
+        SessionError: If the calibration was made from a session, or an adjustment does not fit.
+    """
+    restated = [session.with_tolerances(tolerances) for session in sessions]
+    robot = calibration.robot.with_tolerances(tolerances)
+    calibration = _as_adjusted(replace(calibration, robot=robot), restated)
+    _require_new(calibration, restated)
+    return calibration, restated
+
+
+def _assess_refit(fit: Fit, calibration: Calibration, judgement: Judgement) -> Calibration:
+    """Calibration of the new readings; its nominal readings are those that were predicted."""
+    refit = assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
+    return replace(refit, assessment=assess(refit, fit.problem.session, judgement=judgement))
+
+
+def _is_confirmed(lead: Finding, changes: Sequence[Finding], judgement: Judgement) -> bool | None:
+    """Whether new readings confirm the predictions; None where they are not to be trusted."""
+    agrees = lead.severity == "note" and not changes
+    return None if agrees and judgement.verdict != "enter" else agrees
 
 
 def _require_new(calibration: Calibration, sessions: Sequence[Session]) -> None:
