@@ -17,8 +17,8 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.conditions import UseConditions
+from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import (
-    Failures,
     LoopClosure,
     as_rows,
     find_beyond_travel,

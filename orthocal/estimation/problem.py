@@ -21,8 +21,9 @@ from orthocal.arrays import Array, Mask
 from orthocal.errors import ClosureError, RobotError
 from orthocal.estimation.selection import KnownWithStd, Selection, select_parameters
 from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
+from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.function_cache import cached_per_robot
-from orthocal.kinematics.loop_closure import Failures, LoopClosure
+from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import RobotFunctions
 from orthocal.observation.model import FreeParameters, ObservationModel, ReadingLinearisation
 from orthocal.observation.observations import Observations, build_observations

@@ -16,8 +16,9 @@ from orthocal.errors import ClosureError
 from orthocal.export.linuxcnc.drive_compensation import without_periodic_errors
 from orthocal.export.linuxcnc.nominal_form import SlidesWithRods, find_nominal_form
 from orthocal.kinematics.conditions import UseConditions
+from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.error_map import error_map
-from orthocal.kinematics.loop_closure import Failures, LoopClosure, nominal_closure
+from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.robot.model import Robot, require_commanded_tool
 

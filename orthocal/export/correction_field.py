@@ -26,7 +26,8 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.export.polynomial import Polynomial, PolynomialFit, chebyshev_line
 from orthocal.export.tool_tip import ToolTip
 from orthocal.kinematics.conditions import UseConditions
-from orthocal.kinematics.loop_closure import Failures, nominal_closure
+from orthocal.kinematics.continuation import Failures
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import grid_points
 
 ERROR_PART = 0.1

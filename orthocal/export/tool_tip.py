@@ -16,7 +16,8 @@ from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ExportError, ParameterError
 from orthocal.kinematics.conditions import UseConditions
-from orthocal.kinematics.loop_closure import Failures, LoopClosure
+from orthocal.kinematics.continuation import Failures
+from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import reference_poses, robot_functions
 from orthocal.units import MM
 

@@ -16,8 +16,9 @@ from orthocal.arrays import Array
 from orthocal.errors import ParameterError, SessionError
 from orthocal.io.documents import read_yaml, validate
 from orthocal.io.fields import read_only
+from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.function_cache import cached_per_robot
-from orthocal.kinematics.loop_closure import Failures, nominal_closure
+from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.files.schema import GaugeKeys
 from orthocal.observation.conditions import MINUTES_A_READING, MINUTES_A_SETUP, in_course

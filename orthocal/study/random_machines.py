@@ -24,7 +24,8 @@ from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
 from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.kinematics.conditions import UseSamples, effects_by_condition, sample_use
-from orthocal.kinematics.loop_closure import Failures, LoopClosure
+from orthocal.kinematics.continuation import Failures
+from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import Workspace, gauss_box
 from orthocal.observation.simulate import limits_of, show_readings
 from orthocal.planning.expected_error import noise_of, weigh_readings

@@ -7,7 +7,7 @@ import pytest
 from tolerances import CLOSED, CLOSED_FORM
 
 from orthocal.errors import ClosureError, RobotError
-from orthocal.kinematics import loop_closure
+from orthocal.kinematics import continuation
 from orthocal.kinematics import orthoglide as closed_form
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.kinematics.robot_functions import robot_functions
@@ -199,10 +199,10 @@ def test_a_batch_of_machines_is_closed_as_pinocchio_has_them(request, name, offs
         assert np.abs(alone.forward(postures) - tool).max() < CLOSED
 
 
-@pytest.mark.parametrize("points", [loop_closure.MAX_POINTS, 7])
+@pytest.mark.parametrize("points", [continuation.MAX_POINTS, 7])
 def test_a_machine_out_of_reach_spoils_no_other(orthoglide, monkeypatch, points):
     """Also where a batch is split: 7 postures are one machine."""
-    monkeypatch.setattr(loop_closure, "MAX_POINTS", points)
+    monkeypatch.setattr(continuation, "MAX_POINTS", points)
     _, errors, postures = draw_machines(orthoglide, offset=0.0)
     alone = LoopClosure(orthoglide).close(postures, errors=errors[:3])
     far = np.array(errors)

@@ -14,7 +14,8 @@ import numpy as np
 from orthocal.arrays import Array, Mask
 from orthocal.effects.loading import robot_effects
 from orthocal.kinematics.conditions import APPROACH as DIRECTIONS
-from orthocal.kinematics.loop_closure import Failures, find_beyond_travel, nominal_closure
+from orthocal.kinematics.continuation import Failures
+from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.robot.model import Robot
 from orthocal.session.session import Conditions, Session
 from orthocal.units import DEG, LIMIT, MM

@@ -1,0 +1,389 @@
+"""Newton's method for closure equations, continued from the reference posture.
+
+It works on all postures of all machines at once. A posture that it does not reach from the start is
+approached along a straight path from the reference posture, in steps short enough to stay in the
+assembly mode in which the machine was built.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthocal.arrays import Array, Indices, Mask
+from orthocal.errors import ClosureError
+from orthocal.kinematics.error_map import MachineGeometry
+from orthocal.robot.closing import describe_opening
+from orthocal.robot.model import (
+    Robot,
+    closure_row_units,
+    closure_turns,
+    coordinate_limits,
+    coordinate_names,
+    coordinate_units,
+)
+from orthocal.units import DRIVE_UNITS
+
+Evaluate = Callable[[Array, Array, MachineGeometry], tuple[Array, Array]]
+Failures = dict[int, ClosureError]
+"""Index of a posture to the reason why it cannot be reached. In a batch of machines, posture k of
+machine s of K postures has the index s K + k."""
+
+CLOSED = 1e-12
+"""Largest scaled residual of closed loops, relative to max(1 m, characteristic length), [m]."""
+
+SINGULAR_BELOW = 1e-5
+"""Ratio of smallest to largest singular value below which a posture counts as singular. Near a
+singular posture Newton stops where the residual, quadratic in the distance, is below CLOSED: a
+smaller ratio would not be noticed. The Orthoglide has 1/20 to 1/60."""
+
+SAFETY = 0.1
+"""Part of that bound at which rounding errors of an inverse do not matter."""
+
+MAX_NEWTON_STEP = 1e3
+"""A longer Newton step comes from rows that depend on each other, [m or rad]."""
+
+MAX_LAST_STEP = 1e-6
+"""A longer step from closed loops is that of a nearly singular posture, [m or rad]."""
+
+MAX_NEWTON_STEPS = 30
+MAX_STEP_HALVINGS = 6
+SMALLEST_CONTINUATION_STEP = 1.0 / 512.0
+LARGEST_CONTINUATION_MOVE = 0.3
+"""Change of a passive coordinate in one continuation step, [rad] or characteristic lengths."""
+
+LIMIT_TOLERANCE = 1e-9
+
+MAX_POINTS = 4096
+"""Postures of a batch of machines that are solved together, for the memory of their Jacobians."""
+
+
+class System:
+    """Equations r(x, p) = 0 of many postures, in metres: closures, then coordinates of the tool.
+
+    Args:
+        robot: The robot.
+        evaluate: (x, p, geometry) to residuals, (n, n_rows), and Jacobians by x, (n, n_rows, n_x).
+        index: Joint coordinates that are x, shape (n_x,).
+        start: x of the nominal machine's reference posture, shape (n_x,).
+        origin: p of the nominal machine's reference posture, shape (n_p,).
+        n_tool: Number of tool coordinates.
+
+    Attributes:
+        shortest: Take the shortest steps that close the loops, for robots with free motions: the
+            solution of a system that is singular up to rounding is no useful step.
+        units: Metres per unit of x, shape (n_x,).
+        lower: Lower bounds of x, shape (n_x,).
+        upper: Upper bounds of x, shape (n_x,).
+        names: Joint of each x.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        evaluate: Evaluate,
+        *,
+        index: Indices,
+        start: Array,
+        origin: Array,
+        n_tool: int = 0,
+    ) -> None:
+        self.robot, self.evaluate, self.start, self.origin = robot, evaluate, start, origin
+        self.n_x = index.size
+        self.shortest = robot.closure_rows + n_tool != index.size
+        self.units = coordinate_units(robot)[index]
+        self.lower, self.upper = (limits[index] for limits in coordinate_limits(robot))
+        names = coordinate_names(robot.model)
+        self.names = tuple(names[k] for k in index.tolist())
+        self._row_units = np.append(closure_row_units(robot), np.ones(n_tool))
+        self._turns = np.append(closure_turns(robot), np.zeros(n_tool, dtype=np.bool_))
+
+    def step(self, residuals: Array, jacobians: Array) -> Array:
+        """Newton steps, shape (n, n_x); least squares where rows depend on each other."""
+        if self.shortest:
+            return self._shortest_step(residuals, jacobians)
+        try:
+            steps = np.asarray(np.linalg.solve(jacobians, -residuals[..., None])[..., 0])
+        except np.linalg.LinAlgError:
+            return self._shortest_step(residuals, jacobians)
+        singular = ~(np.abs(steps).max(axis=1, initial=0.0) < MAX_NEWTON_STEP)
+        if singular.any():
+            steps[singular] = self._shortest_step(residuals[singular], jacobians[singular])
+        return steps
+
+    def _shortest_step(self, residuals: Array, jacobians: Array) -> Array:
+        steps = np.full((len(residuals), self.n_x), np.nan)  # no step: the caller drops the posture
+        usable = np.isfinite(jacobians).all(axis=(1, 2))
+        inverse = np.linalg.pinv(jacobians[usable], rcond=1e-10)
+        with np.errstate(over="ignore"):
+            steps[usable] = -(inverse @ residuals[usable][..., None])[..., 0]
+        return steps
+
+    def regular_step(self, residuals: Array, jacobians: Array) -> tuple[Array, Mask]:
+        """Newton steps, and a mask of the Jacobians that are certainly not singular.
+
+        The ratio of singular values is at least 1/(|A| |A⁻¹|) by Frobenius' norm, with the inverse
+        that the step needs anyway.
+        """
+        try:
+            if self.shortest:
+                raise np.linalg.LinAlgError
+            inverses = np.linalg.inv(jacobians)
+        except np.linalg.LinAlgError:
+            return self.step(residuals, jacobians), np.zeros(len(residuals), dtype=np.bool_)
+        size = np.linalg.norm(jacobians / self.units, axis=(1, 2))
+        inverse_size = np.linalg.norm(inverses * self.units[:, None], axis=(1, 2))
+        steps = -(inverses @ residuals[..., None])[..., 0]
+        return steps, np.asarray(size * inverse_size < SAFETY / SINGULAR_BELOW)
+
+    def describe_beyond(self, j: int, value: float) -> str:
+        """Position and limits of a joint in words; a drive's as the controller counts."""
+        drives = {d.name: d for d in self.robot.drives}
+        if self.names[j] in drives:
+            return drives[self.names[j]].describe_beyond(value)
+        unit, size = DRIVE_UNITS["m" if self.units[j] == 1.0 else "rad"]
+        low, high = self.lower[j] / size, self.upper[j] / size
+        return f"at {value / size:.4g} {unit}, outside its limits {low:g} ... {high:g} {unit}"
+
+    def describe(self, x: Array, p: Array, geometry: MachineGeometry) -> str:
+        """Openings of the loops of one posture, in words."""
+        residuals, _ = self.evaluate(x[None], p[None], geometry)
+        return describe_opening(residuals[0] / self._row_units, self._turns)
+
+
+def solve_closures(
+    system: System,
+    targets: Array,
+    geometry: MachineGeometry,
+    *,
+    machines: int,
+    start: ArrayLike | None = None,
+    names: Sequence[str] | None = None,
+    failures: Failures | None = None,
+    allow_singular: bool = True,
+) -> Array:
+    """Newton's method along the straight path from the reference posture, or a start, to targets.
+
+    The first trial covers the complete path. Postures that do not converge, or may have changed
+    their assembly mode, are approached in halved steps.
+
+    Args:
+        system: The equations.
+        targets: p of each posture, shape (K, n_p).
+        geometry: S machines, or S machines in K postures.
+        machines: S.
+        start: x to start from, shape (n_x,), (K, n_x) or (S, K, n_x); by default the system's.
+        names: Names of the postures, for messages.
+        failures: Filled with the points that cannot be reached; by default the first one raises.
+        allow_singular: Accept targets that leave motions free.
+
+    Returns:
+        x, shape (S, K, n_x).
+
+    Raises:
+        ClosureError: If a posture cannot be reached, is outside the limits of a joint or, unless
+            allowed, singular; names the posture and the residual.
+    """
+    count = len(targets)
+    labels = [f"posture {i + 1}" for i in range(count)] if names is None else names
+    if len(labels) != count:
+        raise ValueError(f"found {len(labels)} names for {count} rows")
+    first = system.start if start is None else np.asarray(start, dtype=np.float64)
+    if first.shape[-1:] != (system.n_x,):
+        raise ValueError(f"found the shape {first.shape}; expected {system.n_x} start values a row")
+    begin = np.broadcast_to(first, (machines, count, system.n_x))
+    x = np.array(begin).reshape(machines * count, system.n_x)
+    for i in range(0, len(x), MAX_POINTS):
+        points = np.arange(i, min(i + MAX_POINTS, len(x)))
+        path = _Path(
+            system,
+            targets[points % count],
+            geometry.at(points, len(x)),
+            points=points,
+            labels=labels,
+            failures=failures,
+            allow_singular=allow_singular,
+        )
+        x[points] = path.follow(x[points], restart=start is not None)
+    return x.reshape(begin.shape)
+
+
+class _Path:
+    """Continuation of some points of a batch of machines from the reference posture to targets.
+
+    Args:
+        system: The equations.
+        targets: p of each point, shape (n, n_p).
+        geometry: One row for all points, or a row for each.
+        points: Index of each point in the batch, shape (n,).
+        labels: Names of the postures of a machine, for messages.
+        failures: Filled with the points that cannot be reached; by default the first one raises.
+        allow_singular: Accept targets that leave motions free.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        targets: Array,
+        geometry: MachineGeometry,
+        *,
+        points: NDArray[np.intp],
+        labels: Sequence[str],
+        failures: Failures | None,
+        allow_singular: bool,
+    ) -> None:
+        self._system, self._targets, self._geometry = system, targets, geometry
+        self._points, self._labels, self._failures = points, labels, failures
+        self._allow_singular = allow_singular
+        length = system.robot.characteristic_length
+        self._tolerance = CLOSED * max(1.0, length)
+        self._moves = LARGEST_CONTINUATION_MOVE * np.where(system.units == 1.0, length, 1.0)
+        self._refused = np.zeros(len(points), dtype=np.bool_)
+
+    def _refuse(self, i: int, reason: str, residual: float | None = None) -> None:
+        """Record that a point cannot be reached.
+
+        Raises:
+            ClosureError: If failures are not collected.
+        """
+        point = int(self._points[i])
+        posture = self._labels[point % len(self._labels)]
+        error = ClosureError(reason, posture=posture, residual=residual)
+        if self._failures is None:
+            raise error
+        self._failures.setdefault(point, error)
+        self._refused[i] = True
+
+    def follow(self, start: Array, *, restart: bool) -> Array:
+        """Solutions, NaN at refused points, shape (n, n_x).
+
+        Args:
+            start: x to start from, shape (n, n_x).
+            restart: Begin again at the reference posture where the start does not help.
+        """
+        system, targets, count = self._system, self._targets, len(self._targets)
+        for i in np.flatnonzero(~np.isfinite(targets).all(axis=1)).tolist():
+            self._refuse(i, "has coordinates that are not numbers")
+        x, regular = np.array(start), np.full(count, self._allow_singular)
+        done, step = np.zeros(count), np.ones(count)
+        pending, fresh = np.flatnonzero(~self._refused), np.full(count, restart)
+        while pending.size:
+            reach = np.minimum(1.0, done[pending] + step[pending])
+            path = system.origin + reach[:, None] * (targets[pending] - system.origin)
+            trial, worst, checked = self._newton(pending, x[pending], path)
+            moved = (np.abs(trial - x[pending]) < self._moves).all(axis=1)
+            good = (worst < self._tolerance) & moved
+            reached, failed = pending[good], pending[~good]
+            x[reached], done[reached] = trial[good], reach[good]
+            if not self._allow_singular:
+                regular[reached] = checked[good]
+            retry = failed[fresh[failed]]  # the start was no help: use the reference posture
+            x[retry], step[retry] = system.start, 2.0
+            fresh[pending] = False
+            step[failed] *= 0.5
+            for i in failed[step[failed] < SMALLEST_CONTINUATION_STEP].tolist():
+                self._refuse_unreached(i, x[[i]], done[i])
+            pending = pending[(done[pending] < 1.0) & ~self._refused[pending]]
+        self._refuse_outside_limits(x)
+        uncertain = np.flatnonzero(~regular & ~self._refused)
+        if uncertain.size and system.n_x:
+            self._refuse_singular(x, uncertain)
+        x[self._refused] = np.nan
+        return x
+
+    def _refuse_unreached(self, i: int, x: Array, done: float) -> None:
+        """Refuse a point that continuation does not reach beyond a part of the way."""
+        target = self._targets[[i]]
+        last, worst, _ = self._newton(np.array([i]), x, target)
+        if worst[0] < self._tolerance:
+            reason = (
+                "cannot be reached from the mechanical zero without changing the way in "
+                f"which the loops are assembled, {done:.0%} of the way"
+            )
+        else:
+            at = self._geometry.at(np.array([i]), len(self._points))
+            reason = (
+                "cannot be reached: the loops stay open by "
+                f"{self._system.describe(last[0], target[0], at)}, {done:.0%} of the way "
+                "from the mechanical zero"
+            )
+        self._refuse(i, reason, float(worst[0]))
+
+    def _refuse_outside_limits(self, x: Array) -> None:
+        """Refuse solutions with a joint outside its limits."""
+        system = self._system
+        beyond = np.maximum(x - system.upper, system.lower - x)
+        outside = ~(beyond <= LIMIT_TOLERANCE).all(axis=1)
+        for i in np.flatnonzero(outside & ~self._refused).tolist():
+            j = int(beyond[i].argmax())
+            where = system.describe_beyond(j, float(x[i][j]))
+            reason = f"cannot be reached: joint '{system.names[j]}' would be {where}"
+            self._refuse(i, reason, 0.0)
+
+    def _refuse_singular(self, x: Array, rows: NDArray[np.intp]) -> None:
+        """Refuse solutions at some points that leave motions free, the most singular one first."""
+        system, at = self._system, self._geometry.at(rows, len(self._points))
+        _, jacobians = system.evaluate(x[rows], self._targets[rows], at)
+        values = np.linalg.svd(jacobians / system.units, compute_uv=False)
+        smallest = values[:, system.n_x - 1] if values.shape[1] >= system.n_x else 0.0
+        largest = values.max(axis=1, initial=0.0)  # without closures there are no values
+        ratio = np.broadcast_to(smallest / np.maximum(largest, 1e-300), rows.shape)
+        for k in np.argsort(ratio)[: int((ratio < SINGULAR_BELOW).sum())].tolist():
+            rank = int((values[k] > SINGULAR_BELOW * largest[k]).sum())
+            reason = (
+                f"is singular: the drives leave {system.n_x - rank} of {system.n_x} passive "
+                "motions free"
+            )
+            self._refuse(int(rows[k]), reason)
+
+    def _newton(
+        self, points: NDArray[np.intp], start: Array, p: Array
+    ) -> tuple[Array, Array, Mask]:
+        """Damped Newton's method of some points at once.
+
+        Returns:
+            Solutions, shape (n, n_x), the largest residual of each, shape (n,), [m], and a mask of
+            the solutions that are certainly not singular (if that matters).
+        """
+        system, tolerance, x = self._system, self._tolerance, np.array(start)
+
+        def evaluate(rows: NDArray[np.intp], x: Array) -> tuple[Array, Array, Array]:
+            at = self._geometry.at(points[rows], len(self._points))
+            residuals, jacobians = system.evaluate(x, p[rows], at)
+            return residuals, jacobians, np.abs(residuals).max(axis=1, initial=0.0)
+
+        residuals, jacobians, worst = evaluate(np.arange(len(x)), x)
+        active = np.flatnonzero(worst >= tolerance)
+        for _ in range(MAX_NEWTON_STEPS):
+            if not active.size:
+                break
+            step = system.step(residuals[active], jacobians[active])
+            usable = np.isfinite(step).all(axis=1)
+            rows, step = active[usable], step[usable]
+            moved = []
+            for _ in range(MAX_STEP_HALVINGS):
+                trial = x[rows] + step
+                r, j, size = evaluate(rows, trial)
+                better = size < worst[rows]
+                good = rows[better]
+                x[good], residuals[good], jacobians[good] = trial[better], r[better], j[better]
+                worst[good] = size[better]
+                moved.append(good)
+                rows, step = rows[~better], 0.25 * step[~better]
+                if not rows.size:
+                    break
+            active = np.sort(np.concatenate(moved))
+            active = active[worst[active] >= tolerance]
+        regular = np.zeros(len(x), dtype=np.bool_)
+        closed = np.flatnonzero((worst < tolerance) & np.isfinite(jacobians).all(axis=(1, 2)))
+        if closed.size and system.n_x:  # a last step without evaluation: its Jacobian is at hand
+            found = residuals[closed], jacobians[closed]
+            if self._allow_singular:
+                step = system.step(*found)
+            else:
+                step, regular[closed] = system.regular_step(*found)
+            small = np.abs(step).max(axis=1) < MAX_LAST_STEP
+            x[closed[small]] += step[small]
+        return x, worst, regular
