@@ -19,7 +19,6 @@ from orthocal.errors import ParameterError
 from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.workspace import Workspace
-from orthocal.measurement.joining import join_sessions
 from orthocal.measurement.motion.approach import usual_approaches
 from orthocal.planning.candidates import (
     FEWEST,
@@ -44,6 +43,7 @@ from orthocal.planning.expected_error import (
     noise_of,
     state_noise,
 )
+from orthocal.planning.further_readings import FurtherReadings, find_further_readings
 from orthocal.planning.plan_comparison import Alternative, Comparison
 from orthocal.planning.selection import KILLED, PlannedSetup, PlannedSetups, SetupSearch
 from orthocal.robot.model import Robot
@@ -106,6 +106,8 @@ class MeasuringPlan:
     """Whether the readings complement those of a session."""
     effects: tuple[EffectLimits, ...] = ()
     """Limits of the effects beside geometry, before and after."""
+    further: tuple[FurtherReadings, ...] = ()
+    """Readings for the effects that this plan does not determine."""
 
     def find_remaining(self, *, count: int = 3) -> tuple[RemainingError, ...]:
         """Combinations of errors with the largest effect at the tool after these readings."""
@@ -310,8 +312,7 @@ def _evaluate(
 ) -> MeasuringPlan:
     """Plan with its expected errors, and those of others."""
     plan, measured, forecast = comparison.plan, comparison.measured, comparison.forecast
-    plan_in_course = comparison.equipment.in_course(plan)
-    joined = plan_in_course if measured is None else join_sessions([measured, plan_in_course])
+    joined = comparison.join(comparison.equipment.in_course(plan))
     setups, readings = len(planned.setups), sum(len(s.chosen) for s in planned.setups)
     minutes = comparison.equipment.minutes(setups, len(plan.readings))
     each = round(readings / setups)
@@ -351,6 +352,7 @@ def _evaluate(
         candidates=len(comparison.candidates.session.readings),
         complements=measured is not None,
         effects=limits,
+        further=find_further_readings(comparison, limits),
     )
 
 

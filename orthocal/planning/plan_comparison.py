@@ -56,6 +56,10 @@ class Comparison:
         """
         return self.measured is None or bool(np.any(self.measured.active_offsets))
 
+    def join(self, planned: Session) -> Session:
+        """Planned readings with those that they complement."""
+        return planned if self.measured is None else join_sessions([self.measured, planned])
+
     def list_usual_plans(self) -> tuple[Alternative, ...]:
         """Usual plans with as many setups and readings.
 
@@ -95,7 +99,7 @@ class Comparison:
         return tuple(found)
 
     def _assess(self, name: str, session: Session, *, in_range: bool = True) -> Alternative:
-        whole = session if self.measured is None else join_sessions([self.measured, session])
+        whole = self.join(session)
         minutes = self.equipment.minutes(len(session.setups), len(session.readings))
         expected = self.forecast.after(whole, entered=self.entered) if in_range else None
         return Alternative(name, len(session.setups), len(session.readings), minutes, expected)

@@ -27,6 +27,7 @@ from orthocal.planning.candidates import list_candidates
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import noise_of
 from orthocal.planning.first_plan import first_equipment, paper_plan
+from orthocal.planning.further_readings import WAITS
 from orthocal.planning.plan import plan_readings
 from orthocal.units import MM, PPM, UM
 
@@ -148,6 +149,31 @@ def test_temperature_and_drift_in_a_plan(orthoglide):
         after.append(limits["thermal"].after)
     assert after[0] == pytest.approx(3.0 * PPM)
     assert after[1] < after[0]
+
+
+def test_further_readings_for_effects_that_a_plan_does_not_determine(orthoglide):
+    """Drift by a line through readings of one posture at three times, on its tolerance."""
+    robot = with_effects(orthoglide, ["thermal", "drift"])
+    plan = plan_readings(robot, "full", equipment=FEW, setups=2, starts=1)
+    assert not any(e.determined for e in plan.effects)
+    further = {f.limit.effect: f for f in plan.further}
+    readings = [r for r in plan.session.readings if r.setup == plan.session.readings[0].setup]
+    last = FEW.minutes_a_reading * (len(readings) - 1)
+    std, noise = 0.25, noise_of(plan.session) / UM
+    for wait in (w for w in WAITS if w <= further["drift"].wait):
+        times = np.array([0.0, last, last + wait])
+        slope = noise / np.sqrt(((times - times.mean()) ** 2).sum())
+        limit = 2.0 / np.sqrt(1.0 / std**2 + 1.0 / slope**2)
+        assert (limit < 0.9 * 2.0 * std) == (wait == further["drift"].wait)
+    assert further["drift"].limit.after * 60.0 / UM == pytest.approx(limit, rel=1e-2)
+    assert further["drift"].limit.determined
+    assert further["drift"].readings == 2
+    assert further["drift"].minutes == 2 * further["drift"].wait
+    assert further["thermal"].limit.after < 3.0 * PPM
+    assert further["thermal"].warmer > 0.0
+    assert further["thermal"].readings == len(plan.session.readings)
+    for one in further.values():
+        assert 0.0 < one.gain < 0.3
 
 
 def test_a_day_by_the_clock(planned):

@@ -21,6 +21,7 @@ from orthocal.output.text.accuracy import describe_remaining
 from orthocal.output.text.layout import bullets, counted, plain, section, table_of
 from orthocal.planning.cost_curve import ENOUGH, HOUR, Stage
 from orthocal.planning.expected_error import Criterion, Expected
+from orthocal.planning.further_readings import FurtherReadings
 from orthocal.planning.plan import MeasuringPlan
 from orthocal.planning.plan_comparison import Alternative
 from orthocal.robot.model import Robot
@@ -109,7 +110,10 @@ def describe_expected(plan: MeasuringPlan) -> list[str]:
             f"These readings do not determine the offset of {joined(undetermined)}. Plan more time "
             "or setups."
         )
-    return [*lines, *map(_describe_limits, plan.effects)]
+    further = {(f.limit.effect, f.limit.unit): _describe_further(f) for f in plan.further}
+    for effect in plan.effects:
+        lines.append(_describe_limits(effect) + further.get((effect.effect, effect.unit), ""))
+    return lines
 
 
 def _undetermined_offsets(plan: MeasuringPlan) -> list[str]:
@@ -123,16 +127,34 @@ def _undetermined_offsets(plan: MeasuringPlan) -> list[str]:
 
 def _describe_limits(effect: EffectLimits) -> str:
     """Limit of an effect before and after the readings, in a sentence."""
-    unit, factor = EDGE_UNITS[effect.unit]
-    words = unit.replace("_per_", "/").replace("um/", "µm/")
-    if words == "mm":
-        before, after = (tool_mm(v) for v in (effect.before, effect.after))
-    else:
-        before, after = (f"{v / factor:.2g} {words}" for v in (effect.before, effect.after))
+    before, after = (_limit_words(effect, v) for v in (effect.before, effect.after))
     name = f"{effect.words[:1].upper()}{effect.words[1:]}"
     if effect.determined:
         return f"{name}: known to ±{after} after these readings (tolerance ±{before})."
     return f"{name}: these readings do not determine it; it keeps its tolerance of ±{before}."
+
+
+def _limit_words(effect: EffectLimits, limit: float) -> str:
+    """A limit of an effect with its unit."""
+    unit, factor = EDGE_UNITS[effect.unit]
+    words = unit.replace("_per_", "/").replace("um/", "µm/")
+    return tool_mm(limit) if words == "mm" else f"{limit / factor:.2g} {words}"
+
+
+def _describe_further(further: FurtherReadings) -> str:
+    """Readings that would determine an effect and what they bring, in a sentence."""
+    if further.warmer:
+        what = f"{counted(further.readings, 'further reading')}, {further.warmer:g} K warmer"
+    else:
+        what = (
+            f"{counted(further.readings, 'further reading')} of the first postures, "
+            f"{further.wait:g} min after the last reading of each setup"
+        )
+    after, duration = _limit_words(further.limit, further.limit.after), further.minutes
+    only = "" if further.limit.determined else " only"
+    percent = round(100.0 * further.gain)
+    gain = f"reduce the tool error by {percent} %" if percent else "not reduce the tool error"
+    return f" {what} ({show_duration(duration)}), would bring it to ±{after}{only} and {gain}."
 
 
 def _how_to_measure(plan: MeasuringPlan) -> list[str]:
@@ -205,6 +227,7 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
         "curve": [stage(s) for s in plan.curve],
         "enough": None if plan.enough is None else stage(plan.enough),
         "effects": [asdict(e) for e in plan.effects],
+        "further_readings": [asdict(f) for f in plan.further],
         "remaining": [
             {"rms_um": r.rms / UM, "parts": [{"name": n, "prior_stds": t} for n, t in r.parts]}
             for r in plan.find_remaining()
