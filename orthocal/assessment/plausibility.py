@@ -202,7 +202,7 @@ def _coarse(session: Session, fit: Fit) -> Finding | None:
 
 
 def _near(session: Session) -> Finding | None:
-    """A posture hardly away from another one, beside far ones: given in metres."""
+    """A posture hardly away from another one in the mechanical zero: given in metres."""
     session = session.select(session.readings)  # of several sessions its own postures
     drives = np.array([p.drives for p in session.postures.values()])
     places, first = np.unique(drives, axis=0, return_index=True)
@@ -210,7 +210,9 @@ def _near(session: Session) -> Finding | None:
         return None
     gaps = _nearest(places)
     largest = float(np.linalg.norm(np.ptp(places, axis=0)))
-    near = np.flatnonzero(gaps < TINY * largest)
+    zero = session.robot.drive_zero - session.active_offsets
+    from_zero = np.linalg.norm(places - zero, axis=1)
+    near = np.flatnonzero(np.maximum(gaps, from_zero) < TINY * largest)
     if not near.size:
         return None
     worst = near[first[near].argmax()]

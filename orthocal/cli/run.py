@@ -25,7 +25,7 @@ from orthocal.text import printable
 
 PANELS = {
     "Prepare": ("new", "plan"),
-    "Measure": ("sheet", "record", "import", "simulate", "check"),
+    "Measure": ("sheet", "record", "import", "trace", "simulate", "check"),
     "Calibrate": ("calibrate", "compare", "report", "validate", "again"),
     "Use": ("forward", "inverse", "accuracy", "adjust", "correct", "export", "view"),
     "Study": ("study",),
@@ -37,7 +37,7 @@ MODULES = {"import": "import_"}
 
 
 SLOW = frozenset(
-    "check simulate calibrate compare report validate again accuracy adjust correct export "
+    "check trace simulate calibrate compare report validate again accuracy adjust correct export "
     "view".split()
 )
 """Commands that may take longer than some seconds and print no progress."""

@@ -32,6 +32,9 @@ SHORTEST = 0.2e-3
 STEP = 0.1e-3
 """Shortened approaches are multiples of this, [m]."""
 
+TURNING = 1e-6
+"""Motion of a drive in an approach below which it has no direction, [m, rad]."""
+
 TAKEN_UP = 2.0
 """Least length of an approach, in the limit of the backlash."""
 
@@ -86,6 +89,11 @@ def describe_approach(robot: Robot, approach: str) -> str:
         for letter, d in zip(approach, robot.drives, strict=True)
     ]
     return arrows[0] if len(set(arrows)) == 1 else "".join(arrows)
+
+
+def name_approach(motion: Array) -> str:
+    """Approach by the last motion of each drive, shape (n_drives,); u for one that hardly moves."""
+    return "".join("u" if abs(v) < TURNING else "p" if v > 0.0 else "n" for v in motion.tolist())
 
 
 def approach_steps(robot: Robot, approach: str, other: str = "p", *, share: float = 1.0) -> Array:

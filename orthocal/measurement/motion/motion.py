@@ -29,6 +29,7 @@ from orthocal.measurement.motion.approach import (
     approach_share,
     approach_steps,
     fill_approach,
+    name_approach,
 )
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import predict_readings
@@ -42,9 +43,6 @@ Role = Literal["alignment", "reading", "subtracted", "return"]
 
 STEP = 5e-3
 """Largest distance between samples of a segment, [m]."""
-
-TURNING = 1e-6
-"""Motion of a drive in an approach below which it has no direction, [m, rad]."""
 
 MOST_STOPS = 2000
 """Largest number of readings in one plan: two weeks of work."""
@@ -439,7 +437,7 @@ def _arrive(session: Session, setup: str, stop: Stop, corners: Array, length: fl
     found = []
     for begin in (before, beyond):
         drives = closure.inverse(begin[None])[0]
-        approach = _letters(stop.drives - drives)
+        approach = name_approach(stop.drives - drives)
         found.append(approach)
         if all(a == b or "u" in (a, b) for a, b in zip(stop.approach, approach, strict=True)):
             break
@@ -466,11 +464,6 @@ def _walk(corners: Array, length: float) -> Array:
             return np.asarray(start + length / step * (end - start))
         length -= step
     return np.asarray(corners[-1])
-
-
-def _letters(motion: Array) -> str:
-    """Approach by the last motion of each drive; u for a drive that hardly moves."""
-    return "".join("u" if abs(v) < TURNING else "p" if v > 0.0 else "n" for v in motion.tolist())
 
 
 def _sample_path(robot: Robot, corners: Sequence[Array]) -> _Path | None:

@@ -1,0 +1,285 @@
+"""Traces: readings that a gauge takes many times a second while the tool moves along a path.
+
+A trace is averaged into bins along the path. A polynomial of the path length describes the readings
+between two reversals roughly. In each bin, a line is fitted to their deviations from it. Line and
+polynomial at the middle sample are the reading there. The bins are so short that what the line
+omits, w² h''/24 for a bin of length w, stays below a tenth of the noise of a bin. So averaging
+loses nothing. Where the path reverses, a bin ends, because the approach changes.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.polynomial import Chebyshev
+
+from orthocal.arrays import Array, Indices
+from orthocal.errors import ClosureError, SessionError
+from orthocal.io.documents import parse_number, read_text
+from orthocal.io.files import read_file
+from orthocal.kinematics.loop_closure import nominal_closure
+from orthocal.measurement.files.readings_file import COORDINATES
+from orthocal.measurement.motion.approach import name_approach
+from orthocal.robot.model import Robot, require_tcp
+from orthocal.session.session import Conditions, Posture, Reading, Session
+from orthocal.units import MM
+
+MOST_SAMPLES = 500_000
+"""Samples of one trace: eight minutes at 1 kHz."""
+
+LARGEST_TRACE = 64 * 2**20
+"""Largest file of a trace, [bytes]."""
+
+FEWEST_SAMPLES = 8
+"""Samples of a bin: enough for a line and the noise about it."""
+
+MOST_BINS = 360
+"""Bins between two reversals."""
+
+LONGEST_BIN = 4 * MM
+"""Length of a bin at first: 5° of a circle of 100 mm, [m]."""
+
+BATCHES = 4
+"""Parts of a bin whose means show its noise, correlation within a part included."""
+
+OMITTED = 0.1
+"""Largest error of averaging, in standard deviations of a bin's reading."""
+
+DEGREE = 12
+"""Degree of the polynomial that describes readings between two reversals: two harmonics of a full
+circle to some nm."""
+
+TURN = 0.1 * MM
+"""Path length in which a reversal shows, [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trace:
+    """Samples of a gauge along a path of the tool."""
+
+    points: Array
+    """Commanded tool coordinates, shape (n, n_coordinates), [m]."""
+    values: Array
+    """Readings, shape (n,), [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BinnedTrace:
+    """Readings of a trace, averaged in bins along the path."""
+
+    points: Array
+    """Commanded tool coordinates, shape (m, n_coordinates), [m]."""
+    values: Array
+    """Readings, shape (m,), [m]."""
+    motions: Array
+    """Motion of the tool through each bin, shape (m, n_coordinates), [m]."""
+    std: float
+    """Standard deviation of a reading, [m]."""
+    samples: int
+    """Number of samples."""
+
+
+def read_trace(path: str | Path, robot: Robot) -> Trace:
+    """Read a trace from a CSV file.
+
+    Args:
+        path: CSV with columns reading_mm and x_mm, y_mm, z_mm (those that the drives control): the
+            commanded position of the tool, relative to the mechanical zero. Other columns, such as
+            a time, are ignored.
+        robot: The robot.
+
+    Raises:
+        SessionError: Naming file and line.
+    """
+    file = Path(path)
+    content = read_file(file, error=SessionError, largest=LARGEST_TRACE)
+    text = read_text(file, error=SessionError, content=content)
+    rows = csv.reader(io.StringIO(text, newline=None), skipinitialspace=True)
+    header = [cell.strip() for cell in next(rows, [])]
+    wanted = [*(COORDINATES[c] for c in require_tcp(robot).coordinates), "reading_mm"]
+    missing = next((name for name in wanted if header.count(name) != 1), None)
+    if missing is not None:
+        raise SessionError(
+            f"has the columns {', '.join(header)[:200]}; expected {', '.join(wanted)}, once each",
+            where=f"{file}:1",
+        )
+    columns = [header.index(name) for name in wanted]
+    samples: list[list[float]] = []
+    try:
+        for row in rows:
+            if not any(cell.strip() for cell in row):
+                continue
+            where = f"{file}:{rows.line_num}"
+            if len(row) != len(header):
+                raise SessionError(f"has {len(row)} fields; expected {len(header)}", where=where)
+            samples.append(
+                [
+                    parse_number(row[i].strip(), where=where, name=header[i], error=SessionError)
+                    for i in columns
+                ]
+            )
+            if len(samples) > MOST_SAMPLES:
+                raise SessionError(f"has more than {MOST_SAMPLES} samples", where=str(file))
+    except csv.Error as e:
+        raise SessionError(f"is not valid CSV: {e}", where=f"{file}:{rows.line_num}") from None
+    if len(samples) < FEWEST_SAMPLES:
+        raise SessionError(
+            f"has {len(samples)} samples; expected {FEWEST_SAMPLES} or more", where=str(file)
+        )
+    table = MM * np.array(samples)
+    return Trace(table[:, :-1], table[:, -1])
+
+
+def bin_trace(trace: Trace) -> BinnedTrace:
+    """Average a trace in bins along its path.
+
+    Raises:
+        SessionError: If the tool does not move.
+    """
+    steps = np.linalg.norm(np.diff(trace.points, axis=0), axis=1)
+    length = np.concatenate([[0.0], np.cumsum(steps)])
+    runs = _split_runs(trace.points, length)
+    if not runs:
+        raise SessionError("does not move; expected the commanded position of every sample")
+    smooth = np.zeros(len(length))
+    for run in runs:
+        smooth[run] = Chebyshev.fit(length[run], trace.values[run], DEGREE)(length[run])
+    remainder = trace.values - smooth
+    count = 1
+    while True:
+        by_run = [_split_bins(length, run, count) for run in runs]
+        bins = [b for of_run in by_run for b in of_run]
+        fits = [_fit_line(length[b], remainder[b]) for b in bins]
+        std = float(np.sqrt(np.mean([variance for _, _, variance in fits])))
+        values = np.array([value for value, _, _ in fits])
+        sizes = [len(of_run) for of_run in by_run]
+        if _omitted(values, sizes, std) <= OMITTED * std or max(sizes) >= MOST_BINS:
+            break
+        if min(b.size for b in bins) < 2 * FEWEST_SAMPLES:
+            break
+        count += 1
+    middle = np.array([b[at] for b, (_, at, _) in zip(bins, fits, strict=True)])
+    values += smooth[middle]
+    motions = np.array([trace.points[b[-1]] - trace.points[b[0]] for b in bins])
+    return BinnedTrace(trace.points[middle], values, motions, std, len(trace.values))
+
+
+def _split_runs(points: Array, length: Array) -> list[slice]:
+    """Parts of a path between reversals, without samples at rest at their ends."""
+    marks = np.searchsorted(length, np.arange(0.0, length[-1], TURN))
+    marks = np.unique(np.append(marks, len(length) - 1))
+    tangents = np.diff(points[marks], axis=0)
+    if len(tangents) < 2:
+        return []
+    turns = np.flatnonzero((tangents[1:] * tangents[:-1]).sum(axis=1) < 0.0) + 1
+    ends = [0, *marks[turns].tolist(), len(length) - 1]
+    moved = [(a, b) for a, b in pairwise(ends) if length[b] - length[a] > 2.0 * TURN]
+    return [slice(a, b + 1) for a, b in moved]
+
+
+def _split_bins(length: Array, run: slice, count: int) -> list[Indices]:
+    """Samples of each bin of a run; `count` bins for each `LONGEST_BIN`."""
+    along = length[run]
+    number = max(int(np.ceil(count * (along[-1] - along[0]) / LONGEST_BIN)), 1)
+    edges = along[0] + np.arange(1, number) / number * (along[-1] - along[0])
+    moving = np.flatnonzero(np.diff(along, prepend=-1.0) > 0.0)
+    parts = np.split(moving, np.searchsorted(along[moving], edges))
+    return [run.start + part for part in parts if part.size >= FEWEST_SAMPLES]
+
+
+def _fit_line(along: Array, values: Array) -> tuple[float, int, float]:
+    """Value of a line at the middle sample, the sample's place, and the variance of the value."""
+    middle = int(np.abs(along - 0.5 * (along[0] + along[-1])).argmin())
+    s = along - along.mean()
+    slope = (s @ values) / (s @ s)
+    residuals = values - values.mean() - slope * s
+    means = np.array([part.mean() for part in np.array_split(residuals, BATCHES)])
+    variance = float(means @ means) / (BATCHES - 2) / BATCHES
+    return float(values.mean() + slope * s[middle]), middle, variance
+
+
+def _omitted(values: Array, sizes: list[int], std: float) -> float:
+    """RMS error of the bins' values by the curvature of the readings, noise taken out, [m]."""
+    runs = np.split(values, np.cumsum(sizes)[:-1])
+    bends = np.concatenate([np.diff(run, 2) for run in runs])
+    noise = 6.0 * std**2  # of v₁ − 2 v₂ + v₃
+    return math.sqrt(max(float(bends @ bends) / max(bends.size, 1) - noise, 0.0)) / 24.0
+
+
+def with_traces(session: Session, traces: Mapping[str, Trace]) -> Session:
+    """Session whose setups have the binned readings of traces in place of their own.
+
+    The standard deviation of their gauges becomes that of a bin.
+
+    Args:
+        session: A plan or a session.
+        traces: Setup to its trace.
+
+    Raises:
+        SessionError: If a setup does not exist, or the machine does not reach a point.
+    """
+    readings = [r for r in session.readings if r.setup not in traces and r.is_read]
+    postures = {p for r in readings for p in (r.posture, r.minus)}
+    kept = {n: p for n, p in session.postures.items() if n in postures}
+    stds: dict[str, list[float]] = {}
+    for name, trace in traces.items():
+        if name not in session.setups:
+            raise SessionError(
+                f"'{name}' is not a setup; setups: {', '.join(session.setups)}", where="--trace"
+            )
+        try:
+            binned = bin_trace(trace)
+        except SessionError as e:
+            raise SessionError(e.problem, where=f"trace of {name}") from None
+        stds.setdefault(session.setups[name].gauge, []).append(binned.std)
+        added = _place_bins(session, name, binned)
+        for posture, approach, value in added:
+            kept[posture.name] = posture
+            conditions = Conditions(approach)
+            readings.append(Reading(name, posture.name, value=value, conditions=conditions))
+    gauges = dict(session.gauges)
+    for name, of_gauge in stds.items():
+        sigma = float(np.sqrt(np.mean(np.square(of_gauge))))
+        gauges[name] = replace(gauges[name], sigma=sigma, resolution=None)
+    read = {r.setup for r in readings}
+    setups = {
+        n: replace(s, aligned_at=None) if n in traces else s
+        for n, s in session.setups.items()
+        if n in read
+    }
+    return replace(
+        session,
+        gauges=gauges,
+        setups=setups,
+        postures=kept,
+        readings=tuple(readings),
+        sha256="",
+        readings_path=None,
+    )
+
+
+def _place_bins(
+    session: Session, setup: str, binned: BinnedTrace
+) -> list[tuple[Posture, str, float]]:
+    """Posture, approach and reading of each bin."""
+    closure = nominal_closure(session.robot)
+    names = [f"{setup}-{i + 1:03d}" for i in range(len(binned.values))]
+    try:
+        drives = closure.inverse(binned.points, names=names)
+        before = closure.inverse(binned.points - 0.5 * binned.motions, names=names)
+    except ClosureError as e:
+        raise SessionError(e.reason, where=f"trace of {setup}: {e.posture}") from None
+    found = []
+    for name, point, at, start, value in zip(
+        names, binned.points, drives, before, binned.values.tolist(), strict=True
+    ):
+        posture = Posture(name, "tcp", point, at - session.active_offsets)
+        found.append((posture, name_approach(at - start), value))
+    return found
