@@ -27,9 +27,9 @@ Traces = Annotated[
 def trace(session: PlanPath, traces: Traces, out: OutDirectory, force: Force = False) -> None:
     """Average traces of a gauge into readings of a session.
 
-    A trace is read while the tool moves along a path. It is a CSV file with the columns x_mm, y_mm, z_mm (commanded position of the tool) and
-    reading_mm, with thousands of lines. The directory receives session.yaml with a posture for
-    each average, and readings.csv.
+    A trace is read while the tool moves along a path. It is a CSV file with the columns x_mm,
+    y_mm, z_mm (commanded position of the tool) and reading_mm, with thousands of lines. The
+    directory receives session.yaml with a posture for each average, and readings.csv.
     """
     from orthocal.measurement.files.session_file import load_rows
     from orthocal.measurement.importing.traces import read_trace, with_traces
