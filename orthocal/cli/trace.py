@@ -8,7 +8,6 @@ from typing import Annotated
 from typer import Argument
 
 import orthocal
-from orthocal.assessment.wording import counted
 from orthocal.cli.files import require_new_files
 from orthocal.cli.options import Force, OutDirectory, PlanPath, command
 from orthocal.cli.printing import put_note
@@ -31,6 +30,7 @@ def trace(session: PlanPath, traces: Traces, out: OutDirectory, force: Force = F
     y_mm, z_mm (commanded position of the tool) and reading_mm, with thousands of lines. The
     directory receives session.yaml with a posture for each average, and readings.csv.
     """
+    from orthocal.assessment.wording import counted
     from orthocal.measurement.files.session_file import load_rows
     from orthocal.measurement.importing.traces import read_trace, with_traces
 
