@@ -219,7 +219,7 @@ def mdi(lines):
         wait(idle, line)
 
 
-def run(name):
+def run(name, commands):
     pauses = []
     command.mode(linuxcnc.MODE_AUTO)
     command.wait_complete()
@@ -230,6 +230,10 @@ def run(name):
         wait(lambda: idle() or paused(), "the program")
         if idle():
             return pauses
+        if len(pauses) < len(commands) and commands[len(pauses)]:
+            subprocess.run(["halcmd", *commands[len(pauses)].split()], check=True)
+            time.sleep(0.2)
+            status.poll()
         pauses.append(list(status.joint_position[:status.joints]))
         command.auto(linuxcnc.AUTO_RESUME)
         wait(lambda: status.interp_state != linuxcnc.INTERP_PAUSED, "to go on", 5.0)
@@ -249,13 +253,13 @@ def main():
     recording = subprocess.Popen(["halsampler", "recorded.txt"])
     time.sleep(0.2)
     subprocess.run(["halcmd", "setp", "sampler.0.enable", "1"], check=True)
-    pauses = [run(runs[0]["program"])]
+    pauses = [run(runs[0]["program"], runs[0]["halcmd"])]
     time.sleep(0.3)
     recording.terminate()
     recording.wait()
     for following in runs[1:]:
         mdi(following["mdi"])
-        pauses.append(run(following["program"]))
+        pauses.append(run(following["program"], following["halcmd"]))
     json.dump(pauses, open("pauses.json", "w"))
 
 
@@ -349,7 +353,7 @@ def run_program(program, joints, **options):
     return run_programs([(program[:1], [*program, "M2"])], joints, **options)[0]
 
 
-def run_programs(runs, joints, *, letters="XYZ", lines="", module=None, files=None):
+def run_programs(runs, joints, *, letters="XYZ", lines="", module=None, files=None, halcmd=()):
     """Home the machine, then run programs one after the other.
 
     Args:
@@ -359,6 +363,8 @@ def run_programs(runs, joints, *, letters="XYZ", lines="", module=None, files=No
         lines: Lines that replace those of the same name in the INI.
         module: Folder of an exported kinematics module; without it each joint is a coordinate.
         files: Further files beside the INI, name to text.
+        halcmd: Commands for HAL at the pauses of the first program, "" for none; the joints'
+            positions are those 0.2 s later.
 
     Returns:
         Slides in every servo period of the first program, shape (K, n_joints), [mm]; and for each
@@ -370,7 +376,7 @@ def run_programs(runs, joints, *, letters="XYZ", lines="", module=None, files=No
         try:
             for name, text in (files or {}).items():
                 (folder / name).write_text(text)
-            _write(folder, runs, joints, letters=letters, lines=lines)
+            _write(folder, runs, joints, letters=letters, lines=lines, halcmd=halcmd)
             return _run(folder)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
@@ -402,7 +408,7 @@ def filter_program(ini, program, result):
     return result["code"], result["said"], result["progress"]
 
 
-def _write(folder, runs, joints, *, letters, lines):
+def _write(folder, runs, joints, *, letters, lines, halcmd):
     n = len(joints)
     ini = BASE.format(joints=n, letters=letters)
     ini += "".join(AXIS.format(letter=letter) for letter in letters)
@@ -433,7 +439,10 @@ def _write(folder, runs, joints, *, letters, lines):
         "drive.py": DRIVE,
         "longest.json": json.dumps(LONGEST - 10.0),
         "runs.json": json.dumps(
-            [{"mdi": mdi, "program": f"{i}.ngc"} for i, (mdi, _) in enumerate(runs)]
+            [
+                {"mdi": mdi, "program": f"{i}.ngc", "halcmd": [] if i else list(halcmd)}
+                for i, (mdi, _) in enumerate(runs)
+            ]
         ),
         **{f"{i}.ngc": "\n".join([*program, ""]) for i, (_, program) in enumerate(runs)},
     }

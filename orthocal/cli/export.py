@@ -14,6 +14,7 @@ from orthocal.cli.options import (
     CalibrationPath,
     HalfSideMm,
     OutDirectory,
+    Payload,
     ToolTip,
     command,
     read_numbers,
@@ -40,6 +41,7 @@ def export(
     within: float | None = None,
     half_side_mm: HalfSideMm = None,
     tool: ToolTip = None,
+    payload: Payload = None,
     home_offset: str | None = None,
     latched: str | None = None,
     ini: Path | None = None,
@@ -47,7 +49,7 @@ def export(
 ) -> None:
     """Write a calibration for a controller or another program.
 
-    --half-side-mm and --tool apply to a module for LinuxCNC.
+    --half-side-mm, --tool and --payload apply to a module for LinuxCNC.
 
     Exit code 3: the verdict is not `enter`, or the machine does not reach the requested region or
     tolerance. The reason is printed, and nothing is written.
@@ -80,16 +82,28 @@ def export(
         home_offsets=_home_offsets(home_offset, result) if joints is None else joints.home_offsets,
         latched=_signs(latched) if joints is None else joints.latched,
         half_side=None if half_side_mm is None else half_side_mm * MM,
+        payload=payload,
         module=module,
     )
     files = orthocal.export_calibration(result, to, anyway=anyway, options=options)
     _refuse_both(out, files)
     write_results(out, files)
+    if "kinematics.ini" in files:
+        _note_payload(result, payload)
     if to == "linuxcnc" and assumes_latching(result, options):
         put_note(
             "Assumed: HOME_LATCH_VEL of all joints is positive. If not, use --ini FILE or "
             "--latched: HOME_OFFSET contains half of the backlash with this sign."
         )
+
+
+def _note_payload(calibration: orthocal.Calibration, payload: float | None) -> None:
+    """Say which payload a module assumes, if it is not stated and matters."""
+    from orthocal.output.text.conditions import describe_assumed
+
+    conditions = orthocal.UseConditions(payload=payload)
+    if assumed := describe_assumed(calibration, conditions, fields=("payload",)):
+        put_note(assumed)
 
 
 def _refuse_both(out: Path, files: Iterable[str]) -> None:

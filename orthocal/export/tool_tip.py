@@ -98,11 +98,15 @@ class ToolTip:
         (poses,) = self._pose(*self._closure.inputs(drives, passive))
         return np.asarray(poses)
 
-    def reach(self, points: Array, *, failures: Failures | None = None) -> tuple[Array, Array]:
+    def reach(
+        self, points: Array, *, start: Array | None = None, failures: Failures | None = None
+    ) -> tuple[Array, Array]:
         """Drive and passive coordinates that bring the tip to its targets.
 
         Args:
             points: Commanded points, shape (k, n), [m].
+            start: Drive and passive coordinates to start from, shape (k, n_drives + n_passive); the
+                reference posture by default.
             failures: Filled with the points out of reach, whose results are NaN. Without it the
                 first of them raises.
 
@@ -110,7 +114,7 @@ class ToolTip:
             ClosureError: If a point is out of reach.
             ExportError: If the iteration diverges because the platform turns too much.
         """
-        shifted, targets, start = np.array(points), self.targets(points), None
+        shifted, targets = np.array(points), self.targets(points)
         for _ in range(MOST_STEPS):
             drives, passive = self._closure.reach(shifted, start=start, failures=failures)
             reached = np.isfinite(drives).all(axis=1)

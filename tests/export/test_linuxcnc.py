@@ -144,7 +144,7 @@ def machine_of(robot, errors):
 class Core:
     """orthocal_core.c, compiled with strict warnings."""
 
-    def __init__(self, folder, files):
+    def __init__(self, folder, files, *, periodic=False):
         if shutil.which("gcc") is None:
             if os.environ.get("ORTHOCAL_LINUXCNC") == "required":
                 pytest.fail("a C compiler is required here")
@@ -160,9 +160,10 @@ class Core:
         )
         assert done.returncode == 0, done.stderr
         used = subprocess.run(["nm", "-u", "core.so"], cwd=folder, capture_output=True, text=True)
-        # besides weak symbols and the stack protector the core needs sqrt only
+        # besides weak symbols and the stack protector the core needs these functions only
+        functions = {"sqrt", "sin", "cos", "sincos"} if periodic else {"sqrt"}
         needed = {line.split()[1] for line in used.stdout.splitlines() if line.split()[0] == "U"}
-        assert {name.split("@")[0] for name in needed} <= {"sqrt", "__stack_chk_fail"}
+        assert {name.split("@")[0] for name in needed} <= {*functions, "__stack_chk_fail"}
         self.n = int(re.search(r"#define ORTHOCAL_DRIVES (\d)", files["orthocal_core.h"])[1])
         self.library = ctypes.CDLL(str(folder / "core.so"))
         self.type = ctypes.c_double * self.n

@@ -1,19 +1,20 @@
 """Inverse kinematics of a calibrated machine in few numbers: a closed form and a polynomial.
 
-    q(p) = nominal(p) + f(clamp(p))
+    q(p, T) = nominal(p) + f(clamp(p)) + (clamp(T) − T₀) g(clamp(p))
 
-f is a polynomial of the lowest total degree that meets the tolerance. Beyond the region its
-argument is clamped to the faces. The error is evaluated at points that are not fitted: inside the
-region and on its faces, edges and corners. There the calibrated machine, with its loops closed, is
-compared with the commanded point.
+f is a polynomial of the lowest total degree that meets the tolerance. On a machine that expands
+with its temperature T, g is one of the same degree, per kelvin from the reference T₀. Beyond the
+region their argument is clamped to the faces. The error is evaluated at points that are not fitted:
+inside the region and on its faces, edges and corners, at temperatures over their range. There the
+calibrated machine, with its loops closed, is compared with the commanded point.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,13 +22,17 @@ from numpy.typing import ArrayLike
 from orthocal.arrays import Array
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.calibration.calibration import Calibration
+from orthocal.effects.loading import neutral_values
 from orthocal.errors import ClosureError, ExportError
 from orthocal.export.linuxcnc.drive_compensation import without_periodic_errors
 from orthocal.export.linuxcnc.nominal_form import NominalForm, Tangent, find_nominal_form
 from orthocal.export.polynomial import Polynomial, PolynomialFit, chebyshev_line, total_degree
 from orthocal.export.tool_tip import ToolTip
+from orthocal.kinematics.conditions import UseConditions, effects_by_condition, stated_use
 from orthocal.kinematics.loop_closure import find_beyond_travel
 from orthocal.kinematics.workspace import cube_limits, describe_box, grid_points, tool_at_zero
+from orthocal.robot.description import HIGHEST_C, LOWEST_C
+from orthocal.robot.model import Robot
 from orthocal.units import MM, UM
 
 LETTERS = "XYZABC"
@@ -51,6 +56,30 @@ BEYOND = 5e-3
 LONGER = 10e-3
 """Change of the tool's length of which the effect is stated, [m]."""
 
+WARMER = 15.0
+"""Temperatures to both sides of the reference that a module covers at least, [K]."""
+
+HEAVIER = 1.0
+"""Change of the payload of which the effect is stated, [kg]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ThermalChange:
+    """Change of the correction with the temperature of the machine."""
+
+    reference: float
+    """Temperature without a change, [°C]."""
+    lowest: float
+    highest: float
+    """Limits to which the temperature is clamped, [°C]."""
+    per_kelvin: Polynomial
+    """Change of the drive coordinates, [m/K, rad/K]."""
+
+    def __call__(self, points: Array, temperature: float) -> Array:
+        """Changes, shape (k, n_drives), [m, rad], at points of the region, shape (k, n), [m]."""
+        warmer = min(max(temperature, self.lowest), self.highest) - self.reference
+        return np.asarray(warmer * self.per_kelvin(points))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectedInverse:
@@ -59,6 +88,8 @@ class CorrectedInverse:
     nominal: NominalForm
     correction: Polynomial
     """Correction of the drive coordinates over the region, [m, rad]."""
+    thermal: ThermalChange | None = None
+    """Its change with temperature; None for a machine that does not depend on it."""
 
     @property
     def lower(self) -> Array:
@@ -70,10 +101,18 @@ class CorrectedInverse:
         """Largest coordinates of the region, shape (n,), [m]."""
         return np.asarray(self.correction.middle + self.correction.half)
 
-    def __call__(self, points: Array) -> Array:
-        """Drive coordinates, shape (k, n_drives), [m, rad], for points, shape (k, n), [m]."""
+    def __call__(self, points: Array, temperature: float | None = None) -> Array:
+        """Drive coordinates, shape (k, n_drives), [m, rad].
+
+        Args:
+            points: Shape (k, n), [m].
+            temperature: Of the machine, [°C]; the reference by default.
+        """
         clamped = np.clip(points, self.lower, self.upper)
-        return np.asarray(self.nominal(points) + self.correction(clamped))
+        drives = self.nominal(points) + self.correction(clamped)
+        if self.thermal is not None and temperature is not None:
+            drives = drives + self.thermal(clamped, temperature)
+        return np.asarray(drives)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,6 +136,13 @@ class Approximation:
     """Largest error 5 mm beyond the faces, [m]; None if the machine does not reach that far."""
     longer: float
     """Largest error for a tip 10 mm farther in any direction, [m]."""
+    unheated: float | None
+    """Largest error within the range of temperatures of a module without a thermometer, [m]; None
+    for a machine that does not depend on the temperature."""
+    payload: float | None
+    """Mass on the tool for which it holds, [kg]; None for a machine that does not depend on it."""
+    heavier: float | None
+    """Largest error with 1 kg more on the tool, [m]; None as `payload`."""
 
     @property
     def region(self) -> str:
@@ -120,12 +166,39 @@ def rounded_up(value: float) -> str:
     return f"{math.ceil(value * 10.0**decimals) / 10.0**decimals:.2g}"
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    """The machine at one temperature, and the joint coordinates that reach some points there."""
+
+    temperature: float | None
+    tip: ToolTip
+    drives: Array
+    """Drive coordinates at the nodes of the fit, shape (n_nodes, n_drives), [m, rad]."""
+    expected: Array
+    """Drive coordinates at the checked points, shape (n_checks, n_drives), [m, rad]."""
+    passive: Array
+    """Passive coordinates at the checked points, shape (n_checks, n_passive), [m, rad]."""
+
+    def error(self, checks: Array, inverse: CorrectedInverse, *, cold: bool = False) -> float:
+        """Largest error at the checked points, [m]; infinite out of reach.
+
+        Args:
+            checks: Shape (n_checks, n), [m].
+            inverse: The approximation.
+            cold: Whether it does not know the temperature.
+        """
+        drives = inverse(checks, None if cold else self.temperature)
+        found = _tip_error(self.tip, checks, drives, start=self.passive)
+        return math.inf if found is None else found
+
+
 def approximate(
     calibration: Calibration,
     *,
     within: float,
     tool: ArrayLike = (0.0, 0.0, 0.0),
     half_side: float | None = None,
+    payload: float | None = None,
 ) -> Approximation:
     """Inverse kinematics of the lowest degree that meets a tolerance.
 
@@ -137,13 +210,15 @@ def approximate(
         tool: The tip in the frame of the robot's tool centre point, shape (3,), [m].
         half_side: Half the side of a cube around the mechanical zero, [m]; by default the region
             is the workspace.
+        payload: Mass on the tool beside the platform, [kg]; none by default.
 
     Raises:
         ExportError: If no degree meets the tolerance, with the best error; if the machine has no
             tool or does not reach the region.
+        ParameterError: If the payload is out of range, or nothing depends on it.
     """
     robot = calibration.robot
-    tip = ToolTip(calibration, tool, errors=without_periodic_errors(robot, calibration.errors))
+    UseConditions(payload=payload).require_valid(robot, prefix="--")
     box = _find_box(calibration, half_side)
     middle, half = tool_at_zero(robot) + 0.5 * box.sum(axis=1), 0.5 * (box[:, 1] - box[:, 0])
     n = middle.size
@@ -151,34 +226,142 @@ def approximate(
     nodes = grid_points(chebyshev_line(most + EXTRA_NODES), n)
     checks = middle + half * check_points(n)
     with _reached(box):
-        tip.reach(middle + half * corners(n))  # fails fast
-        drives, _ = tip.reach(middle + half * nodes)
-        for failure in find_beyond_travel(robot, drives, ["a point"] * len(drives)).values():
-            raise failure
-        expected, passive = tip.reach(checks)
+        states = _reach_states(
+            calibration,
+            tool,
+            payload,
+            corners=middle + half * corners(n),
+            nodes=middle + half * nodes,
+            checks=checks,
+        )
     form = find_nominal_form(robot, middle, half)
-    corrections = drives - form(middle + half * nodes)
-    best = math.inf
+    corrections = states[0].drives - form(middle + half * nodes)
+    change, best = _find_change(states), math.inf
     for degree in range(1, most + 1):
         fit = PolynomialFit(nodes, total_degree(n, degree))
-        inverse = CorrectedInverse(form, fit(middle, half, corrections))
-        error = _tip_error(tip, checks, inverse(checks), start=passive)
-        error = math.inf if error is None else RESERVE * error
+        thermal = None if change is None else change.fitted(fit, middle, half)
+        inverse = CorrectedInverse(form, fit(middle, half, corrections), thermal)
+        error = RESERVE * max(state.error(checks, inverse) for state in states)
         best = min(best, error)
         if error <= within:
-            return Approximation(
-                inverse=inverse,
-                tool=tip.tool,
-                coordinates=tuple(tip.coordinates),
-                achieved=error,
-                checked=len(checks),
-                nominal=_nominal_error(tip, form, checks, calibration.active_offsets),
-                beyond=_error_beyond(tip, inverse, calibration),
-                longer=_error_of_longer_tool(tip, expected, passive),
-            )
+            return _describe(calibration, states, inverse, checks, error, payload)
     raise ExportError(
         f"no polynomial of a degree up to {most} keeps the tool within {within / UM:g} µm "
         f"over {describe_box(box)}; the best of them reaches {rounded_up(best / UM)} µm"
+    )
+
+
+def _reach_states(
+    calibration: Calibration,
+    tool: ArrayLike,
+    payload: float | None,
+    *,
+    corners: Array,
+    nodes: Array,
+    checks: Array,
+) -> list[_State]:
+    """The machine at the reference temperature first, then over the range of temperatures.
+
+    Args:
+        calibration: The calibration.
+        tool: As for `approximate`.
+        payload: As for `approximate`.
+        corners: Points that are tried first, shape (2^n, n), [m].
+        nodes: Points of the fit, shape (n_nodes, n), [m].
+        checks: Points at which errors are evaluated, shape (n_checks, n), [m].
+
+    Raises:
+        ClosureError: If a point is out of reach.
+    """
+    robot = calibration.robot
+    errors = without_periodic_errors(robot, calibration.errors)
+    states: list[_State] = []
+    near: tuple[Array | None, Array | None] = (None, None)
+    for temperature in _list_temperatures(robot):
+        conditions = UseConditions(temperature=temperature, payload=payload)
+        tip = ToolTip(calibration, tool, errors=errors, conditions=conditions)
+        if not states:
+            tip.reach(corners)  # fails fast
+        fitted, checked = (
+            tip.reach(points, start=start)
+            for points, start in zip((nodes, checks), near, strict=True)
+        )
+        labels = ["a point"] * len(nodes)
+        for failure in find_beyond_travel(robot, fitted[0], labels).values():
+            raise failure
+        near = np.hstack(fitted), np.hstack(checked)
+        states.append(_State(temperature, tip, fitted[0], *checked))
+    return states
+
+
+def _list_temperatures(robot: Robot) -> list[float | None]:
+    """Reference temperature, then those of the range and between them, [°C]; None without one."""
+    use = stated_use(robot)
+    if use is None or use["temperature"] is None:
+        return [None]
+    reference, (low, high) = neutral_values(robot)["temperature"], use["temperature"]
+    ends = (
+        max(min(low, reference - WARMER), LOWEST_C),
+        min(max(high, reference + WARMER), HIGHEST_C),
+    )
+    return [reference, *(t for end in ends for t in (end, 0.5 * (end + reference)))]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Change:
+    """Change of the drive coordinates at the nodes with temperature."""
+
+    temperatures: Array
+    """The reference first, [°C]."""
+    per_kelvin: Array
+    """Shape (n_nodes, n_drives), [m/K, rad/K]."""
+
+    def fitted(self, fit: PolynomialFit, middle: Array, half: Array) -> ThermalChange:
+        """The change as a polynomial of a box."""
+        t = self.temperatures
+        limits = float(t[0]), float(t.min()), float(t.max())
+        return ThermalChange(*limits, fit(middle, half, self.per_kelvin))
+
+
+def _find_change(states: Sequence[_State]) -> _Change | None:
+    """The straight line through the reference, the first state, that is nearest to the others."""
+    if states[0].temperature is None:
+        return None
+    temperatures = np.array([s.temperature for s in states], dtype=np.float64)
+    warmer = temperatures - temperatures[0]
+    moved = np.array([s.drives - states[0].drives for s in states])
+    return _Change(temperatures, np.tensordot(warmer, moved, axes=1) / (warmer @ warmer))
+
+
+def _describe(
+    calibration: Calibration,
+    states: Sequence[_State],
+    inverse: CorrectedInverse,
+    checks: Array,
+    error: float,
+    payload: float | None,
+) -> Approximation:
+    """An approximation with its errors; the arguments are those of its making."""
+    first = states[0]
+    loaded, heavier = "payload" in effects_by_condition(calibration.robot), None
+    if loaded:
+        payload = payload or 0.0
+        conditions = UseConditions(temperature=first.temperature, payload=payload + HEAVIER)
+        errors = without_periodic_errors(calibration.robot, calibration.errors)
+        tip = ToolTip(calibration, first.tip.tool, errors=errors, conditions=conditions)
+        heavier = replace(first, tip=tip).error(checks, inverse)
+    return Approximation(
+        inverse=inverse,
+        tool=first.tip.tool,
+        coordinates=tuple(first.tip.coordinates),
+        achieved=error,
+        checked=len(checks),
+        nominal=_nominal_error(first.tip, inverse.nominal, checks, calibration.active_offsets),
+        beyond=_error_beyond(first.tip, inverse, calibration),
+        longer=_error_of_longer_tool(first.tip, first.expected, first.passive),
+        unheated=max((s.error(checks, inverse, cold=True) for s in states[1:]), default=None),
+        payload=payload,
+        heavier=heavier,
     )
 
 

@@ -18,6 +18,7 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.export.linuxcnc.approximation import (
     LETTERS,
     Approximation,
+    ThermalChange,
     millimetres,
     rounded_up,
 )
@@ -54,6 +55,8 @@ def write_core(
     }
     screws = _write_screws(calibration, homes)
     common["functions"] = "sqrt, sin and cos" if screws["periodic"] else "sqrt"
+    thermal = _write_thermal(inverse.thermal, to_joints)
+    common |= {name: thermal.pop(name) for name in ("thermal", "reference", "lowest", "highest")}
     core = {
         **common,
         "title": comment_safe(calibration.session.title) or "session without a title",
@@ -68,6 +71,7 @@ def write_core(
         "coefficient": braced(polynomial.coefficients * to_joints[:, None]),
         "nominal": _write_nominal(inverse.nominal, drives, calibration.active_offsets),
         **screws,
+        **thermal,
     }
     return {
         "orthocal_core.c": fill_template("orthocal_core.c", core),
@@ -81,6 +85,20 @@ def write_component(approximation: Approximation) -> dict[str, str]:
     identity = [k for k in range(len(LETTERS)) if k not in coordinates]
     values = {"commanded": braced(coordinates), "identity": braced(identity)}
     return {"orthocal_kins.c": fill_template("orthocal_kins.c", values)}
+
+
+def _write_thermal(change: ThermalChange | None, to_joints: Array) -> dict[str, object]:
+    """Change of the joints per kelvin, its reference and the limits of the temperature."""
+    if change is None:
+        zeros: dict[str, object] = dict.fromkeys(("reference", "lowest", "highest"), "0.0")
+        return {**zeros, "thermal": 0, "per_kelvin": "{{0.0}}"}
+    return {
+        "thermal": 1,
+        "reference": repr(change.reference),
+        "lowest": repr(change.lowest),
+        "highest": repr(change.highest),
+        "per_kelvin": braced(change.per_kelvin.coefficients * to_joints[:, None]),
+    }
 
 
 def _write_screws(calibration: Calibration, homes: Sequence[JointHome]) -> dict[str, object]:

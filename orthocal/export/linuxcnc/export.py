@@ -39,11 +39,12 @@ OPTIONS = {
     "home_offsets": "--home-offset",
     "latched": "--latched",
     "half_side": "--half-side-mm",
+    "payload": "--payload",
     "module": "--module or --offsets",
 }
 """Fields of ExportOptions to their options on the command line."""
 
-MODULE_OPTIONS = ("within", "tool", "half_side")
+MODULE_OPTIONS = ("within", "tool", "half_side", "payload")
 """Options of a kinematics module alone."""
 
 
@@ -65,6 +66,8 @@ class ExportOptions:
     """Sign of HOME_LATCH_VEL of each joint, 1 or -1; 1 by default. It matters with backlash."""
     half_side: float | None = None
     """Half the side of the module's region around the mechanical zero, [m]."""
+    payload: float | None = None
+    """Mass on the tool beside the platform for which the module holds, [kg]; none by default."""
     module: bool | None = None
     """Whether to write a kinematics module or HOME_OFFSET; by default a module if the calibration
     identified more than offsets."""
@@ -134,6 +137,7 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         within=WITHIN if options.within is None else options.within,
         tool=(0.0, 0.0, 0.0) if options.tool is None else options.tool,
         half_side=options.half_side,
+        payload=options.payload,
     )
     return {
         "README.md": write_module_page(calibration, approximation, homes, stated=stated),

@@ -15,6 +15,7 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.effects.compensation import table_name
 from orthocal.export.linuxcnc.approximation import (
     BEYOND,
+    HEAVIER,
     LETTERS,
     LONGER,
     Approximation,
@@ -161,6 +162,27 @@ def _describe_compensation(homes: Sequence[JointHome], *, stated: bool) -> str:
     return "".join(f"\n{text}\n" for text in texts)
 
 
+def _describe_conditions(approximation: Approximation) -> str:
+    """Paragraphs about temperature and payload; empty for a machine that depends on neither."""
+    texts, change = [], approximation.inverse.thermal
+    if change is not None and approximation.unheated is not None:
+        values = {
+            "reference": f"{change.reference:g}",
+            "lowest": f"{change.lowest:g}",
+            "highest": f"{change.highest:g}",
+            "unheated": rounded_up(approximation.unheated / MM),
+        }
+        texts.append(fill_template("temperature.md", values))
+    if approximation.payload is not None and approximation.heavier is not None:
+        values = {
+            "payload": f"{approximation.payload:g}",
+            "more": f"{HEAVIER:g}",
+            "error": rounded_up(max(approximation.heavier, SMALLEST_ERROR) / UM),
+        }
+        texts.append(fill_template("payload.md", values))
+    return "".join(f"\n{text}" for text in texts)
+
+
 def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, stated: bool) -> str:
     """README.md for offsets that are entered as HOME_OFFSET; `stated` as for the lines."""
     half = {e.drive: expanded_uncertainty(calibration, e) for e in find_entries(calibration)}
@@ -241,7 +263,8 @@ def write_module_page(
         "tool": millimetres(approximation.tool),
         "checked": approximation.checked,
         "nominal": nominal,
-        "compensation": _describe_compensation(homes, stated=stated),
+        "compensation": _describe_compensation(homes, stated=stated)
+        + _describe_conditions(approximation),
         "old_values": f" ({', '.join(old)})" if old else "",
         "last": len(homes) - 1,
         "drives": ", ".join(comment_safe(h.drive) for h in homes),

@@ -24,6 +24,33 @@ static const double half[N] = $half;
 static const unsigned char exponent[TERMS][N] = $exponent;
 static const double coefficient[N][TERMS] = $coefficient;
 
+#if ORTHOCAL_THERMAL
+/* change of these coefficients per kelvin, and kelvins from the reference */
+static const double per_kelvin[N][TERMS] = $per_kelvin;
+static double warmer = 0.0;
+
+void orthocal_set_temperature(double celsius)
+{
+    if (celsius < ORTHOCAL_LOWEST)
+        celsius = ORTHOCAL_LOWEST;
+    else if (celsius > ORTHOCAL_HIGHEST)
+        celsius = ORTHOCAL_HIGHEST;
+    else if (celsius != celsius)
+        celsius = ORTHOCAL_REFERENCE;
+    warmer = celsius - ORTHOCAL_REFERENCE;
+}
+#endif
+
+/* Coefficient of a term in a joint. */
+static double weight(int joint, int term)
+{
+#if ORTHOCAL_THERMAL
+    return coefficient[joint][term] + warmer * per_kelvin[joint][term];
+#else
+    return coefficient[joint][term];
+#endif
+}
+
 /* added to each joint, mm or degrees: half of the backlash, which homing subtracts */
 static const double home[N] = $home;
 
@@ -98,7 +125,7 @@ static int evaluate(const double p[N], double q[N], double (*jacobian)[N])
         for (k = 0; k < N; k++)
             term *= powers[k][exponent[t][k]];
         for (i = 0; i < N; i++)
-            q[i] += coefficient[i][t] * term;
+            q[i] += weight(i, t) * term;
         for (k = 0; jacobian && k < N; k++) {
             double derivative = exponent[t][k] * scale[k];
 
@@ -107,7 +134,7 @@ static int evaluate(const double p[N], double q[N], double (*jacobian)[N])
             for (j = 0; j < N; j++)
                 derivative *= powers[j][exponent[t][j] - (j == k)];
             for (i = 0; i < N; i++)
-                jacobian[i][k] += coefficient[i][t] * derivative;
+                jacobian[i][k] += weight(i, t) * derivative;
         }
     }
     drive(q, jacobian);

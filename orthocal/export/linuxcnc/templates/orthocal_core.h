@@ -5,6 +5,18 @@
 
 #define ORTHOCAL_DRIVES $drives
 
+/* 1 if the joints depend on the temperature */
+#define ORTHOCAL_THERMAL $thermal
+#if ORTHOCAL_THERMAL
+#define ORTHOCAL_REFERENCE $reference
+#define ORTHOCAL_LOWEST $lowest
+#define ORTHOCAL_HIGHEST $highest
+
+/* Temperature of the machine for the calls that follow, degrees Celsius; the reference before the
+   first call. Beyond the limits it is the nearest limit; what is not a number is the reference. */
+void orthocal_set_temperature(double celsius);
+#endif
+
 /* Inverse kinematics: joints for a point of the tool. Returns 0, or -1 if the legs do not reach the
    point; joints are unchanged then. */
 int orthocal_inverse(const double point[ORTHOCAL_DRIVES], double joints[ORTHOCAL_DRIVES]);

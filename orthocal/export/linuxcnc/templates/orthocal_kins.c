@@ -12,6 +12,21 @@
 static const int commanded[N] = $commanded;
 static const int identity[LETTERS - N] = $identity;
 
+#if ORTHOCAL_THERMAL
+static struct {
+    hal_float_t *temperature;
+} *pins;
+
+static void read_pins(void)
+{
+    orthocal_set_temperature(*pins->temperature);
+}
+#else
+static void read_pins(void)
+{
+}
+#endif
+
 static double *coordinate(EmcPose *world, int letter)
 {
     switch (letter) {
@@ -33,6 +48,7 @@ int kinematicsForward(const double *joints, EmcPose *world,
 
     (void)fflags;
     (void)iflags;
+    read_pins();
     for (i = 0; i < N; i++)
         point[i] = *coordinate(world, commanded[i]);
     if (orthocal_forward(joints, point) != 0)
@@ -55,6 +71,7 @@ int kinematicsInverse(const EmcPose *world, double *joints,
 
     (void)iflags;
     (void)fflags;
+    read_pins();
     for (i = 0; i < N; i++)
         point[i] = *coordinate(&pose, commanded[i]);
     if (orthocal_inverse(point, joints) != 0)
@@ -77,11 +94,35 @@ MODULE_LICENSE("Dual BSD/GPL");
 
 static int component;
 
+/* Pins of the module; 0, or less than 0 without memory. */
+static int make_pins(void)
+{
+#if ORTHOCAL_THERMAL
+    int failed;
+
+    pins = hal_malloc(sizeof(*pins));
+    if (!pins)
+        return -1;
+    failed = hal_pin_float_newf(HAL_IN, &pins->temperature, component, "orthocal.temperature");
+    if (failed)
+        return failed;
+    *pins->temperature = ORTHOCAL_REFERENCE;
+#endif
+    return 0;
+}
+
 int rtapi_app_main(void)
 {
+    int failed;
+
     component = hal_init("orthocal_kins");
     if (component < 0)
         return component;
+    failed = make_pins();
+    if (failed) {
+        hal_exit(component);
+        return failed;
+    }
     hal_ready(component);
     return 0;
 }

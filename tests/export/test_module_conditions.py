@@ -1,0 +1,240 @@
+"""Kinematics modules of machines that depend on temperature and payload, compiled and run."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+
+import numpy as np
+import pytest
+from effect_plans import write_plan, write_robot
+from independent import Expansion, IndependentMachine, States
+from linuxcnc import require_linuxcnc, run_programs
+from loaded_orthoglide import settle
+from test_linuxcnc import SWITCH, Core, homes_of, joints_at_switch, joints_of, machine_of
+
+from orthocal import (
+    Choice,
+    ExportOptions,
+    ParameterError,
+    UseConditions,
+    calibrate,
+    export_calibration,
+    load_plan,
+    load_robot,
+    simulate_session,
+)
+from orthocal.calibration.machine import Machine
+from orthocal.effects.compliance import GRAVITY
+from orthocal.export.linuxcnc.approximation import approximate
+from orthocal.export.linuxcnc.c_source import write_component, write_core
+from orthocal.export.linuxcnc.instructions import write_module_page
+
+MM = 1e-3
+JOINTS = {"y_slide": "{counts: down}", "z_slide": "{counts: down, at_zero_mm: 0}"}
+WITHIN = 0.1e-6
+"""Tolerance of the modules, [m]."""
+
+CLOSED = 1e-11
+"""Error of the independent machine's loops, [m]."""
+
+TRUTH = {
+    "x_slide.offset": 1.2 * MM,
+    "y_slide.offset": -0.8 * MM,
+    "y_leg.length": 60e-6,
+    "z_coupler.rx": 1e-3,
+    "legs.expansion": 2e-6,
+    "screws.expansion": -1e-6,
+}
+SCREWS = {"x_slide.screw_sin": 9e-6, "y_slide.screw_cos": -7e-6, "z_slide.screw_sin": 4e-6}
+WARM = "thermal: {reference_C: 22, screws_ppm: 9}"
+TEMPERATURES = (7.0, 13.1, 22.0, 28.7, 37.0)
+"""The module covers 15 K to both sides of the reference."""
+
+
+def points_in_region(count, seed):
+    return np.random.default_rng(seed).uniform(-0.06, 0.06, (count, 3))
+
+
+def drives_of(robot, joints):
+    """Drive coordinates, [m], of LinuxCNC's joints, mm; no offset is active."""
+    columns = zip(robot.drives, (joints * MM).T, strict=True)
+    return np.stack([d.from_joint(j) for d, j in columns], axis=-1)
+
+
+class WarmCore(Core):
+    """A core that depends on the temperature."""
+
+    def warm(self, temperature):
+        self.library.orthocal_set_temperature(ctypes.c_double(temperature))
+        return self
+
+
+def build(tmp_path, known, *, periodic=False, **options):
+    approximation = approximate(known, within=WITHIN, half_side=0.06, **options)
+    files = write_core(known, approximation, homes_of(known))
+    return approximation, WarmCore(tmp_path, files, periodic=periodic)
+
+
+@pytest.mark.parametrize("screws", [False, True], ids=["smooth", "screws"])
+def test_core_reaches_points_at_every_temperature(tmp_path, screws):
+    """On a simulated machine that shares no formula with orthocal."""
+    effects = f"{WARM}, screw: {{lead_mm: 5}}" if screws else WARM
+    folder = write_robot(tmp_path / "machine", effects, joints=JOINTS)
+    errors = TRUTH | (SCREWS if screws else {})
+    known = machine_of(load_robot(folder), errors)
+    approximation, core = build(tmp_path, known, periodic=screws)
+    expansion = Expansion(legs=11.5e-6, screws=9e-6, reference=22.0)
+    machine = IndependentMachine(folder, errors, lead=5 * MM, expansion=expansion)
+    points = points_in_region(60, seed=3)
+    for t in TEMPERATURES:
+        drives = drives_of(known.robot, core.warm(t).inverse(points / MM))
+        states = States(drives, np.zeros_like(drives), np.full(len(drives), t))
+        off = np.linalg.norm(machine.tool(states)[0] - points, axis=1)
+        assert off.max() < approximation.achieved + CLOSED
+        assert (
+            np.abs(core.forward(core.inverse(points / MM), start=[0.0] * 3) * MM - points).max()
+            < 1e-12
+        )
+
+
+def test_core_equals_the_machine_at_many_points(tmp_path):
+    """With the tip of a tool, at points that were neither fitted nor checked."""
+    known = machine_of(load_robot(write_robot(tmp_path / "m", WARM, joints=JOINTS)), TRUTH)
+    approximation, core = build(tmp_path, known)
+    points = points_in_region(2000, seed=4)
+    largest = []
+    for t in TEMPERATURES:
+        drives = drives_of(known.robot, core.warm(t).inverse(points / MM))
+        reached = known.machine.forward(drives, conditions=UseConditions(temperature=t))
+        largest.append(np.linalg.norm(reached - points, axis=1).max())
+    assert max(largest) < approximation.achieved <= WITHIN
+    # a module that does not know the temperature
+    cold = drives_of(known.robot, core.warm(22.0).inverse(points / MM))
+    reached = known.machine.forward(cold, conditions=UseConditions(temperature=37.0))
+    off = np.linalg.norm(reached - points, axis=1).max()
+    assert 20e-6 < off < approximation.unheated < 1.5 * off
+
+
+def test_temperature_is_clamped_and_begins_at_the_reference(tmp_path):
+    known = machine_of(load_robot(write_robot(tmp_path / "m", WARM)), TRUTH)
+    approximation, core = build(tmp_path, known)
+    point = [[30.0, -20.0, 10.0]]
+    first = core.inverse(point)
+    change = approximation.inverse.thermal
+    assert (change.reference, change.lowest, change.highest) == (22.0, 7.0, 37.0)
+    for t, same in ((60.0, 37.0), (-40.0, 7.0), (float("nan"), 22.0), (float("inf"), 37.0)):
+        assert np.array_equal(core.warm(t).inverse(point), core.warm(same).inverse(point))
+    assert np.array_equal(core.warm(22.0).inverse(point), first)
+    assert np.abs(core.warm(37.0).inverse(point) - first).max() > 0.01
+
+
+def test_range_of_use_widens_that_of_the_module(tmp_path):
+    folder = write_robot(tmp_path / "m", WARM)
+    text = (folder / "machine.yaml").read_text()
+    (folder / "machine.yaml").write_text(
+        text.replace("\n  tcp: ", "\n  use: {temperature_C: [10, 45]}\n  tcp: ")
+    )
+    change = approximate(
+        machine_of(load_robot(folder), {}), within=1e-6, half_side=0.05
+    ).inverse.thermal
+    assert (change.lowest, change.highest) == (7.0, 45.0)
+
+
+SOFT = "compliance: {rod_N_per_um: 1, platform_kg: 5}"
+
+
+def test_payload_of_the_module(tmp_path):
+    """The tool comes to rest at the point by least energy of springs and weight."""
+    known = machine_of(load_robot(write_robot(tmp_path / "m", SOFT)), {})
+    approximation, core = build(tmp_path, known, payload=3.0)
+    assert approximation.payload == 3.0
+    weight = np.array([0.0, 0.0, -(5.0 + 3.0) * GRAVITY])
+    points = points_in_region(3, seed=5)
+    for point, drives in zip(
+        points, drives_of(known.robot, core.inverse(points / MM)), strict=True
+    ):
+        tool, _ = settle(drives, stiffness=1e6, weight=weight)
+        assert np.linalg.norm(tool - point) < approximation.achieved + SECOND_ORDER
+        heavier, _ = settle(drives, stiffness=1e6, weight=weight * 9.0 / 8.0)
+        off = np.linalg.norm(heavier - point)
+        assert 1e-6 < off < approximation.heavier < 5.0 * off
+
+
+SECOND_ORDER = 50e-9
+"""Forces of the loaded machine differ from those of the nominal one by 1e-3, [m]."""
+
+
+def test_page_states_temperature_and_payload(tmp_path):
+    robot = load_robot(write_robot(tmp_path / "m", f"{WARM}, {SOFT}"))
+    known = machine_of(robot, TRUTH)
+    known.only_offsets = False
+    approximation = approximate(known, within=1e-6, half_side=0.06, payload=0.5)
+    page = write_module_page(known, approximation, homes_of(known), stated=True)
+    assert "`orthocal.temperature`" in page
+    assert "From 7 to 37 °C" in page
+    assert "for 0.5 kg on the tool" in page
+    unheated = float(re.search(r"Without a thermometer .* up to ([\d.]+) mm", page)[1])
+    assert unheated * MM == pytest.approx(approximation.unheated, rel=0.1)
+    assert "hal_pin_float_newf" in write_component(approximation)["orthocal_kins.c"]
+
+
+def test_machines_that_depend_on_nothing_have_no_pin(tmp_path):
+    known = machine_of(load_robot("orthoglide"), {})
+    approximation = approximate(known, within=1e-6, half_side=0.06)
+    files = write_core(known, approximation, homes_of(known))
+    assert "#define ORTHOCAL_THERMAL 0\n" in files["orthocal_core.h"]
+    assert approximation.unheated is approximation.payload is approximation.heavier is None
+    with pytest.raises(ParameterError) as caught:
+        approximate(known, within=1e-6, payload=1.0)
+    assert caught.value.where == "--payload"
+
+
+@pytest.mark.parametrize("payload", [-1.0, float("nan"), 1e9])
+def test_bad_payloads_are_refused(tmp_path, payload):
+    known = machine_of(load_robot(write_robot(tmp_path / "m", SOFT)), {})
+    with pytest.raises(ParameterError) as caught:
+        approximate(known, within=1e-6, half_side=0.06, payload=payload)
+    assert caught.value.where == "--payload"
+
+
+# ---- LinuxCNC itself
+
+FOLLOWED = 0.2e-6
+"""Tolerance of points at rest, [m]: 0.1 µm of the module, and homing of three drives."""
+
+
+def test_joints_follow_the_pin_in_linuxcnc(tmp_path):
+    """The pin is set while the machine stands still, then while it stands at another point."""
+    require_linuxcnc()
+    plan = load_plan(write_plan(tmp_path / "plan", effects=WARM, joints=JOINTS))
+    truth = {k: v for k, v in TRUTH.items() if k.endswith((".offset", ".expansion"))}
+    session = simulate_session(
+        plan.with_controller(np.array([0.4, -0.1, 0.2]) * MM), truth, exact=True
+    )
+    result = calibrate(session.session, Choice("offsets"), solver="variable-projection")
+    options = ExportOptions(module=True, within=WITHIN)
+    files = export_calibration(result, "linuxcnc", anyway=True, options=options)
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    points = np.array([[25.0, -30.0, 15.0], [-40.0, 10.0, -35.0]])
+    words = [" ".join(f"{c}{v:g}" for c, v in zip("XYZ", p, strict=True)) for p in points]
+    rest = ["M0", "G4 P0.3"]
+    lines = [f"G21 G90 G61 F6000 G1 {words[0]}", *rest * 3, f"G1 {words[1]}", *rest * 2, "M2"]
+    steps = [(0, 22.0, ""), (0, 31.0, "31"), (0, 37.0, "80"), (1, 37.0, ""), (1, 12.5, "12.5")]
+    halcmd = [f"setp orthocal.temperature {t}" if t else "" for *_, t in steps]
+    _, pauses = run_programs(
+        [(lines[:1], lines)],
+        joints_of(result, joints_at_switch(result, SWITCH)),
+        lines=files["kinematics.ini"],
+        module=tmp_path,
+        halcmd=halcmd,
+    )
+    active = result.active_offsets
+    for (at, temperature, _), joints in zip(steps, pauses[0], strict=True):
+        columns = zip(result.robot.drives, joints * MM, active, strict=True)
+        drives = np.array([d.from_joint(j) - a for d, j, a in columns])
+        machine = Machine(result.robot, result.errors)
+        real = machine.forward(drives, conditions=UseConditions(temperature=temperature))
+        assert np.linalg.norm(real - points[at] * MM) < FOLLOWED
+    assert np.abs(pauses[0][1] - pauses[0][0]).max() > 0.01
