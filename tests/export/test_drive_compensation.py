@@ -14,7 +14,7 @@ import pytest
 from effect_plans import write_plan
 from linuxcnc import Joint, require_linuxcnc, run_program
 from programs import read_polyline
-from test_linuxcnc import from_pieces, require_followed
+from test_linuxcnc import Core, from_pieces, require_followed
 
 from orthocal import (
     Choice,
@@ -30,7 +30,7 @@ from orthocal import (
 from orthocal.assessment.controller_entries import offsets_to_enter
 from orthocal.export.approach_sides import ApproachSides, find_lags
 from orthocal.export.correction_field import CorrectionField
-from orthocal.export.linuxcnc.drive_compensation import PeriodicErrors
+from orthocal.export.linuxcnc.drive_compensation import PeriodicErrors, find_periodic_errors
 from orthocal.gcode.interpreter import Interpreter
 from orthocal.gcode.path import Motion, Paths, arc_about
 from orthocal.gcode.program import ProgramCorrector
@@ -102,6 +102,12 @@ def follow(calibration, motors):
     return Machine(load_robot("orthoglide"), rigid).forward(slides)
 
 
+def old_home_offsets(calibration):
+    """HOME_OFFSET of each joint during the measurement, [m]."""
+    drives = zip(calibration.robot.drives, SWITCH, ACTIVE, strict=True)
+    return tuple(float(d.to_joint(s + active)) for d, s, active in drives)
+
+
 def joints_of(calibration):
     drives = zip(calibration.robot.drives, SWITCH, ACTIVE, LATCHED, strict=True)
     return [
@@ -132,7 +138,7 @@ REVERSING = 0.3
 """Distance from a corner, at which drives take up their play within some milliseconds, [mm]."""
 
 
-def run(calibration, files, tmp_path, *, module, inverse=None):
+def run(calibration, files, tmp_path, *, module, inverse=None, homes=None):
     for name, text in files.items():
         (tmp_path / name).write_text(text)
     tables = {name: text for name, text in files.items() if name.endswith(".comp")}
@@ -143,9 +149,12 @@ def run(calibration, files, tmp_path, *, module, inverse=None):
         *(f"G1 X{x:g} Y{y:g} Z{z:g}" for x, y, z in CORNERS[2:]),
     ]
     lines = files["kinematics.ini" if module else "joints.ini"]
+    joints = joints_of(calibration)
+    if homes is not None:
+        joints = [replace(j, home_offset=h / MM) for j, h in zip(joints, homes, strict=True)]
     motors = run_program(
         program,
-        joints_of(calibration),
+        joints,
         lines=lines,
         module=tmp_path if module else inverse,
         files=tables,
@@ -167,10 +176,7 @@ def test_the_module_and_backlash_keep_the_path(calibration, tmp_path):
 def test_tables_and_home_offset_keep_the_path(calibration, tmp_path):
     """With nominal kinematics and offsets: the module of a machine without errors."""
     require_linuxcnc()
-    old = tuple(
-        float(d.to_joint(s + active))
-        for d, s, active in zip(calibration.robot.drives, SWITCH, ACTIVE, strict=True)
-    )
+    old = old_home_offsets(calibration)
     options = ExportOptions(module=False, latched=LATCHED, home_offsets=old)
     files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
     assert sorted(name for name in files if name.endswith(".comp")) == [
@@ -237,32 +243,91 @@ def test_switches_are_latched_in_positive_direction_unless_stated(calibration):
     assert np.abs(np.array(opposite) - home_offsets(lines) - backlash).max() < 5e-3
 
 
-def test_an_export_under_its_own_compensation_changes_nothing(calibration, tmp_path):
-    """A session under the exported tables: HOME_OFFSET then contains their trims already."""
-    old = (0.35, 0.28, 0.02)
+@pytest.fixture(scope="module")
+def under_tables(calibration, tmp_path_factory):
+    """Calibration of a session under exported tables, and its HOME_OFFSET."""
+    folder, old = tmp_path_factory.mktemp("tables"), old_home_offsets(calibration)
     options = ExportOptions(module=False, latched=LATCHED, home_offsets=old)
     files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
     for name, text in files.items():
-        (tmp_path / name).write_text(text)
-    trims = read_ini(tmp_path / "joints.ini", calibration.robot).compensation
-    entered = np.array(home_offsets(files["joints.ini"])) * MM
+        (folder / name).write_text(text)
     record = replace(
         calibration.session,
-        compensation=trims,
+        compensation=read_ini(folder / "joints.ini", calibration.robot).compensation,
         controller_offsets=tuple(offsets_to_enter(calibration).tolist()),
     )
-    under = replace(calibration, session=record)
-    options = ExportOptions(module=False, latched=LATCHED, home_offsets=tuple(entered))
+    entered = tuple(np.array(home_offsets(files["joints.ini"])) * MM)
+    return replace(calibration, session=record), entered
+
+
+def test_an_export_under_its_own_compensation_changes_nothing(under_tables):
+    """A session under the exported tables: HOME_OFFSET then contains their trims already."""
+    under, entered = under_tables
+    options = ExportOptions(module=False, latched=LATCHED, home_offsets=entered)
     again = export_calibration(under, "linuxcnc", anyway=True, options=options)
     assert np.abs(np.array(home_offsets(again["joints.ini"])) * MM - entered).max() < 2e-7
-    core = export_calibration(
-        under,
-        "linuxcnc",
-        anyway=True,
-        options=ExportOptions(module=True, latched=LATCHED, home_offsets=tuple(entered)),
+
+
+def test_module_and_tables_together_are_the_exact_correction(under_tables, tmp_path):
+    """Motors of a controller that adds the tables to the module, on both sides of each drive.
+
+    The exact ones by root finding: a slide follows its screw by half of the backlash.
+    """
+    under, entered = under_tables
+    options = ExportOptions(module=True, within=0.05e-6, latched=LATCHED, home_offsets=entered)
+    files = export_calibration(under, "linuxcnc", anyway=True, options=options)
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    named = re.findall(r"^COMP_FILE = (\S+)\nCOMP_FILE_TYPE = 1$", files["kinematics.ini"], re.M)
+    assert named == [f"joint_{i}_module.comp" for i in range(3)]
+    assert "BACKLASH" not in files["kinematics.ini"]
+    stated = float(
+        re.search(r"entries of a table the error is up to ([\d.]+) µm", files["README.md"])[1]
     )
-    assert "delete COMP_FILE" in core["kinematics.ini"]
-    assert "BACKLASH" in core["kinematics.ini"]
+    assert stated < 0.1
+    core = Core(tmp_path, files, periodic=True)
+    robot, errors = under.robot, under.errors
+    points = np.random.default_rng(1).uniform(-0.05, 0.05, (300, 3))
+    rigid = {n: v for n, v in errors.items() if n.endswith(".offset")}
+    slides = Machine(load_robot("orthoglide"), rigid).inverse(points)
+    joints = core.inverse(points / MM) * MM
+    for i, (d, was) in enumerate(zip(robot.drives, under.session.compensation, strict=True)):
+        table = np.loadtxt(tmp_path / named[i]) * MM
+        latching = 1 if LATCHED[i] > 0 else 2
+        home = entered[i]
+        begin = np.interp(home, was.table[:, 0], was.table[:, latching])
+        begin -= np.interp(home, table[:, 0], table[:, latching])
+        sine, cosine, backlash = (
+            errors[f"{d.name}.{kind}"] for kind in ("screw_sin", "screw_cos", "backlash")
+        )
+        for grew, column in ((1.0, 1), (-1.0, 2)):
+            trim = np.interp(joints[:, i], table[:, 0], table[:, column])
+            motors = d.from_joint(joints[:, i] + begin + trim) - under.active_offsets[i]
+            screws = slides[:, i] + d.direction * grew * 0.5 * backlash
+            turns = 2.0 * np.pi * motors / 10e-3
+            off = motors + sine * np.sin(turns) + cosine * np.cos(turns) - screws
+            assert np.abs(off).max() < stated * 1e-6 + 0.05e-6
+
+
+def test_the_module_and_tables_keep_the_path(under_tables, tmp_path):
+    require_linuxcnc()
+    under, entered = under_tables
+    options = ExportOptions(module=True, within=0.05e-6, latched=LATCHED, home_offsets=entered)
+    files = export_calibration(under, "linuxcnc", anyway=True, options=options)
+    real = run(under, files, tmp_path, module=True, homes=entered)
+    require_followed(from_pieces(real, *PATH), PROMISED, COUNTS)
+
+
+def test_module_with_backlash_states_what_it_leaves(calibration):
+    """The phase of the periodic error, shifted by half of the backlash."""
+    options = ExportOptions(module=True, latched=LATCHED)
+    page = export_calibration(calibration, "linuxcnc", anyway=True, options=options)["README.md"]
+    stated = float(re.search(r"On a side it is off by up to ([\d.]+) µm", page)[1])
+    periodic = find_periodic_errors(calibration.robot, calibration.errors)
+    half = [0.5 * calibration.errors[f"{d.name}.backlash"] for d in calibration.robot.drives]
+    at = np.linspace(0.2, 0.21, 4001)[:, None] * np.ones(3)
+    left = np.abs(periodic.invert(at + half) - periodic.invert(at) - half).max()
+    assert left <= stated * 1e-6 < 1.2 * left
 
 
 def test_screws_are_inverted_exactly():

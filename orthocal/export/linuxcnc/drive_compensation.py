@@ -13,13 +13,15 @@ the display HOME_OFFSET is therefore
 
 where T_l(h_old) is that of the compensation that was active while measuring.
 
-A table of COMP_FILE (type 1) lists T₊ and T₋ over the travel and replaces BACKLASH.
+A table of COMP_FILE (type 1) lists T₊ and T₋ over the travel and replaces BACKLASH. It has at most
+256 entries, so a kinematics module contains the periodic errors, for the middle of both sides, and
+leaves to BACKLASH or COMP_FILE what depends on the side.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,7 +29,7 @@ from numpy.typing import ArrayLike
 from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
 from orthocal.effects.backlash import Backlash
-from orthocal.effects.compensation import JointTrim
+from orthocal.effects.compensation import JointTrim, table_name
 from orthocal.effects.loading import robot_effects
 from orthocal.effects.screw import KINDS, Screw
 from orthocal.errors import ExportError, ParameterError
@@ -111,7 +113,15 @@ class JointCompensation(JointTrim):
     latched: int = 1
     """Sign of HOME_LATCH_VEL."""
     error: float = 0.0
-    """Largest error of the table between its entries, [m]."""
+    """Largest error that it leaves in the joint, [m, rad]: of the table between its entries, or of
+    a backlash that does not follow the periodic error of the screw."""
+    beside_module: bool = False
+    """Whether the table is used with a kinematics module, which contains the periodic errors."""
+
+    def file_name(self, joint: int) -> str:
+        """File name of the table of a joint."""
+        name = table_name(joint)
+        return name.replace(".comp", "_module.comp") if self.beside_module else name
 
     def trim_at_home(self, home: float | None, *, opposite: bool = False) -> float:
         """T_l: trim in the latching direction at HOME_OFFSET, [m, rad].
@@ -219,25 +229,83 @@ def tabulate(
                 f"{d.name} has no limits of travel over which a table of its periodic error "
                 "extends; state them in the URDF"
             )
-
-        def trims(joints: Array, i: int = i, half: float = 0.5 * joint.backlash) -> Array:
-            """Trims of both sides of the joint, shape (n, 2), [m]."""
-            drive = robot.drives[i]
-            wanted = np.tile(robot.drive_zero, (len(joints), 1))
-            wanted[:, i] = drive.from_joint(joints) - offsets[i]
-            columns = []
-            for side in (1.0, -1.0):
-                at = np.array(wanted)
-                at[:, i] += drive.direction * side * half
-                columns.append(drive.direction * (periodic.invert(at) - wanted)[:, i])
-            return np.stack(columns, axis=1)
-
-        low, high = np.sort(d.to_joint(np.array([d.lower, d.upper]) + offsets[i])).tolist()
-        places = np.linspace(low, high, MOST_ENTRIES)
-        between = np.linspace(low, high, CHECKED_BETWEEN * (MOST_ENTRIES - 1) + 1)
-        table = np.column_stack([places, trims(places)])
-        exact = trims(between)
-        linear = np.stack([np.interp(between, places, table[:, k]) for k in (1, 2)], axis=1)
-        error = float(np.abs(linear - exact).max())
-        result.append(JointCompensation(joint.backlash, read_only(table), joint.latched, error))
+        travel = d.to_joint(np.array([d.lower, d.upper]) + offsets[i])
+        trims = _Trims(robot, i, offsets[i], 0.5 * joint.backlash, periodic)
+        result.append(_tabulate_joint(joint, trims, np.sort(travel)))
     return tuple(result)
+
+
+def compensate_beside_module(
+    calibration: Calibration,
+    compensation: Sequence[JointCompensation],
+    before: Sequence[JointCompensation],
+) -> tuple[JointCompensation, ...]:
+    """Compensation of backlash beside a kinematics module that contains the periodic errors.
+
+    A joint that had a table during the measurement has one again, which replaces it. It lists what
+    the module, which does not know the side, cannot contain: the backlash, and the difference of
+    the periodic error on both sides. A table that the model does not describe remains.
+
+    Args:
+        calibration: The calibration.
+        compensation: Compensation of backlash.
+        before: Compensation during the measurement.
+    """
+    robot, offsets = calibration.robot, calibration.active_offsets
+    periodic = find_periodic_errors(robot, calibration.errors)
+    result = []
+    for i, (joint, was) in enumerate(zip(compensation, before, strict=True)):
+        half = 0.5 * joint.backlash
+        if joint.table is None and was.table is not None:
+            trims = _Trims(robot, i, offsets[i], half, periodic, beside_module=True)
+            table = _tabulate_joint(joint, trims, was.table[[0, -1], 0])
+            result.append(replace(table, beside_module=True))
+        elif joint.table is None and periodic is not None:
+            slope = 2.0 * np.pi / periodic.lead * np.hypot(periodic.sine[i], periodic.cosine[i])
+            result.append(replace(joint, error=float(slope) * half))
+        else:
+            result.append(joint)
+    return tuple(result)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trims:
+    """Exact trims of a joint as a function of its position."""
+
+    robot: Robot
+    drive: int
+    """Index of its drive."""
+    offset: float
+    """Offset in the controller, [m, rad]."""
+    half: float
+    """Half of the backlash, [m, rad]."""
+    periodic: PeriodicErrors | None
+    beside_module: bool = False
+    """Whether the commanded position is already corrected for the middle of both sides."""
+
+    def __call__(self, joints: Array) -> Array:
+        """Trims of both sides at positions of the joint, shape (n, 2), [m, rad]."""
+        drive, periodic = self.robot.drives[self.drive], self.periodic
+        commanded = np.tile(self.robot.drive_zero, (len(joints), 1))
+        commanded[:, self.drive] = drive.from_joint(joints) - self.offset
+        wanted = commanded
+        if self.beside_module and periodic is not None:
+            wanted = commanded + periodic(commanded)
+        columns = []
+        for side in (1.0, -1.0):
+            at = np.array(wanted)
+            at[:, self.drive] += drive.direction * side * self.half
+            at = at if periodic is None else periodic.invert(at)
+            columns.append(drive.direction * (at - commanded)[:, self.drive])
+        return np.stack(columns, axis=1)
+
+
+def _tabulate_joint(joint: JointCompensation, trims: _Trims, travel: Array) -> JointCompensation:
+    """A joint with a table of its trims over a range of positions, shape (2,), [m, rad]."""
+    low, high = travel.tolist()
+    places = np.linspace(low, high, MOST_ENTRIES)
+    between = np.linspace(low, high, CHECKED_BETWEEN * (MOST_ENTRIES - 1) + 1)
+    table = np.column_stack([places, trims(places)])
+    exact = trims(between)
+    linear = np.stack([np.interp(between, places, table[:, k]) for k in (1, 2)], axis=1)
+    return replace(joint, table=read_only(table), error=float(np.abs(linear - exact).max()))

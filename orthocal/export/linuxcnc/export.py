@@ -9,12 +9,13 @@ from dataclasses import dataclass, fields
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import find_entries, offsets_to_enter
 from orthocal.calibration.calibration import Calibration
-from orthocal.effects.compensation import compensates_alike, format_table, table_name
+from orthocal.effects.compensation import compensates_alike, format_table
 from orthocal.errors import ExportError, ParameterError
 from orthocal.export.linuxcnc.approximation import approximate
 from orthocal.export.linuxcnc.c_source import write_component, write_core
 from orthocal.export.linuxcnc.drive_compensation import (
     JointCompensation,
+    compensate_beside_module,
     find_compensation,
     find_old_compensation,
     find_periodic_errors,
@@ -99,7 +100,8 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
     Returns:
         README.md, joints.ini and a joint_N.comp for each drive with a periodic error, if the
         calibration identified offsets only, or if they are requested; else README.md,
-        kinematics.ini, orthocal_kins.c, orthocal_core.c and orthocal_core.h.
+        kinematics.ini, orthocal_kins.c, orthocal_core.c and orthocal_core.h, and a
+        joint_N_module.comp for each joint that had a table during the measurement.
 
     Raises:
         ExportError: If there is no offset to enter, or no module meets the tolerance.
@@ -115,20 +117,14 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
             raise ExportError("the calibration identified no offset: there is nothing to enter")
         compensation = tabulate(calibration, compensation, offsets_to_enter(calibration))
         _require_change(calibration, compensation, before)
-        tables = {
-            table_name(i): format_table(joint, drive)
-            for i, (joint, drive) in enumerate(
-                zip(compensation, calibration.robot.drives, strict=True)
-            )
-            if joint.table is not None
-        }
         _require_home_offsets(options, [*before, *compensation])
         homes = find_homes(calibration, compensation, before, old=options.home_offsets)
         return {
             "README.md": write_home_page(calibration, homes, stated=stated),
             "joints.ini": write_home_lines(homes, stated=stated),
-            **tables,
+            **_write_tables(calibration, compensation, before),
         }
+    compensation = compensate_beside_module(calibration, compensation, before)
     if not compensates_alike(compensation, before):
         _require_home_offsets(options, before)
     homes = find_homes(calibration, compensation, before, old=options.home_offsets)
@@ -144,6 +140,21 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         "kinematics.ini": write_module_lines(approximation, homes),
         **write_component(approximation),
         **write_core(calibration, approximation, homes),
+        **_write_tables(calibration, compensation, before),
+    }
+
+
+def _write_tables(
+    calibration: Calibration,
+    compensation: Sequence[JointCompensation],
+    before: Sequence[JointCompensation],
+) -> dict[str, str]:
+    """Texts of the tables of joints by their file names, less those that were active before."""
+    joints = zip(calibration.robot.drives, compensation, before, strict=True)
+    return {
+        joint.file_name(i): format_table(joint, drive)
+        for i, (drive, joint, was) in enumerate(joints)
+        if joint.table is not None and joint.table is not was.table
     }
 
 

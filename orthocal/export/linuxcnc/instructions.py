@@ -12,7 +12,6 @@ from orthocal.assessment.controller_entries import (
     offsets_to_enter,
 )
 from orthocal.calibration.calibration import Calibration
-from orthocal.effects.compensation import table_name
 from orthocal.export.linuxcnc.approximation import (
     BEYOND,
     HEAVIER,
@@ -23,6 +22,7 @@ from orthocal.export.linuxcnc.approximation import (
     rounded_up,
 )
 from orthocal.export.linuxcnc.c_source import fill_template
+from orthocal.export.linuxcnc.drive_compensation import SMALLEST, JointCompensation
 from orthocal.export.linuxcnc.home_offsets import JointHome
 from orthocal.export.linuxcnc.nominal_form import Tangent
 from orthocal.text import comment_safe
@@ -123,7 +123,7 @@ def _compensation_lines(joint: int, home: JointHome) -> list[str]:
     if home.compensation.table is not None:
         if home.compensation.table is home.was.table:
             return []
-        return [f"COMP_FILE = {table_name(joint)}", "COMP_FILE_TYPE = 1"]
+        return [f"COMP_FILE = {home.compensation.file_name(joint)}", "COMP_FILE_TYPE = 1"]
     lines = ["# delete COMP_FILE and COMP_FILE_TYPE"] if home.was.table is not None else []
     backlash = home.compensation.backlash
     if backlash or home.was.backlash:
@@ -151,15 +151,33 @@ def _describe_compensation(homes: Sequence[JointHome], *, stated: bool) -> str:
                 "\nThe + is assumed: no option stated the signs. `--ini FILE` takes them from your "
                 "INI file,\n`--latched` states them."
             )
-    errors = [h.compensation.error for h in homes if h.compensation.error]
-    if errors:
-        error = rounded_up(max(errors) / UM)
+    tables = [h.compensation for h in homes if h.compensation.table is not h.was.table]
+    tables = [c for c in tables if c.table is not None]
+    if any(c.beside_module for c in tables):
+        texts.append(
+            "**Tables:** copy the files `joint_*_module.comp` beside your INI file. They replace\n"
+            "the tables of the measurement. The periodic errors of the screws are in the module;\n"
+            "the tables contain what depends on the side." + _between_entries(tables)
+        )
+    elif tables:
         texts.append(
             "**Periodic error of the screws:** copy the files `joint_*.comp` beside your INI file."
-            f"\nBetween the entries of a table the error is up to {error} µm. A kinematics module "
-            "(`--module`)\ncorrects it exactly."
+            f"{_between_entries(tables)} A kinematics module\n(`--module`) corrects it exactly."
+        )
+    uneven = max((h.compensation.error for h in homes if h.compensation.table is None), default=0.0)
+    if uneven > SMALLEST:
+        texts.append(
+            "**Periodic error of the screws:** the module corrects it for the middle of both\n"
+            f"sides. On a side it is off by up to {rounded_up(uneven / UM)} µm: the backlash "
+            "shifts its phase."
         )
     return "".join(f"\n{text}\n" for text in texts)
+
+
+def _between_entries(tables: Sequence[JointCompensation]) -> str:
+    """Sentence about the error of tables between their entries."""
+    error = max(max(table.error for table in tables), SMALLEST_ERROR)
+    return f"\nBetween the entries of a table the error is up to {rounded_up(error / UM)} µm."
 
 
 def _describe_conditions(approximation: Approximation) -> str:
