@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -71,11 +71,8 @@ def export(
     from orthocal.export.linuxcnc.export import assumes_latching
 
     result = orthocal.load_calibration(calibration)
-    joints = None if ini is None else _read_joints(ini, result)
-    if joints is not None:
-        for option, value in (("--home-offset", home_offset), ("--latched", latched)):
-            if value is not None:
-                raise ParameterError("is stated by --ini, too; give one of them", where=option)
+    stated = {"--home-offset": home_offset, "--latched": latched}
+    joints = None if ini is None else _read_joints(ini, result, stated)
     options = orthocal.ExportOptions(
         within=None if within is None else within * UM,
         tool=None if tool is None else read_vector(tool, "--tool"),
@@ -102,7 +99,8 @@ def _note_payload(calibration: orthocal.Calibration, payload: float | None) -> N
     from orthocal.output.text.conditions import describe_assumed
 
     conditions = orthocal.UseConditions(payload=payload)
-    if assumed := describe_assumed(calibration, conditions, fields=("payload",)):
+    assumed = describe_assumed(calibration, conditions, fields=("payload",))
+    if assumed:
         put_note(assumed)
 
 
@@ -121,15 +119,25 @@ def _refuse_both(out: Path, files: Iterable[str]) -> None:
             )
 
 
-def _read_joints(path: Path, calibration: orthocal.Calibration) -> ControllerJoints:
+def _read_joints(
+    path: Path, calibration: orthocal.Calibration, stated: Mapping[str, str | None]
+) -> ControllerJoints:
     """Joints of an INI file, which compensate what the session of a calibration states.
 
+    Args:
+        path: The INI file.
+        calibration: The calibration.
+        stated: Options that the file replaces, with their values.
+
     Raises:
-        ParameterError: If they compensate something else.
+        ParameterError: If they compensate something else, or such an option is given.
     """
     from orthocal.effects.compensation import compensates_alike
     from orthocal.measurement.files.linuxcnc_ini import read_ini
 
+    for option, value in stated.items():
+        if value is not None:
+            raise ParameterError("is stated by --ini, too; give one of them", where=option)
     joints = read_ini(path, calibration.robot)
     if not compensates_alike(joints.compensation, calibration.session.compensation):
         raise ParameterError(
