@@ -99,7 +99,7 @@ def _note_payload(calibration: orthocal.Calibration, payload: float | None) -> N
     from orthocal.output.text.conditions import describe_assumed
 
     conditions = orthocal.UseConditions(payload=payload)
-    assumed = describe_assumed(calibration, conditions, fields=("payload",))
+    assumed = describe_assumed(calibration, conditions, fields=["payload"])
     if assumed:
         put_note(assumed)
 
