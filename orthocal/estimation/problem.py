@@ -156,21 +156,28 @@ class CalibrationProblem:
     def predict_nominal(self, deviations: Array) -> Array:
         """Readings of the nominal machine, each with the offsets that were active when it was read.
 
+        A mounting that was estimated from wrong readings may miss the rod of the nominal machine.
+        The gauge of such a setup counts as exactly aligned.
+
         Args:
             deviations: Deviations of the mounting of the gauges, shape (n_nuisance,), [SI].
 
         Returns:
             Shape (n_entries,), [m of the first gauge]; NaN out of reach.
         """
-        n = self.n_machine
-        active = (self.robot.drive_zero - self.session.zero_drives)[self.observations.setup]
+        n, setup = self.n_machine, self.observations.setup
+        active = (self.robot.drive_zero - self.session.zero_drives)[setup]
         result = np.empty(self.observations.size)
         for offsets in np.unique(active, axis=0):
             theta = self._theta_at(offsets)
             of_session = np.array_equal(theta, self.active_theta)
             passive = self.active_passive if of_session else self.close(theta, failures={})
-            own = (active == offsets).all(axis=1)
-            result[own] = self.predict(np.append(theta[:n], deviations), passive)[own]
+            rows = (active == offsets).all(axis=1)
+            result[rows] = self.predict(np.append(theta[:n], deviations), passive)[rows]
+            missed = rows & np.isin(setup, setup[rows & np.isnan(result)])
+            if missed.any():
+                aligned = np.append(theta[:n], np.zeros_like(deviations))
+                result[missed] = self.predict(aligned, passive)[missed]
         return result
 
     @cached_property

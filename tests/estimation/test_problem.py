@@ -9,7 +9,7 @@ import pytest
 from derivatives import assert_derivative
 from tolerances import KINEMATICS
 
-from orthocal import load_plan
+from orthocal import load_plan, load_session
 from orthocal.errors import ParameterError, RobotError
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.symbolic_problem import SymbolicProblem
@@ -54,6 +54,24 @@ def test_known_values_are_held(plan):
 def test_what_the_controller_corrects_is_the_reference(exact_plan):
     active = replace(exact_plan, controller_offsets=np.array([1e-3, 2e-3, 3e-3]))
     assert np.array_equal(build_problem(active, model="offsets").active_theta, [1e-3, 2e-3, 3e-3])
+
+
+def test_a_gauge_that_misses_the_nominal_rod_counts_as_aligned(root):
+    """Its mounting was estimated from wrong readings; other setups keep theirs."""
+    session = load_session(root / "examples/workshop")
+    problem = build_problem(session, free=["*.offset"])
+    mounting = 1e-5 * np.ones(problem.n_free - problem.n_machine)
+    before = problem.predict_nominal(mounting)
+    name = next(n for n in problem.free if n.endswith(".lateral"))
+    mounting[problem.free.index(name) - problem.n_machine] = 0.02
+    after = problem.predict_nominal(mounting)
+    of_setup = np.array(
+        [name.split(".")[1] == list(session.setups)[i] for i in problem.observations.setup]
+    )
+    np.testing.assert_array_equal(after[~of_setup], before[~of_setup])
+    aligned = problem.predict_nominal(np.zeros_like(mounting))
+    np.testing.assert_array_equal(after[of_setup], aligned[of_setup])
+    assert not np.array_equal(before[of_setup], aligned[of_setup])
 
 
 def test_readings_depend_on_few_variables(plan):
