@@ -163,7 +163,7 @@ CALIBRATE = f"calibrate {EXPERIMENT}"
         ),
         (
             "docs/planning.md",
-            "The error of the paper's six equations",
+            "The paper's six equations are",
             "study linearisation orthoglide --out out/linearisation",
         ),
     ],

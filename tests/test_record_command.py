@@ -113,7 +113,7 @@ def test_what_is_shown_of_a_setup_and_a_posture(folder, run):
         "Monday: 6 readings in 2 setups on orthoglide; none is recorded yet.",
         "Setup yx, 1 of 2: 3 readings Read: leg x, gauge in y, at 0.5 of its length,",
         "Stand: on the +y side, so that the tip touches at (195.1, 5.5, 40.0) mm in zero, 155.1 mm",
-        "Push the plunger in: the dial must grow. If it falls, type every reading of this setup",
+        "Push the plunger in: the reading must grow. If it falls, reverse the sign of every reading",
         "Dial: -5 to 5 mm, resolution 0.01 mm",
         "Go to zero and align the gauge. Press the plunger in to half of its travel, about 5 mm.",
         "Line 2: yx zero (6 of 6 missing)",
@@ -385,7 +385,7 @@ def test_it_goes_on_where_it_was_left(folder, run):
     assert code == 0
     text = " ".join(out.split())
     assert "3 are recorded" in text
-    assert "This setup has readings: neither stand nor dial may have moved since." in text
+    assert "This setup has readings. If the stand or the dial has moved since" in text
     assert cells(folder) == ["0.10", "0.20", "0.30", "0.40", "0.50", "0.60"]
     assert "State in session.yaml which offsets are active in the controller" in text
     load_session(folder)
@@ -502,7 +502,8 @@ def test_the_planned_approach_and_the_temperature_are_recorded(folder, run):
     assert text.count("Temperature of the machine in °C?") == 2
     assert "Enter leaves it open" in text
     assert "Enter keeps 22.5 °C" in text
-    assert "approach ↓ in the last 2 mm" in text
+    assert "in the last 2 mm the displayed number of the joint grows (↑) or falls (↓)" in text
+    assert "Line 3: yx zero ↓ (4 of 5 missing)" in text
     assert "All 5 readings are recorded." in text
     rows = rows_of(folder)
     assert [r["approach"] for r in rows] == ["ppp", "nnn", "ppp", "ppp", "nnn"]

@@ -76,7 +76,7 @@ def again(
         for d, v in zip(new.robot.drives, new.active_offsets.tolist(), strict=True)
     )
     down = [d.name for d in new.robot.drives if d.direction < 0]
-    sign = f" For joints that count down the sign changes: {', '.join(down)}." if down else ""
+    sign = f" The sign is reversed for joints that count down: {', '.join(down)}." if down else ""
     if amounts:
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
         put_out(f"The machine is expected with these adjustments: {settings}.")

@@ -24,7 +24,7 @@ def check(
     json: Json = False,
     details: Details = False,
 ) -> None:
-    """Check readings for mistakes: signs, units, rows, the gauge.
+    """Check readings for mistakes: signs, units, lines, the gauge.
 
     The verdict is that of `calibrate` on the same readings. Readings that are missing are counted.
 

@@ -464,12 +464,14 @@ def _describe_backlash(result: orthocal.Calibration, lags: Array, *, taken_up: b
         unit, size = DRIVE_UNITS[drive.unit]
         listed.append(f"{drive.name} {format_fixed(2.0 * lag / size, 3)} {unit}")
     if taken_up and result.session.compensation:
-        text = "Where drives reverse, the program takes up what the controller, as stated in the"
-        return f"{text} session, leaves of the backlash: {', '.join(listed)}."
+        text = (
+            "Where drives reverse, the program takes up the backlash that the controller does not"
+        )
+        return f"{text} compensate, as the session states: {', '.join(listed)}."
     if taken_up:
-        text = "The program takes up the backlash of the drives where they reverse; the controller"
-        return f"{text} must not: {', '.join(listed)}."
-    return f"For a controller that takes up the backlash of the drives: {', '.join(listed)}."
+        text = f"Where drives reverse, the program takes up their backlash: {', '.join(listed)}."
+        return f"{text} The controller must not compensate it."
+    return f"The controller must compensate the backlash of the drives: {', '.join(listed)}."
 
 
 def _compensated_lags(result: orthocal.Calibration) -> Array:

@@ -32,10 +32,10 @@ LARGEST_OFFSET = 100.0
 
 QUESTIONS = {
     "--leg-mm": "Leg length, from hinge to hinge of a rod, mm",
-    "--travel-mm": "Travel of a slide, LEAST:LARGEST, mm. Count {leg} (the leg) where the legs "
-    "are parallel to their axes, and more further out",
+    "--travel-mm": "Lowest and highest coordinate of a slide, LEAST:LARGEST, mm. It is {leg} (the "
+    "leg) where the legs are parallel to their axes, and grows outwards",
     "--attachment-mm": "Distance from the tool centre point to the hinges on the platform, mm",
-    "--rods-apart-mm": "Distance of the two rods of a leg, from axis to axis, mm",
+    "--rods-apart-mm": "Distance between the two rods of a leg, from axis to axis, mm",
     "--rod-radius-mm": "Radius of a rod, mm",
     "--counts": "Does the number of a joint go up or down as its slide moves outwards? up or "
     "down, for all or as x,y,z",

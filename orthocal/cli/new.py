@@ -58,11 +58,11 @@ class DimensionOptions:
 
     Args:
         leg_mm (MM): Length of a leg, from hinge to hinge of a rod.
-        travel_mm (LEAST:LARGEST): Travel of a slide; its coordinate is the leg length where the
-            legs are parallel to their axes, and more further out.
+        travel_mm (LEAST:LARGEST): Lowest and highest coordinate of a slide. It is the leg length
+            where the legs are parallel to their axes, and grows outwards.
         attachment_mm (MM): Distance from the tool centre point to the hinges on the platform, along
             the axis.
-        rods_apart_mm (MM): Distance of the axes of a leg's two rods.
+        rods_apart_mm (MM): Distance between the axes of the two rods of a leg.
         rod_radius_mm (MM): Radius of a rod.
         counts (up|down[,...]): Direction in which a joint of the controller counts as its slide
             moves outwards: one for all, or x,y,z.

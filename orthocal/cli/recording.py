@@ -379,7 +379,7 @@ class Dialogue:
         if self._last is not None and self._last >= index:
             self._last = None if self._last == index else self._last - 1
         self._note(
-            f"Deleted: line {row.line}, {row.label_with_cycle}. The other lines keep their numbers."
+            f"Deleted: line {row.line}, {self._text.label(row)}. Other lines keep their numbers."
         )
         self._judge()
         self._ask_for_next()

@@ -269,9 +269,9 @@ class LegIndicator:
             words += f", {self.tip.form} on rod {self.rod}"
         if any(self.beside):
             offset = " ".join(
-                f"{axis}{v / MM:+g}" for axis, v in zip("xyz", self.beside, strict=True) if v
+                f"{axis} {v / MM:+g}" for axis, v in zip("xyz", self.beside, strict=True) if v
             )
-            words += f", {offset} mm from the rod in the mechanical zero"
+            words += f", beside the rod at the mechanical zero: {offset} mm"
         return words
 
     def frames(self, robot: Robot) -> Frames:

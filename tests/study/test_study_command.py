@@ -26,7 +26,7 @@ QUICK = {
 }
 ANSWERS = {
     "accuracy": "Expected tool error after calibration",
-    "linearisation": "The error of the paper's six equations exceeds the resolution",
+    "linearisation": "The paper's six equations are wrong by more than the resolution",
     "sensitivity": "Derivatives of 39 outputs (readings and tool coordinates) by 3 errors",
     "bootstrap": "Scatter of the estimates",
 }

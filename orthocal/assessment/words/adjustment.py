@@ -52,8 +52,8 @@ def describe_gain(plan: AdjustmentPlan) -> list[str]:
             f"Expected tool error with the offsets alone: {tool_mm(plan.before.entered)} RMS."
         )
     lines.append(
-        f"{describe_compensated(plan.before.compensated)} The uncertainty of this calibration "
-        "allows no less."
+        f"{describe_compensated(plan.before.compensated)} No adjustment reaches less, because of "
+        "the uncertainty of this calibration."
     )
     return lines
 

@@ -85,7 +85,8 @@ def _clear_amounts(e: Explanation) -> list[tuple[str, float, float, Unit]]:
 
 def _ambiguous(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding:
     every = (*(anomaly.causes or (anomaly.explanation,)), *anomaly.alternatives)
-    ways = ";\n".join(f"  {_lines(session, e)}{_text(session, e)}" for e in every)
+    texts = dict.fromkeys(f"  {_lines(session, e)}{_text(session, e)}" for e in every)
+    ways = ";\n".join(texts)
     return review(
         "ambiguous",
         f"The readings contradict each other. One of these may have happened:\n{ways}.",
@@ -397,8 +398,8 @@ def _remedy(session: Session, e: Explanation) -> str:
         return f"If so, write {new:+.6g} instead of {old:+.6g}."
     if e.kind == "reversed sign" and e.setups:
         return (
-            "Look at the mounting of the gauge. If a minus was forgotten, reverse the signs; if "
-            "the gauge measured the other way, reverse `direction`."
+            "Look at the mounting of the gauge. If a minus sign was forgotten, reverse the signs. "
+            "If the gauge pointed the other way, reverse `direction` of the setup."
         )
     if e.factor is not None:
         return f"If so, multiply these by {e.factor:.6g}."
@@ -427,15 +428,16 @@ def _remedy(session: Session, e: Explanation) -> str:
 def _repeat(session: Session, *found: Explanation) -> str:
     """Repetition or omission of readings, with the command for the first of them."""
     rows = [session.readings[i] for e in found for i in e.rows]
-    words = "Read it again" if len(rows) == 1 else "Look at these readings, read them again"
+    words = "Read it again" if len(rows) == 1 else "Look at these readings. Read them again"
     file = rows[0].file or session.readings_path
     if file is None or rows[0].line is None:
         return f"{words}, or leave out what is wrong."
     line, path = rows[0].line, printable(shlex.quote(str(file.parent)))
-    which = "" if len(rows) == 1 else ", and so on for each that is wrong"
+    others = "" if len(rows) == 1 else " Other lines likewise."
     return (
-        f"{words}, or leave out what is wrong: `orthocal record {path}`, then "
-        f"`again {line}`, `back {line}` to correct it, or `drop {line}`{which}."
+        f"{words}, or leave out what is wrong. In `orthocal record {path}` the command "
+        f"`again {line}` reads line {line} once more, `back {line}` corrects it, and "
+        f"`drop {line}` deletes it.{others}"
     )
 
 

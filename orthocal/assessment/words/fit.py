@@ -85,8 +85,8 @@ def model_error(
     return note(
         "model error",
         f"After the fit, {row} still deviates by {mm(sigma * factor)} mm, "
-        f"{times(sigma / reference)} {source} ({mm(reference * factor)} mm). These are errors of "
-        "legs, axes and mounting, not noise.",
+        f"{times(sigma / reference)} {source} ({mm(reference * factor)} mm). Errors of legs, "
+        "axes and mounting cause this, not noise.",
         "`orthocal compare` shows whether the readings support a larger model." if larger else "",
         sigma_mm=sigma / MM,
         noise_mm=reference / MM,
@@ -155,7 +155,7 @@ def linearisation_error(p: ParameterEstimate, change: float, std: float) -> Find
     return note(
         "linearisation error",
         f"Linearisation changes the estimates by at most {plain(change * p.edge_factor)} "
-        f"{p.edge_unit} ({p.name}), {change / std:.2g} of its standard deviation.",
+        f"{p.edge_unit} ({p.name}), {change / std:.2g} times its standard deviation.",
         "",
         named(p.name),
         part_of_std=change / std,

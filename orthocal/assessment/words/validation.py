@@ -107,11 +107,11 @@ def describe_repetition(repetition: Repetition, *, new: bool = False, title: str
     """
     r, where = repetition, f" in '{title}'" if title else ""
     numbers = {"rows": float(r.matched), "correlation": r.correlation, "chance": r.chance}
-    size = f"(correlation {r.correlation:.3f} over {r.matched} rows; chance "
+    size = f"(correlation {r.correlation:.3f} over {r.matched} lines; chance "
     size += f"gives as much in {100.0 * r.chance:.2g} % of cases)"
     if r.repeats is None:
-        why = f"the fit absorbs nearly all of the {r.matched} shared rows"
-        why = "too few rows are shared" if r.matched < FEWEST else why
+        why = f"the fit absorbs nearly all of the {r.matched} shared lines"
+        why = "too few lines are shared" if r.matched < FEWEST else why
         text = f"Whether the residuals repeat{where} is unknown: {why}."
         return note("repetition unknown", text, **numbers)
     if r.repeats:

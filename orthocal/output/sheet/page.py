@@ -231,9 +231,10 @@ def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[
         align, go = f"{align}, which is also the first posture", []
     mounting = mounting_steps(gauge.setup.sensor) or (
         f"Mount the gauge on the base, on the {side} side of {target}. Point its plunger to "
-        f"{opposite}. {contact}Contact point, from the tool's mechanical zero: {place} mm.",
-        f"Push the plunger in by hand, towards {side}. The dial must grow. If it falls, write "
-        "every reading of this setup with reversed sign.",
+        f"{opposite}. {contact}Contact point, from the tool centre point at the mechanical zero: "
+        f"{place} mm.",
+        f"Push the plunger in with a finger, towards {side}. The reading must grow. If it falls, "
+        "reverse the sign of every reading of this setup.",
     )
     return [
         f"{align}, {gauge.alignment}: {_joint_list(session.robot, gauge.drives)}.",
@@ -259,7 +260,7 @@ def _gauge_zero(gauge: Gauge, first: Stop) -> str:
     """Instruction for setting the gauge zero."""
     again = " Set it again where the table says so." * (first.role == "subtracted")
     return (
-        f"{set_dial(gauge)} This is the gauge zero: set it here only.{again} Tap the stand. The "
+        f"{set_dial(gauge)} This is the gauge zero: set it here only.{again} Tap the stand: the "
         "hand must come back."
     )
 
@@ -434,8 +435,8 @@ def _contact_rule(motions: Sequence[SetupMotion]) -> str:
     if not any(stop.lift for m in motions for stop in m.stops):
         return f"{rule}."
     return (
-        f"{rule}, except on the ways that the setup names: hold the plunger up there, and let it "
-        "down on the rod in the posture. The stand and the bezel stay as they are."
+        f"{rule}, except during the motions that the setup names. Hold the plunger up during these "
+        "motions, then lower it onto the rod. Do not touch the stand or the bezel."
     )
 
 
@@ -449,9 +450,9 @@ def _approach_rule(session: Session, motions: Sequence[SetupMotion]) -> str:
     )
     if len(arrows) > 1:
         return (
-            "Approach each posture as its arrow shows: ↑ with growing numbers of the joints, ↓ "
-            f"with falling ones{_order_of_arrows(robot, arrows)}. The programs do this in the last "
-            f"{length}. {jog}. If a joint went too far, begin the approach again."
+            f"Approach each posture as its arrows show: in the last {length} the displayed number "
+            f"of the joint grows (↑) or falls (↓).{_order_of_arrows(robot, arrows)} The programs "
+            f"do this. {jog}. If a joint went too far, begin the approach again."
         )
     (arrow,) = arrows
     return (
@@ -464,7 +465,7 @@ def _order_of_arrows(robot: Robot, arrows: Collection[str]) -> str:
     """Meaning of several arrows side by side."""
     if all(len(arrow) == 1 for arrow in arrows):
         return ""
-    return f"; of several arrows one is for each of {', '.join(d.name for d in robot.drives)}"
+    return f" Several arrows are in the order {', '.join(d.name for d in robot.drives)}."
 
 
 def _describe_arrow(robot: Robot, arrow: str) -> str:

@@ -163,8 +163,8 @@ def _how_to_measure(plan: MeasuringPlan) -> list[str]:
     approach = f"Approach every posture from the same side: the last {length} in one direction."
     if any(r.approach for r in plan.session.readings):
         approach = (
-            f"Approach each posture as its arrow shows, in the last {length}: ↑ with growing "
-            "numbers of the joints, ↓ with falling ones. The programs do this."
+            f"Approach each posture as its arrows show: in the last {length} the displayed number "
+            "of the joint grows (↑) or falls (↓). The programs do this."
         )
     return [
         "In each setup mount the gauge so that it touches at `section`. Go to the first posture "

@@ -143,13 +143,13 @@ class RecordingText:
                 "content counts."
             )
         parts.append(
-            "Type the reading of the dial in mm. It is on disk before the next question. `help` "
-            "lists the commands. Lines are those of the sheet and of readings.csv."
+            "Type the reading of the dial in mm. It is stored at once. `help` lists the commands. "
+            "Lines are those of the sheet and of readings.csv."
         )
         length = approach_length(session)
         parts.append(
-            f"Approach each posture as its line states, in the last {length}: ↑ with growing "
-            "numbers of the joints, ↓ with falling ones."
+            f"Approach each posture as its arrows show: in the last {length} the displayed number "
+            "of the joint grows (↑) or falls (↓)."
             if any(r.approach for r in rows)
             else f"Approach every posture from the same side: the last {length} in one direction."
         )
@@ -170,8 +170,8 @@ class RecordingText:
         parts = [f"Read: {setup.sensor.describe()}", self._stand(name), _gauge(session, setup)]
         if any(r.is_read for r in of_setup) and any(r.minus is None for r in of_setup):
             parts.append(
-                "This setup has readings: neither stand nor dial may have moved since. If one has, "
-                "`restart` the setup."
+                "This setup has readings. If the stand or the dial has moved since, `restart` the "
+                "setup."
             )
         else:
             parts.append(
@@ -203,9 +203,16 @@ class RecordingText:
             from_hinge = f", {distances[aligned] / MM:.1f} mm from the hinge on the slide"
         return (
             f"Stand: on the {side} side, so that the tip touches at ({at}) mm in {aligned}"
-            f"{from_hinge}. Push the plunger in: the dial must grow. If it falls, type every "
-            "reading of this setup with reversed sign."
+            f"{from_hinge}. Push the plunger in: the reading must grow. If it falls, reverse "
+            "the sign of every reading of this setup."
         )
+
+    def label(self, row: Reading) -> str:
+        """Setup, posture with the arrows of its approach, and the cycle from the second on."""
+        if row.approach is None:
+            return row.label_with_cycle
+        arrows = describe_approach(self._session.robot, row.approach)
+        return f"{row.setup} {row.posture} {arrows}{f', cycle {row.cycle}' * (row.cycle > 1)}"
 
     def row(self, index: int) -> str:
         """Next reading, and the posture of the machine for it."""
@@ -213,11 +220,7 @@ class RecordingText:
         row = rows[index]
         missing = len(self._recording.missing)
         left = f" ({missing} of {len(rows)} missing)" if missing else ""
-        lines = [self.wrap(f"Line {row.line}: {row.label_with_cycle}{left}")]
-        if row.approach is not None:
-            arrow = describe_approach(self._session.robot, row.approach)
-            length = approach_length(self._session)
-            lines.append(self.wrap(f"approach {arrow} in the last {length}", indent="  "))
+        lines = [self.wrap(f"Line {row.line}: {self.label(row)}{left}")]
         for posture in (row.posture, *([row.minus] if row.minus else [])):
             name = f"{posture}: " if row.minus else ""
             lines.append(self._coordinates(posture, name))
@@ -242,7 +245,7 @@ class RecordingText:
     def confirmation(self, index: int) -> str:
         """Confirmation that a reading is on disk."""
         row = self._recording.rows[index]
-        text = f"Recorded: line {row.line}, {row.label_with_cycle}: {show_mm(row.value)} mm"
+        text = f"Recorded: line {row.line}, {self.label(row)}: {show_mm(row.value)} mm"
         return self.wrap(text, indent="  ")
 
     def prediction(self, index: int, mean: float, std: float) -> str:
@@ -301,7 +304,7 @@ class RecordingText:
         last = len(str(rows[-1].line))
         return "\n".join(
             self.wrap(
-                f"{r.line:>{last}}  {r.label_with_cycle}: ".replace("  ", GLUE * 2)
+                f"{r.line:>{last}}  {self.label(r)}: ".replace("  ", GLUE * 2)
                 + (f"{show_mm(r.value)}{GLUE}mm" if r.is_read else "not read"),
                 indent=" " * (last + 2),
             )

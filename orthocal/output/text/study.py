@@ -334,13 +334,11 @@ def _linearisation_answer(s: LinearisationSummary) -> str:
     methods = {m.name: m for m in s.methods}
     sentences = []
     for name, subject in (
-        ("six", "the paper's six equations"),
-        ("first_order", "the first-order solution"),
+        ("six", "The paper's six equations are"),
+        ("first_order", "The first-order solution is"),
     ):
         if name in methods:
-            sentences.append(
-                _limit_sentence(f"The error of {subject}", methods[name], s.resolution)
-            )
+            sentences.append(_limit_sentence(subject, methods[name], s.resolution))
     converged = [size for size, n in zip(s.sizes, s.steps, strict=True) if n is not None]
     if converged and len(converged) == len(s.sizes):
         most = max(n for n in s.steps if n is not None)
@@ -350,7 +348,7 @@ def _linearisation_answer(s: LinearisationSummary) -> str:
         sentences.append(f"Undamped Gauss-Newton steps converge up to {max(converged):.3g} mm.")
     fails = methods["exact"].fails
     if fails is not None:
-        sentences.append(f"The exact solver fails in a direction from {fails:.3g} mm on.")
+        sentences.append(f"The exact solver fails for some errors of {fails:.3g} mm.")
     if s.measurable is not None and s.measurable < s.sizes[-1]:
         sentences.append(f"Machines can be measured in all directions up to {s.measurable:.3g} mm.")
     return " ".join(sentences)
@@ -358,13 +356,13 @@ def _linearisation_answer(s: LinearisationSummary) -> str:
 
 def _limit_sentence(subject: str, m: MethodErrors, resolution: float) -> str:
     def size(value: float | None) -> str:
-        return "for no size" if value is None else f"from a size of {value:.2g} mm on"
+        return "for no size of the errors" if value is None else f"for errors above {value:.2g} mm"
 
-    noise = f"the standard error ({m.standard_error:.3f} mm) {size(m.exceeds_noise)}."
+    noise = f"by more than the standard error ({m.standard_error:.3f} mm) {size(m.exceeds_noise)}."
     if not resolution > 0.0:
-        return f"{subject} exceeds {noise}"
-    first = f"{subject} exceeds the resolution ({resolution:g} mm) {size(m.exceeds_resolution)}"
-    return f"{first}, {noise}"
+        return f"{subject} wrong {noise}"
+    first = f"by more than the resolution ({resolution:g} mm) {size(m.exceeds_resolution)}"
+    return f"{subject} wrong {first}, and {noise}"
 
 
 def _sensitivity(table: StudyTable, all_rows: bool) -> StudyReport:

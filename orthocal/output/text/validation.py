@@ -22,7 +22,12 @@ from orthocal.output.text.layout import (
 )
 from orthocal.units import MM
 
-DETAILS: tuple[FindingKind, ...] = ("must change", "not significant", "repetition unknown")
+DETAILS: tuple[FindingKind, ...] = (
+    "must change",
+    "not significant",
+    "repetition unknown",
+    "residuals differ",
+)
 """Kinds of findings that are printed only with all readings."""
 
 
