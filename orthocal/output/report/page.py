@@ -13,11 +13,13 @@ from pathlib import Path
 from rich.console import Group
 
 from orthocal.arguments import require_kind
+from orthocal.assessment.circular_deviation import find_circles
 from orthocal.assessment.tool_error import ToolAccuracy, assess_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, OrthocalError, RobotError
 from orthocal.io.files import write_file
 from orthocal.io.html import escape, heading, items, page, paragraph, table
+from orthocal.output.report.circle_plots import plot_circle
 from orthocal.output.report.parameter_plots import (
     plot_correlations,
     plot_linearised,
@@ -103,6 +105,7 @@ def build_report(calibration: Calibration, *, saved: Path | None = None) -> str:
         *_adjustments(calibration, saved),
         ("fit", "Residuals", _fit(calibration)),
         ("residuals", "Readings", _readings(calibration)),
+        *_circles(calibration),
         ("parameters", "Parameters", _parameters(calibration)),
         *([("sensors", "Gauges and sensors", to_markup(sensors))] if sensors else []),
         ("scene", "Scene", _scene(calibration)),
@@ -209,6 +212,19 @@ def _readings(calibration: Calibration) -> str:
     words = "All readings" if every else "The largest"
     few = len(calibration.residuals) <= FEW_ROWS
     return _figure(plot_residuals(calibration), "") + _details(words, listed, shown=few)
+
+
+def _circles(calibration: Calibration) -> list[tuple[str, str, str]]:
+    """Section with the circles of ball bars; none without any."""
+    figures = [
+        _figure(
+            plot_circle(circle),
+            "Deviations of the radius from the least-squares circle, magnified. G: circular "
+            "deviation (ISO 230-4), the range of these deviations.",
+        )
+        for circle in find_circles(calibration)
+    ]
+    return [("circles", "Circular deviation", "".join(figures))] if figures else []
 
 
 def _parameters(calibration: Calibration) -> str:
