@@ -14,7 +14,7 @@ from conftest import ROOT
 import orthocal
 
 BASE = "arrays text arguments errors units runtime io"
-MACHINE = f"{BASE} robot effects kinematics sensors session observation measurement"
+MACHINE = f"{BASE} printers robot effects kinematics sensors session observation measurement"
 ESTIMATE = f"{MACHINE} statistics estimation"
 
 ALLOWED = {
@@ -26,14 +26,15 @@ ALLOWED = {
     "runtime": "text errors",
     "io": "arrays text arguments errors units runtime",
     "gcode": BASE,
+    "printers": BASE,
     "robot": BASE,
     "effects": f"{BASE} robot",
     "builder": f"{BASE} robot effects",
     "kinematics": f"{BASE} robot effects",
     "sensors": f"{BASE} robot effects kinematics",
-    "session": f"{BASE} robot effects kinematics sensors",
-    "observation": f"{BASE} robot effects kinematics sensors session",
-    "measurement": f"{BASE} robot effects kinematics sensors session observation",
+    "session": f"{BASE} printers robot effects kinematics sensors",
+    "observation": f"{BASE} printers robot effects kinematics sensors session",
+    "measurement": f"{BASE} printers builder robot effects kinematics sensors session observation",
     "statistics": f"{BASE} robot observation",
     "estimation": f"{MACHINE} statistics",
     "hypotheses": ESTIMATE,
@@ -41,7 +42,7 @@ ALLOWED = {
     "assessment": f"{ESTIMATE} hypotheses calibration",
     "planning": f"{ESTIMATE} hypotheses assessment",
     "study": f"{ESTIMATE} hypotheses assessment planning",
-    "export": f"{BASE} robot effects kinematics calibration assessment",
+    "export": f"{BASE} printers robot effects kinematics calibration assessment",
     "viewer": f"{BASE} robot",
     "output": f"{ESTIMATE} hypotheses calibration assessment planning study viewer",
     "cli": f"{ESTIMATE} builder hypotheses calibration assessment planning study export gcode "

@@ -139,7 +139,8 @@ def assess(
     placed = find_tool(calibration)
     entries = compute_entries(calibration, placed)
     tool, unreached = _tool(calibration, placed, entries)
-    keep, best = _keeps(calibration, entries, tool), tool
+    firmware = calibration.session.firmware is not None  # its settings correct more than offsets
+    keep, best = not firmware and _keeps(calibration, entries, tool), tool
     if keep:
         entries = tuple(e.kept for e in entries)
         tool, _ = _tool(calibration, placed, entries)
@@ -154,7 +155,7 @@ def assess(
     ]
     findings = rank([*judgement.findings, *notes])
     return Assessment(
-        decision=_decide(findings),
+        decision=_decide(findings, firmware=firmware),
         findings=findings,
         entries=entries,
         tool=tool,
@@ -283,7 +284,7 @@ def expanded_uncertainty(calibration: Calibration, entry: ControllerEntry) -> fl
     return float(calibration.expand(entry.std, entry.std_scatter))
 
 
-def _decide(findings: Sequence[Finding]) -> Decision:
+def _decide(findings: Sequence[Finding], *, firmware: bool) -> Decision:
     """The one decision: the gravest finding decides; nothing against entering means enter."""
     verdict, lead = verdict_of(findings), findings[0]
     if verdict != "enter":
@@ -294,6 +295,8 @@ def _decide(findings: Sequence[Finding]) -> Decision:
             return Decision(verdict, headline, found.text, found.action)
     why = first_of(findings, *EXPLANATIONS)
     reason, action = ("", "") if why is None else (why.text, why.action)
+    if firmware:
+        return Decision(verdict, words.FIRMWARE_HEADLINE, reason, words.FIRMWARE_STEP)
     return Decision(
         verdict, words.HEADLINES[verdict], reason, f"{words.NEXT_STEP} {action}".strip()
     )

@@ -20,6 +20,7 @@ from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.hypotheses.hypothesis import Rows
 from orthocal.measurement.joining import split_sessions
 from orthocal.robot.model import Robot
+from orthocal.sensors.protocol import states_readings
 from orthocal.session.session import Gauge, Session
 from orthocal.statistics.chance import chance_of_excess
 from orthocal.statistics.noise import noise_floor
@@ -161,7 +162,12 @@ def _by_fit(session: Session, problem: CalibrationProblem) -> Iterator[Finding |
 
 
 def _dimensions(session: Session, problem: CalibrationProblem) -> Finding | None:
-    """Postures in which the nominal machine would have moved the gauge far more than it did."""
+    """Postures in which the nominal machine would have moved the gauge far more than it did.
+
+    A sensor whose readings are stated does not move.
+    """
+    if any(states_readings(s.sensor) for s in session.setups.values()):
+        return None
     o = problem.observations
     values = problem.values * problem.noise_ratio
     measured, deviation = (

@@ -288,6 +288,7 @@ def _session_record(session: Session) -> SessionRecord:
         purpose=session.purpose,
         seed=session.seed,
         compensation=session.compensation,
+        firmware=session.firmware,
         adjusted=tuple(session.adjusted.items()),
         parts=tuple(_session_record(part) for part in session.parts),
     )

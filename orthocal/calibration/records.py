@@ -17,6 +17,7 @@ from orthocal.estimation.options import SolverKind
 from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
 from orthocal.io.documents import Count, Number, PositiveInSI, PositiveNumber
 from orthocal.io.fields import CLOSED, Many, Matrix, SizeOrInf, SizeOrNaN, Vector
+from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.description import HEAVIEST_KG
 from orthocal.robot.files import MOST_FILES, is_inner_path
 from orthocal.sensors.protocol import GaugeZero, Sensor
@@ -117,6 +118,8 @@ class SessionRecord:
     """Seed of simulated readings; None for measured readings."""
     compensation: Many[JointTrim] = ()
     """What the controller compensated in the joint of each drive; empty for nothing."""
+    firmware: DeltaSettings | None = None
+    """Settings of the firmware of a delta printer."""
     adjusted: Many[tuple[str, Number]] = ()
     """Mechanical adjustments since the machine was built and their amounts, [m]."""
     parts: Many[SessionRecord] = ()

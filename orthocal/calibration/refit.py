@@ -130,6 +130,7 @@ def restore_session(calibration: Calibration) -> Session:
         ),
         controller_offsets=None if offsets is None else read_only(offsets),
         compensation=record.compensation,
+        firmware=record.firmware,
         adjusted=dict(record.adjusted),
         path=None if record.path is None else Path(record.path),
         readings_path=None if record.readings_path is None else Path(record.readings_path),

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
+
+from typer import Option
 
 import orthocal
-from orthocal.cli.options import Json, SessionPath, command
+from orthocal.cli.options import Json, command
 from orthocal.cli.printing import deliver, put_note, put_out
 from orthocal.errors import SessionError
+from orthocal.io.files import exists
 from orthocal.text import printable, shorten
+from orthocal.units import MM
 
 
 @command(name="import")
 def import_(
     table: Path,
-    session: SessionPath,
+    session: Path,
     sheet: str | None = None,
     decimal: str | None = None,
     separator: str | None = None,
@@ -24,15 +29,24 @@ def import_(
     fill: bool = False,
     replace: bool = False,
     dry_run: bool = False,
+    format: Annotated[str | None, Option("--format")] = None,
+    settings: list[Path] | None = None,
+    radius_mm: float | None = None,
     json: Json = False,
 ) -> None:
-    """Import readings from a spreadsheet into a session.
+    """Import readings from a spreadsheet, or the log of a printer.
 
     Encoding, separator, decimal sign and units are detected. An ambiguous table is refused with
     the option that decides. Rows match those of the session by setup, posture, minus and cycle.
 
+    The log of a delta printer becomes a new session with its robot: heights of the bed that
+    Klipper, Marlin or RepRapFirmware probed. It contains the settings of the firmware, or
+    --settings names their files.
+
     Args:
-        table (TABLE): CSV file of any spreadsheet program, or .xlsx workbook.
+        table (TABLE): CSV file of any spreadsheet program, or .xlsx workbook; or a printer's log.
+        session (SESSION): session.yaml, or the directory that contains it; a new directory for a
+            printer's log.
         sheet: Worksheet of a workbook.
         decimal (comma|point): Decimal sign of the readings.
         separator (semicolon|tab|comma|pipe): Separator of the cells.
@@ -44,9 +58,13 @@ def import_(
         fill: Copy an empty setup or posture from the row above.
         replace: Overwrite existing readings that differ.
         dry_run: Show the result without writing it.
+        format (FIRMWARE): klipper, marlin or reprapfirmware; default: recognised.
+        settings (FILE): Settings that a log lacks, such as printer.cfg, config.g or bed.g.
+        radius_mm (MM): Marlin's log: largest distance from the middle that G33 or G29 probed.
     """
-    from orthocal.output.text.import_report import format_import, format_import_json
-
+    if format or settings or radius_mm is not None or _is_printer_log(table, session):
+        _import_printer(table, session, format, settings or [], radius_mm, dry_run=dry_run)
+        return
     options = orthocal.TableOptions(
         sheet=sheet,
         separator=separator,
@@ -57,6 +75,13 @@ def import_(
         fill=fill,
     )
     result = orthocal.import_readings(table, session, options, overwrite=replace)
+    _show(result, dry_run=dry_run, json=json)
+
+
+def _show(result: orthocal.TableImport, *, dry_run: bool, json: bool) -> None:
+    """Write an import unless it is tried, and print it."""
+    from orthocal.output.text.import_report import format_import, format_import_json
+
     written = result.changes and not dry_run
     if written:
         orthocal.write_import(result)
@@ -71,6 +96,39 @@ def import_(
         put_note("Nothing written (--dry-run)")
     else:
         put_note("Nothing written: the session already has all readings")
+
+
+def _is_printer_log(table: Path, session: Path) -> bool:
+    """True if there is no session to import into, and the file is a printer's log for certain."""
+    from orthocal.measurement.importing.printer_log import recognise_log
+
+    place = session / "session.yaml" if session.suffix not in (".yaml", ".yml") else session
+    return not exists(place) and recognise_log(table) is not None
+
+
+def _import_printer(
+    log: Path,
+    directory: Path,
+    firmware: str | None,
+    settings: list[Path],
+    radius_mm: float | None,
+    *,
+    dry_run: bool,
+) -> None:
+    """Write the session of a printer's log."""
+    from orthocal.measurement.importing.printer_log import import_printer_log, write_printer_import
+    from orthocal.output.text.import_report import describe_printer_import, printer_commands
+
+    radius = None if radius_mm is None else radius_mm * MM
+    result = import_printer_log(log, firmware=firmware, settings=settings, radius=radius)
+    if not dry_run:
+        write_printer_import(result, directory)
+    put_out(printable(describe_printer_import(result), keep="\n"))
+    if dry_run:
+        put_note("Nothing written (--dry-run)")
+        return
+    put_note(f"Wrote {directory}")
+    put_out(printable(printer_commands(result, directory), keep="\n"))
 
 
 def _parse_columns(assignments: list[str]) -> dict[str, str]:

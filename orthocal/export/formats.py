@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable
+from functools import partial
 
 import yaml
 
@@ -14,9 +15,11 @@ from orthocal.assessment.controller_entries import entered_offsets, find_entries
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, ExportError, ParameterError
 from orthocal.export.linuxcnc.export import OPTIONS, ExportOptions, export_linuxcnc
+from orthocal.export.printer import export_printer
 from orthocal.export.urdf import export_urdf
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import even_grid
+from orthocal.printers.firmwares import FIRMWARES
 from orthocal.units import MM, format_fixed, tidy
 
 POINTS_A_SIDE = 7
@@ -83,6 +86,8 @@ EXPORTERS: dict[str, Callable[[Calibration], dict[str, str]]] = {
     "urdf": export_urdf,
 }
 """Formats without options: from a calibration to texts of files by their names."""
+
+EXPORTERS |= {name: partial(export_printer, firmware=name) for name in FIRMWARES}
 
 FORMATS = (*EXPORTERS, "linuxcnc")
 

@@ -66,6 +66,12 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
                 "states the effects {}; another session has {}: choose them".format(*names),
                 where=f"{session.path or 'session'}: calibration.effects",
             )
+        if session.firmware != last.firmware:
+            raise SessionError(
+                "states other settings of the firmware than another session; expected readings "
+                "with the same settings",
+                where=f"{session.path or 'session'}: controller.firmware",
+            )
     tolerances = _join_tolerances(sessions)
     purposes = {s.purpose for s in sessions} - {None}
     parts = [_rename(s, labels) for s, labels in zip(sessions, _labels(sessions), strict=True)]

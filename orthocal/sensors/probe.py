@@ -71,6 +71,7 @@ class Probe(ToolIndicator):
     keys: ClassVar[type[SetupKeys]] = ProbeKeys
     ideal: ClassVar[str] = "on the surface"
     zero: ClassVar[GaugeZero] = "known"
+    states_readings: ClassVar[bool] = True
 
     @classmethod
     def from_keys(cls, keys: Any) -> Probe:  # noqa: ANN401 - of `keys`

@@ -142,6 +142,9 @@ class Sensor(Protocol):
     # mounting_steps: tuple[str, ...], optional: steps that mount it in the alignment posture, for
     # the operator (`mounting_steps`)
 
+    # states_readings: ClassVar[bool], optional: whether readings are stated, not shown, so that
+    # equal ones are no sign of a dial that sticks (`states_readings`)
+
     # zero: ClassVar[GaugeZero], optional: gauge zero of its setups unless they state another one;
     # "free" by default (`default_zero`)
 
@@ -227,3 +230,9 @@ def default_zero(sensor: Sensor) -> GaugeZero:
     """Gauge zero of a sensor's setups that state none."""
     zero: GaugeZero = getattr(sensor, "zero", "free")
     return zero
+
+
+def states_readings(sensor: Sensor) -> bool:
+    """True if readings are stated, not shown, so that equal ones say nothing."""
+    stated: bool = getattr(sensor, "states_readings", False)
+    return stated

@@ -24,6 +24,7 @@ from orthocal.effects.loading import with_effects
 from orthocal.io.documents import Number
 from orthocal.io.fields import CLOSED, read_only
 from orthocal.io.html import paragraph, table
+from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import GaugeZero, Sensor
 from orthocal.units import MM
@@ -239,6 +240,8 @@ class Session:
     """Offsets active in the controller, shape (n_drives,), [m, rad]; None where not stated."""
     compensation: Compensation = ()
     """Backlash and errors of screws that the controller compensates; empty for none."""
+    firmware: DeltaSettings | None = None
+    """Settings of the firmware of a delta printer, in whose coordinates the postures are."""
     adjusted: Mapping[str, float] = field(default_factory=dict)
     """Mechanical adjustments since the machine was built, name to amount, [m]; 0 where absent. The
     errors of the machine are those under these adjustments."""

@@ -20,6 +20,12 @@ HEADLINES: dict[Verdict, str] = {
 }
 """Headlines of the verdicts on a calibration."""
 
+FIRMWARE_HEADLINE = "Write new settings for the firmware, then probe again."
+"""Headline of a calibration of a printer whose firmware takes more than offsets."""
+
+FIRMWARE_STEP = "`orthocal export` writes the settings."
+"""The next step with it."""
+
 KEEP_HEADLINE = "Leave the offsets as they are."
 """Headline of a calibration that changes no offset."""
 

@@ -12,6 +12,7 @@ import numpy as np
 from orthocal.arrays import Indices
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, Tails, sparse_rows
+from orthocal.sensors.protocol import states_readings
 
 FEWEST = 4
 """Readings of a setup below which a tail is not distinguished from an outlier."""
@@ -73,7 +74,8 @@ def _cycle_apart(rows: Rows) -> Family | None:
 def _stuck(rows: Rows, sigma: float) -> Family | None:
     runs: list[Indices] = []
     for indices in rows.setups.values():
-        if not rows.single[indices].all():
+        setup = rows.session.setups[rows.session.readings[indices[0]].setup]
+        if not rows.single[indices].all() or states_readings(setup.sensor):
             continue
         ends = np.flatnonzero(np.append(np.diff(rows.values[indices]) != 0.0, True))
         begins = np.append(0, ends[:-1] + 1)

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from orthocal.effects.adjustment import LARGEST_AMOUNT_MM
 from orthocal.io.documents import Count, Name, Number, PositiveNumber
+from orthocal.printers.settings import DeltaSettings, FirmwareName, Three
 from orthocal.robot.description import HEAVIEST_KG
 from orthocal.sensors.mounting import LARGEST_SCALE
 from orthocal.sensors.protocol import LARGEST_READING
@@ -119,6 +120,40 @@ Trim = Annotated[Number, Field(ge=0.0, le=LARGEST_TRIM)]
 Trims = Annotated[list[Trim], Field(min_length=1, max_length=12)]
 
 
+class FirmwareKeys(_Keys):
+    """Settings of the firmware of a delta printer during the measurement."""
+
+    name: FirmwareName
+    radius_mm: PositiveNumber
+    rods_mm: tuple[PositiveNumber, PositiveNumber, PositiveNumber]
+    angles_deg: Three = (210.0, 330.0, 90.0)
+    homed_mm: Three
+    """Coordinates of the carriages at their endstops."""
+    tilts: tuple[Number, Number] = (0.0, 0.0)
+    """Tilts of the bed, RepRapFirmware only."""
+    probe_mm: Three = (0.0, 0.0, 0.0)
+    """Tip of the probe from the nozzle."""
+
+    @model_validator(mode="after")
+    def _rods_are_longer(self) -> FirmwareKeys:
+        if min(self.rods_mm) <= self.radius_mm:
+            raise ValueError(f"rods_mm|found {self.rods_mm}; expected more than the radius")
+        return self
+
+    def to_settings(self) -> DeltaSettings:
+        """The settings in SI units."""
+        rods, angles, homed, probe = (
+            (a * unit, b * unit, c * unit)
+            for (a, b, c), unit in (
+                (self.rods_mm, MM),
+                (self.angles_deg, DEG),
+                (self.homed_mm, MM),
+                (self.probe_mm, MM),
+            )
+        )
+        return DeltaSettings(self.name, self.radius_mm * MM, rods, homed, angles, self.tilts, probe)
+
+
 class ControllerKeys(_Keys):
     """What the controller corrects: one number per drive of the kind, in their order."""
 
@@ -134,6 +169,8 @@ class ControllerKeys(_Keys):
     """Of revolute drives."""
     comp_file: Annotated[list[str | None], Field(min_length=1, max_length=12)] | None = None
     """Table of trims for each drive (COMP_FILE of LinuxCNC, type 1); null for none."""
+    firmware: FirmwareKeys | None = None
+    """Firmware of a delta printer, in whose coordinates the postures are."""
 
     @property
     def stated(self) -> list[str]:

@@ -31,6 +31,7 @@ from orthocal.measurement.files.readings_file import read_rows
 from orthocal.measurement.files.schema import MOST_READINGS, CalibrationKeys, GaugeKeys, SessionKeys
 from orthocal.measurement.files.session_robot import (
     build_compensation,
+    build_firmware,
     build_offsets,
     build_postures,
     require_given_zero,
@@ -295,6 +296,7 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
     where = f"{file}: controller"
     offsets = build_offsets(keys.controller, robot, where)
     compensation = build_compensation(keys.controller, robot, folder=file.parent, where=where)
+    firmware = build_firmware(keys.controller, robot, where)
     for name in keys.adjusted_mm:
         require_adjustment(robot, name, where=f"{file}: adjusted_mm", error=SessionError)
     gauges = {name: g.to_gauge() for name, g in keys.named_gauges.items()}
@@ -324,6 +326,7 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
         readings=(),
         controller_offsets=offsets,
         compensation=compensation,
+        firmware=firmware,
         adjusted={name: amount * MM for name, amount in keys.adjusted_mm.items()},
         path=file,
         purpose=purpose,

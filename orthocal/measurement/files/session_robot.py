@@ -20,6 +20,7 @@ from orthocal.measurement.files.schema import (
     PostureKeys,
     SessionKeys,
 )
+from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.model import Robot
 from orthocal.session.session import Posture, PostureForm
 from orthocal.units import DRIVE_UNITS, MM, Unit
@@ -170,6 +171,22 @@ def build_compensation(
         for name, drive in zip(names, robot.drives, strict=True)
     )
     return tuple(JointTrim(float(v), table) for v, table in zip(values, tables, strict=True))
+
+
+def build_firmware(keys: ControllerKeys | None, robot: Robot, where: str) -> DeltaSettings | None:
+    """Settings of the firmware of a delta printer; None where not stated.
+
+    Raises:
+        SessionError: If the robot does not have three drives along lines.
+    """
+    if keys is None or keys.firmware is None:
+        return None
+    if [d.unit for d in robot.drives] != ["m"] * 3:
+        raise SessionError(
+            f"{robot.name} is no delta printer; expected a robot with three slides",
+            where=f"{where}.firmware",
+        )
+    return keys.firmware.to_settings()
 
 
 def _read_drive_values(

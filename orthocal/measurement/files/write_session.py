@@ -28,13 +28,14 @@ from orthocal.measurement.files.readings_file import (
     format_readings,
 )
 from orthocal.observation.conditions import needed_conditions
+from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.loading import packaged_robots, robot_digest
 from orthocal.robot.model import Robot
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import default_zero
 from orthocal.sensors.registry import write_sensor
 from orthocal.session.session import Conditions, Gauge, Posture, Purpose, Reading, Session, Setup
-from orthocal.units import DRIVE_UNITS, MM, tidy, to_mm, trim_zeros
+from orthocal.units import DEG, DRIVE_UNITS, MM, tidy, to_mm, trim_zeros
 
 
 def session_document(session: Session) -> dict[str, Any]:
@@ -58,7 +59,7 @@ def session_document(session: Session) -> dict[str, Any]:
     }
     if payload := _payload(session):
         document["payload_kg"] = payload
-    if session.controller_offsets is not None or session.compensation:
+    if session.controller_offsets is not None or session.compensation or session.firmware:
         document["controller"] = _controller_document(session)
     if session.adjusted:
         document["adjusted_mm"] = {n: tidy(v / MM) for n, v in session.adjusted.items()}
@@ -127,9 +128,9 @@ def _calibration_document(session: Session) -> dict[str, Any]:
     return document if chosen is None else document | {"effects": list(chosen)}
 
 
-def _controller_document(session: Session) -> dict[str, list[Any]]:
+def _controller_document(session: Session) -> dict[str, Any]:
     """Offsets of prismatic drives in mm, of revolute ones in mrad, and what is compensated."""
-    document: dict[str, list[Any]] = {}
+    document: dict[str, Any] = {}
     if session.controller_offsets is not None:
         for drive, offset in zip(session.robot.drives, session.active_offsets, strict=True):
             key = "offsets_mm" if drive.unit == "m" else "offsets_mrad"
@@ -143,7 +144,22 @@ def _controller_document(session: Session) -> dict[str, list[Any]]:
             None if joint.table is None else table_name(i)
             for i, joint in enumerate(session.compensation)
         ]
+    if session.firmware is not None:
+        document["firmware"] = _firmware_document(session.firmware)
     return document
+
+
+def _firmware_document(settings: DeltaSettings) -> dict[str, Any]:
+    """Settings of the firmware of a delta printer."""
+    return {
+        "name": settings.firmware,
+        "radius_mm": to_mm(settings.radius),
+        "rods_mm": [to_mm(v) for v in settings.rods],
+        "angles_deg": [tidy(v / DEG) for v in settings.angles],
+        "homed_mm": [to_mm(v) for v in settings.homed],
+        "tilts": list(settings.tilts),
+        "probe_mm": [to_mm(v) for v in settings.probe],
+    }
 
 
 def _tables(session: Session) -> dict[str, str]:

@@ -82,7 +82,8 @@ def render_answer(
     assessment = assessment_of(calibration)
     parts: list[RenderableType] = [render_subject(calibration), Text()] if heading else []
     parts += [_decision(assessment.decision), Text()]
-    if assessment.entries and assessment.decision.verdict != "reject":
+    firmware = calibration.session.firmware is not None
+    if assessment.entries and assessment.decision.verdict != "reject" and not firmware:
         parts += [
             _indented(entry_table(calibration)),
             *_entry_notes(calibration, assessment),
@@ -148,6 +149,8 @@ def _tool(calibration: Calibration, assessment: Assessment) -> list[RenderableTy
         unreached = assessment.of_kind("out of reach")
         return [Text(unreached[0].text if unreached else "The tool error is unknown.")]
     texts = [f.text for f in assessment.of_kind("tool error")]
+    if calibration.session.firmware is not None:  # the export states it with its settings
+        texts = []
     return [Text(text) for text in (*texts, *describe_conditions(calibration))]
 
 
@@ -167,7 +170,7 @@ def _listed(calibration: Calibration, assessment: Assessment) -> Sequence[Findin
         for f in assessment.findings
         if (f.severity != "note" or f.kind in LISTED) and f.text != assessment.decision.reason
     ]
-    if assessment.keeps_offsets:
+    if assessment.keeps_offsets or calibration.session.firmware is not None:
         listed = [f for f in listed if f.kind not in ("must change", "not significant")]
     if calibration.only_offsets:  # legs and axes are left out, which matters more
         listed = [f for f in listed if f.kind != "line assumed"]
@@ -183,6 +186,12 @@ def _next_step(
         return decision.action or "none.", ()
     if saved is None:
         return "keep the result by adding `--out DIRECTORY` to this command.", ()
+    firmware = calibration.session.firmware
+    if firmware is not None:
+        directory, new = (quote_path(p) for p in (saved, f"{saved}-{firmware.firmware}"))
+        return "write settings for the firmware; its README says what to expect.", (
+            f"orthocal export {directory} --to {firmware.firmware} --out {new}",
+        )
     directory, new, module = (quote_path(p) for p in (saved, f"{saved}-again", f"{saved}-linuxcnc"))
     correct = (
         not calibration.only_offsets and tool is not None and lowers(tool.entered, tool.compensated)

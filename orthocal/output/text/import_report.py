@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 from orthocal.assessment.wording import counted
@@ -11,7 +13,9 @@ from orthocal.io.tables.cell import column_letters
 from orthocal.io.tables.table import Table
 from orthocal.measurement.files.readings_file import RawReading, is_house
 from orthocal.measurement.importing.import_readings import TableImport
+from orthocal.measurement.importing.printer_log import PrinterImport
 from orthocal.text import runs
+from orthocal.units import DEG, MM
 
 UNIT_SYMBOLS = {"um": "µm"}
 """Symbols of units that have another symbol than their name."""
@@ -168,3 +172,39 @@ def _conditions(row: RawReading) -> dict[str, str | float]:
         "time": row.time,
     }
     return {name: value for name, value in conditions.items() if value != ""}
+
+
+def describe_printer_import(result: PrinterImport) -> str:
+    """Firmware, settings and points of a printer's log, with its notes."""
+    log, mm = result.log, 1.0 / MM
+    s = log.settings
+    rods = ", ".join(f"{v * mm:.3f}" for v in s.rods)
+    stops = ", ".join(f"{v * mm:.3f}" for v in s.endstops)
+    turns = ", ".join(f"{v / DEG:.3f}" for v in s.angles)
+    heights = s.forward(log.carriages)[:, 2] - log.heights + s.probe[2]
+    return "\n".join(
+        [
+            f"{counted(len(log.carriages), 'point')} of a bed, probed with {result.title}",
+            f"  radius     {s.radius * mm:.3f} mm",
+            f"  rods       {rods} mm",
+            f"  towers     {turns}°",
+            f"  endstops   {stops} mm",
+            f"  heights    {heights.min() * mm:+.3f} to {heights.max() * mm:+.3f} mm, as the "
+            "firmware sees them",
+            *log.notes,
+        ]
+    )
+
+
+def printer_commands(result: PrinterImport, directory: Path) -> str:
+    """The next commands after a printer's log."""
+    place, one, new = (
+        shlex.quote(str(p)) for p in (directory, directory / "one", directory / result.firmware)
+    )
+    return "\n".join(
+        [
+            "Next: calibrate, and look at the new settings:",
+            f"  orthocal calibrate {place} --out {one}",
+            f"  orthocal export {one} --to {result.firmware} --out {new}",
+        ]
+    )

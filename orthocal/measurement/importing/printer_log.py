@@ -1,0 +1,163 @@
+"""Import of a printer's log: a robot of the firmware's dimensions, and a session of its bed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from orthocal.builder.families import LinearDelta
+from orthocal.effects.loading import load_robot_content
+from orthocal.errors import SessionError
+from orthocal.io.documents import read_text
+from orthocal.io.fields import read_only
+from orthocal.io.files import exists
+from orthocal.measurement.files.schema import LARGEST_READING_MM
+from orthocal.measurement.files.write_session import write_session
+from orthocal.printers.firmwares import FIRMWARES, find_firmware, require_firmware
+from orthocal.printers.log import PrinterLog
+from orthocal.printers.settings import DeltaSettings, FirmwareName
+from orthocal.robot.model import Robot
+from orthocal.sensors.probe import Probe
+from orthocal.sensors.tool_indicator import Artefact
+from orthocal.session.session import Gauge, Posture, Reading, Session, Setup
+from orthocal.units import MM
+
+ROBOT = "printer"
+
+NOISE = 0.02 * MM
+"""Standard deviation of a probing, [m], with the waviness of a bed between the points."""
+
+TILT = 5e-3
+"""Prior standard deviation of the bed's tilt against the towers, [rad]."""
+
+ROOM = 10 * MM
+"""Travel beyond the endstops and the lowest posture, [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PrinterImport:
+    """A printer's log as a session with its robot; nothing is written."""
+
+    firmware: FirmwareName
+    log: PrinterLog
+    session: Session
+
+    @property
+    def title(self) -> str:
+        """Name of the firmware."""
+        return FIRMWARES[self.firmware].title
+
+
+def recognise_log(path: Path) -> FirmwareName | None:
+    """Firmware of a log where its text is certain; None for any other file."""
+    try:
+        return find_firmware(read_text(path, error=SessionError))
+    except SessionError:
+        return None
+
+
+def import_printer_log(
+    log: str | Path,
+    *,
+    firmware: str | None = None,
+    settings: Sequence[str | Path] = (),
+    radius: float | None = None,
+) -> PrinterImport:
+    """Read the log of a probed bed: triggers, and the settings with which they were taken.
+
+    Args:
+        log: The log: console output, klippy.log, or a printer.cfg with saved heights.
+        firmware: klipper, marlin or reprapfirmware; recognised by default.
+        settings: Files with settings that the log lacks: printer.cfg, config.g, bed.g, M503.
+        radius: Largest distance from the middle that Marlin's G33 or G29 probed, [m].
+
+    Raises:
+        SessionError: Naming the file and line or key, what was found and what was expected.
+    """
+    texts = [read_text(Path(p), error=SessionError) for p in (*settings, log)]
+    text = "\n".join(texts)
+    name = None if firmware is None else require_firmware(firmware, option="--format")
+    name = name or find_firmware(texts[-1]) or find_firmware(text)
+    if name is None:
+        raise SessionError(
+            "is a log of no known firmware, or of several; expected --format "
+            f"{', '.join(FIRMWARES)}",
+            where=str(log),
+        )
+    content = FIRMWARES[name].read_log(text, where=str(log), radius=radius)
+    return PrinterImport(name, content, _session(content, Path(log)))
+
+
+def write_printer_import(result: PrinterImport, folder: str | Path) -> Path:
+    """Write the session and, in a directory within, its robot.
+
+    Returns:
+        Path of the session.yaml.
+
+    Raises:
+        SessionError: If the directory has a session already.
+    """
+    folder = Path(folder)
+    for name in ("session.yaml", "readings.csv", ROBOT):
+        if exists(folder / name):
+            raise SessionError("exists already; choose another directory", where=str(folder / name))
+    return write_session(result.session, folder)
+
+
+def _session(log: PrinterLog, path: Path) -> Session:
+    """Session of a probed bed.
+
+    The nozzle is at the commanded height above the bed where the probe triggers: a printer's owner
+    sets the height of the probe apart. So it has no tolerance, and heights of the bed are absolute.
+    """
+    robot = _robot(log)
+    postures = {
+        f"p{i + 1}": Posture(f"p{i + 1}", "joints", read_only(c), read_only(c))
+        for i, c in enumerate(log.carriages)
+    }
+    x, y, z = log.settings.probe
+    surface = Artefact("plate", direction_std=TILT, form_degree=4)
+    setup = Setup("bed", Probe("-z", surface, (x, y, z), trigger_std=0.0), "", zero="known")
+    readings = tuple(
+        Reading("bed", name, None, 1, float(height), None, None)
+        for name, height in zip(postures, log.heights, strict=True)
+    )
+    limit = LARGEST_READING_MM * MM
+    if np.abs(log.heights).max() > limit:
+        raise SessionError(
+            f"found a height of {np.abs(log.heights).max() / MM:g} mm; expected at most "
+            f"{LARGEST_READING_MM:g} mm",
+            where=str(path),
+        )
+    half = max(5 * MM, float(np.abs(log.heights).max()) + 5 * MM)
+    title = FIRMWARES[log.settings.firmware].title
+    return Session(
+        robot=robot,
+        robot_reference=f"./{ROBOT}",
+        title=f"Probed bed of a delta printer ({title})",
+        source=f"Imported from {path.name}",
+        gauges={"": Gauge(NOISE, None, (-half, half))},
+        postures=postures,
+        setups={"bed": setup},
+        readings=readings,
+        controller_offsets=read_only(np.zeros(3)),
+        firmware=log.settings,
+    )
+
+
+def _robot(log: PrinterLog) -> Robot:
+    """Robot as designed: equal rods, towers 120° apart, the firmware's radius."""
+    machine = _design(log.settings, log.carriages.min(), log.carriages.max())
+    files = {f"{ROBOT}.urdf": machine.urdf(ROBOT), f"{ROBOT}.yaml": machine.yaml()}
+    return load_robot_content(ROBOT, {name: text.encode() for name, text in files.items()})
+
+
+def _design(settings: DeltaSettings, lowest: float, highest: float) -> LinearDelta:
+    """Dimensions by design, with the travel of the carriages."""
+    machine = LinearDelta(rod=round(float(np.mean(settings.rods)), 6), radius=settings.radius)
+    low = max(min(machine.travel[0], lowest - ROOM), MM)
+    high = max(max(settings.homed), highest, machine.height) + ROOM
+    return replace(machine, travel=(round(low, 3), round(high, 3)))

@@ -1,0 +1,1 @@
+"""Firmware of delta printers: kinematics, settings and logs."""

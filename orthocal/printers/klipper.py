@@ -1,0 +1,288 @@
+"""Klipper: settings in printer.cfg, triggers in its log, saved heights and console output.
+
+A stable position is the number of steps of each carriage below its endstop, which does not depend
+on the settings. Sources: klippy/extras/delta_calibrate.py, klippy/extras/probe.py.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from orthocal.arrays import Array
+from orthocal.errors import SessionError
+from orthocal.io.documents import parse_number
+from orthocal.printers.log import (
+    NUMBER,
+    PrinterLog,
+    numbers,
+    place_of,
+    probed_log,
+    require_points,
+    unusual_settings,
+)
+from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings
+from orthocal.units import DEG, MM
+
+DECIMALS = 6
+"""Decimals that Klipper writes itself."""
+
+EXPECTED = (
+    "the end of klippy.log after DELTA_CALIBRATE, a printer.cfg with a section [delta_calibrate], "
+    "or the lines 'probe at X,Y is z=Z' of the console with --settings printer.cfg"
+)
+
+PROBES = ("probe", "bltouch", "smart_effector", "probe_eddy_current", "beacon", "cartographer")
+"""Sections with the offsets of a probe; a name may follow."""
+
+TOWERS = "abc"
+Sections = Mapping[str, Mapping[str, str]]
+Pairs = list[tuple[float, tuple[float, float, float]]]
+"""Heights, [mm], and stable positions, [steps]."""
+
+_RUN = re.compile(
+    r"Calculating delta_calibrate with:\n(?P<heights>\[.*\])\n(?P<distances>\[.*\])\n"
+    r"Initial delta_calibrate parameters: (?P<parameters>\{.*\})"
+)
+_OLD_PROBE = re.compile(rf"probe at ({NUMBER}),({NUMBER}) is z=({NUMBER})")
+_NEW_PROBE = re.compile(rf"probe: at ({NUMBER}),({NUMBER}) bed will contact at z=({NUMBER})")
+
+
+def recognise(text: str) -> bool:
+    """True if a text is of Klipper for certain."""
+    return bool(
+        re.search(r"delta_calibrate|^\[stepper_a\]", text, re.MULTILINE)
+        or _OLD_PROBE.search(text)
+        or _NEW_PROBE.search(text)
+    )
+
+
+def read_log(text: str, *, where: str, radius: float | None = None) -> PrinterLog:
+    """Settings and triggers.
+
+    Args:
+        text: The log, and files with settings.
+        where: Name of the log, for messages.
+        radius: Not used.
+
+    Raises:
+        SessionError: Naming the key or line.
+    """
+    del radius
+    sections = _sections(text)
+    probe = _probe_offset(sections, where)
+    if runs := list(_RUN.finditer(text)):
+        return _read_run(runs[-1], text, probe, where)
+    steps = _saved_heights(sections.get("delta_calibrate", {}), where)
+    if steps is not None:
+        settings = _settings(sections, probe, where)
+        return _with_steps(*steps, settings, _step_lengths(sections, where), where)
+    settings = _settings(sections, probe, where)
+    nozzle = [numbers(m.groups(), where=where, name="probe") for m in _OLD_PROBE.finditer(text)]
+    contacts = [numbers(m.groups(), where=where, name="probe") for m in _NEW_PROBE.finditer(text)]
+    points = np.array([*nozzle, *contacts]).reshape(-1, 3) * MM
+    points[len(nozzle) :] -= settings.probe  # there the point of contact is printed
+    return probed_log(settings, points, where=where, expected=EXPECTED)
+
+
+def _read_run(run: re.Match[str], text: str, probe: Array, where: str) -> PrinterLog:
+    """A calculation in klippy.log, which lists its parameters and triggers."""
+    at = place_of(text, run.start(), where)
+    try:
+        heights, distances, values = (ast.literal_eval(v) for v in run.groups())
+        pairs = [(float(h), (float(a), float(b), float(c))) for h, (a, b, c) in heights]
+        value = {name: float(v) for name, v in values.items()}
+        settings = _with_endstops(
+            value["radius"],
+            [value[f"arm_{k}"] for k in TOWERS],
+            [value[f"angle_{k}"] for k in TOWERS],
+            [value[f"endstop_{k}"] for k in TOWERS],
+            probe,
+            at,
+        )
+        steps = np.array([value[f"stepdist_{k}"] for k in TOWERS]) * MM
+    except (ValueError, SyntaxError, TypeError, KeyError, AttributeError, MemoryError) as e:
+        raise SessionError(
+            f"the calculation of delta_calibrate is damaged ({type(e).__name__}); expected lists "
+            "of heights, distances and parameters as Klipper writes them",
+            where=at,
+        ) from None
+    return _with_steps(pairs, [], len(distances), settings, steps, at)
+
+
+def _with_steps(
+    pairs: Pairs,
+    manual: Pairs,
+    distances: int,
+    settings: DeltaSettings,
+    steps: Array,
+    where: str,
+) -> PrinterLog:
+    """Log from stable positions."""
+    notes = []
+    if distances:
+        notes.append(
+            f"{distances} distances measured on a print are not used: heights of the bed are."
+        )
+    if manual and any(settings.probe[:2]):
+        notes.append(
+            f"{len(manual)} manual heights are not used: they are of the nozzle, beside the probe."
+        )
+    else:
+        pairs = [*manual, *pairs]
+    require_points(len(pairs), where=where, expected=EXPECTED)
+    settings.require_plausible(where=where)
+    stable = np.array([s for _, s in pairs])
+    if stable.shape != (len(pairs), 3) or not np.isfinite(stable).all():
+        raise SessionError("expected three step counts of each height", where=where)
+    if not any(settings.probe):  # no section of a probe: its height is that of its triggers
+        settings = replace(settings, probe=(0.0, 0.0, -pairs[-1][0] * MM))
+    heights = np.array([h for h, _ in pairs]) * MM + settings.probe[2]
+    return PrinterLog(
+        settings,
+        np.array(settings.homed) - stable * steps,
+        heights,
+        (*notes, *unusual_settings(settings)),
+    )
+
+
+def _saved_heights(saved: Mapping[str, str], where: str) -> tuple[Pairs, Pairs, int] | None:
+    """Heights of the probe, manual heights and number of distances; None without any."""
+    found: list[Pairs] = []
+    for prefix in ("height", "manual_height"):
+        pairs: Pairs = []
+        while (key := f"{prefix}{len(pairs)}") in saved:
+            at = f"{where}: [delta_calibrate] {key}_pos"
+            position = numbers(saved.get(f"{key}_pos", "").split(","), where=at, name="steps")
+            if len(position) != 3:
+                raise SessionError(f"found {len(position)} numbers; expected 3", where=at)
+            a, b, c = position
+            pairs.append((_number(saved, key, where, "delta_calibrate"), (a, b, c)))
+        found.append(pairs)
+    count = sum(re.fullmatch(r"distance\d+", key) is not None for key in saved)
+    return (found[0], found[1], count) if found[0] else None
+
+
+def _settings(sections: Sections, probe: Array, where: str) -> DeltaSettings:
+    """Settings of the sections [printer] and [stepper_a] to [stepper_c].
+
+    A tower without arm_length or position_endstop has that of tower a.
+    """
+    steppers = []
+    for k in TOWERS:
+        if f"stepper_{k}" not in sections:
+            raise SessionError(f"has no section [stepper_{k}]; expected {EXPECTED}", where=where)
+        steppers.append({**sections["stepper_a"], **sections[f"stepper_{k}"]})
+    rods, endstops = (
+        [_number(s, key, where, f"stepper_{k}") for k, s in zip(TOWERS, steppers, strict=True)]
+        for key in ("arm_length", "position_endstop")
+    )
+    angles = [
+        _number(sections[f"stepper_{k}"], "angle", where, f"stepper_{k}", default=design / DEG)
+        for k, design in zip(TOWERS, DESIGN_ANGLES, strict=True)
+    ]
+    radius = _number(sections.get("printer", {}), "delta_radius", where, "printer")
+    return _with_endstops(radius, rods, angles, endstops, probe, where)
+
+
+def _with_endstops(
+    radius: float,
+    rods: list[float],
+    angles: list[float],
+    endstops: list[float],
+    probe: Array,
+    where: str,
+) -> DeltaSettings:
+    """Settings from Klipper's values, [mm], [°]."""
+    for rod, k in zip(rods, TOWERS, strict=True):
+        if not 0.0 < radius < rod:
+            raise SessionError(
+                f"delta_radius is {radius:g}, arm_length of tower {k} {rod:g}; expected a radius "
+                "above 0 and rods that are longer",
+                where=where,
+            )
+    homed = [e + math.sqrt(rod**2 - radius**2) for e, rod in zip(endstops, rods, strict=True)]
+    return DeltaSettings(
+        "klipper",
+        radius * MM,
+        (rods[0] * MM, rods[1] * MM, rods[2] * MM),
+        (homed[0] * MM, homed[1] * MM, homed[2] * MM),
+        (angles[0] * DEG, angles[1] * DEG, angles[2] * DEG),
+        probe=(float(probe[0]), float(probe[1]), float(probe[2])),
+    )
+
+
+def _probe_offset(sections: Sections, where: str) -> Array:
+    """Tip of the probe from the nozzle where it triggers, shape (3,), [m]; 0 if not stated."""
+    for name, keys in sections.items():
+        if name.split()[:1] and name.split()[0] in PROBES:
+            x, y, z = (_number(keys, f"{axis}_offset", where, name, default=0.0) for axis in "xyz")
+            return np.array([x, y, -z]) * MM
+    return np.zeros(3)
+
+
+def _step_lengths(sections: Sections, where: str) -> Array:
+    """Travel of a carriage by one step, shape (3,), [m]."""
+    lengths = []
+    for k in TOWERS:
+        keys, name = sections[f"stepper_{k}"], f"stepper_{k}"
+        if "step_distance" in keys:
+            lengths.append(_number(keys, "step_distance", where, name))
+            continue
+        turn, micro = (_number(keys, v, where, name) for v in ("rotation_distance", "microsteps"))
+        full = _number(keys, "full_steps_per_rotation", where, name, default=200.0)
+        gears = re.findall(rf"({NUMBER})\s*:\s*({NUMBER})", keys.get("gear_ratio", ""))
+        ratio = math.prod(float(a) / float(b) for a, b in gears if float(b))
+        if not turn * micro * full * ratio > 0.0:
+            raise SessionError("expected positive numbers", where=f"{where}: [{name}]")
+        lengths.append(turn / (micro * full * ratio))
+    return np.array(lengths) * MM
+
+
+def _number(
+    keys: Mapping[str, str], key: str, where: str, section: str, *, default: float | None = None
+) -> float:
+    """Number of a key.
+
+    Raises:
+        SessionError: If it is missing or no number.
+    """
+    at = f"{where}: [{section}]"
+    if key not in keys:
+        if default is None:
+            raise SessionError(f"has no {key}; expected a number", where=at)
+        return default
+    return parse_number(keys[key], where=at, name=key, error=SessionError)
+
+
+def _sections(text: str) -> dict[str, dict[str, str]]:
+    """Sections of a printer.cfg; keys of the saved part at its end replace those above."""
+    sections: dict[str, dict[str, str]] = {}
+    current: dict[str, str] = {}
+    for line in text.splitlines():
+        bare = re.sub(r"(^|\s)[#;].*", "", re.sub(r"^#\*# ?", "", line)).strip()
+        if head := re.fullmatch(r"\[([\w ]+)\]", bare):
+            current = sections.setdefault(head[1].strip(), {})
+        elif pair := re.fullmatch(r"(\w+)\s*[:=]\s*(.*)", bare):
+            current[pair[1]] = pair[2]
+    return sections
+
+
+def config_lines(settings: DeltaSettings) -> str:
+    """Lines of printer.cfg."""
+    lines = ["[printer]", f"delta_radius: {settings.radius / MM:.{DECIMALS}f}"]
+    towers = zip(TOWERS, settings.endstops, settings.rods, settings.angles, strict=True)
+    for k, endstop, rod, angle in towers:
+        lines += [
+            "",
+            f"[stepper_{k}]",
+            f"position_endstop: {endstop / MM:.{DECIMALS}f}",
+            f"arm_length: {rod / MM:.{DECIMALS}f}",
+            f"angle: {angle / DEG:.{DECIMALS}f}",
+        ]
+    return "\n".join(lines) + "\n"

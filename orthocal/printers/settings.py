@@ -1,0 +1,151 @@
+"""Settings of a delta printer's firmware, and its closed-form kinematics.
+
+The firmware knows three vertical towers at (radius cos φᵢ, radius sin φᵢ) and rods of length Lᵢ.
+The coordinate of a carriage is the height of its hinges above those of the platform with the
+nozzle at height 0:
+
+    hᵢ = √(Lᵢ² − (x − xᵢ)² − (y − yᵢ)²) + z + x τx + y τy
+
+Only RepRapFirmware has the tilts τ. A homed carriage has the coordinate `homed`, from which the
+firmwares' heights and trims of the endstops follow. Sources: klippy/kinematics/delta.py of Klipper,
+Marlin/src/module/delta.cpp of Marlin, LinearDeltaKinematics.cpp of RepRapFirmware.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Field
+
+from orthocal.arrays import Array
+from orthocal.errors import SessionError
+from orthocal.io.documents import Number
+from orthocal.io.fields import CLOSED
+from orthocal.units import DEG, MM
+
+FirmwareName = Literal["klipper", "marlin", "reprapfirmware"]
+
+Positive: TypeAlias = Annotated[Number, Field(gt=0.0)]
+Three: TypeAlias = tuple[Number, Number, Number]
+
+DESIGN_ANGLES = (210 * DEG, 330 * DEG, 90 * DEG)
+"""Directions of the towers a, b and c of every printer as designed, [rad]."""
+
+LARGEST_TURN = 10 * DEG
+"""Largest deviation of a tower from its direction by design, [rad]."""
+
+LARGEST_DIFFERENCE = 0.05
+"""Largest difference of the three rods, relative to their mean. Rods are made in one batch; a
+search without priors may end at rods that differ by a factor of two."""
+
+RODS_PER_RADIUS = (1.2, 5.0)
+"""Smallest and largest ratio of rod and radius."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeltaSettings:
+    """Settings of a firmware."""
+
+    __pydantic_config__ = CLOSED
+
+    firmware: FirmwareName
+    radius: Positive
+    """Horizontal distance of the hinges on carriage and platform, nozzle in the middle, [m]."""
+    rods: tuple[Positive, Positive, Positive]
+    """[m]"""
+    homed: Three
+    """Coordinates of the carriages at their endstops, [m]."""
+    angles: Three = DESIGN_ANGLES
+    """Directions of the towers, [rad]."""
+    tilts: tuple[Number, Number] = (0.0, 0.0)
+    """Tilts of the bed about y and x, [1]; RepRapFirmware only."""
+    probe: Three = (0.0, 0.0, 0.0)
+    """Tip of the probe from the nozzle where it triggers, [m]."""
+
+    @property
+    def towers(self) -> Array:
+        """Positions of the towers, shape (3, 2), [m]."""
+        angles = np.array(self.angles)
+        return self.radius * np.column_stack([np.cos(angles), np.sin(angles)])
+
+    @property
+    def middle(self) -> Array:
+        """Coordinates of the carriages with the nozzle at 0, shape (3,), [m]."""
+        return np.sqrt(np.array(self.rods) ** 2 - self.radius**2)
+
+    @property
+    def endstops(self) -> Array:
+        """Heights of the nozzle at the endstops, shape (3,), [m]: `position_endstop` of Klipper."""
+        return np.array(self.homed) - self.middle
+
+    def inverse(self, points: ArrayLike) -> Array:
+        """Coordinates of the carriages, shape (K, 3), of nozzle positions, shape (K, 3), [m].
+
+        Raises:
+            SessionError: If the rods are too short for a position.
+        """
+        p = np.atleast_2d(np.asarray(points, dtype=np.float64))
+        apart = p[:, None, :2] - self.towers
+        squared = np.array(self.rods) ** 2 - np.sum(apart**2, axis=2)
+        if (squared <= 0.0).any():
+            x, y, z = p[int(np.argmax((squared <= 0.0).any(axis=1)))] / MM
+            raise SessionError(
+                f"the firmware's rods do not reach x {x:g}, y {y:g}, z {z:g} mm; expected a "
+                "position within the radius of the printer"
+            )
+        lifted = p[:, 2] + p[:, :2] @ np.array(self.tilts)
+        return np.asarray(np.sqrt(squared) + lifted[:, None])
+
+    def forward(self, carriages: ArrayLike) -> Array:
+        """Nozzle positions, shape (K, 3), of coordinates of the carriages, shape (K, 3), [m].
+
+        Differences of the three spheres |p − cᵢ|² = Lᵢ² are linear; with x and y as functions of
+        z, the first sphere is a quadratic whose lower root is below the carriages.
+        """
+        h = np.atleast_2d(np.asarray(carriages, dtype=np.float64))
+        t, rods = self.towers, np.array(self.rods)
+        power = np.sum(t**2, axis=1) + h**2 - rods**2
+        across = np.linalg.inv(2.0 * (t[1:] - t[0]))
+        base = (power[:, 1:] - power[:, :1]) @ across.T
+        slope = -2.0 * (h[:, 1:] - h[:, :1]) @ across.T
+        start = base - t[0]
+        a = 1.0 + np.sum(slope**2, axis=1)
+        b = np.sum(start * slope, axis=1) - h[:, 0]
+        c = np.sum(start**2, axis=1) + h[:, 0] ** 2 - rods[0] ** 2
+        z = (-b - np.sqrt(b**2 - a * c)) / a
+        xy = base + slope * z[:, None]
+        return np.column_stack([xy, z - xy @ np.array(self.tilts)])
+
+    def require_plausible(self, *, where: str) -> None:
+        """Refuse settings that no printer has, such as those of a search that went astray.
+
+        Raises:
+            SessionError: Naming the setting; `where` is the file.
+        """
+        mean = float(np.mean(self.rods))
+        for rod, tower in zip(self.rods, "abc", strict=True):
+            if abs(rod - mean) > LARGEST_DIFFERENCE * mean:
+                others = ", ".join(f"{v / MM:g}" for v in self.rods)
+                raise SessionError(
+                    f"the rods of tower {tower} are {rod / MM:g} mm (a, b, c: {others}); expected "
+                    f"rods that differ by at most {100 * LARGEST_DIFFERENCE:g} %: enter the "
+                    "lengths that were measured, not those of a search",
+                    where=where,
+                )
+        low, high = (self.radius * ratio for ratio in RODS_PER_RADIUS)
+        if not low <= mean <= high:
+            raise SessionError(
+                f"rods of {mean / MM:g} mm with a radius of {self.radius / MM:g} mm; expected "
+                f"{low / MM:g} to {high / MM:g} mm",
+                where=where,
+            )
+        for angle, design, tower in zip(self.angles, DESIGN_ANGLES, "abc", strict=True):
+            if abs(angle - design) > LARGEST_TURN:
+                raise SessionError(
+                    f"tower {tower} is at {angle / DEG:g}°; expected {design / DEG:g}° within "
+                    f"{LARGEST_TURN / DEG:g}°",
+                    where=where,
+                )

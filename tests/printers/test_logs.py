@@ -1,0 +1,232 @@
+"""Logs of the firmwares: triggers, settings, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from commands import run_orthocal
+from simulated_printer import Firmware, nominal, rings, write_log, write_settings
+
+from orthocal import load_session
+from orthocal.errors import SessionError
+from orthocal.measurement.importing.printer_log import import_printer_log, write_printer_import
+from orthocal.printers.firmwares import FIRMWARES, find_firmware
+from orthocal.units import MM
+
+PRINTED = 0.01 * MM
+"""[m] Logs have three or four decimals of a mm, and whole steps of 12.5 µm to three decimals."""
+
+
+def odd():
+    """Settings of a printer that was calibrated before."""
+    return Firmware(
+        141.2,
+        np.array([280.0, 280.4, 279.7]),
+        np.array([210.3, 329.8, 90.0]),
+        np.array([317.2, 316.1, 318.0]),
+    )
+
+
+@pytest.fixture
+def probed(tmp_path):
+    """Writes a text into a log and imports it."""
+
+    def read(text, **options):
+        log = tmp_path / "log.txt"
+        log.write_text(text)
+        return import_printer_log(log, **options).log
+
+    return read
+
+
+@pytest.mark.parametrize("firmware", FIRMWARES)
+@pytest.mark.parametrize("m851", [0.0, -1.85])
+def test_carriages_where_the_probe_triggered(probed, firmware, m851):
+    """Travel below the endstops, which no setting changes."""
+    settings, xy = odd(), rings()
+    z = -m851 + 0.3 * np.sin(0.05 * xy[:, 0])
+    text = write_log(firmware, settings, xy, z, m851)
+    assert find_firmware(text) == firmware
+    log = probed(text)
+    travel = np.array(log.settings.homed) - log.carriages
+    expected = settings.travel(np.column_stack([xy, z])) * MM
+    assert np.abs(travel - expected).max() < PRINTED
+    assert log.settings.probe == pytest.approx((0.0, 0.0, m851 * MM))
+    assert np.abs(log.heights).max() < 1e-12
+
+
+def test_console_lines_of_klipper_old_and_new(probed):
+    """Old lines have the nozzle, new ones the point of contact; samples of a point are averaged."""
+    settings = (
+        write_settings("klipper", odd()) + "[probe]\nx_offset: 2\ny_offset: -3\nz_offset: 1\n"
+    )
+    old = probed(
+        settings
+        + "".join(
+            f"// probe at {x},{y} is z={z}\n"
+            for x, y, z in [(0, 0, 1.1), (0, 0, 1.3), (50, 0, 1.2), (0, 50, 0.9)]
+        )
+    )
+    new = probed(
+        settings
+        + "".join(
+            f"// probe: at {x},{y} bed will contact at z={z}\n"
+            for x, y, z in [(2, -3, 0.2), (52, -3, 0.2), (2, 47, -0.1)]
+        )
+    )
+    assert np.abs(old.carriages - new.carriages).max() < 1e-12
+    expected = odd().travel([[0, 0, 1.2], [50, 0, 1.2], [0, 50, 0.9]]) * MM
+    assert np.abs(np.array(old.settings.homed) - old.carriages - expected).max() < 1e-9
+
+
+def test_a_calculation_in_klippy_log(probed):
+    """It holds its own parameters, and heights measured by hand count as they are."""
+    s = odd()
+    parameters = {"radius": s.radius}
+    for i, k in enumerate("abc"):
+        parameters |= {f"angle_{k}": s.angles[i], f"arm_{k}": s.rods[i], f"stepdist_{k}": 0.01}
+        parameters |= {f"endstop_{k}": s.endstops[i]}
+    plain = {k: float(v) for k, v in parameters.items()}
+    points = np.array([[0, 0, 1.5], [50, 0, 1.5], [0, 50, 1.5], [-20, -50, 0.1]])
+    steps = s.travel(points) / 0.01
+    pairs = [
+        (float(p[2]), tuple(map(float, t))) for p, t in zip(points[::-1], steps[::-1], strict=True)
+    ]
+    log = probed(
+        f"Calculating delta_calibrate with:\n{pairs}\n[(74.0, {pairs[0][1]}, {pairs[1][1]})]\n"
+        f"Initial delta_calibrate parameters: {plain}\nCoordinate descent initial error: 1\n"
+    )
+    assert np.abs(log.settings.forward(log.carriages) / MM - points[::-1]).max() < 1e-6
+    assert log.heights == pytest.approx(np.array([-1.4, 0, 0, 0]) * MM)
+    assert "distances" in log.notes[0]
+
+
+def test_tables_of_g33_and_grids(probed):
+    """G33 prints names of towers, a bilinear grid rows from the front to the back."""
+    base = nominal()
+    table = (
+        ">>> G33 P3 V3\nG33 Auto Calibrate\nChecking... AC\n"
+        f".Height:{base.endstops[0]:.2f}    Ex:-0.10  Ey:+0.00  Ez:-0.20    Radius:140.00\n"
+        ".Tower angle :    Tx:+0.00  Ty:+0.00  Tz:+0.00\n"
+        ".    c:+0.011   x:+0.200   y:-0.100   z:+0.300\n"
+        ".             yz:+0.400  zx:-0.500  xy:+0.600\n"
+        "Iteration : 01                                    std dev:0.400\n"
+        ".Height:999.00    Ex:-0.10  Ey:+0.00  Ez:-0.20    Radius:120.00\n"
+        ".Tower angle :    Tx:+0.00  Ty:+0.00  Tz:+0.00\n.    c:+9.000\n"
+    )
+    settings = "M665 L280.00 R140.00 H300\nM666 X-0.1 Y0 Z-0.2\n"
+    with pytest.raises(SessionError) as raised:
+        probed(settings + table)
+    assert raised.value.where == "--radius-mm"
+    log = probed(settings + table, radius=0.08)
+    found = log.settings.forward(log.carriages) / MM
+    angles = np.radians([210, 330, 90, 30, 150, 270])
+    heights = [0.011, 0.2, -0.1, 0.3, 0.4, -0.5, 0.6]
+    xy = np.vstack([[0, 0], 80 * np.column_stack([np.cos(angles), np.sin(angles)])])
+    assert np.abs(found - np.column_stack([xy, heights])).max() < 1e-9
+    lowered = log.settings.endstops - log.settings.endstops[1]
+    assert lowered == pytest.approx(np.array([0.1, 0.0, 0.2]) * MM)
+    grid = "Bilinear Leveling Grid:\n      0      1      2\n"
+    grid += " 0 +9.0 -0.2 +9.0\n 1 +0.1 +0.0 +0.4\n 2 +9 +0.5 +9\n"
+    log = probed(settings + grid, radius=0.06)
+    found = log.settings.forward(log.carriages) / MM
+    assert (
+        np.abs(found - [[0, -60, -0.2], [-60, 0, 0.1], [0, 0, 0], [60, 0, 0.4], [0, 60, 0.5]]).max()
+        < 1e-9
+    )
+    with pytest.raises(SessionError, match="G33 P6"):
+        probed(settings + "G33 P6 V3\n" + table, radius=0.08)
+
+
+def test_reports_of_reprapfirmware(probed):
+    """Replies to M665 and M666 without parameters."""
+    text = (
+        "Diagonals 280.000:280.400:279.700, delta radius 141.200, homed height 317.100, bed radius "
+        "90.0, X 0.300°, Y -0.200°, Z 0.000°\n"
+        "Endstop adjustments X0.10 Y-1.00 Z0.90, tilt X0.30% Y-0.20%\n"
+        "G31 X2 Y3 Z1.5\nG30 P0 X0 Y0 Z-9999\nG30 P2 X0 Y50 Z-9999\nG30 P1 X50 Y0 Z-9999 S-1\n"
+        "G32 bed probe heights: 0.100 0.200 0.300, mean 0.2, deviation from mean 0.1\n"
+    )
+    log = probed(text)
+    expected = Firmware(*vars(odd()).values())
+    expected.tilts = (0.003, -0.002)
+    nozzle = np.array([[-2, -3, 1.6], [48, -3, 1.7], [-2, 47, 1.8]])
+    travel = np.array(log.settings.homed) - log.carriages
+    assert np.abs(travel - expected.travel(nozzle) * MM).max() < 1e-9
+
+
+ABSORBING = (
+    "M665 L180.19 R91.5 H240 A6.348 B-2.297 C-3.480 X0 Y0 Z0\nM666 X0 Y0 Z0\n"
+    "Bed X: 0 Y: 0 Z: 0.1\nBed X: 50 Y: 0 Z: 0.2\nBed X: 0 Y: 50 Z: 0.3\n"
+)
+"""Trims of the rods as in Marlin #14910."""
+
+
+def test_trims_that_absorb_other_errors_are_named(probed, tmp_path):
+    log = probed(ABSORBING)
+    assert "absorb" in log.notes[0]
+    assert "+6.158" in log.notes[0]
+    session = import_printer_log(tmp_path / "log.txt").session
+    lengths = [leg.length for leg in session.robot.legs.values()]
+    assert lengths == pytest.approx([0.18038] * 3, abs=1e-5)
+
+
+KLIPPER = write_log("klipper", nominal(), rings()[:4], np.zeros(4), -1.0)
+MARLIN = write_log("marlin", nominal(), rings()[:4], np.zeros(4))
+RRF = write_log("reprapfirmware", nominal(), rings()[:4], np.zeros(4))
+
+
+@pytest.mark.parametrize(
+    ("text", "where", "found"),
+    [
+        ("hello\n", "log.txt", "no known firmware"),
+        (KLIPPER + MARLIN, "log.txt", "several"),
+        (KLIPPER.replace("delta_radius: 140.000000", "delta_radius: x"), "[printer]", "'x'"),
+        (KLIPPER.replace("microsteps: 16", "m: 1"), "[stepper_a]", "microsteps"),
+        (KLIPPER.replace("arm_length: 280.0", "arm_length: 1620.0", 1), "log.txt", "1620"),
+        (KLIPPER.replace("height1_pos = ", "height1_pos = 1,"), "height1_pos", "4 numbers"),
+        (MARLIN.replace("L280.0", "Q280.0"), "log.txt", "M665 L"),
+        (MARLIN.replace("R140.0", "R340.0"), "log.txt", "R 340"),
+        (MARLIN.replace("Bed X: 0.0000", "Bed X: 990.0000"), "log.txt", "x 990"),
+        (MARLIN.replace("Bed X: -", "Bed -"), "log.txt", "probed points"),
+        (RRF.replace("G30 P3", "G30 P2"), "log.txt:", "4 heights of 3 points"),
+        (RRF.replace("heights: 0.0000", "heights: failed"), "log.txt:", "failed"),
+    ],
+)
+def test_what_is_refused_is_named(probed, text, where, found):
+    with pytest.raises(SessionError) as raised:
+        probed(text)
+    assert where in str(raised.value.where)
+    assert found in raised.value.problem
+
+
+def test_the_command_writes_a_session_and_its_robot(tmp_path):
+    log = tmp_path / "printer.cfg"
+    log.write_text(write_log("klipper", odd(), rings(), np.zeros(41), -1.0))
+    done = run_orthocal(tmp_path, "import", log, tmp_path / "bed")
+    assert done.returncode == 0, done.stderr
+    session = load_session(tmp_path / "bed")
+    direct = import_printer_log(log).session
+    assert session.firmware.radius == pytest.approx(direct.firmware.radius)
+    assert len(session.readings) == 41
+    assert run_orthocal(tmp_path, "calibrate", "--help").returncode == 0
+    again = run_orthocal(tmp_path, "import", log, tmp_path / "bed", "--format", "klipper")
+    assert again.returncode == 2
+    assert "exists" in again.stderr
+
+
+def test_nothing_is_written_for_a_wrong_log(tmp_path):
+    log = tmp_path / "log.txt"
+    log.write_text(RRF.replace("G30 P3", "G30 P2"))
+    done = run_orthocal(tmp_path, "import", log, tmp_path / "bed", "--format", "reprapfirmware")
+    assert done.returncode == 2
+    assert not (tmp_path / "bed").exists()
+
+
+def test_settings_may_come_from_another_file(tmp_path):
+    (tmp_path / "printer.cfg").write_text(write_settings("klipper", odd()))
+    log = tmp_path / "console.txt"
+    log.write_text("".join(f"probe at {x:.3f},{y:.3f} is z=0.1\n" for x, y in rings()))
+    result = import_printer_log(log, settings=[tmp_path / "printer.cfg"])
+    write_printer_import(result, tmp_path / "bed")
+    assert load_session(tmp_path / "bed").firmware.rods == pytest.approx((0.28, 0.2804, 0.2797))
