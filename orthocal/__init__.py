@@ -28,6 +28,8 @@ if TYPE_CHECKING:  # the public names; each is imported when it is first used
     from orthocal.assessment.assess import check_session as check_session
     from orthocal.assessment.comparison import Comparison as Comparison
     from orthocal.assessment.comparison import compare_models as compare_models
+    from orthocal.assessment.judgement import Judgement as Judgement
+    from orthocal.assessment.judgement import judge_session as judge_session
     from orthocal.assessment.recommendation import Recommendation as Recommendation
     from orthocal.assessment.recommendation import recommend_model as recommend_model
     from orthocal.assessment.tool_error import ToolAccuracy as ToolAccuracy

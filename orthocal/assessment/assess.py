@@ -69,6 +69,7 @@ def calibrate(
     solver: SolverOptions | SolverKind = "ipopt",
     profile: Sequence[str] = (),
     start: ArrayLike | None = None,
+    judgement: Judgement | None = None,
 ) -> Calibration:
     """Identify the errors of a machine from sessions, and assess the result.
 
@@ -83,6 +84,7 @@ def calibrate(
         profile: Names or globs of free parameters whose profile-likelihood intervals are wanted.
         start: Initial values of the free errors of the machine, shape (n_machine,), [SI]; by
             default the linearised solution.
+        judgement: Of these sessions with these effects and tolerances, if it is known already.
 
     Returns:
         The calibration with its assessment.
@@ -95,10 +97,11 @@ def calibrate(
         TypeError: If an argument is of another kind.
         ValueError: If `start` does not have one number for each free error of the machine.
     """
-    judged = []
+    judged = [] if judgement is None else [judgement]
 
     def find_scale(session: Session) -> ToleranceScale:
-        judged.append(judge_session(session))
+        if not judged:
+            judged.append(judge_session(session))
         return judged[0].tolerance_scale
 
     calibration, session = identify(
@@ -168,11 +171,12 @@ def assessment_of(calibration: Calibration) -> Assessment:
     return calibration.assessment or assess(calibration)
 
 
-def check_session(session: Session) -> Assessment:
+def check_session(session: Session, *, judgement: Judgement | None = None) -> Assessment:
     """The assessment of readings before anything is calibrated from them.
 
     Args:
         session: The session; readings that are missing (NaN) are counted, and the others judged.
+        judgement: Of its readings, if it is known already.
 
     Raises:
         SessionError: If all are missing.
@@ -182,7 +186,7 @@ def check_session(session: Session) -> Assessment:
     if missing:
         require_read(session, partial=True)
         session = session.select([r for r in session.readings if r.is_read])
-    found = judge_session(session)
+    found = judgement or judge_session(session)
     findings = rank([*found.findings, *missing])
     if found.verdict == "enter":
         within = found.tolerance_scale.factor == 1.0

@@ -110,6 +110,7 @@ def compare_models(
     tolerances: Mapping[str, float] | None = None,
     repeat: Given | Sequence[Given] | None = None,
     options: SolverOptions | None = None,
+    judgement: Judgement | None = None,
 ) -> Comparison:
     """Identify a session by several models, linearised and exactly, and recommend one.
 
@@ -119,6 +120,7 @@ def compare_models(
         tolerances: As in `Choice`, for all models and the judgement of the readings.
         repeat: Another session of the same rows, or several, to compare the residuals with.
         options: Which solver, and how it is run.
+        judgement: Of the sessions with these tolerances, if it is known already.
 
     Raises:
         ParameterError: If a model or name is unknown.
@@ -129,13 +131,10 @@ def compare_models(
     chosen = [s.with_tolerances(tolerances or {}) for s in gather_sessions(sessions)]
     require_names(models or (), argument="models")
     session = join_sessions(chosen)
-    others = [] if repeat is None else gather_sessions(repeat)
-    others = [s.with_tolerances(tolerances or {}) for s in others]
-    for other in others:
-        _require_another(other, chosen)
+    others = _gather_others(() if repeat is None else repeat, tolerances or {}, chosen)
     noise = find_known_noise(session)
     cycles = len({r.cycle for r in session.readings}) > 1
-    judgement = judge_session(session)
+    judgement = judgement or judge_session(session)
     build = partial(build_problem, session, tolerance_scale=judgement.tolerance_scale)
     names = models or session.robot.parameters.models
     results, undetermined = _score_models(build, names, noise.sigma, options)
@@ -240,6 +239,20 @@ def _others(comparison: Comparison, best: ModelResult) -> list[Finding]:
         for r in comparison.results
         if r is not best
     ]
+
+
+def _gather_others(
+    repeat: Given | Sequence[Given], tolerances: Mapping[str, float], compared: Sequence[Session]
+) -> list[Session]:
+    """Sessions to repeat with, which are none of those compared.
+
+    Raises:
+        SessionError: As `_require_another`.
+    """
+    others = [s.with_tolerances(tolerances) for s in gather_sessions(repeat)]
+    for other in others:
+        _require_another(other, compared)
+    return others
 
 
 def _require_another(other: Session, sessions: Sequence[Session]) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
@@ -49,9 +48,6 @@ SCALES = np.geomspace(1.0, 30.0, 86)
 LARGEST_DEVIATION = 3.0
 """Standard deviations from its prediction beyond which a reading is doubtful."""
 
-KEPT = 4
-"""Sessions whose judgements are kept."""
-
 EXPLAINED = ("finer than the gauge", "residuals too small", "scattered repeats", "sigma too large")
 """Kinds that an anomaly with a name explains."""
 
@@ -84,11 +80,11 @@ def rank(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     return tuple(sorted(findings, key=lambda f: _GRAVITY[f.severity]))
 
 
-@lru_cache(maxsize=KEPT)
 def judge_session(session: Session) -> Judgement:
     """Judge the readings of a session, or of several that were joined.
 
-    The last judgements are kept: several models are calibrated from one session, or compared.
+    Several models are calibrated from one session with one judgement, which `calibrate`, `assess`,
+    `compare_models` and `check_session` receive.
 
     Raises:
         ClosureError: If the machine cannot reach a posture.

@@ -53,23 +53,28 @@ class ChoiceOptions:
     bound: list[str] | None = None
     base: bool = False
 
-    def read(self, robot: orthocal.Robot) -> orthocal.Choice:
-        """Choice for a robot with the effects.
+    def read(self, session: orthocal.Session) -> orthocal.Choice:
+        """Choice for a session with the effects, by default its own.
 
         Raises:
-            ParameterError: If an option is malformed, or selects no error of the robot.
+            ParameterError: If an option is malformed, or does not fit the robot.
         """
+        from orthocal.estimation.choice import resolve_choice
         from orthocal.estimation.selection import read_bounds, read_known
 
-        return orthocal.Choice(
+        parameters = session.robot.parameters
+        choice = orthocal.Choice(
             model=self.model,
             free=split_globs(self.free),
             prior=self.prior,
-            known=read_known(self.known or [], robot.parameters, where="--known"),
-            tolerances=read_tolerances(self.tolerance, robot),
-            bounds=read_bounds(self.bound or [], robot.parameters, where="--bound"),
+            known=read_known(self.known or [], parameters, where="--known"),
+            tolerances=read_tolerances(self.tolerance, session.robot),
+            bounds=read_bounds(self.bound or [], parameters, where="--bound"),
             base=self.base,
         )
+        choice = resolve_choice(choice, session)
+        choice.select(parameters)  # refuses what does not fit before the readings are judged
+        return choice
 
 
 @command()
@@ -103,13 +108,19 @@ def calibrate(
         require_writable(out, FILES)
     effects = split_effects(choice.effects)
     session = load_joined(sessions, effects=effects, tolerance=choice.tolerance)
-    with judgement_on_failure(session, json=json):
+    chosen = choice.read(session)
+    options = orthocal.SolverOptions(
+        solver=solver,  # type: ignore[arg-type] # checked there
+        loss=orthocal.Loss(loss),  # type: ignore[arg-type] # likewise
+    )
+    judgement = orthocal.judge_session(session)
+    with judgement_on_failure(session, judgement, json=json):
         result = orthocal.calibrate(
             session,
-            choice.read(session.robot),
-            loss=loss,  # type: ignore[arg-type] # checked there
-            solver=solver,  # type: ignore[arg-type] # likewise
+            chosen,
+            solver=options,
             profile=split_globs(profile),
+            judgement=judgement,
         )
     shown = {"details": details, "all_rows": all_rows, "saved": out}
     deliver_judged(result, json=json, out=out, files=lambda: _build_files(result, out), **shown)

@@ -43,10 +43,13 @@ def compare(
     chosen = split_effects(effects)
     loaded = load_each_once(sessions, effects=chosen, tolerance=tolerance)
     others = load_each_once(repeat, effects=chosen, tolerance=tolerance) if repeat else None
-    with judgement_on_failure(orthocal.join_sessions(loaded), json=json):
+    session = orthocal.join_sessions(loaded)
+    judgement = orthocal.judge_session(session)
+    with judgement_on_failure(session, judgement, json=json):
         comparison = orthocal.compare_models(
             loaded,
             models=split_globs([models] if models else None),
             repeat=others,
+            judgement=judgement,
         )
     deliver_judged(comparison, json=json, details=details, all_rows=all_rows)

@@ -91,13 +91,21 @@ def deliver_judged(
 
 
 @contextmanager
-def judgement_on_failure(session: orthocal.Session, *, json: bool) -> Iterator[None]:
-    """Print the judgement of the readings in place of a failure of the solver that it explains."""
+def judgement_on_failure(
+    session: orthocal.Session, judgement: orthocal.Judgement | None = None, *, json: bool
+) -> Iterator[None]:
+    """Print the judgement of the readings in place of a failure of the solver that it explains.
+
+    Args:
+        session: The readings.
+        judgement: Their judgement, if it is known already.
+        json: True to print JSON instead of text.
+    """
     try:
         yield
     except (SolverError, ClosureError) as failure:
         try:
-            assessment = orthocal.check_session(session)
+            assessment = orthocal.check_session(session, judgement=judgement)
         except OrthocalError:
             raise failure from None
         if not assessment.decision.exit_code:

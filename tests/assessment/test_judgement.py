@@ -16,12 +16,14 @@ from commands import run_orthocal
 from drawn_machines import DrawnMachines
 from effect_plans import write_plan
 
+import orthocal
 from orthocal import (
     Choice,
     Gauge,
     assess_tool,
     calibrate,
     check_session,
+    compare_models,
     load_calibration,
     load_plan,
     load_session,
@@ -29,6 +31,7 @@ from orthocal import (
     write_calibration,
     write_session,
 )
+from orthocal.assessment import assess, comparison
 from orthocal.assessment.judgement import judge_session
 from orthocal.calibration.assessment_record import EXIT_CODES, Finding, FindingKind, Severity
 from orthocal.output.text.summary import result_json
@@ -233,14 +236,43 @@ def test_an_unfinished_session_is_checked_as_far_as_it_was_read(cycles, root, tm
     assert "nothing was read yet" in done.stderr
 
 
-def test_readings_are_judged_once(cycles):
-    """Not again for another model; other values are other readings."""
-    assert calibrate(cycles).assessment.decision.verdict == "enter"
-    before = judge_session.cache_info()
-    assert calibrate(cycles, "full").assessment.decision.verdict == "enter"
-    assert judge_session.cache_info().misses == before.misses
+def test_readings_are_judged_once(cycles, monkeypatch):
+    """Once in a calculation, and not again with their judgement: the result is the same."""
+    sessions = []
+
+    def count(session):
+        sessions.append(session)
+        return judge_session(session)
+
+    for module in (assess, comparison):
+        monkeypatch.setattr(module, "judge_session", count)
+    judgement = judge_session(cycles)
+    given = calibrate(cycles, "full", judgement=judgement)
+    compared = compare_models(cycles, models=["offsets", "lengths"], judgement=judgement)
+    assert check_session(cycles, judgement=judgement).decision.verdict == "enter"
+    assert sessions == []
+    assert calibrate(cycles, "full").assessment.to_document() == given.assessment.to_document()
+    assert sessions == [cycles]
+    again = compare_models(cycles, models=["offsets", "lengths"])
+    assert again.assessment.to_document() == compared.assessment.to_document()
+    assert sessions == [cycles, cycles]
     assert judge_session(reverse(cycles, "zx")).verdict == "review"
     assert judge_session(cycles).verdict == "enter"
+
+
+@pytest.mark.parametrize("command", ["check", "calibrate", "compare"])
+def test_a_command_judges_once(root, command, monkeypatch):
+    sessions = []
+
+    def count(session):
+        sessions.append(session)
+        return judge_session(session)
+
+    monkeypatch.setattr(orthocal, "judge_session", count, raising=False)
+    for module in (assess, comparison):
+        monkeypatch.setattr(module, "judge_session", count)
+    assert run_orthocal(root, command, "examples/table1/experiment-2").returncode == 0
+    assert len(sessions) == 1
 
 
 def test_findings_have_known_kinds_units_and_load_again(calibrated, tmp_path):
