@@ -47,7 +47,7 @@ def express_machine(
     for name, value in errors.items():
         for term, coefficient in robot.parameters[name].terms:
             elementary[term] = elementary[term] + coefficient * value
-    known = {**neutral_conditions(robot), **(conditions or {})}
+    known = {**neutral_conditions(robot), "coordinates": commanded, **(conditions or {})}
     actuated, twists = commanded, dict[Placement, ca.SX]()
     for effect in reversed(robot_effects(robot)):  # the drive's gain and offset act last
         own = {e.name: elementary[e.name] for e in effect.errors}

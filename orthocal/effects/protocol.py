@@ -26,12 +26,17 @@ from orthocal.robot.parameters import ElementaryError
 Symbols = Mapping[str, ca.SX]
 """Names to expressions."""
 
-Condition = Literal["approach", "temperature", "time", "load", "adjustment"]
+Condition = Literal[
+    "approach", "temperature", "time", "load", "adjustment", "coordinates", "reference"
+]
 """Condition of a reading: the direction of each drive's last motion, shape (n_drives,), 1 where its
 coordinate grew, -1 where it fell, 0 if unknown; the temperature, [°C]; the time since the first
 reading of the setup, [s]; the axial force of each rod under the weight on the tool, tension
 positive, shape (n_rods,), [N], which is computed from the posture and the payload; the amounts by
-which the machine was adjusted otherwise than it is at last, shape (n_adjustments,), [m]."""
+which the machine was adjusted otherwise than it is at last, shape (n_adjustments,), [m]; the
+commanded coordinates of the drives, shape (n_drives,), [m, rad], for placements that change along
+the travel; the same in the reference posture of the setup, which replace them where a gauge is
+mounted."""
 
 NEUTRAL: dict[Condition, float] = {
     "approach": 0.0,
@@ -39,9 +44,12 @@ NEUTRAL: dict[Condition, float] = {
     "time": 0.0,
     "load": 0.0,
     "adjustment": 0.0,
+    "coordinates": 0.0,
+    "reference": 0.0,
 }
 """Value of a condition that is not stated. The temperature is that of ISO 1. Without a load a
-machine is weightless, as in the controller's nominal kinematics."""
+machine is weightless, as in the controller's nominal kinematics. Coordinates that are not stated
+are those of the command."""
 
 
 def condition_size(robot: Robot, name: Condition) -> int:
@@ -50,6 +58,8 @@ def condition_size(robot: Robot, name: Condition) -> int:
         "approach": len(robot.drives),
         "load": len(robot.rods),
         "adjustment": len(robot.declared.adjustments),
+        "coordinates": len(robot.drives),
+        "reference": len(robot.drives),
     }
     return sizes.get(name, 1)
 
@@ -119,7 +129,11 @@ class Effect:
         return coordinates
 
     def placements(self, errors: Symbols, conditions: Symbols) -> Mapping[Placement, ca.SX]:
-        """Twists δ of placements, shape (6,) each, [m, rad]; effects on one placement add up."""
+        """Twists δ of placements, shape (6,) each, [m, rad]; effects on one placement add up.
+
+        A placement that changes along the travel of a drive, such as that of a slide whose guide is
+        not straight, depends on the condition `coordinates`.
+        """
         return {}
 
     def rods(self, errors: Symbols, conditions: Symbols) -> Mapping[tuple[str, str], ca.SX]:

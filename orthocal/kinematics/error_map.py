@@ -8,6 +8,10 @@ of the effects for NumPy arrays, `SymbolicErrorMap` for CasADi expressions.
 A command holds the commanded drive coordinates of a posture, followed by those conditions of its
 readings on which drives or placements depend (`ErrorMap.conditions`). Coordinates alone are a
 command under neutral conditions.
+
+Placements may depend on the coordinates of the drives (`Effect.placements`), which are conditions,
+too. A gauge is mounted in the reference posture: such a placement moves twice, with the coordinates
+of the posture and with those of the reference posture.
 """
 
 from __future__ import annotations
@@ -23,12 +27,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocal.arrays import Array, Indices, Mask
 from orthocal.effects.loading import neutral_values
-from orthocal.effects.machine import express_machine
+from orthocal.effects.machine import express_machine, neutral_conditions
 from orthocal.effects.protocol import NEUTRAL, Condition, condition_size
 from orthocal.kinematics.backend.batch_function import BatchFunction
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.se3 import exp6, right_jacobian
 from orthocal.kinematics.symbolic import Pose, nominal_placement
+from orthocal.robot.frames import Placement
 from orthocal.robot.model import Robot
 
 
@@ -94,7 +99,10 @@ class ErrorMap:
 
     Attributes:
         names: Names of the errors.
-        moved: Placements that effects act on.
+        moved: Placements that effects act on; those in the reference posture that differ from them
+            follow at the end.
+        in_reference: Index of a placement among the moved ones to that of the same in the reference
+            posture; empty unless placements depend on the coordinates of drives.
         conditions: Conditions that follow the drive coordinates in a command.
         placement_conditions: Those on which placements depend.
         of_placements: Mask of these in a command, shape (n_command,).
@@ -116,8 +124,11 @@ class ErrorMap:
             robot, commanded, {n: errors[i] for i, n in enumerate(self.names)}, symbols
         )
         moving = {p: ca.sparsify(t) for p, t in machine.twists.items()}
-        self.moved = tuple(p for p, t in moving.items() if t.nnz())
-        twists = ca.vertcat(ca.SX(0, 1), *(moving[p] for p in self.moved))
+        moved = [p for p, t in moving.items() if t.nnz()]
+        there = _in_reference(robot, {p: moving[p] for p in moved}, symbols)
+        self.moved = (*moved, *there)
+        self.in_reference = {moved.index(p): len(moved) + i for i, p in enumerate(there)}
+        twists = ca.vertcat(ca.SX(0, 1), *(moving[p] for p in moved), *there.values())
         self.conditions = _conditions_in(ca.vertcat(twists, machine.actuated), symbols)
         self.placement_conditions = _conditions_in(twists, symbols)
         neutral = neutral_values(robot)
@@ -126,6 +137,11 @@ class ErrorMap:
         drives = np.zeros(len(robot.drives), dtype=np.bool_)
         self.of_placements = np.concatenate([drives, of_placements.astype(np.bool_)])
         self._neutral = np.repeat([neutral[c] for c in self.conditions], sizes).astype(np.float64)
+        of_condition = np.repeat(np.array(self.conditions, dtype=object), sizes)
+        self._own = len(robot.drives) + np.flatnonzero(of_condition == "coordinates")
+        for name in ("coordinates", "reference"):
+            if name in self.conditions:
+                self._neutral[of_condition == name] = robot.drive_zero
         conditions = ca.vertcat(ca.SX(0, 1), *(symbols[c] for c in self.conditions))
         by_errors = ca.jacobian(machine.actuated, errors)
         self.drive_errors = np.unique(np.array(by_errors.sparsity().get_triplet()[1], np.int64))
@@ -175,7 +191,15 @@ class ErrorMap:
         if not missing:
             return coordinates
         neutral = np.broadcast_to(self._neutral, (*coordinates.shape[:-1], missing))
-        return np.concatenate([coordinates, neutral], axis=-1)
+        return self.at_own_coordinates(np.concatenate([coordinates, neutral], axis=-1))
+
+    def at_own_coordinates(self, commands: Array) -> Array:
+        """Commands in which the condition `coordinates` is that of their drives, same shape."""
+        if not self._own.size:
+            return commands
+        result = np.array(commands)
+        result[..., self._own] = commands[..., : self._own.size]
+        return result
 
     def split(self, conditions: ca.SX) -> dict[Condition, ca.SX]:
         """Conditions of a command, shape (n_conditions,), by name."""
@@ -466,6 +490,20 @@ class _Twists:
 def error_map(robot: Robot) -> ErrorMap:
     """The error map of a robot, built once."""
     return ErrorMap(robot)
+
+
+def _in_reference(
+    robot: Robot, twists: Mapping[Placement, ca.SX], symbols: Mapping[Condition, ca.SX]
+) -> dict[Placement, ca.SX]:
+    """Twists in the reference posture of those placements that depend on drive coordinates.
+
+    Other conditions are neutral there, except adjustments.
+    """
+    neutral = {**neutral_conditions(robot), "coordinates": symbols["reference"]}
+    names = [c for c in symbols if c not in ("adjustment", "reference")]
+    old, new = (ca.vertcat(*(v[c] for c in names)) for v in (symbols, neutral))
+    depends = [p for p, t in twists.items() if ca.jacobian(t, symbols["coordinates"]).nnz()]
+    return {p: ca.sparsify(ca.substitute(twists[p], old, new)) for p in depends}
 
 
 def _conditions_in(expression: ca.SX, symbols: Mapping[Condition, ca.SX]) -> tuple[Condition, ...]:

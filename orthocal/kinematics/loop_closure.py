@@ -27,10 +27,11 @@ from orthocal.robot.model import Robot, require_commanded_tool, require_tcp
 MOST_TRANSMISSIONS = 8
 """Tables of postures whose rod forces are remembered for one robot."""
 
-MOST_LOADS = 10
-SETTLED_LOAD = 1e-7
-"""Relative change of the loads of an inverse below which its drive coordinates do not change. Each
-repetition reduces it at least a hundred times."""
+MOST_REPETITIONS = 10
+SETTLED = 1e-9
+"""Relative change of the conditions of an inverse that depend on its drive coordinates, loads and
+coordinates of placements, below which the drive coordinates do not change. Each repetition reduces
+it at least a hundred times."""
 
 
 class LoopClosure:
@@ -198,16 +199,18 @@ class LoopClosure:
             ClosureError, RobotError: As `inverse`.
         """
         n = len(self.robot.drives)
-        if not self._has_load:
+        if not self._depends_on_drives:
             x = self._reach(points, np.zeros((len(points), n)), start, names, failures)
             return x[:, :n], x[:, n:]
-        drives = nominal_closure(self.robot).inverse(points, failures={})
+        drives = np.tile(self.robot.drive_zero, (len(points), 1))
+        if self._has_load:
+            drives = nominal_closure(self.robot).inverse(points, failures={})
         commands = self.commands(drives)
-        for _ in range(MOST_LOADS):
+        for _ in range(MOST_REPETITIONS):
             x = self._reach(points, commands[:, :n], start, names, failures)
             before, commands = commands[:, n:], self.commands(x[:, :n])
-            change = np.abs(commands[:, n:] - before).max(initial=0.0)
-            if change <= SETTLED_LOAD * np.abs(before).max(initial=0.0):
+            change = np.abs(commands[:, n:] - before)
+            if (change <= SETTLED * np.abs(before).max(axis=0, initial=0.0)).all():
                 break
             start = np.where(np.isfinite(x), x, self._inverting.start)
         return x[:, :n], x[:, n:]
@@ -215,13 +218,13 @@ class LoopClosure:
     def _reach(
         self,
         points: Array,
-        loaded_at: Array,
+        conditions_at: Array,
         start: Array | None,
         names: Sequence[str] | None,
         failures: Failures | None,
     ) -> Array:
-        """Joint coordinates of `reach` under the loads at given drive coordinates."""
-        commands = self.commands(loaded_at)
+        """Joint coordinates of `reach` under the conditions at some drive coordinates."""
+        commands = self.commands(conditions_at)
         geometry, _ = self._batch(None, None, commands)
         x: Array = solve_closures(
             self._inverting,
@@ -293,9 +296,15 @@ class LoopClosure:
         values = conditions.values(self.robot)
         if self._has_load:
             values["load"] = find_loads(self.robot, drives, conditions.payload or 0.0)
+        values["coordinates"], values["reference"] = drives, self.robot.drive_zero
         parts = [values[c] for c in map_.conditions]
         stated = [np.broadcast_to(v, (len(drives), v.shape[-1])) for v in parts]
         return np.hstack([drives, *stated])
+
+    @property
+    def _depends_on_drives(self) -> bool:
+        """Whether conditions follow from the drive coordinates."""
+        return self._has_load or "coordinates" in self._functions.errors.conditions
 
     @property
     def _has_load(self) -> bool:

@@ -43,6 +43,8 @@ class RobotFunctions:
         robot: The nominal robot.
         passive: Values of the passive coordinates; symbols by default.
         placements: Symbols of the placements to share with other functions; new ones by default.
+        reference: Whether placements that depend on drive coordinates are those of the reference
+            posture.
 
     Attributes:
         actuated: Symbol of the actual drive coordinates, shape (n_drives,), [m, rad].
@@ -51,7 +53,12 @@ class RobotFunctions:
     """
 
     def __init__(
-        self, robot: Robot, *, passive: ca.SX | None = None, placements: ca.SX | None = None
+        self,
+        robot: Robot,
+        *,
+        passive: ca.SX | None = None,
+        placements: ca.SX | None = None,
+        reference: bool = False,
     ) -> None:
         self.robot = robot
         self.errors: ErrorMap = error_map(robot)
@@ -68,13 +75,15 @@ class RobotFunctions:
         coordinates[robot.passive_index.tolist()] = self.passive
         joints: dict[int, Pose] = {}
         frames: dict[int, Pose] = {}
-        for k, m in enumerate(moved):
-            v = self.placements[12 * k : 12 * k + 12]
+        there = self.errors.in_reference
+        places = {k: there.get(k, k) if reference else k for k in range(len(moved) - len(there))}
+        for k, place in places.items():
+            m, v = moved[k], self.placements[12 * place : 12 * place + 12]
             (frames if m.of_frame else joints)[m.index] = Pose(ca.reshape(v[:9], 3, 3), v[9:])
         self.tree = SymbolicTree(
             robot.model, coordinates, joint_placements=joints, frame_placements=frames
         )
-        self._first = {(m.index, m.of_frame): 6 * k for k, m in enumerate(moved)}
+        self._first = {(moved[k].index, moved[k].of_frame): 6 * p for k, p in places.items()}
         self._of_frames: dict[str, BatchFunction] = {}
 
     @property
@@ -89,7 +98,7 @@ class RobotFunctions:
         Passive joints have their nominal values: they do not move frames that hang on drives alone.
         """
         zero = ca.SX(self.robot.reference_passive)
-        return RobotFunctions(self.robot, passive=zero, placements=self.placements)
+        return RobotFunctions(self.robot, passive=zero, placements=self.placements, reference=True)
 
     @property
     def n_twists(self) -> int:

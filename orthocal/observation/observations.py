@@ -191,6 +191,8 @@ def build_observations(session: Session) -> Observations:
     if "load" in error_map(session.robot).conditions:
         values["load"] = _find_loads(session, table[:, 0], table[:, 1])
     values["adjustment"] = adjustment_table(session)[table[:, 0]]
+    values["coordinates"] = drive_table(session)[table[:, 1]]
+    values["reference"] = session.zero_drives[table[:, 0]]
     trims = _find_trims(session, table[:, 0], table[:, 1], values["approach"])
     states, state = _find_states(session, table[:, 1], values, trims)
     places = np.hstack([table[:, :2], values["approach"]])
@@ -313,6 +315,7 @@ def _find_states(
     of_state = rows[:, 0].astype(np.int64)
     moved = drives[of_state] + rows[:, 1 : 1 + drives.shape[1]]
     commands = np.hstack([moved, rows[:, 1 + drives.shape[1] :]])
+    commands = map_.at_own_coordinates(commands)
     first, variant = np.zeros(1, dtype=np.int64), np.zeros(len(rows), dtype=np.int64)
     if map_.of_placements.any():
         values = commands[:, map_.of_placements]
@@ -369,7 +372,7 @@ def readings_without(session: Session, condition: Condition) -> list[Reading]:
 
     Where no reading of a setup states its time, its rows are in the order of time.
     """
-    if condition == "adjustment":  # the session states it
+    if condition in ("adjustment", "coordinates"):  # the session states it
         return []
     if condition == "approach":
         return [r for r in session.readings if r.approach is None or "u" in r.approach]
