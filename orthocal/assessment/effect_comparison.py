@@ -98,7 +98,7 @@ def _candidates(session: Session) -> tuple[list[str], dict[str, tuple[int, str]]
     possible = missing_effects(session) if stated and robot.chosen_effects is None else ()
     timed = any(r.conditions and r.conditions.time for r in session.readings)
     candidates, lacking = [], {}
-    for name in (*own, *possible):
+    for name in (*own, *(n for n in possible if n in EFFECT_KINDS)):
         rows = rows_without(session, name)
         if name == "drift" and name not in own and not timed:
             continue

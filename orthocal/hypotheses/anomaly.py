@@ -24,6 +24,7 @@ AnomalyKind = Literal[
     "backlash",
     "thermal expansion",
     "periodic screw error",
+    "other effect",
     "offsets not entered",
     "offsets reversed",
     "offsets entered twice",
@@ -32,7 +33,7 @@ AnomalyKind = Literal[
     "machine changed",
 ]
 """Kinds of anomaly; `offset of one drive` is one that differs from the stated offset and matches
-no known way to enter it wrongly."""
+no known way to enter it wrongly. `other effect` is one from another package."""
 
 EFFECT_KINDS: Mapping[str, AnomalyKind] = {
     "backlash": "backlash",
@@ -92,6 +93,8 @@ class Explanation:
     offsets: tuple[float, ...] = ()
     """Offsets that are in the controller instead of those stated, one per drive of the robot,
     [m, rad]."""
+    effect: str = ""
+    """Name of the effect that the machine or its gauges have, and its model lacks."""
     parameters: tuple[str, ...] = ()
     """Error parameters that changed, or those of an effect."""
     amounts: tuple[float, ...] = ()

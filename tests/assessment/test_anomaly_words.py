@@ -22,6 +22,7 @@ def test_every_kind_has_a_sentence(root, kind):
         rows=(0, 1),
         setups=(setup,),
         names=(setup,),
+        effect="backlash",
         factor=-1.0,
         amount=1e-3,
         std=1e-4,

@@ -147,7 +147,7 @@ def test_effects_of_installed_packages_are_found(tmp_path, monkeypatch, root):
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: probe-effects\nVersion: 1.0\n")
     points = "slack = installed_slack:Slack\nbroken = installed_slack:SlackKeys\n"
     (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\n{points}")
-    shutil.copy(root / "tests/effects/slack.py", tmp_path / "site/installed_slack.py")
+    shutil.copy(root / "tests/slack.py", tmp_path / "site/installed_slack.py")
     monkeypatch.syspath_prepend(tmp_path / "site")
     robot = load_robot(write_robot(tmp_path / "machine", KEYS))
     assert type(robot_effects(robot)[-1]).__module__ == "installed_slack"

@@ -5,15 +5,26 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from effect_plans import write_plan
 from scipy.integrate import quad
+from slack import Slack
 from unmodelled_machines import EffectSearch, plan_with_conditions, read_machines
 
-from orthocal import check_session, load_plan, load_session, simulate_session
+from orthocal import (
+    Choice,
+    calibrate,
+    check_session,
+    load_plan,
+    load_session,
+    simulate_session,
+)
+from orthocal.effects import registry
+from orthocal.errors import RobotError
 from orthocal.hypotheses.families.effects import find_effects, missing_effects
 from orthocal.hypotheses.likelihood import AmountPrior, build_likelihood
 from orthocal.hypotheses.linear_model import LinearModel
@@ -114,6 +125,70 @@ def test_an_approach_from_one_side_shows_no_backlash(plan):
     readings = [replace(r, conditions=replace(r.conditions, approach="ppp")) for r in one_side]
     session = read(plan.select(readings), "backlash", {"y_slide.backlash": 0.1e-3})
     assert find_anomalies(session).found == ()
+
+
+@pytest.fixture
+def slack(tmp_path):
+    """Plan of a machine with an effect of another package."""
+    registry.register_effect(Slack)
+    plan = load_plan(write_plan(tmp_path / "plan", effects="slack: {lead_mm: 10}"))
+    yield plan.select([r for r in plan.readings if r.setup in ("yx", "xy", "xz")])
+    registry.unregister_effect("slack")
+
+
+LOOSE = {
+    "x_slide.slack": 30e-6,
+    "y_slide.slack": 50e-6,
+    "x_slide.wave": -9e-6,
+    "y_slide.wave": 12e-6,
+    "rods.growth": 12e-6,
+}
+
+
+def test_an_effect_of_another_package_is_named_in_its_own_words(slack):
+    session = read(slack, "slack", LOOSE)
+    (found,) = find_anomalies(session).found
+    e = found.explanation
+    assert (e.kind, e.effect, found.ambiguous) == ("other effect", "slack", False)
+    for name, amount, std in zip(e.parameters, e.amounts, e.stds, strict=True):
+        assert amount == pytest.approx(LOOSE.get(name, 0.0), abs=3.0 * std)
+    assert dict(zip(e.parameters, e.stds, strict=True))["x_slide.slack"] < 4e-6
+    (finding,) = [f for f in check_session(session).findings if f.severity != "note"]
+    assert finding.kind == "other effect"
+    assert Slack.describe(None) in finding.text
+    assert {"x_slide.slack", "y_slide.slack"} <= {p.parameter for p in finding.places}
+
+
+def test_the_remedy_frees_parameters_that_the_complete_model_lacks(slack):
+    session = read(slack, "slack", LOOSE)
+    (finding,) = [f for f in check_session(session).findings if f.severity != "note"]
+    effects, model, free = re.search(
+        r"--effects (\S+) --model (\S+) --free '(\S+)'`", finding.action
+    ).groups()
+    choice = Choice(model, free=free.split(","), effects=effects.split(","))
+    result = calibrate(session, choice, solver="variable-projection")
+    slack_of_x = next(p for p in result.free if p.name == "x_slide.slack")
+    assert slack_of_x.value == pytest.approx(30e-6, abs=3.0 * slack_of_x.std)
+
+
+def test_a_sound_machine_shows_no_effect_of_another_package(slack):
+    assert missing_effects(slack.with_effects([]))[-1] == "slack"
+    assert find_anomalies(read(slack, "slack", {})).found == ()
+
+
+def test_an_effect_that_does_not_fit_the_robot_is_not_sought(slack):
+    class Unfit(Slack):
+        name = "unfit"
+
+        @classmethod
+        def from_keys(cls, keys, robot):
+            raise RobotError("has no such part")
+
+    registry.register_effect(Unfit)
+    try:
+        assert "unfit" not in missing_effects(slack.with_effects([]))
+    finally:
+        registry.unregister_effect("unfit")
 
 
 def test_a_reversed_sign_is_not_called_an_effect(plan):

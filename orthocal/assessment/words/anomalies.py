@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 
 from orthocal.assessment.wording import joined, mm, note, plain, review, signed, um
 from orthocal.calibration.assessment_record import Finding, Place
-from orthocal.hypotheses.anomaly import EFFECT_KINDS, Anomalies, Anomaly, Explanation
+from orthocal.effects.loading import robot_effects, with_effects
+from orthocal.hypotheses.anomaly import Anomalies, Anomaly, Explanation
 from orthocal.session.session import Session
 from orthocal.text import printable, spans
 from orthocal.units import EDGE_UNITS, MM, UM, Unit
@@ -70,9 +71,23 @@ def _effect_places(session: Session, e: Explanation) -> tuple[Place, ...]:
 
 def _effect_remedy(session: Session, result: Anomalies) -> str:
     """Calibration with all effects that were found, beside those that the machine has."""
-    kinds = {a.explanation.kind for a in result.found if a.explanation.amounts}
-    names = [*session.robot.effect_names, *(n for n, kind in EFFECT_KINDS.items() if kind in kinds)]
-    return f"Calibrate with `--effects {','.join(names)}`."
+    found = [a.explanation.effect for a in result.found if a.explanation.amounts]
+    robot = with_effects(session.robot, (*session.robot.effect_names, *found))
+    names = ",".join(robot.effect_names)
+    free = [e.name for f in robot_effects(robot) if f.name in found for e in f.errors]
+    free = [name for name in free if not robot.parameters.elementary[name].complete]
+    if not free:
+        return f"Calibrate with `--effects {names}`."
+    kinds = [f"*.{name.rpartition('.')[2]}" for name in free]  # no part of the model `full`
+    globs = [k if kinds.count(k) > 1 else n for k, n in zip(kinds, free, strict=True)]
+    patterns = ",".join(dict.fromkeys(globs))
+    return f"Calibrate with `--effects {names} --model full --free '{patterns}'`."
+
+
+def _describe_effect(session: Session, name: str) -> str:
+    """An effect that the machine's model lacks, in its own words."""
+    robot = with_effects(session.robot, (*session.robot.effect_names, name))
+    return next(e.describe() for e in robot_effects(robot) if e.name == name)
 
 
 def _clear_amounts(e: Explanation) -> list[tuple[str, float, float, Unit]]:
@@ -290,6 +305,10 @@ def _text(session: Session, e: Explanation) -> str:
         "periodic screw error": lambda: (
             f"the drives have a periodic error, {_amounts(e)}: readings change with the "
             f"turn of the screws by up to {mm(e.amount or 0.0)} mm"
+        ),
+        "other effect": lambda: (
+            f"the readings show {_describe_effect(session, e.effect)}, by up to "
+            f"{mm(e.amount or 0.0)} mm: {_amounts(e)}"
         ),
         "machine changed": lambda: _changed(session, e),
         "offset of one drive": lambda: (

@@ -1,6 +1,7 @@
 """Systematic effects that readings show although the machine's model lacks them.
 
-How an effect changes the readings comes from the effect itself (`LinearModel.linearise_effect`).
+How an effect changes the readings, and how large it may be, comes from the effect itself
+(`LinearModel.linearise_effect`). So effects of other packages are sought like those of orthocal.
 Effects that the model has are not sought.
 """
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from orthocal.arrays import Indices
 from orthocal.effects.loading import with_effects
-from orthocal.effects.registry import find_effect
+from orthocal.effects.registry import BUILT_IN, effect_names, find_effect
 from orthocal.errors import RobotError
 from orthocal.hypotheses.anomaly import EFFECT_KINDS, Explanation
 from orthocal.hypotheses.hypothesis import Family, Rows, SystematicEffect, group_rows
@@ -30,12 +31,14 @@ LEAST_COLUMN = 1e-3
 def missing_effects(session: Session) -> tuple[str, ...]:
     """Names of the effects that the robot of a session could have, and has not."""
     found = []
-    for name in EFFECT_KINDS:
+    built_in = {effect.name for effect in BUILT_IN}
+    others = [name for name in effect_names() if name not in built_in]
+    for name in (*EFFECT_KINDS, *others):
         if name in session.robot.effect_names:
             continue
         try:
             with_effects(session.robot, (*session.robot.effect_names, name))
-        except RobotError:  # the YAML lacks one of its keys
+        except RobotError:  # the YAML lacks one of its keys, or a package is broken
             continue
         found.append(name)
     return tuple(found)
@@ -77,7 +80,8 @@ def unmodelled_effects(rows: Rows, effects: Sequence[SystematicEffect]) -> Itera
             yield from _drifts(rows, effect)
         every = np.flatnonzero(effect.change.astype(bool) | effect.columns.any(axis=0))
         setups = tuple(dict.fromkeys(rows.session.readings[i].setup for i in every))
-        e = Explanation(EFFECT_KINDS[effect.name], "session", tuple(every.tolist()), setups)
+        kind = EFFECT_KINDS.get(effect.name, "other effect")
+        e = Explanation(kind, "session", tuple(every.tolist()), setups, effect=effect.name)
         yield Family.of([e], systematic=[effect])
 
 
