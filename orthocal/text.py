@@ -75,8 +75,8 @@ def shorten(text: str) -> str:
 def runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
     """First and last of each run of consecutive numbers in an ascending sequence."""
     by_run = groupby(enumerate(numbers), key=lambda place: place[1] - place[0])
-    found = [[number for _, number in run] for _, run in by_run]
-    return [(run[0], run[-1]) for run in found]
+    groups = [[number for _, number in run] for _, run in by_run]
+    return [(run[0], run[-1]) for run in groups]
 
 
 def spans(numbers: Sequence[int], noun: str) -> str:

@@ -91,11 +91,11 @@ class AdjustmentPlan:
     entries: tuple[ControllerEntry, ...]
     """Offsets to enter afterwards."""
     before: ToolErrorSummary
-    """Expected tool error of the machine as it is."""
+    """Expected tool error of the present machine."""
     after: ToolErrorSummary
     """Expected tool error after the adjustments."""
     moved_uncertainty: float
-    """Uncertainty of the field by which the tool moves, RMS after alignment, one σ, [m]."""
+    """Uncertainty of the displacement of the tool, RMS after alignment, one σ, [m]."""
 
     @property
     def gain(self) -> float:
@@ -191,8 +191,8 @@ class _Search:
     ) -> None:
         self.calibration, self.tool, self.candidates = calibration, tool, candidates
         robot, drives = calibration.robot, calibration.robot.drives
-        own = np.flatnonzero(calibration.offset_weights.any(axis=1)).tolist()
-        offsets = [f"{drives[i].name}.offset" for i in own]
+        offset_columns = np.flatnonzero(calibration.offset_weights.any(axis=1)).tolist()
+        offsets = [f"{drives[i].name}.offset" for i in offset_columns]
         names = [*offsets, *(a.parameter for a in candidates)]
         commanded = tool.drives - calibration.active_offsets
         under = (
@@ -230,9 +230,9 @@ class _Search:
 
     def error(self, amounts: Array) -> float:
         """Expected tool error with given amounts, to first order, [m]."""
-        left = self._deviation + self._columns @ amounts
+        deviation = self._deviation + self._columns @ amounts
         spread = np.hypot(self._rounding * (amounts != 0.0), LEVER_SHARE * amounts) * self._sizes
-        return math.hypot(*(float(np.linalg.norm(v)) for v in (left, spread)), self.floor)
+        return math.hypot(*(float(np.linalg.norm(v)) for v in (deviation, spread)), self.floor)
 
     def fit(self, chosen: Iterable[int]) -> Array:
         """Best amounts of some adjustments within their limits, shape (n_candidates,), [m]."""

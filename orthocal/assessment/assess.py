@@ -186,16 +186,16 @@ def check_session(session: Session, *, judgement: Judgement | None = None) -> As
     if missing:
         require_read(session, partial=True)
         session = session.select([r for r in session.readings if r.is_read])
-    found = judgement or judge_session(session)
-    findings = rank([*found.findings, *missing])
-    if found.verdict == "enter":
-        within = found.tolerance_scale.factor == 1.0
+    judgement = judgement or judge_session(session)
+    findings = rank([*judgement.findings, *missing])
+    if judgement.verdict == "enter":
+        within = judgement.tolerance_scale.factor == 1.0
         findings = rank(
             [*findings, words.no_anomaly(len(session.readings), within_tolerances=within)]
         )
     lead = next((f for f in findings if f.severity != "note"), findings[-1])
     decision = Decision(
-        found.verdict, words.SESSION_HEADLINES[found.verdict], lead.text, lead.action
+        judgement.verdict, words.SESSION_HEADLINES[judgement.verdict], lead.text, lead.action
     )
     return Assessment(decision, findings, (), None)
 
@@ -274,8 +274,8 @@ def _entry_findings(
     known = _by_readings(entries)
     large = [e.drive for e in known if is_significant(calibration, e)]
     small = [e.drive for e in known if e.drive not in large]
-    found = [words.must_change(large)] if large else []
-    return [*expected, *found, *([words.not_significant(small)] if small else [])]
+    findings = [words.must_change(large)] if large else []
+    return [*expected, *findings, *([words.not_significant(small)] if small else [])]
 
 
 def is_significant(calibration: Calibration, entry: ControllerEntry) -> bool:
@@ -294,9 +294,9 @@ def _decide(findings: Sequence[Finding], *, firmware: bool) -> Decision:
     if verdict != "enter":
         return Decision(verdict, words.HEADLINES[verdict], lead.text, lead.action)
     for kind, headline in KEEPING.items():
-        found = first_of(findings, kind)
-        if found is not None:
-            return Decision(verdict, headline, found.text, found.action)
+        finding = first_of(findings, kind)
+        if finding is not None:
+            return Decision(verdict, headline, finding.text, finding.action)
     why = first_of(findings, *EXPLANATIONS)
     reason, action = ("", "") if why is None else (why.text, why.action)
     if firmware:

@@ -85,11 +85,11 @@ class CalibratedTool:
             names: What to call the points in messages.
         """
         closures = (s.closure for s in self.sensitivities)
-        found = [
+        workspaces = [
             c.forward(drives, start=self.passive, names=names)
             for c, drives in zip(closures, commanded, strict=True)
         ]
-        return np.concatenate(found)
+        return np.concatenate(workspaces)
 
 
 def find_tool(calibration: Calibration, use: UseSamples | None = None) -> CalibratedTool | None:
@@ -154,8 +154,8 @@ def _sensitivities(calibration: Calibration, use: UseSamples) -> tuple[ToolSensi
     """Tool sensitivity by the free parameters, the unmodelled errors and the remaining offsets."""
     robot, errors = calibration.robot, calibration.errors
     free = [*(p.name for p in calibration.free), *calibration.unmodelled.names]
-    own = [row.any() for row in calibration.offset_weights]
-    offsets = [f"{d.name}.offset" for d, has in zip(robot.drives, own, strict=True) if has]
+    is_offset = [row.any() for row in calibration.offset_weights]
+    offsets = [f"{d.name}.offset" for d, has in zip(robot.drives, is_offset, strict=True) if has]
     free += [n for n in offsets if n not in free]
     return tuple(
         ToolSensitivity(robot, free=free, values=errors, conditions=c) for c in use.conditions

@@ -40,24 +40,24 @@ class Comparison:
 
     title: str
     labels: tuple[str, ...]
-    """Of the rows of the session."""
+    """Labels of the readings of the session."""
     noise: KnownNoise
-    """What residuals are held against."""
+    """Noise with which residuals are compared."""
     independent: int
-    """Independent readings: distinct ones less gauge zeros."""
+    """Independent readings: distinct readings less gauge zeros."""
     results: tuple[ModelResult, ...]
     undetermined: tuple[Undetermined, ...]
     repetition: Repetition | None
     """Residuals of the recommended model against those of another session."""
     repeat_title: str
-    """Of that other session; empty without."""
+    """Title of the other session; empty if there is none."""
     recommendation: Recommendation
     effects: EffectComparison | None
     """Effects beside geometry; None if the readings cannot show any."""
     judgement: Judgement
-    """Of the readings, whatever the model is."""
+    """Judgement of the readings, independent of the model."""
     assessments: tuple[Assessment, ...]
-    """Of the calibration of each result, as `calibrate` states it."""
+    """Assessment of the calibration of each result, as `calibrate` states it."""
 
     def __getitem__(self, model: str) -> ModelResult:
         for result in self.results:
@@ -67,14 +67,14 @@ class Comparison:
 
     @property
     def best(self) -> ModelResult | None:
-        """The recommended model among those compared; else the largest of them."""
+        """The recommended model if it was compared; otherwise the largest model."""
         by_name = {r.model: r for r in self.results}
         largest = self.results[-1] if self.results else None
         return by_name.get(self.recommendation.model, largest)
 
     @property
     def assessment(self) -> Assessment:
-        """The judgement of the readings, and what the comparison shows."""
+        """Judgement of the readings, with the findings of the comparison."""
         return _assess(self)
 
     def to_json(self) -> str:
@@ -119,8 +119,8 @@ def compare_models(
         models: Models of the robot's YAML; all by default.
         tolerances: As in `Choice`, for all models and the judgement of the readings.
         repeat: Another session of the same rows, or several, to compare the residuals with.
-        options: Which solver, and how it is run.
-        judgement: Of the sessions with these tolerances, if it is known already.
+        options: Solver and its options.
+        judgement: Judgement of the sessions with these tolerances, if it was computed already.
 
     Raises:
         ParameterError: If a model or name is unknown.
@@ -185,15 +185,15 @@ def _score_with_prior(
 ) -> ModelResult | Undetermined:
     """Score a model; with its tolerances as a prior if the readings alone do not determine it.
 
-    Larger models always have a prior, so a small one without would be at a disadvantage.
+    Larger models always have a prior. A small model without one would be at a disadvantage.
     """
     problem = build()
     try:
         return score_model(problem, noise=noise, options=options)
     except NotIdentifiableError:
-        held = build(prior=True)
+        with_prior = build(prior=True)
     try:
-        return score_model(held, noise=noise, by_choice=False, options=options)
+        return score_model(with_prior, noise=noise, by_choice=False, options=options)
     except NotIdentifiableError as e:
         return Undetermined(problem.selection.label, problem.n_machine, e.problem)
 
@@ -227,12 +227,12 @@ def _assess(comparison: Comparison) -> Assessment:
 
 
 def _others(comparison: Comparison, best: ModelResult) -> list[Finding]:
-    """Models that are not recommended, and why."""
-    found = comparison.recommendation
+    """Models that are not recommended, with the reasons."""
+    recommendation = comparison.recommendation
     return [
         words.not_recommended(
             r.model,
-            found.of(r.model) - found.of(best.model),
+            recommendation.of(r.model) - recommendation.of(best.model),
             r.exact.unseen_rms,
             best.exact.unseen_rms,
         )
@@ -256,7 +256,7 @@ def _gather_others(
 
 
 def _require_another(other: Session, sessions: Sequence[Session]) -> None:
-    """Refuse a session to repeat with that is of another robot, or one of those compared."""
+    """Refuse a session for `repeat` that is of another robot, or one of the compared sessions."""
     where = None if other.path is None else str(other.path)
     for session in sessions:
         if other.robot.sha256 != session.robot.sha256:
@@ -272,7 +272,7 @@ def _require_another(other: Session, sessions: Sequence[Session]) -> None:
 
 
 def find_known_noise(session: Session) -> KnownNoise:
-    """Noise of a reading that no model has a part in: from cycles, else as given for the gauge."""
+    """Noise of a reading without any model: from cycles, otherwise as stated for the gauge."""
     problem = build_problem(session, free=["*.offset"])
     sigma, dof = estimate_repeatability(problem.values, problem.observations)
     if dof > 0 and sigma > 0.0:

@@ -26,7 +26,7 @@ DECIDED = 1e-2
 absolute error decides on it: such offsets little more than shift and turn the workspace."""
 
 ENTERED_DECIMALS = 6
-"""Decimals of an offset as it is entered, [m, rad]: 1 µm."""
+"""Step of an entered offset, [m, rad]: 1 µm."""
 
 MOST_STEPS = 12
 
@@ -72,16 +72,16 @@ def compute_entries(
         tool: Its tool over the workspace; None if there is none.
     """
     drives, weights = calibration.robot.drives, calibration.offset_weights
-    own = {
+    offset_stds = {
         i: [calibration.parameters[j] for j in np.flatnonzero(row).tolist()]
         for i, row in enumerate(weights)
         if row.any()
     }
-    if not any(p.free for parts in own.values() for p in parts):
+    if not any(p.free for parts in offset_stds.values() for p in parts):
         return ()
     names = [p.name for p in calibration.free]
     identified, enter = calibration.offsets, calibration.active_offsets
-    enter[list(own)] = identified[list(own)]
+    enter[list(offset_stds)] = identified[list(offset_stds)]
     of_free = weights[:, [j for j, p in enumerate(calibration.parameters) if p.free]]
     total, scatter = (
         np.array([_size(row, covariance) for row in of_free])
@@ -89,7 +89,7 @@ def compute_entries(
     )
     judged = None if calibration.only_offsets else tool
     if judged is not None:
-        chosen = choose_offsets(judged, enter, drives=list(own))
+        chosen = choose_offsets(judged, enter, drives=list(offset_stds))
         everything = error_covariance(calibration)
         enter = chosen.offsets
         total = _spread(chosen.gain[:, : len(everything)], everything)
@@ -107,7 +107,7 @@ def compute_entries(
             std_scatter=float(scatter[i]),
             held=_hold(parts[0]) if judged is None and len(parts) == 1 else None,
         )
-        for i, parts in own.items()
+        for i, parts in offset_stds.items()
     )
 
 
@@ -122,8 +122,12 @@ def _hold(p: ParameterEstimate) -> Literal["known", "lower bound", "upper bound"
 def _size(weights: Array, covariance: Array) -> float:
     """Standard deviation of a sum of parameters; those that are not in it may be unknown."""
     at = np.flatnonzero(weights)
-    own = weights[at]
-    return math.sqrt(float(own @ covariance[np.ix_(at, at)] @ own)) if at.size else 0.0
+    weights_there = weights[at]
+    return (
+        math.sqrt(float(weights_there @ covariance[np.ix_(at, at)] @ weights_there))
+        if at.size
+        else 0.0
+    )
 
 
 def _spread(gain: Array, covariance: Array) -> Array:
@@ -202,12 +206,12 @@ def solve_in_order(first: Array, second: Array, first_rows: Array, second_rows: 
     ratios, turned = np.linalg.eigh(half @ half.T)
     directions = np.linalg.solve(factor.T, turned)
     determined = ratios > DECIDED**2
-    kept = directions[:, determined]
-    result = kept @ np.linalg.lstsq(first @ kept, first_rows, rcond=None)[0]
+    strong = directions[:, determined]
+    result = strong @ np.linalg.lstsq(first @ strong, first_rows, rcond=None)[0]
     if not determined.all():
-        rest = directions[:, ~determined]
+        weak = directions[:, ~determined]
         result = (
             result
-            + rest @ np.linalg.lstsq(second @ rest, second_rows - second @ result, rcond=None)[0]
+            + weak @ np.linalg.lstsq(second @ weak, second_rows - second @ result, rcond=None)[0]
         )
     return np.asarray(result)

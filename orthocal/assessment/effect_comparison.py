@@ -93,18 +93,18 @@ def compare_effects(session: Session) -> EffectComparison | None:
 def _candidates(session: Session) -> tuple[list[str], dict[str, tuple[int, str]]]:
     """Effects to weigh, and those that lack conditions in some of the readings."""
     robot = session.robot
-    own = [n for n in robot.effect_names if n in EFFECT_KINDS]
+    present = [n for n in robot.effect_names if n in EFFECT_KINDS]
     stated = any(r.conditions for r in session.readings)
     possible = missing_effects(session) if stated and robot.chosen_effects is None else ()
     timed = any(r.conditions and r.conditions.time for r in session.readings)
     candidates, lacking = [], {}
-    for name in (*own, *(n for n in possible if n in EFFECT_KINDS)):
+    for name in (*present, *(n for n in possible if n in EFFECT_KINDS)):
         rows = rows_without(session, name)
-        if name == "drift" and name not in own and not timed:
+        if name == "drift" and name not in present and not timed:
             continue
         if not rows.size:
             candidates.append(name)
-        elif rows.size < len(session.readings) or name in own:
+        elif rows.size < len(session.readings) or name in present:
             first = session.where(session.readings[int(rows[0])])
             lacking[name] = (int(rows.size), first)
     return candidates, lacking

@@ -74,10 +74,12 @@ def find_limits(problem: CalibrationProblem, noise: float) -> tuple[EffectLimits
             for setup in problem.session.setups
         }
         for unit in dict.fromkeys(units.values()):
-            own = [i for i, n in enumerate(problem.free) if units.get(n) == unit]
-            if own:
-                sizes = before[own].max(), after[own].max()
+            columns = [i for i, n in enumerate(problem.free) if units.get(n) == unit]
+            if columns:
+                sizes = before[columns].max(), after[columns].max()
                 limits.append(
-                    EffectLimits(effect.name, effect.describe(), unit, len(own), *map(float, sizes))
+                    EffectLimits(
+                        effect.name, effect.describe(), unit, len(columns), *map(float, sizes)
+                    )
                 )
     return tuple(limits)

@@ -45,8 +45,8 @@ def find_unshown_effects(session: Session) -> list[Finding]:
     """
     if not any(name in EFFECT_KINDS for name in session.robot.effect_names):
         return []
-    found = [*_unshown_backlash(session), *_unshown_expansion(session)]
-    return [*found, *_alike(session)] if len(session.readings) > 1 else found
+    findings = [*_unshown_backlash(session), *_unshown_expansion(session)]
+    return [*findings, *_alike(session)] if len(session.readings) > 1 else findings
 
 
 def _unshown_backlash(session: Session) -> Iterator[Finding]:
@@ -142,7 +142,7 @@ def _explained(
     information: Array, one: Indices, other: Indices, *, same: bool
 ) -> list[tuple[int, int]]:
     """Parameters of one effect that another explains, with the most similar one of that."""
-    found = []
+    explained = []
     for p in one:
         among = other[other != p] if not same else other[other > p]
         if not among.size:
@@ -151,5 +151,5 @@ def _explained(
         inverse = np.linalg.pinv(information[np.ix_(among, among)], hermitian=True)
         if shared @ inverse @ shared > ALIKE * information[p, p]:
             alone = shared**2 / np.diag(information)[among]
-            found.append((int(p), int(among[int(alone.argmax())])))
-    return found
+            explained.append((int(p), int(among[int(alone.argmax())])))
+    return explained

@@ -105,19 +105,19 @@ def _linearisation(calibration: Calibration) -> list[Finding]:
 def find_unresolved(calibration: Calibration) -> list[Finding]:
     """Parameters that the readings determine only in combination, and those below the noise."""
     seen = calibration.identifiability
-    found = [words.inseparable(c) for c in seen.alike]
+    findings = [words.inseparable(c) for c in seen.alike]
     if seen.unseen:
-        found.append(words.below_noise(seen.unseen))
-    return found
+        findings.append(words.below_noise(seen.unseen))
+    return findings
 
 
 def _line(calibration: Calibration) -> list[Finding]:
     """Finding about gauges that touch a rod but are modelled by the line between the rods."""
     sigma = calibration.noise.sigma
     try:
-        found = find_idealised(restore_session(calibration))
+        idealised = find_idealised(restore_session(calibration))
     except (ClosureError, RobotError):  # the finding of the tool says so
         return []
-    if found is None or not found.size > NOTABLE_IDEALISATION * sigma:
+    if idealised is None or not idealised.size > NOTABLE_IDEALISATION * sigma:
         return []
-    return [words.line_assumed(found.size, found.setup, found.touches, sigma)]
+    return [words.line_assumed(idealised.size, idealised.setup, idealised.touches, sigma)]

@@ -173,8 +173,8 @@ def find_tolerance_scale(session: Session) -> ToleranceScale:
         deviation = model.entries(part.values[None])[0] - about.expected
         repeated, _ = estimate_repeatability(model.problem.values, model.problem.observations)
         noise = max(about.likelihood.sigma, repeated)
-        within, excess, rest, dof = _parts(model, about, deviation, noise)
-        square = float((within**2 / (1.0 + excess)).sum()) + rest
+        within, excess, remainder, dof = _parts(model, about, deviation, noise)
+        square = float((within**2 / (1.0 + excess)).sum()) + remainder
         if dof < 1 or chance_of_excess(square, dof) >= RARE:
             continue
         spread = 1.0 + SCALES[:, None] ** 2 * excess
@@ -197,7 +197,7 @@ def _parts(
     """
     directions, problem = about.likelihood.directions, model.problem
     along = directions @ deviation
-    rest = max(float(deviation @ deviation - along @ along), 0.0) / noise**2
+    square = max(float(deviation @ deviation - along @ along), 0.0) / noise**2
     slopes = about.sizes[:, None] * about.errors.T / noise  # along each direction, by each error
     known, n = problem.robot.parameters, problem.n_machine
     machine = slopes[:, :n]
@@ -206,13 +206,13 @@ def _parts(
     scaled = np.array([known.are_scaled(name) for name in names], dtype=bool)
     basis, sizes, _ = np.linalg.svd(machine[:, offset])
     rank = int((sizes > RESOLVED).sum())
-    kept = basis[:, rank:].T
+    contrasts = basis[:, rank:].T
     unscaled = np.column_stack([slopes[:, n:], machine[:, ~(offset | scaled)]])
-    gauges, errors = kept @ unscaled, kept @ machine[:, scaled]
-    root = np.linalg.cholesky(np.eye(len(kept)) + gauges @ gauges.T)
-    white = np.linalg.solve(root, np.column_stack([kept @ along / noise, errors]))
+    gauges, errors = contrasts @ unscaled, contrasts @ machine[:, scaled]
+    root = np.linalg.cholesky(np.eye(len(contrasts)) + gauges @ gauges.T)
+    white = np.linalg.solve(root, np.column_stack([contrasts @ along / noise, errors]))
     variances, turned = np.linalg.eigh(white[:, 1:] @ white[:, 1:].T)
-    return turned.T @ white[:, 0], np.maximum(variances, 0.0), rest, model.dof - rank
+    return turned.T @ white[:, 0], np.maximum(variances, 0.0), square, model.dof - rank
 
 
 def _describe_detectable(session: Session) -> Finding:

@@ -71,13 +71,13 @@ def find_implausible(session: Session) -> tuple[Finding, ...]:
     They depend on the readings and the robot alone, not on the model that is calibrated: residuals
     are those of a fit of offsets, which leaves more than any larger model does.
     """
-    found: list[Finding | None] = [_legs(session.robot)]
+    findings: list[Finding | None] = [_legs(session.robot)]
     for part in split_sessions(session):
         problem = build_problem(part, model="offsets") if _has_offsets(part.robot) else None
-        found += [_near(part), *find_finer(part)]
+        findings += [_near(part), *find_finer(part)]
         if problem is not None and part.readings:
-            found += _by_fit(part, problem)
-    return tuple(f for f in found if f is not None)
+            findings += _by_fit(part, problem)
+    return tuple(f for f in findings if f is not None)
 
 
 def find_scattered(session: Session) -> tuple[Finding, ...]:
@@ -85,8 +85,8 @@ def find_scattered(session: Session) -> tuple[Finding, ...]:
 
     Where many readings are wrong no single mistake stands out; that they do not repeat does.
     """
-    found = (_scattered(part, g) for part in split_sessions(session) for g in part.gauges)
-    return tuple(f for f in found if f is not None)
+    findings = (_scattered(part, g) for part in split_sessions(session) for g in part.gauges)
+    return tuple(f for f in findings if f is not None)
 
 
 def find_impossible_gauges(session: Session) -> Iterator[Finding]:
@@ -196,15 +196,15 @@ def _too_small(session: Session, fit: Fit) -> Finding | None:
 
 def _coarse(session: Session, fit: Fit) -> Finding | None:
     """A stated noise far above the scatter of repeated readings, or the residuals: another unit."""
-    given, noise = session.gauge.sigma, fit.noise
-    if given is None or len(session.gauges) > 1:
+    stated, noise = session.gauge.sigma, fit.noise
+    if stated is None or len(session.gauges) > 1:
         return None
     repeated = noise.cycles_dof >= FEWEST
     scatter = noise.cycles_sigma if repeated else noise.residual_sigma
     dof = noise.cycles_dof if repeated else noise.residual_dof
-    if dof < FEWEST or not COMPUTED < TOO_COARSE * scatter < given:
+    if dof < FEWEST or not COMPUTED < TOO_COARSE * scatter < stated:
         return None  # readings without any scatter were computed
-    return words.sigma_too_large(given, scatter=scatter)
+    return words.sigma_too_large(stated, scatter=scatter)
 
 
 def _near(session: Session) -> Finding | None:

@@ -67,14 +67,14 @@ def rank_errors(
     root = _square_root(covariance)
     effect = field @ root
     _, directions = np.linalg.eigh(np.einsum("k,kin,kim->nm", weights, effect, effect))
-    found = []
+    errors = []
     for direction in directions.T[::-1][:count]:
         change = root @ direction
         moved = field @ change
         in_prior_stds = change / prior_stds
         order = np.argsort(-np.abs(in_prior_stds))
         lead = np.sign(in_prior_stds[order[0]]) or 1.0
-        found.append(
+        errors.append(
             RemainingError(
                 rms=float(np.sqrt(weights @ (moved**2).sum(axis=1))),
                 parts=tuple(
@@ -84,7 +84,7 @@ def rank_errors(
                 ),
             )
         )
-    return tuple(found)
+    return tuple(errors)
 
 
 def _square_root(covariance: Array) -> Array:

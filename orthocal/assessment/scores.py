@@ -183,8 +183,8 @@ def _predict_unseen(fit: Fit, linearisation: LinearProblem, method: Method) -> A
         out = o.setup == setup
         try:
             if not problem.prior_precision.all():
-                left = np.where(out[:, None], 0.0, linearisation.jacobian)
-                require_determined(problem, decompose(left, o))
+                jacobian = np.where(out[:, None], 0.0, linearisation.jacobian)
+                require_determined(problem, decompose(jacobian, o))
             if method == "exact":
                 theta = fit.program.solve(
                     sigma=fit.sigma,

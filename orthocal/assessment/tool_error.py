@@ -269,7 +269,7 @@ def assess_placed(
     after = None
     if np.isfinite(calibration.model_covariance).all():
         after = measure_uncertainty(jacobian, error_covariance(calibration), space, where)
-    left = tool.deviation(entered_offsets(calibration, entries), names=names)
+    deviation = tool.deviation(entered_offsets(calibration, entries), names=names)
     return ToolAccuracy(
         workspace=space,
         use=tool.use,
@@ -277,7 +277,7 @@ def assess_placed(
         names=free,
         jacobian=jacobian,
         deviation=read_only(tool.deviation(calibration.active_offsets, names=names)),
-        error_after_offsets=read_only(left),
+        error_after_offsets=read_only(deviation),
         before=measure_uncertainty(jacobian, np.diag(prior_stds**2), space, where),
         after=after,
         unstated=read_only(tool.deviation_unless_stated()) if tool.use.varying else None,

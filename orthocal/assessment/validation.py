@@ -190,32 +190,32 @@ def validate_calibration(
         SolverError: If the fit of the new readings does not converge.
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
-    calibration, given = _restate(calibration, gather_sessions(sessions), tolerances or {})
-    measured = [_with_active_offsets(calibration, one) for one in given]
+    calibration, new_sessions = _restate(calibration, gather_sessions(sessions), tolerances or {})
+    measured = [_with_active_offsets(calibration, one) for one in new_sessions]
     session = join_sessions(measured)
     judgement = judge_session(session)
     fit = repeat_fit(calibration, session)
     refit = _assess_refit(fit, calibration, judgement)
     mistake, changes, wrongly_entered = _find_changes(calibration, measured, judgement)
     expected_rms, test = expect_rms(calibration, fit), judge_deviations(calibration, fit)
-    excess = test.chance
+    is_excessive = test.chance
     lead = _agreement(refit, test, expected_rms, explained=bool(changes))
-    confirmed = None if math.isnan(excess) else _is_confirmed(lead, changes, judgement)
+    confirmed = None if math.isnan(is_excessive) else _is_confirmed(lead, changes, judgement)
     further = [] if lead.kind != "as predicted" else _find_further_change(refit)
     keep = wrongly_entered or (confirmed is not False and not further)
     assessed = assessment_of(refit)
     entries = find_entries(calibration) if keep else assessed.entries
     repetition = measure_repetition(calibration, refit)
-    offsets_stated = all(one.controller_offsets is not None for one in given)
+    offsets_stated = all(one.controller_offsets is not None for one in new_sessions)
     notes = [*further, *([] if wrongly_entered else assessed.of_kind(*ENTRY_KINDS))]
-    notes.append(words.describe_repetition(repetition, new=_is_expected(excess) is False))
+    notes.append(words.describe_repetition(repetition, new=_is_expected(is_excessive) is False))
     notes += [] if offsets_stated else [words.controller_assumed()]
     return Validation(
         confirmed=confirmed,
         offsets_stated=offsets_stated,
         expected_rms=expected_rms,
         expected_largest=_expect_largest(calibration, expected_rms),
-        excess_probability=excess,
+        excess_probability=is_excessive,
         refit=refit,
         mistake=mistake,
         enter=entries,
@@ -251,7 +251,7 @@ def _assess_refit(fit: Fit, calibration: Calibration, judgement: Judgement) -> C
 
 
 def _is_confirmed(lead: Finding, changes: Sequence[Finding], judgement: Judgement) -> bool | None:
-    """Whether new readings confirm the predictions; None where they are not to be trusted."""
+    """Confirmation of the predictions by new readings; None if these contradict each other."""
     agrees = lead.severity == "note" and not changes
     return None if agrees and judgement.verdict != "enter" else agrees
 

@@ -232,14 +232,14 @@ def _describe(
     Raises:
         RobotError: If the YAML has no place for one of them.
     """
-    text, found = _RADIUS.subn(f"radius_mm: {in_mm(dimensions.rod_radius)}", _HEAD.sub("", pattern))
-    if not found:
+    text, count = _RADIUS.subn(f"radius_mm: {in_mm(dimensions.rod_radius)}", _HEAD.sub("", pattern))
+    if not count:
         raise RobotError("has no rods with a radius_mm", where=file)
     for axis, joint in zip(AXES, counting, strict=True):
         line = re.compile(_DRIVE.format(axis=axis))
         drive = f"{{{drive_text(dimensions, joint)}}}"
-        text, found = line.subn(rf"\g<name>{drive}\g<rest>", text)
-        if found != 1:
+        text, count = line.subn(rf"\g<name>{drive}\g<rest>", text)
+        if count != 1:
             raise RobotError(
                 f"has no line '{axis}_slide: {{zero_mm: ...}}'; expected one for its zero",
                 where=file,
@@ -319,8 +319,8 @@ def _override(pattern: str, tolerances: Mapping[str, float], file: str) -> str:
         RobotError: If the YAML has no place for them.
     """
     stated = ", ".join(f"{json.dumps(name)}: {_number(v)}" for name, v in tolerances.items())
-    text, found = _TOLERANCES.subn(lambda m: f"{m[1]}, overrides: {{{stated}}}}}", pattern)
-    if found != 1:
+    text, count = _TOLERANCES.subn(lambda m: f"{m[1]}, overrides: {{{stated}}}}}", pattern)
+    if count != 1:
         raise RobotError(
             "has no line 'tolerances: {...}'; expected one for other tolerances", where=file
         )

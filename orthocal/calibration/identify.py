@@ -70,10 +70,10 @@ def identify(
         TypeError: If an argument is of another kind.
         ValueError: If `start` does not have one number for each free error of the machine.
     """
-    given = gather_sessions(sessions)
+    gathered = gather_sessions(sessions)
     if isinstance(choice, Choice):
-        given = [choice.applied_to(one) for one in given]
-    session = join_sessions(given)
+        gathered = [choice.applied_to(one) for one in gathered]
+    session = join_sessions(gathered)
     require_names(profile, argument="profile")
     chosen = resolve_choice(choice, session)
     options = _solver_options(solver, loss)

@@ -18,8 +18,8 @@ def adjust(
 ) -> None:
     """Plan mechanical adjustments of feet, shims and threads.
 
-    Prints which to set, by how much and in which order. The robot's YAML declares them under
-    orthocal.adjustments.
+    Prints which adjustments to set, by how much and in which order. The robot's YAML declares them
+    under orthocal.adjustments.
 
     Exit code 3: the verdict is not `enter`; the reason is printed.
 

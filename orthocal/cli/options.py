@@ -298,10 +298,10 @@ def read_temperatures(text: str | None) -> tuple[float, float] | None:
         return None
     where = "--temperature"
     first, colon, last = text.partition(":")
-    found = read_number(first, where), read_number(last if colon else first, where)
-    for value in found:
+    temperatures = read_number(first, where), read_number(last if colon else first, where)
+    for value in temperatures:
         require_between(value, LOWEST_C, HIGHEST_C, where)
-    return found
+    return temperatures
 
 
 def load_robot_or_session(subject: str) -> tuple[orthocal.Session | None, orthocal.Robot]:

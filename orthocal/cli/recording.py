@@ -275,8 +275,8 @@ class Dialogue:
         aside -= concerned
         if not aside or not concerned:
             return False
-        found = find_warnings(self._recording.measured(without=aside))
-        return any(concerned & set(find_rows(f, rows)) for f in found)
+        findings = find_warnings(self._recording.measured(without=aside))
+        return any(concerned & set(find_rows(f, rows)) for f in findings)
 
     def _stop_judging(self, error: Exception) -> None:
         """Print once why readings cannot be judged; they are recorded all the same."""
@@ -359,7 +359,7 @@ class Dialogue:
             raise SessionError("nothing was read yet")
         if not rows[index].is_read:
             raise SessionError(f"line {rows[index].line} was not read yet")
-        self._note_moved(index, "read it once more only if the stand is still there")
+        self._note_moved(index, "read it once more only if the stand was not moved")
         line = rows[index].line
         index = self._recording.repeat(index)
         self._note(f"Added: line {self._recording.rows[index].line}, which repeats line {line}.")

@@ -37,13 +37,13 @@ def trace(session: PlanPath, traces: Traces, out: OutDirectory, force: Force = F
     require_new_files(out, FILES, force=force)
     plan = load_rows(session)
     files = _split(traces)
-    found = {name: read_trace(path, plan.robot) for name, path in files.items()}
-    averaged = with_traces(plan, found)
+    by_setup = {name: read_trace(path, plan.robot) for name, path in files.items()}
+    averaged = with_traces(plan, by_setup)
     path = orthocal.write_session(averaged, out)
-    samples = sum(len(t.values) for t in found.values())
+    samples = sum(len(t.values) for t in by_setup.values())
     put_note(
         f"Wrote {path}: {counted(len(averaged.readings), 'reading')}, of which the traces of "
-        f"{', '.join(found)} are {samples} samples"
+        f"{', '.join(by_setup)} are {samples} samples"
     )
 
 

@@ -221,16 +221,16 @@ def _terms(robot: Robot, placement: Placement, twist: Array) -> list[tuple[str, 
     model = robot.model
     terms: list[tuple[str, float]] = []
     if placement.of_frame:
-        owner, rest = f"frame.{model.frames[placement.index].name}", twist
+        owner, remainder = f"frame.{model.frames[placement.index].name}", twist
     else:
-        owner, rest = str(model.names[placement.index]), twist
+        owner, remainder = str(model.names[placement.index]), twist
         if owner in {d.name for d in robot.drives}:
             axis = joint_axis(model, placement.index)
             k = int(np.abs(axis).argmax())
             offset = float(twist[k] / axis[k])
-            rest = np.where(np.arange(6) == k, 0.0, twist - offset * axis)
+            remainder = np.where(np.arange(6) == k, 0.0, twist - offset * axis)
             terms.append((f"{owner}.offset", offset))
-    terms += [(f"{owner}.{a}", float(v)) for a, v in zip(AXES, rest, strict=True)]
+    terms += [(f"{owner}.{a}", float(v)) for a, v in zip(AXES, remainder, strict=True)]
     return [(name, v) for name, v in terms if abs(v) > NEGLIGIBLE]
 
 
@@ -304,9 +304,9 @@ def _foot_twists(keys: AdjustmentKeys, robot: Robot) -> dict[Placement, Array]:
     """Placement of the slide that a foot moves, with its twist in the joint's axes."""
     drives = [d.name for d in robot.drives]
     if keys.moves not in drives:
-        found = "is missing" if keys.moves is None else f"found '{keys.moves}'"
+        problem = "is missing" if keys.moves is None else f"found '{keys.moves}'"
         raise RobotError(
-            f"{found}; expected one of the drives {', '.join(drives)}, or 'lengthens' and a rod",
+            f"{problem}; expected one of the drives {', '.join(drives)}, or 'lengthens' and a rod",
             where="moves",
         )
     for key in ("at_mm", "direction"):

@@ -94,7 +94,7 @@ def displace_drives(
 
 
 def describe_trims(robot: Robot, trims: Sequence[JointTrim]) -> str:
-    """What a controller compensates in each drive, in words; empty for nothing."""
+    """Compensation of a controller in each drive, in words; empty if there is none."""
     texts = []
     for drive, trim in zip(robot.drives, trims, strict=False):
         unit, size = DRIVE_UNITS[drive.unit]

@@ -68,9 +68,9 @@ def _joint_errors(robot: Robot, keys: GeometryTolerances) -> Iterator[Elementary
     model, motors = robot.model, {d.name for d in robot.drives}
     for i in range(1, model.njoints):
         name = str(model.names[i])
-        own = int(np.abs(joint_axis(model, i)).argmax()) if name in motors else None
+        motor_axis = int(np.abs(joint_axis(model, i)).argmax()) if name in motors else None
         for axis in range(6):
-            if axis != own:
+            if axis != motor_axis:
                 yield _error(name, axis, keys, complete=True, of_frame=False)
 
 

@@ -50,11 +50,11 @@ def express_machine(
     known = {**neutral_conditions(robot), "coordinates": commanded, **(conditions or {})}
     actuated, twists = commanded, dict[Placement, ca.SX]()
     for effect in reversed(robot_effects(robot)):  # the drive's gain and offset act last
-        own = {e.name: elementary[e.name] for e in effect.errors}
+        of_effect = {e.name: elementary[e.name] for e in effect.errors}
         needed: Symbols = {name: known[name] for name in effect.conditions}
-        actuated = effect.drives(actuated, own, needed)
-        changes = [effect.placements(own, needed)]
-        for rod, change in effect.rods(own, needed).items():
+        actuated = effect.drives(actuated, of_effect, needed)
+        changes = [effect.placements(of_effect, needed)]
+        for rod, change in effect.rods(of_effect, needed).items():
             changes.append(stretch_rod(robot, robot.rods[rod], change))
         for placement, twist in (item for part in changes for item in part.items()):
             before = twists.get(placement)

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from orthocal.robot.frames import Placement, carriers, hangs_on
+from orthocal.robot.frames import Placement, carriers, parent_frame
 from orthocal.robot.model import Robot, Rod
 
 SAME_PLACE = 1e-6
@@ -49,14 +49,14 @@ def stretch_rod(robot: Robot, rod: Rod, change: ca.SX) -> dict[Placement, ca.SX]
             move(Placement(joint, False), pose, data.oMi[body])
     for frame in sorted(_used_frames(robot)):
         if int(model.frames[frame].parentJoint) == body:
-            above = hangs_on(model, frame)
-            carrier = data.oMi[body] if above is None else data.oMf[above]
+            parent = parent_frame(model, frame)
+            carrier = data.oMi[body] if parent is None else data.oMf[parent]
             move(Placement(frame, True), data.oMf[frame], carrier)
     return twists
 
 
 def _body_of(robot: Robot, rod: Rod, share: Mapping[int, float]) -> int:
-    """Joint that moves a rod's link: the last one before its tip, from the root's."""
+    """Joint that moves the link of a rod: the last one before its tip."""
     model = robot.model
     first, joint = (int(model.frames[robot.frame_id(f)].parentJoint) for f in (rod.root, rod.tip))
     while joint != first and joint > 0 and share[joint] > 1.0 - SAME_PLACE:

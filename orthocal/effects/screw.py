@@ -1,9 +1,9 @@
 """Periodic error of each drive's screw, once a turn.
 
-    really at  ρ + A sin(2πρ/lead) + B cos(2πρ/lead)
+    actual coordinate = ρ + A sin(2πρ/lead) + B cos(2πρ/lead)
 
-with the commanded coordinate ρ without the controller's offset, which belongs to the screw and its
-home switch.
+with the commanded coordinate ρ. It excludes the offset of the controller, so that the phase belongs
+to the screw and its home switch.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class ScrewKeys(EffectKeys):
     """Keys under `orthocal.effects.screw`."""
 
     lead_mm: PositiveNumber
-    """Travel in a turn of the screw."""
+    """Travel per turn of the screw."""
     periodic_tolerance_mm: PositiveNumber = 0.01
-    """Of A and of B."""
+    """Tolerance of A and of B."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,8 +58,8 @@ class CalibrationProblem:
         session: The session.
         robot: Its robot.
         machine_selection: The argument `selection`.
-        selection: It with the nuisance parameters appended.
-        parameters: Its free parameters.
+        selection: `machine_selection` with the nuisance parameters appended.
+        parameters: The free parameters of `selection`.
         states: Loop closures to solve.
         passive_scale: One unit of each scaled passive coordinate, shape (n_passive,), [m, rad].
         free: Names of the free parameters, which are the columns of the Jacobian.
@@ -96,7 +96,7 @@ class CalibrationProblem:
         self.passive_scale = LENGTH_SCALE / coordinate_units(self.robot)[self.robot.passive_index]
 
     def with_values(self, values: ArrayLike) -> CalibrationProblem:
-        """Problem for other readings of the same rows; nothing is built again.
+        """Problem for other readings of the same rows; it shares all functions.
 
         Args:
             values: Readings of the session's rows, shape (n_rows,), [m].
@@ -107,7 +107,7 @@ class CalibrationProblem:
         return other
 
     def with_noise_ratio(self, noise_ratio: Array) -> CalibrationProblem:
-        """Problem with other noise ratios; nothing is built again.
+        """Problem with other noise ratios; it shares all functions.
 
         Args:
             noise_ratio: As for `CalibrationProblem`.
@@ -142,7 +142,8 @@ class CalibrationProblem:
     def active_theta(self) -> Array:
         """Free parameters at the active offsets of the controller, shape (n_free,), [SI].
 
-        All others are 0. Clipped to the bounds. The point of linearisation and the default start.
+        All other parameters are 0. The values are clipped to the bounds. They are the point of
+        linearisation and the default start.
         """
         return self._theta_at(self.session.active_offsets)
 

@@ -1,8 +1,8 @@
-"""Points to command on each side of drives with backlash, for a controller that knows none.
+"""Points to command on each side of drives with backlash, for a controller without compensation.
 
-The correction of points is for the middle of both sides. On a side a drive has to go farther by the
-shift d that it then lags behind. To first order the point moves by J d, with the Jacobian J of the
-nominal forward kinematics; the second order is below 0.01 µm for a backlash of 0.1 mm.
+Corrected points are for the middle of both sides. To reach one from one side, the drives must move
+farther by their lags d. To first order the commanded point changes by J d, with the Jacobian J of
+the nominal forward kinematics. The second order is below 0.01 µm for a backlash of 0.1 mm.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ to the characteristic length."""
 def find_lags(robot: Robot, errors: Mapping[str, float]) -> Array:
     """Distances by which drives lag behind on one side, shape (n_drives,), [m, rad].
 
-    Half of the difference of both sides at the mechanical zero, which is half the backlash.
+    This is half of the difference between both sides at the mechanical zero: half the backlash.
 
     Args:
         robot: The robot.
         errors: Parameter to value, [SI].
     """
     map_, zero = error_map(robot), robot.drive_zero[None]
-    smooth = without_periodic_errors(robot, errors)  # whose slope depends on the coordinate
+    smooth = without_periodic_errors(robot, errors)  # their slope depends on the coordinate
     if "approach" not in map_.conditions:
         return np.zeros(len(robot.drives))
 

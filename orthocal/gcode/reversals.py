@@ -91,11 +91,11 @@ def split_at_reversals(paths: Paths, sides: Sides) -> Parts:
     filled = np.take_along_axis(taken, np.maximum.accumulate(index, axis=0), axis=0)
     turned = (filled[1:] != filled[:-1]).any(axis=1)
     sides.last = filled[-1]
-    kept = (first == 0.0) | turned
-    of, first = of[kept], first[kept]
+    unchanged = (first == 0.0) | turned
+    of, first = of[unchanged], first[unchanged]
     last = np.where(np.append(of[1:] == of[:-1], False), np.append(first[1:], 1.0), 1.0)
     ends = np.cumsum(np.bincount(of, minlength=len(counts))).tolist()
-    return Parts(of, first, last, filled[1:][kept], turned[kept], [0, *ends[:-1]], ends)
+    return Parts(of, first, last, filled[1:][unchanged], turned[unchanged], [0, *ends[:-1]], ends)
 
 
 def _find_cuts(paths: Paths, sides: Sides, of: Indices, first: Array, last: Array) -> Array:

@@ -133,8 +133,8 @@ class SystematicEffect:
 
     def select(self, chosen: Mask) -> SystematicEffect:
         """Effect of some of its parameters."""
-        kept = tuple(p for p, c in zip(self.parameters, chosen, strict=True) if c)
-        return SystematicEffect(self.name, kept, self.change, self.columns[chosen])
+        parameters = tuple(p for p, c in zip(self.parameters, chosen, strict=True) if c)
+        return SystematicEffect(self.name, parameters, self.change, self.columns[chosen])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,16 +232,16 @@ class Rows:
     @cached_property
     def groups(self) -> dict[tuple[str, str], tuple[str, ...]]:
         """Setups of each leg and of each gauge, where these are several setups but not all."""
-        found: dict[tuple[str, str], list[str]] = {}
+        members: dict[tuple[str, str], list[str]] = {}
         for name in self.setups:
             setup = self.session.setups[name]
             leg = getattr(setup.sensor, "leg", None)
             if isinstance(leg, str):
-                found.setdefault(("leg", leg), []).append(name)
+                members.setdefault(("leg", leg), []).append(name)
             if len(self.session.gauges) > 1:
-                found.setdefault(("gauge", setup.gauge), []).append(name)
+                members.setdefault(("gauge", setup.gauge), []).append(name)
         every = len(self.setups)
-        return {k: tuple(v) for k, v in found.items() if 1 < len(v) < every}
+        return {k: tuple(v) for k, v in members.items() if 1 < len(v) < every}
 
     def of_setups(self, setups: Sequence[str]) -> Indices:
         """Rows of some setups."""
@@ -258,10 +258,10 @@ class Rows:
 
 def group_rows(keys: Iterable[Key]) -> dict[Key, Indices]:
     """Rows of each key, in their order; the keys are those of all rows."""
-    found: dict[Key, list[int]] = {}
+    by_key: dict[Key, list[int]] = {}
     for i, key in enumerate(keys):
-        found.setdefault(key, []).append(i)
-    return {key: np.array(rows) for key, rows in found.items()}
+        by_key.setdefault(key, []).append(i)
+    return {key: np.array(rows) for key, rows in by_key.items()}
 
 
 def sparse_rows(

@@ -141,13 +141,13 @@ def share_rows(one: Term, other: Term) -> bool:
 
 def distinct_terms(terms: Sequence[Term]) -> list[Term]:
     """Hypotheses that share no row with one before."""
-    found: list[Term] = []
+    distinct: list[Term] = []
     used: set[int] = set()
     for t in terms:
         if not used & set(t.explanation.rows):
-            found.append(t)
+            distinct.append(t)
             used |= set(t.explanation.rows)
-    return found
+    return distinct
 
 
 def _unmatched(one: Sequence[Term], other: Sequence[Term]) -> tuple[list[Term], list[Term]]:
@@ -186,12 +186,12 @@ def find_alternatives(
         mine, others = _unmatched(chosen.terms, s.terms)
         if any(t is term for t in mine):
             if others:
-                found = [
+                sets = [
                     c
                     for t, c in zip(s.terms, explain_with_amounts(s), strict=True)
                     if any(t is o for o in others)
                 ]
-                alternatives.update(dict.fromkeys(found))
+                alternatives.update(dict.fromkeys(sets))
             continue
         for cause in explain_with_amounts(s):
             if set(cause.rows) == set(e.rows) and e.agrees_with(cause) and cause.kind != e.kind:

@@ -335,8 +335,8 @@ class LinearModel:
         problem = CalibrationProblem(other, selection)
         reading, jacobian = problem.predict_and_jacobian(problem.active_theta)
         nominal = self.problem.predict(self.problem.active_theta) * self.problem.noise_ratio
-        own = set(self.problem.free) | set(offsets)
-        new = [i for i, n in enumerate(problem.free) if n not in own]
+        present = set(self.problem.free) | set(offsets)
+        new = [i for i, n in enumerate(problem.free) if n not in present]
         return SystematicEffect(
             name,
             tuple(problem.parameters[i] for i in new),

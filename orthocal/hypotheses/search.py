@@ -3,8 +3,8 @@
 Families of hypotheses share the prior probability, and the hypotheses of each share that of their
 family. The Bayes factor of their mixture against no anomaly exceeds e^c by chance in at most one of
 e^c sound sessions (Markov's inequality), however many are tried. Anomalies are added one after the
-other (forward selection), in small sessions two at once as well (`pairs.py`), and taken out again
-where the others explain them (backward elimination). The best ones are linearised anew.
+other (forward selection), in small sessions also in pairs (`pairs.py`). Those that the others
+explain are removed again (backward elimination). The best ones are linearised anew.
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ from orthocal.hypotheses.pairs import Singles, find_pairs
 from orthocal.session.session import Session
 
 CLEARLY = 7.0
-"""Logarithm of the Bayes factor from which on an anomaly is reported: by chance in at most one of
-e⁷ = 1,100 sessions."""
+"""Least logarithm of the Bayes factor of a reported anomaly. By chance at most one of e⁷ = 1,100
+sessions reaches it."""
 
 EFFECT_CLEARLY = 4.5
-"""Logarithm of the Bayes factor, prior probability aside, from which on an effect of the machine is
-reported that the model lacks: such effects are usual. By chance in at most one of 90 sessions, and
-far less often in simulated ones (`tests/benchmarks/checking.py --effects 1000`)."""
+"""Least logarithm of the Bayes factor, without the prior probability, of a reported effect that the
+model lacks. It is smaller than CLEARLY because such effects are usual. By chance at most one of 90
+sessions reaches it, far fewer in simulations (`tests/benchmarks/checking.py --effects 1000`)."""
 
 EFFECT_SCALES = np.array([1.0, 4.0])
 """Grid of amplitudes of the parameters of an effect, [prior std]."""
@@ -69,7 +69,7 @@ NEARLY = 3.0
 """Logarithm of the Bayes factor up to which another explanation is nearly as likely."""
 
 WORTH_REFITTING = 4.0
-"""Logarithm of the Bayes factor, to first order, from which on hypotheses are linearised anew."""
+"""Least logarithm of the Bayes factor, to first order, of hypotheses that are linearised anew."""
 
 FAMILIES = 28.0
 """Families of mistakes that share the prior probability; each effect is as likely as a family."""
@@ -84,16 +84,16 @@ MOST_PAIRS_REFITTED = 12
 """Pairs that are linearised anew."""
 
 COARSE = 2.0
-"""Logarithm of the Bayes factor below 1 at which a pair is left out after the coarse grid: the sum
-over the full grid of scales may exceed its largest term by that and `WORTH_REFITTING`."""
+"""A pair is omitted after the coarse grid if its logarithm of the Bayes factor is below −COARSE.
+The sum over the full grid may exceed its largest term by COARSE + WORTH_REFITTING."""
 
 FAR_BEHIND = CLEARLY + NEARLY
-"""Logarithm of the Bayes factor beyond which a pair that explains less than a single hypothesis is
-omitted."""
+"""A pair is omitted if its logarithm of the Bayes factor is smaller by this than that of the best
+single hypothesis."""
 
 MOST_COMBINED = 5
-"""Most likely single hypotheses that are combined in pairs where none by itself leaves readings
-that a machine shows."""
+"""Number of the most likely single hypotheses that are combined in pairs, if none of them alone
+leads to plausible readings."""
 
 MOST_PAIRED = 60
 """Rows of a session up to which pairs of hypotheses are considered."""
@@ -108,18 +108,17 @@ LARGEST_CHANGE = 100.0
 """Change of an error of the machine, in prior std, that no machine makes between two sessions."""
 
 LARGEST_VOLUME = float(np.log(1000.0))
-"""Logarithm of the factor on volumes beyond which a family is not considered in pairs."""
-
+"""Largest logarithm of the factor on volumes of a family that is considered in pairs."""
 
 LEAST_EFFECT = 1e-3
-"""Part of the noise by which a change of one prior std must move the readings to be considered."""
+"""Least change of the readings by one prior std of a considered change, relative to the noise."""
 
 CHUNK = 4096
-"""Hypotheses that are scored at a time, for their memory."""
+"""Number of hypotheses that are scored at a time, to limit the memory."""
 
 
 def find_anomalies(session: Session) -> Anomalies:
-    """Find what is wrong with a session, from its readings and its robot alone.
+    """Anomalies of a session, from its readings and its robot.
 
     Args:
         session: A session, or several joined ones; rows that were not read are not in it.
@@ -149,9 +148,9 @@ class _Search:
     def run(self) -> Anomalies:
         """Forward selection, backward elimination and their result.
 
-        A unit or a decimal point of many readings explains several gross errors a little: where one
-        is found, single readings are tried by themselves as well. No correction is proposed that
-        leaves more than the readings as written and that no machine shows.
+        A wrong unit or decimal point of many readings also explains a small part of several gross
+        errors. If one is found, the search is repeated with single readings only. A correction is
+        not proposed if it increases the residuals and leads to implausible readings.
         """
         state, near = self._select(grouped=True)
         if any(t.explanation.factor and len(t.explanation.rows) > 1 for t in state.terms):
@@ -161,7 +160,7 @@ class _Search:
         return self._result(*((self.sound, []) if self._worsens(state) else (state, near)))
 
     def _worsens(self, state: HypothesisSet) -> bool:
-        """True if the corrected readings are further from any machine than those as written."""
+        """True if a correction increases the residuals and leads to implausible readings."""
         before, after = (self.model.rms(s.remaining, s.about) for s in (self.sound, state))
         return after > before and not self.is_plausible(state)
 
@@ -176,21 +175,21 @@ class _Search:
         state = self.sound
         near: list[tuple[HypothesisSet, HypothesisSet]] = []
         while len(state.terms) < MOST_ANOMALIES:
-            found, alternatives = self._step(state, grouped=grouped)
-            if found is None:
+            extended, alternatives = self._step(state, grouped=grouped)
+            if extended is None:
                 break
-            state = self._eliminate(found)
-            near += [(found, s) for s in alternatives]
+            state = self._eliminate(extended)
+            near += [(extended, s) for s in alternatives]
             if alternatives and not is_local(self.session, state, alternatives):
                 break
         return state, near
 
     def evaluate(self, terms: Sequence[Term], start: ModelLinearisation) -> HypothesisSet:
-        """Score a set of hypotheses, linearised where it leads.
+        """Score a set of hypotheses, linearised at the errors that it implies.
 
-        The first step may lead beyond FURTHEST, as readings are not linear over offsets of some mm:
-        what is not linear looks like errors far beyond their tolerances. If the next step does not
-        lead back, it does not count.
+        The first step may exceed FURTHEST, because readings are not linear over offsets of some mm:
+        the nonlinear part looks like errors far beyond their tolerances. Such a step does not count
+        unless the next step returns within FURTHEST.
         """
         model = self.model
         known = [t.shift for t in terms if t.shift is not None and t.known]
@@ -310,7 +309,7 @@ class _Search:
         if not self.is_plausible(likeliest) and len(state.terms) + 2 <= MOST_ANOMALIES:
             tried += self._combine(state, single)
         ranked = sorted(tried, key=negative_log_posterior)
-        # of several anomalies at once a single one leaves readings that no machine shows
+        # a single anomaly of several leads to implausible readings
         plausible = [s for s in ranked if self.is_plausible(s)]
         if plausible and plausible[0].log_posterior > ranked[0].log_posterior - CLEARLY:
             ranked = plausible
@@ -335,7 +334,7 @@ class _Search:
     def _moved_together(
         self, state: HypothesisSet, scored: list[tuple[Family, Array]], rows: Rows
     ) -> Iterator[tuple[Term, ...]]:
-        """Changes of two or more drives between the same sessions: one alone explains little."""
+        """Changes of two or more drives between the same sessions."""
         before = {(t.explanation.drives, t.explanation.sessions) for t in state.terms}
         since: dict[tuple[str, ...], list[Term]] = {}
         for family, _ in scored:
@@ -349,28 +348,28 @@ class _Search:
                     yield from combinations(terms, count)
 
     def _combine(self, state: HypothesisSet, single: list[Term]) -> list[HypothesisSet]:
-        """Sets with two of the most likely hypotheses, where neither suffices by itself."""
+        """Sets with two of the most likely hypotheses, if neither suffices alone."""
         apart = combinations(distinct_terms(single)[:MOST_COMBINED], 2)
         tried = [self.evaluate((*state.terms, *more), state.about) for more in apart]
         if not tried:
             return []
         one, other = min(tried, key=negative_log_posterior).terms[-2:]
         others = [
-            (t, kept)
-            for out, kept in ((one, other), (other, one))
+            (t, partner)
+            for out, partner in ((one, other), (other, one))
             for t in single
-            if t is not out and not share_rows(t, kept) and share_rows(t, out)
+            if t is not out and not share_rows(t, partner) and share_rows(t, out)
         ]
         return tried + [self.evaluate((*state.terms, *more), state.about) for more in others]
 
     def is_plausible(self, state: HypothesisSet) -> bool:
-        """True if the corrected readings are those of a machine near its tolerances."""
+        """True if a machine near its tolerances explains the corrected readings."""
         score = state.score
         quiet = score.noise_scale < LARGEST_NOISE_SCALE or not self.model.stated
         return score.tolerance_scale < LARGEST_TOLERANCE_SCALE and quiet
 
     def _eliminate(self, state: HypothesisSet) -> HypothesisSet:
-        """Take out hypotheses that the others make superfluous."""
+        """Remove hypotheses that the others make superfluous."""
         while len(state.terms) > 1:
             fewer = [
                 (min(NEARLY, _needed(out)), self.evaluate(others, self.sound.about))
@@ -535,8 +534,8 @@ class _Search:
             np.vstack(rows) != 0.0,
         )
         least = sound + max(-COARSE, single - FAR_BEHIND)
-        found = find_pairs(likelihood, state.remaining, singles, least=least)
-        evidence = found.log_posterior - sound
+        pairs = find_pairs(likelihood, state.remaining, singles, least=least)
+        evidence = pairs.log_posterior - sound
         if not evidence.size:
             return [], -np.inf
         hypotheses = [(f, h) for f in families for h in range(f.count)]
@@ -545,7 +544,7 @@ class _Search:
         def term(m: int) -> Term:
             return self._term(*hypotheses[m], corrected)
 
-        chosen = found.members[evidence > WORTH_REFITTING - NEARLY][:MOST_PAIRS_REFITTED]
+        chosen = pairs.members[evidence > WORTH_REFITTING - NEARLY][:MOST_PAIRS_REFITTED]
         return [(term(a), term(b)) for a, b in chosen.tolist()], float(log_of_sum(evidence))
 
     def _expected(self, state: HypothesisSet, row: int) -> float:

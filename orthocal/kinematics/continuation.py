@@ -379,11 +379,11 @@ class _Path:
         regular = np.zeros(len(x), dtype=np.bool_)
         closed = np.flatnonzero((worst < tolerance) & np.isfinite(jacobians).all(axis=(1, 2)))
         if closed.size and system.n_x:  # a last step without evaluation: its Jacobian is at hand
-            found = residuals[closed], jacobians[closed]
+            evaluated = residuals[closed], jacobians[closed]
             if self._allow_singular:
-                step = system.step(*found)
+                step = system.step(*evaluated)
             else:
-                step, regular[closed] = system.regular_step(*found)
+                step, regular[closed] = system.regular_step(*evaluated)
             small = np.abs(step).max(axis=1) < MAX_LAST_STEP
             x[closed[small]] += step[small]
         return x, worst, regular

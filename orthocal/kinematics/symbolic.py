@@ -20,7 +20,7 @@ from orthocal.effects.machine import express_machine
 from orthocal.effects.protocol import Condition, Placement
 from orthocal.errors import RobotError
 from orthocal.kinematics.se3 import exp6, log6
-from orthocal.robot.frames import hangs_on
+from orthocal.robot.frames import parent_frame
 from orthocal.robot.model import Robot, joint_axis
 
 
@@ -98,7 +98,7 @@ class SymbolicTree:
         joint_placements: Joint to its placement in its parent's moving frame; the model's by
             default.
         frame_placements: Index of a frame to its placement in the frame that it hangs on (see
-            `hangs_on`); the model's by default.
+            `parent_frame`); the model's by default.
     """
 
     def __init__(
@@ -138,7 +138,7 @@ class SymbolicTree:
     def frame_pose(self, frame: int) -> Pose:
         """Pose of a frame in the world; the errors of frames that it hangs on act on it."""
         if frame not in self._frames:
-            parent = hangs_on(self.model, frame)
+            parent = parent_frame(self.model, frame)
             placement = self._frame_placements.get(frame)
             if placement is None:
                 placement = constant_pose(nominal_placement(self.model, Placement(frame, True)))
@@ -162,7 +162,7 @@ def nominal_placement(model: pin.Model, placement: Placement) -> pin.SE3:
     """Placement of a joint, or of a frame in the frame that it hangs on, or else in its joint."""
     if not placement.of_frame:
         return model.jointPlacements[placement.index]
-    parent, nominal = hangs_on(model, placement.index), model.frames[placement.index].placement
+    parent, nominal = parent_frame(model, placement.index), model.frames[placement.index].placement
     return nominal if parent is None else model.frames[parent].placement.inverse() * nominal
 
 

@@ -55,8 +55,8 @@ def in_course(
     setups = [r.setup for r in session.readings]
     if not setups:
         return session
-    begun = np.cumsum([False, *(a != b for a, b in pairwise(setups))])
-    minutes = begun * minutes_a_setup + np.arange(len(setups)) * minutes_a_reading
+    setup_index = np.cumsum([False, *(a != b for a, b in pairwise(setups))])
+    minutes = setup_index * minutes_a_setup + np.arange(len(setups)) * minutes_a_reading
     neutral = neutral_values(session.robot)["temperature"]
     first, last = temperatures or (neutral, neutral)
     warmth = np.interp(minutes, [0.0, max(float(minutes[-1]), 1e-9)], [first, last])

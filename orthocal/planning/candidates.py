@@ -182,8 +182,8 @@ def measure_candidates(
         rows = np.flatnonzero(o.setup == k)
         if rows.size < FEWEST:
             continue
-        own = [i for i in range(n, len(owners)) if owners[i] == f"setup.{name}"]
-        shared, mine = jacobian[rows][:, common], jacobian[rows][:, own]
+        of_setup = [i for i in range(n, len(owners)) if owners[i] == f"setup.{name}"]
+        shared, mine = jacobian[rows][:, common], jacobian[rows][:, of_setup]
         aligned = []
         for index, seen in aligned_of.get(name, ()):
             sensitivity = jacobian[rows, index] / problem.theta_scale[index]
@@ -252,16 +252,16 @@ def _add_postures(
     box = choose_box(robot, equipment.box)
     middle = tool_at_zero(robot)
     coordinates = () if robot.tcp is None else robot.tcp.coordinates
-    own = [k for k, c in enumerate(coordinates) if abs(leg.axis[c]) > ON_AXIS]
+    along = [k for k, c in enumerate(coordinates) if abs(leg.axis[c]) > ON_AXIS]
     lines = []
     for k, (low, high) in enumerate(box):
-        if own and k not in own:
+        if along and k not in along:
             side = middle[k] + np.linspace(-equipment.across, equipment.across, PLACES_ACROSS)
             lines.append(np.unique(np.clip(side, low, high)))
         else:
-            line = np.linspace(low, high, equipment.along if own else PLACES_ACROSS)
-            whole = np.round(line / WHOLE) * WHOLE + _phases(robot, line.size)
-            lines.append(np.unique(np.clip(whole, low, high).round(9)))
+            line = np.linspace(low, high, equipment.along if along else PLACES_ACROSS)
+            rounded = np.round(line / WHOLE) * WHOLE + _phases(robot, line.size)
+            lines.append(np.unique(np.clip(rounded, low, high).round(9)))
     points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(lines))
     points = np.unique(np.vstack([np.clip(middle, box[:, 0], box[:, 1]), points.round(9)]), axis=0)
     points = points[reachable(robot, points)]
@@ -302,14 +302,14 @@ def _sensors(leg: Leg, equipment: Equipment) -> Iterator[tuple[str, LegIndicator
 
 def _directions(leg: Leg) -> list[Direction]:
     """Two directions across a leg, along axes of the world that are perpendicular to it."""
-    found: list[Direction] = [
+    directions: list[Direction] = [
         name for name, axis in zip("xyz", np.eye(3), strict=True) if abs(axis @ leg.axis) < 1e-6
     ]
-    if len(found) >= 2:
-        return found
+    if len(directions) >= 2:
+        return directions
     first = np.cross(leg.axis, np.eye(3)[int(np.abs(leg.axis).argmin())])
-    if found:
-        first = np.eye(3)["xyz".index(str(found[0]))]
+    if directions:
+        first = np.eye(3)["xyz".index(str(directions[0]))]
     first /= np.linalg.norm(first)
     second = np.cross(leg.axis, first)
     return [(float(a), float(b), float(c)) for a, b, c in (first, second)]
@@ -328,8 +328,8 @@ def _with_lateral_positions(session: Session) -> Session:
     for reading in session.readings:
         read[reading.setup].append(reading)
     on_rods = tuple(r for name in views for r in read[name])
-    found = locate_contacts(replace(session, setups=views, readings=on_rods))
-    for name, (postures, contact) in found.items():
+    contacts = locate_contacts(replace(session, setups=views, readings=on_rods))
+    for name, (postures, contact) in contacts.items():
         sensor = sensors[name]
         constants, half = sensor.constants(robot), _lateral_room(sensor, robot)
         side, start = constants[8:11], constants[11:14]
@@ -338,10 +338,10 @@ def _with_lateral_positions(session: Session) -> Session:
         lowest, highest = (round(f(aside.values()) / step) for f in (min, max))
         for k in range(lowest, highest + 1):
             near = [r for r in read[name] if abs(aside[r.posture] - k * step) <= half]
-            own = name if k == 0 else f"{name}_{k * step / MM:+.3g}"
+            view_name = name if k == 0 else f"{name}_{k * step / MM:+.3g}"
             x, y, z = (float(v) for v in (k * step * side).round(9) + 0.0)
-            setups[own] = Setup(own, replace(sensor, beside=(x, y, z)))
-            readings += [replace(r, setup=own) for r in near]
+            setups[view_name] = Setup(view_name, replace(sensor, beside=(x, y, z)))
+            readings += [replace(r, setup=view_name) for r in near]
     return replace(session, setups=setups, readings=tuple(readings))
 
 

@@ -152,11 +152,11 @@ def choose_box(robot: Robot, asked: Array | None) -> Array:
     """
     if asked is None:
         return find_box(robot)
-    found, middle = np.array(asked, dtype=np.float64), tool_at_zero(robot)
+    ranges, middle = np.array(asked, dtype=np.float64), tool_at_zero(robot)
     for k, way in itertools.product(range(middle.size), (-1.0, 1.0)):
         end = 0 if way < 0.0 else 1
         point = np.array(middle)
-        point[k] = found[k, end]
+        point[k] = ranges[k, end]
         if way * (point[k] - middle[k]) <= 0.0 or reachable(robot, point[None])[0]:
             continue
         near, far = 0.0, abs(point[k] - middle[k])
@@ -165,10 +165,10 @@ def choose_box(robot: Robot, asked: Array | None) -> Array:
             reached = reachable(robot, point[None])[0]
             near, far = (0.5 * (near + far), far) if reached else (near, 0.5 * (near + far))
         steps = math.floor(max(near - ROOM, 0.0) / STEP + 1e-9)
-        found[k, end] = middle[k] + way * STEP * steps
-    beyond = found[:, 0] > found[:, 1]  # nothing is in reach, and there will be no postures
-    found[beyond] = asked[beyond]
-    return read_only(found)
+        ranges[k, end] = middle[k] + way * STEP * steps
+    beyond = ranges[:, 0] > ranges[:, 1]  # nothing is in reach, and there will be no postures
+    ranges[beyond] = asked[beyond]
+    return read_only(ranges)
 
 
 def _reach(robot: Robot, middle: Array, coordinate: int, way: float) -> float:
@@ -219,15 +219,17 @@ def load_dial(path: str | Path, equipment: Equipment) -> Equipment:
         SessionError: Naming file and key.
     """
     file = Path(path)
-    found = read_yaml(file, error=SessionError)
-    if not isinstance(found, dict):
+    document = read_yaml(file, error=SessionError)
+    if not isinstance(document, dict):
         raise SessionError("expected keys and values, such as sigma_mm: 0.005", where=str(file))
-    data: dict[str, Any] = dict(found)
-    own = {k: data.pop(k) for k in MOUNTING_KEYS if k in data}
+    data: dict[str, Any] = dict(document)
+    mounting_keys = {k: data.pop(k) for k in MOUNTING_KEYS if k in data}
     gauge = validate(GaugeKeys, data, where=str(file), error=SessionError)
     if gauge.scale_tolerance is not None:
-        own["scale_tolerance"] = gauge.scale_tolerance
-    mounting = Mounting.from_keys(validate(MountingKeys, own, where=str(file), error=SessionError))
+        mounting_keys["scale_tolerance"] = gauge.scale_tolerance
+    mounting = Mounting.from_keys(
+        validate(MountingKeys, mounting_keys, where=str(file), error=SessionError)
+    )
     if gauge.sigma_mm is None and gauge.resolution_mm is None:
         raise SessionError(
             "is missing; a plan needs the repeatability of the readings",

@@ -120,8 +120,8 @@ class ToolForecast:
             if not determined & {term for term, _ in parameters[n].terms}
         )
         self.names = (*free, *self.others)
-        own = {**(others or {}), **{p.name: p.prior_std for p in selection.parameters}}
-        self.prior_stds = np.array([own.get(n, parameters[n].prior_std) for n in self.names])
+        stds = {**(others or {}), **{p.name: p.prior_std for p in selection.parameters}}
+        self.prior_stds = np.array([stds.get(n, parameters[n].prior_std) for n in self.names])
         nominal = nominal_closure(robot)
         drives, passive = nominal.reach(region.points)
         self.workspace = region.repeat(use.size)
@@ -190,13 +190,13 @@ class ToolForecast:
         each = [
             f for part in call_in_parallel([partial(posteriors, p) for p in parts]) for f in part
         ]
-        found = [covariance for covariance, _ in each if covariance is not None]
+        covariances = [covariance for covariance, _ in each if covariance is not None]
         lost = sum(share / len(drawn) for _, share in each)
-        if not found:
+        if not covariances:
             raise ClosureError(
                 "cannot be read on machines within their tolerances", posture="the planned ones"
             )
-        return replace(self._expected(np.mean(found, axis=0)), lost=lost)
+        return replace(self._expected(np.mean(covariances, axis=0)), lost=lost)
 
     def about_nominal(self, session: Session) -> Expected:
         """Expected tool error to first order about the nominal machine, as in the search."""
@@ -213,8 +213,8 @@ class ToolForecast:
         if not self.others:
             return None
         n = len(self.selection.names)
-        own = dict(zip(self.others, self.prior_stds[n:].tolist(), strict=True))
-        free = build_problem(session, free=self.others, prior=True, prior_stds=own)
+        stds = dict(zip(self.others, self.prior_stds[n:].tolist(), strict=True))
+        free = build_problem(session, free=self.others, prior=True, prior_stds=stds)
         problem = weigh_readings(free)
         _, slopes = problem.predict_and_jacobian(np.zeros(problem.n_free))
         return slopes[:, : len(self.others)]
@@ -340,8 +340,8 @@ class Weigher:
 def _root(rows: Array) -> Array:
     """R with R Rᵀ = rowsᵀ rows and as few columns as possible, shape (n, p)."""
     values, vectors = np.linalg.eigh(rows.T @ rows)
-    kept = values > values[-1] * 1e-14
-    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
+    positive = values > values[-1] * 1e-14
+    return np.asarray(vectors[:, positive] * np.sqrt(values[positive]))
 
 
 def noise_of(session: Session) -> float:
@@ -357,8 +357,8 @@ def weigh_readings(problem: CalibrationProblem) -> CalibrationProblem:
         return problem
     noise = np.ones(problem.observations.size)
     for group in groups:
-        own = noise_floor(group.gauge.sigma, group.gauge.resolution)
-        noise[group.entries] = own / noise_of(session)
+        floor = noise_floor(group.gauge.sigma, group.gauge.resolution)
+        noise[group.entries] = floor / noise_of(session)
     return problem.with_noise_ratio(noise)
 
 

@@ -132,11 +132,11 @@ def _read_legs(
     middle = tool_at_zero(robot)
     points, setups, readings = {"zero": middle}, {}, []
     for leg in robot.legs.values():
-        own = int(np.abs(leg.axis).argmax())
-        extremes = {f"{'xyz'[own]}_{name}": ends[own, i] for name, i in (("max", 1), ("min", 0))}
+        axis = int(np.abs(leg.axis).argmax())
+        extremes = {f"{'xyz'[axis]}_{name}": ends[axis, i] for name, i in (("max", 1), ("min", 0))}
         for name, shift in extremes.items():
-            points[name] = middle + shift * np.eye(len(middle))[own]
-        for k in (k for k in range(3) if k != own):
+            points[name] = middle + shift * np.eye(len(middle))[axis]
+        for k in (k for k in range(3) if k != axis):
             setup = f"{'xyz'[k]}{leg.name}"
             setups[setup] = Setup(setup, equipment.list_sensors(leg, "xyz"[k], 0.5)[0])
             readings += [Reading(setup, posture) for posture in ("zero", *extremes)]

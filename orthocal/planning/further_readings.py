@@ -64,7 +64,7 @@ def find_further_readings(
         None for effects that no readings of these kinds would show.
     """
     conditions = {e.name: e.conditions for e in added_effects(comparison.plan.robot)}
-    found = []
+    proposals = []
     for limit in limits:
         tried = list[FurtherReadings]()
         if not limit.determined:
@@ -72,8 +72,8 @@ def find_further_readings(
                 tried.append(_evaluate(comparison, extension, limit))
                 if tried[-1].limit.determined:
                     break
-        found += [further for further in tried[-1:] if further.limit.after < limit.after]
-    return tuple(found)
+        proposals += [further for further in tried[-1:] if further.limit.after < limit.after]
+    return tuple(proposals)
 
 
 def _evaluate(

@@ -135,12 +135,12 @@ class SetupGain:
 
     def further_gains(self, rows: list[int]) -> Array:
         """Gain of each further reading, given some readings of this setup, shape (m,)."""
-        rest = self.spread[rows]
-        solved = np.linalg.solve(self._covariance(rest, rows), rest)
+        spread = self.spread[rows]
+        solved = np.linalg.solve(self._covariance(spread, rows), spread)
         effect = solved.T @ self.effect[rows]
         np.subtract(self.effect, effect, out=effect)
-        rest *= solved
-        return self._single_gains(effect, self.variance - rest.sum(axis=0))
+        spread *= solved
+        return self._single_gains(effect, self.variance - spread.sum(axis=0))
 
     def best_pairs(self, pairs: Pairs, most: int) -> list[tuple[float, tuple[int, int]]]:
         """Best pairs of readings with their gains; the gauge is aligned in the first reading.
@@ -156,15 +156,15 @@ class SetupGain:
         if not i.size:
             return []
         gains = self._begun_differences()[i, j] if self.aligned else self._differences(pairs)
-        found: list[tuple[float, tuple[int, int]]] = []
+        ranked: list[tuple[float, tuple[int, int]]] = []
         while True:
             best = int(gains.argmax())
             gain, pair = float(gains[best]), (int(i[best]), int(j[best]))
             if gain < 0.0:
-                return found
-            found.append((gain, pair))
-            if len(found) == most:
-                return found
+                return ranked
+            ranked.append((gain, pair))
+            if len(ranked) == most:
+                return ranked
             if self.aligned:  # the first reading makes the difference
                 gains[i == pair[0]] = -1.0
                 continue

@@ -299,7 +299,7 @@ def _choose_setups(
 
 
 def _is_reached(planned: PlannedSetups, sides: list[int]) -> bool:
-    """Whether the limits of parameters, in their limits before, are within the goal."""
+    """True if all limits, relative to those before, are within the goal."""
     variance = np.diag(np.linalg.inv(planned.information))[sides]
     return bool(np.sqrt(variance.max(initial=0.0)) <= GOAL)
 

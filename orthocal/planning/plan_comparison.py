@@ -50,7 +50,7 @@ class Comparison:
 
     @property
     def entered(self) -> bool:
-        """Whether identified offsets are entered before the readings are taken.
+        """True if identified offsets are entered before the readings are taken.
 
         A session is complemented under its own offsets.
         """
@@ -71,16 +71,17 @@ class Comparison:
         chosen = [setups[i % len(setups)] for i in range(count)] if setups else []
         each = [total // count + (i < total % count) for i in range(count)]
         lines = [self._line(setup) for setup in chosen]
-        found = []
+        plans = []
         for name, select in (("the paper's", _ends_and_zero), ("even", _evenly)):
             rows = [select(*line, n) for line, n in zip(lines, each, strict=True)]
             if any(rows):
                 in_range = all(map(_is_in_range, chosen, rows))
                 session = self._session(
-                    chosen, [[self.candidates.session.readings[i] for i in own] for own in rows]
+                    chosen,
+                    [[self.candidates.session.readings[i] for i in indices] for indices in rows],
                 )
-                found.append(self._assess(name, session, in_range=in_range))
-        return tuple(found)
+                plans.append(self._assess(name, session, in_range=in_range))
+        return tuple(plans)
 
     def list_alternatives(self) -> tuple[Alternative, ...]:
         """Plans with a finer dial, a blade, or one square block for each leg."""
@@ -90,18 +91,18 @@ class Comparison:
         ]
         if any(indicator_of(s).tip.form == "ball" for s in self.plan.setups.values()):
             changes.append(("a blade instead of the ball", _with_blade))
-        found = []
+        alternatives = []
         for name, change in changes:
             try:
-                found.append(self._assess(name, change(self.plan)))
+                alternatives.append(self._assess(name, change(self.plan)))
             except OrthocalError:
                 continue  # a gauge that cannot be mounted is no alternative
-        return tuple(found)
+        return tuple(alternatives)
 
     def _assess(self, name: str, session: Session, *, in_range: bool = True) -> Alternative:
-        whole = self.join(session)
+        joined = self.join(session)
         minutes = self.equipment.minutes(len(session.setups), len(session.readings))
-        expected = self.forecast.after(whole, entered=self.entered) if in_range else None
+        expected = self.forecast.after(joined, entered=self.entered) if in_range else None
         return Alternative(name, len(session.setups), len(session.readings), minutes, expected)
 
     def _middle_setups(self) -> list[CandidateSetup]:
@@ -145,12 +146,12 @@ class Comparison:
         setups: dict[str, Setup] = {}
         readings: list[Reading] = []
         for i, (setup, own_rows) in enumerate(zip(chosen, rows, strict=True)):
-            own = f"{setup.name}.{i}"
-            setups[own] = replace(source.setups[setup.name], name=own)
+            name = f"{setup.name}.{i}"
+            setups[name] = replace(source.setups[setup.name], name=name)
             cycles: dict[str, int] = {}
             for r in own_rows:
                 cycles[r.posture] = cycles.get(r.posture, 0) + 1
-                readings.append(replace(r, setup=own, cycle=cycles[r.posture]))
+                readings.append(replace(r, setup=name, cycle=cycles[r.posture]))
         return replace(source, setups=setups, readings=tuple(readings)).select(readings)
 
 

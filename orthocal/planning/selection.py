@@ -182,16 +182,16 @@ class SetupSearch:
     def run(self, start: _Start) -> PlannedSetups:
         """Setups of one start: added one after the other, then exchanged."""
         with threadpool_limits(1):  # on several threads sums may be rounded differently
-            found = self.empty
+            plan = self.empty
             for count, drawn in start:
-                found = self._extend(found, drawn or self._find_best(found.information, count))
+                plan = self._extend(plan, drawn or self._find_best(plan.information, count))
             for _ in range(MOST_ROUNDS):
-                before = found.error
-                for k in range(len(found.setups)):
-                    found = self._exchange(found, k)
-                if found.error > before * (1.0 - LEAST_IMPROVEMENT):
+                before = plan.error
+                for k in range(len(plan.setups)):
+                    plan = self._exchange(plan, k)
+                if plan.error > before * (1.0 - LEAST_IMPROVEMENT):
                     break
-            return found
+            return plan
 
     @property
     def empty(self) -> PlannedSetups:
@@ -362,15 +362,15 @@ class Gains:
 
         Only setups whose best pair of readings gains most are completed.
         """
-        begun = [
+        present = [
             (gain, which, pair)
             for which in range(len(self.search.reduced))
             if self._pairs(which, count).flat.size
             for gain, pair in self._ranking_setup(which).best_pairs(self._pairs(which, count), 1)
         ]
-        begun.sort(key=lambda b: -b[0])
+        present.sort(key=lambda b: -b[0])
         completed = []
-        for _, which, pair in begun[:MOST_COMPLETED]:
+        for _, which, pair in present[:MOST_COMPLETED]:
             gain, chosen = self.setup(which, pair[0]).complete(pair, count)
             completed.append((gain, PlannedSetup(which, chosen)))
         return [planned for _, planned in sorted(completed, key=lambda c: -c[0])]

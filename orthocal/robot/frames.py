@@ -32,7 +32,7 @@ def find_frame(model: pin.Model, name: str, *, where: str) -> int:
     raise RobotError(f"the URDF has no frame '{name}'", where=where)
 
 
-def hangs_on(model: pin.Model, frame: int) -> int | None:
+def parent_frame(model: pin.Model, frame: int) -> int | None:
     """Parent frame on the same joint, whose errors move this frame; None if there is none."""
     f = model.frames[frame]
     parent = int(f.parentFrame)
@@ -46,7 +46,7 @@ def carriers(model: pin.Model, frame: int) -> Iterator[int]:
     current: int | None = frame
     while current is not None:
         yield current
-        current = hangs_on(model, current)
+        current = parent_frame(model, current)
 
 
 def place_frames(model: pin.Model, nominal: pin.Model, twists: Mapping[str, Array]) -> None:

@@ -212,10 +212,10 @@ def _find_file(folder: Path, suffix: str, *names: str) -> Path:
     preferred = [folder / f"{name}{suffix}" for name in names]
     files = [p for p in preferred if p.is_file()][:1] or sorted(folder.glob(f"*{suffix}"))
     if len(files) != 1:
-        found = ", ".join(f.name for f in files) or "none"
+        names_found = ", ".join(f.name for f in files) or "none"
         raise RobotError(
             f"expected one {suffix[1:].upper()} file, or one named {preferred[-1].name}; found "
-            f"{found}",
+            f"{names_found}",
             where=str(folder),
         )
     return files[0]

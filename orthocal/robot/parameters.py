@@ -273,12 +273,12 @@ class ParameterSet:
             ParameterError: If a name or unit is unknown, or a number is implausible.
         """
         matched = {name for glob in self.read_tolerances(given) for name in self.select([glob])}
-        kept = {
+        others = {
             key: value
             for key, value in self.stated.items()
             if not matched.issuperset(self.select([self.read_glob(key)[0]]))
         }
-        stated = kept | dict(given)
+        stated = others | dict(given)
         if stated == self.stated:
             return self
         parameters = {p.name: p for p in self.defaults}

@@ -160,10 +160,10 @@ class BallBar:
         known = "It is known" if not self.length_std else "Its true length need not be known"
         return (
             "Mount one ball at the tool and the other on the table, at about "
-            f"X{x} Y{y} Z{z} mm from the tool's mechanical zero. The places need not be exact.",
+            f"X{x} Y{y} Z{z} mm from the tool centre point at the mechanical zero, by eye.",
             f"Put the bar between the balls. Its dial shows 0 at a length of {length}. {known}.",
-            "Make the bar longer by hand. The dial must grow. If it falls, write every reading of "
-            "this setup with reversed sign.",
+            "Make the bar longer with your hand. The reading must grow. If it falls, reverse the "
+            "sign of every reading of this setup.",
         )
 
     def path(self, start: Array, end: Array) -> Array:

@@ -136,7 +136,7 @@ class ToolIndicatorKeys(SetupKeys):
 
 @dataclass(frozen=True, slots=True)
 class Artefact:
-    """What the indicator touches; standard deviations of its errors."""
+    """Artefact that the indicator touches, with the standard deviations of its errors."""
 
     kind: Kind
     along: str | None = None
@@ -288,8 +288,8 @@ class ToolIndicator:
             place + over + " Clamp it: it must stay until all its readings are taken.",
             f"Mount the indicator at the tool. Its plunger points to {self.direction} and touches "
             f"the {words}.",
-            "Push the plunger in by hand. The dial must grow. If it falls, write every reading of "
-            "this setup with reversed sign.",
+            "Push the plunger in with a finger. The reading must grow. If it falls, reverse the "
+            "sign of every reading of this setup.",
         )
 
     def frames(self, robot: Robot) -> Frames:

@@ -110,10 +110,10 @@ class MachineModel:
             names: Names of the errors, shape (n,).
         """
         place = {name: i for i, name in enumerate(names)}
-        own = self.problem.functions.errors.names
-        result = np.zeros((len(errors), len(own)))
-        known = [i for i, name in enumerate(own) if name in place]
-        result[:, known] = errors[:, [place[own[i]] for i in known]]
+        error_names = self.problem.functions.errors.names
+        result = np.zeros((len(errors), len(error_names)))
+        known = [i for i, name in enumerate(error_names) if name in place]
+        result[:, known] = errors[:, [place[error_names[i]] for i in known]]
         return result
 
     def identified_part(self, errors: Array, names: Sequence[str]) -> Array:
@@ -132,9 +132,9 @@ class MachineModel:
         """True if all errors of the machines are identified."""
         if not set(truth.robot.effect_names) <= set(self.robot.effect_names):
             return False
-        own = self.columns
+        columns = self.columns
         moved = self.translate(truth.errors_per_theta.T, truth.functions.errors.names).T
-        return np.allclose(own @ (np.linalg.pinv(own) @ moved), moved, atol=1e-12)
+        return np.allclose(columns @ (np.linalg.pinv(columns) @ moved), moved, atol=1e-12)
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,7 +257,7 @@ class RandomMachines:
 
     @property
     def alike_without_errors(self) -> bool:
-        """Whether model and machines without errors have the same readings and the same tool."""
+        """True if model and machines without errors have the same readings and the same tool."""
         readings, tools = [], []
         for problem in (self.truth, self.model.problem):
             none = np.zeros((1, len(problem.functions.errors.names)))

@@ -91,16 +91,16 @@ def run_study(
     total = sum(sizes)
     with open_results(path, study, anew=anew) as (results, store):
         waiting = [task for task in range(len(sizes)) if task not in results]
-        kept = sum(sizes[task] for task in results)
+        completed = sum(sizes[task] for task in results)
         start, done = time.monotonic(), 0
         if report is not None:
-            report(Progress(kept, total, kept, None))
+            report(Progress(completed, total, completed, None))
         for task, columns in _run_tasks(study, waiting, workers, dask):
             store(task, columns)
             done += sizes[task]
             if report is not None:
-                seconds_left = (time.monotonic() - start) * (total - kept - done) / done
-                report(Progress(kept + done, total, kept, seconds_left))
+                seconds_left = (time.monotonic() - start) * (total - completed - done) / done
+                report(Progress(completed + done, total, completed, seconds_left))
         return StudyTable(study, _join_columns(results))
 
 

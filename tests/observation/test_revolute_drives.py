@@ -221,8 +221,9 @@ def test_a_session_needs_a_zero_that_is_given(tmp_path):
     legs = "  legs: {a: {root: elbow_a, tip: end_a}}\n"
     folder = write_wide_linkage(tmp_path / "wide", legs)
     message = (
-        r"robot: 'wide' cannot stand with its drives at 0, and its mechanical zero is not given; "
-        r"add to orthocal.drives in .*wide.yaml: motor_a.zero_deg \(-?\d+\.\d+ was found\), motor_b"
+        r"robot: 'wide' cannot be posed with its drives at 0, and its mechanical zero is not "
+        r"stated; add to orthocal.drives in .*wide.yaml: "
+        r"motor_a.zero_deg \(-?\d+\.\d+ was found\), motor_b"
     )
     with pytest.raises(SessionError, match=message):
         load_plan(write_plan(tmp_path / "plan", folder))

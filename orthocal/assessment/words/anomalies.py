@@ -93,9 +93,9 @@ def _describe_effect(session: Session, name: str) -> str:
 def _clear_amounts(e: Explanation) -> list[tuple[str, float, float, Unit]]:
     """Parameters of an effect that clearly differ from 0, or the clearest: value, std and unit."""
     every = range(len(e.amounts))
-    found = [(e.parameters[i], e.amounts[i], e.stds[i], e.units[i]) for i in every]
-    found.sort(key=lambda entry: -abs(entry[1]) / entry[2])
-    return [f for f in found if abs(f[1]) > 2.0 * f[2]] or found[:1]
+    amounts = [(e.parameters[i], e.amounts[i], e.stds[i], e.units[i]) for i in every]
+    amounts.sort(key=lambda entry: -abs(entry[1]) / entry[2])
+    return [f for f in amounts if abs(f[1]) > 2.0 * f[2]] or amounts[:1]
 
 
 def _ambiguous(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding:
@@ -120,7 +120,7 @@ def _unexplained(session: Session, result: Anomalies) -> Finding:
         f"{'only a part' if result.found else 'it'}: several parts may have changed, or several "
         "readings are wrong.",
         "Calibrate the session that was measured last alone: the values to enter must belong to "
-        "the machine as it is now."
+        "the present machine."
         if session.joined
         else "Measure again.",
         before_rms_um=result.rms_before / UM,

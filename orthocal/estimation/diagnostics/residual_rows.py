@@ -33,17 +33,17 @@ class ResidualRow:
     predicted: Number
     """Prediction of the calibrated machine, [m]."""
     line: Count | None
-    """Line in the CSV."""
+    """Line of readings.csv."""
     file: str | None
-    """The CSV, if it is not the one of the session."""
+    """CSV file, if it is not that of the session."""
     studentised: NumberOrNaN
     """Studentised deleted residual; NaN if no other row predicts it."""
     influence: Number
-    """Largest change of a parameter without this row, in its standard deviations."""
+    """Largest change of a parameter if this row is omitted, in standard deviations of it."""
     influenced: str
-    """Which parameter that is."""
+    """Name of the parameter with this change."""
     unseen: NumberOrNaN
-    """Error of predicting it from all other setups, [m]; NaN if they do not determine the model."""
+    """Measured minus predicted from all other setups, [m]; NaN if these do not determine it."""
     conditions: Conditions | None = None
     """Conditions of the reading, where stated."""
 

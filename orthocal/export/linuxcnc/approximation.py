@@ -188,8 +188,8 @@ class _State:
             cold: Whether it does not know the temperature.
         """
         drives = inverse(checks, None if cold else self.temperature)
-        found = _tip_error(self.tip, checks, drives, start=self.passive)
-        return math.inf if found is None else found
+        tip_error = _tip_error(self.tip, checks, drives, start=self.passive)
+        return math.inf if tip_error is None else tip_error
 
 
 def approximate(

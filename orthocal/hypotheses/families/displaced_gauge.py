@@ -61,14 +61,16 @@ def _displaced(rows: Rows) -> Family | None:
 
 def _cycle_apart(rows: Rows) -> Family | None:
     """An inner cycle; before the second and the last one the gauge was displaced for good."""
-    found = []
+    explanations = []
     for (name, cycle), indices in rows.cycles.items():
         setup = rows.setups[name]
         inner = indices[0] != setup[0] and indices[-1] != setup[-1]
         if inner and indices.size > 1 and rows.single[indices].all():
             at = tuple(indices.tolist())
-            found.append(Explanation("displaced gauge", "cycle", at, names=(name,), cycle=cycle))
-    return Family.with_effects(rows, found) if found else None
+            explanations.append(
+                Explanation("displaced gauge", "cycle", at, names=(name,), cycle=cycle)
+            )
+    return Family.with_effects(rows, explanations) if explanations else None
 
 
 def _stuck(rows: Rows, sigma: float) -> Family | None:
@@ -86,11 +88,11 @@ def _stuck(rows: Rows, sigma: float) -> Family | None:
     if not runs:
         return None
     setups = [rows.session.readings[run[0]].setup for run in runs]
-    found = [
+    explanations = [
         Explanation("stuck dial", "setup", tuple(run.tolist()), names=(setup,))
         for run, setup in zip(runs, setups, strict=True)
     ]
     silent = [run[1 : MOST_STUCK + 1] for run in runs]
     steps = np.array([rows.gauge(int(run[0])).resolution or sigma for run in runs])
     volume = -np.log(steps) * [len(indices) for indices in silent]
-    return Family.of(found, size=rows.count * MOST_STUCK, log_volume=volume, silent=silent)
+    return Family.of(explanations, size=rows.count * MOST_STUCK, log_volume=volume, silent=silent)

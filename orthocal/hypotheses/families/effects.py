@@ -30,7 +30,7 @@ LEAST_COLUMN = 1e-3
 
 def missing_effects(session: Session) -> tuple[str, ...]:
     """Names of the effects that the robot of a session could have, and has not."""
-    found = []
+    names = []
     built_in = {effect.name for effect in BUILT_IN}
     others = [name for name in effect_names() if name not in built_in]
     for name in (*EFFECT_KINDS, *others):
@@ -40,8 +40,8 @@ def missing_effects(session: Session) -> tuple[str, ...]:
             with_effects(session.robot, (*session.robot.effect_names, name))
         except RobotError:  # the YAML lacks one of its keys, or a package is broken
             continue
-        found.append(name)
-    return tuple(found)
+        names.append(name)
+    return tuple(names)
 
 
 def rows_without(session: Session, name: str) -> Indices:
@@ -53,7 +53,7 @@ def rows_without(session: Session, name: str) -> Indices:
 
 def find_effects(model: LinearModel) -> list[SystematicEffect]:
     """Effects that the readings of a session could show, but the model lacks."""
-    session, found = model.problem.session, []
+    session, effects = model.problem.session, []
     for name in missing_effects(session):
         lacking = rows_without(session, name)
         if lacking.size == len(session.readings):
@@ -64,8 +64,8 @@ def find_effects(model: LinearModel) -> list[SystematicEffect]:
             seen &= ~effect.columns[:, lacking].any(axis=1)
             seen &= [p.name.startswith("setup.") for p in effect.parameters]
         if seen.any():
-            found.append(effect.select(seen))
-    return found
+            effects.append(effect.select(seen))
+    return effects
 
 
 def unmodelled_effects(rows: Rows, effects: Sequence[SystematicEffect]) -> Iterator[Family]:
@@ -87,18 +87,20 @@ def unmodelled_effects(rows: Rows, effects: Sequence[SystematicEffect]) -> Itera
 
 def _drifts(rows: Rows, effect: SystematicEffect) -> Iterator[Family]:
     """Drift of each setup by any amount, and the same drift of all."""
-    session, found, ramps = rows.session, [], []
+    session, explanations, ramps = rows.session, [], []
     of_setup = group_rows(r.setup for r in session.readings)
     for column in effect.columns:
         setup = session.readings[int(np.abs(column).argmax())].setup
         if of_setup[setup].size >= FEWEST:
-            found.append(Explanation("drift", "setup", tuple(of_setup[setup].tolist()), (setup,)))
+            explanations.append(
+                Explanation("drift", "setup", tuple(of_setup[setup].tolist()), (setup,))
+            )
             ramp = column[of_setup[setup]]
             ramps.append(ramp / np.ptp(ramp))
-    if len(found) > 1:
-        every = tuple(i for e in found for i in e.rows)
-        names = tuple(e.setups[0] for e in found)
-        found.append(Explanation("drift", "session", every, names))
+    if len(explanations) > 1:
+        every = tuple(i for e in explanations for i in e.rows)
+        names = tuple(e.setups[0] for e in explanations)
+        explanations.append(Explanation("drift", "session", every, names))
         ramps.append(np.concatenate(ramps))
-    if found:
-        yield Family.with_effects(rows, found, ramps)
+    if explanations:
+        yield Family.with_effects(rows, explanations, ramps)

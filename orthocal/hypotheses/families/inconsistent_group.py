@@ -30,16 +30,16 @@ def inconsistent_groups(rows: Rows) -> Iterator[Family]:
 def _setups(rows: Rows) -> Family | None:
     if not 2 < len(rows.setups) <= MOST_GROUPS:
         return None
-    found, groups = [], []
+    explanations, groups = [], []
     for name, indices in rows.setups.items():
         amounts = [r for (setup, *_), r in rows.repeated.items() if setup == name]
         if rows.single[indices].all():  # the gauge zero is free
             amounts = amounts[1:]
         if 1 < len(amounts) <= MOST:
             at = tuple(indices.tolist())
-            found.append(Explanation("inconsistent setup", "setup", at, (name,)))
+            explanations.append(Explanation("inconsistent setup", "setup", at, (name,)))
             groups.append(amounts)
-    return Family.of(found, groups=groups)
+    return Family.of(explanations, groups=groups)
 
 
 def _postures(rows: Rows) -> Family | None:
@@ -49,10 +49,10 @@ def _postures(rows: Rows) -> Family | None:
     if len(by_label) < 3:
         return None
     groups = {k: v for k, v in by_label.items() if 1 < len(v) <= MOST}
-    found = [
+    explanations = [
         Explanation(
             "inconsistent posture", "postures", tuple(np.concatenate(g).tolist()), names=(label,)
         )
         for label, g in groups.items()
     ]
-    return Family.of(found, groups=list(groups.values()))
+    return Family.of(explanations, groups=list(groups.values()))

@@ -50,7 +50,7 @@ def _wrong_offsets(model: LinearModel) -> Family | None:
     if not tried or len(place) < len(drives):
         return None
 
-    found = [
+    explanations = [
         Explanation(
             kind,
             "session",
@@ -66,7 +66,7 @@ def _wrong_offsets(model: LinearModel) -> Family | None:
         for i, name in enumerate(drives):
             direction[place[name]] = (active[k, i] - c[i]) / scale[place[name]]
         shifts.append(MachineShift(np.arange(len(labels)) == k, direction))
-    return Family.of(found, shifts=shifts)
+    return Family.of(explanations, shifts=shifts)
 
 
 def enter_wrongly(
@@ -145,7 +145,7 @@ def _steps(
     place: dict[str, int],
 ) -> Family:
     labels, active = model.labels, model.active
-    found, shifts = [], []
+    explanations, shifts = [], []
     for later, apart in divide_sessions(model.order):
         sessions = np.isin(np.arange(len(labels)), later)
         named = tuple(labels[k] for k in (later if apart else later[:1]))
@@ -153,7 +153,7 @@ def _steps(
         entered = bool(between.min() > ROUNDING)
         for name, direction in directions:
             drive = drive_of.get(place.get(name, -1))
-            found.append(
+            explanations.append(
                 Explanation(
                     "offset of one drive" if entered and drive else "machine changed",
                     "session",
@@ -164,7 +164,7 @@ def _steps(
                 )
             )
             shifts.append(MachineShift(sessions, direction))
-    return Family.of(found, shifts=shifts, known=False)
+    return Family.of(explanations, shifts=shifts, known=False)
 
 
 def divide_sessions(order: Indices) -> Iterator[tuple[list[int], bool]]:
@@ -186,8 +186,8 @@ def divide_sessions(order: Indices) -> Iterator[tuple[list[int], bool]]:
     seen: list[set[int]] = []
     for size in range(1, n // 2 + 1):
         for some in map(list, combinations(sessions, size)):
-            rest = set(sessions) - set(some)
-            if set(some) not in steps and rest not in seen:
+            others = set(sessions) - set(some)
+            if set(some) not in steps and others not in seen:
                 seen.append(set(some))
                 yield some, True
 

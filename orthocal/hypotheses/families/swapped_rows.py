@@ -73,12 +73,12 @@ def _of_setup(rows: Rows) -> list[Explanation]:
 
 def _across_setups(rows: Rows) -> list[Explanation]:
     """Pairs of the same posture in two setups, as in a line of the sheet with slipped columns."""
-    found = group_rows((r.postures, r.cycle) for r in rows.session.readings)
-    if sum(len(indices) ** 2 for indices in found.values()) > 2 * MOST:
+    by_state = group_rows((r.postures, r.cycle) for r in rows.session.readings)
+    if sum(len(indices) ** 2 for indices in by_state.values()) > 2 * MOST:
         return []
     return [
         _rows(i, j)
-        for indices in found.values()
+        for indices in by_state.values()
         for i, j in combinations(indices, 2)
         if rows.session.readings[i].setup != rows.session.readings[j].setup
     ]
@@ -107,13 +107,13 @@ def _postures(rows: Rows) -> list[Explanation]:
         by_label.setdefault(rows.posture(i), {})[r.setup, r.cycle] = i
     if len(by_label) ** 2 > 2 * MOST or len(by_label) * rows.count > 100 * MOST:
         return []
-    found: list[Explanation] = []
+    explanations: list[Explanation] = []
     for a, b in combinations(by_label, 2):
         both = [k for k in by_label[a] if k in by_label[b]]
         if len({setup for setup, _ in both}) > 1:
             one, other = (np.array([by_label[x][k] for k in both]) for x in (a, b))
-            found.append(_pair("postures", one, other, names=(a, b)))
-    return found
+            explanations.append(_pair("postures", one, other, names=(a, b)))
+    return explanations
 
 
 def _setups(rows: Rows) -> list[Explanation]:
@@ -134,20 +134,20 @@ def _setups(rows: Rows) -> list[Explanation]:
 def _legs(rows: Rows) -> list[Explanation]:
     """All setups of two legs, in their order."""
     legs = {name: setups for (scope, name), setups in rows.groups.items() if scope == "leg"}
-    found: list[Explanation] = []
+    explanations: list[Explanation] = []
     for a, b in combinations(legs, 2):
         sizes = [[rows.setups[s].size for s in legs[x]] for x in (a, b)]
         if sizes[0] == sizes[1]:
             one, other = rows.of_setups(legs[a]), rows.of_setups(legs[b])
-            found.append(_pair("legs", one, other, (*legs[a], *legs[b]), (a, b)))
-    return found
+            explanations.append(_pair("legs", one, other, (*legs[a], *legs[b]), (a, b)))
+    return explanations
 
 
 def _backwards(rows: Rows) -> list[Explanation]:
     """The rows of a setup written from the last to the first."""
-    found: list[Explanation] = []
+    explanations: list[Explanation] = []
     for name, indices in rows.setups.items():
         half = indices.size // 2
         if half > 1:
-            found.append(_pair("setup", indices[:half], indices[::-1][:half], (name,)))
-    return found
+            explanations.append(_pair("setup", indices[:half], indices[::-1][:half], (name,)))
+    return explanations

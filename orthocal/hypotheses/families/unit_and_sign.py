@@ -87,13 +87,15 @@ def _reversed(
 def _groups(rows: Rows) -> list[Explanation]:
     """Groups of readings that may share a factor, with their signs reversed."""
     every = tuple(rows.setups)
-    found = [_reversed("session", np.arange(rows.count), every)]
+    explanations = [_reversed("session", np.arange(rows.count), every)]
     for (scope, name), setups in rows.groups.items():
         kind: Scope = "leg" if scope == "leg" else "gauge"
-        found.append(_reversed(kind, rows.of_setups(setups), setups, (name,)))
+        explanations.append(_reversed(kind, rows.of_setups(setups), setups, (name,)))
     if len(every) > 1:
-        found += [_reversed("setup", indices, (name,)) for name, indices in rows.setups.items()]
-    return found
+        explanations += [
+            _reversed("setup", indices, (name,)) for name, indices in rows.setups.items()
+        ]
+    return explanations
 
 
 def _scaled(

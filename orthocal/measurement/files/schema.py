@@ -155,7 +155,7 @@ class FirmwareKeys(_Keys):
 
 
 class ControllerKeys(_Keys):
-    """What the controller corrects: one number per drive of the kind, in their order."""
+    """Corrections of the controller: one number per drive of the kind, in their order."""
 
     offsets_mm: Vector | None = None
     """Of prismatic drives."""

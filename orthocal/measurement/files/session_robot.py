@@ -44,8 +44,8 @@ def require_given_zero(robot: Robot, where: str) -> None:
     ]
     if zeros:
         raise SessionError(
-            f"'{robot.name}' cannot stand with its drives at 0, and its mechanical zero is not "
-            f"given; add to orthocal.drives in {robot.yaml}: {', '.join(zeros)}",
+            f"'{robot.name}' cannot be posed with its drives at 0, and its mechanical zero is not "
+            f"stated; add to orthocal.drives in {robot.yaml}: {', '.join(zeros)}",
             where=where,
         )
 

@@ -245,8 +245,8 @@ def _read_temperature(table: Table, row: Row, column: int) -> str:
         SessionError: If it may be in °C or °F.
     """
     text = row.cell(column).text.strip()
-    number, own = split_degrees(text)
-    degrees = own or split_degrees(table.header[column])[1]
+    number, unit = split_degrees(text)
+    degrees = unit or split_degrees(table.header[column])[1]
     value = parse_numeral(number.strip(), "comma" if "," in number else "point")
     if value is None or value.adjusted() > 3:
         return text

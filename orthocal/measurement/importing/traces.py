@@ -227,7 +227,7 @@ def with_traces(session: Session, traces: Mapping[str, Trace]) -> Session:
     """
     readings = [r for r in session.readings if r.setup not in traces and r.is_read]
     postures = {p for r in readings for p in (r.posture, r.minus)}
-    kept = {n: p for n, p in session.postures.items() if n in postures}
+    used = {n: p for n, p in session.postures.items() if n in postures}
     stds: dict[str, list[float]] = {}
     for name, trace in traces.items():
         if name not in session.setups:
@@ -241,7 +241,7 @@ def with_traces(session: Session, traces: Mapping[str, Trace]) -> Session:
         stds.setdefault(session.setups[name].gauge, []).append(binned.std)
         added = _place_bins(session, name, binned)
         for posture, approach, value in added:
-            kept[posture.name] = posture
+            used[posture.name] = posture
             conditions = Conditions(approach)
             readings.append(Reading(name, posture.name, value=value, conditions=conditions))
     gauges = dict(session.gauges)
@@ -258,7 +258,7 @@ def with_traces(session: Session, traces: Mapping[str, Trace]) -> Session:
         session,
         gauges=gauges,
         setups=setups,
-        postures=kept,
+        postures=used,
         readings=tuple(readings),
         sha256="",
         readings_path=None,
@@ -276,10 +276,10 @@ def _place_bins(
         before = closure.inverse(binned.points - 0.5 * binned.motions, names=names)
     except ClosureError as e:
         raise SessionError(e.reason, where=f"trace of {setup}: {e.posture}") from None
-    found = []
+    bins = []
     for name, point, at, start, value in zip(
         names, binned.points, drives, before, binned.values.tolist(), strict=True
     ):
         posture = Posture(name, "tcp", point, at - session.active_offsets)
-        found.append((posture, name_approach(at - start), value))
-    return found
+        bins.append((posture, name_approach(at - start), value))
+    return bins

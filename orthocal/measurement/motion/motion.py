@@ -434,23 +434,23 @@ def _arrive(session: Session, setup: str, stop: Stop, corners: Array, length: fl
     point, closure = corners[-1], nominal_closure(session.robot)
     before = _walk(corners[::-1], length)
     beyond = 2.0 * point - before
-    found = []
+    approaches = []
     for begin in (before, beyond):
         drives = closure.inverse(begin[None])[0]
         approach = name_approach(stop.drives - drives)
-        found.append(approach)
+        approaches.append(approach)
         if all(a == b or "u" in (a, b) for a, b in zip(stop.approach, approach, strict=True)):
             break
     else:
         raise SessionError(
             f"cannot be approached as stated ({stop.approach}): along the path of setup "
-            f"'{setup}' the drives arrive with {' or '.join(found)}",
+            f"'{setup}' the drives arrive with {' or '.join(approaches)}",
             where=f"{session.path or 'session'}: postures.{stop.posture}",
         )
     via = corners[1:]
     if begin is before:
-        rest = np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1)[::-1])[::-1]
-        via = corners[1:-1][rest[1:] > length]
+        remaining = np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1)[::-1])[::-1]
+        via = corners[1:-1][remaining[1:] > length]
     return replace(
         stop, approach=approach, approach_drives=drives, approach_point=begin, via=tuple(via)
     )

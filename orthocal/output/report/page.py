@@ -313,7 +313,7 @@ def _provenance(calibration: Calibration) -> str:
 
 def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
     """Tolerances, known values and bounds that the user stated."""
-    usual = calibration.robot.parameters.defaults
+    defaults = calibration.robot.parameters.defaults
     factor = calibration.tolerance_scale.factor
     tolerances, known, bounds = [], [], []
     for p in calibration.parameters:
@@ -323,14 +323,14 @@ def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
             continue
         if p.prior and (p.mean != 0.0 or not calibration.prior):
             known.append(f"{p.name} {p.mean * f:g} ± {show_limit(p.prior_std) * f:g} {unit}")
-        elif p.prior_std not in (usual[p.name].prior_std, factor * usual[p.name].prior_std):
-            limit, usually = (show_limit(q.prior_std) * f for q in (p, usual[p.name]))
-            tolerances.append(f"{p.name} {limit:g} {unit} instead of {usually:g}")
+        elif p.prior_std not in (defaults[p.name].prior_std, factor * defaults[p.name].prior_std):
+            limit, default = (show_limit(q.prior_std) * f for q in (p, defaults[p.name]))
+            tolerances.append(f"{p.name} {limit:g} {unit} instead of {default:g}")
         if p.lower is not None or p.upper is not None:
             low, high = ("∞" if v is None else f"{v * f:g}" for v in (p.lower, p.upper))
             bounds.append(f"{p.name} {low} … {high} {unit}".replace(" ∞ …", " −∞ …"))
     rows = [
-        (name, _some(texts))
+        (name, _abbreviate(texts))
         for name, texts in (("Tolerances", tolerances), ("Known values", known), ("Bounds", bounds))
         if texts
     ]
@@ -339,8 +339,8 @@ def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
     return rows or [("Assumptions", "the tolerances of the robot")]
 
 
-def _some(texts: Sequence[str]) -> str:
-    """All texts if they are few, else the first of them."""
+def _abbreviate(texts: Sequence[str]) -> str:
+    """Texts as a list; of many only the first, with the number of the others."""
     more = len(texts) - MOST_NAMED
     return "; ".join(texts[:MOST_NAMED]) + (f"; and {more} more" if more > 0 else "")
 

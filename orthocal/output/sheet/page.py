@@ -261,7 +261,7 @@ def _gauge_zero(gauge: Gauge, first: Stop) -> str:
     again = " Set it again where the table says so." * (first.role == "subtracted")
     return (
         f"{set_dial(gauge)} This is the gauge zero: set it here only.{again} Tap the stand: the "
-        "hand must come back."
+        "hand must return to 0."
     )
 
 

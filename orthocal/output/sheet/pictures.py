@@ -261,7 +261,7 @@ class Picture:
             title: Description for those who do not see the picture.
         """
         placed = self.place_labels()
-        texts = "".join(_leader(*found) + _text(*found) for found in placed)
+        texts = "".join(_leader(*label) + _text(*label) for label in placed)
         return (
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self.width:g} '
             f'{self.height:g}" style="width:{self.width:g}mm;max-width:100%;height:auto" '

@@ -181,7 +181,7 @@ def _next_step(
     calibration: Calibration, assessment: Assessment, saved: Path | None
 ) -> tuple[str, tuple[str, ...]]:
     """The next action, and the commands for it."""
-    decision, tool, kept = assessment.decision, assessment.tool, assessment.keeps_offsets
+    decision, tool, unchanged = assessment.decision, assessment.tool, assessment.keeps_offsets
     if decision.verdict != "enter":
         return decision.action or "none.", ()
     if saved is None:
@@ -196,20 +196,20 @@ def _next_step(
     correct = (
         not calibration.only_offsets and tool is not None and lowers(tool.entered, tool.compensated)
     )
-    if correct and (kept or calibration.measured_again):
+    if correct and (unchanged or calibration.measured_again):
         words = "correct the other errors, in LinuxCNC or in programs."
-        if not kept:
+        if not unchanged:
             words = (
                 "correct all identified errors, in LinuxCNC or in programs, without entering these "
                 "offsets. If the controller corrects offsets only, enter them."
             )
-        active = "" if kept else " --offsets active"
+        active = "" if unchanged else " --offsets active"
         return words, (
             f"orthocal export {directory} --to linuxcnc --out {module}",
             f"orthocal correct {directory} PROGRAM.ngc{active} --out CORRECTED.ngc",
         )
     words = "enter the offsets, home the machine and measure again."
-    if kept:
+    if unchanged:
         words = "nothing to enter. After a crash or a change of the machine measure again."
     return words, (
         f"orthocal again {directory} --out {new}",
