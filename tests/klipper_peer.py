@@ -1,0 +1,77 @@
+"""Klipper's way to the settings of a delta printer: six parameters by coordinate descent.
+
+Radius, two towers and three endstops minimise the sum of squared heights of the triggers. Each
+parameter in turn takes a step that grows by a tenth where it helps and shrinks by a tenth where it
+does not, until the steps add up to 1e-5 mm and degrees (Klipper's documents: Delta_Calibrate.md).
+With `extended` the three rods are free as well, as with distances that were measured on a print.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from simulated_printer import Firmware
+
+from orthocal.printers.settings import DeltaSettings
+from orthocal.units import DEG, MM
+
+ENOUGH = 1e-5
+MOST_ROUNDS = 10_000
+
+
+def descend(cost, start):
+    """Coordinate descent from a start; the values, and the number of rounds."""
+    values, steps = np.array(start), np.ones(len(start))
+    least, rounds = cost(values), 0
+    while steps.sum() > ENOUGH and rounds < MOST_ROUNDS:
+        rounds += 1
+        for k in range(len(values)):
+            for sign in (1.0, -1.0):
+                tried = values.copy()
+                tried[k] += sign * steps[k]
+                found = cost(tried)
+                if found < least:
+                    least, values = found, tried
+                    steps[k] *= 1.1
+                    break
+            else:
+                steps[k] *= 0.9
+    return values, rounds
+
+
+def calibrate_as_klipper(settings, travel, trigger, *, extended=False):
+    """New settings from the travel below the endstops at the triggers.
+
+    Args:
+        settings: Present settings, a `Firmware`.
+        travel: Shape (K, 3), [mm].
+        trigger: Height of the nozzle at the trigger, [mm].
+        extended: Whether the rods are free.
+    """
+
+    def unpack(values):
+        rods = values[6:9] if extended else settings.rods
+        angles = np.array([values[1], values[2], settings.angles[2]])
+        return Firmware(values[0], np.array(rods), angles, values[3:6])
+
+    def cost(values):
+        s = unpack(values)
+        if s.radius <= 0.0 or (s.rods <= s.radius).any():
+            return np.inf
+        with np.errstate(invalid="ignore"):
+            z = locate(s, travel)[:, 2]
+        return float(((z - trigger) ** 2).sum()) if np.isfinite(z).all() else np.inf
+
+    start = [settings.radius, *settings.angles[:2], *settings.endstops]
+    start += list(settings.rods) if extended else []
+    values, rounds = descend(cost, start)
+    return unpack(values), rounds
+
+
+def locate(settings, travel):
+    """Where a firmware believes its nozzle, shape (K, 3), [mm]."""
+    middle = np.sqrt(settings.rods**2 - settings.radius**2)
+    delta = DeltaSettings("klipper", settings.radius * MM, tuple(settings.rods * MM), (0.0,) * 3)
+    delta = replace(delta, angles=tuple(np.array(settings.angles) * DEG))
+    return delta.forward((settings.endstops + middle - travel) * MM) / MM
