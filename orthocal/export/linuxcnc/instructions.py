@@ -142,14 +142,14 @@ def _describe_compensation(homes: Sequence[JointHome], *, stated: bool) -> str:
             for i, h in with_backlash
         )
         texts.append(
-            f"**Backlash:** {listed}. LinuxCNC compensates it\nby the lines BACKLASH, or by the "
-            "columns of COMP_FILE. The sign of HOME_LATCH_VEL must be as stated here, and that of\n"
-            "HOME_SEARCH_VEL the same: half of the backlash, with this sign, is part of the zero."
+            f"**Backlash:** {listed}.\nLinuxCNC compensates it by the lines BACKLASH, or by the "
+            "columns of COMP_FILE. HOME_OFFSET contains half of\nthe backlash, with the sign of "
+            "HOME_LATCH_VEL. HOME_LATCH_VEL and HOME_SEARCH_VEL must have the signs stated here."
         )
         if not stated and any(map(_depends_on_latching, homes)):
             texts[-1] += (
-                "\nThe + is assumed: no option stated the signs. `--ini FILE` takes them from your "
-                "INI file,\n`--latched` states them."
+                "\nThe signs + are assumed, because no option states them. `--ini FILE` reads them "
+                "from your INI file,\n`--latched` states them."
             )
     tables = [h.compensation for h in homes if h.compensation.table is not h.was.table]
     tables = [c for c in tables if c.table is not None]
@@ -157,7 +157,7 @@ def _describe_compensation(homes: Sequence[JointHome], *, stated: bool) -> str:
         texts.append(
             "**Tables:** copy the files `joint_*_module.comp` beside your INI file. They replace\n"
             "the tables of the measurement. The periodic errors of the screws are in the module;\n"
-            "the tables contain what depends on the side." + _between_entries(tables)
+            "the tables contain the part that depends on the side of approach." + _between_entries(tables)
         )
     elif tables:
         texts.append(
@@ -229,7 +229,7 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, sta
     if not calibration.only_offsets:
         scope = (
             "The calibration identified more than offsets. These offsets minimise the tool error\n"
-            "while nothing else is corrected."
+            "if the controller corrects nothing else."
         )
     if assessment_of(calibration).keeps_offsets:
         scope = "The offsets stay as they are."

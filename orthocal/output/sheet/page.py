@@ -416,8 +416,9 @@ def _compensation(session: Session) -> str:
     if "approach" not in needed_conditions(session.robot):
         return ""
     return (
-        "session.yaml states that the controller compensates no backlash. If it does (LinuxCNC: "
-        "BACKLASH, COMP_FILE), write it into session.yaml: controller: {backlash_mm: [...]}."
+        "session.yaml states that the controller compensates no backlash. If it compensates "
+        "backlash (LinuxCNC: BACKLASH, COMP_FILE), state this in session.yaml: "
+        "controller: {backlash_mm: [...]}."
     )
 
 
