@@ -157,7 +157,7 @@ def _describe_compensation(homes: Sequence[JointHome], *, stated: bool) -> str:
         texts.append(
             "**Tables:** copy the files `joint_*_module.comp` beside your INI file. They replace\n"
             "the tables of the measurement. The periodic errors of the screws are in the module;\n"
-            "the tables contain the part that depends on the side of approach." + _between_entries(tables)
+            "the tables contain the part that depends on the side." + _between_entries(tables)
         )
     elif tables:
         texts.append(
