@@ -93,7 +93,7 @@ class BallBar:
 
     kind: ClassVar[str] = "ball_bar"
     keys: ClassVar[type[SetupKeys]] = BallBarKeys
-    ideal: ClassVar[str] = "on a sphere"
+    ideal: ClassVar[str] = "its sphere"
     zero: ClassVar[GaugeZero] = "known"
 
     @classmethod
@@ -244,7 +244,8 @@ class BallBar:
             else f"the balls would be {d / MM:.1f} mm apart; the bar has {self.length / MM:g} mm"
             for d in distances.tolist()
         ]
-        return Contact(balls, direction, along, problems, "centre_mm")
+        centre = np.array(self.centre)
+        return Contact(balls, direction, along, problems, "centre_mm", fixed=centre)
 
 
 def _metres(point: Sequence[float]) -> tuple[float, float, float]:

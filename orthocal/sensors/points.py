@@ -117,7 +117,7 @@ class Points:
 
     kind: ClassVar[str] = "points"
     keys: ClassVar[type[SetupKeys]] = PointKeys
-    ideal: ClassVar[str] = "where the nominal machine has it"
+    ideal: ClassVar[str] = "its nominal position"
     zero: ClassVar[GaugeZero] = "known"
     largest_reading: ClassVar[float] = LARGEST_MM * MM
 
@@ -281,7 +281,8 @@ class Points:
         targets = poses[:, :3, 3] + poses[:, :3, :3] @ np.array(self.target)
         direction = self.constants(robot)[:3]
         across = np.linalg.svd(direction[None])[2][-1]
-        return Contact(targets, direction, across, [""] * len(targets), "target_mm")
+        problems = [""] * len(targets)
+        return Contact(targets, direction, across, problems, "target_mm", at_tool=True)
 
 
 def read_covariance(rows: Sequence[Sequence[float]]) -> tuple[Triple, Triple, Triple]:

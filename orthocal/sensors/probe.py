@@ -69,7 +69,7 @@ class Probe(ToolIndicator):
 
     kind: ClassVar[str] = "probe"
     keys: ClassVar[type[SetupKeys]] = ProbeKeys
-    ideal: ClassVar[str] = "on the surface"
+    ideal: ClassVar[str] = "the surface"
     zero: ClassVar[GaugeZero] = "known"
     states_readings: ClassVar[bool] = True
 

@@ -103,6 +103,12 @@ class Contact:
     """Key of the setup that says where it touches, for messages."""
     tip: TouchingTip | None = None
     """The tip, if the setup states one."""
+    at_tool: bool = False
+    """True if the gauge moves with the tool: then it is behind its tip, against `direction`."""
+    fixed: Array | None = None
+    """Fixed end of a bar whose other end is the contact, in the world, shape (3,), [m]."""
+    surface: Array | None = None
+    """Corners of the touched surface of an artefact, in the world, shape (4, 3), [m]."""
 
 
 class SetupKeys(BaseModel):

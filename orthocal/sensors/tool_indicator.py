@@ -46,6 +46,9 @@ ALIGNMENT = 5.0 * MRAD
 LENGTH_MM = 200.0
 """Length of the artefact that is used, by default."""
 
+BLADE, BLOCK = 20 * MM, (35 * MM, 9 * MM)
+"""Width of a blade, length and width of a gauge block in pictures, [m]."""
+
 LARGEST_MM = 2000.0
 
 Kind = Literal["straightedge", "square", "plate", "gauge_block"]
@@ -176,7 +179,7 @@ class ToolIndicator:
 
     kind: ClassVar[str] = "tool_indicator"
     keys: ClassVar[type[SetupKeys]] = ToolIndicatorKeys
-    ideal: ClassVar[str] = "along the artefact"
+    ideal: ClassVar[str] = "the artefact"
 
     @classmethod
     def from_keys(cls, keys: ToolIndicatorKeys) -> ToolIndicator:
@@ -371,7 +374,29 @@ class ToolIndicator:
         poses = frames[0]
         tips = poses[:, :3, 3] + poses[:, :3, :3] @ np.array(self.tool)
         d = direction_vector(self.direction)
-        return Contact(tips, d, self._along, [""] * len(tips), "artefact")
+        return Contact(
+            tips,
+            d,
+            self._along,
+            [""] * len(tips),
+            "artefact",
+            at_tool=True,
+            surface=self._surface(tips),
+        )
+
+    def _surface(self, tips: Array) -> Array:
+        """Corners of the touched surface, under the middle of the tips, shape (4, 3), [m]."""
+        a = self.artefact
+        across = np.cross(self._along, direction_vector(self.direction))
+        length, width = {
+            "gauge_block": BLOCK,
+            "plate": (a.length, a.length),
+        }.get(a.kind, (a.length, BLADE))
+        middle = 0.5 * (tips.min(axis=0) + tips.max(axis=0))
+        ways = [(u, v) for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+        return np.array(
+            [middle + 0.5 * (u * length * self._along + v * width * across) for u, v in ways]
+        )
 
     @property
     def _along(self) -> Array:

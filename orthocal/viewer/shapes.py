@@ -224,6 +224,30 @@ def draw_gauge(
     scene.add(f"{path}/needle", g.Box([0.09 * size, 0.04 * size, 0.75 * size]), dark, hand)
 
 
+BAR = "bar"
+"""Node of the bar within that of a ball bar."""
+
+
+def draw_bar(scene: Scene, path: str, fixed: Array, ball: Array, size: float) -> None:
+    """A ball bar: a fixed ball on a post, and a bar with a ball at its other end.
+
+    Args:
+        scene: The scene.
+        path: Path of the node.
+        fixed: Centre of the fixed ball, shape (3,), [m].
+        ball: Centre of the other ball, shape (3,), [m].
+        size: Radius of the balls, [m].
+    """
+    steel, dark = material((0.75, 0.76, 0.8), shiny=True), material((0.16, 0.17, 0.2), shiny=True)
+    length = float(np.linalg.norm(ball - fixed))
+    foot = _shift(*to_triple(fixed))
+    scene.add(f"{path}/post", cylinder(3.0 * size, 0.5 * size, start=-3.0 * size), dark, foot)
+    scene.add(f"{path}/fixed", g.Sphere(size), steel, foot)
+    scene.add(f"{path}/{BAR}/rod", cylinder(length, 0.35 * size), dark)
+    scene.add(f"{path}/{BAR}/ball", g.Sphere(size), steel, _shift(0.0, 0.0, length))
+    scene.place(f"{path}/{BAR}", pose_along(fixed, (ball - fixed) / max(length, 1e-9)))
+
+
 def _shift(x: float, y: float, z: float) -> Array:
     """A pose that is shifted but not turned, shape (4, 4), [m]."""
     pose = np.eye(4)

@@ -205,8 +205,11 @@ def dial_zero(gauge: Gauge) -> str:
     return f"{0.5 * (low + high) / MM + 0.0:g}"
 
 
-def set_dial(gauge: Gauge) -> str:
-    """Instruction for setting the gauge zero."""
+def set_dial(session: Session, setup: str) -> str:
+    """Instruction for setting the gauge zero of a setup."""
+    gauge = session.gauges[session.setups[setup].gauge]
+    if session.setups[setup].zero == "known":
+        return "Do not set the gauge zero on the machine: it is known, and readings are absolute."
     travel = ""
     if gauge.range is not None:
         travel = f", about {0.5 * (gauge.range[1] - gauge.range[0]) / MM:g} mm"

@@ -117,7 +117,7 @@ def write_program(
     stops = motion.stops if motion.alignment is None else (motion.alignment, *motion.stops)
     for i, stop in enumerate(stops):
         zero = "0" if stop.role == "subtracted" else ""
-        if stop is motion.stops[0] and stop.role == "reading":
+        if stop is motion.stops[0] and stop.role == "reading" and of_setup.zero == "free":
             zero = dial_zero(gauge)
         actions = (
             mount if i == 0 else "",

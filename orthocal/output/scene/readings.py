@@ -24,10 +24,12 @@ from orthocal.viewer.machine import VIEW, MachineScene
 from orthocal.viewer.motion import Timeline
 from orthocal.viewer.scene import Label, LegendEntry, Scene, Step, node_name, round_scale
 from orthocal.viewer.shapes import (
+    BAR,
     Colour,
     css,
     dial_distance,
     draw_arrow,
+    draw_bar,
     draw_gauge,
     pose_along,
     to_triple,
@@ -99,6 +101,7 @@ def draw_readings(
         point = contact.points[0]
         rows = [next((r for r in s.rows if r.setup == setup.name), None) for s in stops]
         gauge = _draw_gauge(drawing, setup, contact, dial)
+        _move_gauge(drawing, gauge, _find_contact(drawing, setup, poses, moving=True), timeline)
         _hide_at_others(scene, gauge, setup, stops, timeline)
         # arrows of gauges with the same contact are beside each other
         others = (contacts[s.name].points[0] for s in setups[:i])
@@ -160,17 +163,40 @@ def _deviation(row: Deviation | None, node: str) -> float:
 def _draw_gauge(drawing: MachineScene, setup: Setup, contact: Contact, dial: float) -> str:
     """Draw the gauge of a setup; return its node."""
     node, tip = f"{GAUGES}/{node_name(setup.name)}", contact.tip
+    if contact.fixed is not None:
+        draw_bar(drawing.scene, node, contact.fixed, contact.points[0], 0.3 * dial)
+        return node
+    stem = -contact.direction if contact.at_tool else contact.direction
     draw_gauge(
         drawing.scene,
         node,
         contact.points[0],
-        contact.direction,
-        _facing(contact.direction),
+        stem,
+        _facing(stem),
         dial,
         ball=None if tip is None else tip.radius,
         edge=None if tip is None or tip.edge is None else tip.width * tip.edge,
     )
     return node
+
+
+def _move_gauge(drawing: MachineScene, node: str, contact: Contact, timeline: Timeline) -> None:
+    """Animate a gauge that moves with the tool, or a bar that turns about its fixed end.
+
+    Args:
+        drawing: The scene of the machine.
+        node: Node of the gauge.
+        contact: Its contact in all frames of the animation.
+        timeline: Times of the frames.
+    """
+    scene, points = drawing.scene, contact.points
+    if contact.fixed is not None:
+        ends = points - contact.fixed
+        lengths = np.linalg.norm(ends, axis=1)
+        turned = pose_along(np.tile(contact.fixed, (len(ends), 1)), ends / lengths[:, None])
+        scene.move(f"{node}/{BAR}", timeline.times, turned)
+    elif contact.at_tool:
+        scene.track(node, "position", "vector3", timeline.times, points)
 
 
 def _hide_at_others(
@@ -221,11 +247,13 @@ def _labelled_setups(
     return {row.setup for row in worst.values()}
 
 
-def _find_contact(drawing: MachineScene, setup: Setup, poses: Mapping[str, Array]) -> Contact:
-    """Contact of a sensor with the drawn machine in the first frame."""
+def _find_contact(
+    drawing: MachineScene, setup: Setup, poses: Mapping[str, Array], *, moving: bool = False
+) -> Contact:
+    """Contact of a sensor with the drawn machine in the first frame, or in all frames."""
     frames = setup.sensor.frames(drawing.robot)
     at_zero = reference_poses(drawing.robot, frames.at_zero)
-    in_posture = [poses[f][:1] for f in frames.in_posture]
+    in_posture = [poses[f] if moving else poses[f][:1] for f in frames.in_posture]
     return setup.sensor.contact(in_posture, at_zero, drawing.robot)
 
 

@@ -30,11 +30,11 @@ from orthocal.output.sheet.gauge_position import (
     find_gauge_position,
     name_tip,
 )
-from orthocal.output.sheet.pictures import draw_machine, draw_section
+from orthocal.output.sheet.pictures import draw_machine, draw_section, draw_tool
 from orthocal.output.text.layout import counted, true_minus
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import mounting_steps
-from orthocal.session.session import Gauge, Session
+from orthocal.session.session import Session, Setup
 from orthocal.units import DRIVE_UNITS, LIMIT, MM, format_fixed
 from orthocal.viewer.visuals import load_visuals
 
@@ -80,7 +80,8 @@ def sheet_files(
     setups = []
     for motion in motions:
         gauge = find_gauge_position(session, motion, guidance, links)
-        pictures = draw_machine(session.robot, visuals, gauge) + draw_section(gauge)
+        pictures = draw_machine(session.robot, visuals, gauge)
+        pictures += draw_section(gauge) if gauge.leg is not None else draw_tool(gauge)
         setups.append(_setup(session, motion, gauge, pictures, with_program=bool(programs)))
     title = f"Measuring sheet: {session.robot.name}, {session.title}"
     style = (resources.files("orthocal.output.sheet") / "sheet.css").read_text(encoding="utf-8")
@@ -126,7 +127,7 @@ def _front(
     ]
     rules = [
         _approach_rule(session, motions),
-        _contact_rule(motions),
+        _contact_rule(session, motions),
         "After you have set the gauge zero, do not touch the bezel, the stand or the arm of the "
         "gauge. If the gauge was bumped, start that setup again.",
         "Write down what the dial shows, with its sign. Estimate the last digit. If you took no "
@@ -240,7 +241,7 @@ def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[
         f"{align}, {gauge.alignment}: {_joint_list(session.robot, gauge.drives)}.",
         *mounting,
         *go,
-        _gauge_zero(session.gauges[gauge.setup.gauge], first),
+        _gauge_zero(session, gauge.setup, first),
         "Take the readings in the order below. The line numbers are those of readings.csv.",
     ]
 
@@ -256,12 +257,14 @@ def _across(gauge: GaugePosition) -> str:
     )
 
 
-def _gauge_zero(gauge: Gauge, first: Stop) -> str:
+def _gauge_zero(session: Session, setup: Setup, first: Stop) -> str:
     """Instruction for setting the gauge zero."""
+    if setup.zero == "known":
+        return set_dial(session, setup.name)
     again = " Set it again where the table says so." * (first.role == "subtracted")
     return (
-        f"{set_dial(gauge)} This is the gauge zero: set it here only.{again} Tap the stand: the "
-        "hand must return to 0."
+        f"{set_dial(session, setup.name)} This is the gauge zero: set it here only.{again} Tap the "
+        "stand: the hand must return to 0."
     )
 
 
@@ -430,9 +433,11 @@ def _count_outwards(robot: Robot) -> str:
     return ", ".join(f"{verbs[d.direction]} for {d.name}" for d in robot.drives)
 
 
-def _contact_rule(motions: Sequence[SetupMotion]) -> str:
+def _contact_rule(session: Session, motions: Sequence[SetupMotion]) -> str:
     """Rule for the tip between the readings of a setup."""
-    rule = "Keep the tip on its rod from the first reading of a setup to the last"
+    on_legs = all(s.sensor.place[0] == "leg" for s in session.setups.values())
+    kept = "the tip on its rod" if on_legs else "each gauge in contact"
+    rule = f"Keep {kept} from the first reading of a setup to the last"
     if not any(stop.lift for m in motions for stop in m.stops):
         return f"{rule}."
     return (

@@ -347,8 +347,9 @@ def draw_machine(robot: Robot, visuals: Sequence[Visual], gauge: GaugePosition) 
     """Picture of the machine in the alignment posture of a setup, with its gauge."""
     shapes = [(visual, _visual_points(visual, gauge.poses[visual.link])) for visual in visuals]
     reach = 0.32 * float(np.ptp(np.concatenate([p for _, p in shapes]), axis=0).max())
-    dial = gauge.point + reach * gauge.contact.direction
-    points = np.concatenate([*(p for _, p in shapes), dial[None], gauge.tool_path])
+    dial = _gauge_end(gauge, reach)
+    surface = np.zeros((0, 3)) if gauge.contact.surface is None else gauge.contact.surface
+    points = np.concatenate([*(p for _, p in shapes), dial[None], gauge.tool_path, surface])
     view = _View(-np.array(VIEW), np.eye(3)[2], points, MACHINE_SIZE)
     picture = Picture(*MACHINE_SIZE)
 
@@ -362,13 +363,42 @@ def draw_machine(robot: Robot, visuals: Sequence[Visual], gauge: GaugePosition) 
     for visual, corners in sorted(shapes, key=lambda s: -float((s[1] @ view.forward).mean())):
         fill, stroke = looks.get(joint(visual.link), ("#f1f2f4", "#9aa0a8"))
         picture.polygon(outline(view.project(corners)), fill=fill, stroke=stroke)
+    if len(surface):
+        picture.polygon(view.project(surface), fill="#dbe9d8", stroke=GREEN, width=0.4)
     _draw_tool_path(picture, view, gauge)
     foot = view.project(gauge.point)
-    _draw_dial(picture, view, gauge, foot, view.project(dial), radius=5.0)
+    if gauge.contact.fixed is None:
+        _draw_dial(picture, view, gauge, foot, view.project(dial), radius=5.0)
+    else:
+        _draw_bar(picture, foot, view.project(dial))
     picture.circle(foot, 1.1, fill=BLACK, stroke="#fff")
     _draw_axes(picture, view, np.array([14.0, 18.0]))
     _label_leg(picture, view, gauge)
     return picture.to_svg(f"Setup {gauge.setup.name}: the gauge on the machine")
+
+
+def _gauge_end(gauge: GaugePosition, reach: float) -> Array:
+    """Fixed end of a bar, or the centre of a dial, in the alignment posture, shape (3,), [m]."""
+    contact = gauge.contact
+    if contact.fixed is not None:
+        return contact.fixed
+    return np.asarray(gauge.point + (-reach if contact.at_tool else reach) * contact.direction)
+
+
+def _draw_bar(picture: Picture, ball: Array, fixed: Array) -> None:
+    """A ball bar on paper, from its fixed ball to the ball at the tool, which is drawn later."""
+    picture.line([fixed, ball], stroke="#fff", width=2.4)
+    picture.line([fixed, ball], width=0.9)
+    picture.circle(fixed, 1.6, fill=BLUE, stroke="#fff")
+    picture.label(fixed, "fixed ball", shift=(0.0, 4.5), colour=BLUE, bold=True)
+    way = ball - fixed
+    length = float(np.linalg.norm(way))
+    if length < 4.0:
+        return
+    side = 2.6 * np.array([-way[1], way[0]]) / length
+    foot, tip = fixed + 0.3 * way + side, fixed + 0.9 * way + side
+    picture.arrow(foot, tip, stroke=ORANGE, width=0.9)
+    picture.label(0.5 * (foot + tip), "dial grows", shift=2.0 * side, colour=ORANGE, bold=True)
 
 
 def _visual_points(visual: Visual, pose: Array) -> Array:
@@ -473,6 +503,41 @@ def _draw_axes(picture: Picture, view: _View, origin: Array) -> None:
         picture.arrow(origin, origin + 9.0 * way, stroke=GREY, width=0.5)
         tip = origin + 9.0 * way
         picture.label(tip, name, shift=2.8 * way, colour="#444", size=3.4, leader=False)
+
+
+def draw_tool(gauge: GaugePosition) -> str:
+    """Picture of a sensor at the tool: its contacts, the bar or the artefact, without the machine.
+
+    The view is along the axis of the world that shows most, or oblique for contacts in space.
+    """
+    contact = gauge.contact
+    parts = [contact.points, *([] if contact.surface is None else [contact.surface])]
+    parts += [] if contact.fixed is None else [contact.fixed[None]]
+    size = max(float(np.ptp(np.concatenate(parts), axis=0).max()), 0.02)
+    end = _gauge_end(gauge, 0.35 * size)
+    around = np.concatenate([*parts, end[None]])
+    spread = np.linalg.svd(around - around.mean(axis=0))
+    flat = len(around) > 2 and spread[1][-1] < 0.02 * spread[1][0]
+    forward = -np.array(VIEW)
+    if flat:
+        normal = spread[2][-1]
+        forward = normal * np.sign(normal @ forward)
+    up = np.eye(3)[2] if abs(forward[2]) < 0.9 * np.linalg.norm(forward) else np.eye(3)[1]
+    view = _View(forward, up, around, SECTION_SIZE)
+    picture = Picture(*SECTION_SIZE)
+    if contact.surface is not None:
+        picture.polygon(view.project(contact.surface), fill="#dbe9d8", stroke=GREEN, width=0.4)
+    places = view.project(contact.points)
+    for place in places:
+        picture.circle(place, 0.9, fill=GREEN, stroke="#fff")
+    foot = places[gauge.aligned]
+    if contact.fixed is None:
+        _draw_dial(picture, view, gauge, foot, view.project(end), radius=5.0)
+    else:
+        _draw_bar(picture, foot, view.project(end))
+    picture.circle(foot, 1.1, fill=BLACK, stroke="#fff")
+    _draw_axes(picture, view, _free_corner(view.project(around)))
+    return picture.to_svg(f"Setup {gauge.setup.name}: the places of its readings")
 
 
 def draw_section(gauge: GaugePosition) -> str:

@@ -176,7 +176,7 @@ class RecordingText:
         else:
             parts.append(
                 f"Go to {aligned} and align the gauge. {go}"
-                f"{set_dial(session.gauges[setup.gauge])} From then on touch neither stand nor "
+                f"{set_dial(session, setup.name)} From then on touch neither stand nor "
                 "dial until the setup is complete."
             )
         if all(r.minus is not None for r in of_setup):

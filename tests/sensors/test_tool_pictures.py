@@ -1,0 +1,79 @@
+"""Sheet, programs and scene of sensors at the tool: known zeros, artefacts, bars that turn."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from lxml import etree
+from machines import place
+
+from orthocal import load_plan
+from orthocal.output.scene.drawing import draw_scene
+from orthocal.output.sheet.page import sheet_files
+
+PLAN = """robot: orthoglide
+gauge: {sigma_mm: 0.005, range_mm: [-5, 5]}
+postures:
+  a: {tcp_mm: [50, 0, -20]}
+  b: {tcp_mm: [0, 50, -20]}
+  c: {tcp_mm: [-50, 0, -20]}
+setups:
+  plate: {sensor: tool_indicator, direction: -z, artefact: {kind: plate, length_mm: 150},
+          tool_mm: [0, 0, -40]}
+  bar: {sensor: ball_bar, centre_mm: [0, 0, -100], length_mm: 64, tool_mm: [0, 0, -40]}
+"""
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pictures")
+    (folder / "plan.yaml").write_text(PLAN)
+    return load_plan(folder / "plan.yaml")
+
+
+@pytest.fixture(scope="module")
+def files(plan):
+    return sheet_files(plan)
+
+
+def section(files, number):
+    page = etree.HTML(files["sheet.html"])
+    (found,) = page.xpath(f'//section[@id="setup-{number}"]')
+    return found
+
+
+def words(element):
+    return " ".join("".join(element.itertext()).split())
+
+
+def test_only_a_gauge_with_a_free_zero_is_set(files):
+    plate, bar = (words(section(files, n)) for n in (1, 2))
+    assert "turn the bezel" in plate
+    assert "turn the bezel" not in bar
+    assert "set the dial to 0" in files["01-plate.ngc"]
+    assert "set the dial" not in files["02-bar.ngc"]
+
+
+def test_pictures_show_the_artefact_and_the_bar(files):
+    for number, label in ((1, "dial grows −z"), (2, "fixed ball")):
+        pictures = section(files, number).findall(".//svg")
+        assert len(pictures) == 2
+        assert all(label in words(picture) for picture in pictures)
+    outlines = section(files, 1).findall(".//svg")[1].findall(".//polygon")
+    corners = [re.findall(r"[-0-9.]+", p.get("points")) for p in outlines]
+    assert any(len(c) == 8 for c in corners)
+
+
+def test_a_bar_turns_about_its_fixed_ball_with_the_tool(plan):
+    scene = draw_scene(plan)
+    (moving,) = [n for n in scene.nodes if n.endswith("bar/bar/rod")]
+    node = moving.removesuffix("/rod").removeprefix("/")
+    pose = scene.pose(node)
+    np.testing.assert_allclose(pose[:3, 3], [0.0, 0.0, -0.1], atol=1e-9)
+    tool = place(plan.robot, plan.robot.drive_zero, plan.robot.tcp.frame)
+    along = tool + np.array([0.0, 0.0, -0.04]) - pose[:3, 3]
+    np.testing.assert_allclose(pose[:3, 2], along / np.linalg.norm(along), atol=1e-6)
+    (command,) = [c for c in scene.commands if c["type"] == "set_animation"]
+    assert any(part["path"].endswith("bar/bar") for part in command["animations"])
