@@ -97,8 +97,7 @@ def draw_readings(
     dial = DIAL * drawing.size * min(1.0, math.sqrt(MANY_GAUGES / max(len(setups), 1)))
     labelled = _labelled_setups(setups, measured, contacts)
     for i, setup in enumerate(setups):
-        contact = contacts[setup.name]
-        point = contact.points[0]
+        contact, point = contacts[setup.name], contacts[setup.name].points[0]
         rows = [next((r for r in s.rows if r.setup == setup.name), None) for s in stops]
         gauge = _draw_gauge(drawing, setup, contact, dial)
         _move_gauge(drawing, gauge, _find_contact(drawing, setup, poses, moving=True), timeline)
