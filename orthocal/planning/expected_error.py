@@ -6,6 +6,7 @@ of the identified parameters, the errors that are not identified, and their effe
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -81,6 +82,12 @@ class Expected:
     def reported(self) -> ErrorSize:
         """Tool error in the reported form."""
         return self.tool.sizes.reported
+
+    def rms_by(self, criterion: Criterion) -> float:
+        """RMS tool error that a criterion minimises, [m]; NaN for criteria of another kind."""
+        sizes = self.sizes
+        forms = {"aligned": sizes.reported, "relative": sizes.relative, "absolute": sizes.absolute}
+        return forms[criterion].rms if criterion in forms else math.nan
 
 
 class ToolForecast:

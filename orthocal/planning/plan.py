@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 
@@ -45,11 +44,12 @@ from orthocal.planning.expected_error import (
 )
 from orthocal.planning.further_readings import FurtherReadings, find_further_readings
 from orthocal.planning.plan_comparison import Alternative, Comparison
+from orthocal.planning.planned_session import build_session
 from orthocal.planning.selection import KILLED, PlannedSetup, PlannedSetups, SetupSearch
 from orthocal.robot.model import Robot
 from orthocal.runtime.worker_pool import call_in_parallel, run_in_parallel, worker_budget
 from orthocal.sensors.leg_indicator import LegIndicator
-from orthocal.session.session import Posture, Purpose, Reading, Session, Setup
+from orthocal.session.session import Purpose, Session
 from orthocal.statistics.information import VAGUE
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -120,6 +120,19 @@ class MeasuringPlan:
             names=self.expected.names,
             count=count,
         )
+
+    @property
+    def better_usual_plans(self) -> list[tuple[float, tuple[PlannedSetup, ...]]]:
+        """Smaller expected errors of usual plans of equal cost, with their setups.
+
+        The search minimises the error about the nominal machine, and prefers simple setups.
+        """
+        errors = [
+            (usual.expected.rms_by(self.criterion), usual.planned)
+            for usual in self.compared
+            if usual.expected is not None
+        ]
+        return [better for better in errors if better[0] < self.expected.rms_by(self.criterion)]
 
     @property
     def enough(self) -> Stage | None:
@@ -219,10 +232,22 @@ def _plan(
         forecast.weigh(work.criterion, len(candidates.state)),
     )
     planned = _search_setups(search, candidates, options, work)
-    plan = build_session(candidates, planned.setups, measured)
+
+    def compare(planned: PlannedSetups) -> Comparison:
+        plan = build_session(candidates, planned.setups, measured)
+        return Comparison(candidates, plan, equipment, forecast, measured)
+
     work.report("comparing the plan with others")
-    comparison = Comparison(candidates, plan, equipment, forecast, measured)
-    return _evaluate(search, planned, comparison, work)
+    plan = _evaluate(search, planned, compare(planned), work)
+    better = min(plan.better_usual_plans, key=lambda usual: usual[0], default=None)
+    if better is None:
+        return plan
+    work.report("searching from a usual plan, which is better")
+    error, setups = better
+    improved = search.improve(setups)
+    expected = compare(improved).expect_plan()
+    best = improved if expected.rms_by(work.criterion) < error else search.plan_of(setups)
+    return _evaluate(search, best, compare(best), work)
 
 
 def _search_setups(
@@ -322,7 +347,7 @@ def _evaluate(
                 lambda: compute_curve(search, each, setups, comparison.equipment),
                 comparison.list_alternatives,
                 comparison.list_usual_plans,
-                lambda: forecast.after(joined, entered=comparison.entered),
+                comparison.expect_plan,
                 lambda: forecast.after(joined, entered=False),
                 lambda: forecast.about_nominal(joined),
                 lambda: (
@@ -364,99 +389,11 @@ def _scale(
     Gauges on machines within their tolerances are less sensitive than on the nominal one, errors
     that are not identified remain, and the search omits the readings that close a setup.
     """
-    if criterion not in ("aligned", "relative", "absolute"):
+    rms = nominal.rms_by(criterion)
+    if math.isnan(rms):
         return 1.0, 0.0
-
-    def rms(found: Expected) -> float:
-        sizes = found.sizes
-        size = {"aligned": sizes.reported, "relative": sizes.relative, "absolute": sizes.absolute}
-        return size[criterion].rms
-
-    remainder = math.sqrt(max(rms(nominal) ** 2 - stage.error**2, 0.0))
-    return rms(expected) / math.hypot(stage.error, remainder), remainder
-
-
-def build_session(
-    candidates: Candidates, planned: Sequence[PlannedSetup], measured: Session | None = None
-) -> Session:
-    """Session of planned setups, named, in the order of measuring.
-
-    Each setup begins with the posture in which its gauge is aligned, continues with short motions,
-    and ends with the first posture.
-    """
-    source = candidates.session
-    used_names = set() if measured is None else set(measured.setups)
-    setups: dict[str, Setup] = {}
-    readings: list[Reading] = []
-    used: dict[str, Posture] = {}
-    legs = list(source.robot.legs)
-
-    def place(setup: PlannedSetup) -> tuple[int, str]:
-        name = candidates.setups[setup.candidate].name
-        leg = source.setups[name].sensor.place[1]
-        return (legs.index(leg) if leg in legs else len(legs), name)
-
-    for setup in sorted(planned, key=place):
-        candidate = candidates.setups[setup.candidate]
-        name = _setup_name(candidate.name, {*used_names, *setups})
-        rows = [source.readings[i] for i in candidate.rows[list(setup.chosen)]]
-        points = np.array([source.postures[r.posture].values for r in rows])
-        setups[name] = replace(source.setups[candidate.name], name=name, aligned_at=rows[0].posture)
-        readings += [replace(rows[i], setup=name) for i in order_postures(points)]
-        readings.append(replace(rows[0], setup=name, cycle=2))
-        used.update((r.posture, source.postures[r.posture]) for r in rows)
-    plan = replace(
-        source,
-        title="Planned readings",
-        setups=setups,
-        readings=tuple(readings),
-        postures={n: p for n, p in source.postures.items() if n in used},
-    )
-    if measured is None:
-        return plan
-    plan = replace(plan, compensation=measured.compensation)
-    if measured.controller_offsets is None:
-        return plan
-    return plan.with_controller(measured.controller_offsets)
-
-
-def order_postures(points: Array) -> list[int]:
-    """Order of points on a short closed path that begins with the first one.
-
-    The nearest point next, then parts are reversed while that shortens the path (2-opt).
-
-    Args:
-        points: Tool positions, shape (n, n_coordinates), [m].
-    """
-    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
-
-    def length(order: list[int]) -> float:
-        return float(sum(distance[a, b] for a, b in pairwise([*order, order[0]])))
-
-    order, unvisited = [0], set(range(1, len(points)))
-    while unvisited:
-        nearest = min(unvisited, key=lambda i: (distance[order[-1], i], i))
-        order.append(nearest)
-        unvisited.remove(nearest)
-    shorter = True
-    while shorter:
-        shorter = False
-        for i in range(1, len(order) - 1):
-            for j in range(i + 1, len(order)):
-                other = order[:i] + order[i : j + 1][::-1] + order[j + 1 :]
-                if length(other) < length(order) - 1e-12:
-                    order, shorter = other, True
-    return order
-
-
-def _setup_name(candidate: str, used_names: set[str]) -> str:
-    """Short name of a setup: direction and leg, with a number where there are several."""
-    short = candidate.partition("_")[0]
-    if short not in used_names:
-        return short
-    return next(
-        f"{short}_{i}" for i in range(2, len(used_names) + 3) if f"{short}_{i}" not in used_names
-    )
+    remainder = math.sqrt(max(rms**2 - stage.error**2, 0.0))
+    return expected.rms_by(criterion) / math.hypot(stage.error, remainder), remainder
 
 
 def _prior(candidates: Candidates, forecast: ToolForecast, measured: Session | None) -> Array:

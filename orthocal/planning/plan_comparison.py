@@ -10,12 +10,14 @@ import numpy as np
 from orthocal.errors import OrthocalError
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.joining import join_sessions
-from orthocal.planning.candidates import Candidates, CandidateSetup, indicator_of
+from orthocal.planning.candidates import FEWEST, Candidates, CandidateSetup, indicator_of
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import Expected, ToolForecast
+from orthocal.planning.planned_session import build_session
+from orthocal.planning.selection import PlannedSetup
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.tips import Tip
-from orthocal.session.session import Gauge, Reading, Session, Setup
+from orthocal.session.session import Gauge, Session
 
 MIDDLE = 0.5
 """Section of the paper's gauges, as a fraction of the leg."""
@@ -36,6 +38,8 @@ class Alternative:
     minutes: float
     expected: Expected | None
     """None where readings are not within the gauge's range."""
+    planned: tuple[PlannedSetup, ...] = ()
+    """Its setups, without their closing readings; empty for the same readings by another gauge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +65,7 @@ class Comparison:
         return planned if self.measured is None else join_sessions([self.measured, planned])
 
     def list_usual_plans(self) -> tuple[Alternative, ...]:
-        """Usual plans with as many setups and readings.
+        """Usual plans with as many setups and readings; each setup ends with its first posture.
 
         The paper's: each leg at mid-length in both directions, in the mechanical zero and at the
         ends of the travel to either side, repeated. And evenly spaced postures on the same lines.
@@ -73,15 +77,27 @@ class Comparison:
         lines = [self._line(setup) for setup in chosen]
         plans = []
         for name, select in (("the paper's", _ends_and_zero), ("even", _evenly)):
-            rows = [select(*line, n) for line, n in zip(lines, each, strict=True)]
-            if any(rows):
-                in_range = all(map(_is_in_range, chosen, rows))
-                session = self._session(
-                    chosen,
-                    [[self.candidates.session.readings[i] for i in indices] for indices in rows],
-                )
-                plans.append(self._assess(name, session, in_range=in_range))
+            rows = [select(*line, n - 1) for line, n in zip(lines, each, strict=True)]
+            if any(len(indices) < FEWEST for indices in rows):
+                continue
+            planned = [self._as_planned(*of_setup) for of_setup in zip(chosen, rows, strict=True)]
+            session = build_session(self.candidates, planned, self.measured)
+            usual = self._assess(name, session, in_range=all(map(_is_in_range, chosen, rows)))
+            plans.append(replace(usual, planned=tuple(planned)))
         return tuple(plans)
+
+    def _as_planned(self, setup: CandidateSetup, rows: Sequence[int]) -> PlannedSetup:
+        """Setup of a plan with these rows."""
+        at = np.searchsorted(setup.rows, rows).tolist()
+        return PlannedSetup(self.candidates.setups.index(setup), tuple(at))
+
+    def expect_plan(self) -> Expected:
+        """Expected error after the plan."""
+        return self._expect(self.plan)
+
+    def _expect(self, session: Session) -> Expected:
+        joined = self.join(self.equipment.in_course(session))
+        return self.forecast.after(joined, entered=self.entered)
 
     def list_alternatives(self) -> tuple[Alternative, ...]:
         """Plans with a finer dial, a blade, or one square block for each leg."""
@@ -100,9 +116,8 @@ class Comparison:
         return tuple(alternatives)
 
     def _assess(self, name: str, session: Session, *, in_range: bool = True) -> Alternative:
-        joined = self.join(session)
         minutes = self.equipment.minutes(len(session.setups), len(session.readings))
-        expected = self.forecast.after(joined, entered=self.entered) if in_range else None
+        expected = self._expect(session) if in_range else None
         return Alternative(name, len(session.setups), len(session.readings), minutes, expected)
 
     def _middle_setups(self) -> list[CandidateSetup]:
@@ -137,22 +152,6 @@ class Comparison:
         on = on[np.argsort(points[on, along])]
         nearest = int(np.abs(points[on, along]).argmin()) if on.size else 0
         return setup.rows[on].tolist(), nearest
-
-    def _session(
-        self, chosen: Sequence[CandidateSetup], rows: Sequence[Sequence[Reading]]
-    ) -> Session:
-        """Session of setups and their readings; a posture that is read again is a new cycle."""
-        source = self.candidates.session
-        setups: dict[str, Setup] = {}
-        readings: list[Reading] = []
-        for i, (setup, own_rows) in enumerate(zip(chosen, rows, strict=True)):
-            name = f"{setup.name}.{i}"
-            setups[name] = replace(source.setups[setup.name], name=name)
-            cycles: dict[str, int] = {}
-            for r in own_rows:
-                cycles[r.posture] = cycles.get(r.posture, 0) + 1
-                readings.append(replace(r, setup=name, cycle=cycles[r.posture]))
-        return replace(source, setups=setups, readings=tuple(readings)).select(readings)
 
 
 def _is_in_range(setup: CandidateSetup, rows: Sequence[int]) -> bool:

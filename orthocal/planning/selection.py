@@ -179,6 +179,15 @@ class SetupSearch:
                 plan = self._exchange(plan, (n - 1) % (n + 1))
             yield plan
 
+    def plan_of(self, setups: Sequence[PlannedSetup]) -> PlannedSetups:
+        """Plan of given setups."""
+        information = self.prior + self.information_of(*setups)
+        return PlannedSetups(tuple(setups), information, self.error_of(information))
+
+    def improve(self, setups: Sequence[PlannedSetup]) -> PlannedSetups:
+        """Plan from given setups, which are exchanged for better ones."""
+        return self.run([(len(s.chosen), s) for s in setups])
+
     def run(self, start: _Start) -> PlannedSetups:
         """Setups of one start: added one after the other, then exchanged."""
         with threadpool_limits(1):  # on several threads sums may be rounded differently

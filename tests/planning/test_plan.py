@@ -29,12 +29,13 @@ from orthocal.kinematics.workspace import cube, find_workspace
 from orthocal.measurement.files.write_session import write_session
 from orthocal.measurement.joining import join_sessions
 from orthocal.output.text.plan import OUT_OF_RANGE, plan_json
+from orthocal.planning import plan as planning
 from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.cost_curve import compute_curve, find_enough
 from orthocal.planning.equipment import Equipment, choose_box, find_box
 from orthocal.planning.expected_error import ToolForecast
 from orthocal.planning.plan import plan_readings
-from orthocal.planning.selection import SetupSearch
+from orthocal.planning.selection import PlannedSetup, SetupSearch
 from orthocal.sensors.mounting import EXACT, Mounting
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Gauge
@@ -328,3 +329,30 @@ def test_enough_does_not_depend_on_the_number_of_setups_of_the_plan(orthoglide):
     few, many = (find_enough(curve) for curve in curves)
     assert few == many is not None
     assert len(curves[1]) > len(curves[0]) > few.setups
+
+
+@pytest.mark.parametrize("readings", [6, 10])
+def test_a_usual_plan_that_is_better_is_preferred(orthoglide, monkeypatch, readings):
+    """A search that ends at setups of one leg alone; ten readings repeat postures of the paper."""
+    monkeypatch.setattr(planning, "_search_setups", worst_setups)
+    equipment = Equipment(along=5, across=0.0, sections=(0.5,))
+    choice = Choice("full", tolerances=OFFSETS)
+    plan = plan_readings(orthoglide, choice, setups=2, readings=readings, equipment=equipment)
+    assert len(plan.session.readings) == readings + 2
+    assert len({r.key for r in plan.session.readings}) == readings + 2
+    assert [a.readings for a in plan.compared] == [readings + 2] * 2
+    assert plan.better_usual_plans == []
+    best = min(a.expected.reported.rms for a in plan.compared)
+    assert plan.expected.reported.rms <= best
+    bad = plan_readings(
+        orthoglide, choice, setups=2, readings=readings, equipment=equipment, criterion="D"
+    )
+    assert bad.expected.reported.rms > best  # of another figure nothing is compared
+
+
+def worst_setups(search, candidates, options, work):
+    """The first candidate setup twice."""
+    (counts,) = options
+    first = candidates.setups[0]
+    chosen = [tuple(np.flatnonzero(first.reachable[0])[:n].tolist()) for n in counts]
+    return search.plan_of([PlannedSetup(0, rows) for rows in chosen])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from orthocal.planning.candidates import AlignedParameter, Candidates, CandidateSetup
-from orthocal.planning.plan import order_postures
+from orthocal.planning.planned_session import order_postures
 from orthocal.planning.selection import Gains, PlannedSetup, SetupSearch
 from orthocal.runtime import worker_pool as cores
 

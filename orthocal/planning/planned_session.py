@@ -1,0 +1,100 @@
+"""Session of planned setups, in the order of measuring."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from orthocal.arrays import Array
+from orthocal.planning.candidates import Candidates
+from orthocal.planning.selection import PlannedSetup
+from orthocal.session.session import Posture, Reading, Session, Setup
+
+
+def build_session(
+    candidates: Candidates, planned: Sequence[PlannedSetup], measured: Session | None = None
+) -> Session:
+    """Session of planned setups, named, in the order of measuring.
+
+    Each setup begins with the posture in which its gauge is aligned, continues with short motions,
+    and ends with the first posture.
+    """
+    source = candidates.session
+    used_names = set() if measured is None else set(measured.setups)
+    setups: dict[str, Setup] = {}
+    readings: list[Reading] = []
+    used: dict[str, Posture] = {}
+    legs = list(source.robot.legs)
+
+    def place(setup: PlannedSetup) -> tuple[int, str]:
+        name = candidates.setups[setup.candidate].name
+        leg = source.setups[name].sensor.place[1]
+        return (legs.index(leg) if leg in legs else len(legs), name)
+
+    for setup in sorted(planned, key=place):
+        candidate = candidates.setups[setup.candidate]
+        name = _setup_name(candidate.name, {*used_names, *setups})
+        rows = [source.readings[i] for i in candidate.rows[list(setup.chosen)]]
+        points = np.array([source.postures[r.posture].values for r in rows])
+        setups[name] = replace(source.setups[candidate.name], name=name, aligned_at=rows[0].posture)
+        cycles: Counter[tuple[str | None, ...]] = Counter()
+        for row in (*(rows[i] for i in order_postures(points)), rows[0]):
+            cycles[row.place] += 1
+            readings.append(replace(row, setup=name, cycle=cycles[row.place]))
+        used.update((r.posture, source.postures[r.posture]) for r in rows)
+    plan = replace(
+        source,
+        title="Planned readings",
+        setups=setups,
+        readings=tuple(readings),
+        postures={n: p for n, p in source.postures.items() if n in used},
+    )
+    if measured is None:
+        return plan
+    plan = replace(plan, compensation=measured.compensation)
+    if measured.controller_offsets is None:
+        return plan
+    return plan.with_controller(measured.controller_offsets)
+
+
+def order_postures(points: Array) -> list[int]:
+    """Order of points on a short closed path that begins with the first one.
+
+    The nearest point next, then parts are reversed while that shortens the path (2-opt).
+
+    Args:
+        points: Tool positions, shape (n, n_coordinates), [m].
+    """
+    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
+
+    def length(order: list[int]) -> float:
+        return float(sum(distance[a, b] for a, b in pairwise([*order, order[0]])))
+
+    order, unvisited = [0], set(range(1, len(points)))
+    while unvisited:
+        nearest = min(unvisited, key=lambda i: (distance[order[-1], i], i))
+        order.append(nearest)
+        unvisited.remove(nearest)
+    shorter = True
+    while shorter:
+        shorter = False
+        for i in range(1, len(order) - 1):
+            for j in range(i + 1, len(order)):
+                other = order[:i] + order[i : j + 1][::-1] + order[j + 1 :]
+                if length(other) < length(order) - 1e-12:
+                    order, shorter = other, True
+    return order
+
+
+def _setup_name(candidate: str, used_names: set[str]) -> str:
+    """Short name of a setup: direction and leg, with a number where there are several."""
+    short = candidate.partition("_")[0]
+    if short not in used_names:
+        return short
+    return next(
+        f"{short}_{i}" for i in range(2, len(used_names) + 3) if f"{short}_{i}" not in used_names
+    )
