@@ -7,8 +7,8 @@ model,
     p(y | M) = ∫ p(y | θ, σ) p(θ | M) dθ,
 
 with the parameters of the model at their prior standard deviations (times a scale) and all others
-at 0, gauge zeros free. σ is the stated noise of a reading, with its rounding; if none is stated it
-is integrated over with a broad prior.
+at 0, gauge zeros free. Parameters that are never negative have half-normal priors. σ is the stated
+noise of a reading, with its rounding; if none is stated it is integrated over with a broad prior.
 """
 
 from __future__ import annotations
@@ -116,7 +116,19 @@ def weigh_model(session: Session, model: str) -> tuple[float, Array]:
         scales = np.append(1.0, SCALES)
         likelihood = about.likelihood
         logs = likelihood.log_densities(likelihood.products(deviation[None]), scales, noises)
-        evidence = log_of_sum(logs.reshape(scales.size, -1) + weights, axis=1)
+        logs = logs.reshape(scales.size, noises.size)
+        positive = np.array([p.positive for p in readings.problem.parameters])
+        if positive.any():
+            logs += [
+                [
+                    about.log_positive_share(
+                        deviation, positive, tolerance_scale=float(e), noise_scale=float(s)
+                    )
+                    for s in noises
+                ]
+                for e in scales
+            ]
+        evidence = log_of_sum(logs + weights, axis=1)
         total += float(evidence[0])
         by_scale += evidence[1:]
     return total, by_scale

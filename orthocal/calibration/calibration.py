@@ -19,7 +19,7 @@ from orthocal.effects.compensation import displace_drives
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow, root_mean_square
 from orthocal.kinematics.conditions import APPROACH
 from orthocal.robot.model import Robot
-from orthocal.statistics.chance import expanded_uncertainty
+from orthocal.statistics.chance import bounded_interval, expanded_uncertainty
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -160,9 +160,20 @@ class Calibration(CalibrationRecord):
 
     @property
     def intervals(self) -> tuple[tuple[float, float], ...]:
-        """Values of `free` ± their expanded uncertainties, [SI]."""
+        """Values of `free` ± their expanded uncertainties, [SI].
+
+        Bounds truncate the distribution of an estimate: backlash is never negative.
+        """
         half = self.expanded_uncertainties.tolist()
-        return tuple((p.value - u, p.value + u) for p, u in zip(self.free, half, strict=True))
+        return tuple(
+            bounded_interval(
+                p.value,
+                u,
+                -math.inf if p.lower is None else p.lower,
+                math.inf if p.upper is None else p.upper,
+            )
+            for p, u in zip(self.free, half, strict=True)
+        )
 
     @property
     def active_offsets(self) -> Array:

@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from orthocal.arrays import Array, Indices
+from orthocal.arrays import Array, Indices, Mask
 from orthocal.errors import ClosureError, SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.linear import require_finite
@@ -27,6 +27,7 @@ from orthocal.hypotheses.hypothesis import (
 )
 from orthocal.hypotheses.likelihood import Likelihood, Products, build_likelihood
 from orthocal.session.session import Session
+from orthocal.statistics.distributions import log_positive_share
 from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 
@@ -79,6 +80,28 @@ class ModelLinearisation:
         variance = e2 * self.sizes**2 + (noise_scale * self.likelihood.sigma) ** 2
         along = self.likelihood.directions @ deviation
         return np.asarray(self.errors @ (e2 * self.sizes / variance * along))
+
+    def log_positive_share(
+        self, deviation: Array, positive: Mask, *, tolerance_scale: float, noise_scale: float
+    ) -> float:
+        """Gain of the log likelihood by half-normal in place of normal priors.
+
+        ln 2ᵏ P(θ₊ > 0 | y), for k errors that are never negative: their prior density is twice that
+        of a normal prior, and only the positive part of the posterior counts.
+
+        Args:
+            deviation: As for `errors_for`.
+            positive: Mask of these errors, shape (n_free,).
+            tolerance_scale: As for `errors_for`.
+            noise_scale: As for `errors_for`.
+        """
+        scales = {"tolerance_scale": tolerance_scale, "noise_scale": noise_scale}
+        mean = self.errors_for(deviation, **scales)[positive]
+        known = tolerance_scale**2 * self.sizes**2
+        known /= known + (noise_scale * self.likelihood.sigma) ** 2
+        rows = self.errors[positive]
+        covariance = tolerance_scale**2 * (np.eye(len(rows)) - rows * known @ rows.T)
+        return len(rows) * math.log(2.0) + log_positive_share(mean, covariance)
 
 
 class LinearModel:

@@ -8,7 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array
-from orthocal.statistics.distributions import chi_square_tail, f_tail, normal_quantile, t_quantile
+from orthocal.statistics.distributions import (
+    chi_square_tail,
+    f_tail,
+    least_number,
+    normal_quantile,
+    t_quantile,
+)
 
 BY_CHANCE = 0.01
 """Significance level of tests of residuals against noise."""
@@ -49,6 +55,33 @@ def coverage_factor(dof: float) -> float:
     """
     factor = confidence_factor(dof)
     return max(COVERAGE, factor) if math.isfinite(factor) else math.nan
+
+
+def bounded_interval(
+    value: float, uncertainty: float, lower: float, upper: float
+) -> tuple[float, float]:
+    """Shortest interval of a normal distribution about a value, truncated at bounds.
+
+    It has the coverage of the value ± its expanded uncertainty with k = 2, which it is without
+    bounds. NaN for an uncertainty that is unknown.
+
+    Args:
+        value: Most likely value, within the bounds.
+        uncertainty: Expanded uncertainty, two standard deviations.
+        lower: Lower bound, -inf for none.
+        upper: Upper bound, inf for none.
+    """
+    if not 0.0 < uncertainty < math.inf:
+        return value - uncertainty, value + uncertainty
+    to_deviations = COVERAGE / uncertainty / math.sqrt(2.0)
+    below, above = ((value - lower) * to_deviations, (upper - value) * to_deviations)
+
+    def share(half: float) -> float:
+        return math.erf(min(half, below)) + math.erf(min(half, above))
+
+    wanted = math.erf(COVERAGE / math.sqrt(2.0)) * share(math.inf)
+    half = least_number(lambda h: share(h) >= wanted) / to_deviations
+    return max(value - half, lower), min(value + half, upper)
 
 
 def expanded_uncertainty(

@@ -10,10 +10,17 @@ import math
 from collections.abc import Callable, Iterable
 from statistics import NormalDist
 
+import numpy as np
+
+from orthocal.arrays import Array
+
 SMALLEST = 1e-300
 """Replaces a zero denominator of a continued fraction."""
 
 PRECISION = 1e-15
+
+LATTICE = 2048
+"""Points of the lattice over which the probability of an orthant is integrated."""
 
 MOST_TERMS = 100_000
 """Number of terms of a series or a continued fraction; √a terms are usual."""
@@ -22,6 +29,39 @@ MOST_TERMS = 100_000
 def normal_quantile(share: float) -> float:
     """Quantile of the standard normal distribution."""
     return NormalDist().inv_cdf(share)
+
+
+def log_positive_share(mean: Array, covariance: Array) -> float:
+    """Logarithm of the probability that all of some normal variables are positive.
+
+    By separation of variables, x = m + L z, integrated over a fixed lattice (Genz, 1992).
+
+    Args:
+        mean: m, shape (k,).
+        covariance: L Lᵀ, shape (k, k).
+    """
+    from scipy.special import log_ndtr, ndtri_exp
+
+    root = np.linalg.cholesky(covariance)
+    shares = np.log(_lattice(mean.size - 1))
+    drawn = np.zeros((LATTICE, mean.size))
+    logs = np.zeros(LATTICE)
+    for i, (limit, row) in enumerate(zip(mean, root, strict=True)):
+        log_share = log_ndtr((limit - drawn[:, :i] @ row[:i]) / row[i])
+        logs += log_share
+        if i + 1 < mean.size:
+            drawn[:, i] = ndtri_exp(shares[:, i] + log_share)
+    return float(np.logaddexp.reduce(logs) - math.log(LATTICE))
+
+
+def _lattice(dimensions: int) -> Array:
+    """Points that fill the unit cube evenly, shape (LATTICE, dimensions): Kronecker's sequence."""
+    root = 2.0
+    for _ in range(64):  # x = (1 + x)^(1 / (d + 1))
+        root = (1.0 + root) ** (1.0 / (dimensions + 1))
+    steps = root ** -np.arange(1.0, dimensions + 1)
+    wrapped = (np.arange(1, LATTICE + 1)[:, None] * steps) % 1.0
+    return np.asarray(np.clip(1.0 - np.abs(2.0 * wrapped - 1.0), 1e-12, 1.0))
 
 
 def chi_square_tail(dof: float, value: float) -> float:
