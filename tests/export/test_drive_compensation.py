@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import run_orthocal
 from effect_plans import write_plan
 from linuxcnc import Joint, require_linuxcnc, run_program
 from programs import read_polyline
@@ -26,8 +27,10 @@ from orthocal import (
     load_plan,
     load_robot,
     simulate_session,
+    write_calibration,
 )
 from orthocal.assessment.controller_entries import offsets_to_enter
+from orthocal.effects.compensation import JointTrim
 from orthocal.export.approach_sides import ApproachSides, find_lags
 from orthocal.export.correction_field import CorrectionField
 from orthocal.export.linuxcnc.drive_compensation import PeriodicErrors, find_periodic_errors
@@ -343,26 +346,31 @@ DENSE = 0.02
 """Distance of the points at which a corrected program is followed, [mm]."""
 
 
+PROGRAM = [
+    "G21 G90 G0 X{:g} Y{:g} Z{:g}".format(*CORNERS[0]),
+    "G1 X28 Y-8 Z15 F600",
+    "G2 X28 Y-8 Z15 I-16 J0",
+    *(f"G1 X{x:g} Y{y:g} Z{z:g}" for x, y, z in CORNERS[2:]),
+]
+
+
+def points_along(lines):
+    """Points along a program of straight lines, shape (K, 3), [mm]."""
+    corners = np.array([point for written in read_polyline(lines).values() for point, _ in written])
+    lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    counts = np.maximum(np.ceil(lengths / DENSE).astype(int), 1)
+    pieces = zip(corners[:-1], corners[1:], counts, strict=True)
+    return np.vstack([a + (b - a) * np.linspace(0, 1, n + 1)[1:, None] for a, b, n in pieces])
+
+
 def run_corrected(calibration, field, *, backlash):
     """Tool of the calibrated machine along a corrected program, shape (K, 3), [mm]."""
     lags = find_lags(calibration.robot, calibration.errors)
     sides = ApproachSides(calibration.robot, lags) if backlash else None
     interpreter = Interpreter("p", axes=field.axes, offsets={})
     corrector = ProgramCorrector(interpreter, field, within=WITHIN, sides=sides)
-    x, y, z = CORNERS[0]
-    program = [
-        f"G21 G90 G0 X{x:g} Y{y:g} Z{z:g}",
-        "G1 X28 Y-8 Z15 F600",
-        "G2 X28 Y-8 Z15 I-16 J0",
-        *(f"G1 X{x:g} Y{y:g} Z{z:g}" for x, y, z in CORNERS[2:]),
-    ]
-    text = "".join(corrector.run(f"{line}\n" for line in program))
-    read = read_polyline(text.splitlines())
-    corners = np.array([point for written in read.values() for point, _ in written])
-    lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
-    counts = np.maximum(np.ceil(lengths / DENSE).astype(int), 1)
-    pieces = zip(corners[:-1], corners[1:], counts, strict=True)
-    points = np.vstack([a + (b - a) * np.linspace(0, 1, n + 1)[1:, None] for a, b, n in pieces])
+    text = "".join(corrector.run(f"{line}\n" for line in PROGRAM))
+    points = points_along(text.splitlines())
     motors = Machine(load_robot("orthoglide"), {}).inverse(points * MM) - ACTIVE
     real = follow(calibration, motors) / MM
     return real[np.linalg.norm(real - CORNERS[0], axis=1) > TAKEN_UP]
@@ -378,6 +386,59 @@ def test_a_corrected_program_takes_up_backlash(calibration):
     assert (np.count_nonzero(off < WITHIN, axis=1) > COUNTS).all()
     ignored = from_pieces(run_corrected(calibration, field, backlash=False), *PATH)
     assert ignored.min(axis=0).max() > 20 * WITHIN
+
+
+def motors_of(calibration, points):
+    """Motors of a controller that adds its trims to nominal kinematics, shape (K, 3), [m]."""
+    displayed = Machine(load_robot("orthoglide"), {}).inverse(points * MM)
+    motors = displayed - calibration.active_offsets
+    trims = zip(calibration.robot.drives, calibration.session.compensation, strict=True)
+    for i, (drive, trim) in enumerate(trims):
+        joints = drive.to_joint(displayed[:, i])
+        steps = np.append(1.0, np.diff(joints))
+        moved = np.maximum.accumulate(np.where(steps != 0.0, np.arange(len(steps)), 0))
+        grew = steps[moved] > 0.0
+        if trim.table is None:
+            added = np.where(grew, 0.5, -0.5) * trim.backlash
+        else:
+            up, down = (np.interp(joints, trim.table[:, 0], trim.table[:, k]) for k in (1, 2))
+            added = np.where(grew, up, down)
+        motors[:, i] += drive.direction * added
+    return motors
+
+
+@pytest.mark.parametrize("controller", ["tables", "half of the backlash"])
+def test_correct_leaves_to_the_controller_what_it_compensates(
+    controller, calibration, under_tables, tmp_path
+):
+    """A program for a controller with the compensation of the measurement."""
+    result, _ = under_tables
+    if controller != "tables":
+        backlash = [calibration.errors[f"{d.name}.backlash"] for d in calibration.robot.drives]
+        trims = tuple(JointTrim(0.5 * b) for b in backlash)
+        result = replace(calibration, session=replace(calibration.session, compensation=trims))
+    (tmp_path / "one").mkdir()
+    write_calibration(result, tmp_path / "one/calibration.json")
+    (tmp_path / "part.ngc").write_text("\n".join([*PROGRAM, ""]))
+    words = ["correct", "one", "part.ngc", "--offsets", "active", "--anyway", "--out", "good.ngc"]
+    done = run_orthocal(tmp_path, *words)
+    assert done.returncode == 0, done.stderr
+    points = points_along((tmp_path / "good.ngc").read_text().splitlines())
+    real = follow(calibration, motors_of(result, points)) / MM
+    real = real[np.linalg.norm(real - CORNERS[0], axis=1) > TAKEN_UP]
+    off = from_pieces(real, *PATH)
+    assert off.min(axis=0).max() < WITHIN + SIDED
+    # a controller that compensates nothing would need another program
+    none = follow(
+        calibration,
+        Machine(load_robot("orthoglide"), {}).inverse(points * MM) - result.active_offsets,
+    )
+    none = none[np.linalg.norm(none / MM - CORNERS[0], axis=1) > TAKEN_UP] / MM
+    assert from_pieces(none, *PATH).min(axis=0).max() > 10 * WITHIN
+
+
+SIDED = 1.0e-6
+"""Part of the periodic errors that depends on the side, in drives: 0.2 µm each, [m]."""
 
 
 def test_lags_are_half_the_backlash(calibration, orthoglide):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from commands import run_orthocal
@@ -10,6 +12,7 @@ from effect_plans import write_plan
 from orthocal import (
     ParameterError,
     calibrate,
+    load_calibration,
     load_plan,
     simulate_session,
     write_calibration,
@@ -80,28 +83,92 @@ def test_wrong_files_are_refused(folder, orthoglide, old, new, where):
     assert caught.value.where == f"{folder / 'machine.ini'}: {where}"
 
 
-def test_commands_read_the_file(folder):
-    """Export reads the INI of the measurement, again the one with what was entered."""
+@pytest.fixture(scope="module")
+def one(tmp_path_factory):
+    """Directory of a calibration with backlash."""
+    folder = tmp_path_factory.mktemp("calibrated")
     plan = load_plan(write_plan(folder / "plan", effects="backlash: {}"))
     truth = {f"{d}_slide.backlash": 30e-6 for d in "xyz"}
     session = simulate_session(plan.with_controller(np.zeros(3)), truth, seed=1).session
-    result = calibrate(session, solver="variable-projection")
     (folder / "one").mkdir()
+    result = calibrate(session, solver="variable-projection")
     write_calibration(result, folder / "one" / "calibration.json")
-    one, home = folder / "one", folder / "home"
-    export = ["export", one, "--to", "linuxcnc", "--offsets", "--out", home, "--ini"]
-    refused = run_orthocal(folder, *export, folder / "machine.ini")
-    assert refused.returncode == 2
-    assert "machine.ini" in refused.stderr
+    return folder / "one"
+
+
+@pytest.fixture
+def plain(folder):
+    """INI file of a controller that compensates nothing, as during the measurement."""
     lines = [v for v in INI.splitlines() if not v.startswith(("BACKLASH", "COMP"))]
     (folder / "plain.ini").write_text("\n".join(lines))
-    done = run_orthocal(folder, *export, folder / "plain.ini")
+    return folder / "plain.ini"
+
+
+def export(folder, one, out, *words):
+    return run_orthocal(
+        folder, "export", one, "--to", "linuxcnc", "--offsets", "--out", out, *words
+    )
+
+
+def test_export_refuses_the_file_of_another_controller(folder, one):
+    done = export(folder, one, "home", "--ini", folder / "machine.ini")
+    assert done.returncode == 2
+    assert "machine.ini" in done.stderr
+    assert not (folder / "home").exists()
+
+
+def test_export_takes_home_and_latching_from_the_file(folder, one, plain):
+    by_file = export(folder, one, "file", "--ini", plain)
+    assert by_file.returncode == 0, by_file.stderr
+    assert "Assumed" not in by_file.stderr
+    stated = ["--home-offset", "352.5,340,-3.25", "--latched=-,+,+"]
+    assert export(folder, one, "stated", *stated).returncode == 0
+    other = ["--home-offset", "352.5,340,-3.25", "--latched=+,+,+"]
+    assert export(folder, one, "other", *other).returncode == 0
+    lines = [(folder / name / "joints.ini").read_text() for name in ("file", "stated", "other")]
+    assert lines[0] == lines[1] != lines[2]
+    twice = export(folder, one, "twice", "--ini", plain, "--latched", "+,+,+")
+    assert twice.returncode == 2
+    assert "--latched" in twice.stderr
+
+
+def test_latching_is_positive_by_default_and_said_to_be(folder, one):
+    home = ["--home-offset", "352.5,340,-3.25"]
+    default = export(folder, one, "default", *home)
+    assert "Assumed: HOME_LATCH_VEL of all joints is positive" in default.stderr
+    stated = export(folder, one, "stated", *home, "--latched", "+,+,+")
+    assert "Assumed" not in stated.stderr
+    texts = [(folder / name / "joints.ini").read_text() for name in ("default", "stated")]
+    entered = [re.findall(r"^HOME_OFFSET = (\S+)", text, re.M) for text in texts]
+    assert entered[0] == entered[1]
+    assert len(entered[0]) == 3
+
+
+def test_again_states_the_backlash_of_the_file(folder, one, plain):
+    assert export(folder, one, "home", "--ini", plain).returncode == 0
+    words = ["again", one, "--out", folder / "second", "--ini", folder / "home/joints.ini"]
+    done = run_orthocal(folder, *words)
     assert done.returncode == 0, done.stderr
-    assert "Assumed" not in done.stderr
-    again = ["again", one, "--out", folder / "second", "--ini", home / "joints.ini"]
-    done = run_orthocal(folder, *again)
-    assert done.returncode == 0, done.stderr
-    second = load_plan(folder / "second")
+    second, result = load_plan(folder / "second"), load_calibration(one)
     entered = [trim.backlash for trim in second.compensation]
-    identified = [result.errors[f"{d.name}.backlash"] for d in plan.robot.drives]
+    identified = [result.errors[f"{d.name}.backlash"] for d in second.robot.drives]
     assert entered == pytest.approx(identified, abs=1e-7)
+    assert "x_slide" in done.stdout.partition("compensates backlash")[2]
+
+
+def test_again_states_the_tables_of_the_file(folder, one):
+    """The tables are copied beside the new session."""
+    done = run_orthocal(folder, "again", one, "--out", "second", "--ini", "machine.ini")
+    assert done.returncode == 0, done.stderr
+    first, _, last = load_plan(folder / "second").compensation
+    assert first.backlash == pytest.approx(0.031 * MM)
+    expected = np.array([[0.0, 0.01, -0.02], [100.0, 0.03, -0.04]]) * MM
+    assert last.table == pytest.approx(expected, abs=1e-12)
+    assert "z_slide by a table" in done.stdout
+
+
+def test_again_without_the_file_keeps_what_the_session_states(folder, one):
+    done = run_orthocal(folder, "again", one, "--out", "second")
+    assert done.returncode == 0, done.stderr
+    assert load_plan(folder / "second").compensation == ()
+    assert "compensates backlash" not in done.stdout

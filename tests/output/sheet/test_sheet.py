@@ -18,6 +18,7 @@ from machines import place
 from orthocal import load_plan
 from orthocal.builder.build import make_robot
 from orthocal.builder.machine_file import Counting, Dimensions
+from orthocal.effects.compensation import JointTrim
 from orthocal.output.sheet.page import sheet_files
 from orthocal.units import MM
 
@@ -187,6 +188,22 @@ def test_front_page_states_zero_travel_and_approach(page):
     assert "into it: controller: {offsets_mm: [0, 0, 0]}." in text
     assert words(page.findall(".//code")[-1]) == "orthocal calibrate ."
     assert "`" not in text
+
+
+def test_front_page_states_what_the_controller_compensates(small):
+    """What the session states; that it states none only where backlash matters."""
+    table = np.array([[0.0, 1e-5, -1e-5], [0.4, 2e-5, -2e-5]])
+    trims = (JointTrim(table=table), JointTrim(0.05 * MM), JointTrim())
+
+    def front(session):
+        (page,) = (text for name, text in sheet_files(session).items() if name.endswith(".html"))
+        return " ".join(words(etree.HTML(page)).split())
+
+    stated = front(replace(small, compensation=trims))
+    assert "controller compensates backlash" in stated
+    assert "x_slide by a table, y_slide 0.050 mm (LinuxCNC" in stated
+    assert "compensates" not in front(small)
+    assert "compensates no backlash" in front(small.with_effects(["backlash"]))
 
 
 def test_sheet_after_a_calibration_has_shifted_travel_and_ends_with_validation(small):
