@@ -23,12 +23,14 @@ from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.measurement.motion.approach import can_approach, describe_approach
 from orthocal.observation.conditions import MORNING, in_course
+from orthocal.observation.model import predict_readings
 from orthocal.planning.candidates import list_candidates
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import noise_of
 from orthocal.planning.first_plan import first_equipment, paper_plan
 from orthocal.planning.further_readings import WAITS
 from orthocal.planning.plan import plan_readings
+from orthocal.session.session import Gauge
 from orthocal.units import MM, PPM, UM
 
 TODAY = 24
@@ -129,6 +131,45 @@ def test_positions_lie_at_fractions_of_the_lead(orthoglide):
         along = [p.values[0] for n, p in session.postures.items() if n.startswith("x")]
         phases = {round(v / 5e-3 % 1.0 % 1.0, 6) for v in along}
         assert len(phases - {1.0}) == least
+
+
+def test_a_plan_determines_both_parts_of_a_periodic_error(orthoglide):
+    """Limits between the bound of readings that depend on one screw alone, and three times it.
+
+    Readings k of a setup with the sensitivity s_k to a drive, at the phases φ_k of its screw, have
+    the information Σ w_k w_kᵀ/σ² about A and B, with w_k = s_k (sin φ_k, cos φ_k) less its mean
+    over the setup, whose zero is free. The prior adds 1/p².
+    """
+    lead, std = 5.0 * MM, 10.0 * UM
+    keys = {"screw": {"lead_mm": lead / MM, "periodic_tolerance_mm": 2.0 * std / MM}}
+    robot = replace(orthoglide, declared=replace(orthoglide.declared, effects=keys))
+    fine = Gauge(sigma=0.5 * UM, resolution=1.0 * UM, range=(-5.0 * MM, 5.0 * MM))
+    equipment = Equipment(gauge=fine, sections=(0.5,), across=0.0)
+    plan = plan_readings(with_effects(robot, ["screw"]), "full", equipment=equipment, starts=1)
+    session, sigma = plan.session, noise_of(plan.session)
+    rows = [r.posture for r in session.readings]
+    setups = np.array([r.setup for r in session.readings])
+    bounds = []
+    for i, drive in enumerate(session.robot.drives):
+        coordinates = np.array([session.postures[name].drives[i] for name in rows])
+        phases = np.sort(coordinates / lead % 1.0)
+        assert np.diff(np.append(phases, phases[0] + 1.0)).max() < 0.4
+        ahead, behind = (
+            predict_readings(session, {f"{drive.name}.offset": d}) for d in (10 * UM, -10 * UM)
+        )
+        turns = 2.0 * np.pi * coordinates / lead
+        weights = np.column_stack([np.sin(turns), np.cos(turns)])
+        weights *= ((ahead - behind) / (20.0 * UM))[:, None]
+        for name in session.setups:
+            weights[setups == name] -= weights[setups == name].mean(axis=0)
+        information = weights.T @ weights / sigma**2
+        part = np.linalg.eigvalsh(information)[0] / np.trace(information)
+        assert part > 0.2  # of at most 0.5: neither A nor B alone
+        bounds.append(np.diag(np.linalg.inv(information + np.eye(2) / std**2)))
+    bound = 2.0 * np.sqrt(np.max(bounds))
+    (screw,) = plan.effects
+    assert (screw.before, screw.count) == (pytest.approx(2.0 * std), 6)
+    assert bound < screw.after < 3.0 * bound < 0.25 * screw.before
 
 
 def test_the_paper_plan_is_read_from_one_side(machine, orthoglide):
