@@ -36,8 +36,10 @@ from orthocal.assessment.calibrated_tool import (
     place_tool,
 )
 from orthocal.assessment.controller_entries import (
+    backlash_changes,
     compute_entries,
     entered_offsets,
+    find_backlash,
     solve_in_order,
     weigh_field,
 )
@@ -148,7 +150,9 @@ def plan_adjustments(
             "the noise of the readings is unknown, and with it the expected tool error; read every "
             "posture twice, or state gauge.sigma_mm"
         )
-    search = _Search(calibration, tool, candidates, before.compensated)
+    backlash = find_backlash(calibration)
+    changes = backlash_changes(calibration, backlash)
+    search = _Search(calibration, tool.compensating(changes), candidates, before.compensated)
     chosen = search.choose()
     amounts, after, entries = np.zeros(len(candidates)), before, assessment_of(calibration).entries
     for _ in range(MOST_ROUNDS if chosen else 0):
@@ -158,8 +162,8 @@ def plan_adjustments(
         amounts = improved
         adjusted = adjust_calibration(calibration, search.named(amounts))
         placed = place_tool(adjusted, tool.workspace.once(tool.use.size))
-        entries = compute_entries(adjusted, placed)
-        accuracy = assess_placed(adjusted, placed, entries)
+        entries = compute_entries(adjusted, placed.compensating(changes))
+        accuracy = assess_placed(adjusted, placed, entries, backlash)
         summary = summarise_tool(adjusted, accuracy)
         after = summary or before
         search.correct(amounts, accuracy.error_after_offsets)

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arguments import require_kind
 from orthocal.assessment.calibrated_tool import CalibratedTool, find_tool
-from orthocal.assessment.controller_entries import compute_entries
+from orthocal.assessment.controller_entries import (
+    WORTH_ENTERING,
+    backlash_changes,
+    compute_backlash,
+    compute_entries,
+    is_worth_changing,
+    lowers,
+)
 from orthocal.assessment.fit_findings import find_fit_findings
 from orthocal.assessment.judgement import Judgement, judge_session, rank, verdict_of
 from orthocal.assessment.recommendation import Recommendation, recommend_model
@@ -20,6 +27,7 @@ from orthocal.assessment.words import entries as words
 from orthocal.assessment.words.comparison import describe_recommendation
 from orthocal.calibration.assessment_record import (
     Assessment,
+    BacklashEntry,
     ControllerEntry,
     Decision,
     Finding,
@@ -47,11 +55,6 @@ EXPLANATIONS: tuple[FindingKind, ...] = (
     "fits",
 )
 """Kinds of which the first explains the decision to enter."""
-
-
-WORTH_ENTERING = 0.05
-"""Share by which the expected tool error must fall for the offsets to be entered. Also that by
-which it must fall for a correction of all errors to be recommended."""
 
 KEEPING: dict[FindingKind, str] = {
     "no offset": words.NOTHING_HEADLINE,
@@ -139,29 +142,28 @@ def assess(
     measured = session or restore_session(calibration)
     if judgement is None:
         judgement = judge_session(measured)
-    placed = find_tool(calibration)
-    entries = compute_entries(calibration, placed)
-    tool, unreached = _tool(calibration, placed, entries)
-    firmware = calibration.session.firmware is not None  # its settings correct more than offsets
-    keep, best = not firmware and _keeps(calibration, entries, tool), tool
-    if keep:
-        entries = tuple(e.kept for e in entries)
-        tool, _ = _tool(calibration, placed, entries)
+    chosen = _choose(calibration)
+    entries, tool, keep = chosen.entries, chosen.tool, chosen.keep
     notes = [
         *find_fit_findings(calibration),
-        *([_no_change_needed(calibration, entries, best)] if keep else []),
+        *([_no_change_needed(calibration, entries, chosen.best)] if keep else []),
         *_entry_findings(calibration, entries, tool, keep=keep),
         *describe_recommendation(
             recommendation or recommend_model(measured), chosen=calibration.model
         ),
-        *unreached,
+        *chosen.unreached,
     ]
     findings = rank([*judgement.findings, *notes])
     return Assessment(
-        decision=_decide(findings, firmware=firmware),
+        decision=_decide(
+            findings,
+            firmware=calibration.session.firmware is not None,
+            backlash=any(e.change for e in chosen.backlash),
+        ),
         findings=findings,
         entries=entries,
         tool=tool,
+        backlash=chosen.backlash,
     )
 
 
@@ -200,40 +202,77 @@ def check_session(session: Session, *, judgement: Judgement | None = None) -> As
     return Assessment(decision, findings, (), None)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Chosen:
+    """What to enter, and the tool error with it."""
+
+    entries: tuple[ControllerEntry, ...]
+    backlash: tuple[BacklashEntry, ...]
+    keep: bool
+    """Whether the offsets stay as they are."""
+    tool: ToolErrorSummary | None
+    best: ToolErrorSummary | None
+    """With the best offsets."""
+    unreached: list[Finding]
+
+
+def _choose(calibration: Calibration) -> _Chosen:
+    """Choose offsets and backlash to enter: those that are worth entering."""
+    placed = find_tool(calibration)
+    backlash = compute_backlash(calibration, placed)
+    changes = backlash_changes(calibration, backlash)
+    entries = compute_entries(calibration, placed and placed.compensating(changes))
+    best, unreached = _tool(calibration, placed, entries, backlash)
+    stay = tuple(e.kept for e in entries)
+    now = None if best is None else best.now
+    if changes.any() and best is not None:
+        staying, _ = _tool(calibration, placed, stay, backlash)
+        now = None if staying is None else staying.entered
+    firmware = calibration.session.firmware is not None  # its settings correct more than offsets
+    keep = not firmware and _keeps(calibration, entries, now, best)
+    if entries and not keep:
+        return _Chosen(entries, backlash, keep, best, best, unreached)
+    if not is_worth_changing(calibration, placed, backlash):
+        backlash = tuple(e.kept for e in backlash)
+    tool, _ = _tool(calibration, placed, stay, backlash)
+    return _Chosen(stay, backlash, keep, tool, best, unreached)
+
+
 def _tool(
     calibration: Calibration,
     placed: CalibratedTool | None,
     entries: Sequence[ControllerEntry],
+    backlash: Sequence[BacklashEntry],
 ) -> tuple[ToolErrorSummary | None, list[Finding]]:
     """The expected tool error, or why it is unknown."""
     try:
-        accuracy = assess_placed(calibration, require_tool(calibration, placed), entries)
+        tool = require_tool(calibration, placed)
+        accuracy = assess_placed(calibration, tool, entries, backlash)
     except (ClosureError, RobotError) as e:
         return None, [words.out_of_reach(str(e))]
     return summarise_tool(calibration, accuracy), []
 
 
 def _keeps(
-    calibration: Calibration, entries: Sequence[ControllerEntry], tool: ToolErrorSummary | None
+    calibration: Calibration,
+    entries: Sequence[ControllerEntry],
+    now: float | None,
+    tool: ToolErrorSummary | None,
 ) -> bool:
     """True if the offsets stay as they are: entering them gains too little at the tool.
 
     Args:
         calibration: The calibration.
         entries: Offsets with the least tool error.
+        now: Tool error with the active ones, [m]; None if unknown.
         tool: The tool error with them; None without a tool to judge by: then significance decides.
     """
     if not entries:
         return False
-    if tool is not None:
-        return not lowers(tool.now, tool.entered)
+    if tool is not None and now is not None:
+        return not lowers(now, tool.entered)
     known = _by_readings(entries)
     return bool(known) and not any(is_significant(calibration, e) for e in known)
-
-
-def lowers(now: float, then: float) -> bool:
-    """True if an expected tool error, [m], falls enough to enter or to correct something."""
-    return not then > (1.0 - WORTH_ENTERING) * now
 
 
 def _by_readings(entries: Sequence[ControllerEntry]) -> list[ControllerEntry]:
@@ -283,19 +322,27 @@ def is_significant(calibration: Calibration, entry: ControllerEntry) -> bool:
     return not abs(entry.best_change) <= expanded_uncertainty(calibration, entry)
 
 
-def expanded_uncertainty(calibration: Calibration, entry: ControllerEntry) -> float:
+def expanded_uncertainty(calibration: Calibration, entry: ControllerEntry | BacklashEntry) -> float:
     """Expanded uncertainty of the best value to enter, [unit]; see `Calibration.expand`."""
     return float(calibration.expand(entry.std, entry.std_scatter))
 
 
-def _decide(findings: Sequence[Finding], *, firmware: bool) -> Decision:
-    """The one decision: the gravest finding decides; nothing against entering means enter."""
+def _decide(findings: Sequence[Finding], *, firmware: bool, backlash: bool) -> Decision:
+    """The one decision: the gravest finding decides; nothing against entering means enter.
+
+    Args:
+        findings: All findings, the gravest first.
+        firmware: Whether the session is of a controller whose settings are calibrated.
+        backlash: Whether there is backlash to enter.
+    """
     verdict, lead = verdict_of(findings), findings[0]
     if verdict != "enter":
         return Decision(verdict, words.HEADLINES[verdict], lead.text, lead.action)
     for kind, headline in KEEPING.items():
         finding = first_of(findings, kind)
         if finding is not None:
+            if backlash:
+                headline = f"{headline} {words.BACKLASH_HEADLINE}"
             return Decision(verdict, headline, finding.text, finding.action)
     why = first_of(findings, *EXPLANATIONS)
     reason, action = ("", "") if why is None else (why.text, why.action)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +12,7 @@ from orthocal.arrays import Array
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
-from orthocal.kinematics.conditions import UseConditions, UseSamples, sample_use
+from orthocal.kinematics.conditions import APPROACH, UseConditions, UseSamples, sample_use
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace, find_workspace
@@ -49,6 +49,19 @@ class CalibratedTool:
     def free(self) -> tuple[str, ...]:
         """Names of the parameters."""
         return self.sensitivities[0].free
+
+    def compensating(self, backlash: Array) -> CalibratedTool:
+        """The tool with a controller that takes up more backlash.
+
+        Args:
+            backlash: Change of the compensated backlash of each drive, (n_drives,), [m, rad].
+        """
+        if not backlash.any():
+            return self
+        unknown = "u" * backlash.size
+        sides = [[APPROACH[s] for s in c.approach or unknown] for c in self.use.conditions]
+        trims = self.trims + 0.5 * np.array(sides)[:, None, :] * backlash
+        return replace(self, trims=read_only(trims))
 
     def deviation(self, offsets: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
         """Actual less commanded position of the tool, shape (C K, 3), [m].

@@ -1,8 +1,11 @@
-"""Offsets to enter into a controller that corrects offsets only.
+"""Offsets and backlash to enter into a controller that corrects nothing else.
 
 A machine whose legs and axes are off as well is not served best by its true offsets: others make up
 for a part of its other errors. Entered is what leaves the least error at the tool, over the region
 that it reaches.
+
+A backlash is entered where the readings determine it: where it, or its change, is larger than its
+expanded uncertainty, or where entering it lowers the expected tool error.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.assessment.calibrated_tool import CalibratedTool, error_covariance, find_tool
-from orthocal.calibration.assessment_record import ControllerEntry
+from orthocal.calibration.assessment_record import BacklashEntry, ControllerEntry
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.io.fields import read_only
@@ -27,6 +30,10 @@ absolute error decides on it: such offsets little more than shift and turn the w
 
 ENTERED_DECIMALS = 6
 """Step of an entered offset, [m, rad]: 1 µm."""
+
+WORTH_ENTERING = 0.05
+"""Share by which the expected tool error must fall for the offsets to be entered. Also that by
+which it must fall for a correction of all errors to be recommended."""
 
 MOST_STEPS = 12
 
@@ -43,7 +50,86 @@ def find_entries(calibration: Calibration) -> tuple[ControllerEntry, ...]:
     """
     if calibration.assessment is not None:
         return calibration.assessment.entries
-    return compute_entries(calibration, find_tool(calibration))
+    tool = find_tool(calibration)
+    changes = backlash_changes(calibration, compute_backlash(calibration, tool))
+    return compute_entries(calibration, tool and tool.compensating(changes))
+
+
+def find_backlash(calibration: Calibration) -> tuple[BacklashEntry, ...]:
+    """Backlash to enter of each drive, as the assessment records it; empty without any."""
+    if calibration.assessment is not None:
+        return calibration.assessment.backlash
+    return compute_backlash(calibration, find_tool(calibration))
+
+
+def backlash_changes(calibration: Calibration, entries: Sequence[BacklashEntry]) -> Array:
+    """Changes of the backlash that the controller takes up, shape (n_drives,), [m, rad]."""
+    changes = {e.drive: e.change for e in entries}
+    return np.array([changes.get(d.name, 0.0) for d in calibration.robot.drives])
+
+
+def lowers(now: float, then: float) -> bool:
+    """True if an expected tool error, [m], falls enough to enter or to correct something."""
+    return not then > (1.0 - WORTH_ENTERING) * now
+
+
+def compute_backlash(
+    calibration: Calibration, tool: CalibratedTool | None
+) -> tuple[BacklashEntry, ...]:
+    """Backlash to enter of each drive, computed anew.
+
+    Args:
+        calibration: The calibration.
+        tool: Its tool over the workspace; None if there is none.
+    """
+    by_name = {p.name: p for p in calibration.parameters}
+    active = calibration.compensated_backlash.tolist()
+    entries = []
+    for drive, now in zip(calibration.robot.drives, active, strict=True):
+        p = by_name.get(f"{drive.name}.backlash")
+        if p is None or not (p.free or p.value):
+            continue
+        value, std = max(p.value, 0.0), p.std if p.free else 0.0
+        scatter = p.std_scatter if p.free else 0.0
+        entries.append(BacklashEntry(drive.name, drive.unit, now, value, value, std, scatter))
+    unclear = [e.kept if _is_determined(calibration, e) else e for e in entries]
+    if _changes_tool(calibration, tool, unclear):
+        return tuple(entries)
+    return tuple(e if _is_determined(calibration, e) else e.kept for e in entries)
+
+
+def _is_determined(calibration: Calibration, entry: BacklashEntry) -> bool:
+    half = float(calibration.expand(entry.std, entry.std_scatter))
+    return max(entry.identified, abs(entry.identified - entry.active)) > half
+
+
+def is_worth_changing(
+    calibration: Calibration, tool: CalibratedTool | None, entries: Sequence[BacklashEntry]
+) -> bool:
+    """True if backlash is to be entered even where the offsets stay as they are."""
+    return any(
+        abs(e.change) > float(calibration.expand(e.std, e.std_scatter)) for e in entries
+    ) or _changes_tool(calibration, tool, entries)
+
+
+def _changes_tool(
+    calibration: Calibration, tool: CalibratedTool | None, entries: Sequence[BacklashEntry]
+) -> bool:
+    """True if changes of the compensated backlash lower the expected tool error enough.
+
+    That of a controller which corrects all other errors, to first order.
+    """
+    names = [] if tool is None else list(tool.free)
+    known = {f"{e.drive}.backlash": e.change for e in entries if e.change}
+    at = [names.index(n) for n in known if n in names]
+    if tool is None or not at or not np.isfinite(calibration.model_covariance).all():
+        return False
+    change = np.array([known[names[i]] for i in at])
+    covariance = error_covariance(calibration)
+    aligned, _ = weigh_field(tool, tool.jacobian[:, :, : len(covariance)])
+    uncertain = math.sqrt(max(float(np.sum((aligned @ covariance) * aligned)), 0.0))
+    left = float(np.linalg.norm(aligned[:, at] @ change))
+    return left > 0.0 and lowers(math.hypot(uncertain, left), uncertain)
 
 
 def entered_offsets(

@@ -25,8 +25,13 @@ from orthocal.assessment.calibrated_tool import (
     find_tool,
     place_tool,
 )
-from orthocal.assessment.controller_entries import entered_offsets
+from orthocal.assessment.controller_entries import (
+    backlash_changes,
+    entered_offsets,
+    find_backlash,
+)
 from orthocal.calibration.assessment_record import (
+    BacklashEntry,
     ControllerEntry,
     ToolErrorSummary,
     ToolUse,
@@ -113,11 +118,14 @@ class ToolAccuracy:
     deviation: Array
     """Actual minus commanded tool position with the active offsets, shape (C K, 3), [m]."""
     error_after_offsets: Array
-    """The same with the offsets to enter, in a controller that corrects offsets only."""
+    """The same with the offsets and the backlash to enter, in a controller that corrects nothing
+    else."""
     before: ToolUncertainty
     """Uncertainty from the priors alone."""
     after: ToolUncertainty | None
     """Uncertainty after the calibration; None if the noise is unknown."""
+    without_backlash: Array | None = None
+    """The same with the offsets to enter, but not the backlash; None without backlash to enter."""
     unstated: Array | None = None
     """Error of a controller that corrects all errors without these conditions, shape (C K, 3), [m];
     None where they do not vary."""
@@ -256,10 +264,11 @@ def assess_placed(
     calibration: Calibration,
     tool: CalibratedTool,
     entries: Sequence[ControllerEntry] | None = None,
+    backlash: Sequence[BacklashEntry] | None = None,
     *,
     names: Sequence[str] | None = None,
 ) -> ToolAccuracy:
-    """`assess_tool` over points whose tool is known, with offsets to enter that may be known."""
+    """`assess_tool` over points whose tool is known, with entries that may be known."""
     unmodelled = calibration.unmodelled
     prior_stds = np.r_[[p.prior_std for p in calibration.free], unmodelled.prior_stds]
     free = tuple(tool.free[: len(prior_stds)])
@@ -269,7 +278,11 @@ def assess_placed(
     after = None
     if np.isfinite(calibration.model_covariance).all():
         after = measure_uncertainty(jacobian, error_covariance(calibration), space, where)
-    deviation = tool.deviation(entered_offsets(calibration, entries), names=names)
+    offsets = entered_offsets(calibration, entries)
+    entered = find_backlash(calibration) if backlash is None else backlash
+    changes = backlash_changes(calibration, entered)
+    deviation = tool.compensating(changes).deviation(offsets, names=names)
+    without = read_only(tool.deviation(offsets, names=names)) if changes.any() else None
     return ToolAccuracy(
         workspace=space,
         use=tool.use,
@@ -280,6 +293,7 @@ def assess_placed(
         error_after_offsets=read_only(deviation),
         before=measure_uncertainty(jacobian, np.diag(prior_stds**2), space, where),
         after=after,
+        without_backlash=without,
         unstated=read_only(tool.deviation_unless_stated()) if tool.use.varying else None,
     )
 
@@ -297,6 +311,9 @@ def summarise_tool(calibration: Calibration, accuracy: ToolAccuracy) -> ToolErro
     known = accuracy.after.sizes
     compensated = known.reported.rms
     now, entered = (accuracy.measure(d) for d in (accuracy.deviation, accuracy.error_after_offsets))
+    field, without = accuracy.without_backlash, None
+    if field is not None:
+        without = math.hypot(accuracy.measure(field).reported.rms, compensated)
     return ToolErrorSummary(
         box=tuple((float(low), float(high)) for low, high in accuracy.workspace.limits),
         coordinates=accuracy.workspace.letters,
@@ -304,6 +321,7 @@ def summarise_tool(calibration: Calibration, accuracy: ToolAccuracy) -> ToolErro
         entered=math.hypot(entered.reported.rms, compensated),
         compensated=compensated,
         now_absolute=math.hypot(now.absolute.rms, known.absolute.rms),
+        without_backlash=without,
         entered_absolute=math.hypot(entered.absolute.rms, known.absolute.rms),
         use=_summarise_use(calibration, accuracy, compensated),
     )

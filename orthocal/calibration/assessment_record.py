@@ -205,6 +205,36 @@ class ControllerEntry(InUnit):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class BacklashEntry(InUnit):
+    """Backlash of one drive for the controller to compensate."""
+
+    __pydantic_config__ = CLOSED
+
+    drive: str
+    unit: Unit
+    active: Number
+    """Backlash that the controller compensates now, at the mechanical zero, [unit]."""
+    identified: Number
+    """Backlash of the identified machine, [unit]."""
+    enter: Number
+    """Backlash to enter, [unit]: `identified`, or the active one if the change is undetermined."""
+    std: SizeOrNaN
+    """Standard deviation of `identified` from noise, priors and unmodelled errors, [unit]."""
+    std_scatter: SizeOrNaN
+    """The part of it that is due to the noise of the readings, [unit]."""
+
+    @property
+    def change(self) -> float:
+        """Backlash to enter less the active one, [unit]."""
+        return self.enter - self.active
+
+    @property
+    def kept(self) -> BacklashEntry:
+        """The entry that leaves the backlash as it is."""
+        return replace(self, enter=self.active)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class UsePart:
     """Contribution of a condition of use that varies to the tool error, RMS, [m]."""
 
@@ -265,11 +295,14 @@ class ToolErrorSummary:
     now: SizeOrNaN
     """Aligned, with the offsets that are active now."""
     entered: SizeOrNaN
-    """Aligned, with the offsets to be entered."""
+    """Aligned, with the offsets and the backlash to be entered."""
     compensated: SizeOrNaN
     """Aligned, with a controller that corrects all identified errors."""
     entered_absolute: SizeOrNaN
     now_absolute: SizeOrNaN
+    without_backlash: SizeOrNaN | None = None
+    """Aligned, with the offsets to be entered but not the backlash; None without backlash to
+    enter."""
     use: ToolUse | None = None
     """Conditions of use; None for a machine that depends on none."""
 
@@ -292,6 +325,8 @@ class Assessment:
     """What to enter, drive by drive; empty if no offset was identified."""
     tool: ToolErrorSummary | None
     """None if the robot has no tool, or nothing determines the noise."""
+    backlash: Many[BacklashEntry] = ()
+    """What to enter of the backlash of each drive; empty if the model has none."""
 
     @property
     def keeps_offsets(self) -> bool:

@@ -207,6 +207,16 @@ class Calibration(CalibrationRecord):
         )
 
     @property
+    def compensated_backlash(self) -> Array:
+        """Backlash that the controller took up while measuring, at the mechanical zero.
+
+        Shape (n_drives,), [m, rad].
+        """
+        zero = self.robot.drive_zero[None]
+        ahead, behind = (self.displacement(zero, side * zero.size)[0] for side in "pn")
+        return np.asarray(ahead - behind)
+
+    @property
     def only_offsets(self) -> bool:
         """True if the identified machine has no errors but offsets."""
         are_offsets = self.robot.parameters.are_offsets

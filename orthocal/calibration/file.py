@@ -25,7 +25,7 @@ from orthocal.io.files import exists, is_folder, write_file
 from orthocal.robot.model import Robot
 from orthocal.text import shorten
 
-SCHEMA = "orthocal/calibration/9"
+SCHEMA = "orthocal/calibration/10"
 
 FOLLOWS = 1e-9
 """Largest relative difference of a derived number from its recomputed value."""

@@ -228,7 +228,7 @@ def _prepare(
         OrthocalError: If a condition of use is invalid, or the correction cannot be computed.
     """
     from orthocal.assessment.controller_entries import offsets_to_enter
-    from orthocal.export.approach_sides import ApproachSides, find_lags
+    from orthocal.export.approach_sides import ApproachSides
     from orthocal.export.correction_field import CorrectionField
     from orthocal.gcode.interpreter import Interpreter
     from orthocal.gcode.program import ProgramCorrector
@@ -250,7 +250,7 @@ def _prepare(
         one_tool=tip is not None,
     )
     region, words = _find_region(result)
-    lags = find_lags(result.robot, result.errors) - _compensated_lags(result)
+    lags = _find_lags(result)
     taken_up = options.backlash is Backlash.PROGRAM and bool(lags.any())
     sides = ApproachSides(result.robot, lags) if taken_up else None
     return _Correction(
@@ -474,12 +474,18 @@ def _describe_backlash(result: orthocal.Calibration, lags: Array, *, taken_up: b
     return f"The controller must compensate the backlash of the drives: {', '.join(listed)}."
 
 
-def _compensated_lags(result: orthocal.Calibration) -> Array:
-    """Lags that the controller takes up itself, as the session states, (n_drives,), [m, rad]."""
-    zero = result.robot.drive_zero[None]
-    ahead, behind = (result.displacement(zero, side * zero.size)[0] for side in "pn")
-    half: Array = 0.5 * (ahead - behind)
-    return half
+def _find_lags(result: orthocal.Calibration) -> Array:
+    """Lags of the drives that the controller does not take up itself, (n_drives,), [m, rad].
+
+    Half of the backlash, less what the session states as compensated; 0 where it is not determined.
+    """
+    from orthocal.assessment.controller_entries import find_backlash
+    from orthocal.export.approach_sides import find_lags
+
+    lags: Array = find_lags(result.robot, result.errors) - 0.5 * result.compensated_backlash
+    kept = {e.drive for e in find_backlash(result) if e.enter != e.identified}
+    lags[[d.name in kept for d in result.robot.drives]] = 0.0
+    return lags
 
 
 def _describe_controller(

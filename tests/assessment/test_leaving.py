@@ -9,9 +9,15 @@ import numpy as np
 import pytest
 
 from orthocal import calibrate, load_session, restore_session, simulate_session
-from orthocal.assessment.assess import WORTH_ENTERING, assess, is_significant, lowers
+from orthocal.assessment.assess import assess, is_significant
 from orthocal.assessment.calibrated_tool import find_tool
-from orthocal.assessment.controller_entries import entered_offsets, find_entries, offsets_to_enter
+from orthocal.assessment.controller_entries import (
+    WORTH_ENTERING,
+    entered_offsets,
+    find_entries,
+    lowers,
+    offsets_to_enter,
+)
 from orthocal.assessment.tool_error import assess_placed, summarise_tool
 from orthocal.errors import ExportError
 from orthocal.export.formats import export_calibration

@@ -25,11 +25,11 @@ from orthocal import (
     write_calibration,
 )
 from orthocal.assessment.assess import assess
-from orthocal.assessment.calibrated_tool import error_covariance
-from orthocal.assessment.controller_entries import entered_offsets
+from orthocal.assessment.calibrated_tool import error_covariance, place_tool
+from orthocal.assessment.controller_entries import entered_offsets, find_backlash
 from orthocal.assessment.judgement import Judgement
 from orthocal.assessment.recommendation import Recommendation
-from orthocal.assessment.tool_error import summarise_tool
+from orthocal.assessment.tool_error import assess_placed, summarise_tool
 from orthocal.calibration.identify import identify
 from orthocal.errors import ParameterError, RobotError
 from orthocal.kinematics.conditions import sample_use
@@ -172,18 +172,23 @@ def test_it_is_that_of_sampled_machines_under_sampled_conditions(calibration, wo
     commanded = {
         "now": drives - calibration.active_offsets,
         "entered": drives - entered_offsets(calibration),
+        "without_backlash": drives - entered_offsets(calibration),
         "unstated": calibration.machine.inverse(workspace.points),
     }
+    half = 0.5 * np.array([e.change for e in find_backlash(calibration)])
+    assert half.min() > 0.0
     conditions, shares = zip(*full_factorial(), strict=True)
     weights = np.outer(shares, workspace.weights)
     fields = {name: [] for name in (*commanded, "compensated")}
     for c in conditions:
         closure = LoopClosure(robot, free=names, fixed=at, conditions=c)
         for name, at_drives in commanded.items():
+            sides = np.array([1.0 if s == "p" else -1.0 for s in c.approach])
+            at_drives = at_drives + (sides * half if name == "entered" else 0.0)
             fields[name].append(closure.forward(at_drives, theta=theta) - targets)
         corrected = calibration.machine.inverse(workspace.points, conditions=c)
         fields["compensated"].append(closure.forward(corrected, theta=theta) - targets)
-    expected = {name: getattr(figures, name) for name in ("now", "entered", "compensated")}
+    expected = {name: getattr(figures, name) for name in fields if name != "unstated"}
     expected["unstated"] = figures.use.unstated
     for name, field in fields.items():
         of_machines = np.array(field).swapaxes(0, 1)
@@ -195,9 +200,14 @@ def test_it_is_that_of_sampled_machines_under_sampled_conditions(calibration, wo
     assert figures.use.unstated > figures.compensated
 
 
+def summarise_without_backlash(calibration, workspace):
+    """Tool errors of a controller that does not take up backlash."""
+    placed = place_tool(calibration, workspace)
+    return summarise_tool(calibration, assess_placed(calibration, placed, backlash=()))
+
+
 def test_parts_are_what_constant_conditions_save(calibration, workspace):
-    accuracy = assess_tool(calibration, workspace)
-    both = summarise_tool(calibration, accuracy)
+    both = summarise_without_backlash(calibration, workspace)
     parts = {p.condition: p.size for p in both.use.parts}
     assert list(parts) == ["approach", "temperature", "payload"]
     lag = [0.5 * calibration[f"{k}_slide.backlash"].value for k in "xyz"]
@@ -210,7 +220,7 @@ def test_parts_are_what_constant_conditions_save(calibration, workspace):
     }
     for name, change in changes.items():
         other = with_use(calibration, **change)
-        found = summarise_tool(other, assess_tool(other, workspace))
+        found = summarise_without_backlash(other, workspace)
         without = np.sqrt(both.entered**2 - parts[name] ** 2)
         assert found.entered == pytest.approx(without, rel=0.02), name
         assert name not in [p.condition for p in found.use.parts]
@@ -287,7 +297,7 @@ def test_the_assessment_states_the_tool_error_in_use(assessed, tmp_path):
     assert again.use.unstated == tool.use.unstated
     text = " ".join(summarize(assessed).split())
     assert "used from both sides, 15…35 °C, payload 0…4 kg." in text
-    assert "if the tool is used from both sides; approach from one side avoids it." in text
+    assert "With the controller's backlash as it is now: " in text
     assert "Temperatures of 15…35 °C add" in text
     assert "A payload of 0…4 kg adds" in text
 

@@ -52,7 +52,7 @@ def test_the_file_gives_the_same_object_back(root, tmp_path, example, model):
 
 def test_the_file_has_what_was_promised(result):
     document = json.loads(calibration_json(result))
-    assert document["schema"] == "orthocal/calibration/9"
+    assert document["schema"] == "orthocal/calibration/10"
     assert {
         "robot",
         "session",

@@ -32,6 +32,9 @@ KEEP_HEADLINE = "Leave the offsets as they are."
 NOTHING_HEADLINE = "Nothing to enter: no offset was identified."
 """Headline of a calibration without offsets."""
 
+BACKLASH_HEADLINE = "Enter the backlash."
+"""Added to the headline of a calibration that changes no offset."""
+
 SESSION_HEADLINES: dict[Verdict, str] = {
     "enter": "No anomaly found.",
     "review": "Check these readings first.",
@@ -140,10 +143,14 @@ def describe_tool_error(tool: ToolErrorSummary, *, keep: bool = False) -> str:
         tool: The tool error.
         keep: Whether the offsets stay as they are.
     """
-    if keep:
+    backlash = tool.without_backlash is not None
+    if keep and not backlash:
         return f"Expected tool error with the active offsets: {tool_mm(tool.now)} RMS."
+    entered = "this backlash" if keep else "these offsets"
+    if backlash and not keep:
+        entered += " and this backlash"
     return (
-        f"Expected tool error with these offsets: {tool_mm(tool.entered)} RMS "
+        f"Expected tool error with {entered}: {tool_mm(tool.entered)} RMS "
         f"(now {tool_mm(tool.now)})."
     )
 
@@ -190,6 +197,10 @@ def describe_use_parts(tool: ToolErrorSummary) -> list[str]:
         return []
     lines = []
     for part in tool.use.parts:
+        if part.condition == "approach" and tool.without_backlash is not None:
+            if tool.without_backlash - tool.entered >= 0.5 * UM:
+                lines.append(describe_without_backlash(tool.without_backlash))
+            continue
         without = math.sqrt(max(tool.entered**2 - part.size**2, 0.0))
         added = tool.entered - without
         little = added < 0.5 * UM
@@ -207,6 +218,14 @@ def describe_use_parts(tool: ToolErrorSummary) -> list[str]:
         elif tool.use.payload is not None:
             lines.append(f"A payload of {_describe_range(tool.use.payload)} kg adds {amount}.")
     return lines
+
+
+def describe_without_backlash(rms: float) -> str:
+    """Sentence about the tool error with the present backlash of the controller, RMS, [m]."""
+    return (
+        f"With the controller's backlash as it is now: {tool_mm(rms)}. Approach from one side "
+        "avoids the difference."
+    )
 
 
 def _describe_range(limits: tuple[float, float]) -> str:

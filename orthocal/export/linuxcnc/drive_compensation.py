@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array
+from orthocal.assessment.controller_entries import find_backlash
 from orthocal.calibration.calibration import Calibration
 from orthocal.effects.backlash import Backlash
 from orthocal.effects.compensation import JointTrim, table_name
@@ -98,14 +99,6 @@ def without_periodic_errors(robot: Robot, errors: Mapping[str, float]) -> dict[s
     return {name: value for name, value in errors.items() if name not in periodic}
 
 
-def find_backlash(robot: Robot, errors: Mapping[str, float]) -> Array:
-    """Backlash of each drive, 0 where none is worth compensating, shape (n_drives,), [m, rad]."""
-    if not any(isinstance(e, Backlash) for e in robot_effects(robot)):
-        return np.zeros(len(robot.drives))
-    values = np.array([errors.get(f"{d.name}.backlash", 0.0) for d in robot.drives])
-    return np.where(values < SMALLEST, 0.0, values)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class JointCompensation(JointTrim):
     """Compensation of one joint, with the direction in which homing latches its switch."""
@@ -174,7 +167,7 @@ def find_old_compensation(
 def find_compensation(
     calibration: Calibration, latched: Sequence[int] | None
 ) -> tuple[JointCompensation, ...]:
-    """Compensation of backlash alone, in the order of the drives.
+    """Compensation of backlash alone, in the order of the drives: what is worth entering.
 
     If the model has neither backlash nor periodic errors, it is that which was active.
 
@@ -193,9 +186,12 @@ def find_compensation(
         )
     if Backlash not in modelled:
         return old
-    backlash = find_backlash(robot, calibration.errors)
+    enter = {e.drive: e.enter for e in find_backlash(calibration)}
+    backlash = [
+        enter.get(d.name, joint.backlash) for d, joint in zip(robot.drives, old, strict=True)
+    ]
     return tuple(
-        JointCompensation(float(b), None, joint.latched)
+        JointCompensation(b if b >= SMALLEST else 0.0, None, joint.latched)
         for b, joint in zip(backlash, old, strict=True)
     )
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from orthocal.assessment.assess import assessment_of, expanded_uncertainty
 from orthocal.assessment.controller_entries import (
     ENTERED_DECIMALS,
+    find_backlash,
     find_entries,
     offsets_to_enter,
 )
@@ -26,7 +27,7 @@ from orthocal.export.linuxcnc.drive_compensation import SMALLEST, JointCompensat
 from orthocal.export.linuxcnc.home_offsets import JointHome
 from orthocal.export.linuxcnc.nominal_form import Tangent
 from orthocal.text import comment_safe
-from orthocal.units import DRIVE_UNITS, MM, UM
+from orthocal.units import DRIVE_UNITS, MM, UM, format_fixed
 
 SMALLEST_ERROR = 1e-9
 """Smallest error that a page states, [m]."""
@@ -201,6 +202,22 @@ def _describe_conditions(approximation: Approximation) -> str:
     return "".join(f"\n{text}" for text in texts)
 
 
+def _describe_undetermined(calibration: Calibration) -> str:
+    """Paragraph about drives whose change of backlash is not determined; empty without any."""
+    joints = {d.name: i for i, d in enumerate(calibration.robot.drives)}
+    texts = []
+    for e in find_backlash(calibration):
+        if e.change:
+            continue
+        unit, size = DRIVE_UNITS[e.unit]
+        half = format_fixed(expanded_uncertainty(calibration, e) / size, 3)
+        texts.append(f"JOINT_{joints[e.drive]} (±{half} {unit})")
+    if not texts:
+        return ""
+    listed = ", ".join(texts)
+    return f"\n**Backlash left as it is, since its change is not determined:** {listed}.\n"
+
+
 def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, stated: bool) -> str:
     """README.md for offsets that are entered as HOME_OFFSET; `stated` as for the lines."""
     half = {e.drive: expanded_uncertainty(calibration, e) for e in find_entries(calibration)}
@@ -239,7 +256,8 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, sta
         "table": "\n".join(rows),
         "unit": unit,
         "active": active,
-        "compensation": _describe_compensation(homes, stated=stated),
+        "compensation": _describe_compensation(homes, stated=stated)
+        + _describe_undetermined(calibration),
     }
     return fill_template("home_offset.md", values)
 
@@ -282,7 +300,8 @@ def write_module_page(
         "checked": approximation.checked,
         "nominal": nominal,
         "compensation": _describe_compensation(homes, stated=stated)
-        + _describe_conditions(approximation),
+        + _describe_conditions(approximation)
+        + _describe_undetermined(calibration),
         "old_values": f" ({', '.join(old)})" if old else "",
         "last": len(homes) - 1,
         "drives": ", ".join(comment_safe(h.drive) for h in homes),

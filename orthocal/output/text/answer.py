@@ -11,7 +11,8 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from orthocal.assessment.assess import assessment_of, expanded_uncertainty, lowers
+from orthocal.assessment.assess import assessment_of, expanded_uncertainty
+from orthocal.assessment.controller_entries import lowers
 from orthocal.assessment.plausibility import describe_legs
 from orthocal.assessment.wording import joined
 from orthocal.assessment.words.anomalies import describe_evidence
@@ -89,6 +90,8 @@ def render_answer(
             *_entry_notes(calibration, assessment),
             Text(),
         ]
+    if assessment.backlash and assessment.decision.verdict != "reject":
+        parts += [_indented(render_backlash(calibration)), Text()]
     parts += _tool(calibration, assessment)
     parts.append(bullets([f.words for f in _listed(calibration, assessment)]))
     return Group(*parts, render_next(*_next_step(calibration, assessment, saved)))
@@ -209,7 +212,10 @@ def _next_step(
             f"orthocal correct {directory} PROGRAM.ngc{active} --out CORRECTED.ngc",
         )
     words = "enter the offsets, home the machine and measure again."
-    if unchanged:
+    if any(e.change for e in assessment.backlash):
+        what = "backlash" if unchanged else "offsets and the backlash"
+        words = f"enter the {what}, home the machine and measure again."
+    elif unchanged:
         words = "nothing to enter. After a crash or a change of the machine measure again."
     return words, (
         f"orthocal again {directory} --out {new}",
@@ -328,6 +334,22 @@ def render_values(calibration: Calibration) -> RenderableType:
             "a controller that corrects all identified errors."
         )
     return noted(Group() if complete else table, *notes)
+
+
+def render_backlash(calibration: Calibration) -> RenderableType:
+    """Backlash for the controller to take up, drive by drive; a line if there is none to enter."""
+    entries = assessment_of(calibration).backlash
+    rows, halves = [], []
+    for e in entries:
+        factor = e.edge_factor
+        half = plain(expanded_uncertainty(calibration, e) * factor)
+        unchanged = "stays" if e.active else "not determined"
+        enter = plain(e.enter * factor) if e.change else unchanged
+        rows.append((e.drive, plain(e.active * factor), enter, half, e.edge_unit))
+        halves.append(f"±{half} {e.edge_unit}")
+    if not any(e.change or e.active for e in entries):
+        return Text(f"Backlash: not determined ({max(halves)}).")
+    return table_of(("backlash", "now", "enter", "±", "unit"), rows)
 
 
 def entry_table(calibration: Calibration, *, identified: bool = False) -> Table:

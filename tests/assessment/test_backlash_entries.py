@@ -1,0 +1,183 @@
+"""Backlash to enter: one decision for answer, export, corrected programs and tool error."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from effect_plans import write_plan
+
+from orthocal import ExportOptions, calibrate, export_calibration, load_plan, simulate_session
+from orthocal.assessment.assess import assess, expanded_uncertainty
+from orthocal.assessment.calibrated_tool import find_tool
+from orthocal.assessment.controller_entries import (
+    backlash_changes,
+    compute_backlash,
+    entered_offsets,
+    is_worth_changing,
+)
+from orthocal.cli.correct import _find_lags
+from orthocal.effects.compensation import JointTrim
+from orthocal.kinematics.conditions import UseConditions
+from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
+from orthocal.output.text.answer import render_answer
+from orthocal.output.text.layout import to_text
+
+QUICK = {"solver": "variable-projection"}
+TRUTH = {
+    "x_slide.offset": 0.8e-3,
+    "y_slide.offset": -0.5e-3,
+    "x_slide.backlash": 40e-6,
+    "y_slide.backlash": 60e-6,
+}
+"""The z drive has no backlash."""
+
+NOISE = 6e-6
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("entered") / "plan"
+    effects = "backlash: {}, screw: {lead_mm: 10, periodic_tolerance_mm: 0.02}"
+    plan = load_plan(write_plan(folder, effects=effects)).with_effects(["backlash"])
+    gauge = replace(plan.gauge, sigma=NOISE)
+    return plan.with_gauge(gauge).with_controller(np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def calibration(plan):
+    return calibrate(simulate_session(plan, TRUTH, seed=3, sigma=NOISE).session, "offsets", **QUICK)
+
+
+def by_drive(calibration):
+    return {e.drive[0]: e for e in calibration.assessment.backlash}
+
+
+def test_a_backlash_is_entered_where_it_is_determined(calibration):
+    found = by_drive(calibration)
+    for drive, entered in zip("xyz", (True, True, False), strict=True):
+        e, p = found[drive], calibration[f"{drive}_slide.backlash"]
+        half = expanded_uncertainty(calibration, e)
+        assert half == pytest.approx(float(calibration.expand(p.std, p.std_scatter)))
+        assert (e.identified > half) is entered
+        assert e.enter == (max(p.value, 0.0) if entered else 0.0)
+
+
+def test_every_output_has_the_same_decision(calibration, plan):
+    found = by_drive(calibration)
+    options = ExportOptions(module=False, latched=(1, 1, 1))
+    lines = export_calibration(calibration, "linuxcnc", options=options)
+    written = dict(re.findall(r"\[JOINT_(\d)\][^\[]*?BACKLASH = (\S+)", lines["joints.ini"]))
+    assert sorted(written) == ["0", "1"]
+    for joint, drive in (("0", "x"), ("1", "y")):
+        assert float(written[joint]) * 1e-3 == pytest.approx(found[drive].enter, abs=1e-7)
+    half = f"±{expanded_uncertainty(calibration, found['z']) * 1e3:.3f} mm"
+    assert f"JOINT_2 ({half})" in lines["README.md"]
+    lags = _find_lags(calibration)
+    assert lags == pytest.approx(
+        0.5 * backlash_changes(calibration, list(found.values())), abs=1e-9
+    )
+    text = to_text(render_answer(calibration, saved=Path("out")))
+    rows = [r.split() for r in text.splitlines() if r.split()[:1] == ["z_slide"]]
+    assert rows[1][2:4] == ["not", "determined"]
+    assert "and this backlash" in text
+
+
+def test_a_table_has_the_same_decision(plan):
+    both = plan.with_effects(["backlash", "screw"])
+    truth = {**TRUTH, "x_slide.screw_sin": 15e-6, "z_slide.screw_sin": 15e-6}
+    session = simulate_session(both, truth, seed=3, sigma=NOISE).session
+    calibration = calibrate(session, "offsets", **QUICK)
+    found = by_drive(calibration)
+    assert found["x"].enter > 0.0
+    assert found["z"].enter == 0.0
+    options = ExportOptions(module=False, latched=(1, 1, 1), home_offsets=(0.3, 0.3, 0.3))
+    files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
+    for joint, drive in (("0", "x"), ("2", "z")):
+        rows = np.array([r.split() for r in files[f"joint_{joint}.comp"].splitlines()], float)
+        apart = 1e-3 * (rows[:, 1] - rows[:, 2])
+        assert apart == pytest.approx(found[drive].enter, rel=0.05, abs=1e-9)
+
+
+def test_the_tool_error_is_that_of_what_is_entered(calibration):
+    """Of the closed loops under every combination of sides, with the motors moved by hand."""
+    tool, placed = calibration.assessment.tool, find_tool(calibration)
+    points = placed.workspace.points[: len(placed.drives)]
+    nominal = nominal_closure(calibration.robot)
+    drives = nominal.inverse(points) - entered_offsets(calibration)
+    half = 0.5 * np.array([e.enter for e in calibration.assessment.backlash])
+    for expected, taken_up in ((tool.entered, half), (tool.without_backlash, 0.0 * half)):
+        fields = []
+        for sides in itertools.product((1.0, -1.0), repeat=3):
+            letters = "".join("p" if s > 0.0 else "n" for s in sides)
+            closure = LoopClosure(
+                calibration.robot,
+                fixed=calibration.errors,
+                conditions=UseConditions(approach=letters),
+            )
+            reached = closure.forward(drives + np.array(sides) * taken_up)
+            fields.append(reached - placed.targets[: len(points)])
+        field = np.concatenate(fields)
+        space = placed.workspace.once(placed.use.size).repeat(8)
+        targets = np.tile(placed.targets[: len(points)], (8, 1))
+        aligned = space.remove_motion(field, targets)
+        known = np.sqrt(space.weights @ (aligned**2).sum(axis=1))
+        assert np.hypot(known, tool.compensated) == pytest.approx(expected, rel=1e-6)
+    assert tool.without_backlash > 1.1 * tool.entered
+
+
+def test_an_undetermined_backlash_is_entered_if_that_lowers_the_tool_error(calibration):
+    """As uncertain as it is large: entered only if it moves the tool by a third of what is left."""
+    tool = find_tool(calibration)
+    index = next(i for i, p in enumerate(calibration.parameters) if p.name == "x_slide.backlash")
+    p = calibration.parameters[index]
+    free = [q.name for q in calibration.free].index(p.name)
+    for scale, entered in ((1.0, True), (0.1, False)):
+        covariance = np.array(calibration.model_covariance) * 1e-2
+        value = p.value * scale
+        vague = replace(p, value=value, std=value)
+        vague_at = replace(
+            calibration,
+            assessment=None,
+            model_covariance=covariance,
+            parameters=tuple(vague if q is p else q for q in calibration.parameters),
+        )
+        assert [q.name for q in vague_at.free][free] == p.name
+        (x, *_) = compute_backlash(vague_at, tool)
+        assert x.identified < float(vague_at.expand(value, 0.0))
+        assert (x.enter == value) is entered
+
+
+def test_backlash_that_the_controller_takes_up_stays(plan, calibration):
+    trims = tuple(JointTrim(e.enter) for e in calibration.assessment.backlash)
+    again = replace(plan.with_controller(entered_offsets(calibration).round(6)), compensation=trims)
+    second = calibrate(
+        simulate_session(again, TRUTH, seed=4, sigma=NOISE).session, "offsets", **QUICK
+    )
+    found = second.assessment
+    assert [e.active for e in found.backlash] == pytest.approx([t.backlash for t in trims])
+    assert found.keeps_offsets
+    assert not any(e.change for e in found.backlash)
+    assert found.tool.without_backlash is None
+    assert not is_worth_changing(second, find_tool(second), found.backlash)
+    text = to_text(render_answer(second, saved=Path("out")))
+    assert text.count(" stays ") == 2
+    assert "Next: nothing to enter" in text or "Next: correct" in text
+
+
+def test_backlash_alone_is_entered_where_the_offsets_stay(plan):
+    right = plan.with_controller(np.array([0.8e-3, -0.5e-3, 0.0]))
+    session = simulate_session(right, TRUTH, seed=5, sigma=NOISE).session
+    found = calibrate(session, "offsets", **QUICK)
+    judged = assess(found)
+    assert judged.keeps_offsets
+    assert any(e.change for e in judged.backlash)
+    assert "Enter the backlash." in judged.decision.headline
+    assert judged.tool.entered < judged.tool.without_backlash == judged.tool.now
+    options = ExportOptions(module=False, latched=(1, 1, 1))
+    lines = export_calibration(found, "linuxcnc", anyway=True, options=options)["joints.ini"]
+    assert lines.count("BACKLASH = ") == 2
