@@ -310,6 +310,8 @@ def _entry_findings(
         return [words.no_offset(), *expected]
     if entries[0].active is None:
         expected.append(words.controller_not_stated([e.drive for e in entries], keep=keep))
+    elif not calibration.session.parts and any(e.active for e in entries):
+        expected.append(words.earlier_readings())
     known = _by_readings(entries)
     large = [e.drive for e in known if is_significant(calibration, e)]
     small = [e.drive for e in known if e.drive not in large]

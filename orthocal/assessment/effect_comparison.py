@@ -1,8 +1,9 @@
 """Effects beside geometry, weighed by the readings as models are.
 
-By the marginal likelihood of the complete model with each set of effects, and by the prediction of
-each setup from all others. Effects are added one after the other as long as the evidence for them
-is strong.
+By the marginal likelihood of the complete model with each set of effects. Effects are added one
+after the other as long as the evidence for them is strong. The prediction of each setup from all
+others is stated, too, but does not decide: it depends on few readings. Under a model that the
+readings support, the estimate with it has the least expected tool error.
 """
 
 from __future__ import annotations
@@ -39,6 +40,9 @@ class EffectComparison:
     weighed: tuple[WeighedEffects, ...]
     """Without effects first, then each by itself, then the supported ones together."""
     recommended: tuple[str, ...]
+    """Those for which the evidence is strong, whatever left-out setups say."""
+    identified: tuple[str, ...]
+    """Effects that the session or its robot chooses."""
     lacking: Mapping[str, tuple[int, str]]
     """Effect that was not weighed to the number of readings without its conditions, and the place
     of the first."""
@@ -64,20 +68,21 @@ def compare_effects(session: Session) -> EffectComparison | None:
         ClosureError: If the nominal machine cannot reach a posture.
     """
     candidates, lacking = _candidates(session)
+    chosen = tuple(session.robot.effect_names)
     if not candidates:
-        return EffectComparison((), (), lacking) if lacking else None
+        return EffectComparison((), (), chosen, lacking) if lacking else None
     others = [n for n in session.robot.effect_names if n not in EFFECT_KINDS]
     model = complete_model(session.robot.parameters)
     known: dict[tuple[str, ...], tuple[float, float]] = {}
 
     def weigh(names: Sequence[str]) -> float:
-        chosen = order_effects(names)
-        if chosen not in known:
-            with_them = session.with_effects((*others, *chosen))
+        trial = order_effects(names)
+        if trial not in known:
+            with_them = session.with_effects((*others, *trial))
             errors = LinearModel(with_them).predict_left_out(session.values)
             rms = float(np.sqrt(np.mean(errors**2)))
-            known[chosen] = weigh_model(with_them, model)[0], rms
-        return known[chosen][0]
+            known[trial] = weigh_model(with_them, model)[0], rms
+        return known[trial][0]
 
     weigh(())
     supported: tuple[str, ...] = ()
@@ -87,7 +92,7 @@ def compare_effects(session: Session) -> EffectComparison | None:
             break
         supported = order_effects((*supported, likeliest))
     weighed = [WeighedEffects(n, e - known[()][0], rms) for n, (e, rms) in known.items()]
-    return EffectComparison(tuple(weighed), supported, lacking)
+    return EffectComparison(tuple(weighed), supported, chosen, lacking)
 
 
 def _candidates(session: Session) -> tuple[list[str], dict[str, tuple[int, str]]]:

@@ -2,8 +2,8 @@
 
 The new session is measured with the calibrated offsets active in the controller. The calibration
 is confirmed if the new readings deviate as predicted, within the uncertainty of the calibration,
-and no change between the sessions is found. A confirmed calibration can still be improved by the
-new readings: then the values to enter are those of a calibration from them.
+and no change between the sessions is found. A confirmed calibration can still be improved: then the
+values to enter are those of a calibration from the readings of both.
 """
 
 from __future__ import annotations
@@ -94,11 +94,14 @@ class Validation:
     refit: Calibration
     """The same fit to the new readings, with its assessment. Its deviations are those from the
     machine as it was calibrated."""
+    joint: Calibration | None
+    """Calibration from its readings and the new ones together, as `calibrate` assesses it; None if
+    the calibration is not confirmed."""
     mistake: Anomaly | None
     """Change between the sessions: offsets that were entered wrongly, or a machine that changed."""
     enter: tuple[ControllerEntry, ...]
-    """Values to enter: those of the calibration if they were entered wrongly or the new readings
-    change none significantly, otherwise those from the new readings."""
+    """Values to enter: those of the calibration if they were entered wrongly or all readings
+    together change none, otherwise those of `answer`."""
     repetition: Repetition
     """Correlation of the residuals of both fits."""
     assessment: Assessment
@@ -110,25 +113,30 @@ class Validation:
         return _is_expected(self.excess_probability)
 
     @property
+    def answer(self) -> Calibration:
+        """Calibration whose values count: `joint`, or `refit` if that is None."""
+        return self.joint or self.refit
+
+    @property
     def nothing_to_change(self) -> bool:
-        """True if a calibration from the new readings keeps the active offsets."""
-        return assessment_of(self.refit).keeps_offsets
+        """True if a calibration from these readings keeps the active offsets."""
+        return assessment_of(self.answer).keeps_offsets
 
     def to_json(self) -> str:
         """Document for JSON, SI units."""
-        refit = self.refit
+        refit, answer = self.refit, self.answer
         changes = [
             {
                 "drive": e.drive,
                 "unit": e.unit,
                 "change": e.best_change,
-                "expanded_uncertainty": finite_or_none(expanded_uncertainty(refit, e)),
-                "significant": is_significant(refit, e),
+                "expanded_uncertainty": finite_or_none(expanded_uncertainty(answer, e)),
+                "significant": is_significant(answer, e),
             }
-            for e in assessment_of(refit).entries
+            for e in assessment_of(answer).entries
         ]
         document = {
-            "schema": "orthocal/validation/3",
+            "schema": "orthocal/validation/4",
             "title": refit.session.title,
             "offsets_stated": self.offsets_stated,
             "confirmed": self.confirmed,
@@ -140,6 +148,7 @@ class Validation:
             "refit_largest": refit.largest_after,
             "as_expected": self.as_expected,
             "excess_probability": finite_or_none(self.excess_probability),
+            "joint": self.joint is not None,
             "nothing_to_change": self.nothing_to_change,
             "changes": changes,
             "mistake": None if self.mistake is None else _mistake_document(self.mistake),
@@ -177,11 +186,10 @@ def validate_calibration(
 
     Args:
         calibration: The calibration whose offsets were entered.
-        sessions: Measured afterwards, with its offsets active in the controller. A session that
-            does not state the offsets of its controller is assumed to have them. Mechanical
-            adjustments that the sessions state change the predicted readings.
-        tolerances: As in `Choice`, for the judgement of the new sessions and of changes. The
-            predictions are those of the calibration, with the tolerances that it was made with.
+        sessions: Measured afterwards, with its offsets in the controller, as is assumed of those
+            that state none. Adjustments that they state change the predicted readings.
+        tolerances: As in `Choice`, for the judgement of the new sessions and of changes, not for
+            the predictions.
 
     Raises:
         SessionError: If a session is of another robot, states offsets of another calibration, or is
@@ -193,38 +201,38 @@ def validate_calibration(
     calibration, new_sessions = _restate(calibration, gather_sessions(sessions), tolerances or {})
     measured = [_with_active_offsets(calibration, one) for one in new_sessions]
     session = join_sessions(measured)
-    judgement = judge_session(session)
-    fit = repeat_fit(calibration, session)
+    judgement, fit = judge_session(session), repeat_fit(calibration, session)
     refit = _assess_refit(fit, calibration, judgement)
     mistake, changes, wrongly_entered = _find_changes(calibration, measured, judgement)
     expected_rms, test = expect_rms(calibration, fit), judge_deviations(calibration, fit)
-    is_excessive = test.chance
     lead = _agreement(refit, test, expected_rms, explained=bool(changes))
-    confirmed = None if math.isnan(is_excessive) else _is_confirmed(lead, changes, judgement)
-    further = [] if lead.kind != "as predicted" else _find_further_change(refit)
+    confirmed = None if math.isnan(test.chance) else _is_confirmed(lead, changes, judgement)
+    joint = _join(calibration, session) if confirmed else None
+    further = [] if joint is None else _find_further_change(joint)
+    assessed = assessment_of(joint or refit)
     keep = wrongly_entered or (confirmed is not False and not further)
-    assessed = assessment_of(refit)
     entries = find_entries(calibration) if keep else assessed.entries
     repetition = measure_repetition(calibration, refit)
-    offsets_stated = all(one.controller_offsets is not None for one in new_sessions)
+    stated = all(one.controller_offsets is not None for one in new_sessions)
     notes = [*further, *([] if wrongly_entered else assessed.of_kind(*ENTRY_KINDS))]
-    notes.append(words.describe_repetition(repetition, new=_is_expected(is_excessive) is False))
-    notes += [] if offsets_stated else [words.controller_assumed()]
+    notes.append(words.describe_repetition(repetition, new=_is_expected(test.chance) is False))
+    notes += [] if stated else [words.controller_assumed()]
     return Validation(
         confirmed=confirmed,
-        offsets_stated=offsets_stated,
+        offsets_stated=stated,
         expected_rms=expected_rms,
         expected_largest=_expect_largest(calibration, expected_rms),
-        excess_probability=is_excessive,
+        excess_probability=test.chance,
         refit=refit,
+        joint=joint,
         mistake=mistake,
         enter=entries,
         repetition=repetition,
-        assessment=Assessment(
+        assessment=replace(
+            assessed,
             decision=_decide(confirmed, judgement, lead, changes),
             findings=rank([*judgement.findings, lead, *changes, *notes]),
             entries=entries,
-            tool=assessed.tool,
         ),
     )
 
@@ -254,6 +262,15 @@ def _is_confirmed(lead: Finding, changes: Sequence[Finding], judgement: Judgemen
     """Confirmation of the predictions by new readings; None if these contradict each other."""
     agrees = lead.severity == "note" and not changes
     return None if agrees and judgement.verdict != "enter" else agrees
+
+
+def _join(calibration: Calibration, session: Session) -> Calibration:
+    """Calibration from its readings and those of a new session, assessed."""
+    every = join_sessions([restore_session(calibration), session])
+    judgement = judge_session(every)
+    fit = repeat_fit(calibration, every, tolerance_scale=judgement.tolerance_scale)
+    joint = assemble_calibration(fit)
+    return replace(joint, assessment=assess(joint, every, judgement=judgement))
 
 
 def _require_new(calibration: Calibration, sessions: Sequence[Session]) -> None:
@@ -387,12 +404,12 @@ def _agreement(
     return words.as_predicted(achieved, test.limit * achieved, numbers)
 
 
-def _find_further_change(refit: Calibration) -> list[Finding]:
-    """Finding about offsets that a calibration from the new readings changes."""
-    judged = assessment_of(refit)
+def _find_further_change(joint: Calibration) -> list[Finding]:
+    """Finding about offsets that a calibration from all readings changes."""
+    judged = assessment_of(joint)
     if judged.keeps_offsets:
         return []
-    return [words.further_change([e for e in judged.entries if is_significant(refit, e)])]
+    return [words.further_change([e for e in judged.entries if is_significant(joint, e)])]
 
 
 def _expect_largest(calibration: Calibration, expected_rms: float) -> float:

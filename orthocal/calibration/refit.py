@@ -17,6 +17,7 @@ from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
+from orthocal.estimation.tolerance_scale import ToleranceScale
 from orthocal.estimation.weighting import SMALLEST_SIGMA
 from orthocal.io.fields import read_only
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
@@ -41,11 +42,20 @@ def repeat_calibration(calibration: Calibration, sessions: Given | Sequence[Give
     return assemble_calibration(repeat_fit(calibration, session), nominal=nominal)
 
 
-def repeat_fit(calibration: Calibration, session: Session) -> Fit:
-    """The fit of `repeat_calibration`."""
+def repeat_fit(
+    calibration: Calibration, session: Session, *, tolerance_scale: ToleranceScale | None = None
+) -> Fit:
+    """The fit of `repeat_calibration`.
+
+    Args:
+        calibration: Whose parameters they are.
+        session: The other session.
+        tolerance_scale: Scale of the tolerances; that of the calibration by default.
+    """
     solver = calibration.solver
     options = SolverOptions(solver=solver.name, loss=Loss(solver.loss, solver.loss_width))
-    return fit_problem(_repeat_problem(calibration, session), options=options)
+    problem = _repeat_problem(calibration, session, tolerance_scale or calibration.tolerance_scale)
+    return fit_problem(problem, options=options)
 
 
 def restore_mounting_covariance(calibration: Calibration) -> Array:
@@ -53,7 +63,8 @@ def restore_mounting_covariance(calibration: Calibration) -> Array:
 
     Shape (n_free, n_free), [SI]; zeros if the noise is unknown.
     """
-    problem = _repeat_problem(calibration, restore_session(calibration))
+    session = restore_session(calibration)
+    problem = _repeat_problem(calibration, session, calibration.tolerance_scale)
     if not math.isfinite(calibration.noise.sigma):
         return np.zeros((problem.n_machine, problem.n_machine))
     noise = {g.name: g.noise / calibration.noise.sigma for g in calibration.gauges}
@@ -71,18 +82,26 @@ def restore_mounting_covariance(calibration: Calibration) -> Array:
     )
 
 
-def _repeat_problem(calibration: Calibration, session: Session) -> CalibrationProblem:
+def _repeat_problem(
+    calibration: Calibration, session: Session, scale: ToleranceScale
+) -> CalibrationProblem:
     free = calibration.free
     parameters = session.robot.parameters
+    names = tuple(p.name for p in free)
+    old, new = (s.factors(parameters, names) for s in (calibration.tolerance_scale, scale))
+    stds = np.array([p.prior_std for p in free]) / old * new
     selection = Selection(
         label=calibration.model,
-        parameters=tuple(replace(parameters[p.name], prior_std=p.prior_std) for p in free),
+        parameters=tuple(
+            replace(parameters[n], prior_std=std)
+            for n, std in zip(names, stds.tolist(), strict=True)
+        ),
         prior=np.array([p.prior for p in free]),
         mean=read_only([p.mean for p in free]),
         lower=read_only([-np.inf if p.lower is None else p.lower for p in free]),
         upper=read_only([np.inf if p.upper is None else p.upper for p in free]),
         fixed={p.name: p.value for p in calibration.parameters if not p.free},
-        tolerance_scale=calibration.tolerance_scale,
+        tolerance_scale=scale,
     )
     return CalibrationProblem(session, selection)
 

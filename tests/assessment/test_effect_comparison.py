@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from effect_plans import write_plan
 from orthocal import calibrate, load_plan, load_session, simulate_session, write_session
 from orthocal.assessment.comparison import compare_models
 from orthocal.assessment.effect_comparison import compare_effects
+from orthocal.assessment.words.comparison import describe_effects
 from orthocal.calibration.assessment_record import EXIT_CODES
 from orthocal.estimation.options import SolverOptions
 from orthocal.hypotheses.linear_model import LinearModel
@@ -104,10 +106,31 @@ def test_comparison_and_calibration_have_the_same_verdict(session, tmp_path):
     assert len(document["weighed"]) == 2
 
 
-def test_the_answer_names_the_option(session):
+@pytest.mark.parametrize(
+    ("identified", "option"),
+    [(("backlash",), ""), (("thermal",), "thermal,backlash"), ((), "backlash")],
+)
+def test_the_option_is_named_unless_the_effect_is_identified_already(session, identified, option):
+    """With those that are: an option in place of them would take them away."""
+    found = compare_effects(session.with_effects(["backlash"]))
+    (note, *_) = describe_effects(replace(found, identified=identified), 40)
+    assert note.kind == "effects recommended"
+    stated = re.findall(r"--effects (\S+)`", note.action)
+    assert [set(s.split(",")) for s in stated] == ([set(option.split(","))] if option else [])
+
+
+def test_the_evidence_counts_where_left_out_setups_disagree(session):
+    found = compare_effects(session.with_effects(["backlash"]))
+    none, best = found.weighed
+    worse = replace(best, unseen_rms=1.5 * none.unseen_rms)
+    said = [describe_effects(replace(found, weighed=(none, w)), 40)[0].text for w in (best, worse)]
+    assert ["the evidence counts" in text for text in said] == [False, True]
+
+
+def test_the_answer_has_the_recommendation(session):
     found = compare_models(session.with_effects(["backlash"]), models=["offsets"], options=QUICK)
     (note,) = found.assessment.of_kind("effects recommended")
-    assert "--effects backlash" in note.action
+    assert note.action == ""
     assert note.numbers["log_evidence"] > 10.0
     verdict = calibrate(session, "offsets", solver="variable-projection").assessment.decision
     assert found.assessment.decision.verdict == verdict.verdict == "enter"

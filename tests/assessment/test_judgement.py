@@ -302,6 +302,7 @@ NOTES = {
     "no offset": lambda c, t: calibrate(c, Choice(free=["x_leg.length"])),
     "no change needed": lambda c, t: calibrate(t["3"]),
     "fits": lambda c, t: calibrate(c),
+    "earlier readings": lambda c, t: calibrate(c.with_controller(np.full(3, 1e-3))),
 }
 
 

@@ -57,7 +57,8 @@ def test_experiment_3_validates_experiment_2_as_in_the_paper(table1):
     assert abs(result.expected_largest - expected[1]) < THREE_DECIMALS_MM
     assert abs(result.refit.rms_before - achieved[0]) < THREE_DECIMALS_MM
     assert abs(result.refit.largest_before - achieved[1]) < THREE_DECIMALS_MM
-    changes = np.array([e.best_change for e in assessment_of(result.refit).entries]) * 1e3
+    refit = assessment_of(result.refit)
+    changes = np.array([e.best_change for e in refit.entries]) * 1e3
     assert np.abs(changes - [0.0667, 0.1411, 0.0025]).max() < 0.005
     assert result.as_expected
     assert result.nothing_to_change
@@ -72,7 +73,7 @@ def test_experiment_3_validates_experiment_2_as_in_the_paper(table1):
     assert result.assessment.of_kind("controller not stated")
     assert decision.headline in summarize(result)
     document = json.loads(result.to_json())
-    assert document["schema"] == "orthocal/validation/3"
+    assert document["schema"] == "orthocal/validation/4"
     assert document["confirmed"] is True
     assert document["nothing_to_change"] is True
 
@@ -229,7 +230,8 @@ SOUND += [("workshop", "full", (1, 4))]
     ("name", "model", "seed"), [(n, m, seed) for n, m, seeds in SOUND for seed in seeds]
 )
 def test_validate_and_calibrate_agree_on_the_same_session(root, name, model, seed):
-    """Sound machines are confirmed, and both commands state the same values to enter.
+    """Sound machines are confirmed, and both commands state the same values to enter: those of
+    all readings together.
 
     One sound machine in a hundred has deviations that are larger than predicted; these have not.
     """
@@ -240,21 +242,22 @@ def test_validate_and_calibrate_agree_on_the_same_session(root, name, model, see
     entered = np.round(entered_offsets(calibration), 6)
     session = simulate_session(plan.with_controller(entered), errors, seed=seed + 1000).session
     result = validate_calibration(calibration, session)
-    again = calibrate(session, model, solver="variable-projection").assessment
+    again = calibrate([first, session], model, solver="variable-projection").assessment
     assert result.confirmed
+    assert result.answer is result.joint
     assert result.assessment.decision.verdict == again.decision.verdict == "enter"
     assert result.nothing_to_change is again.keeps_offsets
     stated = [e.enter for e in result.enter]
     kept = entered.tolist() if again.keeps_offsets else [e.enter for e in again.entries]
     assert stated == pytest.approx(kept, abs=1e-6)
     for validated, calibrated in zip(
-        assessment_of(result.refit).entries, again.entries, strict=True
+        assessment_of(result.joint).entries, again.entries, strict=True
     ):
         assert validated.enter == pytest.approx(calibrated.enter, abs=1e-8)
         assert validated.std == pytest.approx(calibrated.std, rel=1e-4)
     judged = {f.kind for f in judge_session(session).findings}
     assert judged <= {f.kind for f in result.assessment.findings}
-    assert judged <= {f.kind for f in again.findings}
+    assert judged <= {f.kind for f in calibrate(session, model).assessment.findings}
 
 
 def test_a_change_that_leaves_the_offsets_is_seen_by_validate_alone(plan):

@@ -8,6 +8,7 @@ from orthocal.assessment.effect_comparison import EffectComparison
 from orthocal.assessment.recommendation import Recommendation
 from orthocal.assessment.wording import joined, mm, note, tool_mm
 from orthocal.calibration.assessment_record import Finding
+from orthocal.effects.registry import order_effects
 from orthocal.units import MM, UM
 
 
@@ -73,14 +74,22 @@ def describe_effects(found: EffectComparison | None, readings: int) -> list[Find
             "",
         )
     else:
-        names = found.recommended
+        names, missing = found.recommended, set(found.recommended) - set(found.identified)
+        them, are = ("it", "is") if len(names) == 1 else ("them", "are")
+        worse = best.unseen_rms > none.unseen_rms
         text = (
-            f"Recommended effects: {joined(names)}. The readings are much more likely with "
-            f"{'it' if len(names) == 1 else 'them'} (ln evidence {best.log_evidence:+.1f}). "
-            f"Left-out setups are predicted to {mm(best.unseen_rms)} mm, without to "
-            f"{mm(none.unseen_rms)} mm."
+            f"Recommended effects: {joined(names)}. The readings are much more likely with {them} "
+            f"(ln evidence {best.log_evidence:+.1f}). Left-out setups are predicted "
+            f"{'worse, ' if worse else ''}to {mm(best.unseen_rms)} mm, without to "
+            f"{mm(none.unseen_rms)} mm"
         )
-        action = f"Calibrate with `--effects {','.join(names)}`."
+        text += "; the evidence counts, which is of all readings together." if worse else "."
+        action = ""
+        if missing:
+            every = order_effects({*found.identified, *names})
+            action = f"Calibrate with `--effects {','.join(every)}`."
+        else:
+            text += f" {joined(names).capitalize()} {are} identified already."
     numbers = {"log_evidence": best.log_evidence, "unseen_rms_mm": best.unseen_rms / MM}
     return [note("effects recommended", text, action, **numbers), *notes]
 

@@ -136,6 +136,16 @@ def controller_not_stated(drives: Sequence[str], *, keep: bool) -> Finding:
     )
 
 
+def earlier_readings() -> Finding:
+    """Finding that the controller has offsets, which readings of another session may have given."""
+    return note(
+        "earlier readings",
+        "The controller had offsets in this session. If they come from earlier readings of this "
+        "machine, this answer does not use these readings, and may differ from that of all.",
+        "Calibrate both sessions together: that answer counts.",
+    )
+
+
 def describe_tool_error(tool: ToolErrorSummary, *, keep: bool = False) -> str:
     """Sentence about the expected tool error, the same in every output.
 

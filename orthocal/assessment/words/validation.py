@@ -14,6 +14,8 @@ UNKNOWN = "Whether the calibration is confirmed is unknown."
 
 AGAIN = "To use this, calibrate from this session."
 
+TOGETHER = "To use this, calibrate the sessions together."
+
 
 def nothing_predicted(numbers: Mapping[str, float]) -> Finding:
     """The calibration had no redundancy, so it predicts nothing."""
@@ -74,7 +76,7 @@ def as_predicted(achieved: float, limit: float, numbers: Mapping[str, float]) ->
 
 
 def further_change(entries: Sequence[ControllerEntry]) -> Finding:
-    """The new readings improve what to enter by more than its uncertainty.
+    """All readings together improve what to enter.
 
     Args:
         entries: Offsets that change by more than their uncertainty; none if only all of them
@@ -92,7 +94,7 @@ def further_change(entries: Sequence[ControllerEntry]) -> Finding:
         f"The new readings still improve {noun}: {joined(changes)}."
         if changes
         else "The new readings still improve the offsets together.",
-        AGAIN,
+        TOGETHER,
         named(*(e.drive for e in entries)),
     )
 

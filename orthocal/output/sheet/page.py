@@ -324,12 +324,11 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
             cells.append((_number(stop.expected / MM, 2, sign=True), "number"))
         body = "".join(f'<td class="{kind}">{escape(text)}</td>' for text, kind in cells)
         box = "<td>set to 0</td>" if stop.role == "subtracted" else '<td class="box"></td>'
-        box += '<td class="box"></td>' * len(to_note)
+        box += '<td class="box condition"></td>' * len(to_note)
         remark = escape(motion.closing(stop))
         rows.append(f'<tr>{body}{box}<td class="note">{remark}</td></tr>')
-    return (
-        f'<table class="boxes"><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
-    )
+    kind = "boxes wide" if approaches or to_note else "boxes"
+    return f'<table class="{kind}"><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
 
 
 def _asked_once(session: Session) -> tuple[str, ...]:

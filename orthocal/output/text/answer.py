@@ -54,6 +54,7 @@ LISTED: tuple[FindingKind, ...] = (
     "change unknown",
     "above tolerances",
     "no redundancy",
+    "earlier readings",
     "held by a bound",
     "not significant",
     "line assumed",

@@ -11,7 +11,13 @@ from rich.text import Text
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.validation import Validation
 from orthocal.calibration.assessment_record import FindingKind
-from orthocal.output.text.answer import describe_conditions, entry_table, quote_path, render_next
+from orthocal.output.text.answer import (
+    describe_conditions,
+    entry_table,
+    quote_path,
+    render_backlash,
+    render_next,
+)
 from orthocal.output.text.layout import (
     bullets,
     mm,
@@ -40,8 +46,9 @@ def render_validation(validation: Validation, *, all_rows: bool = False) -> Rend
         for f in judged.findings
         if f.text not in judged.decision.reason and (all_rows or f.kind not in DETAILS)
     ]
+    answer = validation.answer
     if judged.tool is not None and judged.of_kind("tool error"):
-        findings += describe_conditions(refit)
+        findings += describe_conditions(answer)
     parts = [
         Text("Validation of a calibration", style="bold"),
         Text(refit.session.title),
@@ -50,9 +57,10 @@ def render_validation(validation: Validation, *, all_rows: bool = False) -> Rend
     if validation.mistake is not None and validation.enter:
         rows = [(e.drive, signed(e.enter * e.edge_factor), e.edge_unit) for e in validation.enter]
         parts.append(section("Values to enter", table_of(("drive", "enter", "unit"), rows)))
-    if judged.of_kind("further change") and refit.session.path is not None:
-        session = quote_path(Path(refit.session.path).parent)
-        command = f"orthocal calibrate {session} --out {session}-calibration"
+    paths = [part.path for part in answer.session.parts]
+    if judged.of_kind("further change") and paths and None not in paths:
+        sessions = [quote_path(Path(path).parent) for path in paths if path is not None]
+        command = f"orthocal calibrate {' '.join(sessions)} --out {sessions[-1]}-calibration"
         parts.append(Padding(render_next("to use the better offsets:", [command]), (0, 0, 0, 2)))
     rms = (validation.expected_rms, refit.rms_before, refit.rms_after)
     largest = (validation.expected_largest, refit.largest_before, refit.largest_after)
@@ -61,8 +69,10 @@ def render_validation(validation: Validation, *, all_rows: bool = False) -> Rend
         [("RMS [mm]", *map(mm, rms)), ("largest [mm]", *map(mm, largest))],
     )
     parts.append(section("Measured less predicted", deviations))
-    if assessment_of(refit).entries:
-        parts.append(section("Offsets from the new readings", entry_table(refit)))
+    if assessment_of(answer).entries:
+        source = "the new readings" if validation.joint is None else "all readings"
+        backlash = [Text(), render_backlash(answer)] if assessment_of(answer).backlash else []
+        parts.append(section(f"Offsets from {source}", Group(entry_table(answer), *backlash)))
     readings = residual_table(
         refit.residuals,
         {

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from browser import open_browser, visit
 from commands import run_orthocal
 from lxml import etree
 from machines import place
@@ -20,6 +21,7 @@ from orthocal.builder.build import make_robot
 from orthocal.builder.machine_file import Counting, Dimensions
 from orthocal.effects.compensation import JointTrim
 from orthocal.output.sheet.page import sheet_files
+from orthocal.session.session import Conditions
 from orthocal.units import MM
 
 ROUNDED = 1e-3
@@ -323,3 +325,30 @@ def test_bad_input_is_refused(root, tmp_path, arguments, message):
     assert message in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert not (tmp_path / "out").exists()
+
+
+PRINTED = 184.0 / 25.4 * 96.0
+"""Width of the text of an A4 page within the sheet's margins, [px]."""
+
+
+@pytest.mark.parametrize("effects", [(), ("backlash", "thermal", "drift")])
+def test_tables_of_readings_are_as_wide_as_the_text(small, effects, tmp_path):
+    """With columns for approach, temperature and time, and for what a perfect machine shows."""
+    plan = small.with_effects(effects)
+    if effects:
+        readings = [
+            replace(r, conditions=Conditions(approach="pn"[i % 2] * 3))
+            for i, r in enumerate(plan.readings)
+        ]
+        plan = replace(plan, readings=tuple(readings))
+    path = tmp_path / "sheet.html"
+    path.write_text(sheet_files(plan)["sheet.html"])
+    with open_browser() as browser, visit(browser, path.as_uri()) as found:
+        found.page.set_viewport_size({"width": round(PRINTED), "height": 1000})
+        found.page.emulate_media(media="print")
+        widths = found.page.evaluate(
+            """() => [...document.querySelectorAll('table')].map((table) =>
+                 [table.getBoundingClientRect().right, table.rows[0].cells.length])"""
+        )
+    assert max(right for right, _ in widths) <= round(PRINTED) + 0.5
+    assert max(columns for _, columns in widths) == (12 if effects else 9)
