@@ -50,6 +50,7 @@ def again(
         ini (FILE): INI file of LinuxCNC with the entered lines, or joints.ini of an export, whose
             BACKLASH and COMP_FILE the session then states; default: those of the last session.
     """
+    from orthocal.assessment.controller_entries import find_backlash
     from orthocal.effects.compensation import describe_trims
     from orthocal.export.formats import require_entering
 
@@ -82,6 +83,11 @@ def again(
         put_out(f"The machine is expected with these adjustments: {settings}.")
     if trims := describe_trims(new.robot, new.compensation):
         put_out(f"The controller compensates backlash, as session.yaml states: {trims}.")
+    if ini is None and any(e.change for e in find_backlash(result)):
+        put_note(
+            "session.yaml states the backlash that the controller compensated before. If you enter "
+            "another: --ini FILE with the entered lines, or controller: {backlash_mm: [...]}."
+        )
     put_out(
         f"Enter these offsets of the slides, home, and measure again: {offsets}.{sign}\n"
         f"  orthocal record {out}\n"

@@ -77,7 +77,7 @@ def export(
         within=None if within is None else within * UM,
         tool=None if tool is None else read_vector(tool, "--tool"),
         home_offsets=_home_offsets(home_offset, result) if joints is None else joints.home_offsets,
-        latched=_signs(latched) if joints is None else joints.latched,
+        latched=_signs(latched) if joints is None or joints.latched is None else joints.latched,
         half_side=None if half_side_mm is None else half_side_mm * MM,
         payload=payload,
         module=module,
@@ -135,10 +135,10 @@ def _read_joints(
     from orthocal.effects.compensation import compensates_alike
     from orthocal.measurement.files.linuxcnc_ini import read_ini
 
-    for option, value in stated.items():
-        if value is not None:
-            raise ParameterError("is stated by --ini, too; give one of them", where=option)
     joints = read_ini(path, calibration.robot)
+    for option, value in stated.items():
+        if value is not None and (option != "--latched" or joints.latched is not None):
+            raise ParameterError("is stated by --ini, too; give one of them", where=option)
     if not compensates_alike(joints.compensation, calibration.session.compensation):
         raise ParameterError(
             "has other BACKLASH or COMP_FILE than the session states under `controller` "

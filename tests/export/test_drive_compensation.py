@@ -80,7 +80,10 @@ def calibration(tmp_path_factory):
     )
     plan = load_plan(folder).with_controller(ACTIVE)
     session = simulate_session(plan, TRUTH, seed=4, sigma=0.5e-6).session
-    return calibrate(session, Choice("offsets"), solver="variable-projection")
+    found = calibrate(session, Choice("offsets"), solver="variable-projection")
+    # unmodelled errors leave some backlash undetermined, which the real machine here has as found
+    entered = tuple(replace(e, enter=e.identified) for e in found.assessment.backlash)
+    return replace(found, assessment=replace(found.assessment, backlash=entered))
 
 
 def play(screws, backlash):

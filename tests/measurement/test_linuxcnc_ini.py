@@ -59,6 +59,13 @@ def test_joints_are_read(folder, orthoglide):
     )
 
 
+def test_lines_of_an_export_state_no_direction_of_latching(folder, orthoglide):
+    """Which is then assumed and noted, instead of read as positive."""
+    lines = [v for v in INI.splitlines() if not v.startswith("HOME_LATCH")]
+    (folder / "machine.ini").write_text("\n".join(lines))
+    assert read_ini(folder / "machine.ini", orthoglide).latched is None
+
+
 def test_a_machine_without_compensation_has_none(folder, orthoglide):
     lines = [v for v in INI.splitlines() if not v.startswith(("BACKLASH", "COMP"))]
     (folder / "machine.ini").write_text("\n".join(lines))

@@ -35,8 +35,8 @@ class ControllerJoints:
 
     home_offsets: tuple[float, ...]
     """HOME_OFFSET, [m, rad]."""
-    latched: tuple[int, ...]
-    """Sign of HOME_LATCH_VEL, 1 or -1."""
+    latched: tuple[int, ...] | None
+    """Sign of HOME_LATCH_VEL, 1 or -1; None if no joint states one, as in lines of an export."""
     compensation: Compensation
     """BACKLASH and COMP_FILE; empty if no joint has any."""
 
@@ -84,7 +84,10 @@ def read_ini(path: Path, robot: Robot) -> ControllerJoints:
             table = read_trims(path.parent, name, drive, where)
         trims.append(JointTrim(numbers["BACKLASH"] * size, table))
     compensated = any(t.backlash or t.table is not None for t in trims)
-    return ControllerJoints(tuple(homes), tuple(latched), tuple(trims) if compensated else ())
+    stated = any("HOME_LATCH_VEL" in sections[f"JOINT_{i}"] for i in range(len(homes)))
+    return ControllerJoints(
+        tuple(homes), tuple(latched) if stated else None, tuple(trims) if compensated else ()
+    )
 
 
 def _read_sections(path: Path) -> Mapping[str, Mapping[str, str]]:

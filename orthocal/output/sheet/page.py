@@ -327,8 +327,8 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
         box += '<td class="box condition"></td>' * len(to_note)
         remark = escape(motion.closing(stop))
         rows.append(f'<tr>{body}{box}<td class="note">{remark}</td></tr>')
-    kind = "boxes wide" if approaches or to_note else "boxes"
-    return f'<table class="{kind}"><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
+    kind, body = "boxes wide" if approaches or to_note else "boxes", "".join(rows)
+    return f'<table class="{kind}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
 
 
 def _asked_once(session: Session) -> tuple[str, ...]:
