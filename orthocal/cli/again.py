@@ -50,8 +50,6 @@ def again(
         ini (FILE): INI file of LinuxCNC with the entered lines, or joints.ini of an export, whose
             BACKLASH and COMP_FILE the session then states; default: those of the last session.
     """
-    from orthocal.assessment.controller_entries import find_backlash
-    from orthocal.effects.compensation import describe_trims
     from orthocal.export.formats import require_entering
 
     require_new_files(out, FILES, remedy="expected a new directory")
@@ -81,19 +79,35 @@ def again(
     if amounts:
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
         put_out(f"The machine is expected with these adjustments: {settings}.")
-    if trims := describe_trims(new.robot, new.compensation):
-        put_out(f"The controller compensates backlash, as session.yaml states: {trims}.")
-    if ini is None and any(e.change for e in find_backlash(result)):
-        put_note(
-            "session.yaml states the backlash that the controller compensated before. If you enter "
-            "another: --ini FILE with the entered lines, or controller: {backlash_mm: [...]}."
-        )
+    _describe_backlash(result, new, entered=ini is not None)
     put_out(
         f"Enter these offsets of the slides, home, and measure again: {offsets}.{sign}\n"
         f"  orthocal record {out}\n"
         f"  orthocal validate {calibration} {out}"
     )
     put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, and sheet.html")
+
+
+def _describe_backlash(
+    calibration: orthocal.Calibration, new: orthocal.Session, *, entered: bool
+) -> None:
+    """Print the backlash that a new session states as compensated.
+
+    Args:
+        calibration: The calibration.
+        new: The session.
+        entered: Whether an INI file states what was entered.
+    """
+    from orthocal.assessment.controller_entries import find_backlash
+    from orthocal.effects.compensation import describe_trims
+
+    if trims := describe_trims(new.robot, new.compensation):
+        put_out(f"The controller compensates backlash, as session.yaml states: {trims}.")
+    if not entered and any(e.change for e in find_backlash(calibration)):
+        put_note(
+            "session.yaml states the backlash that the controller compensated before. If you enter "
+            "another: --ini FILE with the entered lines, or controller: {backlash_mm: [...]}."
+        )
 
 
 def _read_amounts(calibration: orthocal.Calibration, text: str | None) -> dict[str, float]:

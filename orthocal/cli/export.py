@@ -68,8 +68,6 @@ def export(
         ini (FILE): linuxcnc: INI file during the measurement, instead of --home-offset and
             --latched.
     """
-    from orthocal.export.linuxcnc.export import assumes_latching
-
     result = orthocal.load_calibration(calibration)
     stated = {"--home-offset": home_offset, "--latched": latched}
     joints = None if ini is None else _read_joints(ini, result, stated)
@@ -87,7 +85,15 @@ def export(
     write_results(out, files)
     if "kinematics.ini" in files:
         _note_payload(result, payload)
-    if to == "linuxcnc" and assumes_latching(result, options):
+    if to == "linuxcnc":
+        _note_latching(result, options)
+
+
+def _note_latching(calibration: orthocal.Calibration, options: orthocal.ExportOptions) -> None:
+    """Print what was assumed about the directions in which homing latches the switches."""
+    from orthocal.export.linuxcnc.export import assumes_latching
+
+    if assumes_latching(calibration, options):
         put_note(
             "Assumed: HOME_LATCH_VEL of all joints is positive. If not, use --ini FILE or "
             "--latched: HOME_OFFSET contains half of the backlash with this sign."
