@@ -176,7 +176,7 @@ def test_again_is_the_same_session_with_offsets_active(calibrated, experiment, t
     assert (out / "sheet.html").read_text().startswith("<!DOCTYPE html>")
     code, _, err = orthocal("again", calibrated, "--out", out)
     assert code == 2
-    assert err == f"orthocal: {out}/session.yaml: exists already; expected a new directory\n"
+    assert err == f"orthocal: {out}/session.yaml: exists already; --force overwrites it\n"
 
 
 def test_the_printed_json_holds_what_the_file_holds_and_the_decision(experiment, tmp_path):

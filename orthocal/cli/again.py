@@ -8,16 +8,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import orthocal
-from orthocal.cli.files import require_new_files
 from orthocal.cli.options import (
     Anyway,
     CalibrationPath,
+    Force,
     OutDirectory,
     command,
     read_number,
     require_between,
     split_globs,
 )
+from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import put_note, put_out
 from orthocal.cli.sheet import sheet_or_problem
 from orthocal.errors import ParameterError
@@ -35,6 +36,7 @@ def again(
     adjusted: str | None = None,
     ini: Path | None = None,
     anyway: Anyway = False,
+    force: Force = False,
 ) -> None:
     """Plan the same readings again, with the offsets to enter.
 
@@ -52,7 +54,7 @@ def again(
     """
     from orthocal.export.formats import require_entering
 
-    require_new_files(out, FILES, remedy="expected a new directory")
+    require_new_session(out, FILES, force=force)
     result = orthocal.load_calibration(calibration)
     if not anyway:
         require_entering(result)
@@ -74,12 +76,11 @@ def again(
         f"{d.name} {v * d.edge_factor:+.3f} {d.edge_unit}"
         for d, v in zip(new.robot.drives, new.active_offsets.tolist(), strict=True)
     )
-    down = [d.name for d in new.robot.drives if d.direction < 0]
-    sign = f" The sign is reversed for joints that count down: {', '.join(down)}." if down else ""
     if amounts:
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
         put_out(f"The machine is expected with these adjustments: {settings}.")
     _describe_backlash(result, new, entered=ini is not None)
+    sign = _describe_signs(new.robot)
     put_out(
         f"Enter these offsets of the slides, home, and measure again: {offsets}.{sign}\n"
         f"  orthocal record {out}\n"
@@ -108,6 +109,12 @@ def _describe_backlash(
             "session.yaml states the backlash that the controller compensated before. If you enter "
             "another: --ini FILE with the entered lines, or controller: {backlash_mm: [...]}."
         )
+
+
+def _describe_signs(robot: orthocal.Robot) -> str:
+    """Note about joints that count down; empty without any."""
+    down = [d.name for d in robot.drives if d.direction < 0]
+    return f" The sign is reversed for joints that count down: {', '.join(down)}." if down else ""
 
 
 def _read_amounts(calibration: orthocal.Calibration, text: str | None) -> dict[str, float]:

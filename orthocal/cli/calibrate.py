@@ -14,6 +14,7 @@ from orthocal.cli.options import (
     AllRows,
     Details,
     Effects,
+    Force,
     Free,
     Json,
     Model,
@@ -25,8 +26,8 @@ from orthocal.cli.options import (
     split_effects,
     split_globs,
 )
+from orthocal.cli.overwriting import require_own_results
 from orthocal.cli.printing import deliver_judged, judgement_on_failure
-from orthocal.io.files import require_writable
 
 FILES = ("calibration.json", "report.html")
 
@@ -89,6 +90,7 @@ def calibrate(
     json: Json = False,
     details: Details = False,
     all_rows: AllRows = False,
+    force: Force = False,
 ) -> None:
     """Identify the errors of a machine and the offsets to enter.
 
@@ -105,7 +107,7 @@ def calibrate(
         profile (PATTERNS): For research: profile-likelihood intervals of these errors (slow).
     """
     if out is not None:
-        require_writable(out, FILES)
+        require_own_results(out, dict.fromkeys(FILES, ""), force=force)
     effects = split_effects(choice.effects)
     session = load_joined(sessions, effects=effects, tolerance=choice.tolerance)
     chosen = choice.read(session)

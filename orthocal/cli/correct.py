@@ -22,6 +22,7 @@ import orthocal
 from orthocal.cli.options import (
     Anyway,
     CalibrationPath,
+    Force,
     Payload,
     Temperature,
     ToolTip,
@@ -29,13 +30,13 @@ from orthocal.cli.options import (
     read_conditions,
     read_vector,
 )
+from orthocal.cli.overwriting import require_own_file
 from orthocal.cli.printing import put_note, put_part
 from orthocal.errors import CalibrationFileError, GcodeError, OutputError, ParameterError
 from orthocal.io.files import (
     is_folder,
     read_file,
     read_parts,
-    require_writable_file,
     write_file,
 )
 from orthocal.text import comment_safe, shorten
@@ -113,6 +114,7 @@ def correct(
     options: CorrectionOptions,
     out: Path | None = None,
     anyway: Anyway = False,
+    force: Force = False,
 ) -> None:
     """Correct a G-code program for the errors of the machine.
 
@@ -133,7 +135,7 @@ def correct(
 
     controller = _read_controller(options)
     if out is not None:
-        require_writable_file(out)
+        require_own_file(out, force=force)
     result = orthocal.load_calibration(calibration)
     if not anyway:
         require_entering(result)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,6 +12,7 @@ import orthocal
 from orthocal.cli.options import (
     Anyway,
     CalibrationPath,
+    Force,
     HalfSideMm,
     OutDirectory,
     Payload,
@@ -20,6 +21,7 @@ from orthocal.cli.options import (
     read_numbers,
     read_vector,
 )
+from orthocal.cli.overwriting import mark_written, require_own_results
 from orthocal.cli.printing import put_note, write_results
 from orthocal.errors import ParameterError
 from orthocal.io.files import exists
@@ -46,6 +48,7 @@ def export(
     latched: str | None = None,
     ini: Path | None = None,
     anyway: Anyway = False,
+    force: Force = False,
 ) -> None:
     """Write a calibration for a controller or another program.
 
@@ -81,8 +84,8 @@ def export(
         module=module,
     )
     files = orthocal.export_calibration(result, to, anyway=anyway, options=options)
-    _refuse_both(out, files)
-    write_results(out, files)
+    _require_free(out, files, force=force)
+    write_results(out, mark_written(files))
     if "kinematics.ini" in files:
         _note_payload(result, payload)
     if to == "linuxcnc":
@@ -110,11 +113,11 @@ def _note_payload(calibration: orthocal.Calibration, payload: float | None) -> N
         put_note(assumed)
 
 
-def _refuse_both(out: Path, files: Iterable[str]) -> None:
-    """Refuse a directory with the export that these files are an alternative to.
+def _require_free(out: Path, files: Mapping[str, str], *, force: bool) -> None:
+    """Refuse a directory with files of somebody else, or with an alternative to these files.
 
     Raises:
-        ParameterError: Naming the file of the other export.
+        OrthocalError: Naming the file.
     """
     for mine, other in (ALTERNATIVES, ALTERNATIVES[::-1]):
         if mine in files and exists(out / other):
@@ -123,6 +126,7 @@ def _refuse_both(out: Path, files: Iterable[str]) -> None:
                 "would correct offsets twice: choose another directory",
                 where=str(out / other),
             )
+    require_own_results(out, files, force=force)
 
 
 def _read_joints(

@@ -1,17 +1,13 @@
-"""Sessions that commands read, and directories that they must not overwrite."""
+"""Sessions that commands read."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import orthocal
 from orthocal.cli.options import state_tolerances
-from orthocal.errors import OrthocalError, SessionError
-from orthocal.io.files import exists, require_writable
-
-SIMULATED = "Simulated"
-"""First word of the source of a simulated session."""
+from orthocal.errors import SessionError
 
 FEWEST_DIFFERENT = 4
 """Number of different values from which equal readings show that a session is a copy."""
@@ -78,54 +74,6 @@ def _same_readings(one: orthocal.Session, other: orthocal.Session) -> bool:
         [(r.setup, r.posture, r.minus, r.cycle, r.value) for r in s.readings] for s in (one, other)
     ]
     return rows[0] == rows[1] and len({r[-1] for r in rows[0]}) >= FEWEST_DIFFERENT
-
-
-def require_new_files(
-    directory: Path,
-    names: Iterable[str],
-    *,
-    force: bool = False,
-    remedy: str = "--force overwrites it",
-    error: type[OrthocalError] = SessionError,
-) -> None:
-    """Refuse to overwrite files of a directory.
-
-    Args:
-        directory: The directory; it need not exist.
-        names: Names of the files.
-        force: True to allow it.
-        remedy: End of the message.
-        error: Kind of error to raise.
-
-    Raises:
-        OrthocalError: If the directory cannot be written, or of kind `error`, if a file exists.
-    """
-    require_writable(directory)
-    for name in names:
-        if exists(directory / name) and not force:
-            raise error(f"exists already; {remedy}", where=str(directory / name))
-
-
-def require_no_readings(directory: Path) -> None:
-    """Refuse to overwrite measured readings, even with --force.
-
-    Raises:
-        SessionError: If the session of the directory has readings that were not simulated.
-    """
-    from orthocal.measurement.files.session_file import SESSION, load_rows
-
-    if not exists(directory / SESSION):
-        return
-    try:
-        session = load_rows(directory)
-    except OrthocalError:  # it was not a session
-        return
-    count = sum(r.is_read for r in session.readings)
-    if count and not session.source.startswith(SIMULATED):
-        raise SessionError(
-            f"contains {count} readings, which --force does not overwrite; move them first",
-            where=str(session.readings_path or directory),
-        )
 
 
 def state_conditions(

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import typer
 
 import orthocal
-from orthocal.cli.files import require_new_files, require_no_readings
 from orthocal.cli.options import (
     Day,
     Force,
@@ -27,6 +26,7 @@ from orthocal.cli.options import (
     read_workspace,
     split_effects,
 )
+from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import put_note, put_out
 from orthocal.errors import OrthocalError, ParameterError, RobotError
 from orthocal.io.files import exists, read_file, require_plain_name, write_files
@@ -262,10 +262,9 @@ def _require_new(folder: Path, *, force: bool) -> str:
             f"'{name}' is a robot that comes with orthocal; choose another name", where=str(folder)
         )
     files = (MACHINE, f"{name}.yaml", f"{name}.urdf")
-    require_new_files(folder, files, force=force, error=RobotError)
+    require_new_session(folder, files, force=force, error=RobotError)
     files = ("session.yaml", "readings.csv", "sheet.html")
-    require_new_files(folder / FIRST, files, force=force, error=RobotError)
-    require_no_readings(folder / FIRST)
+    require_new_session(folder / FIRST, files, force=force, error=RobotError)
     return name
 
 

@@ -9,7 +9,6 @@ from typing import Annotated
 from typer import Option
 
 import orthocal
-from orthocal.cli.files import require_new_files, require_no_readings
 from orthocal.cli.options import (
     Day,
     Details,
@@ -36,6 +35,7 @@ from orthocal.cli.options import (
     split_effects,
     split_globs,
 )
+from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import deliver, put_note
 from orthocal.cli.sheet import sheet_or_problem
 from orthocal.errors import ParameterError
@@ -120,8 +120,7 @@ def plan(
             where="--criterion",
         )
     if out is not None:
-        require_new_files(out, FILES, force=force)
-        require_no_readings(out)
+        require_new_session(out, FILES, force=force)
     workers = options.workers or available_cores()
     chosen = _choose(subject, options, workers=workers)
     deliver(lambda: plan_json(chosen), lambda: print_summary(chosen, details=details), json=json)

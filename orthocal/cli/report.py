@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import orthocal
-from orthocal.cli.options import CalibrationPath, command
+from orthocal.cli.options import CalibrationPath, Force, command
+from orthocal.cli.overwriting import require_own_file
 from orthocal.cli.printing import put_note
-from orthocal.io.files import is_folder, require_writable_file
+from orthocal.io.files import is_folder
 
 
 @command()
-def report(calibration: CalibrationPath, out: Path | None = None) -> None:
+def report(calibration: CalibrationPath, out: Path | None = None, force: Force = False) -> None:
     """Write the report of a calibration as a page.
 
     Args:
@@ -21,5 +22,5 @@ def report(calibration: CalibrationPath, out: Path | None = None) -> None:
     target = out or (Path() if result.path is None else result.path.parent)
     if is_folder(target):
         target = target / "report.html"
-    require_writable_file(target, kinds=(".html", ".htm"))
+    require_own_file(target, force=force, kinds=(".html", ".htm"))
     put_note(f"Wrote {orthocal.write_report(result, target)}")

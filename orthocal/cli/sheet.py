@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import orthocal
-from orthocal.cli.files import require_new_files
 from orthocal.cli.options import Force, OptionalOutDirectory, PlanPath, command, read_numbers
+from orthocal.cli.overwriting import require_own_results
 from orthocal.cli.printing import put_note
 from orthocal.errors import OrthocalError
-from orthocal.io.files import is_folder, write_files
+from orthocal.io.files import is_folder, require_writable, write_files
 
 
 @command()
@@ -35,9 +35,9 @@ def sheet(
     x, y, z = read_numbers(shift_mm, "--shift-mm", "XYZ")
     options = ProgramOptions(feed=feed, approach_feed=approach_feed, shift_mm=(x, y, z))
     directory = out or (session if is_folder(session) else session.parent)
-    require_new_files(directory, ())
+    require_writable(directory)
     files = sheet_files(orthocal.load_plan(session), options=options)
-    require_new_files(directory, files, force=force)
+    require_own_results(directory, files, force=force)
     write_files(directory, files)
     programs = len(files) - 1
     more = f" and {programs} programs" if programs else "; no programs: the drives control no tool"

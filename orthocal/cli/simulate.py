@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import orthocal
-from orthocal.cli.files import require_new_files, state_conditions
+from orthocal.cli.files import state_conditions
 from orthocal.cli.options import (
     Day,
     Effects,
@@ -19,6 +19,7 @@ from orthocal.cli.options import (
     split_effects,
     state_tolerances,
 )
+from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import put_note
 
 FILES = ("session.yaml", "readings.csv", "truth.yaml")
@@ -51,7 +52,7 @@ def simulate(
     from orthocal.observation.simulate import collect_errors, truth_document
     from orthocal.robot.parameters import errors_at
 
-    require_new_files(out, FILES, force=force)
+    require_new_session(out, FILES, force=force)
     planned = orthocal.load_plan(plan)
     if effects is not None:
         with errors_at("--effects"):

@@ -8,8 +8,8 @@ from typing import Annotated
 from typer import Argument
 
 import orthocal
-from orthocal.cli.files import require_new_files
 from orthocal.cli.options import Force, OutDirectory, PlanPath, command
+from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import put_note
 from orthocal.errors import SessionError
 from orthocal.text import shorten
@@ -34,7 +34,7 @@ def trace(session: PlanPath, traces: Traces, out: OutDirectory, force: Force = F
     from orthocal.measurement.files.session_file import load_rows
     from orthocal.measurement.importing.traces import read_trace, with_traces
 
-    require_new_files(out, FILES, force=force)
+    require_new_session(out, FILES, force=force)
     plan = load_rows(session)
     files = _split(traces)
     by_setup = {name: read_trace(path, plan.robot) for name, path in files.items()}

@@ -303,10 +303,7 @@ def test_the_command_writes_beside_the_session_or_elsewhere(small, tmp_path):
     assert f"Wrote {out}/sheet.html to print and 4 programs" in done.stderr
     assert "Z50.0000" in (out / "03-zx.ngc").read_text()
     assert "world origin at (0, 0, 50) mm" in (out / "sheet.html").read_text()
-    done = run_orthocal(tmp_path, *words)
-    assert done.returncode == 2
-    assert done.stderr == f"orthocal: {out}/sheet.html: exists already; --force overwrites it\n"
-    assert run_orthocal(tmp_path, *words, "--force").returncode == 0
+    assert run_orthocal(tmp_path, *words).returncode == 0
     assert "Z50" not in (out / "03-zx.ngc").read_text()
 
 

@@ -1,0 +1,103 @@
+"""What commands overwrite: their own results; nothing of somebody else; no measured reading."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+from calibrated import EXPERIMENT_2, calibrated
+from commands import run_orthocal
+
+from orthocal import write_calibration
+from orthocal.cli.overwriting import WRITTEN
+
+pytestmark = pytest.mark.usefixtures("without_plots")
+
+MINE = "# my notes about orthocal\n"
+PROGRAM = "G21 G90\nG0 X0 Y0 Z0\nG1 X10 Y-10 F300\nM2\n"
+
+RESULTS = {
+    "report.html": ("report", "one"),
+    "sheet.html": ("sheet", "session", "--out", "out"),
+    "01-xy.ngc": ("sheet", "session", "--out", "out"),
+    "calibration.json": ("calibrate", "session", "--out", "out"),
+    "errors.yaml": ("export", "one", "--to", "yaml", "--out", "out"),
+    "corrections.csv": ("export", "one", "--to", "table", "--out", "out"),
+    "orthoglide.urdf": ("export", "one", "--to", "urdf", "--out", "out"),
+    "orthoglide.yaml": ("export", "one", "--to", "urdf", "--out", "out"),
+    "README.md": ("export", "one", "--to", "linuxcnc", "--out", "out"),
+    "joints.ini": ("export", "one", "--to", "linuxcnc", "--out", "out"),
+    "kinematics.ini": ("export", "one", "--to", "linuxcnc", "--module", "--out", "out"),
+    "orthocal_core.c": ("export", "one", "--to", "linuxcnc", "--module", "--out", "out"),
+    "part.ngc": ("correct", "one", "program.ngc", "--out", "out/part.ngc"),
+}
+"""Name of a result and the command that writes it."""
+
+
+@pytest.fixture
+def folder(root, tmp_path):
+    """A session, a calibration of it and a program."""
+    shutil.copytree(root / "examples" / EXPERIMENT_2, tmp_path / "session")
+    (tmp_path / "one").mkdir()
+    write_calibration(calibrated(EXPERIMENT_2), tmp_path / "one/calibration.json")
+    (tmp_path / "program.ngc").write_text(PROGRAM)
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_result_replaces_its_own_alone(folder, name):
+    words = RESULTS[name]
+    file = folder / ("one" if name == "report.html" else "out") / name
+    for _ in range(2):  # the second one replaces the first
+        done = run_orthocal(folder, *words)
+        assert done.returncode == 0, done.stderr
+    written = file.read_bytes()
+    for other in file.parent.iterdir():
+        if other.name != "calibration.json" or name == "calibration.json":
+            other.unlink()
+    file.write_text(MINE)
+    done = run_orthocal(folder, *words)
+    assert done.returncode == 2
+    where = file.relative_to(folder)
+    assert f"{where}: exists, and orthocal did not write it; --force overwrites it" in done.stderr
+    assert file.read_text() == MINE
+    assert {p.name for p in file.parent.iterdir()} <= {name, "calibration.json"}
+    assert run_orthocal(folder, *words, "--force").returncode == 0
+    if name not in ("calibration.json", "report.html"):  # these state times
+        assert file.read_bytes() == written
+
+
+def test_the_exported_robot_does_not_replace_the_nominal_one(folder, root):
+    shutil.copytree(root / "robots/orthoglide", folder / "robot")
+    done = run_orthocal(folder, "export", "one", "--to", "urdf", "--out", "robot")
+    assert done.returncode == 2
+    assert "robot/orthoglide.urdf: exists, and" in done.stderr
+
+
+def test_exports_are_marked_once(folder):
+    """Also that of a calibration of an exported robot."""
+    words = ("export", "one", "--to", "urdf", "--out", "out")
+    assert run_orthocal(folder, *words).returncode == 0
+    session = folder / "session/session.yaml"
+    session.write_text(session.read_text().replace("robot: orthoglide", "robot: ../out"))
+    assert run_orthocal(folder, "calibrate", "session", "--out", "one").returncode == 0
+    assert run_orthocal(folder, *words).returncode == 0
+    for name in ("orthoglide.urdf", "orthoglide.yaml"):
+        assert (folder / "out" / name).read_text().count(WRITTEN) == 1
+
+
+def test_measured_readings_are_never_replaced(folder):
+    trace = folder / "trace.csv"
+    trace.write_text("x_mm,y_mm,z_mm,reading_mm\n0,0,0,0\n")
+    for words in (
+        ("plan", "orthoglide"),
+        ("again", "one"),
+        ("simulate", "session", "--error", "x_slide.offset_mm=1"),
+        ("trace", "session", f"yx={trace}"),
+    ):
+        for force in ([], ["--force"]):
+            before = {p.name: p.read_bytes() for p in (folder / "session").iterdir()}
+            done = run_orthocal(folder, *words, "--out", "session", *force)
+            assert done.returncode == 2, words
+            assert ("does not overwrite" if force else "exists already") in done.stderr
+            assert {p.name: p.read_bytes() for p in (folder / "session").iterdir()} == before
