@@ -22,7 +22,8 @@ from orthocal import (
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import entered_offsets, find_entries
 from orthocal.assessment.judgement import judge_session
-from orthocal.assessment.predictive import judge_deviations, measure_repetition
+from orthocal.assessment.predictive import Repetition, judge_deviations, measure_repetition
+from orthocal.assessment.words.validation import describe_repetition
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.identify import identify
 from orthocal.calibration.refit import repeat_fit
@@ -76,6 +77,13 @@ def test_experiment_3_validates_experiment_2_as_in_the_paper(table1):
     assert document["schema"] == "orthocal/validation/4"
     assert document["confirmed"] is True
     assert document["nothing_to_change"] is True
+
+
+@pytest.mark.parametrize(
+    ("chance", "text"), [(0.22, "in 22 % of cases"), (1e-9, "in less than 0.01 % of cases")]
+)
+def test_the_chance_of_a_repetition_is_a_share_of_cases(chance, text):
+    assert text in describe_repetition(Repetition(6, 0.5, chance)).text
 
 
 def test_offsets_that_were_entered_with_their_sign_turned_are_found_out(plan):

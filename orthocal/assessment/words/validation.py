@@ -12,6 +12,9 @@ CONFIRMED = "The calibration is confirmed."
 NOT_CONFIRMED = "The calibration is not confirmed."
 UNKNOWN = "Whether the calibration is confirmed is unknown."
 
+LEAST_SHARE = 1e-4
+"""Probability of a repetition by chance below which no smaller one is printed."""
+
 AGAIN = "To use this, calibrate from this session."
 
 TOGETHER = "To use this, calibrate the sessions together."
@@ -109,8 +112,13 @@ def describe_repetition(repetition: Repetition, *, new: bool = False, title: str
     """
     r, where = repetition, f" in '{title}'" if title else ""
     numbers = {"rows": float(r.matched), "correlation": r.correlation, "chance": r.chance}
-    size = f"(correlation {r.correlation:.3f} over {r.matched} lines; chance "
-    size += f"gives as much in {100.0 * r.chance:.2g} % of cases)"
+    share = (
+        f"{100.0 * r.chance:.2g} %"
+        if r.chance >= LEAST_SHARE
+        else f"less than {100.0 * LEAST_SHARE:g} %"
+    )
+    size = f"(correlation {r.correlation:.3f} over {r.matched} lines; chance gives as much in "
+    size += f"{share} of cases)"
     if r.repeats is None:
         why = f"the fit absorbs nearly all of the {r.matched} shared lines"
         why = "too few lines are shared" if r.matched < FEWEST else why
