@@ -24,7 +24,7 @@ from orthocal.errors import ClosureError, OrthocalError
 from orthocal.io.documents import write_plain
 from orthocal.io.fields import finite_or_none
 from orthocal.output.text.answer import quote_path, render_next
-from orthocal.output.text.layout import EXPANDED, bullets, plain, print_rich, signed, table_of
+from orthocal.output.text.layout import bullets, plain, print_rich, signed, table_of
 from orthocal.units import MM
 
 SCHEMA = "orthocal/adjustment/1"
@@ -87,9 +87,9 @@ def render_plan(
         headers = ("", "adjustment", "set", "amount", "±", "tool error")
         parts += [Padding(table_of(headers, rows, left=3), (0, 0, 0, 2)), Text()]
         notes = [
-            "amount, ± and tool error in mm. tool error: after this adjustment and those before "
-            "it, with the offsets entered again.",
-            EXPANDED,
+            "Amount, ± and tool error are in mm. The tool error is that after this adjustment and "
+            "those before it, with the offsets entered again.",
+            "±: in 19 of 20 cases the best amount lies within it.",
             *notes,
         ]
     parts += [Text(line) for line in describe_gain(plan)]
