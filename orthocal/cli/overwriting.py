@@ -105,10 +105,10 @@ def require_own_results(directory: Path, files: Mapping[str, str], *, force: boo
     """
     require_writable(directory, files)
     there = {directory / n: text for n, text in files.items() if exists(directory / n)}
-    own = {path for path in there if _is_marked(path)}
+    marked = {path for path in there if _is_marked(path)}
     for path, text in there.items():
-        is_table = path.suffix in TABLES and (own or _has_header(path, text))
-        if not (force or path in own or is_table):
+        is_table = path.suffix in TABLES and (marked or _has_header(path, text))
+        if not (force or path in marked or is_table):
             raise _refusal(path)
 
 

@@ -11,7 +11,7 @@ from tolerances import SAME_NUMBER
 
 from orthocal.assessment.circular_deviation import find_circles
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.output.report.circle_plots import plot_circle
+from orthocal.output.report.reading_plots import plot_circle
 from orthocal.sensors.ball_bar import BallBar
 
 CENTRE, TOOL, RADIUS = np.array([2e-3, -1e-3, -50e-3]), np.array([0.0, 0.0, -40e-3]), 0.05

@@ -19,14 +19,18 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, OrthocalError, RobotError
 from orthocal.io.files import write_file
 from orthocal.io.html import escape, heading, items, page, paragraph, table
-from orthocal.output.report.circle_plots import plot_circle
 from orthocal.output.report.parameter_plots import (
     plot_correlations,
     plot_linearised,
     plot_parameters,
     plot_singular_values,
 )
-from orthocal.output.report.reading_plots import plot_residuals, plot_setups, plot_spread
+from orthocal.output.report.reading_plots import (
+    plot_circle,
+    plot_residuals,
+    plot_setups,
+    plot_spread,
+)
 from orthocal.output.report.tool_map import Field, plot_tool_map
 from orthocal.output.scene.drawing import draw_scene
 from orthocal.output.text.accuracy import render_tool
