@@ -144,10 +144,11 @@ def assess(
         judgement = judge_session(measured)
     chosen = _choose(calibration)
     entries, tool, keep = chosen.entries, chosen.tool, chosen.keep
+    firmware = calibration.session.firmware is not None  # takes settings, no offsets
     notes = [
         *find_fit_findings(calibration),
         *([_no_change_needed(calibration, entries, chosen.best)] if keep else []),
-        *_entry_findings(calibration, entries, tool, keep=keep),
+        *([] if firmware else _entry_findings(calibration, entries, tool, keep=keep)),
         *describe_recommendation(
             recommendation or recommend_model(measured), chosen=calibration.model
         ),
@@ -157,11 +158,11 @@ def assess(
     return Assessment(
         decision=_decide(
             findings,
-            firmware=calibration.session.firmware is not None,
+            firmware=firmware,
             backlash=any(e.change for e in chosen.backlash),
         ),
         findings=findings,
-        entries=entries,
+        entries=() if firmware else entries,
         tool=tool,
         backlash=chosen.backlash,
     )

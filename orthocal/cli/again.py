@@ -56,6 +56,12 @@ def again(
 
     require_new_session(out, FILES, force=force)
     result = orthocal.load_calibration(calibration)
+    if result.session.firmware is not None:
+        raise ParameterError(
+            "is of a printer's log; expected a controller of offsets: probe the bed with the new "
+            "settings, and `orthocal import` the new log",
+            where=str(calibration),
+        )
     if not anyway:
         require_entering(result)
     amounts = _read_amounts(result, adjusted)

@@ -97,8 +97,8 @@ def _settings(text: str, shown: re.Match[str] | None, probe: Array, where: str) 
     printed = {} if shown is None else {k: v for k, v in shown.groupdict().items() if v is not None}
     for name, value in printed.items():
         key = {"E": f"E{name[-1].upper()}", "T": name[-1].upper()}.get(name[0], name)
-        (v,) = numbers([value], where=where, name=name)
-        if key not in words or abs(v - float(words[key])) > ROUNDED:
+        stated = numbers([value, words.get(key, value)], where=where, name=name)
+        if key not in words or abs(stated[0] - stated[1]) > ROUNDED:
             words[key] = value
     for letter in "LRH":
         if letter not in words:

@@ -13,7 +13,15 @@ import pytest
 from commands import run_orthocal
 from simulated_printer import Printer, nominal, read_settings, rings, write_log
 
-from orthocal import ExportError, calibrate, draw_errors, export_calibration, load_session
+from orthocal import (
+    ExportError,
+    calibrate,
+    draw_errors,
+    export_calibration,
+    load_calibration,
+    load_session,
+    write_calibration,
+)
 from orthocal.export.printer import _find_targets, fit_firmware
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.measurement.importing.printer_log import import_printer_log
@@ -154,3 +162,18 @@ def test_other_sessions_are_refused(root):
     calibration = calibrate(load_session(root / "examples/raw-cycles"), "offsets")
     with pytest.raises(ExportError, match=r"controller\.firmware"):
         export_calibration(calibration, "klipper", anyway=True)
+
+
+def test_offsets_of_a_printer_are_not_to_be_entered(calibrated, tmp_path):
+    """Its firmware takes settings; a session that measures again comes from a new log."""
+    _, calibration = calibrated
+    assert calibration.assessment.entries == ()
+    assert calibration.assessment.decision.verdict == "enter"
+    write_calibration(calibration, tmp_path / "one")
+    done = run_orthocal(tmp_path, "again", "one", "--out", "two")
+    assert done.returncode == 2
+    assert "import" in done.stderr
+    assert not (tmp_path / "two").exists()
+    again = load_calibration(tmp_path / "one")
+    assert again.session.firmware == calibration.session.firmware
+    assert fit_firmware(again, "klipper").settings == fit_firmware(calibration, "klipper").settings

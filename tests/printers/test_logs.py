@@ -230,3 +230,13 @@ def test_settings_may_come_from_another_file(tmp_path):
     result = import_printer_log(log, settings=[tmp_path / "printer.cfg"])
     write_printer_import(result, tmp_path / "bed")
     assert load_session(tmp_path / "bed").firmware.rods == pytest.approx((0.28, 0.2804, 0.2797))
+
+
+def test_what_two_readers_of_a_setting_disagree_about_is_refused(probed):
+    """A colon in M666 beside what G33 printed, as a damaged line has it."""
+    text = (
+        "M665 L280 R140 H300\nM666 X0 Y0:-0.2\n.Height:300.00  Ex:+0.00  Ey:+0.00  Ez:+0.00  "
+        "Radius:140.00\n.    c:+0.0   x:+0.2   y:-0.1   z:+0.3\n"
+    )
+    with pytest.raises(SessionError, match=r"0:-0\.2"):
+        probed(text, radius=0.08)

@@ -84,8 +84,7 @@ def render_answer(
     assessment = assessment_of(calibration)
     parts: list[RenderableType] = [render_subject(calibration), Text()] if heading else []
     parts += [_decision(assessment.decision), Text()]
-    firmware = calibration.session.firmware is not None
-    if assessment.entries and assessment.decision.verdict != "reject" and not firmware:
+    if assessment.entries and assessment.decision.verdict != "reject":
         parts += [
             _indented(entry_table(calibration)),
             *_entry_notes(calibration, assessment),
@@ -153,8 +152,6 @@ def _tool(calibration: Calibration, assessment: Assessment) -> list[RenderableTy
         unreached = assessment.of_kind("out of reach")
         return [Text(unreached[0].text if unreached else "The tool error is unknown.")]
     texts = [f.text for f in assessment.of_kind("tool error")]
-    if calibration.session.firmware is not None:  # the export states it with its settings
-        texts = []
     return [Text(text) for text in (*texts, *describe_conditions(calibration))]
 
 
@@ -174,7 +171,7 @@ def _listed(calibration: Calibration, assessment: Assessment) -> Sequence[Findin
         for f in assessment.findings
         if (f.severity != "note" or f.kind in LISTED) and f.text != assessment.decision.reason
     ]
-    if assessment.keeps_offsets or calibration.session.firmware is not None:
+    if assessment.keeps_offsets:
         listed = [f for f in listed if f.kind not in ("must change", "not significant")]
     if calibration.only_offsets:  # legs and axes are left out, which matters more
         listed = [f for f in listed if f.kind != "line assumed"]
