@@ -56,12 +56,7 @@ def again(
 
     require_new_session(out, FILES, force=force)
     result = orthocal.load_calibration(calibration)
-    if result.session.firmware is not None:
-        raise ParameterError(
-            "is of a printer's log; expected a controller of offsets: probe the bed with the new "
-            "settings, and `orthocal import` the new log",
-            where=str(calibration),
-        )
+    _require_offsets(result, calibration)
     if not anyway:
         require_entering(result)
     amounts = _read_amounts(result, adjusted)
@@ -121,6 +116,20 @@ def _describe_signs(robot: orthocal.Robot) -> str:
     """Note about joints that count down; empty without any."""
     down = [d.name for d in robot.drives if d.direction < 0]
     return f" The sign is reversed for joints that count down: {', '.join(down)}." if down else ""
+
+
+def _require_offsets(calibration: orthocal.Calibration, path: Path) -> None:
+    """Refuse a printer, whose firmware takes settings.
+
+    Raises:
+        ParameterError: If the session states a firmware.
+    """
+    if calibration.session.firmware is not None:
+        raise ParameterError(
+            "is of a printer's log; expected a controller of offsets: probe the bed with the new "
+            "settings, and `orthocal import` the new log",
+            where=str(path),
+        )
 
 
 def _read_amounts(calibration: orthocal.Calibration, text: str | None) -> dict[str, float]:
