@@ -168,16 +168,18 @@ def rounded_up(value: float) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _State:
-    """The machine at one temperature, and the joint coordinates that reach some points there."""
+    """The machine at one temperature."""
 
     temperature: float | None
     tip: ToolTip
-    drives: Array
-    """Drive coordinates at the nodes of the fit, shape (n_nodes, n_drives), [m, rad]."""
+    drives: Array | None
+    """Drive coordinates at the nodes of the fit, shape (n_nodes, n_drives), [m, rad]; None at a
+    temperature that is not fitted."""
     expected: Array
-    """Drive coordinates at the checked points, shape (n_checks, n_drives), [m, rad]."""
+    """Drive coordinates at the checked points at the reference temperature, shape (n_checks,
+    n_drives), [m, rad]."""
     passive: Array
-    """Passive coordinates at the checked points, shape (n_checks, n_passive), [m, rad]."""
+    """Passive coordinates there, from which loops are closed, (n_checks, n_passive), [m, rad]."""
 
     def error(self, checks: Array, inverse: CorrectedInverse, *, cold: bool = False) -> float:
         """Largest error at the checked points, [m]; infinite out of reach.
@@ -235,7 +237,7 @@ def approximate(
             checks=checks,
         )
     form = find_nominal_form(robot, middle, half)
-    corrections = states[0].drives - form(middle + half * nodes)
+    corrections = np.asarray(states[0].drives) - form(middle + half * nodes)
     change, best = _find_change(states), math.inf
     for degree in range(1, most + 1):
         fit = PolynomialFit(nodes, total_degree(n, degree))
@@ -275,36 +277,39 @@ def _reach_states(
     """
     robot = calibration.robot
     errors = without_periodic_errors(robot, calibration.errors)
-    states: list[_State] = []
-    near: tuple[Array | None, Array | None] = (None, None)
-    for temperature in _list_temperatures(robot):
+    labels, states = ["a point"] * len(nodes), list[_State]()
+    start, checked = None, None
+    for temperature, fitted in _list_temperatures(robot):
         conditions = UseConditions(temperature=temperature, payload=payload)
-        tip = ToolTip(calibration, tool, errors=errors, conditions=conditions)
+        tip, drives = ToolTip(calibration, tool, errors=errors, conditions=conditions), None
         if not states:
             tip.reach(corners)  # fails fast
-        fitted, checked = (
-            tip.reach(points, start=start)
-            for points, start in zip((nodes, checks), near, strict=True)
-        )
-        labels = ["a point"] * len(nodes)
-        for failure in find_beyond_travel(robot, fitted[0], labels).values():
-            raise failure
-        near = np.hstack(fitted), np.hstack(checked)
-        states.append(_State(temperature, tip, fitted[0], *checked))
+        if fitted:
+            drives, passive = tip.reach(nodes, start=start)
+            start = np.hstack([drives, passive])
+            for failure in find_beyond_travel(robot, drives, labels).values():
+                raise failure
+        checked = tip.reach(checks) if checked is None else checked
+        states.append(_State(temperature, tip, drives, *checked))
     return states
 
 
-def _list_temperatures(robot: Robot) -> list[float | None]:
-    """Reference temperature, then those of the range and between them, [°C]; None without one."""
+def _list_temperatures(robot: Robot) -> list[tuple[float | None, bool]]:
+    """Temperatures, [°C], and whether the machine is fitted there.
+
+    First the reference, None without one; then the ends of the range; then temperatures between
+    them, at which the machine is only checked.
+    """
     use = stated_use(robot)
     if use is None or use["temperature"] is None:
-        return [None]
+        return [(None, True)]
     reference, (low, high) = neutral_values(robot)["temperature"], use["temperature"]
     ends = (
         max(min(low, reference - WARMER), LOWEST_C),
         min(max(high, reference + WARMER), HIGHEST_C),
     )
-    return [reference, *(t for end in ends for t in (end, 0.5 * (end + reference)))]
+    between = [(0.5 * (end + reference), False) for end in ends]
+    return [(reference, True), *((end, True) for end in ends), *between]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -324,13 +329,15 @@ class _Change:
 
 
 def _find_change(states: Sequence[_State]) -> _Change | None:
-    """The straight line through the reference, the first state, that is nearest to the others."""
-    if states[0].temperature is None:
+    """The straight line through the reference, the first state, that is nearest to the ends."""
+    fitted = [(s.temperature, s.drives) for s in states if s.drives is not None]
+    if len(fitted) == 1:
         return None
-    temperatures = np.array([s.temperature for s in states], dtype=np.float64)
+    temperatures = np.array([t for t, _ in fitted], dtype=np.float64)
+    drives = np.array([d for _, d in fitted])
     warmer = temperatures - temperatures[0]
-    moved = np.array([s.drives - states[0].drives for s in states])
-    return _Change(temperatures, np.tensordot(warmer, moved, axes=1) / (warmer @ warmer))
+    slopes = np.tensordot(warmer, drives - drives[0], axes=1) / (warmer @ warmer)
+    return _Change(temperatures, slopes)
 
 
 def _describe(
