@@ -363,6 +363,8 @@ def test_rounded_up():
             2,
             "--module or --offsets: is an option of --to linuxcnc alone",
         ),
+        (["--module", "--payload", "1"], 2, "--payload: found 1.0; no effect of the machine"),
+        (["--payload", "1"], 2, "--payload: is an option of a kinematics module, and the"),
         (["--module", "--half-side-mm", "250"], 3, "the machine does not reach ±250 mm"),
     ],
 )

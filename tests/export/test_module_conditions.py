@@ -156,7 +156,7 @@ def test_payload_of_the_module(tmp_path):
     approximation, core = build(tmp_path, known, payload=3.0, within=1e-6)
     assert approximation.payload == 3.0
     weight = np.array([0.0, 0.0, -(5.0 + 3.0) * GRAVITY])
-    points = points_in_region(2, seed=5)
+    points = points_in_region(1, seed=5)
     for point, drives in zip(
         points, drives_of(known.robot, core.inverse(points / MM)), strict=True
     ):
