@@ -22,7 +22,7 @@ from orthocal.assessment.words import effects as words
 from orthocal.calibration.assessment_record import Finding
 from orthocal.effects.loading import neutral_values, robot_effects
 from orthocal.hypotheses.anomaly import EFFECT_KINDS
-from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.hypotheses.linear_model import linear_model
 from orthocal.observation.observations import drive_table
 from orthocal.session.session import Conditions, Session
 
@@ -96,15 +96,15 @@ def _read_warmer(session: Session, setup: str) -> Session:
 
 def _shows_expansion(session: Session) -> bool:
     """True if readings determine coefficients of expansion, as a plan states it."""
-    model = LinearModel(session)
+    model = linear_model(session)
     limits = find_limits(model.problem, model.sigma)
     return any(limit.determined for limit in limits if limit.effect == "thermal")
 
 
 def _alike(session: Session) -> Iterator[Finding]:
     """Parameters of effects that change the readings alike."""
-    model = LinearModel(session)
-    about = model.linearise(np.zeros(model.problem.n_free), (), None, slopes=True)
+    model = linear_model(session)
+    about = model.at_reference(slopes=True)
     members = _members(session, model.problem.free)
     every = [i for indices in members.values() for i in indices]
     columns, others = about.slopes[:, every], np.delete(about.slopes, every, axis=1)

@@ -26,7 +26,7 @@ from orthocal.assessment.words.anomalies import describe_anomalies, describe_no_
 from orthocal.calibration.assessment_record import Finding, Severity, Verdict
 from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
 from orthocal.hypotheses.families.sessions import detectable_changes
-from orthocal.hypotheses.linear_model import LinearModel, ModelLinearisation
+from orthocal.hypotheses.linear_model import LinearModel, ModelLinearisation, linear_model
 from orthocal.hypotheses.search import find_anomalies
 from orthocal.measurement.joining import split_sessions
 from orthocal.session.session import Session
@@ -168,7 +168,7 @@ def find_tolerance_scale(session: Session) -> ToleranceScale:
     for part in split_sessions(session):
         if any(g.sigma is None for g in part.gauges.values()) or len(part.readings) < 2:
             continue
-        model = LinearModel(part)
+        model = linear_model(part)
         about = model.most_likely(part.values)
         deviation = model.entries(part.values[None])[0] - about.expected
         repeated, _ = estimate_repeatability(model.problem.values, model.problem.observations)

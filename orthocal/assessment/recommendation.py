@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -23,9 +24,12 @@ from orthocal.arrays import Array
 from orthocal.errors import OrthocalError
 from orthocal.estimation.selection import complete_model
 from orthocal.hypotheses.likelihood import NOISE_SCALES, log_of_sum, noise_weights
-from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.hypotheses.linear_model import linear_model
 from orthocal.measurement.joining import split_sessions
 from orthocal.session.session import Session
+
+KEPT = 4
+"""Recommendations that are kept."""
 
 STRONG = 5.0
 """ln of the Bayes factor from which evidence is strong: 150 to 1 (Kass and Raftery, 1995)."""
@@ -69,10 +73,17 @@ class Recommendation:
 def recommend_model(session: Session, models: Sequence[str] = ()) -> Recommendation:
     """The model that the readings recommend.
 
+    The last recommendations are kept: several models are calibrated from one session, or compared.
+
     Args:
         session: The session, or several that were joined: their evidence adds up.
         models: Models of the robot to weigh against the complete one; by default all.
     """
+    return _recommend(session, tuple(models))
+
+
+@lru_cache(maxsize=KEPT)
+def _recommend(session: Session, models: tuple[str, ...]) -> Recommendation:
     parameters = session.robot.parameters
     complete = complete_model(parameters)
     names = [m for m in dict.fromkeys(models or parameters.models) if m != complete]
@@ -106,7 +117,7 @@ def weigh_model(session: Session, model: str) -> tuple[float, Array]:
     for part in split_sessions(session):
         if len(part.readings) < 2:
             continue
-        readings = LinearModel(part, model)
+        readings = linear_model(part, model)
         about = readings.most_likely(part.values)
         deviation = readings.entries(part.values[None])[0] - about.expected
         stated = readings.stated

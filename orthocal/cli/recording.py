@@ -14,7 +14,7 @@ from orthocal.calibration.assessment_record import Finding
 from orthocal.cli.printing import put_out
 from orthocal.cli.recorded_conditions import RecordedConditions
 from orthocal.errors import OrthocalError, SessionError
-from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.hypotheses.linear_model import linear_model
 from orthocal.io.tables.numerals import parse_typed_reading
 from orthocal.measurement.recording import Recording
 from orthocal.output.text.recording import COMMANDS, RecordingText, find_rows
@@ -219,7 +219,7 @@ class Dialogue:
         session = self._recording.measured(without=doubted)
         position = sum(r.is_read and i not in doubted for i, r in enumerate(rows[:index]))
         try:
-            mean, std = LinearModel(session).predict_row(session.values, position)
+            mean, std = linear_model(session).predict_row(session.values, position)
         except (OrthocalError, np.linalg.LinAlgError) as e:
             self._stop_judging(e)
             return False

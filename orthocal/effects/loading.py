@@ -88,6 +88,11 @@ def with_effects(robot: Robot, names: Sequence[str] | None) -> Robot:
     for name in chosen or ():
         if name not in existing:
             raise ParameterError(f"'{name}' is not an effect; effects: {', '.join(existing)}")
+    return _choose_effects(robot, chosen)
+
+
+@lru_cache(maxsize=4 * MAX_LOADED)
+def _choose_effects(robot: Robot, chosen: tuple[str, ...] | None) -> Robot:
     plain = replace(robot, chosen_effects=chosen, parameters=ParameterSet())
     return _add_parameters(plain).with_tolerances(robot.parameters.stated)
 

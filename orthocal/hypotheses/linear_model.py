@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import cached_property
+from functools import cached_property, lru_cache
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -30,6 +32,11 @@ from orthocal.session.session import Session
 from orthocal.statistics.distributions import log_positive_share
 from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
+
+Result = TypeVar("Result")
+
+KEPT = 6
+"""Models that are kept."""
 
 MOST_ROUNDS = 2
 """Relinearisations per hypothesis."""
@@ -134,6 +141,27 @@ class LinearModel:
         self.labels, self.session_of_entry = label_sessions(session, o.setup)
         self._counts = np.bincount(o.zero, minlength=o.n_zeros).astype(np.float64)
         self._incidence = self.problem.zero_incidence
+        self._shared: dict[Hashable, object] = {}
+
+    def with_values(self, values: Array) -> LinearModel:
+        """The model for other readings of the same rows, shape (n_rows,), [m]."""
+        other = copy.copy(self)
+        other.problem = self.problem.with_values(values)
+        return other
+
+    def share(self, name: Hashable, compute: Callable[[], Result]) -> Result:
+        """A result that does not depend on the values of the readings, computed once."""
+        if name not in self._shared:
+            self._shared[name] = compute()
+        return cast(Result, self._shared[name])
+
+    def at_reference(self, *, slopes: bool) -> ModelLinearisation:
+        """The model linearised about the machine without errors; errors as for `linearise`."""
+
+        def linearise() -> ModelLinearisation:
+            return self.linearise(np.zeros(self.problem.n_free), (), None, slopes=slopes)
+
+        return self.share(("reference", slopes), linearise)
 
     @property
     def offsets(self) -> dict[str, int]:
@@ -326,7 +354,7 @@ class LinearModel:
             entries: Readings, zeros projected out, shape (n_entries,), [m].
             effect: Effect per unit, zeros projected out, shape (n_entries,); 0 for none.
         """
-        about = self.linearise(np.zeros(self.problem.n_free), (), None, slopes=False)
+        about = self.at_reference(slopes=False)
         for _ in range(MOST_STEPS):
             deviation = entries - about.expected
             (amount,), _ = about.likelihood.estimate_amounts(deviation, effect[None])
@@ -437,6 +465,52 @@ class LinearModel:
         along = about.sizes * (about.errors.T @ errors)
         residuals = (deviation - along @ about.likelihood.directions) * self.problem.noise_ratio
         return float(np.sqrt(np.mean(self.problem.observations.rows(residuals) ** 2)))
+
+
+def linear_model(session: Session, model: str | None = None) -> LinearModel:
+    """Linearised model; of the last sessions with the same rows it is built once.
+
+    Args:
+        session: As for `LinearModel`.
+        model: As for `LinearModel`.
+
+    Raises:
+        ParameterError, RobotError: As for `LinearModel`.
+    """
+    if len(session.gauges) > 1:  # their relative noise may come from the values
+        return LinearModel(session, model)
+    return _build(_Rows(session, model)).with_values(session.values)
+
+
+class _Rows:
+    """All of a session but the values of its readings; equal for the same objects."""
+
+    def __init__(self, session: Session, model: str | None) -> None:
+        self.session, self.model = session, model
+        offsets = session.controller_offsets
+        same = (
+            *(session.robot, session.postures, session.setups, *session.gauges.values()),
+            *(session.compensation, session.firmware, session.adjusted, session.path),
+        )
+        self._key = (
+            *map(id, same),
+            *(None if offsets is None else offsets.tobytes(), session.joined, model),
+            tuple(
+                (r.setup, r.posture, r.minus, r.cycle, r.line, r.file, r.conditions)
+                for r in session.readings
+            ),
+        )
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Rows) and self._key == other._key
+
+
+@lru_cache(maxsize=KEPT)
+def _build(rows: _Rows) -> LinearModel:
+    return LinearModel(rows.session, rows.model)
 
 
 def _refer_to_most_corrected(session: Session) -> Session:

@@ -49,6 +49,7 @@ from orthocal.hypotheses.linear_model import (
     NEAR,
     LinearModel,
     ModelLinearisation,
+    linear_model,
 )
 from orthocal.hypotheses.pairs import Singles, find_pairs
 from orthocal.session.session import Session
@@ -113,6 +114,9 @@ LARGEST_VOLUME = float(np.log(1000.0))
 LEAST_EFFECT = 1e-3
 """Least change of the readings by one prior std of a considered change, relative to the noise."""
 
+EXTREME = 50.0
+"""Errors, in prior std, about which nothing is linearised: hardly a machine with them closes."""
+
 CHUNK = 4096
 """Number of hypotheses that are scored at a time, to limit the memory."""
 
@@ -127,7 +131,7 @@ def find_anomalies(session: Session) -> Anomalies:
         ClosureError: If the machine cannot reach a posture.
         RobotError: If closures of the robot depend on each other.
     """
-    linear = LinearModel(session)
+    linear = linear_model(session)
     if len(session.readings) < 2 or linear.dof < 1:
         return Anomalies((), 0.0, True, 0.0, 0.0, 1.0, 1.0)
     return _Search(session, linear).run()
@@ -142,7 +146,7 @@ class _Search:
         self.values = session.values
         self.slopes = len(model.labels) > 1
         self.effects = find_effects(model)
-        start = model.linearise(np.zeros(model.problem.n_free), (), None, slopes=self.slopes)
+        start = model.at_reference(slopes=self.slopes)
         self.sound = self.evaluate((), start)
 
     def run(self) -> Anomalies:
@@ -189,7 +193,7 @@ class _Search:
 
         The first step may exceed FURTHEST, because readings are not linear over offsets of some mm:
         the nonlinear part looks like errors far beyond their tolerances. Such a step does not count
-        unless the next step returns within FURTHEST.
+        unless the next step returns within FURTHEST. No step exceeds EXTREME.
         """
         model = self.model
         known = [t.shift for t in terms if t.shift is not None and t.known]
@@ -208,7 +212,7 @@ class _Search:
             )
             if np.abs(errors - about.theta).max(initial=0.0) < NEAR:
                 break
-            if k and not _is_near(errors):
+            if not _is_near(errors) and (k or np.abs(errors).max() > EXTREME):
                 break
             applied = np.array(
                 [a[0] for t, a in zip(terms, state.amounts, strict=True) if t.shift and not t.known]

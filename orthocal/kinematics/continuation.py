@@ -27,6 +27,7 @@ from orthocal.robot.model import (
 from orthocal.units import DRIVE_UNITS
 
 Evaluate = Callable[[Array, Array, MachineGeometry], tuple[Array, Array]]
+Prepare = Callable[[Array, MachineGeometry], Array]
 Failures = dict[int, ClosureError]
 """Index of a posture to the reason why it cannot be reached. In a batch of machines, posture k of
 machine s of K postures has the index s K + k."""
@@ -65,7 +66,8 @@ class System:
 
     Args:
         robot: The robot.
-        evaluate: (x, p, geometry) to residuals, (n, n_rows), and Jacobians by x, (n, n_rows, n_x).
+        evaluate: (x, v, geometry) to residuals, (n, n_rows), and Jacobians by x, (n, n_rows, n_x).
+        prepare: (p, geometry) to v, shape (n, n_v), what is the same for all x.
         index: Joint coordinates that are x, shape (n_x,).
         start: x of the nominal machine's reference posture, shape (n_x,).
         origin: p of the nominal machine's reference posture, shape (n_p,).
@@ -85,12 +87,14 @@ class System:
         robot: Robot,
         evaluate: Evaluate,
         *,
+        prepare: Prepare,
         index: Indices,
         start: Array,
         origin: Array,
         n_tool: int = 0,
     ) -> None:
-        self.robot, self.evaluate, self.start, self.origin = robot, evaluate, start, origin
+        self.robot, self.evaluate, self.prepare = robot, evaluate, prepare
+        self.start, self.origin = start, origin
         self.n_x = index.size
         self.shortest = robot.closure_rows + n_tool != index.size
         self.units = coordinate_units(robot)[index]
@@ -149,7 +153,7 @@ class System:
 
     def describe(self, x: Array, p: Array, geometry: MachineGeometry) -> str:
         """Openings of the loops of one posture, in words."""
-        residuals, _ = self.evaluate(x[None], p[None], geometry)
+        residuals, _ = self.evaluate(x[None], self.prepare(p[None], geometry), geometry)
         return describe_opening(residuals[0] / self._row_units, self._turns)
 
 
@@ -325,7 +329,7 @@ class _Path:
     def _refuse_singular(self, x: Array, rows: NDArray[np.intp]) -> None:
         """Refuse solutions at some points that leave motions free, the most singular one first."""
         system, at = self._system, self._geometry.at(rows, len(self._points))
-        _, jacobians = system.evaluate(x[rows], self._targets[rows], at)
+        _, jacobians = system.evaluate(x[rows], system.prepare(self._targets[rows], at), at)
         values = np.linalg.svd(jacobians / system.units, compute_uv=False)
         smallest = values[:, system.n_x - 1] if values.shape[1] >= system.n_x else 0.0
         largest = values.max(axis=1, initial=0.0)  # without closures there are no values
@@ -348,10 +352,11 @@ class _Path:
             the solutions that are certainly not singular (if that matters).
         """
         system, tolerance, x = self._system, self._tolerance, np.array(start)
+        prepared = system.prepare(p, self._geometry.at(points, len(self._points)))
 
         def evaluate(rows: NDArray[np.intp], x: Array) -> tuple[Array, Array, Array]:
             at = self._geometry.at(points[rows], len(self._points))
-            residuals, jacobians = system.evaluate(x, p[rows], at)
+            residuals, jacobians = system.evaluate(x, prepared[rows], at)
             return residuals, jacobians, np.abs(residuals).max(axis=1, initial=0.0)
 
         residuals, jacobians, worst = evaluate(np.arange(len(x)), x)

@@ -7,7 +7,7 @@ to drives. `continuation` solves the equations.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -26,6 +26,9 @@ from orthocal.robot.model import Robot, require_commanded_tool, require_tcp
 
 MOST_TRANSMISSIONS = 8
 """Tables of postures whose rod forces are remembered for one robot."""
+
+MOST_SOLUTIONS, MOST_KEPT = 16, 200
+"""Sets of postures whose solutions from the reference posture are kept, and postures of a set."""
 
 MOST_REPETITIONS = 10
 SETTLED = 1e-9
@@ -66,6 +69,7 @@ class LoopClosure:
         self.fixed = {k: v for k, v in (fixed or {}).items() if k not in self.free}
         """Values of the parameters that are not free."""
         self._fixed = self._functions.errors.expand(self.fixed)
+        self._solutions = _solutions(robot)
 
     def close(
         self,
@@ -101,22 +105,31 @@ class LoopClosure:
                 or, unless free motions are allowed, singular; names the posture and the residual.
         """
         d, single = self._as_commands(drives)
-        geometry, batch = self._batch(theta, errors, d)
-        system = self._closing
-        if allow_free:
-            system = copy.copy(system)
-            system.shortest = True
-        passive = solve_closures(
-            system,
-            d,
-            geometry,
-            machines=len(geometry.drive_errors),
-            start=start,
-            names=names,
-            failures=failures,
-            allow_singular=allow_free,
-        )
-        passive = passive if batch else passive[0]
+        at: Array = self.errors(theta) if errors is None else np.asarray(errors, dtype=np.float64)
+
+        def solve() -> Array:
+            geometry, batch = self._batch(None, at, d)
+            system = self._closing
+            if allow_free:
+                system = copy.copy(system)
+                system.shortest = True
+            passive = solve_closures(
+                system,
+                d,
+                geometry,
+                machines=len(geometry.drive_errors),
+                start=start,
+                names=names,
+                failures=failures,
+                allow_singular=allow_free,
+            )
+            return passive if batch else passive[0]
+
+        from_reference = start is None and failures is None and not allow_free
+        if from_reference and at.ndim == 1 and len(d) <= MOST_KEPT:
+            passive = self._solutions.find((at.tobytes(), d.tobytes()), solve)
+        else:
+            passive = solve()
         return passive[..., 0, :] if single else passive
 
     def forward(
@@ -348,14 +361,17 @@ class LoopClosure:
         robot, function = self.robot, self._functions.closure_by_passive
         map_ = self._functions.errors
 
-        def evaluate(x: Array, p: Array, geometry: MachineGeometry) -> tuple[Array, Array]:
-            actuated = map_.actuate(p, geometry.drive_errors)
+        def prepare(p: Array, geometry: MachineGeometry) -> Array:
+            return map_.actuate(p, geometry.drive_errors)
+
+        def evaluate(x: Array, actuated: Array, geometry: MachineGeometry) -> tuple[Array, Array]:
             g, g_q = function(actuated, x, geometry.placements)
             return g, g_q
 
         return System(
             robot,
             evaluate,
+            prepare=prepare,
             index=robot.passive_index,
             start=robot.reference_passive,
             origin=map_.command(robot.drive_zero),
@@ -386,7 +402,38 @@ class LoopClosure:
         neutral = map_.command(robot.drive_zero)[n_d:]
         origin = np.concatenate([tool_at_zero[chosen], neutral])
         start = np.concatenate([robot.drive_zero, robot.reference_passive])
-        return System(robot, evaluate, index=index, start=start, origin=origin, n_tool=len(chosen))
+        return System(
+            robot,
+            evaluate,
+            prepare=lambda p, _: p,
+            index=index,
+            start=start,
+            origin=origin,
+            n_tool=len(chosen),
+        )
+
+
+class _Solutions:
+    """The last solutions from the reference posture: every model of a session begins with them."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[bytes, bytes], Array] = {}
+
+    def find(self, key: tuple[bytes, bytes], solve: Callable[[], Array]) -> Array:
+        """The solution of a key, solved now if it is not among the last ones."""
+        solution = self._kept.pop(key, None)
+        if solution is None:
+            solution = solve()
+        self._kept[key] = solution
+        while len(self._kept) > MOST_SOLUTIONS:
+            self._kept.pop(next(iter(self._kept)), None)
+        return np.array(solution)
+
+
+@cached_per_robot(maxsize=8)
+def _solutions(robot: Robot) -> _Solutions:
+    """Solutions of a robot, with errors or without."""
+    return _Solutions()
 
 
 @cached_per_robot(maxsize=8)

@@ -53,6 +53,10 @@ def rows_without(session: Session, name: str) -> Indices:
 
 def find_effects(model: LinearModel) -> list[SystematicEffect]:
     """Effects that the readings of a session could show, but the model lacks."""
+    return model.share("effects", lambda: _find_effects(model))
+
+
+def _find_effects(model: LinearModel) -> list[SystematicEffect]:
     session, effects = model.problem.session, []
     for name in missing_effects(session):
         lacking = rows_without(session, name)

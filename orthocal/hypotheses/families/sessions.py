@@ -13,7 +13,7 @@ import numpy as np
 from orthocal.arrays import Array, Indices
 from orthocal.hypotheses.anomaly import AnomalyKind, Explanation
 from orthocal.hypotheses.hypothesis import Family, MachineShift
-from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.hypotheses.linear_model import LinearModel, linear_model
 from orthocal.session.session import Session
 
 MOST_DRIVES = 6
@@ -204,11 +204,11 @@ def detectable_changes(session: Session) -> dict[str, float]:
     Raises:
         ClosureError: If the machine cannot reach a posture.
     """
-    model = LinearModel(session)
+    model = linear_model(session)
     if len(model.labels) < 2 or model.dof < 1:
         return {}
     problem, offsets = model.problem, model.offsets
-    about = model.linearise(np.zeros(problem.n_free), (), None, slopes=True)
+    about = model.at_reference(slopes=True)
     sizes = dict.fromkeys(offsets, 0.0)
     sessions = np.arange(len(model.labels))
     steps = [np.isin(sessions, later) for later, apart in divide_sessions(model.order) if not apart]
