@@ -14,7 +14,9 @@ from conftest import ROOT
 
 import orthocal
 from orthocal import calibrate, draw_scene, load_session
+from orthocal.effects import registry as effect_registry
 from orthocal.errors import NotIdentifiableError
+from orthocal.sensors import registry as sensor_registry
 from orthocal.session.session import Purpose
 
 pytestmark = pytest.mark.usefixtures("without_plots")
@@ -80,8 +82,22 @@ def beside_examples(tmp_path_factory):
     return make
 
 
+@pytest.fixture
+def registries():
+    """Sensors and effects that a page registers exist within the test only."""
+    kinds = [
+        (sensor_registry.sensor_kinds, sensor_registry.unregister_sensor),
+        (effect_registry.effect_names, effect_registry.unregister_effect),
+    ]
+    before = [set(names()) for names, _ in kinds]
+    yield
+    for (names, unregister), known in zip(kinds, before, strict=True):
+        for name in set(names()) - known:
+            unregister(name)
+
+
 @pytest.mark.parametrize("page", with_code("python"))
-def test_the_python_of_a_page_runs(beside_examples, page):
+def test_the_python_of_a_page_runs(beside_examples, registries, page):
     folder = beside_examples()
     for code in blocks("python", page):
         done = run_here(folder, lambda code=code: exec(code, {"__name__": "__main__"}))

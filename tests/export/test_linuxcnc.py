@@ -129,7 +129,7 @@ def machine_of(robot, errors):
     """A stand-in for the calibration of a machine with known errors."""
     n = len(robot.drives)
     return SimpleNamespace(
-        assessment=SimpleNamespace(entries=()),
+        assessment=SimpleNamespace(entries=(), backlash=()),
         robot=robot,
         errors=errors,
         active_offsets=np.zeros(n),

@@ -9,6 +9,7 @@ from orthocal.assessment.recommendation import Recommendation
 from orthocal.assessment.wording import joined, mm, note, tool_mm
 from orthocal.calibration.assessment_record import Finding
 from orthocal.effects.registry import order_effects
+from orthocal.io.documents import LARGEST_NUMBER
 from orthocal.units import MM, UM
 
 
@@ -30,7 +31,8 @@ def describe_recommendation(found: Recommendation, *, chosen: str | None = None)
     other = -found.of(chosen) + evidence if chosen is not None else math.nan
     numbers = {"log_evidence": evidence}
     if math.isfinite(other) and chosen != found.model:
-        numbers["log_evidence_against_chosen"] = other
+        # of a gauge that would be far finer than any machine, without meaning as a number
+        numbers["log_evidence_against_chosen"] = min(max(other, -LARGEST_NUMBER), LARGEST_NUMBER)
     findings = [note("recommended", f"Recommended model: {found.model}. {reason}", **numbers)]
     if found.tolerance_scale != 1.0:
         findings.append(
