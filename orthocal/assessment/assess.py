@@ -205,7 +205,7 @@ def check_session(session: Session, *, judgement: Judgement | None = None) -> As
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Chosen:
-    """What to enter, and the tool error with it."""
+    """Values to enter, and the tool error with them."""
 
     entries: tuple[ControllerEntry, ...]
     backlash: tuple[BacklashEntry, ...]

@@ -75,7 +75,7 @@ class Offsets(StrEnum):
 
 
 class Backlash(StrEnum):
-    """What takes up the backlash of the drives."""
+    """Part that takes up the backlash of the drives."""
 
     PROGRAM = "program"
     CONTROLLER = "controller"

@@ -23,7 +23,6 @@ import numpy as np
 from pydantic import Field
 
 from orthocal.arrays import Array
-from orthocal.errors import SessionError
 from orthocal.io.documents import Name, Number, PositiveNumber
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.mounting import SCALE
@@ -35,6 +34,7 @@ from orthocal.sensors.protocol import (
     Sensor,
     SetupKeys,
     View,
+    require_tool,
 )
 from orthocal.units import MM, read_limit, show_limit, tidy, to_mm
 
@@ -136,11 +136,7 @@ class BallBar:
         Raises:
             SessionError: Naming the key.
         """
-        if robot.tcp is None:
-            raise SessionError(
-                f"'{robot.name}' has no tool for a ball bar; add orthocal.tcp to {robot.yaml}",
-                where=f"{where}.sensor",
-            )
+        require_tool(robot, "a ball bar", where=where)
 
     @property
     def place(self) -> tuple[str, str]:

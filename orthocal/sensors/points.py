@@ -38,6 +38,7 @@ from orthocal.sensors.protocol import (
     Sensor,
     SetupKeys,
     View,
+    require_tool,
 )
 from orthocal.units import MM, MRAD, UM, read_limit, show_limit, tidy, to_mm
 
@@ -203,11 +204,7 @@ class Points:
         Raises:
             SessionError: Naming the key.
         """
-        if robot.tcp is None:
-            raise SessionError(
-                f"'{robot.name}' has no tool for a target; add orthocal.tcp to {robot.yaml}",
-                where=f"{where}.sensor",
-            )
+        require_tool(robot, "a target", where=where)
 
     @property
     def place(self) -> tuple[str, str]:

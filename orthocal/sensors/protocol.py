@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from orthocal.arrays import Array
 from orthocal.effects.protocol import Condition
+from orthocal.errors import SessionError
 from orthocal.io.documents import Name
 from orthocal.kinematics.symbolic import Pose
 from orthocal.robot.model import Robot
@@ -206,6 +207,19 @@ class Sensor(Protocol):
             at_zero: Poses of its frames in the reference posture, shape (4, 4) each.
             robot: The robot.
         """
+
+
+def require_tool(robot: Robot, noun: str, *, where: str) -> None:
+    """Refuse a robot without a tool for a sensor at the tool.
+
+    Raises:
+        SessionError: Naming the key; `where` is the setup's file and key.
+    """
+    if robot.tcp is None:
+        raise SessionError(
+            f"'{robot.name}' has no tool for {noun}; add orthocal.tcp to {robot.yaml}",
+            where=f"{where}.sensor",
+        )
 
 
 def sensor_conditions(sensor: Sensor) -> tuple[Condition, ...]:

@@ -37,6 +37,7 @@ from orthocal.sensors.protocol import (
     Sensor,
     SetupKeys,
     View,
+    require_tool,
 )
 from orthocal.units import MM, MRAD, read_limit, show_limit, tidy, to_mm
 
@@ -251,11 +252,7 @@ class ToolIndicator:
         Raises:
             SessionError: Naming the key.
         """
-        if robot.tcp is None:
-            raise SessionError(
-                f"'{robot.name}' has no tool for an indicator; add orthocal.tcp to {robot.yaml}",
-                where=f"{where}.sensor",
-            )
+        require_tool(robot, "an indicator", where=where)
 
     @property
     def place(self) -> tuple[str, str]:

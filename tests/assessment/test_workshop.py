@@ -28,7 +28,7 @@ from orthocal.statistics.information import decompose
 NOISE = 5e-6
 STEP = 10e-6
 SIGMA = np.hypot(NOISE, STEP / np.sqrt(12.0))
-MACHINES = 24
+MACHINES = 40
 
 
 def as_measured(plan, errors, rng):

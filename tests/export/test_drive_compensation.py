@@ -345,7 +345,7 @@ def test_screws_are_inverted_exactly():
 
 # ---- programs that take up backlash themselves
 
-DENSE = 0.05
+DENSE = 0.02
 """Distance of the points at which a corrected program is followed, [mm]."""
 
 

@@ -491,3 +491,16 @@ def test_a_posture_is_passed_where_its_approach_has_the_other_direction(bar):
     rows[1] = replace(rows[1], conditions=Conditions("ppp"))
     with pytest.raises(SessionError, match="along the path of setup 'bar'"):
         plan_motion(replace(bar, readings=tuple(rows)))
+
+
+def test_a_path_returns_to_its_first_posture_from_either_side(bar):
+    """Readings state the approaches that the path gives them; the return states none."""
+    rows = tuple(Reading("bar", name) for name in "adb")
+    (motion,) = plan_motion(replace(bar, readings=rows))
+    arrived = [s.approach for s in motion.stops if s.role == "reading"]
+    stated = tuple(replace(r, conditions=Conditions(a)) for r, a in zip(rows, arrived, strict=True))
+    (again,) = plan_motion(replace(bar, readings=stated))
+    assert [s.approach for s in again.stops[:-1]] == arrived
+    assert (again.stops[-1].role, again.stops[-1].posture) == ("return", "a")
+    back = again.stops[-1].approach
+    assert back not in (arrived[0], arrived[0].translate(str.maketrans("pn", "np")))

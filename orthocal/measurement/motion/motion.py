@@ -188,7 +188,8 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
     motions = []
     for number, (setup, rows_of_setup) in enumerate(rows.items(), 1):
         if setup in guided:
-            of_setup = _list_stops(rows_of_setup, aligned_at[setup], _stops_on_path(session, setup))
+            on_path = _stops_on_path(session, setup)
+            of_setup = _list_stops(rows_of_setup, aligned_at[setup], on_path, any_side=True)
             stops = _follow_path(session, setup, of_setup, guided[setup])
         else:
             stops = _list_stops(rows_of_setup, aligned_at[setup], stop_at)
@@ -341,9 +342,20 @@ def _begin_approaches(
 
 
 def _list_stops(
-    rows: Sequence[tuple[int, Reading]], aligned_at: str, stop_at: Approaches
+    rows: Sequence[tuple[int, Reading]],
+    aligned_at: str,
+    stop_at: Approaches,
+    *,
+    any_side: bool = False,
 ) -> list[Stop]:
-    """Alignment of the gauge, stops in the order of the rows, and the first posture again."""
+    """Alignment of the gauge, stops in the order of the rows, and the first posture again.
+
+    Args:
+        rows: Lines and readings of the setup.
+        aligned_at: Alignment posture.
+        stop_at: Stops by posture and stated approach.
+        any_side: Whether the first posture is reached again from whichever side the path has.
+    """
     first_line, row = rows[0]
     first = row.minus or row.posture
     begin = stop_at[first, row.approach]
@@ -359,7 +371,10 @@ def _list_stops(
         repeats = first_line if again else None
         stop = stop_at[r.posture, r.approach]
         stops.append(replace(stop, line=line, repeats=repeats, cycle=r.cycle))
-    if (stops[-1].posture, stops[-1].approach) != (first, begin.approach):
+    if any_side:
+        begin = replace(begin, approach="u" * len(begin.approach))
+    same_side = any_side or stops[-1].approach == begin.approach
+    if stops[-1].posture != first or not same_side:
         stops.append(replace(begin, role="return", repeats=first_line))
     return stops
 
