@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocal.assessment.recommendation import STRONG, weigh_model
-from orthocal.effects.registry import order_effects
+from orthocal.effects.loading import errors_of_no_model, measurable_effects
+from orthocal.effects.registry import find_effect, order_effects
+from orthocal.errors import RobotError
 from orthocal.estimation.selection import complete_model
-from orthocal.hypotheses.anomaly import EFFECT_KINDS
 from orthocal.hypotheses.families.effects import missing_effects, rows_without
 from orthocal.hypotheses.linear_model import LinearModel
 from orthocal.session.session import Session
@@ -43,6 +44,8 @@ class EffectComparison:
     """Those for which the evidence is strong, whatever left-out setups say."""
     identified: tuple[str, ...]
     """Effects that the session or its robot chooses."""
+    named: tuple[str, ...]
+    """Errors of recommended effects that no model contains: `--free` names them."""
     lacking: Mapping[str, tuple[int, str]]
     """Effect that was not weighed to the number of readings without its conditions, and the place
     of the first."""
@@ -56,7 +59,7 @@ class EffectComparison:
 def compare_effects(session: Session) -> EffectComparison | None:
     """Weigh the effects that a session or its robot chooses; without a choice all possible ones.
 
-    Without a choice drift needs the time of the readings, as the others need their conditions.
+    Without a choice drift needs the time of the readings, not only their order.
 
     Args:
         session: The session, or several that were joined.
@@ -70,18 +73,20 @@ def compare_effects(session: Session) -> EffectComparison | None:
     candidates, lacking = _candidates(session)
     chosen = tuple(session.robot.effect_names)
     if not candidates:
-        return EffectComparison((), (), chosen, lacking) if lacking else None
-    others = [n for n in session.robot.effect_names if n not in EFFECT_KINDS]
+        return EffectComparison((), (), chosen, (), lacking) if lacking else None
+    present = [e.name for e in measurable_effects(session.robot)]
+    computed = [n for n in chosen if n not in present]
     model = complete_model(session.robot.parameters)
     known: dict[tuple[str, ...], tuple[float, float]] = {}
 
     def weigh(names: Sequence[str]) -> float:
         trial = order_effects(names)
         if trial not in known:
-            with_them = session.with_effects((*others, *trial))
-            errors = LinearModel(with_them).predict_left_out(session.values)
+            with_them = session.with_effects((*computed, *trial))
+            free = errors_of_no_model(with_them.robot)
+            errors = LinearModel(with_them, free=free).predict_left_out(session.values)
             rms = float(np.sqrt(np.mean(errors**2)))
-            known[trial] = weigh_model(with_them, model)[0], rms
+            known[trial] = weigh_model(with_them, model, free=free)[0], rms
         return known[trial][0]
 
     weigh(())
@@ -92,20 +97,22 @@ def compare_effects(session: Session) -> EffectComparison | None:
             break
         supported = order_effects((*supported, likeliest))
     weighed = [WeighedEffects(n, e - known[()][0], rms) for n, (e, rms) in known.items()]
-    return EffectComparison(tuple(weighed), supported, chosen, lacking)
+    named = errors_of_no_model(session.with_effects(supported).robot)
+    return EffectComparison(tuple(weighed), supported, chosen, named, lacking)
 
 
 def _candidates(session: Session) -> tuple[list[str], dict[str, tuple[int, str]]]:
     """Effects to weigh, and those that lack conditions in some of the readings."""
     robot = session.robot
-    present = [n for n in robot.effect_names if n in EFFECT_KINDS]
+    present = [e.name for e in measurable_effects(robot)]
     stated = any(r.conditions for r in session.readings)
     possible = missing_effects(session) if stated and robot.chosen_effects is None else ()
     timed = any(r.conditions and r.conditions.time for r in session.readings)
     candidates, lacking = [], {}
-    for name in (*present, *(n for n in possible if n in EFFECT_KINDS)):
+    for name in (*present, *possible):
         rows = rows_without(session, name)
-        if name == "drift" and name not in present and not timed:
+        conditions = find_effect(name, where="effects", error=RobotError).conditions
+        if "time" in conditions and name not in present and not timed:
             continue
         if not rows.size:
             candidates.append(name)

@@ -6,10 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthocal.effects.loading import robot_effects
-from orthocal.effects.protocol import Effect
+from orthocal.effects.loading import measurable_effects
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.robot.model import Robot
 from orthocal.statistics.information import VAGUE, Information
 from orthocal.statistics.zeros import project_out_zeros
 from orthocal.units import LIMIT, Unit
@@ -40,11 +38,6 @@ class EffectLimits:
         return self.after < DETERMINED * self.before
 
 
-def added_effects(robot: Robot) -> tuple[Effect, ...]:
-    """Effects of a robot beside those of geometry and drives."""
-    return tuple(e for e in robot_effects(robot) if e.name in robot.effect_names)
-
-
 def find_limits(problem: CalibrationProblem, noise: float) -> tuple[EffectLimits, ...]:
     """Limits of the parameters of effects after the readings of a problem.
 
@@ -55,8 +48,7 @@ def find_limits(problem: CalibrationProblem, noise: float) -> tuple[EffectLimits
         problem: Calibration problem with priors.
         noise: Standard deviation of a reading, [m].
     """
-    robot = problem.session.robot
-    effects = added_effects(robot)
+    effects = measurable_effects(problem.session.robot)
     if not effects:
         return ()
     _, jacobian = problem.predict_and_jacobian(problem.active_theta)

@@ -20,8 +20,11 @@ from orthocal.arrays import Array, Indices
 from orthocal.assessment.effect_limits import find_limits
 from orthocal.assessment.words import effects as words
 from orthocal.calibration.assessment_record import Finding
-from orthocal.effects.loading import neutral_values, robot_effects
-from orthocal.hypotheses.anomaly import EFFECT_KINDS
+from orthocal.effects.loading import (
+    errors_of_no_model,
+    measurable_effects,
+    neutral_values,
+)
 from orthocal.hypotheses.linear_model import linear_model
 from orthocal.observation.observations import drive_table
 from orthocal.session.session import Conditions, Session
@@ -43,7 +46,7 @@ def find_unshown_effects(session: Session) -> list[Finding]:
     Raises:
         ClosureError: If the nominal machine cannot reach a posture.
     """
-    if not any(name in EFFECT_KINDS for name in session.robot.effect_names):
+    if not measurable_effects(session.robot):
         return []
     findings = [*_unshown_backlash(session), *_unshown_expansion(session)]
     return [*findings, *_alike(session)] if len(session.readings) > 1 else findings
@@ -103,8 +106,10 @@ def _shows_expansion(session: Session) -> bool:
 
 def _alike(session: Session) -> Iterator[Finding]:
     """Parameters of effects that change the readings alike."""
-    model = linear_model(session)
+    free = errors_of_no_model(session.robot)
+    model = linear_model(session, free=free)
     about = model.at_reference(slopes=True)
+    effects = {e.name: e for e in measurable_effects(session.robot)}
     members = _members(session, model.problem.free)
     every = [i for indices in members.values() for i in indices]
     columns, others = about.slopes[:, every], np.delete(about.slopes, every, axis=1)
@@ -123,18 +128,18 @@ def _alike(session: Session) -> Iterator[Finding]:
         alike = _explained(information, seen[one], seen[other], same=one == other)
         if alike:
             partners = sorted({labels[q] for _, q in alike} - {labels[p] for p, _ in alike})
-            yield words.effects_alike(one, other, [labels[p] for p, _ in alike], partners)
+            yield words.effects_alike(
+                effects[one], effects[other], [labels[p] for p, _ in alike], partners
+            )
 
 
 def _members(session: Session, free: tuple[str, ...]) -> dict[str, list[int]]:
     """Places of the parameters of each effect among the free ones."""
     members: dict[str, list[int]] = {}
-    for effect in robot_effects(session.robot):
-        if type(effect).name not in EFFECT_KINDS:
-            continue
+    for effect in measurable_effects(session.robot):
         names = {e.name for e in effect.errors}
         names |= {f"setup.{s}.{e.name}" for s in session.setups for e in effect.setup_errors}
-        members[type(effect).name] = [i for i, name in enumerate(free) if name in names]
+        members[effect.name] = [i for i, name in enumerate(free) if name in names]
     return members
 
 

@@ -111,13 +111,19 @@ def _recommend(session: Session, models: tuple[str, ...]) -> Recommendation:
     return Recommendation(complete, scale, tuple(evidence), gain if strong_scale else 0.0)
 
 
-def weigh_model(session: Session, model: str) -> tuple[float, Array]:
-    """Ln p(y | M) at the stated tolerances, and at each of SCALES, shape (n_scales,)."""
+def weigh_model(session: Session, model: str, *, free: tuple[str, ...] = ()) -> tuple[float, Array]:
+    """Ln p(y | M) at the stated tolerances, and at each of SCALES, shape (n_scales,).
+
+    Args:
+        session: The session, or several that were joined.
+        model: Name of the model.
+        free: Names of further errors that are free.
+    """
     total, by_scale = 0.0, np.zeros(SCALES.size)
     for part in split_sessions(session):
         if len(part.readings) < 2:
             continue
-        readings = linear_model(part, model)
+        readings = linear_model(part, model, free=free)
         about = readings.most_likely(part.values)
         deviation = readings.entries(part.values[None])[0] - about.expected
         stated = readings.stated

@@ -158,6 +158,20 @@ def robot_effects(robot: Robot) -> tuple[Effect, ...]:
     return tuple(effects)
 
 
+def measurable_effects(robot: Robot) -> tuple[Effect, ...]:
+    """Effects of a robot beside those of geometry and drives, with parameters to identify."""
+    return tuple(
+        e
+        for e in robot_effects(robot)
+        if e.name in robot.effect_names and (e.errors or e.setup_errors)
+    )
+
+
+def errors_of_no_model(robot: Robot) -> tuple[str, ...]:
+    """Names of the errors of effects that must be named to be identified: not `complete`."""
+    return tuple(e.name for f in measurable_effects(robot) for e in f.errors if not e.complete)
+
+
 def neutral_values(robot: Robot) -> dict[Condition, float]:
     """Values of conditions that are not stated, at which the effects of a robot change nothing."""
     values = dict(NEUTRAL)

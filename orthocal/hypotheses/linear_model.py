@@ -119,17 +119,20 @@ class LinearModel:
     Args:
         session: A session, or several joined ones.
         model: Name of the model of the errors that the machine may have; all by default.
+        free: Names of further errors.
 
     Raises:
         RobotError: If closures of the robot depend on each other.
-        ParameterError: If the model is unknown.
+        ParameterError: If the model or a name is unknown.
     """
 
-    def __init__(self, session: Session, model: str | None = None) -> None:
+    def __init__(
+        self, session: Session, model: str | None = None, *, free: tuple[str, ...] = ()
+    ) -> None:
         session = _refer_to_most_corrected(session)
         parameters = session.robot.parameters
         names = machine_errors(session.robot) if model is None else parameters.select_model(model)
-        selection = select_parameters(parameters, free=names, prior=True)
+        selection = select_parameters(parameters, free=[*names, *free], prior=True)
         problem = CalibrationProblem(session, selection)
         self.problem = problem.with_noise_ratio(initial_noise_ratio(session, problem.observations))
         o = self.problem.observations
@@ -467,26 +470,29 @@ class LinearModel:
         return float(np.sqrt(np.mean(self.problem.observations.rows(residuals) ** 2)))
 
 
-def linear_model(session: Session, model: str | None = None) -> LinearModel:
+def linear_model(
+    session: Session, model: str | None = None, *, free: tuple[str, ...] = ()
+) -> LinearModel:
     """Linearised model; of the last sessions with the same rows it is built once.
 
     Args:
         session: As for `LinearModel`.
         model: As for `LinearModel`.
+        free: As for `LinearModel`.
 
     Raises:
         ParameterError, RobotError: As for `LinearModel`.
     """
     if len(session.gauges) > 1:  # their relative noise may come from the values
-        return LinearModel(session, model)
-    return _build(_Rows(session, model)).with_values(session.values)
+        return LinearModel(session, model, free=free)
+    return _build(_Rows(session, model, free)).with_values(session.values)
 
 
 class _Rows:
     """All of a session but the values of its readings; equal for the same objects."""
 
-    def __init__(self, session: Session, model: str | None) -> None:
-        self.session, self.model = session, model
+    def __init__(self, session: Session, model: str | None, free: tuple[str, ...]) -> None:
+        self.session, self.model, self.free = session, model, free
         offsets = session.controller_offsets
         same = (
             *(session.robot, session.postures, session.setups, *session.gauges.values()),
@@ -494,7 +500,7 @@ class _Rows:
         )
         self._key = (
             *map(id, same),
-            *(None if offsets is None else offsets.tobytes(), session.joined, model),
+            *(None if offsets is None else offsets.tobytes(), session.joined, model, free),
             tuple(
                 (r.setup, r.posture, r.minus, r.cycle, r.line, r.file, r.conditions)
                 for r in session.readings
@@ -510,7 +516,7 @@ class _Rows:
 
 @lru_cache(maxsize=KEPT)
 def _build(rows: _Rows) -> LinearModel:
-    return LinearModel(rows.session, rows.model)
+    return LinearModel(rows.session, rows.model, free=rows.free)
 
 
 def _refer_to_most_corrected(session: Session) -> Session:

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from datetime import timedelta
 from typing import NamedTuple
 
-from orthocal.assessment.effect_limits import EffectLimits, added_effects, find_limits
+from orthocal.assessment.effect_limits import EffectLimits, find_limits
 from orthocal.assessment.effect_separability import WARMER
-from orthocal.effects.loading import neutral_values
+from orthocal.effects.loading import measurable_effects, neutral_values
 from orthocal.effects.protocol import Condition
 from orthocal.planning.expected_error import noise_of
 from orthocal.planning.plan_comparison import Comparison
@@ -63,7 +63,7 @@ def find_further_readings(
         One for each effect: the shortest that determine it, or else the longest that are tried.
         None for effects that no readings of these kinds would show.
     """
-    conditions = {e.name: e.conditions for e in added_effects(comparison.plan.robot)}
+    conditions = {e.name: e.conditions for e in measurable_effects(comparison.plan.robot)}
     proposals = []
     for limit in limits:
         tried = list[FurtherReadings]()

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from commands import run_orthocal
 from effect_plans import write_plan
+from slack import Slack, SlackKeys
 
 from orthocal import calibrate, load_plan, load_session, simulate_session, write_session
 from orthocal.assessment.comparison import compare_models
 from orthocal.assessment.effect_comparison import compare_effects
 from orthocal.assessment.words.comparison import describe_effects
 from orthocal.calibration.assessment_record import EXIT_CODES
+from orthocal.effects import registry
 from orthocal.estimation.options import SolverOptions
 from orthocal.hypotheses.linear_model import LinearModel
 
@@ -58,6 +60,34 @@ def test_a_machine_without_effects_needs_none(plan):
     errors = {n: v for n, v in ERRORS.items() if "backlash" not in n}
     session = simulate_session(plan, errors, seed=4).session.with_effects(None)
     assert compare_effects(session).recommended == ()
+
+
+@pytest.fixture
+def slack(tmp_path):
+    """Readings of a machine with an effect of another package, whose YAML does not name it."""
+    registry.register_effect(Slack)
+    plan = load_plan(write_plan(tmp_path / "plan", effects="thermal: {}"))
+    plan = plan.select([r for r in plan.readings if r.setup in ("yx", "xy", "xz")])
+    truth = {"y_leg.length": 40e-6, "x_slide.slack": 30e-6, "y_slide.slack": 50e-6}
+    machine = plan.with_effects(["slack"])
+    yield simulate_session(machine, truth, seed=4).session.with_effects(None)
+    registry.unregister_effect("slack")
+
+
+def test_an_effect_of_another_package_is_weighed_like_those_of_orthocal(slack):
+    """It explains what backlash explains, and the waves of the screws besides."""
+    bare = slack.with_effects(["slack"])
+    found = compare_effects(bare)
+    assert [w.effects for w in found.weighed] == [(), ("slack",)]
+    assert found.recommended == ("slack",)
+    assert found.best.log_evidence > 10.0
+    assert set(found.named) == {e.name for e in Slack.from_keys(SlackKeys(), bare.robot).errors}
+    (note, *_) = describe_effects(found, 40)
+    assert "--effects slack --model full --free '" in note.action
+    every = compare_effects(slack)
+    alone = {w.effects: w.log_evidence for w in every.weighed if len(w.effects) < 2}
+    assert {("backlash",), ("thermal",), ("drift",), ("slack",)} < set(alone)
+    assert alone[("slack",)] == pytest.approx(found.best.log_evidence, abs=0.5)
 
 
 def test_readings_without_conditions_are_not_weighed(root, session):

@@ -7,8 +7,9 @@ import shlex
 from collections.abc import Callable, Sequence
 
 from orthocal.assessment.wording import joined, mm, note, plain, review, signed, um
+from orthocal.assessment.words.effects import identify_effects
 from orthocal.calibration.assessment_record import Finding, Place
-from orthocal.effects.loading import robot_effects, with_effects
+from orthocal.effects.loading import errors_of_no_model, robot_effects, with_effects
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, Explanation
 from orthocal.session.session import Session
 from orthocal.text import printable, spans
@@ -73,15 +74,7 @@ def _effect_remedy(session: Session, result: Anomalies) -> str:
     """Calibration with all effects that were found, beside those that the machine has."""
     found = [a.explanation.effect for a in result.found if a.explanation.amounts]
     robot = with_effects(session.robot, (*session.robot.effect_names, *found))
-    names = ",".join(robot.effect_names)
-    free = [e.name for f in robot_effects(robot) if f.name in found for e in f.errors]
-    free = [name for name in free if not robot.parameters.elementary[name].complete]
-    if not free:
-        return f"Calibrate with `--effects {names}`."
-    kinds = [f"*.{name.rpartition('.')[2]}" for name in free]  # no part of the model `full`
-    globs = [k if kinds.count(k) > 1 else n for k, n in zip(kinds, free, strict=True)]
-    patterns = ",".join(dict.fromkeys(globs))
-    return f"Calibrate with `--effects {names} --model full --free '{patterns}'`."
+    return identify_effects(robot.effect_names, errors_of_no_model(robot))
 
 
 def _describe_effect(session: Session, name: str) -> str:

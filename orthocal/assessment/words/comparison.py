@@ -7,6 +7,7 @@ import math
 from orthocal.assessment.effect_comparison import EffectComparison
 from orthocal.assessment.recommendation import Recommendation
 from orthocal.assessment.wording import joined, mm, note, tool_mm
+from orthocal.assessment.words.effects import identify_effects
 from orthocal.calibration.assessment_record import Finding
 from orthocal.effects.registry import order_effects
 from orthocal.io.documents import LARGEST_NUMBER
@@ -78,7 +79,7 @@ def describe_effects(found: EffectComparison | None, readings: int) -> list[Find
     else:
         names, missing = found.recommended, set(found.recommended) - set(found.identified)
         them, are = ("it", "is") if len(names) == 1 else ("them", "are")
-        worse = best.unseen_rms > none.unseen_rms
+        worse = round(best.unseen_rms / MM, 3) > round(none.unseen_rms / MM, 3)  # as printed
         text = (
             f"Recommended effects: {joined(names)}. The readings are much more likely with {them} "
             f"(ln evidence {best.log_evidence:+.1f}). Left-out setups are predicted "
@@ -87,9 +88,9 @@ def describe_effects(found: EffectComparison | None, readings: int) -> list[Find
         )
         text += "; the evidence counts, which is of all readings together." if worse else "."
         action = ""
-        if missing:
+        if missing or found.named:
             every = order_effects({*found.identified, *names})
-            action = f"Calibrate with `--effects {','.join(every)}`."
+            action = identify_effects(every, found.named)
         else:
             text += f" {joined(names).capitalize()} {are} identified already."
     numbers = {"log_evidence": best.log_evidence, "unseen_rms_mm": best.unseen_rms / MM}

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from orthocal.assessment.wording import joined, named, note
 from orthocal.calibration.assessment_record import Finding, Place
+from orthocal.effects.protocol import Effect
 
 PARTS = {
     "backlash": "backlash",
@@ -13,7 +14,23 @@ PARTS = {
     "screw": "the periodic error of the screws",
     "drift": "the drift of the gauge",
 }
-"""Effects in words."""
+"""Effects of orthocal in words."""
+
+
+def identify_effects(effects: Sequence[str], free: Sequence[str]) -> str:
+    """The advice to identify effects.
+
+    Args:
+        effects: Names of all effects to identify.
+        free: Names of those of their parameters that no model contains.
+    """
+    names = ",".join(effects)
+    if not free:
+        return f"Calibrate with `--effects {names}`."
+    kinds = [f"*.{name.rpartition('.')[2]}" for name in free]  # no part of the model `full`
+    globs = [k if kinds.count(k) > 1 else n for k, n in zip(kinds, free, strict=True)]
+    patterns = ",".join(dict.fromkeys(globs))
+    return f"Calibrate with `--effects {names} --model full --free '{patterns}'`."
 
 
 def approach_not_stated() -> Finding:
@@ -66,19 +83,20 @@ def one_temperature(temperature: float | None, setup: str) -> Finding:
 
 
 def effects_alike(
-    one: str, other: str, parameters: Sequence[str], partners: Sequence[str]
+    one: Effect, other: Effect, parameters: Sequence[str], partners: Sequence[str]
 ) -> Finding:
     """Parameters of effects that change the readings alike."""
+    first, second = (PARTS.get(e.name, e.describe()) for e in (one, other))
     what = f"{joined(parameters)} from {joined(partners)}" if partners else joined(parameters)
     why = (
-        f"{PARTS[one]} and {PARTS[other]} change them alike"
-        if one != other
-        else f"these parts of {PARTS[one]} change them alike"
+        f"{first} and {second} change them alike"
+        if one is not other
+        else f"these parts of {first} change them alike"
     )
     return note(
         "effects inseparable",
         f"These readings do not separate {what}: {why}.",
-        _separating({one, other}),
+        _separating({one.name, other.name}),
         named(*parameters, *partners),
     )
 

@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from orthocal.arrays import Indices
-from orthocal.effects.loading import with_effects
-from orthocal.effects.registry import BUILT_IN, effect_names, find_effect
+from orthocal.effects.loading import measurable_effects, with_effects
+from orthocal.effects.registry import effect_names, find_effect, order_effects
 from orthocal.errors import RobotError
 from orthocal.hypotheses.anomaly import EFFECT_KINDS, Explanation
 from orthocal.hypotheses.hypothesis import Family, Rows, SystematicEffect, group_rows
@@ -29,18 +29,17 @@ LEAST_COLUMN = 1e-3
 
 
 def missing_effects(session: Session) -> tuple[str, ...]:
-    """Names of the effects that the robot of a session could have, and has not."""
-    names = []
-    built_in = {effect.name for effect in BUILT_IN}
-    others = [name for name in effect_names() if name not in built_in]
-    for name in (*EFFECT_KINDS, *others):
-        if name in session.robot.effect_names:
+    """Names of the effects with parameters that the robot of a session could have, and has not."""
+    present, names = session.robot.effect_names, []
+    for name in order_effects(effect_names()):
+        if name in present:
             continue
         try:
-            with_effects(session.robot, (*session.robot.effect_names, name))
+            robot = with_effects(session.robot, (*present, name))
         except RobotError:  # the YAML lacks one of its keys, or a package is broken
             continue
-        names.append(name)
+        if any(e.name == name for e in measurable_effects(robot)):
+            names.append(name)
     return tuple(names)
 
 
