@@ -273,9 +273,9 @@ def gauss_box(robot: Robot, box: ArrayLike) -> Workspace:
 def find_workspace(robot: Robot, reach: Callable[[Array], object] | None = None) -> Workspace:
     """Workspace of a robot, or of a machine that must reach it.
 
-    The box in the robot's YAML, or a cube of ±60 mm; a smaller box of the same shape where the
-    machine does not reach that one. Its largest side is a whole number of millimetres, or has two
-    digits below 10 mm.
+    The box in the robot's YAML, or the largest cube of at most ±60 mm that the nominal machine
+    reaches; a smaller box of the same shape where the machine does not reach that one. Its largest
+    side is a whole number of millimetres, or has two digits below 10 mm.
 
     Args:
         robot: The robot.
@@ -291,8 +291,8 @@ def find_workspace(robot: Robot, reach: Callable[[Array], object] | None = None)
     """
     require_commanded_tool(robot)
     if reach is not None:
-        requested = cube_limits(robot) if robot.workspace is None else robot.workspace
-        reached = _largest_box(robot, requested, reach)
+        box = _default_workspace(robot).limits if robot.workspace is None else robot.workspace
+        reached = _largest_box(robot, box, reach)
         complete = robot.workspace is None or reached.box is robot.workspace
         return reached if complete else replace(reached, requested=robot.workspace)
     if robot.workspace is None:

@@ -35,6 +35,15 @@ def test_the_default_is_a_cube_of_60_mm(orthoglide):
     assert find_workspace(orthoglide).words == "the workspace ±60 mm"
 
 
+def test_a_machine_that_reaches_more_keeps_the_default_of_the_nominal_one(tmp_path):
+    """Plans are made for the nominal machine, tool errors for the calibrated one."""
+    lower, upper = 0.15, 0.34
+    robot = make_robot(Dimensions(leg=0.28, lower=lower, upper=upper), tmp_path / "small")
+    planned = find_workspace(robot)
+    assert planned.half_side < 0.06
+    assert np.array_equal(find_workspace(robot, lambda points: None).limits, planned.limits)
+
+
 def test_rules_over_a_box_are_exact_for_polynomials(orthoglide):
     """Mean of x² y over the box, by its antiderivative; all rules lie within the limits."""
     low, high = np.array(BOX).T
