@@ -22,6 +22,7 @@ from orthocal.assessment.calibrated_tool import CalibratedTool, error_covariance
 from orthocal.calibration.assessment_record import BacklashEntry, ControllerEntry
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
+from orthocal.effects.compensation import Compensation, JointTrim
 from orthocal.io.fields import read_only
 
 DECIDED = 1e-2
@@ -66,6 +67,19 @@ def backlash_changes(calibration: Calibration, entries: Sequence[BacklashEntry])
     """Changes of the backlash that the controller takes up, shape (n_drives,), [m, rad]."""
     changes = {e.drive: e.change for e in entries}
     return np.array([changes.get(d.name, 0.0) for d in calibration.robot.drives])
+
+
+def compensation_to_enter(calibration: Calibration) -> Compensation:
+    """Compensation of a controller that takes up the backlash to enter.
+
+    Empty where nothing changes, and beside tables: an export writes others.
+    """
+    changes = backlash_changes(calibration, find_backlash(calibration))
+    tables = any(trim.table is not None for trim in calibration.session.compensation)
+    if tables or not changes.any():
+        return ()
+    entered = np.round(calibration.compensated_backlash + changes, ENTERED_DECIMALS)
+    return tuple(map(JointTrim, entered.tolist()))
 
 
 def lowers(now: float, then: float) -> bool:

@@ -38,7 +38,7 @@ def again(
     anyway: Anyway = False,
     force: Force = False,
 ) -> None:
-    """Plan the same readings again, with the offsets to enter.
+    """Plan the same readings again, with the offsets and the backlash to enter.
 
     The directory receives session.yaml, an empty readings.csv and a measuring sheet.
 
@@ -50,9 +50,12 @@ def again(
         adjusted (NAME=MM,...): Mechanical adjustments since the calibration and their amounts, such
             as x_outer_foot_y=0.12; or plan, for those that `orthocal adjust` prints.
         ini (FILE): INI file of LinuxCNC with the entered lines, or joints.ini of an export, whose
-            BACKLASH and COMP_FILE the session then states; default: those of the last session.
+            BACKLASH and COMP_FILE the session then states; default: the backlash to enter, and the
+            tables of the last session.
     """
+    from orthocal.assessment.controller_entries import compensation_to_enter
     from orthocal.export.formats import require_entering
+    from orthocal.measurement.files.linuxcnc_ini import read_ini
 
     require_new_session(out, FILES, force=force)
     result = orthocal.load_calibration(calibration)
@@ -61,9 +64,9 @@ def again(
         require_entering(result)
     amounts = _read_amounts(result, adjusted)
     new = _plan_again(result, session, amounts)
-    if ini is not None:
-        from orthocal.measurement.files.linuxcnc_ini import read_ini
-
+    if ini is None:
+        new = replace(new, compensation=compensation_to_enter(result) or new.compensation)
+    else:
         new = replace(new, compensation=read_ini(ini, result.robot).compensation)
     comment = (
         "A plan: enter these offsets, then run `orthocal record .` in this directory, or fill in\n"
@@ -73,49 +76,31 @@ def again(
     if problem:
         put_note(problem)
     orthocal.write_session(new, out, comment=comment, extra=sheet, blank=True)
+    if amounts:
+        settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
+        put_out(f"The machine is expected with these adjustments: {settings}.")
+    put_out(_describe_entries(new))
+    put_out(f"  orthocal record {out}\n  orthocal validate {calibration} {out}")
+    put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, and sheet.html")
+
+
+def _describe_entries(new: orthocal.Session) -> str:
+    """What the controller corrects while a new session is read, in words."""
+    from orthocal.effects.compensation import describe_trims
+
     offsets = ", ".join(
         f"{d.name} {v * d.edge_factor:+.3f} {d.edge_unit}"
         for d, v in zip(new.robot.drives, new.active_offsets.tolist(), strict=True)
     )
-    if amounts:
-        settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
-        put_out(f"The machine is expected with these adjustments: {settings}.")
-    _describe_backlash(result, new, entered=ini is not None)
-    sign = _describe_signs(new.robot)
-    put_out(
-        f"Enter these offsets of the slides, home, and measure again: {offsets}.{sign}\n"
-        f"  orthocal record {out}\n"
-        f"  orthocal validate {calibration} {out}"
-    )
-    put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, and sheet.html")
-
-
-def _describe_backlash(
-    calibration: orthocal.Calibration, new: orthocal.Session, *, entered: bool
-) -> None:
-    """Print the backlash that a new session states as compensated.
-
-    Args:
-        calibration: The calibration.
-        new: The session.
-        entered: Whether an INI file states what was entered.
-    """
-    from orthocal.assessment.controller_entries import find_backlash
-    from orthocal.effects.compensation import describe_trims
-
-    if trims := describe_trims(new.robot, new.compensation):
-        put_out(f"The controller compensates backlash, as session.yaml states: {trims}.")
-    if not entered and any(e.change for e in find_backlash(calibration)):
-        put_note(
-            "session.yaml states the backlash that the controller compensated before. If you enter "
-            "another: --ini FILE with the entered lines, or controller: {backlash_mm: [...]}."
+    text = f"Enter these offsets of the slides, home, and measure again: {offsets}."
+    if down := [d.name for d in new.robot.drives if d.direction < 0]:
+        text += f" The sign is reversed for joints that count down: {', '.join(down)}."
+    if backlash := describe_trims(new.robot, new.compensation):
+        text += (
+            f"\nThe controller is expected to take up this backlash: {backlash}. If it does not, "
+            "remove it from `controller` in session.yaml."
         )
-
-
-def _describe_signs(robot: orthocal.Robot) -> str:
-    """Note about joints that count down; empty without any."""
-    down = [d.name for d in robot.drives if d.direction < 0]
-    return f" The sign is reversed for joints that count down: {', '.join(down)}." if down else ""
+    return text
 
 
 def _require_offsets(calibration: orthocal.Calibration, path: Path) -> None:

@@ -160,7 +160,7 @@ def test_again_states_the_backlash_of_the_file(folder, one, plain):
     entered = [trim.backlash for trim in second.compensation]
     identified = [result.errors[f"{d.name}.backlash"] for d in second.robot.drives]
     assert entered == pytest.approx(identified, abs=1e-7)
-    assert "x_slide" in done.stdout.partition("compensates backlash")[2]
+    assert "x_slide" in done.stdout.partition("take up this backlash")[2]
 
 
 def test_again_states_the_tables_of_the_file(folder, one):
@@ -174,8 +174,13 @@ def test_again_states_the_tables_of_the_file(folder, one):
     assert "z_slide by a table" in done.stdout
 
 
-def test_again_without_the_file_keeps_what_the_session_states(folder, one):
+def test_again_without_the_file_states_the_backlash_of_the_answer(folder, one):
+    """What `calibrate` says to enter is what the next session is read with."""
     done = run_orthocal(folder, "again", one, "--out", "second")
     assert done.returncode == 0, done.stderr
-    assert load_plan(folder / "second").compensation == ()
-    assert "compensates backlash" not in done.stdout
+    second = load_plan(folder / "second")
+    entries = load_calibration(one).assessment.backlash
+    assert any(e.change for e in entries)
+    stated = [trim.backlash for trim in second.compensation]
+    assert stated == pytest.approx([e.active + e.change for e in entries], abs=5e-7)
+    assert "x_slide" in done.stdout.partition("take up this backlash")[2]
