@@ -21,7 +21,7 @@ from orthocal.cli.options import (
 from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import put_note, put_out
 from orthocal.cli.sheet import sheet_or_problem
-from orthocal.errors import ParameterError
+from orthocal.errors import ExportError, ParameterError
 from orthocal.io.files import exists
 from orthocal.units import MM
 
@@ -42,7 +42,8 @@ def again(
 
     The directory receives session.yaml, an empty readings.csv and a measuring sheet.
 
-    Exit code 3: the verdict is not `enter`; the reason is printed, and nothing is written.
+    Exit code 3: the verdict is not `enter`, or the planned adjustments are not worth doing. The
+    reason is printed, and nothing is written.
 
     Args:
         session (SESSION): Session with the setups and postures; default: that of the calibration,
@@ -62,7 +63,7 @@ def again(
     _require_offsets(result, calibration)
     if not anyway:
         require_entering(result)
-    amounts = _read_amounts(result, adjusted)
+    amounts = _read_amounts(result, adjusted, anyway=anyway)
     new = _plan_again(result, session, amounts)
     if ini is None:
         new = replace(new, compensation=compensation_to_enter(result) or new.compensation)
@@ -117,18 +118,25 @@ def _require_offsets(calibration: orthocal.Calibration, path: Path) -> None:
         )
 
 
-def _read_amounts(calibration: orthocal.Calibration, text: str | None) -> dict[str, float]:
+def _read_amounts(
+    calibration: orthocal.Calibration, text: str | None, *, anyway: bool
+) -> dict[str, float]:
     """Adjustments of the option `--adjusted`, name to amount, [m].
 
     Raises:
         ParameterError: If the text is not NAME=MM, or a name is unknown or stated twice.
         RobotError: If adjustments are to be planned, and the robot declares none.
+        ExportError: If adjustments are to be planned, and are not worth doing.
     """
+    from orthocal.assessment.words.adjustment import HEADLINES
     from orthocal.effects.adjustment import LARGEST_AMOUNT_MM, require_adjustment
 
     where, amounts = "--adjusted", dict[str, float]()
     if text == "plan":
-        return orthocal.plan_adjustments(calibration).amounts
+        plan = orthocal.plan_adjustments(calibration)
+        if not plan.adjustments or (plan.judgement != "worthwhile" and not anyway):
+            raise ExportError(HEADLINES[plan.judgement], where=where)
+        return plan.amounts
     for part in [] if text is None else split_globs([text]):
         name, equals, value = (piece.strip() for piece in part.partition("="))
         if not equals:

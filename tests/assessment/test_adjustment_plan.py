@@ -21,6 +21,7 @@ from orthocal import (
 from orthocal.assessment.adjustment_plan import LEAST_GAIN, _Search
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.controller_entries import offsets_to_enter
+from orthocal.assessment.words.adjustment import HEADLINES
 from orthocal.calibration.adjusting import adjust_calibration
 from orthocal.effects.adjustment import find_adjustments
 from orthocal.errors import RobotError
@@ -165,6 +166,30 @@ def test_a_machine_of_right_angles_is_left_alone(plan):
     assert planned.gain < 0.05
 
 
+def test_a_second_session_is_refused_as_the_adjustment_is(plan, tmp_path):
+    """Nothing is written for a machine that `adjust` leaves as it is."""
+    from test_cli import orthocal as run
+
+    errors = {"x_slide.offset": 0.4e-3, "y_slide.rz": 1.4e-3}
+    session = simulate_session(plan, errors, seed=1, sigma=3e-6).session
+    write_calibration(calibrate(session, **QUICK), tmp_path / "calibration.json")
+    code, out, _ = run("adjust", tmp_path, "--json")
+    document = json.loads(out)
+    assert not document["worthwhile"]
+    amounts = {a["name"]: a["amount"] for a in document["adjustments"]}
+    assert amounts
+    new = tmp_path / "new"
+    words = ("again", tmp_path, "--adjusted", "plan", "--out", new)
+    code, out, err = run(*words)
+    assert code == 3
+    assert HEADLINES[document["judgement"]] in err
+    assert not out
+    assert not new.exists()
+    code, out, _ = run(*words, "--anyway")
+    assert code == 0
+    assert all(name in (new / "session.yaml").read_text() for name in amounts)
+
+
 def test_adjustments_that_are_not_worth_doing_are_details(machines, plans):
     _, calibration = machines[4]
     assert plans[4].judgement == "worthwhile"
@@ -215,6 +240,8 @@ def test_the_command_and_the_report(machines, tmp_path):
     document = json.loads(text)
     assert document["schema"] == "orthocal/adjustment/1"
     names = [a["name"] for a in document["adjustments"]]
+    assert document["worthwhile"]
+    assert run("again", tmp_path, "--adjusted", "plan", "--out", tmp_path / "planned")[0] == 0
     assert all(name in out for name in names)
     assert document["after"]["entered"] < document["before"]["entered"]
     assert names[0] in build_report(calibration)
