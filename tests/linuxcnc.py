@@ -382,6 +382,16 @@ def run_programs(runs, joints, *, letters="XYZ", lines="", module=None, files=No
             shutil.rmtree(folder, ignore_errors=True)
 
 
+def play(screws, backlash):
+    """Slides behind screws with play, shape (K, n): each moves when its play is used up."""
+    slides = np.array(screws)
+    for i, half in enumerate(0.5 * backlash):
+        at = slides[0, i]
+        for k, screw in enumerate(screws[:, i].tolist()):
+            slides[k, i] = at = min(max(at, screw - half), screw + half)
+    return slides
+
+
 def filter_program(ini, program, result):
     """Filter a program as LinuxCNC's window does, with the window's functions.
 

@@ -176,16 +176,20 @@ def read_polyline(lines, offset=(0.0, 0.0, 0.0)):
     return points
 
 
+AT_ONCE = 100_000
+"""Number of pairs of a point and a piece of a polyline that are compared at once."""
+
+
 def distances(points, polyline):
     """Distances of points from a polyline, shape (k,)."""
-    a, b = polyline[:-1], polyline[1:]
-    along = b - a
+    a, along = polyline[:-1], np.diff(polyline, axis=0)
     square = np.maximum(np.einsum("ij,ij->i", along, along), 1e-30)
-    result = np.empty(len(points))
-    for k, p in enumerate(points):
-        t = np.clip(np.einsum("ij,ij->i", p - a, along) / square, 0.0, 1.0)
-        result[k] = np.sqrt(((a + t[:, None] * along - p) ** 2).sum(axis=1).min())
-    return result
+    result, step = [], max(1, AT_ONCE // len(a))
+    for first in range(0, len(points), step):
+        away = points[first : first + step, None] - a
+        t = np.clip(np.einsum("kij,ij->ki", away, along) / square, 0.0, 1.0)
+        result.append(np.linalg.norm(away - t[..., None] * along, axis=2).min(axis=1))
+    return np.concatenate(result)
 
 
 def own_distances(points, polyline):

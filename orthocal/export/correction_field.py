@@ -240,7 +240,7 @@ class CorrectionField:
         corners = np.flatnonzero((np.abs(self._nodes) > 1.0 - 1e-12).all(axis=1))
         if self.exactly(middle[None])[1]:
             return "exact" if key[0] else fallback
-        if any(self.exactly(nodes[[i]])[1] for i in corners.tolist()):
+        if self.exactly(nodes[corners])[1]:
             return fallback
         commanded, refused = self.exactly(nodes)
         if refused:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from commands import run_orthocal
 from effect_plans import write_plan
-from linuxcnc import Joint, require_linuxcnc, run_program
+from linuxcnc import Joint, play, require_linuxcnc, run_program
 from programs import read_polyline
 from test_linuxcnc import Core, from_pieces, require_followed
 
@@ -86,14 +86,6 @@ def calibration(tmp_path_factory):
     return replace(found, assessment=replace(found.assessment, backlash=entered))
 
 
-def play(screws, backlash):
-    """Slides behind screws with play, shape (K, n): each moves when its play is used up."""
-    slides = np.array(screws)
-    for k in range(1, len(slides)):
-        slides[k] = np.clip(slides[k - 1], screws[k] - 0.5 * backlash, screws[k] + 0.5 * backlash)
-    return slides
-
-
 def follow(calibration, motors):
     """Tool of the calibrated machine whose motors were recorded, shape (K, 3), [m]."""
     robot, errors = calibration.robot, calibration.errors
@@ -152,7 +144,7 @@ def run(calibration, files, tmp_path, *, module, inverse=None, homes=None):
         "G21 G90 G61 G1 X24 Y-14 Z12 F6000",  # a way off, so that every play is taken up
         "G21 G90 G61 F1500 G1 X28 Y-8 Z15",
         "G2 X28 Y-8 Z15 I-16 J0",
-        *(f"G1 X{x:g} Y{y:g} Z{z:g}" for x, y, z in CORNERS[2:]),
+        *(f"G1 X{x:g} Y{y:g} Z{z:g} F6000" for x, y, z in CORNERS[2:]),
     ]
     lines = files["kinematics.ini" if module else "joints.ini"]
     joints = joints_of(calibration)

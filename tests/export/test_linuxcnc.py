@@ -567,11 +567,11 @@ def filtered(root, full, tmp_path):
 
 def test_linuxcnc_follows_a_path_with_a_filtered_program(root, mixed, full, filtered, tmp_path):
     """With nominal kinematics, the tip of the calibrated machine follows a circle and lines."""
-    centre, radius = (10.0, -8.0, 15.0), 10.0
-    corners = [(20.0, -8.0, 15.0), (-20.0, 10.0, -15.0), (-15.0, -20.0, 10.0)]
+    centre, radius = (10.0, -8.0, 15.0), 5.0
+    corners = [(15.0, -8.0, 15.0), (-10.0, 6.0, -8.0), (-8.0, -14.0, 5.0)]
     program = [
-        "G21 G90 G61 G0 X20 Y-8 Z15 (begins)",
-        "N1 F6000 G2 X20 Y-8 Z15 I-10 J0",
+        "G21 G90 G61 G0 X15 Y-8 Z15 (begins)",
+        "N1 F6000 G2 X15 Y-8 Z15 I-5 J0",
         *(f"G1 X{x:g} Y{y:g} Z{z:g}" for x, y, z in corners[1:]),
     ]
     code, said, progress, text = filtered(program)

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from linuxcnc import Joint, run_programs
+from linuxcnc import Joint, play, run_programs
 from machines import place
 
 from orthocal import calibrate, export_calibration, load_plan, simulate_session
@@ -426,10 +426,7 @@ def test_linuxcnc_takes_up_backlash_from_the_stated_side(small, sided, tmp_path)
     at = begun[-len(expected) :]
     assert slides[at] == pytest.approx(expected, abs=5e-4)
     backlash = np.array([0.03, 0.04, 0.05])
-    actual, follows = np.empty_like(slides), slides[0]
-    for k, commanded in enumerate(slides):  # the slide is pushed at either end of the play
-        follows = np.clip(follows, commanded - backlash / 2.0, commanded + backlash / 2.0)
-        actual[k] = follows
+    actual = play(slides, backlash)
     sides = np.array([directions(stop.approach) for stop in motion.stops])
     assert actual[at] - slides[at] == pytest.approx(-backlash / 2.0 * sides, abs=1e-6)
 
