@@ -20,6 +20,8 @@ AnomalyKind = Literal[
     "row offset",
     "stuck dial",
     "displaced gauge",
+    "displaced artefact",
+    "wrong dimension",
     "drift",
     "backlash",
     "thermal expansion",
@@ -74,7 +76,8 @@ class Explanation:
     setups: tuple[str, ...] = ()
     """Setups that are concerned as a whole."""
     names: tuple[str, ...] = ()
-    """Legs, gauges or postures that the scope refers to."""
+    """Legs, gauges or postures that the scope refers to; a displaced artefact; the key of a wrong
+    dimension and its stated size in mm."""
     cycle: int | None = None
     """The cycle, where one alone is concerned."""
     factor: float | None = None
@@ -82,7 +85,8 @@ class Explanation:
     amount: float | None = None
     """Amount by which the rows are too large, [m] (misread dial, outlier, displaced gauge; for a
     drift of the last row against the first; of other effects the range of what they add to the
-    rows); of `machine changed` the change, [SI]."""
+    rows); of `machine changed` the change, [SI]; of a wrong dimension its true less its stated
+    size, [m]."""
     std: float | None = None
     """Standard deviation of the amount, [SI]."""
     missing: bool | None = None

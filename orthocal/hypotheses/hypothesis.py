@@ -159,8 +159,9 @@ class Family:
     log_volume: Array | None = None
     """Logarithm of the factor by which the edit scales a volume of readings, shape (h,); of silent
     rows, the logarithm of the density of what they show."""
-    groups: Sequence[Sequence[Indices]] = ()
-    """Rows that share an unknown amount, several groups per hypothesis."""
+    groups: Sequence[Sequence[Indices] | Array] = ()
+    """Several effects per hypothesis: the rows that each shifts alike, or their changes of the rows
+    per unit, shape (k, n_rows)."""
     systematic: Sequence[SystematicEffect] = ()
     """Effects that the machine may have."""
     silent: Sequence[Indices] = ()

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property, lru_cache
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -28,7 +28,9 @@ from orthocal.hypotheses.hypothesis import (
     row_products,
 )
 from orthocal.hypotheses.likelihood import Likelihood, Products, build_likelihood
-from orthocal.session.session import Session
+from orthocal.observation.model import predict_readings
+from orthocal.sensors.protocol import DIMENSION_STEP, stated_dimensions
+from orthocal.session.session import Session, Setup
 from orthocal.statistics.distributions import log_positive_share
 from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
@@ -398,6 +400,56 @@ class LinearModel:
             o.rows(jacobian[:, new]).T,
         )
 
+    def nuisance_columns(self) -> Array:
+        """Change of the rows by one prior std of each nuisance parameter, [m].
+
+        About the machine without errors, shape (n_nuisance, n_rows); zeros are not projected out.
+        """
+
+        def compute() -> Array:
+            problem = self.problem
+            passive = self.at_reference(slopes=False).passive
+            _, jacobian = problem.predict_and_jacobian(problem.active_theta, passive)
+            columns = (jacobian * problem.theta_scale)[:, problem.n_machine :]
+            return problem.observations.rows(columns * problem.noise_ratio[:, None]).T
+
+        return self.share("nuisance", compute)
+
+    def dimension_changes(self) -> dict[tuple[str, str], dict[str, Array]]:
+        """Change of the rows by each dimension that setups state, per unit, (n_rows,) each.
+
+        About the machine without errors.
+
+        Returns:
+            Key of the dimension and its stated size, to setup, to the change.
+        """
+
+        def compute() -> dict[tuple[str, str], dict[str, Array]]:
+            session, o = self.problem.session, self.problem.observations
+            setups = {r.setup: session.setups[r.setup] for r in session.readings}
+            larger: dict[str, Setup] = {}
+            sizes: dict[str, tuple[str, str]] = {}
+            for name, setup in setups.items():
+                for key, sensor in stated_dimensions(setup.sensor).items():
+                    larger[name] = replace(setup, sensor=sensor)
+                    sizes[name] = key, _stated(setup.sensor.to_keys(), key)
+            if not larger:
+                return {}
+            other = replace(session, setups={**session.setups, **larger})
+            passive = self.at_reference(slopes=False).passive
+            stated, changed = (
+                o.rows(predict_readings(s, observations=o, passive=passive))
+                for s in (session, other)
+            )
+            change = (changed - stated) / DIMENSION_STEP
+            changes: dict[tuple[str, str], dict[str, Array]] = {}
+            for name, size in sizes.items():
+                of_setup = [r.setup == name for r in session.readings]
+                changes.setdefault(size, {})[name] = np.where(of_setup, change, 0.0)
+            return changes
+
+        return self.share("dimensions", compute)
+
     def shift_entries(self, about: ModelLinearisation, shift: MachineShift) -> Array:
         """Effect of a machine shift on the entries, zeros projected out, (n_entries,), [m]."""
         moved = np.asarray(about.slopes @ shift.direction)
@@ -551,3 +603,9 @@ def label_sessions(session: Session, setup: Indices) -> tuple[tuple[str, ...], I
     labels = tuple(n for n in dict.fromkeys(of_setup) if n in read)
     place = np.array([labels.index(n) if n in labels else -1 for n in of_setup])
     return labels, place[setup]
+
+
+def _stated(keys: Mapping[str, Any], key: str) -> str:
+    """Value of a key of a setup such as artefact.height_mm, as text."""
+    first, _, others = key.partition(".")
+    return _stated(keys[first], others) if others else f"{keys[first]:g}"

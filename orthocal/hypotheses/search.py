@@ -17,9 +17,10 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Indices
 from orthocal.errors import ClosureError, SessionError
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, AnomalyKind
+from orthocal.hypotheses.families.artefacts import wrong_artefacts
 from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
 from orthocal.hypotheses.families.effects import find_effects, unmodelled_effects
 from orthocal.hypotheses.families.inconsistent_group import inconsistent_groups
@@ -72,7 +73,7 @@ NEARLY = 3.0
 WORTH_REFITTING = 4.0
 """Least logarithm of the Bayes factor, to first order, of hypotheses that are linearised anew."""
 
-FAMILIES = 28.0
+FAMILIES = 30.0
 """Families of mistakes that share the prior probability; each effect is as likely as a family."""
 
 MOST_ANOMALIES = 4
@@ -399,7 +400,7 @@ class _Search:
                 logs = np.array(
                     [
                         likelihood.score_set(
-                            deviation, [self.model.entries(_marks(g, rows_count))]
+                            deviation, [self.model.entries(_vectors(g, rows_count))]
                         ).log_likelihood
                         for g in family.groups
                     ]
@@ -471,7 +472,7 @@ class _Search:
         prior = float(_prior(family)[h])
         explanation = family.explain(h)
         if family.groups:
-            return Term(explanation, prior, effects=_marks(family.groups[h], rows.count))
+            return Term(explanation, prior, effects=_vectors(family.groups[h], rows.count))
         if family.systematic:
             effect = family.systematic[h]
             return Term(explanation, prior, -effect.change, effect.columns, effect)
@@ -628,6 +629,7 @@ def _families(model: LinearModel, rows: Rows, *, grouped: bool = True) -> Iterat
     if grouped:
         yield from wrong_units_and_signs(rows, model.sigma)
     yield from displaced_gauges(rows, model.sigma)
+    yield from wrong_artefacts(model, rows)
     yield from wrong_readings(rows)
     yield from swapped_rows(rows)
     yield from row_offsets(rows)
@@ -655,6 +657,11 @@ def _prior(family: Family) -> Array:
 def _prior_of(effect: SystematicEffect) -> AmountPrior:
     """Prior of the parameters of an effect, in prior std."""
     return AmountPrior(EFFECT_SCALES, effect.positive)
+
+
+def _vectors(group: Sequence[Indices] | Array, count: int) -> Array:
+    """Effects of a group per unit, shape (k, count)."""
+    return group if isinstance(group, np.ndarray) else _marks(group, count)
 
 
 def _marks(groups: Sequence[NDArray[np.int64]], count: int) -> Array:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import casadi as ca
@@ -27,6 +27,7 @@ from orthocal.io.documents import Name, Number, PositiveNumber
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.mounting import SCALE
 from orthocal.sensors.protocol import (
+    DIMENSION_STEP,
     Contact,
     Frames,
     GaugeZero,
@@ -194,6 +195,11 @@ class BallBar:
         """Fixed ball (3), length (1), ball at the tool (3)."""
         del robot
         return np.array([*self.centre, self.length, *self.tool])
+
+    @property
+    def dimensions(self) -> Mapping[str, Sensor]:
+        """The bar with another length."""
+        return {"length_mm": replace(self, length=self.length + DIMENSION_STEP)}
 
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:

@@ -30,6 +30,9 @@ ToolPath = Callable[[Array, Array], Array]
 """Corners of the path of the tool from one position to another, shape (n, n_coordinates), [m], with
 both ends."""
 
+DIMENSION_STEP = 1e-6
+"""Increment of a dimension for its effect on readings, [m]."""
+
 LARGEST_READING = 0.3
 """Largest reading of an indicator; no leg is as far from parallel, [m]."""
 
@@ -158,6 +161,9 @@ class Sensor(Protocol):
     # largest_reading: ClassVar[float], optional: largest reading that it shows, [m]; 300 mm by
     # default (`largest_reading`)
 
+    # dimensions: Mapping[str, Sensor], optional: key of a stated dimension in session.yaml, to the
+    # same sensor with a dimension that is larger by DIMENSION_STEP (`stated_dimensions`)
+
     @classmethod
     def from_keys(cls, keys: Any) -> Self:  # noqa: ANN401 - an instance of `keys`
         """Build the sensor from the keys of a session.yaml."""
@@ -244,6 +250,12 @@ def largest_reading(sensor: Sensor) -> float:
     """Largest reading that a sensor shows; a larger one has a wrong unit, [m]."""
     largest: float = getattr(sensor, "largest_reading", LARGEST_READING)
     return largest
+
+
+def stated_dimensions(sensor: Sensor) -> Mapping[str, Sensor]:
+    """Keys of the dimensions that a setup states, to the sensor with a larger one."""
+    dimensions: Mapping[str, Sensor] = getattr(sensor, "dimensions", {})
+    return dimensions
 
 
 def default_zero(sensor: Sensor) -> GaugeZero:

@@ -17,7 +17,7 @@ straightedge, that is turned over shows its errors with the opposite sign (rever
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import casadi as ca
@@ -31,6 +31,7 @@ from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.direction import direction_vector
 from orthocal.sensors.mounting import SCALE, rotate
 from orthocal.sensors.protocol import (
+    DIMENSION_STEP,
     Contact,
     Frames,
     NuisanceParameter,
@@ -313,6 +314,14 @@ class ToolIndicator:
         level = a.table * float(d.sum())
         numbers = [0.5 * a.length, share, sign, a.height, level]
         return np.array([*d, *along, *square_to_both, *self.tool, *numbers])
+
+    @property
+    def dimensions(self) -> Mapping[str, Sensor]:
+        """A gauge block of another height."""
+        if self.artefact.kind != "gauge_block":
+            return {}
+        higher = replace(self.artefact, height=self.artefact.height + DIMENSION_STEP)
+        return {"artefact.height_mm": replace(self, artefact=higher)}
 
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:

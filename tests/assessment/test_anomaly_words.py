@@ -21,7 +21,7 @@ def test_every_kind_has_a_sentence(root, kind):
         "setup",
         rows=(0, 1),
         setups=(setup,),
-        names=(setup,),
+        names=(setup, "50"),
         effect="backlash",
         factor=-1.0,
         amount=1e-3,

@@ -2,20 +2,35 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_ball_bar import circles
+from test_tool_indicator import AXES, STEPS, Plan
 
 from orthocal import draw_errors, simulate_session
 from orthocal.assessment.judgement import judge_session
+from orthocal.observation.model import predict_readings
+from orthocal.observation.sensor_groups import nuisance_parameters
+
+SQUARE = "kind: square, name: granite, square_tolerance_mrad: 1, straight_tolerance_mm: 0.002"
+BLOCK = "kind: gauge_block, height_mm: 50, height_tolerance_mm: 0.0005, table_mm: -25"
+
+
+def errors_of(plan, seed):
+    names = plan.robot.parameters.select_model("full")
+    return draw_errors(plan.robot, names, seed=seed, tolerances={"*.offset_mm": 1.0})
+
+
+def warnings_of(session):
+    return [f for f in judge_session(session).findings if f.severity != "note"]
 
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory):
     plan = circles(tmp_path_factory.mktemp("mistakes"))
-    names = plan.robot.parameters.select_model("full")
-    errors = draw_errors(plan.robot, names, seed=2, tolerances={"*.offset_mm": 1.0})
-    return simulate_session(plan, errors, seed=2).session
+    return simulate_session(plan, errors_of(plan, 2), seed=2).session
 
 
 def reverse_setup(values, setup):
@@ -57,7 +72,83 @@ def test_a_mistake_is_named_with_its_place(sound, mistake):
     kind, place = MISTAKES[mistake]
     values = np.array(sound.values)
     mistake(values, np.array([r.setup for r in sound.readings]))
-    found = [f for f in judge_session(sound.with_values(values)).findings if f.severity != "note"]
+    found = warnings_of(sound.with_values(values))
     assert [f.kind for f in found] == [kind]
     if place is not None:
         assert {p.setup for p in found[0].places} == {place}
+
+
+@pytest.mark.parametrize("first", ["yz", "zx"])
+@pytest.mark.parametrize("size", [50e-6, 0.3e-3])
+def test_a_ball_displaced_between_setups_is_named(tmp_path, first, size):
+    plan = circles(tmp_path)
+    errors = errors_of(plan, 1)
+    simulated = simulate_session(plan, errors, seed=1)
+    names = [p.name for p in nuisance_parameters(plan).parameters]
+    nuisance = np.array([simulated.nuisance.get(name, 0.0) for name in names])
+    displaced = nuisance + size * np.array([name.startswith("ball.post.") for name in names])
+    before, after = (predict_readings(plan, errors, nuisance=n) for n in (nuisance, displaced))
+    later = ["yz", "zx"][["yz", "zx"].index(first) :]
+    changed = [r.setup in later for r in plan.readings]
+    values = simulated.session.values + np.where(changed, after - before, 0.0)
+    found = warnings_of(simulated.session.with_values(values))
+    assert found[0].kind == "displaced artefact"
+    assert [p.setup for p in found[0].places] == later
+
+
+def with_artefact(session, names, **keys):
+    setups = dict(session.setups)
+    for name in names:
+        sensor = setups[name].sensor
+        other = replace(sensor, artefact=replace(sensor.artefact, **keys))
+        setups[name] = replace(setups[name], sensor=other)
+    return replace(session, setups=setups)
+
+
+@pytest.fixture(scope="module")
+def turned_over(tmp_path_factory):
+    """A square along x and y beside the paper's readings, before and after it was turned over."""
+    plan = Plan()
+    plan.legs()
+    for over in (False, True):
+        for along, across in ("xy", "yx"):
+            points = [tuple(s * v for v in AXES[along]) for s in STEPS]
+            key = f"{SQUARE}, along: {along}, reversed: {str(over).lower()}"
+            plan.read(f"{'over' if over else 'first'}_{along}", across, key, points)
+    plan = plan.load(tmp_path_factory.mktemp("square"))
+    return simulate_session(plan, errors_of(plan, 0), seed=0).session
+
+
+def test_a_square_that_was_turned_over_as_stated_is_not_accused(turned_over):
+    assert warnings_of(turned_over) == []
+
+
+@pytest.mark.parametrize("wrong", [("over_x", "over_y"), ("over_y",)], ids="-".join)
+def test_a_square_that_was_turned_over_unstated_is_named(turned_over, wrong):
+    found = warnings_of(with_artefact(turned_over, wrong, reversed=False))
+    assert len(found) == 1
+    assert found[0].kind == ("displaced artefact" if len(wrong) == 2 else "ambiguous")
+    assert "square granite was displaced or turned over" in found[0].text
+    assert found[0].places[0].setup == wrong[0]
+
+
+@pytest.mark.parametrize("height", [50.5, 49.0])
+def test_a_gauge_block_of_another_height_is_named(tmp_path, height):
+    """On the table and on the block by turns: nothing else explains that."""
+    plan = Plan()
+    plan.legs()
+    for axis, across in ("xy", "yz", "zx"):
+        points = [
+            tuple(v * np.array(AXES[axis]) + s * np.array(AXES[across]))
+            for s in (-4, 0, 4)
+            for v in (-25, 25)
+        ]
+        plan.read(f"block_{axis}", f"-{axis}", BLOCK, points)
+    plan = plan.load(tmp_path)
+    session = simulate_session(plan, errors_of(plan, 1), seed=1).session
+    assert warnings_of(session) == []
+    (found,) = warnings_of(with_artefact(session, ["block_y"], height=height * 1e-3))
+    assert found.kind == "wrong dimension"
+    assert {p.setup for p in found.places} == {"block_y"}
+    assert found.numbers["dimension_mm"] == pytest.approx(50.0, abs=0.05)
+    assert found.numbers["stated_mm"] == height

@@ -49,6 +49,8 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
         numbers["amount_um"] = (e.amount or 0.0) / UM
         action = _effect_remedy(session, result)
         return review(e.kind, text, action, _effect_places(session, e), **numbers)
+    if e.kind == "wrong dimension":
+        numbers["dimension_mm"], numbers["stated_mm"] = _dimensions_mm(e)
     if anomaly.expected is not None:
         text += (
             f" It reads {signed(first.value / MM)} mm; the other readings predict "
@@ -286,6 +288,11 @@ def _text(session: Session, e: Explanation) -> str:
             f"the same {len(e.rows)} times"
         ),
         "displaced gauge": lambda: _displaced(session, e),
+        "displaced artefact": lambda: (
+            f"{_artefact(e)} was displaced{' or turned over' if _can_turn(e) else ''} before "
+            f"setup {e.setups[0]}"
+        ),
+        "wrong dimension": lambda: _other_dimension(session, e),
         "drift": lambda: _drifted(e),
         "backlash": lambda: (
             f"the drives have backlash: {_amounts(e)}. Readings differ by up to "
@@ -363,6 +370,31 @@ def _offset(session: Session, e: Explanation) -> str:
     )
 
 
+def _artefact(e: Explanation) -> str:
+    """Artefact that setups share, such as ball post, with its session."""
+    label, _, artefact = e.names[0].rpartition("/")
+    return f"{artefact.replace('.', ' ')}{f' of session {label}' if label else ''}"
+
+
+def _can_turn(e: Explanation) -> bool:
+    """True if an artefact has two sides: a square or a straightedge."""
+    artefact = "".join(e.names[:1]).rpartition("/")[2]
+    return artefact.startswith(("square.", "straightedge."))
+
+
+def _dimensions_mm(e: Explanation) -> tuple[float, float]:
+    """True and stated size of a wrong dimension, [mm]."""
+    stated = float(e.names[1])
+    return stated + (e.amount or 0.0) / MM, stated
+
+
+def _other_dimension(session: Session, e: Explanation) -> str:
+    """A dimension that differs from the stated one, with both sizes."""
+    true, stated = _dimensions_mm(e)
+    what = e.names[0].rpartition(".")[2].removesuffix("_mm")
+    return f"the {what} in {_subject(session, e)} is {plain(true)} mm, not {stated:g} mm"
+
+
 def _swapped(session: Session, e: Explanation) -> str:
     if e.scope == "setup":
         return f"the readings of setup {e.setups[0]} were written in reverse order"
@@ -409,9 +441,12 @@ def _remedy(session: Session, e: Explanation) -> str:
         new = old - (e.amount or 0.0) / MM if e.factor is None else old * e.factor
         return f"If so, write {new:+.6g} instead of {old:+.6g}."
     if e.kind == "reversed sign" and e.setups:
+        way = ""
+        if all("direction" in session.setups[name].sensor.to_keys() for name in e.setups):
+            way = " If the gauge pointed the other way, reverse `direction` of the setup."
         return (
-            "Look at the mounting of the gauge. If a minus sign was forgotten, reverse the signs. "
-            "If the gauge pointed the other way, reverse `direction` of the setup."
+            "Look at the mounting of the gauge. If a minus sign was forgotten, reverse the signs."
+            f"{way}"
         )
     if e.factor is not None:
         return f"If so, multiply these by {e.factor:.6g}."
@@ -424,6 +459,9 @@ def _remedy(session: Session, e: Explanation) -> str:
     if e.kind == "inconsistent posture" and e.scope == "postures":
         return "Check its coordinates, and read it again."
     remedies = {
+        "displaced artefact": ("Check `reversed` of its setups. " if _can_turn(e) else "")
+        + "If it was displaced, give it another name in the later setups.",
+        "wrong dimension": f"If so, measure it, and correct `{''.join(e.names[:1])}`.",
         "inconsistent setup": "Check its leg, direction, section and the mounting of its gauge; "
         "then read it again, or leave it out.",
         "swapped rows": "If so, swap them back.",

@@ -1,0 +1,111 @@
+"""Artefacts of sensors at the tool: displaced between setups, or of another dimension than stated.
+
+Setups share an artefact, such as the fixed ball of a bar, a square, or the station of a tracker. If
+it is displaced before one of them, its placement and its errors are others in all later setups. A
+square that is turned over without a statement is such a displacement: its error changes its sign.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from orthocal.arrays import Array, Indices
+from orthocal.hypotheses.anomaly import Explanation
+from orthocal.hypotheses.hypothesis import Family, Rows
+from orthocal.observation.sensor_groups import nuisance_parameters
+from orthocal.session.session import Session
+
+if TYPE_CHECKING:
+    from orthocal.hypotheses.linear_model import LinearModel
+
+LEAST_COLUMN = 1e-3
+"""Part of the noise by which one prior std of a placement must move the readings to be considered.
+"""
+
+
+def wrong_artefacts(model: LinearModel, rows: Rows) -> Iterator[Family]:
+    """Artefacts displaced between setups, and dimensions that differ from the stated ones.
+
+    Args:
+        model: The linearised model.
+        rows: The rows.
+    """
+    for family in (_displaced(model, rows), _other_dimensions(model, rows)):
+        if family is not None:
+            yield family
+
+
+def shared_placements(session: Session) -> dict[str, dict[str, Indices]]:
+    """Artefacts that setups share, each with its setups and their parameters of it.
+
+    Returns:
+        Artefact, such as `ball.post`, to setup, to indices of its nuisance parameters among those
+        of the session.
+    """
+    shared: dict[str, dict[str, Indices]] = {}
+    nuisance = nuisance_parameters(session)
+    for setup, indices in zip(session.setups.values(), nuisance.of_setup, strict=True):
+        label = setup.name.rpartition("/")[0] if session.joined else ""
+        places: dict[str, list[int]] = {}
+        for u, i in zip(setup.sensor.nuisance_parameters, indices, strict=False):
+            if u.shared_by is not None and not u.of_gauge:
+                artefact = ".".join(u.shared_by.split(".")[:2])
+                places.setdefault(f"{label}/{artefact}".lstrip("/"), []).append(i)
+        for artefact, of_setup in places.items():
+            shared.setdefault(artefact, {})[setup.name] = np.array(of_setup)
+    return {artefact: setups for artefact, setups in shared.items() if len(setups) > 1}
+
+
+def _displaced(model: LinearModel, rows: Rows) -> Family | None:
+    """An artefact displaced before a setup, with all its parameters new from there on."""
+    explanations, groups = [], []
+    columns = model.nuisance_columns()
+    for artefact, placements in shared_placements(rows.session).items():
+        names = sorted(placements, key=lambda name: rows.setups[name][0])
+        for k in range(1, len(names)):
+            later = names[k:]
+            at = rows.of_setups(later)
+            if rows.of_setups(names[:k]).max() > at.min():
+                continue
+            parameters = np.unique(np.concatenate([placements[name] for name in later]))
+            changes = np.zeros((parameters.size, rows.count))
+            changes[:, at] = columns[np.ix_(parameters, at)]
+            sizes = np.abs(changes).max(axis=1)
+            seen = sizes > LEAST_COLUMN * model.sigma
+            if seen.any():
+                every, setups = tuple(at.tolist()), tuple(later)
+                explanations.append(
+                    Explanation("displaced artefact", "setups", every, setups, (artefact,))
+                )
+                groups.append(changes[seen] / sizes[seen, None])
+    return Family.of(explanations, groups=groups) if explanations else None
+
+
+def _other_dimensions(model: LinearModel, rows: Rows) -> Family | None:
+    """A dimension of another size in one setup, or in all setups that state the same one."""
+    explanations: list[Explanation] = []
+    shapes: list[Array] = []
+    for size, changes in model.dimension_changes().items():
+        for setups in _each_and_all(changes):
+            change = np.sum([changes[name] for name in setups], axis=0)
+            at = np.flatnonzero(change)
+            explanations.append(
+                Explanation(
+                    "wrong dimension",
+                    "setup" if len(setups) == 1 else "setups",
+                    tuple(at.tolist()),
+                    setups,
+                    size,
+                )
+            )
+            shapes.append(change[at])
+    return Family.with_effects(rows, explanations, shapes) if explanations else None
+
+
+def _each_and_all(changes: Mapping[str, Array]) -> list[tuple[str, ...]]:
+    """Each setup, and all of them together if there are several."""
+    each: list[tuple[str, ...]] = [(name,) for name in changes]
+    return [*each, tuple(changes)] if len(each) > 1 else each
