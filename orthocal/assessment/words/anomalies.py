@@ -265,11 +265,7 @@ def _text(session: Session, e: Explanation) -> str:
             session, e, UNITS.get(e.factor or 0.0, "in mm and read as inches")
         ),
         "decimal point": lambda: _written(session, e, "with a misplaced decimal point"),
-        "reversed sign": lambda: (
-            f"the sign of {_subject(session, e)} is reversed"
-            if e.scope in ("reading", "posture")
-            else f"the signs of {_subject(session, e)} are reversed"
-        ),
+        "reversed sign": lambda: _reversed(session, e),
         "misread dial": lambda: (
             f"{_subject(session, e)} was read {abs(e.amount or 0.0) / MM:g} mm too "
             f"{'high' if (e.amount or 0.0) > 0 else 'low'}, by a turn or a mark of the dial"
@@ -288,10 +284,7 @@ def _text(session: Session, e: Explanation) -> str:
             f"the same {len(e.rows)} times"
         ),
         "displaced gauge": lambda: _displaced(session, e),
-        "displaced artefact": lambda: (
-            f"{_artefact(e)} was displaced{' or turned over' if _can_turn(e) else ''} before "
-            f"setup {e.setups[0]}"
-        ),
+        "displaced artefact": lambda: _displaced_artefact(e),
         "wrong dimension": lambda: _other_dimension(session, e),
         "drift": lambda: _drifted(e),
         "backlash": lambda: (
@@ -370,10 +363,19 @@ def _offset(session: Session, e: Explanation) -> str:
     )
 
 
-def _artefact(e: Explanation) -> str:
-    """Artefact that setups share, such as ball post, with its session."""
+def _reversed(session: Session, e: Explanation) -> str:
+    subject = _subject(session, e)
+    if e.scope in ("reading", "posture"):
+        return f"the sign of {subject} is reversed"
+    return f"the signs of {subject} are reversed"
+
+
+def _displaced_artefact(e: Explanation) -> str:
+    """Displacement of an artefact that setups share, such as ball post, with its session."""
     label, _, artefact = e.names[0].rpartition("/")
-    return f"{artefact.replace('.', ' ')}{f' of session {label}' if label else ''}"
+    name = f"{artefact.replace('.', ' ')}{f' of session {label}' if label else ''}"
+    how = "displaced or turned over" if _can_turn(e) else "displaced"
+    return f"{name} was {how} before setup {e.setups[0]}"
 
 
 def _can_turn(e: Explanation) -> bool:
