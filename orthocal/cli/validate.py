@@ -9,6 +9,7 @@ from orthocal.cli.files import load_each_once
 from orthocal.cli.options import (
     AllRows,
     CalibrationPath,
+    Details,
     Json,
     Tolerances,
     command,
@@ -23,6 +24,7 @@ def validate(
     sessions: list[Path],
     tolerance: Tolerances = None,
     json: Json = False,
+    details: Details = False,
     all_rows: AllRows = False,
 ) -> None:
     """Compare new readings with the predictions of a calibration.
@@ -38,4 +40,4 @@ def validate(
     tolerances = read_tolerances(tolerance, before.robot)
     with judgement_on_failure(orthocal.join_sessions(loaded), json=json):
         validation = orthocal.validate_calibration(before, loaded, tolerances=tolerances)
-    deliver_judged(validation, json=json, all_rows=all_rows)
+    deliver_judged(validation, json=json, details=details, all_rows=all_rows)

@@ -38,7 +38,7 @@ def summarize(
 
     Args:
         result: The result.
-        details: Whether to describe a calibration, comparison or plan completely.
+        details: Whether to describe a result completely, not by the short answer.
         all_rows: Whether to list every reading and parameter; includes the details.
         html: Whether to return HTML, as a notebook shows it.
     """
@@ -60,7 +60,7 @@ def render_result(
 
     Args:
         result: The result.
-        details: Whether to describe a calibration, comparison or plan completely.
+        details: Whether to describe a result completely, not by the short answer.
         all_rows: Whether to list every reading and parameter.
         saved: Directory in which a calibration was written.
     """
@@ -88,7 +88,7 @@ def render_result(
         return render_comparison(result, details=details, all_rows=all_rows)
     from orthocal.output.text.validation import render_validation
 
-    return render_validation(result, all_rows=all_rows)
+    return render_validation(result, details=details, all_rows=all_rows)
 
 
 def render_calibration(
