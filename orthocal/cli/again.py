@@ -38,7 +38,7 @@ def again(
     anyway: Anyway = False,
     force: Force = False,
 ) -> None:
-    """Plan the same readings again, with the offsets and the backlash to enter.
+    """Plan the same readings again, with the values to enter.
 
     The directory receives session.yaml, an empty readings.csv and a measuring sheet.
 
