@@ -353,7 +353,9 @@ def run_program(program, joints, **options):
     return run_programs([(program[:1], [*program, "M2"])], joints, **options)[0]
 
 
-def run_programs(runs, joints, *, letters="XYZ", lines="", module=None, files=None, halcmd=()):
+def run_programs(
+    runs, joints, *, letters="XYZ", lines="", module=None, files=None, halcmd=(), output=False
+):
     """Home the machine, then run programs one after the other.
 
     Args:
@@ -365,6 +367,7 @@ def run_programs(runs, joints, *, letters="XYZ", lines="", module=None, files=No
         files: Further files beside the INI, name to text.
         halcmd: Commands for HAL at the pauses of the first program, "" for none; the joints'
             positions are those 0.2 s later.
+        output: Whether to record digital output 0 as well, in the last column.
 
     Returns:
         Slides in every servo period of the first program, shape (K, n_joints), [mm]; and for each
@@ -376,7 +379,7 @@ def run_programs(runs, joints, *, letters="XYZ", lines="", module=None, files=No
         try:
             for name, text in (files or {}).items():
                 (folder / name).write_text(text)
-            _write(folder, runs, joints, letters=letters, lines=lines, halcmd=halcmd)
+            _write(folder, runs, joints, letters=letters, lines=lines, halcmd=halcmd, output=output)
             return _run(folder)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
@@ -418,7 +421,7 @@ def filter_program(ini, program, result):
     return result["code"], result["said"], result["progress"]
 
 
-def _write(folder, runs, joints, *, letters, lines, halcmd):
+def _write(folder, runs, joints, *, letters, lines, halcmd, output):
     n = len(joints)
     ini = BASE.format(joints=n, letters=letters)
     ini += "".join(AXIS.format(letter=letter) for letter in letters)
@@ -440,7 +443,8 @@ def _write(folder, runs, joints, *, letters, lines, halcmd):
         for i, letter in enumerate(letters):
             for limit in ("MIN_LIMIT", "MAX_LIMIT"):
                 sections[f"[AXIS_{letter}]"][limit] = sections[f"[JOINT_{i}]"][limit]
-    hal = HAL.format(joints=n, kinds="f" * n) + hal_joints
+    hal = HAL.format(joints=n, kinds="f" * n + "b" * output) + hal_joints
+    hal += f"net trigger motion.digital-out-00 => sampler.0.pin.{n}\n" if output else ""
     hal += "addf sampler.0 servo-thread\nsetp sampler.0.enable 0\n"
     files = {
         "simulated.ini": _as_text(sections),

@@ -16,24 +16,30 @@ def sheet(
     feed: float = 600.0,
     approach_feed: float = 120.0,
     shift_mm: str = "0,0,0",
+    dwell: float | None = None,
+    trigger: str | None = None,
     out: OptionalOutDirectory = None,
     force: Force = False,
 ) -> None:
     """Write a measuring sheet and a G-code program for each setup.
 
-    The programs pause in the alignment posture of each setup and at each reading. Without --out
-    the files are written beside the session.
+    The programs pause in the alignment posture of each setup and at each reading. With --dwell or
+    --trigger they pause only where the operator has to act, so that a logger reads the gauge.
+    Without --out the files are written beside the session.
 
     Args:
         feed (MM/MIN): Feed between postures.
         approach_feed (MM/MIN): Feed over the last 2 mm to a posture.
         shift_mm (X,Y,Z): Machine coordinates (G53) of the origin of the world, mm.
+        dwell (SECONDS): Time at each reading instead of a pause (G4).
+        trigger (OUTPUT): Trigger of a logger after the dwell (default: 1 s): digital output 0 to
+            63 (M64, M65 of LinuxCNC), or an M-code from M100 to M199.
     """
     from orthocal.measurement.motion.motion_program import ProgramOptions
     from orthocal.output.sheet.page import sheet_files
 
     x, y, z = read_numbers(shift_mm, "--shift-mm", "XYZ")
-    options = ProgramOptions(feed=feed, approach_feed=approach_feed, shift_mm=(x, y, z))
+    options = ProgramOptions(feed, approach_feed, (x, y, z), dwell, trigger)
     directory = out or (session if is_folder(session) else session.parent)
     require_writable(directory)
     files = sheet_files(orthocal.load_plan(session), options=options)

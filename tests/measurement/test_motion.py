@@ -330,12 +330,55 @@ def test_shift_moves_all_coordinates(small, motions):
         ("feed", 0.0, "--feed"),
         ("approach_feed", float("nan"), "--approach-feed"),
         ("shift_mm", (0.0, 1e9, 0.0), "--shift-mm"),
+        ("dwell", 0.01, "--dwell"),
+        ("dwell", float("nan"), "--dwell"),
+        ("trigger", "64", "--trigger"),
+        ("trigger", "M30", "--trigger"),
     ],
 )
 def test_feeds_and_shifts_out_of_range_are_refused(option, value, where):
     with pytest.raises(ParameterError) as refused:
         ProgramOptions(**{option: value})
     assert refused.value.where == where
+
+
+def codes(text):
+    """Lines of a program without comments and motions."""
+    return [line for line in text.splitlines() if line and line[0] != "(" and "G53" not in line]
+
+
+@pytest.fixture(scope="module")
+def unlimited(small):
+    """The plan with a gauge that reads in all postures without a hand."""
+    return replace(small, gauges={"": replace(small.gauge, range=None)})
+
+
+def test_an_automatic_program_dwells_and_triggers_at_each_reading(unlimited):
+    motion = plan_motion(unlimited)[0]
+    readings = sum(r.setup == motion.setup for r in unlimited.readings)
+    begin, end = ["G21 G90 G94 G40 G49", "F600", "M0"], ["M2"]
+    by_options = {
+        ProgramOptions(dwell=2.5): ["G4 P2.5"],
+        ProgramOptions(dwell=2.5, trigger="M110"): ["G4 P2.5", "M110"],
+        ProgramOptions(trigger="3"): ["G4 P1", "M64 P3", "G4 P0.1", "M65 P3"],
+    }
+    plain, _ = read_program(write_program(unlimited, motion), unlimited.robot)
+    for options, lines in by_options.items():
+        text = write_program(unlimited, motion, options)
+        assert codes(text) == [*begin, *readings * lines, *end]
+        moved, _ = read_program(text, unlimited.robot)
+        assert moved == pytest.approx(plain)
+
+
+def test_an_automatic_program_pauses_where_a_hand_is_needed(small, motions, experiment_2):
+    motion = motions[0]
+    assert [bool(s.lift) for s in motion.stops] == [False, True, True, False]
+    text = write_program(small, motion, ProgramOptions(dwell=2.0))
+    # mounted, read, held; released, read, held; released, read
+    assert codes(text)[2:-1] == ["M0", "G4 P2", "M0", "M0", "G4 P2", "M0", "M0", "G4 P2"]
+    difference = plan_motion(experiment_2)[0]
+    text = write_program(experiment_2, difference, ProgramOptions(dwell=2.0))
+    assert codes(text)[2:-1] == ["M0", "M0", "G4 P2"]  # mounted; set to 0; read
 
 
 def test_too_many_readings_are_refused(small):
@@ -376,7 +419,7 @@ CONTROLLER_STATES = {
 """Lines before the program; no two displacements in `all` cancel."""
 
 
-def _run_nominal(session, program, folder, before=((),)):
+def _run_nominal(session, program, folder, before=((),), *, output=False):
     """A program on nominal legs, after lines of MDI; as `run_programs`."""
     robot = session.robot
     anything = replace(session, gauges={"": replace(session.gauge, range=None)})
@@ -393,7 +436,8 @@ def _run_nominal(session, program, folder, before=((),)):
         for d, s in zip(robot.drives, switch, strict=True)
     ]
     runs = [([*RESET, *mdi], program.splitlines()) for mdi in before]
-    return run_programs(runs, joints, lines=files["kinematics.ini"], module=folder)
+    lines = files["kinematics.ini"]
+    return run_programs(runs, joints, lines=lines, module=folder, output=output)
 
 
 def test_linuxcnc_joints_do_not_depend_on_offsets_rotation_or_tool_length(small, motions, tmp_path):
@@ -429,6 +473,21 @@ def test_linuxcnc_takes_up_backlash_from_the_stated_side(small, sided, tmp_path)
     actual = play(slides, backlash)
     sides = np.array([directions(stop.approach) for stop in motion.stops])
     assert actual[at] - slides[at] == pytest.approx(-backlash / 2.0 * sides, abs=1e-6)
+
+
+def test_linuxcnc_triggers_a_logger_in_every_posture_at_rest(unlimited, tmp_path):
+    motion, dwell = plan_motion(unlimited)[0], 0.5
+    options = ProgramOptions(6000.0, 1500.0, dwell=dwell, trigger="0")
+    program = write_program(unlimited, motion, options)
+    recorded, (pauses,) = _run_nominal(unlimited, program, tmp_path, output=True)
+    slides, output = recorded[:, :-1], recorded[:, -1]
+    assert len(pauses) == 1
+    rising = np.flatnonzero(np.diff(output, prepend=0.0) > 0.5)
+    read = [stop for stop in motion.stops if stop.role == "reading"]
+    assert slides[rising] == pytest.approx(np.array([s.drives for s in read]) / MM, abs=5e-4)
+    for k in rising:
+        before = slides[max(k - int(0.9e3 * dwell), 0) : k]
+        assert np.abs(before - slides[k]).max() < 1e-6
 
 
 BAR = """robot: orthoglide

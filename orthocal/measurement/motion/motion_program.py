@@ -1,7 +1,9 @@
 """G-code programs that move the machine through a setup and pause (M0) where the operator acts.
 
 A program starts at the mechanical zero, without a gauge. The first pause is in the alignment
-posture, where the gauge is mounted and aligned. Then there is one for each reading.
+posture, where the gauge is mounted and aligned. Then there is one for each reading. For a logger,
+a program dwells and triggers it instead. It still pauses where the operator sets the dial or holds
+the plunger up.
 
 Every motion is in machine coordinates (G53), so that work offsets (G54 to G59.3), G92 and a
 coordinate rotation have no effect. Coordinates are those of nominal kinematics; comments list the
@@ -23,7 +25,7 @@ from orthocal.robot.model import Robot
 from orthocal.sensors.leg_indicator import BallIndicator
 from orthocal.sensors.protocol import mounting_steps
 from orthocal.session.session import Session
-from orthocal.text import comment_safe
+from orthocal.text import comment_safe, shorten
 from orthocal.units import DRIVE_UNITS, MM, format_fixed
 
 LETTERS = "XYZ"
@@ -36,6 +38,18 @@ LONGEST_NAME = 40
 
 FASTEST = 20_000.0
 """Largest feed, [mm/min]."""
+
+LONGEST_DWELL = 600.0
+"""Longest dwell at a reading, [s]."""
+
+SETTLE = 1.0
+"""Dwell before a trigger, unless another one is stated, [s]."""
+
+PULSE = 0.1
+"""Length of a pulse of a digital output, [s]."""
+
+TRIGGER = re.compile(r"(?P<output>[0-9]|[1-5][0-9]|6[0-3])|M1[0-9][0-9]")
+"""Digital output of LinuxCNC, or an M-code of the user."""
 
 LARGEST_SHIFT = 1e5
 """Largest coordinate of the machine's origin, [mm]."""
@@ -64,6 +78,11 @@ class ProgramOptions:
     """Feed of the approach, [mm/min]."""
     shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Machine coordinates (G53) of the world's origin, [mm]."""
+    dwell: float | None = None
+    """Time at each reading in place of a pause, [s]; None for a pause."""
+    trigger: str | None = None
+    """Trigger of a logger at the end of that time: an M-code from M100 to M199, or the number of a
+    digital output that gives a pulse."""
 
     def __post_init__(self) -> None:
         for name, feed in (("--feed", self.feed), ("--approach-feed", self.approach_feed)):
@@ -75,6 +94,31 @@ class ProgramOptions:
             raise ParameterError(
                 f"expected numbers within ±{LARGEST_SHIFT:g} mm", where="--shift-mm"
             )
+        if self.dwell is not None and not 0.1 <= self.dwell <= LONGEST_DWELL:
+            raise ParameterError(
+                f"found {self.dwell:g}; expected 0.1 to {LONGEST_DWELL:g} s", where="--dwell"
+            )
+        if self.trigger is not None and not TRIGGER.fullmatch(self.trigger):
+            raise ParameterError(
+                f"found '{shorten(self.trigger)}'; expected a digital output, 0 to 63, or an "
+                "M-code, M100 to M199",
+                where="--trigger",
+            )
+
+    @property
+    def automatic(self) -> bool:
+        """True if readings need no operator."""
+        return self.dwell is not None or self.trigger is not None
+
+    @property
+    def reading_lines(self) -> list[str]:
+        """Lines at a reading without an operator."""
+        lines = [f"G4 P{SETTLE if self.dwell is None else self.dwell:g}"]
+        if self.trigger is None:
+            return lines
+        if TRIGGER.fullmatch(self.trigger)["output"] is None:  # type: ignore[index] # checked above
+            return [*lines, self.trigger]
+        return [*lines, f"M64 P{self.trigger}", f"G4 P{PULSE:g}", f"M65 P{self.trigger}"]
 
 
 def program_name(motion: SetupMotion) -> str:
@@ -105,7 +149,9 @@ def write_program(
         f"({comment_safe(of_setup.sensor.describe(), 120)})",
         f"(Machine coordinates, mm; tool at the mechanical zero: "
         f"{_words(robot, tool_at_zero(robot), options)})",
-        *PREAMBLE,
+        *PREAMBLE[:-1],
+        *(["(Dwells at each reading: G4 P in seconds)"] if options.automatic else []),
+        PREAMBLE[-1],
         f"F{options.feed:g}",
     ]
     sensor, gauge = of_setup.sensor, session.gauges[of_setup.gauge]
@@ -130,12 +176,33 @@ def write_program(
         lines.append(f"({_label(stop)}{side}; joints {_joints(robot, stop)})")
         lines += _moves(robot, stop, options)
         lines.append(f"(MSG, {_label(stop)}: {instruction})")
-        if i + 1 < len(stops) and stops[i + 1].lift:
-            lines.append(f"(MSG, hold the plunger up on the way to {_label(stops[i + 1])})")
-        if stop.role != "return":
-            lines.append("M0")
+        following = stops[i + 1] if i + 1 < len(stops) else None
+        needs_hand = i == 0 or bool(zero or stop.lift)
+        lines += _read(stop, following, options, needs_hand=needs_hand)
     lines.append("(MSG, end: remove the gauge, then jog the machine to its mechanical zero)")
     return "\n".join([*lines, "M2", ""])
+
+
+def _read(
+    stop: Stop, following: Stop | None, options: ProgramOptions, *, needs_hand: bool
+) -> list[str]:
+    """Pause for the operator, or dwell and trigger of a logger.
+
+    Args:
+        stop: The posture.
+        following: The next one.
+        options: Options of the program.
+        needs_hand: Whether the operator has to act before the reading.
+    """
+    hold = []
+    if following is not None and following.lift:
+        hold = [f"(MSG, hold the plunger up on the way to {_label(following)})"]
+    if stop.role == "return" or not options.automatic:
+        return hold if stop.role == "return" else [*hold, "M0"]
+    lines = ["M0"] * needs_hand
+    if stop.role == "reading":
+        lines += options.reading_lines
+    return [*lines, *hold, "M0"] if hold else lines
 
 
 def _moves(robot: Robot, stop: Stop, options: ProgramOptions) -> list[str]:

@@ -169,12 +169,19 @@ def _largest_difference(robot: Robot) -> str:
 
 def _programs(options: ProgramOptions | None) -> str:
     """Advice for running the programs."""
-    shift = (options or ProgramOptions()).shift_mm
+    options = options or ProgramOptions()
+    shift = options.shift_mm
     origin = f", world origin at ({', '.join(f'{v:g}' for v in shift)}) mm" if any(shift) else ""
+    stops = "stop (M0) in the alignment posture and at each reading"
+    if options.automatic:
+        stops = (
+            "stop (M0) where you mount the gauge, set its dial or hold its plunger. A logger reads "
+            "the gauge: its values are in the order of the lines"
+        )
     return paragraph(
         f"Programs: G-code in mm, in machine coordinates (G53){origin}. Work offsets, G92 and "
-        "rotation have no effect on them. They cancel the tool length (G49) and stop (M0) in the "
-        "alignment posture and at each reading: press cycle start to continue. Run the first "
+        f"rotation have no effect on them. They cancel the tool length (G49) and {stops}. "
+        "Press cycle start to continue. Run the first "
         "program without a gauge and with a slow override. Before you start a program, remove the "
         "gauge and jog the machine to its mechanical zero: its first motion goes straight to the "
         "first posture, and nothing may be in its way."
