@@ -41,6 +41,15 @@ from orthocal.cli.sheet import sheet_or_problem
 from orthocal.errors import ParameterError
 from orthocal.units import MM
 
+Owned = Annotated[
+    list[Path] | None,
+    Option(
+        "--with",
+        metavar="FILE",
+        help="A sensor at the tool that you have, such as a ball bar or a square; repeatable.",
+    ),
+]
+
 FILES = ("session.yaml", "readings.csv", "plan.json", "plan.svg", "sheet.html")
 
 
@@ -75,6 +84,7 @@ class PlanOptions:
     hours: Hours = None
     add: Positive = None
     gauge: Gauge = None
+    with_: Owned = None
     touches: str | None = None
     sections: str | None = None
     box: str | None = None
@@ -212,6 +222,7 @@ def _read_equipment(
     """Equipment of the options, with the gauge of a file or of a measured session."""
     from orthocal.kinematics.workspace import coordinate_letters
     from orthocal.planning.equipment import SECTIONS, equipment_of, load_dial
+    from orthocal.planning.owned_sensors import load_owned_sensor
 
     box = options.box
     limits = None if box is None else read_box(box, coordinate_letters(robot), where="--box")
@@ -236,6 +247,7 @@ def _read_equipment(
         minutes_a_setup=options.minutes_a_setup,
         minutes_a_reading=options.minutes_a_reading,
         temperatures=temperatures,
+        owned=tuple(load_owned_sensor(path) for path in options.with_ or ()),
     )
     if options.gauge is not None:
         return load_dial(options.gauge, equipment)

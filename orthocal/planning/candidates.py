@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +23,12 @@ from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import nominal_sensitivity
 from orthocal.observation.observations import build_observations
 from orthocal.planning.equipment import Equipment, choose_box, place_tool, reachable
+from orthocal.planning.tool_candidates import list_tool_candidates
 from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.direction import Direction
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.tips import Tip
-from orthocal.session.session import Conditions, Posture, Reading, Session, Setup
+from orthocal.session.session import Conditions, Gauge, Posture, Reading, Session, Setup
 from orthocal.statistics.noise import noise_floor
 from orthocal.units import MM
 
@@ -54,6 +55,9 @@ ON_AXIS = 0.999
 
 ZERO_PRIOR = 0.01
 """Prior standard deviation of a gauge zero, [m]: large beside any reading."""
+
+DIAL = "dial"
+"""Name of the gauge for legs beside sensors at the tool."""
 
 FEWEST = 2
 """Fewest readings of a setup: one alone only determines the gauge zero."""
@@ -88,6 +92,8 @@ class CandidateSetup:
     """Whether a gauge that begins in one reading (row) has another (column) in its range,
     shape (m, m)."""
     aligned: tuple[AlignedParameter, ...] = ()
+    absolute: bool = False
+    """Whether the gauge zero is known."""
 
     def jacobian_of(self, chosen: Sequence[int]) -> Array:
         """Jacobian of some readings, the gauge aligned in the first, (n_chosen, n_state)."""
@@ -135,29 +141,40 @@ def list_candidates(robot: Robot, equipment: Equipment, *, reference: str = "") 
     Raises:
         ParameterError: If there are no candidates, or too many.
     """
-    if not robot.legs:
+    if not robot.legs and not equipment.owned:
         raise ParameterError(
             f"'{robot.name}' has no legs for a gauge; add orthocal.legs", where="plan"
         )
+    tool = list_tool_candidates(robot, equipment.owned, equipment.box)
+    dial = DIAL if equipment.owned else ""
     postures: dict[str, Posture] = {}
     setups: dict[str, Setup] = {}
     readings: list[Reading] = []
     for leg in robot.legs.values():
         names = _add_postures(robot, leg, equipment, postures)
         for name, sensor in _sensors(leg, equipment):
-            setups[name] = Setup(name, sensor)
+            setups[name] = Setup(name, sensor, dial)
             readings += [Reading(name, p) for p in names]
             if len(readings) > MOST_CANDIDATES * 10:
                 break
     session = Session(
         robot=robot,
         robot_reference=reference or robot.name,
-        gauges={"": equipment.gauge},
+        gauges={dial: equipment.gauge},
         postures=postures,
         setups=setups,
         readings=tuple(readings),
     )
-    return _with_approaches(_touching(_with_lateral_positions(session)))
+    if session.readings:
+        session = _with_approaches(_touching(_with_lateral_positions(session)))
+    gauges, further, of_tool, more = tool
+    return replace(
+        session,
+        gauges={**session.gauges, **gauges},
+        postures={**session.postures, **further},
+        setups={**session.setups, **of_tool},
+        readings=(*session.readings, *more),
+    )
 
 
 def measure_candidates(
@@ -192,12 +209,17 @@ def measure_candidates(
             at = [session.readings[i].posture for i in rows].index(aligned_at[name])
             shared -= np.outer(sensitivity, moved[at])  # the session aligns the gauge there
             aligned.append(AlignedParameter(sensitivity, moved))
-        spread = mine @ mine.T
-        unknown = spare_range * _difference_std(shared, spread)
+        spread, ratio = mine @ mine.T, float(problem.noise_ratio[rows[0]])
+        absolute = session.setups[name].zero == "known"
+        gauge = session.gauges[session.setups[name].gauge]
+        # the operator places a fixed ball so that its first reading is in the middle of the range
+        unknown = spare_range * ratio * _difference_std(shared, spread)
         needed.append(float(unknown.max()))
-        reachable = _find_reachable(session, h[rows], unknown)
-        covariance = spread + ZERO_PRIOR**2
-        setups.append(CandidateSetup(name, rows, shared, covariance, reachable, tuple(aligned)))
+        reachable = _find_reachable(gauge, ratio * h[rows], unknown)
+        covariance = spread + (0.0 if absolute else (ZERO_PRIOR / ratio) ** 2)
+        setups.append(
+            CandidateSetup(name, rows, shared, covariance, reachable, tuple(aligned), absolute)
+        )
     state = tuple(problem.free[i] for i in common)
     typical = float(np.median(needed)) if needed else 0.0
     return Candidates(session, problem, tuple(setups), sigma, state, typical)
@@ -237,11 +259,11 @@ def _difference_std(jacobian: Array, spread: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
 
-def _find_reachable(session: Session, h: Array, unknown: Array) -> NDArray[np.bool_]:
+def _find_reachable(gauge: Gauge, h: Array, unknown: Array) -> NDArray[np.bool_]:
     """True if a gauge with the middle of its range in one posture has another in its range."""
-    if session.gauge.range is None:
+    if gauge.range is None:
         return np.ones((h.size, h.size), dtype=np.bool_)
-    half = 0.5 * (session.gauge.range[1] - session.gauge.range[0])
+    half = 0.5 * (gauge.range[1] - gauge.range[0])
     return np.asarray(np.abs(h[:, None] - h[None]) <= half - unknown)
 
 
@@ -318,8 +340,16 @@ def _directions(leg: Leg) -> list[Direction]:
 def _with_lateral_positions(session: Session) -> Session:
     """Candidates with further gauges where the rod is in displaced postures."""
     robot, wide = session.robot, Tip("blade", 0.0, 10.0)
-    sensors = {name: indicator_of(setup) for name, setup in session.setups.items()}
-    views = {n: Setup(n, s.on_rod(s.rod, wide)) for n, s in sensors.items() if s.rod is not None}
+    sensors = {
+        name: sensor
+        for name, setup in session.setups.items()
+        if (sensor := indicator_of(setup)) is not None
+    }
+    views = {
+        n: replace(session.setups[n], sensor=s.on_rod(s.rod, wide))
+        for n, s in sensors.items()
+        if s.rod is not None
+    }
     if not views:
         return session
     setups = {n: s for n, s in session.setups.items() if n not in views}
@@ -340,14 +370,15 @@ def _with_lateral_positions(session: Session) -> Session:
             near = [r for r in read[name] if abs(aside[r.posture] - k * step) <= half]
             view_name = name if k == 0 else f"{name}_{k * step / MM:+.3g}"
             x, y, z = (float(v) for v in (k * step * side).round(9) + 0.0)
-            setups[view_name] = Setup(view_name, replace(sensor, beside=(x, y, z)))
+            lateral = replace(sensor, beside=(x, y, z))
+            setups[view_name] = replace(session.setups[name], name=view_name, sensor=lateral)
             readings += [replace(r, setup=view_name) for r in near]
     return replace(session, setups=setups, readings=tuple(readings))
 
 
-def indicator_of(setup: Setup) -> LegIndicator:
-    """Sensor of a candidate setup."""
-    return cast(LegIndicator, setup.sensor)
+def indicator_of(setup: Setup) -> LegIndicator | None:
+    """Indicator at a leg of a candidate setup; None for another sensor."""
+    return setup.sensor if isinstance(setup.sensor, LegIndicator) else None
 
 
 def _lateral_room(sensor: LegIndicator, robot: Robot) -> float:

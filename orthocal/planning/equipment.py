@@ -23,6 +23,7 @@ from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.files.schema import GaugeKeys
 from orthocal.observation.conditions import MINUTES_A_READING, MINUTES_A_SETUP, in_course
 from orthocal.planning.expected_error import state_noise
+from orthocal.planning.owned_sensors import OwnedSensor
 from orthocal.robot.model import Leg, Robot, require_commanded_tool
 from orthocal.sensors.direction import Direction
 from orthocal.sensors.leg_indicator import LegIndicator, Section
@@ -83,6 +84,8 @@ class Equipment:
     temperatures: tuple[float, float] | None = None
     """Temperature at the first and at the last reading, [°C]; by default that at which the nominal
     dimensions hold."""
+    owned: tuple[OwnedSensor, ...] = ()
+    """Available sensors at the tool."""
 
     def list_sensors(self, leg: Leg, direction: Direction, fraction: float) -> list[LegIndicator]:
         """Indicators at a section of a leg: one for each rod that the tip can touch.

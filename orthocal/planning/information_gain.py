@@ -155,7 +155,10 @@ class SetupGain:
         i, j = pairs.first, pairs.second
         if not i.size:
             return []
-        gains = self._begun_differences()[i, j] if self.aligned else self._differences(pairs)
+        if self.setup.absolute:
+            gains = self.gains(np.column_stack([i, j]))
+        else:
+            gains = self._begun_differences()[i, j] if self.aligned else self._differences(pairs)
         ranked: list[tuple[float, tuple[int, int]]] = []
         while True:
             best = int(gains.argmax())

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 
 import numpy as np
 
@@ -60,6 +61,9 @@ READINGS_A_SETUP = (3, 5, 9, 16)
 """Numbers of readings of a setup that are tried for a given time."""
 
 USUAL_SETUPS = 6
+
+LONG_SETUPS, LONG_READINGS = (0, 1, 2, 3), (9, 16, 48)
+"""Numbers of setups with many readings, and of these, where sensors at the tool are available."""
 
 GOAL = 0.4
 """Limit of backlash after a plan, in its limit before, that plans reach if they can: the tool may
@@ -438,7 +442,7 @@ def _list_counts(
     if hours is not None:
         if setups is not None or readings is not None:
             raise ParameterError("found with --setups or --readings; expected one", where="--hours")
-        options = []
+        options = _mix_counts(hours * HOUR, equipment) if equipment.owned else []
         for most in READINGS_A_SETUP:
             count = int(hours * HOUR / equipment.minutes(1, most + 1))
             if 1 <= count <= MOST_SETUPS:
@@ -462,7 +466,22 @@ def _list_counts(
             "setups: the first one only determines the gauge zero",
             where="--readings",
         )
+    if equipment.owned and setups is None and readings is None:
+        return _mix_counts(equipment.minutes(count, total + count), equipment)
     return [[total // count + (i < total % count) for i in range(count)]]
+
+
+def _mix_counts(minutes: float, equipment: Equipment) -> list[list[int]]:
+    """Setups of few and of many readings that take at most a time."""
+    few = READINGS_A_SETUP[0]
+    options: list[list[int]] = []
+    for many, long in product(LONG_READINGS, LONG_SETUPS):
+        left = minutes - long * equipment.minutes(1, many + 1)
+        short = int(left / equipment.minutes(1, few + 1) + 1e-9)
+        counts = [many] * long + [few] * short
+        if left >= 0.0 and 1 <= len(counts) <= MOST_SETUPS and counts not in options:
+            options.append(counts)
+    return options
 
 
 def _choose_counts(
@@ -490,20 +509,27 @@ def _simplify(
     """
     session, setups = candidates.session, candidates.setups
 
+    indicators = {
+        which: sensor
+        for which, setup in enumerate(setups)
+        if (sensor := indicator_of(session.setups[setup.name])) is not None
+    }
+
     def distance(which: int) -> float:
-        return float(np.linalg.norm(indicator_of(session.setups[setups[which].name]).beside))
+        return float(np.linalg.norm(indicators[which].beside))
 
     def without_lateral(which: int) -> LegIndicator:
-        sensor = indicator_of(session.setups[setups[which].name])
-        return replace(sensor, beside=(0.0, 0.0, 0.0))
+        return replace(indicators[which], beside=(0.0, 0.0, 0.0))
 
     most, reached = (1.0 + SIMPLER) * planned.error, _is_reached(planned, sides)
     for k, old in enumerate(planned.setups):
+        if old.candidate not in indicators:
+            continue
         candidate = setups[old.candidate]
         postures = [session.readings[i].place[1:] for i in candidate.rows[list(old.chosen)]]
         base = without_lateral(old.candidate)
         others = planned.information - search.information_of(old)
-        for which in sorted(range(len(setups)), key=distance):
+        for which in sorted(indicators, key=distance):
             if distance(which) >= distance(old.candidate):
                 break
             if without_lateral(which) != base:

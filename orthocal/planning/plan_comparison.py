@@ -105,7 +105,8 @@ class Comparison:
             ("a dial of half the scatter and resolution", _with_finer_dial),
             ("each leg's gauges on one square block", _with_blocks),
         ]
-        if any(indicator_of(s).tip.form == "ball" for s in self.plan.setups.values()):
+        sensors = map(indicator_of, self.plan.setups.values())
+        if any(s is not None and s.tip.form == "ball" for s in sensors):
             changes.append(("a blade instead of the ball", _with_blade))
         alternatives = []
         for name, change in changes:
@@ -125,7 +126,7 @@ class Comparison:
         best: dict[tuple[str, object], tuple[float, CandidateSetup]] = {}
         for setup in self.candidates.setups:
             sensor = indicator_of(self.candidates.session.setups[setup.name])
-            if any(sensor.beside):
+            if sensor is None or any(sensor.beside):
                 continue
             key = (sensor.leg, sensor.direction)
             distance = abs(sensor.section.value - MIDDLE)
@@ -178,9 +179,12 @@ def _evenly(line: Sequence[int], zero: int, count: int) -> list[int]:
 
 
 def _with_finer_dial(session: Session) -> Session:
-    old = session.gauge
-    sigma, resolution = (None if v is None else FINER * v for v in (old.sigma, old.resolution))
-    return replace(session, gauges={"": Gauge(sigma, resolution, old.range)})
+    gauges = dict(session.gauges)
+    for name in {s.gauge for s in session.setups.values() if indicator_of(s) is not None}:
+        old = gauges[name]
+        sigma, resolution = (None if v is None else FINER * v for v in (old.sigma, old.resolution))
+        gauges[name] = Gauge(sigma, resolution, old.range)
+    return replace(session, gauges=gauges)
 
 
 def _with_blocks(session: Session) -> Session:
@@ -198,5 +202,9 @@ def _with_blade(session: Session) -> Session:
 
 
 def _with_sensors(session: Session, change: Callable[[LegIndicator], LegIndicator]) -> Session:
-    changed = {n: replace(s, sensor=change(indicator_of(s))) for n, s in session.setups.items()}
-    return replace(session, setups=changed)
+    changed = {
+        name: replace(setup, sensor=change(sensor))
+        for name, setup in session.setups.items()
+        if (sensor := indicator_of(setup)) is not None
+    }
+    return replace(session, setups={**session.setups, **changed})

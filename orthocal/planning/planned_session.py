@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from orthocal.arrays import Array
+from orthocal.measurement.motion.motion import state_path_approaches
 from orthocal.planning.candidates import Candidates
 from orthocal.planning.selection import PlannedSetup
 from orthocal.session.session import Posture, Reading, Session, Setup
@@ -51,14 +52,15 @@ def build_session(
         title="Planned readings",
         setups=setups,
         readings=tuple(readings),
+        gauges={n: g for n, g in source.gauges.items() if n in {s.gauge for s in setups.values()}},
         postures={n: p for n, p in source.postures.items() if n in used},
     )
     if measured is None:
-        return plan
+        return state_path_approaches(plan)
     plan = replace(plan, compensation=measured.compensation)
-    if measured.controller_offsets is None:
-        return plan
-    return plan.with_controller(measured.controller_offsets)
+    if measured.controller_offsets is not None:
+        plan = plan.with_controller(measured.controller_offsets)
+    return state_path_approaches(plan)
 
 
 def order_postures(points: Array) -> list[int]:

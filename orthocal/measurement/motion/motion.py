@@ -30,13 +30,14 @@ from orthocal.measurement.motion.approach import (
     approach_steps,
     fill_approach,
     name_approach,
+    usual_approaches,
 )
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations, drive_table
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.protocol import Contact, ToolPath, tool_path
-from orthocal.session.session import Gauge, Posture, Reading, Session
+from orthocal.session.session import Conditions, Gauge, Posture, Reading, Session
 from orthocal.units import MM
 
 Role = Literal["alignment", "reading", "subtracted", "return"]
@@ -198,6 +199,33 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
         alignment = stops.pop(0) if stops[0].role == "alignment" else None
         motions.append(SetupMotion(setup, number, len(rows), alignment, tuple(stops)))
     return tuple(motions)
+
+
+def state_path_approaches(session: Session) -> Session:
+    """Session whose readings state the approaches that follow from the paths of their sensors.
+
+    Only approaches that an effect of the machine distinguishes are stated.
+
+    Raises:
+        SessionError: As `plan_motion`.
+    """
+    guided = _guided_setups(session)
+    if not guided or not usual_approaches(session.robot):
+        return session
+    of_line = {
+        (m.setup, stop.line): stop.approach
+        for m in plan_motion(session)
+        if m.setup in guided
+        for stop in m.stops
+        if stop.role == "reading"
+    }
+    readings = tuple(
+        replace(r, conditions=replace(r.conditions or Conditions(), approach=of_line[key]))
+        if (key := (r.setup, i + 2 if r.line is None else r.line)) in of_line
+        else r
+        for i, r in enumerate(session.readings)
+    )
+    return replace(session, readings=readings)
 
 
 def dial_zero(gauge: Gauge) -> str:

@@ -1,0 +1,236 @@
+"""Candidate setups of sensors at the tool: places of a bar or an artefact, and their postures."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from orthocal.arrays import Array
+from orthocal.errors import ParameterError, SessionError
+from orthocal.kinematics.loop_closure import nominal_closure
+from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.measurement.motion.approach import can_approach, usual_approaches
+from orthocal.planning.equipment import choose_box, place_tool, reachable
+from orthocal.planning.owned_sensors import OwnedSensor
+from orthocal.robot.model import Robot
+from orthocal.sensors.protocol import Sensor, default_zero, tool_path
+from orthocal.sensors.registry import read_setup
+from orthocal.session.session import Conditions, Gauge, Posture, Reading, Setup
+from orthocal.units import MM
+
+ON_CIRCLE = 24
+"""Positions on a circle of a ball bar."""
+
+LATITUDES = (0.0, 0.5, -0.5)
+"""Distances of the planes of circles from the fixed ball, in lengths of the bar."""
+
+ON_EDGE = 9
+"""Positions along an edge."""
+
+ON_PLATE = 5
+"""Positions along each side of a plate."""
+
+LEVELS = (-0.5, 0.0, 0.5)
+"""Positions of an artefact across, and of a fixed ball, in the half sides of the box."""
+
+STEP = 5 * MM
+"""Step of the positions, [m]."""
+
+
+def list_tool_candidates(
+    robot: Robot, owned: Sequence[OwnedSensor], box: Array | None
+) -> tuple[dict[str, Gauge], dict[str, Posture], dict[str, Setup], list[Reading]]:
+    """Gauges, postures, setups and readings of every place of the sensors.
+
+    Args:
+        robot: The robot, with three tool coordinates.
+        owned: The available sensors.
+        box: Limits of the tool's coordinates; by default those of `choose_box`.
+
+    Raises:
+        ParameterError: If the machine has no three tool coordinates, or reaches no place.
+        SessionError: If the keys of a sensor are invalid.
+    """
+    if not owned:
+        return {}, {}, {}, []
+    if robot.tcp is None or tuple(robot.tcp.coordinates) != (0, 1, 2):
+        raise ParameterError("need a tool that moves along x, y and z", where="--with")
+    limits, middle = choose_box(robot, box), tool_at_zero(robot)
+    gauges = {sensor.name: sensor.gauge for sensor in owned}
+    postures: dict[str, Posture] = {}
+    setups: dict[str, Setup] = {}
+    readings: list[Reading] = []
+    for sensor in owned:
+        before = len(setups)
+        for name, keys, points in _places(sensor, middle, limits):
+            reached = points[reachable(robot, points)]
+            if len(reached) < 2:
+                continue
+            _, built = read_setup(
+                {**sensor.keys, **keys}, where=str(sensor.file), under="", error=SessionError
+            )
+            names = [_name(p, middle) for p in reached]
+            for posture, placed in place_tool(robot, names, reached).items():
+                postures.setdefault(posture, placed)
+            setups[name] = Setup(name, built, sensor.name, zero=default_zero(built))
+            readings += [
+                Reading(name, posture, conditions=conditions)
+                for posture, conditions in _approached(robot, built, names, reached)
+            ]
+        if len(setups) == before:
+            raise ParameterError("the machine reaches no place for it", where=str(sensor.file))
+    return gauges, postures, setups, readings
+
+
+def _approached(
+    robot: Robot, sensor: Sensor, names: Sequence[str], points: Array
+) -> list[tuple[str, Conditions | None]]:
+    """Postures with each approach that effects of the machine distinguish.
+
+    Approaches of a sensor that prescribes the path of the tool follow from the complete plan.
+    """
+    unique = dict(zip(names, points, strict=True))
+    approaches = usual_approaches(robot)
+    if not approaches or tool_path(sensor) is not None:
+        return [(name, None) for name in unique]
+    drives = nominal_closure(robot).inverse(np.array(list(unique.values())))
+    return [
+        (name, Conditions(a))
+        for a in approaches
+        for name, able in zip(unique, can_approach(robot, drives, a), strict=True)
+        if able
+    ]
+
+
+def _places(
+    sensor: OwnedSensor, middle: Array, box: Array
+) -> Iterator[tuple[str, dict[str, Any], Array]]:
+    """Name, keys and tool positions of each place of a sensor."""
+    if sensor.keys["sensor"] == "ball_bar":
+        yield from _bars(sensor, middle, box)
+        return
+    artefact = sensor.keys.get("artefact")
+    kind = artefact.get("kind") if isinstance(artefact, Mapping) else None
+    places = {
+        "square": _edges,
+        "straightedge": _edges,
+        "plate": _plates,
+        "gauge_block": _blocks,
+    }
+    if kind not in places:
+        raise SessionError(
+            f"found {kind!r}; expected one of {', '.join(places)}",
+            where=f"{sensor.file}: artefact.kind",
+        )
+    yield from places[kind](sensor, middle, box)
+
+
+def _bars(
+    sensor: OwnedSensor, middle: Array, box: Array
+) -> Iterator[tuple[str, dict[str, Any], Array]]:
+    """Spheres about fixed balls: circles in planes through the ball and beside it."""
+    del middle
+    length = float(sensor.keys.get("length_mm", 0.0)) * MM
+    tool = np.array(sensor.keys.get("tool_mm", (0.0, 0.0, 0.0))) * MM
+    half, centre = 0.5 * (box[:, 1] - box[:, 0]), box.mean(axis=1)
+    angle = 2.0 * np.pi * np.arange(ON_CIRCLE) / ON_CIRCLE
+    for k, level in enumerate(LEVELS):
+        ball = np.round((centre + level * half[2] * np.eye(3)[2]) / STEP) * STEP
+        circles = []
+        for axis, share in itertools.product(range(3), LATITUDES):
+            radius = length * np.sqrt(1.0 - share**2)
+            first, second = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
+            around = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
+            circles.append(ball + share * length * np.eye(3)[axis] + radius * around)
+        points = np.unique(np.concatenate(circles).round(9), axis=0)
+        inside = ((points >= box[:, 0]) & (points <= box[:, 1])).all(axis=1)
+        keys = {
+            "centre_mm": ((ball + tool) / MM).round(6).tolist(),
+            "ball": f"{sensor.name}_{k + 1}",
+        }
+        yield f"{sensor.name}_{k}", keys, points[inside]
+
+
+def _edges(
+    sensor: OwnedSensor, middle: Array, box: Array
+) -> Iterator[tuple[str, dict[str, Any], Array]]:
+    """Edges along each axis, touched across it; both arms of a square in a plane share it."""
+    artefact = dict(sensor.keys["artefact"])
+    length = float(artefact.get("length_mm", 200.0)) * MM
+    for along, direction in itertools.permutations(range(3), 2):
+        other = 3 - along - direction
+        for k, level in enumerate(LEVELS):
+            place = _at_level(middle, box, other, level)
+            line = _line(middle, box, along, length)
+            points = np.repeat(place[None], len(line), axis=0)
+            points[:, along] = line
+            plane = "".join(sorted("xyz"[along] + "xyz"[direction]))
+            named = {"name": f"{sensor.name}_{plane}_{k + 1}"}
+            keys = {
+                "direction": "xyz"[direction],
+                "artefact": {**artefact, "along": "xyz"[along], **named},
+            }
+            yield f"{sensor.name}{'xyz'[along]}{'xyz'[direction]}_{k}", keys, points
+
+
+def _plates(
+    sensor: OwnedSensor, middle: Array, box: Array
+) -> Iterator[tuple[str, dict[str, Any], Array]]:
+    """Plates across each axis."""
+    length = float(sensor.keys["artefact"].get("length_mm", 200.0)) * MM
+    for axis in range(3):
+        for k, level in enumerate(LEVELS):
+            points = _grid(middle, box, axis, length, ON_PLATE)
+            points[:, axis] = _at_level(middle, box, axis, level)[axis]
+            yield f"{sensor.name}{'xyz'[axis]}_{k}", {"direction": f"-{'xyz'[axis]}"}, points
+
+
+def _blocks(
+    sensor: OwnedSensor, middle: Array, box: Array
+) -> Iterator[tuple[str, dict[str, Any], Array]]:
+    """Places beside a gauge block and on it, along each axis."""
+    artefact = dict(sensor.keys["artefact"])
+    height = float(artefact.get("height_mm", 0.0)) * MM
+    for axis in range(3):
+        low = np.round((middle[axis] - 0.5 * height) / STEP) * STEP
+        points = np.repeat(_grid(middle, box, axis, 60 * MM, 3), 2, axis=0)
+        points[0::2, axis], points[1::2, axis] = low, low + height
+        keys = {
+            "direction": f"-{'xyz'[axis]}",
+            "artefact": {**artefact, "table_mm": float((low - 0.0) / MM)},
+        }
+        yield f"{sensor.name}{'xyz'[axis]}", keys, points
+
+
+def _at_level(middle: Array, box: Array, axis: int, level: float) -> Array:
+    place = np.array(middle)
+    half = 0.5 * (box[axis, 1] - box[axis, 0])
+    place[axis] = np.round((box[axis].mean() + level * half) / STEP) * STEP
+    return place
+
+
+def _line(middle: Array, box: Array, axis: int, length: float, count: int = ON_EDGE) -> Array:
+    """Positions along an axis on an artefact about the middle, shape (n,), [m]."""
+    low = max(float(box[axis, 0]), float(middle[axis]) - 0.5 * length)
+    high = min(float(box[axis, 1]), float(middle[axis]) + 0.5 * length)
+    return np.unique(np.round(np.linspace(low, high, count) / STEP) * STEP)
+
+
+def _grid(middle: Array, box: Array, axis: int, length: float, count: int) -> Array:
+    """Positions on a square across an axis, shape (n, 3), [m]."""
+    sides = [_line(middle, box, k, length, count) for k in range(3) if k != axis]
+    pairs = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
+    return np.insert(pairs, axis, middle[axis], axis=1)
+
+
+def _name(point: Array, middle: Array) -> str:
+    """Name of a posture: displacement from the mechanical zero, such as x+60_y-10."""
+    parts = [
+        f"{letter}{round(v / MM, 3):+g}"
+        for letter, v in zip("xyz", point - middle, strict=True)
+        if abs(v) > 1e-9
+    ]
+    return "_".join(parts) or "zero"
