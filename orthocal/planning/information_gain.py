@@ -133,14 +133,24 @@ class SetupGain:
                 spread += both[:, None, None] * outer
         return np.asarray((effect * np.linalg.solve(spread, effect)).sum(axis=(1, 2)))
 
-    def further_gains(self, rows: list[int]) -> Array:
-        """Gain of each further reading, given some readings of this setup, shape (m,)."""
+    def exchange_gains(self, rows: list[int]) -> Array:
+        """Gain of each reading in place of each of those chosen, beside the others, shape (k, m).
+
+        With W the inverse of V_SS + σ² I, leaving reading p out changes W by −w wᵀ / w_p, w being
+        its column. Residual effects and variances of all readings change by one product each.
+        """
         spread = self.spread[rows]
-        solved = np.linalg.solve(self._covariance(spread, rows), spread)
-        effect = solved.T @ self.effect[rows]
-        np.subtract(self.effect, effect, out=effect)
-        spread *= solved
-        return self._single_gains(effect, self.variance - spread.sum(axis=0))
+        inverse = np.linalg.inv(self._covariance(spread, rows))
+        solved, weighted = inverse @ spread, inverse @ self.effect[rows]
+        effect = self.effect - solved.T @ self.effect[rows]
+        variance = self.variance - np.vecdot(spread, solved, axis=0)
+        own = inverse.diagonal()[:, None]
+        share = solved / own
+        gains = np.vecdot(weighted, weighted)[:, None] * share
+        gains += 2.0 * (weighted @ effect.T)
+        gains *= share
+        gains += np.vecdot(effect, effect)
+        return np.asarray(gains / (np.maximum(variance + share * solved, 0.0) + self.noise))
 
     def best_pairs(self, pairs: Pairs, most: int) -> list[tuple[float, tuple[int, int]]]:
         """Best pairs of readings with their gains; the gauge is aligned in the first reading.
@@ -156,7 +166,7 @@ class SetupGain:
         if not i.size:
             return []
         if self.setup.absolute:
-            gains = self.gains(np.column_stack([i, j]))
+            gains = self._both(pairs)
         else:
             gains = self._begun_differences()[i, j] if self.aligned else self._differences(pairs)
         ranked: list[tuple[float, tuple[int, int]]] = []
@@ -182,6 +192,16 @@ class SetupGain:
         gains = q[i] + q[j] - 2.0 * product.reshape(-1)[flat]
         gains /= v[i] + (v + 2.0 * self.noise)[j] - 2.0 * self.spread.reshape(-1)[flat]
         return np.asarray(gains)
+
+    def _both(self, pairs: Pairs) -> Array:
+        """Gains of pairs, shape (n_pairs,): with a known zero, those of both readings."""
+        if self.aligned:
+            return self.gains(np.column_stack([pairs.first, pairs.second]))
+        product, variance = self.effect @ self.effect.T, self.variance + self.noise
+        own = np.outer(product.diagonal(), variance)
+        gains = own + own.T - 2.0 * product * self.spread
+        gains /= np.outer(variance, variance) - self.spread**2
+        return np.asarray(gains.reshape(-1)[pairs.flat])
 
     def _begun_differences(self) -> Array:
         """Gains of all pairs, the gauge aligned in the first (row), shape (m, m)."""

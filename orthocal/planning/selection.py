@@ -398,15 +398,17 @@ class Gains:
         for _ in range(MOST_PASSES):
             before = list(chosen)
             gain = self.setup(planned.candidate, chosen[0])
-            for place in range(len(chosen)):
+            gains = gain.exchange_gains(chosen)
+            for place, old in enumerate(before):
                 others = chosen[:place] + chosen[place + 1 :]
                 # from another first reading the gauge must reach all others
                 allowed = np.array(
                     setup.reachable[chosen[0]] if place else setup.reachable[:, others].all(axis=1)
                 )
                 allowed[others] = False
-                gains = gain.further_gains(others)
-                chosen[place] = int(np.where(allowed, gains, -1.0).argmax())
+                chosen[place] = int(np.where(allowed, gains[place], -1.0).argmax())
+                if chosen[place] != old:
+                    gains = gain.exchange_gains(chosen)
             if chosen == before:
                 break
         return PlannedSetup(planned.candidate, tuple(chosen))

@@ -51,13 +51,28 @@ def test_a_gain_is_the_reduction_of_the_error(drawn):
         assert taking.gains(np.array([rows])) == pytest.approx(taken, rel=1e-9)
 
 
-def test_the_gain_of_one_further_reading(drawn):
+def test_the_gain_of_a_reading_in_place_of_another(drawn):
     kind, information, root, taking = drawn
-    rows = [5, 1]
-    gains = taking.further_gains(rows)
-    for more in set(range(READINGS)) - set(rows):
-        taken = left(kind, information, root, rows) - left(kind, information, root, [*rows, more])
-        assert gains[more] == pytest.approx(taken, rel=1e-9)
+    rows = [5, 1, 3]
+    gains = taking.exchange_gains(rows)
+    for place in range(len(rows)):
+        others = rows[:place] + rows[place + 1 :]
+        for more in set(range(READINGS)) - set(others):
+            both = (
+                left(kind, information, root, others),
+                left(kind, information, root, [*others, more]),
+            )
+            assert gains[place, more] == pytest.approx(both[0] - both[1], rel=1e-9)
+
+
+def test_the_best_pair_of_an_absolute_setup(drawn):
+    kind, information, root, taking = drawn
+    taking = replace(taking, setup=replace(kind, absolute=True))
+    pairs = Pairs.of(taking.setup, 2)
+    gains = taking.gains(np.column_stack([pairs.first, pairs.second]))
+    (gain, pair), *_ = taking.best_pairs(pairs, 1)
+    assert gain == pytest.approx(gains.max(), rel=1e-9)
+    assert taking.gains(np.array([pair])) == pytest.approx(gain, rel=1e-9)
 
 
 @pytest.mark.parametrize("count", [2, 3, 4])
