@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from datetime import datetime, timedelta
 from itertools import pairwise
@@ -36,8 +37,7 @@ def in_course(
     session: Session,
     *,
     temperatures: tuple[float, float] | None = None,
-    minutes_a_setup: float = MINUTES_A_SETUP,
-    minutes_a_reading: float = MINUTES_A_READING,
+    durations: Mapping[str, tuple[float, float]] | None = None,
     start: datetime = MORNING,
 ) -> Session:
     """Session whose readings were taken one after the other on a day that warms or cools evenly.
@@ -48,15 +48,16 @@ def in_course(
         session: The session; approaches stay what they are.
         temperatures: Temperature of the first and the last reading, [°C]; by default the neutral
             one.
-        minutes_a_setup: Time to mount a gauge.
-        minutes_a_reading: Time of a reading.
+        durations: Minutes to mount a gauge and to read it, by its name; by default usual ones.
         start: Time of the first reading.
     """
     setups = [r.setup for r in session.readings]
     if not setups:
         return session
-    setup_index = np.cumsum([False, *(a != b for a, b in pairwise(setups))])
-    minutes = setup_index * minutes_a_setup + np.arange(len(setups)) * minutes_a_reading
+    usual, known = (MINUTES_A_SETUP, MINUTES_A_READING), durations or {}
+    of_setup = {n: known.get(s.gauge, usual) for n, s in session.setups.items()}
+    steps = [of_setup[a][1] + of_setup[b][0] * (a != b) for a, b in pairwise(setups)]
+    minutes = np.cumsum([0.0, *steps])
     neutral = neutral_values(session.robot)["temperature"]
     first, last = temperatures or (neutral, neutral)
     warmth = np.interp(minutes, [0.0, max(float(minutes[-1]), 1e-9)], [first, last])

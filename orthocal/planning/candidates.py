@@ -94,6 +94,8 @@ class CandidateSetup:
     aligned: tuple[AlignedParameter, ...] = ()
     absolute: bool = False
     """Whether the gauge zero is known."""
+    gauge: str = ""
+    """Name of its gauge."""
 
     def jacobian_of(self, chosen: Sequence[int]) -> Array:
         """Jacobian of some readings, the gauge aligned in the first, (n_chosen, n_state)."""
@@ -211,14 +213,17 @@ def measure_candidates(
             aligned.append(AlignedParameter(sensitivity, moved))
         spread, ratio = mine @ mine.T, float(problem.noise_ratio[rows[0]])
         absolute = session.setups[name].zero == "known"
-        gauge = session.gauges[session.setups[name].gauge]
+        of_gauge = session.setups[name].gauge
+        gauge = session.gauges[of_gauge]
         # the operator places a fixed ball so that its first reading is in the middle of the range
         unknown = spare_range * ratio * _difference_std(shared, spread)
         needed.append(float(unknown.max()))
         reachable = _find_reachable(gauge, ratio * h[rows], unknown)
         covariance = spread + (0.0 if absolute else (ZERO_PRIOR / ratio) ** 2)
         setups.append(
-            CandidateSetup(name, rows, shared, covariance, reachable, tuple(aligned), absolute)
+            CandidateSetup(
+                name, rows, shared, covariance, reachable, tuple(aligned), absolute, of_gauge
+            )
         )
     state = tuple(problem.free[i] for i in common)
     typical = float(np.median(needed)) if needed else 0.0

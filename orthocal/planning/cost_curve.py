@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 
 from orthocal.errors import ParameterError
-from orthocal.planning.equipment import Equipment
-from orthocal.planning.selection import SetupSearch
+from orthocal.planning.timed_search import TimedSearch
 
 ENOUGH = 0.05
 """Relative reduction of the error by another hour below which a plan has enough readings."""
@@ -34,24 +34,23 @@ class Stage:
     """Value of the criterion, [m] or prior std."""
 
 
-def compute_curve(
-    search: SetupSearch, each: int, planned: int, equipment: Equipment
-) -> tuple[Stage, ...]:
+def compute_curve(search: TimedSearch, each: int | None, planned: int) -> tuple[Stage, ...]:
     """Expected error after each setup, added one after the other.
 
     It depends on the number of setups of the plan in its length alone.
 
     Args:
         search: Candidates and prior information.
-        each: Readings of each setup.
+        each: Readings of each setup; None for those with the largest gain per minute.
         planned: Setups of the plan.
-        equipment: Equipment, for the duration.
     """
-    stages = [Stage(0, 0, 0.0, search.empty.error)]
+    stages = [Stage(0, 0, 0.0, search.search.empty.error)]
     fewest = min(math.ceil(LONGER * planned), MOST_SETUPS)
+    grown = search.grow() if each is None else search.search.grow([each] * MOST_SETUPS)
     try:
-        for n, plan in enumerate(search.grow([each] * MOST_SETUPS), 1):
-            stages.append(Stage(n, n * each, equipment.minutes(n, n * (each + 1)), plan.error))
+        for n, plan in enumerate(islice(grown, MOST_SETUPS), 1):
+            readings = sum(len(s.chosen) for s in plan.setups)
+            stages.append(Stage(n, readings, search.minutes(plan.setups), plan.error))
             if n >= fewest and find_enough(stages) is not None:
                 break
     except ParameterError:  # a setup of that many readings is not possible

@@ -23,7 +23,7 @@ from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.files.schema import GaugeKeys
 from orthocal.observation.conditions import MINUTES_A_READING, MINUTES_A_SETUP, in_course
 from orthocal.planning.expected_error import state_noise
-from orthocal.planning.owned_sensors import OwnedSensor
+from orthocal.planning.owned_sensors import Duration, OwnedSensor
 from orthocal.robot.model import Leg, Robot, require_commanded_tool
 from orthocal.sensors.direction import Direction
 from orthocal.sensors.leg_indicator import LegIndicator, Section
@@ -106,17 +106,25 @@ class Equipment:
         return [line.on_rod(rod, self.tip) for rod in self.rods or tuple(leg.rods)[:1]]
 
     def minutes(self, setups: int, readings: int) -> float:
-        """Duration of setups and their readings."""
+        """Duration of setups at legs and their readings."""
         return setups * self.minutes_a_setup + readings * self.minutes_a_reading
+
+    def durations(self, session: Session) -> dict[str, Duration]:
+        """Duration of setups and readings with each gauge of a session."""
+        usual = Duration(self.minutes_a_setup, self.minutes_a_reading)
+        known = {sensor.name: sensor.duration for sensor in self.owned}
+        return {name: known.get(name, usual) for name in session.gauges}
+
+    def minutes_of(self, plan: Session) -> float:
+        """Duration of a session's setups and readings."""
+        durations = self.durations(plan)
+        of_setup = {name: durations[setup.gauge] for name, setup in plan.setups.items()}
+        setups = sum(duration.setup for duration in of_setup.values())
+        return setups + sum(of_setup[r.setup].reading for r in plan.readings)
 
     def in_course(self, plan: Session) -> Session:
         """Planned readings with the times and temperatures at which they will be taken."""
-        return in_course(
-            plan,
-            temperatures=self.temperatures,
-            minutes_a_setup=self.minutes_a_setup,
-            minutes_a_reading=self.minutes_a_reading,
-        )
+        return in_course(plan, temperatures=self.temperatures, durations=self.durations(plan))
 
 
 @cached_per_robot(maxsize=8)

@@ -101,7 +101,7 @@ def _extensions(comparison: Comparison, conditions: Sequence[Condition]) -> Iter
     plan = comparison.equipment.in_course(comparison.plan)
     setups, readings = len(plan.setups), len(plan.readings)
     if "temperature" in conditions:
-        minutes = comparison.equipment.minutes(setups, readings)
+        minutes = comparison.equipment.minutes_of(plan)
         yield _Extension(_read_again_warmer(plan), readings, minutes, warmer=WARMER)
     if "time" in conditions:
         for wait in WAITS:

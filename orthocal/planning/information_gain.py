@@ -143,7 +143,7 @@ class SetupGain:
         inverse = np.linalg.inv(self._covariance(spread, rows))
         solved, weighted = inverse @ spread, inverse @ self.effect[rows]
         effect = self.effect - solved.T @ self.effect[rows]
-        variance = self.variance - np.vecdot(spread, solved, axis=0)
+        variance = self.variance - np.vecdot(spread.T, solved.T)
         own = inverse.diagonal()[:, None]
         share = solved / own
         gains = np.vecdot(weighted, weighted)[:, None] * share
@@ -221,31 +221,39 @@ class SetupGain:
         return np.asarray(gains / spreads)
 
     def complete(self, pair: tuple[int, int], count: int) -> tuple[float, tuple[int, ...]]:
-        """Add readings greedily to a pair, with the gain of all of them.
+        """Add readings greedily to a pair, with the gain of all of them."""
+        gains, chosen = self.grow(pair, count)
+        return gains[-1], chosen
+
+    def grow(self, pair: tuple[int, int], count: int) -> tuple[tuple[float, ...], tuple[int, ...]]:
+        """Add readings greedily to a pair, with the gains of the first one, of two, and so on.
 
         Each reading that is added conditions the others: one more column of the Cholesky factor
-        of V.
+        of V. Fewer readings are added if the range of the gauge allows no more.
         """
         spread, effect, variance = self.spread, self.effect, self.variance
         steps, shared = np.empty((count, len(variance))), np.empty_like(effect)
-        chosen, gain = list(pair), 0.0
+        chosen, gains = list(pair), list[float]()
         refused = ~self.setup.reachable[pair[0]]
         for k in range(count):
             if k >= len(chosen):
                 refused[chosen] = True
-                gains = self._single_gains(effect, variance)
-                np.putmask(gains, refused, -1.0)
-                chosen.append(int(gains.argmax()))
+                single = self._single_gains(effect, variance)
+                np.putmask(single, refused, -1.0)
+                best = int(single.argmax())
+                if refused[best]:
+                    break
+                chosen.append(best)
             row, column = chosen[k], spread[chosen[k]]
             if k:
                 column = column - steps[:k, row] @ steps[:k]
             size = math.sqrt(column[row] + self.noise)
             step, share = np.divide(column, size, out=steps[k]), effect[row] / size
-            gain += float(share @ share)
+            gains.append(float(share @ share) + (gains[-1] if gains else 0.0))
             np.multiply(step[:, None], share, out=shared)
             effect = np.subtract(effect, shared, out=effect if k else None)
             variance = variance - step**2
-        return gain, tuple(chosen)
+        return tuple(gains), tuple(chosen)
 
     def _covariance(self, rest: Array, rows: list[int]) -> Array:
         """V_SS + σ² I of readings, from their rows of V."""

@@ -5,17 +5,69 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from orthocal.errors import SessionError
-from orthocal.io.documents import read_yaml, validate
+from orthocal.io.documents import Number, read_yaml, validate
 from orthocal.measurement.files.schema import GaugeKeys
 from orthocal.session.session import Gauge
 from orthocal.statistics.noise import noise_floor
 
+SLACK = 1e-9
+"""Minutes by which rounding may exceed a time."""
+
+
+class Duration(NamedTuple):
+    """Minutes that a gauge takes."""
+
+    setup: float
+    reading: float
+
+    def of(self, readings: int) -> float:
+        """Minutes of a setup with this number of readings and a closing one."""
+        return self.setup + (readings + 1) * self.reading
+
+    def most(self, minutes: float, limit: int) -> int:
+        """Largest number of readings of a setup within a time, beside the closing one."""
+        left = minutes - self.setup + SLACK
+        if left < self.reading * (limit + 1):
+            return max(int(left / self.reading) - 1, 0)
+        return limit if left > 0.0 else 0
+
+
+DURATIONS = {
+    "ball_bar": Duration(10.0, 0.5),
+    "probe": Duration(2.0, 0.1),
+    "tool_indicator": Duration(10.0, 0.5),
+}
+"""Usual durations of each kind of sensor. A probe moves by itself."""
+
+Minutes = Annotated[Number, Field(ge=0.0, le=1e4)]
+
+
+class DurationKeys(BaseModel):
+    """Keys of a sensor's file about time."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+    minutes_a_setup: Minutes | None = None
+    minutes_a_reading: Minutes | None = None
+
+    def to_duration(self, usual: Duration) -> Duration:
+        """Duration, by default the usual one."""
+        setup, reading = self.minutes_a_setup, self.minutes_a_reading
+        return Duration(
+            usual.setup if setup is None else float(setup),
+            usual.reading if reading is None else float(reading),
+        )
+
+
 PLACED = {
     "ball_bar": ("centre_mm", "ball"),
     "tool_indicator": ("direction",),
+    "probe": (),
 }
 """Kinds of sensor that a plan places, with the keys that the plan chooses."""
 
@@ -29,13 +81,15 @@ class OwnedSensor:
     keys: Mapping[str, Any]
     """Keys of its setups in a session.yaml, without those that the plan chooses."""
     file: Path
+    duration: Duration
 
 
 def load_owned_sensor(path: str | Path) -> OwnedSensor:
     """A sensor from a file: the keys of its gauge and those of a setup, without its place.
 
     Args:
-        path: YAML with `sensor`, `sigma_mm`, `range_mm` and the like, and the keys of a setup.
+        path: YAML with `sensor`, `sigma_mm`, `range_mm` and the like, the keys of a setup, and
+            `minutes_a_setup` and `minutes_a_reading`.
 
     Raises:
         SessionError: Naming file and key.
@@ -47,6 +101,8 @@ def load_owned_sensor(path: str | Path) -> OwnedSensor:
             f"expected the key sensor: {' or '.join(PLACED)}, and those of the sensor",
             where=str(file),
         )
+    times = {k: data.pop(k) for k in DurationKeys.model_fields if k in data}
+    duration = validate(DurationKeys, times, where=str(file), error=SessionError)
     gauge_keys = {k: v for k, v in data.items() if k in GaugeKeys.model_fields}
     shared = {"scale_tolerance", "tip"}
     gauge = validate(GaugeKeys, gauge_keys, where=str(file), error=SessionError).to_gauge()
@@ -59,4 +115,5 @@ def load_owned_sensor(path: str | Path) -> OwnedSensor:
         if key in keys:
             raise SessionError("the plan chooses it; leave it out", where=f"{file}: {key}")
     name = "".join(c for c in file.stem if c.isalnum() or c in "_-") or "sensor"
-    return OwnedSensor(name, gauge, keys, file)
+    usual = DURATIONS[data["sensor"]]
+    return OwnedSensor(name, gauge, keys, file, duration.to_duration(usual))

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
 
 import numpy as np
 
@@ -47,6 +46,7 @@ from orthocal.planning.further_readings import FurtherReadings, find_further_rea
 from orthocal.planning.plan_comparison import Alternative, Comparison
 from orthocal.planning.planned_session import build_session
 from orthocal.planning.selection import KILLED, PlannedSetup, PlannedSetups, SetupSearch
+from orthocal.planning.timed_search import TimedSearch
 from orthocal.robot.model import Robot
 from orthocal.runtime.worker_pool import call_in_parallel, run_in_parallel, worker_budget
 from orthocal.sensors.leg_indicator import LegIndicator
@@ -61,9 +61,6 @@ READINGS_A_SETUP = (3, 5, 9, 16)
 """Numbers of readings of a setup that are tried for a given time."""
 
 USUAL_SETUPS = 6
-
-LONG_SETUPS, LONG_READINGS = (0, 1, 2, 3), (9, 16, 48)
-"""Numbers of setups with many readings, and of these, where sensors at the tool are available."""
 
 GOAL = 0.4
 """Limit of backlash after a plan, in its limit before, that plans reach if they can: the tool may
@@ -190,11 +187,19 @@ def plan_readings(
     chosen = resolve_choice(choice, measured, default_model=MODEL)
     robot, measured = _with_choice(robot, measured, chosen)
     equipment = equipment or Equipment()
-    counts = _list_counts(setups, readings, hours, equipment, robot)
+    counts: Sequence[list[int]] | float
+    counts = options = _list_counts(setups, readings, hours, equipment, robot)
+    if equipment.owned and setups is None and readings is None:
+        counts = HOUR * hours if hours is not None else equipment.minutes(*_totals(options[0]))
     forecast = ToolForecast(robot, chosen.select(robot.parameters), workspace)
     session = list_candidates(robot, equipment, reference=reference)
     session = replace(session, purpose=Purpose(chosen.model, tuple(chosen.free)))
     return _plan(session, counts, forecast, equipment, measured, work)
+
+
+def _totals(counts: Sequence[int]) -> tuple[int, int]:
+    """Numbers of setups and of readings, with the closing ones."""
+    return len(counts), sum(counts) + len(counts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,7 +215,7 @@ class _Work:
 
 def _plan(
     session: Session,
-    options: Sequence[list[int]],
+    options: Sequence[list[int]] | float,
     forecast: ToolForecast,
     equipment: Equipment,
     measured: Session | None,
@@ -220,7 +225,7 @@ def _plan(
 
     Args:
         session: All candidate readings.
-        options: Possible numbers of readings of each setup.
+        options: Possible numbers of readings of each setup, or the available time, [min].
         forecast: Expected errors of the robot.
         equipment: Gauge, tip and region.
         measured: Existing readings.
@@ -235,14 +240,15 @@ def _plan(
         _prior(candidates, forecast, measured),
         forecast.weigh(work.criterion, len(candidates.state)),
     )
-    planned = _search_setups(search, candidates, options, work)
+    timed = TimedSearch(search, equipment.durations(session))
+    planned = _search_setups(timed, candidates, options, work)
 
     def compare(planned: PlannedSetups) -> Comparison:
         plan = build_session(candidates, planned.setups, measured)
         return Comparison(candidates, plan, equipment, forecast, measured)
 
     work.report("comparing the plan with others")
-    plan = _evaluate(search, planned, compare(planned), work)
+    plan = _evaluate(timed, planned, compare(planned), work)
     better = min(plan.better_usual_plans, key=lambda usual: usual[0], default=None)
     if better is None:
         return plan
@@ -251,31 +257,40 @@ def _plan(
     improved = search.improve(setups)
     expected = compare(improved).expect_plan()
     best = improved if expected.rms_by(work.criterion) < error else search.plan_of(setups)
-    return _evaluate(search, best, compare(best), work)
+    return _evaluate(timed, best, compare(best), work)
 
 
 def _search_setups(
-    search: SetupSearch, candidates: Candidates, options: Sequence[list[int]], work: _Work
+    timed: TimedSearch,
+    candidates: Candidates,
+    options: Sequence[list[int]] | float,
+    work: _Work,
 ) -> PlannedSetups:
-    """Setups with the smallest error for one of the possible numbers of readings."""
-    counts = (
-        options[0]
-        if len(options) == 1
-        else _choose_counts(search, work.seed, work.workers, options)
-    )
-    work.report(f"choosing readings of {len(counts)} setup{'s' * (len(counts) > 1)}")
+    """Setups with the smallest error for a time, or one of the possible numbers of readings."""
+    search = timed.search
+
+    def report(start: int, _: float) -> None:
+        work.report(f"search {start} finished")
+
+    if isinstance(options, float):
+        work.report(f"choosing setups for {options:.0f} min")
+
+        def choose(weighted: SetupSearch) -> PlannedSetups:
+            within = replace(timed, search=weighted)
+            return within.choose(options, starts=work.starts, workers=work.workers, report=report)
+    else:
+        counts = options[0]
+        if len(options) > 1:
+            counts = _choose_counts(search, work.seed, work.workers, options)
+        work.report(f"choosing readings of {len(counts)} setup{'s' * (len(counts) > 1)}")
+
+        def choose(weighted: SetupSearch) -> PlannedSetups:
+            return weighted.choose(
+                counts, seed=work.seed, starts=work.starts, workers=work.workers, report=report
+            )
+
     sides = _find_sides(candidates, candidates.session.robot)
-    planned = _choose_setups(
-        search,
-        sides,
-        lambda weighted: weighted.choose(
-            counts,
-            seed=work.seed,
-            starts=work.starts,
-            workers=work.workers,
-            report=lambda start, _: work.report(f"search {start} finished"),
-        ),
-    )
+    planned = _choose_setups(search, sides, choose)
     return _simplify(candidates, planned, search, sides)
 
 
@@ -334,7 +349,7 @@ def _is_reached(planned: PlannedSetups, sides: list[int]) -> bool:
 
 
 def _evaluate(
-    search: SetupSearch,
+    search: TimedSearch,
     planned: PlannedSetups,
     comparison: Comparison,
     work: _Work,
@@ -343,12 +358,12 @@ def _evaluate(
     plan, measured, forecast = comparison.plan, comparison.measured, comparison.forecast
     joined = comparison.join(comparison.equipment.in_course(plan))
     setups, readings = len(planned.setups), sum(len(s.chosen) for s in planned.setups)
-    minutes = comparison.equipment.minutes(setups, len(plan.readings))
-    each = round(readings / setups)
+    minutes = comparison.equipment.minutes_of(plan)
+    each = None if comparison.equipment.owned else round(readings / setups)
     with worker_budget(work.workers):
         curve, helps, compared, expected, first_round, nominal, known, limits = call_in_parallel(
             (
-                lambda: compute_curve(search, each, setups, comparison.equipment),
+                lambda: compute_curve(search, each, setups),
                 comparison.list_alternatives,
                 comparison.list_usual_plans,
                 comparison.expect_plan,
@@ -442,12 +457,12 @@ def _list_counts(
     if hours is not None:
         if setups is not None or readings is not None:
             raise ParameterError("found with --setups or --readings; expected one", where="--hours")
-        options = _mix_counts(hours * HOUR, equipment) if equipment.owned else []
+        options = []
         for most in READINGS_A_SETUP:
             count = int(hours * HOUR / equipment.minutes(1, most + 1))
             if 1 <= count <= MOST_SETUPS:
                 options.append([most] * count)
-        if not options:
+        if not options and not equipment.owned:
             least = equipment.minutes(1, READINGS_A_SETUP[0] + 1) / HOUR
             raise ParameterError(
                 f"found {hours:g}; expected at least {least:.2g}, a setup of "
@@ -466,22 +481,7 @@ def _list_counts(
             "setups: the first one only determines the gauge zero",
             where="--readings",
         )
-    if equipment.owned and setups is None and readings is None:
-        return _mix_counts(equipment.minutes(count, total + count), equipment)
     return [[total // count + (i < total % count) for i in range(count)]]
-
-
-def _mix_counts(minutes: float, equipment: Equipment) -> list[list[int]]:
-    """Setups of few and of many readings that take at most a time."""
-    few = READINGS_A_SETUP[0]
-    options: list[list[int]] = []
-    for many, long in product(LONG_READINGS, LONG_SETUPS):
-        left = minutes - long * equipment.minutes(1, many + 1)
-        short = int(left / equipment.minutes(1, few + 1) + 1e-9)
-        counts = [many] * long + [few] * short
-        if left >= 0.0 and 1 <= len(counts) <= MOST_SETUPS and counts not in options:
-            options.append(counts)
-    return options
 
 
 def _choose_counts(

@@ -24,6 +24,9 @@ MIDDLE = 0.5
 
 BLADE = Tip("blade", 0.0, 20e-3)
 
+PAPER_READINGS = 4
+"""Readings of the paper's setups: zero, both ends, and zero again."""
+
 FINER = 0.5
 """Factor of sigma and resolution of a finer dial."""
 
@@ -72,6 +75,10 @@ class Comparison:
         """
         setups = self._middle_setups()
         count, total = len(self.plan.setups), len(self.plan.readings)
+        if self.equipment.owned:  # setups of the paper's gauges in the same time
+            minutes = self.equipment.minutes_of(self.plan)
+            count = max(int(minutes / self.equipment.minutes(1, PAPER_READINGS)), 1)
+            total = PAPER_READINGS * count
         chosen = [setups[i % len(setups)] for i in range(count)] if setups else []
         each = [total // count + (i < total % count) for i in range(count)]
         lines = [self._line(setup) for setup in chosen]
@@ -117,7 +124,7 @@ class Comparison:
         return tuple(alternatives)
 
     def _assess(self, name: str, session: Session, *, in_range: bool = True) -> Alternative:
-        minutes = self.equipment.minutes(len(session.setups), len(session.readings))
+        minutes = self.equipment.minutes_of(session)
         expected = self._expect(session) if in_range else None
         return Alternative(name, len(session.setups), len(session.readings), minutes, expected)
 

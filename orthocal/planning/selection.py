@@ -7,6 +7,7 @@ Then each setup, and each of its readings, is exchanged for a better one until l
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -32,7 +33,7 @@ MOST_REFINED = 4
 """Candidate setups whose readings are exchanged, to find the best of them."""
 
 MOST_COMPLETED = 12
-"""Candidate setups for which more than the best pair of readings is computed."""
+"""Candidate setups of each gauge for which more than the best pair of readings is computed."""
 
 MOST_PAIRS = 3
 """Pairs of readings from which the readings of a setup are completed."""
@@ -369,7 +370,19 @@ class Gains:
     def rank(self, count: int) -> list[PlannedSetup]:
         """Best readings of each candidate setup, completed greedily; largest gain first.
 
-        Only setups whose best pair of readings gains most are completed.
+        Only setups of each gauge whose best pair of readings gains most are completed.
+        """
+        completed = []
+        for which, pair in self.begin(count):
+            gain, chosen = self.setup(which, pair[0]).complete(pair, count)
+            completed.append((gain, PlannedSetup(which, chosen)))
+        return [planned for _, planned in sorted(completed, key=lambda c: -c[0])]
+
+    def begin(self, count: int) -> list[tuple[int, tuple[int, int]]]:
+        """Setups of each gauge whose best pair of readings gains most, with this pair.
+
+        Args:
+            count: Number of readings that the range of the gauge allows beside the first one.
         """
         present = [
             (gain, which, pair)
@@ -378,11 +391,14 @@ class Gains:
             for gain, pair in self._ranking_setup(which).best_pairs(self._pairs(which, count), 1)
         ]
         present.sort(key=lambda b: -b[0])
-        completed = []
-        for _, which, pair in present[:MOST_COMPLETED]:
-            gain, chosen = self.setup(which, pair[0]).complete(pair, count)
-            completed.append((gain, PlannedSetup(which, chosen)))
-        return [planned for _, planned in sorted(completed, key=lambda c: -c[0])]
+        of_gauge: Counter[str] = Counter()
+        begun = []
+        for _, which, pair in present:
+            gauge = self.search.reduced[which].gauge
+            of_gauge[gauge] += 1
+            if of_gauge[gauge] <= MOST_COMPLETED:
+                begun.append((which, pair))
+        return begun
 
     def restart(self, planned: PlannedSetup) -> list[PlannedSetup]:
         """Setup completed greedily from each of the best pairs of readings."""

@@ -34,7 +34,13 @@ ON_PLATE = 5
 """Positions along each side of a plate."""
 
 LEVELS = (-0.5, 0.0, 0.5)
-"""Positions of an artefact across, and of a fixed ball, in the half sides of the box."""
+"""Positions of an artefact across its surface, in the half sides of the box about its middle."""
+
+BALLS = (
+    *((0.0, 0.0, level) for level in LEVELS),
+    *itertools.product((-0.5, 0.5), repeat=3),
+)
+"""Positions of a fixed ball, in the half sides of the box about its middle."""
 
 STEP = 5 * MM
 """Step of the positions, [m]."""
@@ -137,8 +143,8 @@ def _bars(
     tool = np.array(sensor.keys.get("tool_mm", (0.0, 0.0, 0.0))) * MM
     half, centre = 0.5 * (box[:, 1] - box[:, 0]), box.mean(axis=1)
     angle = 2.0 * np.pi * np.arange(ON_CIRCLE) / ON_CIRCLE
-    for k, level in enumerate(LEVELS):
-        ball = np.round((centre + level * half[2] * np.eye(3)[2]) / STEP) * STEP
+    for k, place in enumerate(BALLS):
+        ball = np.round((centre + np.array(place) * half) / STEP) * STEP
         circles = []
         for axis, share in itertools.product(range(3), LATITUDES):
             radius = length * np.sqrt(1.0 - share**2)

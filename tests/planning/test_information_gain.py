@@ -66,7 +66,7 @@ def test_the_gain_of_a_reading_in_place_of_another(drawn):
 
 
 def test_the_best_pair_of_an_absolute_setup(drawn):
-    kind, information, root, taking = drawn
+    kind, *_, taking = drawn
     taking = replace(taking, setup=replace(kind, absolute=True))
     pairs = Pairs.of(taking.setup, 2)
     gains = taking.gains(np.column_stack([pairs.first, pairs.second]))
