@@ -56,7 +56,6 @@ def _ratio(seed, hands):
             covariance = np.linalg.inv(np.eye(STATE) + told[able].sum(axis=1))
             squares = np.trace(root.T @ covariance @ root, axis1=1, axis2=2)
             best = min(best, float(np.sqrt(squares.min())))
-    print(seed, hands, plan.error / best)
     return plan.error / best
 
 
