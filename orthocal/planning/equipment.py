@@ -115,6 +115,11 @@ class Equipment:
         known = {sensor.name: sensor.duration for sensor in self.owned}
         return {name: known.get(name, usual) for name in session.gauges}
 
+    @property
+    def once(self) -> frozenset[str]:
+        """Sensors of which a plan has one setup at most."""
+        return frozenset(s.name for s in self.owned if s.keys["sensor"] == "probe")
+
     def minutes_of(self, plan: Session) -> float:
         """Duration of a session's setups and readings."""
         durations = self.durations(plan)

@@ -240,7 +240,7 @@ def _plan(
         _prior(candidates, forecast, measured),
         forecast.weigh(work.criterion, len(candidates.state)),
     )
-    timed = TimedSearch(search, equipment.durations(session))
+    timed = TimedSearch(search, equipment.durations(session), equipment.once)
     planned = _search_setups(timed, candidates, options, work)
 
     def compare(planned: PlannedSetups) -> Comparison:

@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 from threadpoolctl import threadpool_limits
 
-from orthocal.arrays import Array
 from orthocal.errors import ParameterError
 from orthocal.planning.candidates import FEWEST
 from orthocal.planning.owned_sensors import SLACK, Duration
@@ -32,7 +31,7 @@ from orthocal.planning.selection import (
 )
 from orthocal.runtime.worker_pool import run_in_parallel
 
-READINGS = (2, 3, 4, 6, 9, 12, 16, 24, 32, 48)
+READINGS = (2, 3, 4, 6, 9, 12, 16, 24, 32, 48, 64, 96)
 """Numbers of readings of a setup that are tried."""
 
 MOST_ROUNDS = 4
@@ -62,6 +61,8 @@ class TimedSearch:
     search: SetupSearch
     durations: Mapping[str, Duration]
     """Of each gauge, by its name."""
+    once: frozenset[str] = frozenset()
+    """Gauges of which a plan has one setup at most: a bed does not move."""
 
     def choose(
         self,
@@ -114,7 +115,7 @@ class TimedSearch:
         with threadpool_limits(1):  # on several threads sums may be rounded differently
             plan = self.search.empty
             if first is not None:
-                options = self._list_options(plan.information, 0.5 * minutes)
+                options = self._list_options(plan, 0.5 * minutes)
                 of_gauge = [o for o in options if self._gauge(o.planned) == first]
                 if of_gauge:
                     best = max(of_gauge, key=lambda o: o.gain)
@@ -138,7 +139,7 @@ class TimedSearch:
     def grow(self) -> Iterator[PlannedSetups]:
         """Plans with one setup more each, of the largest gain per minute."""
         plan = self.search.empty
-        while options := self._list_options(plan.information, UNLIMITED):
+        while options := self._list_options(plan, UNLIMITED):
             plan = self._with(plan, max(options, key=_rate).planned)
             yield plan
 
@@ -158,18 +159,22 @@ class TimedSearch:
         """Plan with further setups of largest gain per minute, until none fits."""
         while True:
             left = minutes - self.minutes(plan.setups)
-            options = self._list_options(plan.information, left)
+            options = self._list_options(plan, left)
             if not options:
                 return plan
             best = max(options, key=_rate)
             plan = self._with(plan, best.planned)
 
-    def _list_options(self, information: Array, minutes: float) -> list[_Option]:
-        """Setups that fit into a time, with their gains beside an information."""
-        most = {name: d.most(minutes, READINGS[-1]) for name, d in self.durations.items()}
+    def _list_options(self, plan: PlannedSetups, minutes: float) -> list[_Option]:
+        """Setups that fit into a time, with their gains beside those of a plan."""
+        used = self.once & {self._gauge(setup) for setup in plan.setups}
+        most = {
+            name: 0 if name in used else d.most(minutes, READINGS[-1])
+            for name, d in self.durations.items()
+        }
         if max(most.values()) < FEWEST:
             return []
-        gains, options = Gains.of(self.search, information), list[_Option]()
+        gains, options = Gains.of(self.search, plan.information), list[_Option]()
         for which, pair in gains.begin(FEWEST):
             gauge = self.search.reduced[which].gauge
             if most[gauge] < FEWEST:
@@ -190,7 +195,7 @@ class TimedSearch:
             others.remove(setup)
         information = plan.information - self.search.information_of(*old)
         without = replace(plan, setups=tuple(others), information=information)
-        options = self._list_options(information, minutes - self.minutes(others))
+        options = self._list_options(without, minutes - self.minutes(others))
         if not options:
             return plan
         rate = max(options, key=_rate).planned

@@ -33,6 +33,9 @@ ON_EDGE = 9
 ON_PLATE = 5
 """Positions along each side of a plate."""
 
+ON_BED = 11
+"""Positions along each side of a bed."""
+
 LEVELS = (-0.5, 0.0, 0.5)
 """Positions of an artefact across its surface, in the half sides of the box about its middle."""
 
@@ -54,7 +57,8 @@ def list_tool_candidates(
     Args:
         robot: The robot, with three tool coordinates.
         owned: The available sensors.
-        box: Limits of the tool's coordinates; by default those of `choose_box`.
+        box: Limits of the tool's coordinates; by default the workspace that the robot states, or
+            those of `choose_box`: a tool may not go below a bed.
 
     Raises:
         ParameterError: If the machine has no three tool coordinates, or reaches no place.
@@ -64,7 +68,8 @@ def list_tool_candidates(
         return {}, {}, {}, []
     if robot.tcp is None or tuple(robot.tcp.coordinates) != (0, 1, 2):
         raise ParameterError("need a tool that moves along x, y and z", where="--with")
-    limits, middle = choose_box(robot, box), tool_at_zero(robot)
+    stated = robot.workspace if box is None else box
+    limits, middle = choose_box(robot, stated), tool_at_zero(robot)
     gauges = {sensor.name: sensor.gauge for sensor in owned}
     postures: dict[str, Posture] = {}
     setups: dict[str, Setup] = {}
@@ -118,6 +123,9 @@ def _places(
     if sensor.keys["sensor"] == "ball_bar":
         yield from _bars(sensor, middle, box)
         return
+    if sensor.keys["sensor"] == "probe":
+        yield from _beds(sensor, middle, box)
+        return
     artefact = sensor.keys.get("artefact")
     kind = artefact.get("kind") if isinstance(artefact, Mapping) else None
     places = {
@@ -158,6 +166,20 @@ def _bars(
             "ball": f"{sensor.name}_{k + 1}",
         }
         yield f"{sensor.name}_{k}", keys, points[inside]
+
+
+def _beds(
+    sensor: OwnedSensor, middle: Array, box: Array
+) -> Iterator[tuple[str, dict[str, Any], Array]]:
+    """Points of a bed, in whose plane the origin of the world lies."""
+    direction = str(sensor.keys.get("direction", "-z"))
+    if direction[-1:] not in list("xyz"):
+        direction = "-z"  # refused with the other keys
+    axis = "xyz".index(direction[-1])
+    tip = np.array(sensor.keys.get("tool_mm", (0.0, 0.0, 0.0)))[axis] * MM
+    points = _grid(middle, box, axis, 2.0 * float(np.ptp(box, axis=1).max()), ON_BED)
+    points[:, axis] = -tip
+    yield sensor.name, {}, points
 
 
 def _edges(

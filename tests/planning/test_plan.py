@@ -34,8 +34,10 @@ from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.cost_curve import compute_curve, find_enough
 from orthocal.planning.equipment import Equipment, choose_box, find_box
 from orthocal.planning.expected_error import ToolForecast
+from orthocal.planning.owned_sensors import Duration
 from orthocal.planning.plan import plan_readings
 from orthocal.planning.selection import PlannedSetup, SetupSearch
+from orthocal.planning.timed_search import TimedSearch
 from orthocal.sensors.mounting import EXACT, Mounting
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Gauge
@@ -324,8 +326,9 @@ def test_usual_plans_that_the_dial_cannot_read_have_no_expected_error(orthoglide
 def test_enough_does_not_depend_on_the_number_of_setups_of_the_plan(orthoglide):
     """With `--setups 6` it was 9 setups, with `--setups 9` more."""
     equipment = Equipment(along=5, across=0.0, sections=(0.5,))
-    search = make_search(orthoglide, equipment)
-    curves = [compute_curve(search, 3, planned, equipment) for planned in (1, 9)]
+    durations = {"": Duration(equipment.minutes_a_setup, equipment.minutes_a_reading)}
+    search = TimedSearch(make_search(orthoglide, equipment), durations)
+    curves = [compute_curve(search, 3, planned) for planned in (1, 9)]
     few, many = (find_enough(curve) for curve in curves)
     assert few == many is not None
     assert len(curves[1]) > len(curves[0]) > few.setups
@@ -350,9 +353,9 @@ def test_a_usual_plan_that_is_better_is_preferred(orthoglide, monkeypatch, readi
     assert bad.expected.reported.rms > best  # of another figure nothing is compared
 
 
-def worst_setups(search, candidates, options, work):
+def worst_setups(timed, candidates, options, work):
     """The first candidate setup twice."""
     (counts,) = options
     first = candidates.setups[0]
     chosen = [tuple(np.flatnonzero(first.reachable[0])[:n].tolist()) for n in counts]
-    return search.plan_of([PlannedSetup(0, rows) for rows in chosen])
+    return timed.search.plan_of([PlannedSetup(0, rows) for rows in chosen])

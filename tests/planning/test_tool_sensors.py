@@ -38,6 +38,7 @@ BLOCK = SQUARE.replace(
     "square, straight_tolerance_mm: 0.002, square_tolerance_mrad: 0.02, length_mm: 150",
     "gauge_block, height_mm: 50, height_tolerance_mm: 0.0005",
 )
+PROBE = "sensor: probe\nsigma_mm: 0.01\n"
 QUICK = {"along": 5, "across": 0.0, "sections": (0.5,)}
 
 
@@ -162,6 +163,7 @@ def test_approaches_of_a_bar_follow_from_its_path(owned):
 @pytest.mark.parametrize(
     ("text", "place"),
     [
+        (BAR + "minutes_a_reading: -1\n", "minutes_a_reading"),
         (BAR.replace("ball_bar", "leg"), ""),
         (BAR.replace("sigma_mm: 0.002\n", ""), "sigma_mm"),
         (BAR + "centre_mm: [0, 0, 0]\n", "centre_mm"),
@@ -171,3 +173,47 @@ def test_a_wrong_file_is_refused_by_its_key(owned, text, place):
     with pytest.raises(SessionError) as caught:
         owned(bar=text)
     assert str(caught.value.where).endswith(place or "bar.yaml")
+
+
+def test_a_plan_for_a_linear_delta_with_a_bar_a_plate_and_a_probe(owned):
+    """Postures stay above the bed."""
+    robot = load_robot("linear_delta")
+    sensors = owned(bar=BAR, plate=PLATE, probe=PROBE)
+    plan = plan_readings(robot, hours=1.5, equipment=Equipment(owned=sensors, **QUICK), starts=2)
+    assert plan.minutes <= 90.0 + 1e-9
+    gauges = [s.gauge for s in plan.session.setups.values()]
+    assert "bar" in gauges
+    assert gauges.count("probe") <= 1
+    at_tool = {n for n, s in plan.session.setups.items() if s.gauge != "dial"}
+    used = {r.posture for r in plan.session.readings if r.setup in at_tool}
+    points = np.array([plan.session.postures[n].values for n in used])
+    assert (
+        (points >= robot.workspace[:, 0] - 1e-9) & (points <= robot.workspace[:, 1] + 1e-9)
+    ).all()
+    assert plan.expected.reported.rms < 0.05 * plan.known.reported.rms
+
+
+def test_a_bed_is_probed_once_at_the_height_of_its_plane(owned):
+    robot = load_robot("linear_delta")
+    sensors = owned(probe=PROBE + "tool_mm: [0, 0, -20]\n")
+    _, postures, setups, readings = list_tool_candidates(robot, sensors, None)
+    assert list(setups) == ["probe"]
+    assert len(readings) > 100
+    assert {p.values[2] for p in postures.values()} == {0.02}
+    plan = plan_readings(robot, hours=0.5, equipment=Equipment(owned=sensors, **QUICK), starts=1)
+    assert [s.gauge for s in plan.session.setups.values()].count("probe") <= 1
+
+
+def test_the_minutes_of_a_sensor_are_those_of_its_file(owned):
+    robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 1.0})
+    slow = BAR + "minutes_a_setup: 40\nminutes_a_reading: 2\n"
+    equipment = Equipment(owned=owned(bar=slow), **QUICK)
+    plan = plan_readings(robot, hours=2.0, equipment=equipment, starts=1)
+    session, bars = plan.session, {n for n, s in plan.session.setups.items() if s.gauge == "bar"}
+    of_bar = sum(r.setup in bars for r in session.readings)
+    expected = 40.0 * len(bars) + 2.0 * of_bar
+    expected += 10.0 * (len(session.setups) - len(bars)) + 0.5 * (len(session.readings) - of_bar)
+    assert plan.minutes == pytest.approx(expected)
+    assert plan.minutes <= 120.0 + 1e-9
+    times = [r.conditions.time for r in equipment.in_course(session).readings]
+    assert (times[-1] - times[0]).total_seconds() / 60.0 > plan.minutes - 45.0
