@@ -36,8 +36,12 @@ if TYPE_CHECKING:  # the public names; each is imported when it is first used
     from orthocal.assessment.tool_error import assess_tool as assess_tool
     from orthocal.assessment.validation import Validation as Validation
     from orthocal.assessment.validation import validate_calibration as validate_calibration
+    from orthocal.builder.biglide import Biglide as Biglide
     from orthocal.builder.build import make_robot as make_robot
-    from orthocal.builder.machine_file import Dimensions as Dimensions
+    from orthocal.builder.dimensions import Dimensions as Dimensions
+    from orthocal.builder.linear_delta import LinearDelta as LinearDelta
+    from orthocal.builder.orthoglide import InclinedOrthoglide as InclinedOrthoglide
+    from orthocal.builder.orthoglide import Orthoglide as Orthoglide
     from orthocal.calibration.adjusting import adjust_calibration as adjust_calibration
     from orthocal.calibration.assessment_record import Assessment as Assessment
     from orthocal.calibration.assessment_record import Decision as Decision

@@ -10,7 +10,7 @@ import pinocchio as pin
 from machines import place
 from scipy.spatial.transform import Rotation
 
-from orthocal import Dimensions, make_robot
+from orthocal import Orthoglide, make_robot
 from orthocal.assessment.controller_entries import offsets_to_enter
 from orthocal.effects.adjustment import find_adjustments
 from orthocal.kinematics.loop_closure import nominal_closure
@@ -23,7 +23,7 @@ TOLERANCES = {"*_slide.r?_mrad": 6.0, "*.offset_mm": 2.0}
 
 def shimmed_plan(folder):
     """The paper's readings on a machine as `orthocal new` makes it, with feet under its rails."""
-    robot = make_robot(Dimensions(), folder)
+    robot = make_robot(Orthoglide(), folder)
     return paper_plan(robot, Equipment()).with_tolerances(TOLERANCES)
 
 

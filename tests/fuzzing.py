@@ -43,7 +43,6 @@ import yaml
 from lxml import etree
 
 from orthocal import (
-    Dimensions,
     calibrate,
     draw_scene,
     load_calibration,
@@ -63,6 +62,7 @@ from orthocal.assessment.tool_tables import (
 )
 from orthocal.builder.build import remake_robot
 from orthocal.builder.machine_file import read_machine
+from orthocal.builder.orthoglide import Orthoglide
 from orthocal.calibration.file import calibration_document, write_calibration
 from orthocal.cli.correct import _lines
 from orthocal.errors import OrthocalError
@@ -198,7 +198,7 @@ def lay_out(folder: Path) -> None:
     write_calibration(calibrate(load_session(folder), "full"), folder / "calibration.json")
     (folder / "part.ngc").write_text(PROGRAM, encoding="utf-8")
     (folder / "dial.yaml").write_text(DIAL, encoding="utf-8")
-    make_robot(Dimensions(), folder / "made")
+    make_robot(Orthoglide(), folder / "made")
     lay_out_journals(folder)
 
 

@@ -18,6 +18,7 @@ from lxml import etree
 
 from orthocal import load_plan, load_robot
 from orthocal.builder.build import remake_robot
+from orthocal.builder.orthoglide import Orthoglide
 from orthocal.cli import dialogue as asking
 from orthocal.errors import ClosureError, ParameterError
 from orthocal.kinematics.loop_closure import nominal_closure
@@ -396,7 +397,12 @@ def test_options_are_not_asked_for(monkeypatch):
             return "260\n"
 
     monkeypatch.setattr(sys, "stdin", Terminal())
-    given = {**SIZES, "--leg-mm": None}
-    assert asking.find_answers(given).dimensions.leg == pytest.approx(0.26)
+    given = {
+        option.strip("-").replace("-", "_"): asking.Stated(option, text)
+        for option, text in SIZES.items()
+        if option != "--leg-mm"
+    }
+    assert asking.find_answers(Orthoglide, given).dimensions.leg == pytest.approx(0.26)
+    given["travel_mm"] = asking.Stated("--travel-mm", "10:20")
     with pytest.raises(ParameterError, match=r"--travel-mm: travel from 10 to 20 mm"):
-        asking.find_answers({**given, "--travel-mm": "10:20"})
+        asking.find_answers(Orthoglide, given)

@@ -1,1 +1,1 @@
-"""Robot files of an Orthoglide with given dimensions."""
+"""Robot files of machines of given kind and dimensions."""

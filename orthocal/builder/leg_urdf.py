@@ -1,16 +1,16 @@
-"""URDF of a machine with three slides and legs of two parallel rods that carry a platform.
+"""URDF of a machine with slides and legs of rods that carry a platform.
 
-The legs are those of the Orthoglide: prismatic slide, swivel, a parallelogram of two rods, wrist
-and fork. Slides may have any place and direction. The platform hangs on the first leg; loop
-closures join it to the others.
+Legs of the Orthoglide have a slide, a swivel, a parallelogram of two rods, a wrist and a fork.
+Planar legs have a slide and a parallelogram, or a slide and one rod. Slides may have any place and
+direction. The platform hangs on the first leg; loop closures join it to the others.
 
 Frames of a leg: Z along the two hinge axes that are as far apart as the rods; X from the hinge on
-the slide to the hinge on the platform; Y = Z × X.
+the slide to the hinge on the platform; Y = Z × X, the axis of the rods' hinges.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -29,7 +29,12 @@ COLOURS = {
     "blue": (0.22, 0.41, 0.75),
 }
 
+LEG_COLOURS = ("red", "green", "blue")
+
 QUARTER = 0.5 * np.pi
+
+ROUNDING = 1e-14
+"""Largest rounding error of an angle, [rad]."""
 
 LIMITS = {"effort": 1000.0, "velocity": 2.0}
 
@@ -79,16 +84,28 @@ class Shape:
     turned: Array = field(default_factory=lambda: np.eye(3))
 
 
+FOOT = Shape((0.018, 0.018, 0.018), "dark")
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Body:
-    """Dimensions of the rods, and what is drawn of base and platform."""
+    """Dimensions of the rods, and what is drawn of base, slides and platform."""
 
     rods_apart: float
     rod_radius: float
     base: Sequence[Shape]
     """In the world."""
+    slider: Sequence[Shape]
+    """In the slide's frame, from the middle of its hinge."""
     platform: Sequence[Shape]
     """In the tool's frame, which is parallel to the world."""
+    foot: Shape = FOOT
+    """Hinge on the platform, in the leg's frame."""
+
+
+def coloured(letters: str) -> Iterable[tuple[str, str]]:
+    """Names of legs with their colours."""
+    return zip(letters, LEG_COLOURS, strict=False)
 
 
 def machine_urdf(name: str, legs: Sequence[LegGeometry], body: Body, *, comment: str) -> str:
@@ -100,74 +117,154 @@ def machine_urdf(name: str, legs: Sequence[LegGeometry], body: Body, *, comment:
         body: Rods and drawings.
         comment: First line.
     """
+    root = _robot(name, body)
+    first = legs[0]
+    for leg in legs:
+        _add_leg(root, leg, body)
+        if leg is not first:
+            k = leg.name
+            _link(root, f"{k}_foot_end")
+            _fixed(root, f"{k}_foot_end_mount", f"{k}_foot", f"{k}_foot_end", _to_tool(leg))
+    _add_platform(root, f"{first.name}_foot", first, body)
+    return _text(root, comment)
+
+
+def planar_urdf(name: str, legs: Sequence[LegGeometry], body: Body, *, comment: str) -> str:
+    """URDF of a machine whose legs move in a plane, of two rods or, if these are 0 apart, of one.
+
+    Legs of two rods keep the platform from turning: the first one carries it, the others end in
+    pins on it. Of legs of one rod, the last one carries the platform, and the first one ends in a
+    pin on it, the tool centre point.
+
+    Args:
+        name: Name of the robot.
+        legs: Its legs.
+        body: Rods and drawings.
+        comment: First line.
+    """
+    root = _robot(name, body)
+    first, *others = legs
+    if body.rods_apart:
+        for leg in legs:
+            _add_slide(root, leg, body)
+            k = leg.name
+            _link(root, f"{k}_yoke", _yoke(body))
+            _fixed(root, f"{k}_yoke_mount", f"{k}_slider", f"{k}_yoke", _root(leg))
+            _add_parallelogram(root, leg, body)
+        _add_platform(root, f"{first.name}_leg_tip", first, body)
+        for leg in others:
+            _mounted(root, f"{leg.name}_pin", "platform", leg.tip)
+        return _text(root, comment)
+    for leg in legs:
+        k = leg.name
+        _add_slide(root, leg, body)
+        _link(root, f"{k}_leg_root")
+        _fixed(root, f"{k}_leg_root_mount", f"{k}_slider", f"{k}_leg_root", _root(leg))
+        _link(root, f"{k}_rod", _rod(leg, body))
+        _hinge(root, f"{k}_bar", f"{k}_slider", f"{k}_rod", _root(leg), np.eye(3)[1])
+        _link(root, f"{k}_foot")
+        end = np.array([leg.length, 0.0, 0.0]), np.eye(3)
+        if leg is first:
+            _hinge(root, f"{k}_end", f"{k}_rod", f"{k}_foot", end, np.eye(3)[1])
+            continue
+        _fixed(root, f"{k}_foot_mount", f"{k}_rod", f"{k}_foot", end)
+        _link(root, f"{k}_end")
+        _fixed(root, f"{k}_end_mount", f"{k}_foot", f"{k}_end", _to_tool(leg))
+    _add_platform(root, f"{first.name}_foot", first, body)
+    return _text(root, comment)
+
+
+def _robot(name: str, body: Body) -> etree._Element:
+    """Robot with materials and base."""
     root = etree.Element("robot", name=name)
     for colour, rgb in COLOURS.items():
         material = etree.SubElement(root, "material", name=colour)
         etree.SubElement(material, "color", rgba=_numbers([*rgb, 1.0]))
     _link(root, "base", body.base)
-    for i, leg in enumerate(legs):
-        _add_leg(root, leg, body, end=i > 0)
-    _link(root, "platform", body.platform)
-    first = legs[0]
-    _fixed(root, "platform_mount", f"{first.name}_foot", "platform", _to_tool(first))
-    _link(root, "tcp")
-    _fixed(root, "tcp_mount", "platform", "tcp", (np.zeros(3), np.eye(3)))
+    return root
+
+
+def _text(root: etree._Element, comment: str) -> str:
     etree.indent(root)
     text = str(etree.tostring(root, encoding="unicode"))
     return f'<?xml version="1.0"?>\n<!-- {comment} -->\n{text}\n'
 
 
-def _add_leg(root: etree._Element, leg: LegGeometry, body: Body, *, end: bool) -> None:
-    """Slide and leg; with `end`, the frame that a loop closure joins to the platform."""
-    k, half, length = leg.name, 0.5 * body.rods_apart, leg.length
-    inwards = leg.frame.T @ leg.direction
-    origin = leg.slide - leg.zero * leg.direction
-    across = pin.rpy.rpyToMatrix(QUARTER, 0.0, 0.0)
-    lying = pin.rpy.rpyToMatrix(0.0, QUARTER, 0.0)
-    r = body.rod_radius
-    hinge = (r + 0.0035, 4.0 * r)
-    rod = [
-        Shape((r, length), leg.colour, np.array([0.5 * length, 0.0, 0.0]), lying),
-        Shape(hinge, "steel", turned=across),
-        Shape(hinge, "steel", np.array([length, 0.0, 0.0]), across),
-    ]
-    to_root = leg.frame.T @ (leg.root - leg.slide)
-    slider = [Shape((0.03, 0.03, body.rods_apart), "dark", 0.5 * to_root)]
-    yoke = [Shape((0.01, body.rods_apart + 0.03), "steel"), Shape((0.014, 0.022), "dark")]
-    crossbar = [Shape((0.009, body.rods_apart + 0.02), "steel", np.array([0.0, 0.0, -half]))]
-    tip = np.array([length, 0.0, 0.0])
-    up, down = np.array([0.0, 0.0, half]), np.array([0.0, 0.0, -half])
+def _add_platform(root: etree._Element, parent: str, leg: LegGeometry, body: Body) -> None:
+    """Platform and tool centre point, on the frame in which a leg ends."""
+    _link(root, "platform", body.platform)
+    _fixed(root, "platform_mount", parent, "platform", _to_tool(leg))
+    _link(root, "tcp")
+    _fixed(root, "tcp_mount", "platform", "tcp", (np.zeros(3), np.eye(3)))
 
+
+def _add_leg(root: etree._Element, leg: LegGeometry, body: Body) -> None:
+    """Slide and leg in space."""
+    k = leg.name
+    y, z = np.eye(3)[1], np.eye(3)[2]
+    _add_slide(root, leg, body)
+    _link(root, f"{k}_yoke", _yoke(body))
+    _hinge(root, f"{k}_swivel", f"{k}_slider", f"{k}_yoke", _root(leg), z)
+    _add_parallelogram(root, leg, body)
+    _link(root, f"{k}_knuckle", [Shape((0.012, 0.024), "dark")])
+    down = np.array([0.0, 0.0, -0.5 * body.rods_apart])
+    _hinge(root, f"{k}_wrist", f"{k}_crossbar", f"{k}_knuckle", (down, np.eye(3)), z)
+    _link(root, f"{k}_foot", [body.foot])
+    _hinge(root, f"{k}_fork", f"{k}_knuckle", f"{k}_foot", (np.zeros(3), np.eye(3)), y)
+
+
+def _add_slide(root: etree._Element, leg: LegGeometry, body: Body) -> None:
+    k, (to_root, _) = leg.name, _root(leg)
+    slider = [Shape(s.sizes, s.material, to_root + s.at, s.turned) for s in body.slider]
     _link(root, f"{k}_slider", slider)
     _joint(
         root,
         f"{k}_slide",
         "prismatic",
         ("base", f"{k}_slider"),
-        (origin, leg.frame),
-        inwards,
+        (leg.slide - leg.zero * leg.direction, leg.frame),
+        leg.frame.T @ leg.direction,
         leg.travel,
     )
-    _link(root, f"{k}_yoke", yoke)
-    turned = leg.frame.T @ leg.axes
-    y, z = np.eye(3)[1], np.eye(3)[2]
-    _hinge(root, f"{k}_swivel", f"{k}_slider", f"{k}_yoke", (to_root, turned), z)
+
+
+def _add_parallelogram(root: etree._Element, leg: LegGeometry, body: Body) -> None:
+    """Two rods between yoke and crossbar."""
+    k, half = leg.name, 0.5 * body.rods_apart
+    y, tip = np.eye(3)[1], np.array([leg.length, 0.0, 0.0])
+    up, down = np.array([0.0, 0.0, half]), np.array([0.0, 0.0, -half])
     for name, side in (("a", up), ("b", down)):
-        _link(root, f"{k}_rod_{name}", rod)
+        _link(root, f"{k}_rod_{name}", _rod(leg, body))
         _hinge(root, f"{k}_bar_{name}", f"{k}_yoke", f"{k}_rod_{name}", (side, np.eye(3)), y)
     _mounted(root, f"{k}_rod_b_tip", f"{k}_rod_b", tip)
+    crossbar = [Shape((0.009, body.rods_apart + 0.02), "steel", down)]
     _link(root, f"{k}_crossbar", crossbar)
     _hinge(root, f"{k}_coupler", f"{k}_rod_a", f"{k}_crossbar", (tip, np.eye(3)), y)
     _mounted(root, f"{k}_crossbar_end", f"{k}_crossbar", 2.0 * down)
     _mounted(root, f"{k}_leg_root", f"{k}_yoke", np.zeros(3))
     _mounted(root, f"{k}_leg_tip", f"{k}_crossbar", down)
-    _link(root, f"{k}_knuckle", [Shape((0.012, 0.024), "dark")])
-    _hinge(root, f"{k}_wrist", f"{k}_crossbar", f"{k}_knuckle", (down, np.eye(3)), z)
-    _link(root, f"{k}_foot", [Shape((0.018, 0.018, 0.018), "dark")])
-    _hinge(root, f"{k}_fork", f"{k}_knuckle", f"{k}_foot", (np.zeros(3), np.eye(3)), y)
-    if end:
-        _link(root, f"{k}_foot_end")
-        _fixed(root, f"{k}_foot_end_mount", f"{k}_foot", f"{k}_foot_end", _to_tool(leg))
+
+
+def _yoke(body: Body) -> list[Shape]:
+    return [Shape((0.01, body.rods_apart + 0.03), "steel"), Shape((0.014, 0.022), "dark")]
+
+
+def _rod(leg: LegGeometry, body: Body) -> list[Shape]:
+    """Rod with the hinges at both ends."""
+    across = pin.rpy.rpyToMatrix(QUARTER, 0.0, 0.0)
+    lying = pin.rpy.rpyToMatrix(0.0, QUARTER, 0.0)
+    r, length = body.rod_radius, leg.length
+    hinge = (r + 0.0035, 4.0 * r)
+    return [
+        Shape((r, length), leg.colour, np.array([0.5 * length, 0.0, 0.0]), lying),
+        Shape(hinge, "steel", turned=across),
+        Shape(hinge, "steel", np.array([length, 0.0, 0.0]), across),
+    ]
+
+
+def _root(leg: LegGeometry) -> tuple[Array, Array]:
+    """Middle of the hinge on the slide, and axes of the leg, in the slide's frame."""
+    return leg.frame.T @ (leg.root - leg.slide), leg.frame.T @ leg.axes
 
 
 def _to_tool(leg: LegGeometry) -> tuple[Array, Array]:
@@ -237,10 +334,16 @@ def _joint(
 
 
 def _origin(owner: etree._Element, at: Array, turned: Array) -> None:
-    rpy = pin.rpy.matrixToRpy(turned)
-    etree.SubElement(
-        owner, "origin", xyz=_numbers(at), rpy=" ".join(f"{v + 0.0:.17g}" for v in rpy)
-    )
+    angles = [_exact_angle(float(v)) for v in pin.rpy.matrixToRpy(turned)]
+    rpy = " ".join(f"{v + 0.0:.17g}" for v in angles)
+    etree.SubElement(owner, "origin", xyz=_numbers(at), rpy=rpy)
+
+
+def _exact_angle(angle: float) -> float:
+    """Angle, [rad]; a quarter turn exactly where it is one but for rounding."""
+    quarters = round(angle / QUARTER)
+    exact = quarters * QUARTER
+    return exact if abs(angle - exact) < ROUNDING else angle
 
 
 def _numbers(values: Sequence[float] | Array) -> str:

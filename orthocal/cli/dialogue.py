@@ -8,13 +8,8 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from orthocal.builder.machine_file import (
-    AS_DRIVE,
-    Counting,
-    Dimensions,
-    find_counting_problem,
-    in_mm,
-)
+from orthocal.builder.dimensions import Dimension, Dimensions, in_mm
+from orthocal.builder.machine_file import AS_DRIVE, Counting, find_counting_problem
 from orthocal.cli.options import read_number
 from orthocal.cli.printing import put_note
 from orthocal.errors import ParameterError
@@ -23,118 +18,192 @@ from orthocal.units import MM
 if TYPE_CHECKING:
     from orthocal.cli.options import Array
 
-AXES = "xyz"
-
 Answer = TypeVar("Answer")
 
 LARGEST_OFFSET = 100.0
 """Largest tolerance of the home switches, [mm]."""
 
-QUESTIONS = {
-    "--leg-mm": "Leg length, from hinge to hinge of a rod, mm",
-    "--travel-mm": "Lowest and highest coordinate of a slide, LEAST:LARGEST, mm. It is {leg} (the "
-    "leg) where the legs are parallel to their axes, and grows outwards",
-    "--attachment-mm": "Distance from the tool centre point to the hinges on the platform, mm",
-    "--rods-apart-mm": "Distance between the two rods of a leg, from axis to axis, mm",
-    "--rod-radius-mm": "Radius of a rod, mm",
-    "--counts": "Does the number of a joint go up or down as its slide moves outwards? up or "
-    "down, for all or as x,y,z",
-    "--at-zero-mm": "What does the controller show where the legs are parallel to their axes, mm? "
-    "One number for all, or x,y,z",
+IN_METRES = 5e-3
+"""Lengths of legs below that are probably in metres, [m]."""
+
+COUNTS, AT_ZERO = "counts", "at_zero_mm"
+"""Keys of the joints of the controller."""
+
+COUNTING = {
+    COUNTS: "Does the number of a joint go up or down as its slide moves {growing}? up or "
+    "down, for all or as {letters}",
+    AT_ZERO: "What does the controller show {at_zero}, mm? One number for all, or {letters}",
 }
-"""Options and the questions at the terminal that replace them; {leg} is the leg length in mm."""
+"""Keys of the joints and the questions at the terminal."""
 
 
-COUNTING = ("--counts", "--at-zero-mm")
-"""Options about the joints of the controller."""
+class Stated(NamedTuple):
+    """Value of a dimension on the command line."""
+
+    option: str
+    """Option that states it."""
+    text: str
 
 
 class Answers(NamedTuple):
     """Answers so far; the usual values in place of other ones."""
 
-    dimensions: Dimensions = Dimensions()
-    counting: tuple[Counting, ...] = (AS_DRIVE,) * len(AXES)
+    dimensions: Dimensions
+    counting: tuple[Counting, ...]
+    asked: bool = False
+    """Whether some were asked for at the terminal."""
 
 
-def find_answers(options: Mapping[str, str | None]) -> Answers:
+class _Question(NamedTuple):
+    """A dimension or a property of the joints, as it is asked for."""
+
+    key: str
+    words: str
+    usual: str | None = None
+    dimension: Dimension | None = None
+    """None for a property of the joints."""
+
+    @property
+    def option(self) -> str:
+        """Option that states it."""
+        return OPTIONS.get(self.key, f"--dimension {self.key}")
+
+
+OPTIONS = {
+    key: f"--{key.replace('_', '-')}"
+    for key in ("leg_mm", "travel_mm", "attachment_mm", "rods_apart_mm", "rod_radius_mm",
+                COUNTS, AT_ZERO)
+}  # fmt: skip
+"""Keys that have options of their own."""
+
+
+def _questions(kind: type[Dimensions]) -> list[_Question]:
+    """Questions about a machine of a kind, in the order of their answers."""
+    words = {
+        "growing": kind.growing, "at_zero": kind.at_zero, "letters": ",".join(kind.letters)
+    }  # fmt: skip
+    usual = {} if kind.read_legs else {COUNTS: "up", AT_ZERO: "{zero}"}
+    return [
+        *(_Question(d.key, d.question, d.usual, d) for d in kind.keys),
+        *(_Question(k, text.format(**words), usual.get(k)) for k, text in COUNTING.items()),
+    ]
+
+
+def find_answers(kind: type[Dimensions], stated: Mapping[str, Stated]) -> Answers:
     """Dimensions of a machine and how its joints count; missing ones are asked for at a terminal.
 
     Args:
-        options: Each option of `QUESTIONS` to its value; None where it is missing.
+        kind: Kind of the machine.
+        stated: Key of machine.yaml, counts or at_zero_mm to what the command line states.
 
     Raises:
         ParameterError: If an option is invalid, contradicts the others, or is missing without a
             terminal.
     """
-    missing = [option for option in QUESTIONS if options[option] is None]
-    if missing and not (sys.stdin is not None and sys.stdin.isatty()):
-        for option, text in options.items():
-            if text and option in COUNTING:
-                _read_counting(Answers().counting, option, text)
-            elif text:
-                _read_lengths(option, text)
+    questions = _questions(kind)
+    keys = {q.key for q in questions}
+    for key, (option, _) in stated.items():
+        if key not in keys:
+            raise ParameterError(
+                f"'{key}' is no dimension of the kind {kind.kind}; expected "
+                f"{', '.join(d.key for d in kind.keys)}",
+                where=option,
+            )
+    answers = Answers(kind(), (AS_DRIVE,) * len(kind.letters))
+    terminal = sys.stdin is not None and sys.stdin.isatty()
+    missing = [q for q in questions if q.key not in stated and q.usual is None]
+    if missing and not terminal:
+        for question in questions:
+            if question.key in stated:
+                _read(answers, question, stated[question.key])
         raise ParameterError(
-            f"missing options: {', '.join(missing)}; without a terminal every dimension must be an "
-            "option"
+            f"missing options: {', '.join(q.option for q in missing)}; without a terminal every "
+            "dimension must be an option"
         )
-    answers = Answers()
-    for option, question in QUESTIONS.items():
-        text, add = options[option], partial(_add, answers, option)
-        words = question.format(leg=in_mm(answers.dimensions.leg))
-        answers = _ask_until_valid(words, option, add) if text is None else add(text)
-    return answers
+    for question in questions:
+        add = partial(_add, answers, question)
+        zero = in_mm(answers.dimensions.zero)
+        if question.key in stated:
+            answers = add(stated[question.key])
+        elif not terminal or not missing:
+            answers = add(Stated(question.option, (question.usual or "").format(zero=zero)))
+        else:
+            answers = _ask_question(question, zero, add)
+    return answers._replace(asked=bool(missing))
 
 
-def _add(answers: Answers, option: str, text: str) -> Answers:
+def _ask_question(question: _Question, zero: str, add: Callable[[Stated], Answers]) -> Answers:
+    """Answers with that to a question at the terminal."""
+    usual = None if question.usual is None else question.usual.format(zero=zero)
+    words = question.words.format(zero=zero)
+    if usual is not None:
+        words = f"{words}. Enter alone: {usual}"
+    return _ask_until_valid(
+        words, question.option, lambda text: add(Stated(question.option, text or usual or ""))
+    )
+
+
+def _add(answers: Answers, question: _Question, stated: Stated) -> Answers:
     """Answers with one more.
 
     Raises:
         ParameterError: If the answer is missing or invalid, or contradicts earlier ones.
     """
-    if not text:
-        raise ParameterError("found nothing; expected an answer", where=option)
-    if option in COUNTING:
-        return answers._replace(counting=_read_counting(answers.counting, option, text))
-    name = option.strip("-").removesuffix("-mm").replace("-", "_")
-    dimensions = replace(answers.dimensions, **_read_lengths(option, text))
-    problem = dimensions.find_problem()
-    if problem and problem[0] == name:  # dimensions after it have no answers yet
-        in_metres = name == "leg" and 0.0 < dimensions.leg < 0.005
-        raise ParameterError(problem[1] + (": mm, not m" if in_metres else ""), where=option)
-    return answers._replace(dimensions=dimensions)
+    if not stated.text:
+        raise ParameterError("found nothing; expected an answer", where=stated.option)
+    answers = _read(answers, question, stated)
+    dimension = question.dimension
+    problem = answers.dimensions.find_problem()
+    if dimension and problem and problem[0] == dimension.name:  # later ones have no answers yet
+        value = getattr(answers.dimensions, dimension.name)
+        in_metres = dimension.name in ("leg", "rod") and 0.0 < value < IN_METRES
+        raise ParameterError(problem[1] + (": mm, not m" if in_metres else ""), where=stated.option)
+    return answers
 
 
-def _read_lengths(option: str, text: str) -> dict[str, Any]:
-    """Fields of `Dimensions` of an option, [m].
+def _read(answers: Answers, question: _Question, stated: Stated) -> Answers:
+    """Answers with one more, which may contradict others.
 
     Raises:
-        ParameterError: If the option is malformed.
+        ParameterError: If it is malformed.
     """
-    if option != "--travel-mm":
-        return {option.strip("-").removesuffix("-mm").replace("-", "_"): _length(text, option)}
-    low, colon, high = text.partition(":")
-    if not colon:
+    if question.dimension is None:
+        return answers._replace(counting=_read_counting(answers.counting, question.key, stated))
+    d = question.dimension
+    parts = stated.text.split(d.separator) if d.separator else [stated.text]
+    if len(parts) != d.count:
         raise ParameterError(
-            f"found '{text}'; expected LEAST:LARGEST, in mm, such as 100:320", where=option
+            f"found '{stated.text}'; expected {d.form}, in {d.unit}, such as {_example(d)}",
+            where=stated.option,
         )
-    return {"lower": _length(low, option), "upper": _length(high, option)}
+    value: Any = d.to_si([read_number(part, stated.option) for part in parts])
+    changed: Any = {d.name: value}
+    return answers._replace(dimensions=replace(answers.dimensions, **changed))
 
 
-def _read_counting(counting: tuple[Counting, ...], option: str, text: str) -> tuple[Counting, ...]:
-    """Joints with an answer for all, or one for each of x, y, z.
+def _example(dimension: Dimension) -> str:
+    return dimension.usual or "100:320"
+
+
+def _read_counting(
+    counting: tuple[Counting, ...], key: str, stated: Stated
+) -> tuple[Counting, ...]:
+    """Joints with an answer for all, or one for each.
 
     Raises:
         ParameterError: If the answer is invalid.
     """
-    parts = [part.strip() for part in text.split(",")]
-    if len(parts) not in (1, len(AXES)):
+    option, count = stated.option, len(counting)
+    parts = [part.strip() for part in stated.text.split(",")]
+    if len(parts) not in (1, count):
         raise ParameterError(
-            f"has {len(parts)} parts; expected one for all, or three: x,y,z", where=option
+            f"has {len(parts)} parts; expected one for all, or one for each of the {count} joints",
+            where=option,
         )
-    joints = list(zip(counting, parts * (len(AXES) // len(parts)), strict=True))
-    if option == "--at-zero-mm":
+    joints = list(zip(counting, parts * (count // len(parts)), strict=True))
+    if key == AT_ZERO:
         counting = tuple(replace(joint, at_zero=_length(part, option)) for joint, part in joints)
-        problem = find_counting_problem(counting)
+        problem = find_counting_problem(counting, count)
         if problem:
             raise ParameterError(problem, where=option)
         return counting

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,7 +32,9 @@ from orthocal.errors import OrthocalError, ParameterError, RobotError
 from orthocal.io.files import exists, read_file, require_plain_name, write_files
 
 if TYPE_CHECKING:
-    from orthocal.builder.build import Counting, Dimensions
+    from orthocal.builder.dimensions import Dimensions
+    from orthocal.builder.machine_file import Counting
+    from orthocal.cli.dialogue import Stated
 
 USUAL_OFFSET = 4.0
 """Tolerance of the zeros of a new machine, whose home switches were never measured, [mm]."""
@@ -54,22 +56,30 @@ COMMENT = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DimensionOptions:
-    """Dimensions of a machine; `find_answers` reads them.
+    """Kind and dimensions of a machine; `find_answers` reads them.
 
     Args:
-        leg_mm (MM): Length of a leg, from hinge to hinge of a rod.
+        kind (KIND): orthoglide (the default), inclined-orthoglide, linear-delta or biglide.
+        dimension (KEY=VALUE): Dimension of the kind by its key in machine.yaml, such as rod_mm=280.
+            inclined-orthoglide: elevation_deg; linear-delta: rod_mm, radius_mm, angles_deg,
+            platform_mm; and those below.
+        leg_mm (MM): Length of a leg, from hinge to hinge of a rod; not of a linear-delta.
         travel_mm (LEAST:LARGEST): Lowest and highest coordinate of a slide. It is the leg length
-            where the legs are parallel to their axes, and grows outwards.
+            where the legs are parallel to their axes, and grows outwards. Of a linear-delta: height
+            of its hinges above those of the platform on the bed.
         attachment_mm (MM): Distance from the tool centre point to the hinges on the platform, along
-            the axis.
-        rods_apart_mm (MM): Distance between the axes of the two rods of a leg.
+            the axis; not of a linear-delta.
+        rods_apart_mm (MM): Distance between the axes of the two rods of a leg; 0 for a biglide with
+            one rod in each leg.
         rod_radius_mm (MM): Radius of a rod.
         counts (up|down[,...]): Direction in which a joint of the controller counts as its slide
-            moves outwards: one for all, or x,y,z.
+            moves outwards or upwards: one for all, or x,y,z.
         at_zero_mm (MM[,...]): Coordinate that the controller shows where the legs are parallel to
-            their axes: one for all, or x,y,z.
+            their axes, or the tool is in the middle of the bed: one for all, or x,y,z.
     """
 
+    kind: str | None = None
+    dimension: list[str] | None = None
     leg_mm: str | None = None
     travel_mm: str | None = None
     attachment_mm: str | None = None
@@ -78,10 +88,44 @@ class DimensionOptions:
     counts: str | None = None
     at_zero_mm: str | None = None
 
-    @property
-    def by_option(self) -> dict[str, str | None]:
-        """Values by the names of their options."""
-        return {f"--{k.replace('_', '-')}": value for k, value in asdict(self).items()}
+    def by_key(self) -> dict[str, Stated]:
+        """Key of machine.yaml, counts or at_zero_mm to what states it.
+
+        Raises:
+            ParameterError: If an option is malformed, or states a dimension twice.
+        """
+        from orthocal.cli.dialogue import OPTIONS, Stated
+
+        stated: dict[str, Stated] = {}
+        for key, option in OPTIONS.items():
+            text = getattr(self, key)
+            if text is not None:
+                stated[key] = Stated(option, text)
+        for text in self.dimension or []:
+            key, equal, value = (part.strip() for part in text.partition("="))
+            if not equal or not key:
+                raise ParameterError(
+                    f"found '{text}'; expected KEY=VALUE, such as rod_mm=280", where="--dimension"
+                )
+            if key in stated:
+                raise ParameterError(f"states {key} twice", where="--dimension")
+            stated[key] = Stated(f"--dimension {key}", value)
+        return stated
+
+    def read_kind(self) -> type[Dimensions]:
+        """Kind of the machine.
+
+        Raises:
+            ParameterError: If there is no such kind.
+        """
+        from orthocal.builder.kinds import KINDS, USUAL
+
+        kind = KINDS.get(self.kind or USUAL)
+        if kind is None:
+            raise ParameterError(
+                f"found '{self.kind}'; expected {', '.join(KINDS)}", where="--kind"
+            )
+        return kind
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,8 +159,8 @@ def new(
 ) -> None:
     """Make a machine of your dimensions, a first plan and its sheet.
 
-    Missing dimensions are asked for at a terminal. Without --tolerance the zeros of the joints may
-    be off by up to 4 mm.
+    --kind chooses the kind of machine. Missing dimensions are asked for at a terminal. Without
+    --tolerance the zeros of the joints may be off by up to 4 mm.
 
     Exit code 3 with --again: an existing plan no longer fits the changed machine.
 
@@ -125,13 +169,14 @@ def new(
         again: Make URDF, YAML and sheets again from DIRECTORY/machine.yaml.
     """
     if again:
-        _require_none({**dimensions.by_option, "--workspace-mm": options.workspace_mm})
+        stated = {option: text for option, text in dimensions.by_key().values()}
+        _require_none({"--kind": dimensions.kind, **stated, "--workspace-mm": options.workspace_mm})
         _make_again(folder)
         return
     if options.paper and options.hours is not None:
         raise ParameterError("found with --paper, whose setups are fixed", where="--hours")
     name = _require_new(folder, force=force)
-    design = _design(name, dimensions.by_option, options)
+    design = _design(name, dimensions, options)
     _write(folder, name, design)
     _report(folder, design)
     if not design.tolerance_stated:
@@ -157,7 +202,7 @@ class _Design:
     """Files beside session.yaml and readings.csv."""
 
 
-def _design(name: str, dimensions: Mapping[str, str | None], options: FirstPlanOptions) -> _Design:
+def _design(name: str, dimensions: DimensionOptions, options: FirstPlanOptions) -> _Design:
     """Machine of the options and answers, with its first plan.
 
     Raises:
@@ -170,8 +215,8 @@ def _design(name: str, dimensions: Mapping[str, str | None], options: FirstPlanO
     if options.gauge is not None:
         equipment = load_dial(options.gauge, equipment)
     effects = split_effects(options.effects) or []
-    machine, counting = find_answers(dimensions)
-    asked, tolerance = None in dimensions.values(), options.tolerance
+    machine, counting, asked = find_answers(dimensions.read_kind(), dimensions.by_key())
+    tolerance = options.tolerance
     with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
         robot = _make_trial(machine, Path(trial) / name, counting, effects)
         if asked or options.workspace_mm is not None:

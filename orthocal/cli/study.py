@@ -408,8 +408,9 @@ def _source(
         return
     if session is not None or robot.name != "orthoglide":
         raise ParameterError("applies to the robot orthoglide alone", where="--leg-mm")
-    usual, scale = orthocal.Dimensions(), _scale_of(leg_mm)
-    dimensions = orthocal.Dimensions(leg_mm * MM, scale * usual.lower, scale * usual.upper)
+    scale = _scale_of(leg_mm)
+    lower, upper = (scale * limit for limit in orthocal.Orthoglide().travel)
+    dimensions = orthocal.Orthoglide(leg=leg_mm * MM, travel=(lower, upper))
     problem = dimensions.find_problem()
     if problem:
         raise ParameterError(problem[1], where="--leg-mm")
@@ -418,7 +419,7 @@ def _source(
 
 
 def _scale_of(leg_mm: float) -> float:
-    return leg_mm * MM / orthocal.Dimensions().leg
+    return leg_mm * MM / orthocal.Orthoglide().leg
 
 
 def _parameter_globs(texts: list[str] | None, robot: orthocal.Robot) -> tuple[str, ...] | None:

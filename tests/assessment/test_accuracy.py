@@ -35,7 +35,7 @@ from orthocal.assessment.tool_error import (
     measure_uncertainty,
 )
 from orthocal.builder.build import make_robot
-from orthocal.builder.machine_file import Dimensions
+from orthocal.builder.orthoglide import Orthoglide
 from orthocal.errors import RobotError
 from orthocal.estimation.problem import build_problem
 from orthocal.export.formats import export_corrections
@@ -400,7 +400,7 @@ def test_machines_that_are_worse_than_their_tolerances_are_found_to_be(root, tim
 def test_every_figure_at_the_tool_is_for_the_stated_workspace(tmp_path):
     """Tool error, correction table and LinuxCNC module of a machine with a box of its own."""
     box = np.array([[-0.05, 0.06], [-0.06, 0.05], [-0.07, 0.04]])
-    robot = make_robot(Dimensions(workspace=tuple(map(tuple, box))), tmp_path / "mine")
+    robot = make_robot(Orthoglide(workspace=tuple(map(tuple, box))), tmp_path / "mine")
     session = simulate_session(paper_plan(robot, Equipment()), {"x_slide.offset": 1e-3}, seed=1)
     result = calibrate(session.session, "offsets")
     found = assess_tool(result)

@@ -7,7 +7,7 @@ import pytest
 
 from orthocal import load_robot
 from orthocal.builder.build import make_robot
-from orthocal.builder.machine_file import Dimensions
+from orthocal.builder.orthoglide import Orthoglide
 from orthocal.errors import ClosureError, RobotError
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import box_workspace, even_grid, find_workspace, gauss_box
@@ -16,7 +16,7 @@ BOX = ((-0.05, 0.06), (-0.06, 0.05), (-0.07, 0.04))
 
 
 def make(folder, box=BOX):
-    return make_robot(Dimensions(workspace=box), folder / "mine")
+    return make_robot(Orthoglide(workspace=box), folder / "mine")
 
 
 def test_a_stated_workspace_is_read_from_the_yaml(tmp_path):

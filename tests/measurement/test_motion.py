@@ -19,7 +19,8 @@ from machines import place
 
 from orthocal import calibrate, export_calibration, load_plan, simulate_session
 from orthocal.builder.build import make_robot
-from orthocal.builder.machine_file import Counting, Dimensions
+from orthocal.builder.machine_file import Counting
+from orthocal.builder.orthoglide import Orthoglide
 from orthocal.effects.loading import with_effects
 from orthocal.errors import ParameterError, SessionError
 from orthocal.export.linuxcnc.export import ExportOptions
@@ -34,9 +35,7 @@ ROUNDED = 1e-4
 """Rounding of coordinates and joints in a program, [mm]. Half a unit in each of three
 joints moves the tool by less."""
 
-SMALL = Dimensions(
-    leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004
-)
+SMALL = Orthoglide(leg=0.25, travel=(0.1, 0.32), attachment=0.03, rods_apart=0.06, rod_radius=0.004)
 COUNTING = (Counting(True, 0.0), Counting(False, 0.005), Counting(False, None))
 
 PLAN = """robot: mine

@@ -9,7 +9,7 @@ import pytest
 
 from orthocal import load_plan
 from orthocal.builder.build import make_robot
-from orthocal.builder.machine_file import Dimensions
+from orthocal.builder.orthoglide import Orthoglide
 from orthocal.errors import RobotError
 from orthocal.measurement.files.session_file import check_contacts
 from orthocal.planning.equipment import Equipment, reachable
@@ -37,11 +37,11 @@ def test_the_first_plan_of_the_orthoglide_is_the_paper_plan(orthoglide, root):
 @pytest.mark.parametrize(
     "sizes",
     [
-        Dimensions(
-            leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004
+        Orthoglide(
+            leg=0.25, travel=(0.1, 0.32), attachment=0.03, rods_apart=0.06, rod_radius=0.004
         ),
-        Dimensions(leg=0.15, lower=0.06, upper=0.24, attachment=0.02),
-        Dimensions(leg=0.6, lower=0.3, upper=0.9),
+        Orthoglide(leg=0.15, travel=(0.06, 0.24), attachment=0.02),
+        Orthoglide(leg=0.6, travel=(0.3, 0.9)),
     ],
 )
 def test_the_paper_plan_of_other_dimensions_is_within_reach(tmp_path, sizes):
@@ -68,6 +68,6 @@ def test_the_paper_plan_uses_the_given_equipment(orthoglide):
 
 
 def test_a_machine_that_hardly_moves_is_refused(tmp_path):
-    robot = make_robot(Dimensions(leg=0.25, lower=0.245, upper=0.3), tmp_path / "mine")
+    robot = make_robot(Orthoglide(leg=0.25, travel=(0.245, 0.3)), tmp_path / "mine")
     with pytest.raises(RobotError, match="expected 10 mm to either side of the mechanical zero"):
         paper_plan(robot, Equipment())

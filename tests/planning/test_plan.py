@@ -20,7 +20,8 @@ from orthocal import (
     simulate_session,
     summarize,
 )
-from orthocal.builder.build import Dimensions, make_robot
+from orthocal.builder.build import make_robot
+from orthocal.builder.orthoglide import Orthoglide
 from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch import BatchSolver
@@ -142,7 +143,7 @@ def test_calibrated_machines_have_the_expected_tool_error(planned):
 
 def test_the_expected_tool_error_is_for_the_stated_workspace(tmp_path):
     """A machine of ±80 mm: the promise over ±60 mm is far too good for it."""
-    dimensions = Dimensions(lower=0.1, upper=0.42, workspace=((-0.08, 0.08),) * 3)
+    dimensions = Orthoglide(travel=(0.1, 0.42), workspace=((-0.08, 0.08),) * 3)
     robot = make_robot(dimensions, tmp_path / "large")
     equipment = Equipment(sections=(0.5,), across=0.0, along=5)
     choice = Choice("full", tolerances=OFFSETS)
@@ -279,7 +280,7 @@ def test_what_cannot_be_planned_is_refused(orthoglide, arguments, message):
 @pytest.mark.parametrize("leg", [0.1, 0.31025])
 def test_the_default_workspace_keeps_clear_of_the_end_of_the_reach(tmp_path, leg):
     """There it is singular: nothing that is promised of the tool would mean anything."""
-    sizes = Dimensions(leg=leg, lower=0.3 * leg, upper=1.6 * leg, attachment=0.02, rods_apart=0.04)
+    sizes = Orthoglide(leg=leg, travel=(0.3 * leg, 1.6 * leg), attachment=0.02, rods_apart=0.04)
     robot = make_robot(sizes, tmp_path / "mine")
     space = find_workspace(robot)
     assert space.half_side == (0.06 if leg > 0.2 else pytest.approx(0.04, abs=0.02))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from models import JOINTS
 
-from orthocal import load_robot
+from orthocal import Biglide, load_robot, make_robot
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import robot_functions
 
@@ -30,21 +30,27 @@ def observed_points(robot, errors, drives):
 
 
 @pytest.fixture(scope="module")
-def effects(orthoglide):
-    """Effect of every elementary error, by central differences, [m/m, m/rad]."""
+def simple_biglide(tmp_path_factory):
+    """Two slides with one rod each."""
+    machine = Biglide(rods_apart=0.0, attachment=0.0)
+    return make_robot(machine, tmp_path_factory.mktemp("made") / "simple")
+
+
+@pytest.fixture(params=["orthoglide", "biglide", "simple"])
+def machine(request, orthoglide, simple_biglide):
+    made = {"orthoglide": orthoglide, "simple": simple_biglide}
+    return made.get(request.param) or load_robot(request.param)
+
+
+def test_redundant_errors_have_no_effect_and_all_others_have(machine):
+    """Effect of every elementary error by central differences, [m/m, m/rad]."""
     rng = np.random.default_rng(7)
-    tool = rng.uniform(-0.08, 0.05, (4, 3))
-    drives = LoopClosure(orthoglide).inverse(tool)
-    found = {}
-    for name in orthoglide.parameters.elementary:
-        plus, minus = (observed_points(orthoglide, {name: s}, drives) for s in (STEP, -STEP))
-        found[name] = np.abs(plus - minus).max() / (2.0 * STEP)
-    return found
-
-
-def test_redundant_errors_have_no_effect_and_all_others_have(orthoglide, effects):
-    for name, size in effects.items():
-        redundant = name in orthoglide.parameters.redundant
+    tool = rng.uniform(-0.08, 0.05, (4, 3))[:, : len(machine.drives)]
+    drives = LoopClosure(machine).inverse(tool)
+    for name in machine.parameters.elementary:
+        plus, minus = (observed_points(machine, {name: s}, drives) for s in (STEP, -STEP))
+        size = np.abs(plus - minus).max() / (2.0 * STEP)
+        redundant = name in machine.parameters.redundant
         assert (size < 1e-6) if redundant else (size > 1e-3), name
 
 

@@ -23,7 +23,7 @@ from orthocal import (
     simulate_session,
     write_session,
 )
-from orthocal.builder.families import LinearDelta
+from orthocal.builder.linear_delta import LinearDelta
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.observation.model import predict_readings
 from orthocal.observation.sensor_groups import nuisance_parameters

@@ -8,7 +8,8 @@ from gauges import exact
 from tolerances import THREE_DECIMALS_MM
 
 from orthocal import load_plan
-from orthocal.builder.build import Dimensions, make_robot
+from orthocal.builder.build import make_robot
+from orthocal.builder.orthoglide import Orthoglide
 from orthocal.errors import NotIdentifiableError, ParameterError
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.kinematics import orthoglide as closed_forms
@@ -145,9 +146,7 @@ def test_order_of_convergence(summary):
 
 def test_gauss_newton_diverges_on_short_legs(tmp_path):
     """A machine of short legs, 60 mm off."""
-    robot = make_robot(
-        Dimensions(leg=0.15, lower=0.06, upper=0.24, attachment=0.02), tmp_path / "m"
-    )
+    robot = make_robot(Orthoglide(leg=0.15, travel=(0.06, 0.24), attachment=0.02), tmp_path / "m")
     from orthocal.planning.first_plan import Displacements
 
     study = build_linearisation_study(
@@ -159,7 +158,7 @@ def test_gauss_newton_diverges_on_short_legs(tmp_path):
 
 
 def test_longer_legs_are_less_nonlinear(tmp_path, orthoglide):
-    longer = make_robot(Dimensions(leg=0.6205, lower=0.43, upper=0.7), tmp_path / "long")
+    longer = make_robot(Orthoglide(leg=0.6205, travel=(0.43, 0.7)), tmp_path / "long")
     errors = [
         run_task(build_linearisation_study(r, sizes=[2.0], along=ALONG), 0)["first_order"][0]
         for r in (orthoglide, longer)

@@ -343,9 +343,10 @@ def sent(study):
 
 def test_a_robot_whose_directory_is_gone(orthoglide, tmp_path):
     """As on another machine, or where its files were changed meanwhile."""
-    from orthocal.builder.build import Dimensions, make_robot
+    from orthocal.builder.build import make_robot
+    from orthocal.builder.orthoglide import Orthoglide
 
-    sizes = Dimensions(leg=0.25, lower=0.1, upper=0.32)
+    sizes = Orthoglide(leg=0.25, travel=(0.1, 0.32))
     robot = make_robot(sizes, tmp_path / "mine")
     study = build_linearisation_study(robot, sizes=[1.0], along=[1, -0.6, 0.3])
     expected = run_study(study).columns

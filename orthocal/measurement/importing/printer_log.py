@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from orthocal.builder.families import LinearDelta
+from orthocal.builder.linear_delta import LinearDelta
 from orthocal.effects.loading import load_robot_content
 from orthocal.errors import SessionError
 from orthocal.io.documents import read_text
@@ -159,5 +159,5 @@ def _design(settings: DeltaSettings, lowest: float, highest: float) -> LinearDel
     """Dimensions by design, with the travel of the carriages."""
     machine = LinearDelta(rod=round(float(np.mean(settings.rods)), 6), radius=settings.radius)
     low = max(min(machine.travel[0], lowest - ROOM), MM)
-    high = max(max(settings.homed), highest, machine.height) + ROOM
+    high = max(max(settings.homed), highest, machine.zero) + ROOM
     return replace(machine, travel=(round(low, 3), round(high, 3)))

@@ -18,7 +18,8 @@ from machines import place
 
 from orthocal import load_plan
 from orthocal.builder.build import make_robot
-from orthocal.builder.machine_file import Counting, Dimensions
+from orthocal.builder.machine_file import Counting
+from orthocal.builder.orthoglide import Orthoglide
 from orthocal.effects.compensation import JointTrim
 from orthocal.output.sheet.page import sheet_files
 from orthocal.session.session import Conditions
@@ -30,9 +31,7 @@ ROUNDED = 1e-3
 ROUNDED_PLACE = 0.06
 """Places are shown with one decimal, [mm]."""
 
-SMALL = Dimensions(
-    leg=0.25, lower=0.1, upper=0.32, attachment=0.03, rods_apart=0.06, rod_radius=0.004
-)
+SMALL = Orthoglide(leg=0.25, travel=(0.1, 0.32), attachment=0.03, rods_apart=0.06, rod_radius=0.004)
 COUNTING = (Counting(True, 0.0), Counting(False, 0.005), Counting(False, None))
 
 PLAN = """robot: mine

@@ -1,0 +1,113 @@
+"""Dimensions of a biglide: the Orthoglide's planar sister."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from orthocal.arrays import Array
+from orthocal.builder.dimensions import (
+    ATTACHMENT,
+    LEG,
+    ROD_RADIUS,
+    TRAVEL,
+    Dimension,
+    in_mm,
+)
+from orthocal.builder.leg_urdf import Body, Shape, planar_urdf
+from orthocal.builder.orthoglide import DRAWN_PLATFORM, DRAWN_SLIDE, SlidingLegs
+from orthocal.builder.robot_yaml import (
+    ONE_ROD,
+    TWO_RODS,
+    Loop,
+    length_sums,
+    parallelogram_loop,
+    robot_yaml,
+)
+
+ACROSS = ("x", "z")
+"""Rows of a closure in the plane, in the frame of a leg, whose Y is across the plane."""
+
+PLATE = np.array([0.02, 0.02, 0.012])
+"""Width and thickness of the drawn platform, [m]."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Biglide(SlidingLegs):
+    """Dimensions of two crossed slides whose legs move the tool in their plane, [m]."""
+
+    attachment: float = 0.06
+
+    kind: ClassVar[str] = "biglide"
+    keys: ClassVar[tuple[Dimension, ...]] = (
+        LEG,
+        TRAVEL,
+        ATTACHMENT,
+        Dimension(
+            "rods_apart",
+            "Distance between the two rods of a leg, from axis to axis, mm; 0 for legs of one rod",
+            "The two rods of a leg, from axis to axis; 0 for legs of one rod.",
+        ),
+        ROD_RADIUS,
+    )
+    letters: ClassVar[str] = "xy"
+    coordinates: ClassVar[str] = "xy"
+
+    @property
+    def single(self) -> bool:
+        """Whether a leg has one rod."""
+        return self.rods_apart == 0.0
+
+    def find_problem(self) -> tuple[str, str] | None:
+        """Name of the first impossible dimension, and why; None if all are possible."""
+        if not self.single:
+            return SlidingLegs.find_problem(self)
+        apart = 4.0 * abs(self.rod_radius)  # one rod has nothing to clear
+        problem = SlidingLegs.find_problem(replace(self, rods_apart=apart))
+        if problem is None and self.attachment:
+            return "rods_apart", (
+                "legs of one rod meet in the tool centre point, but their hinges are "
+                f"{in_mm(self.attachment)} mm from it; expected one of both to differ"
+            )
+        return problem
+
+    def frames(self) -> list[Array]:
+        """Frames of the slides along x and y, with Y downwards."""
+        axes = np.eye(3)
+        return [np.column_stack([-a, -axes[2], np.cross(-a, -axes[2])]) for a in axes[:2]]
+
+    def urdf(self, name: str) -> str:
+        """URDF of the machine."""
+        apart, radius = self.rods_apart, self.rod_radius
+        pin = Shape((radius + 0.002, 0.05), "steel")
+        arms = [
+            Shape(tuple(np.abs(leg.tip) + PLATE), "brass", 0.5 * leg.tip) for leg in self.legs()
+        ]
+        ball = DRAWN_PLATFORM[-1]
+        platform = (ball, pin) if self.single else (*arms, ball, pin)
+        body = Body(apart, radius, self.rails(), DRAWN_SLIDE, platform)
+        return planar_urdf(name, self.legs(), body, comment=self.title)
+
+    def yaml(self) -> str:
+        """YAML of the machine."""
+        if self.single:
+            loops = [Loop("platform", ("platform", "y_end"), "6d", ("x", "y", "rz"))]
+            sums = {"x_leg.length": ["x_end.x"], "y_leg.length": ["-frame.y_end.y"]}
+        else:
+            loops = [parallelogram_loop(k) for k in self.letters]
+            loops.append(Loop("platform", ("y_leg_tip", "y_pin"), "3d", ACROSS))
+            sums = length_sums(self.letters)
+        return robot_yaml(
+            self.title,
+            letters=self.letters,
+            zero=self.zero,
+            rod_radius=self.rod_radius,
+            loops=loops,
+            parameters=sums,
+            tip="{k}_end" if self.single else "{k}_leg_tip",
+            rods=ONE_ROD if self.single else TWO_RODS,
+            coordinates=self.coordinates,
+            workspace=self.workspace,
+        )

@@ -1,0 +1,222 @@
+"""Dimensions of a linear delta."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from orthocal.builder.dimensions import (
+    ROD_RADIUS,
+    RODS_APART,
+    Dimension,
+    Dimensions,
+    find_length_problem,
+    find_rods_problem,
+    in_mm,
+    in_unit,
+)
+from orthocal.builder.leg_urdf import Body, LegGeometry, Shape, coloured, machine_urdf
+from orthocal.builder.robot_yaml import length_sums, platform_loops, robot_yaml
+from orthocal.units import DEG
+
+UP = np.array([0.0, 0.0, 1.0])
+
+FARTHEST = 0.95
+"""Largest horizontal distance between the hinges of a rod, as a part of its length."""
+
+NEAREST_TOWERS = 60.0 * DEG
+"""Least angle between two towers, [rad]."""
+
+CLOSE = 1e-9
+"""[m]"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinearDelta(Dimensions):
+    """Dimensions of three vertical slides around a bed, [m, rad]."""
+
+    rod: float = 0.28
+    """Length of a rod, from hinge to hinge."""
+    radius: float = 0.14
+    """Horizontal distance of the hinges on a slide from those on the platform, with the tool in the
+    middle: the delta radius of printers."""
+    angles: tuple[float, ...] = (210 * DEG, 330 * DEG, 90 * DEG)
+    """Directions of the towers from the middle of the bed."""
+    travel: tuple[float, float] = (0.03, 0.56)
+    """Least and largest height of the hinges on a slide above those on the platform when the tool
+    is on the bed."""
+    platform: float = 0.03
+    """Distance of the tool centre point from the hinges on the platform."""
+    rods_apart: float = 0.05
+    rod_radius: float = 0.003
+
+    kind: ClassVar[str] = "linear-delta"
+    keys: ClassVar[tuple[Dimension, ...]] = (
+        Dimension(
+            "rod",
+            "Length of a rod, from hinge to hinge, mm",
+            "Length of a rod (diagonal), from hinge to hinge.",
+        ),
+        Dimension(
+            "radius",
+            "Delta radius: horizontal distance of the hinges on a slide from those on the platform "
+            "with the tool in the middle, mm",
+            "Delta radius: horizontal distance of the hinges on a slide from those on the\n"
+            "platform with the tool in the middle of the bed.",
+        ),
+        Dimension(
+            "angles",
+            "Directions of the towers from the middle of the bed, A,B,C, degrees",
+            "Directions of the towers from the middle of the bed.",
+            unit="deg",
+            form="A,B,C",
+            usual="210,330,90",
+        ),
+        Dimension(
+            "travel",
+            "Lowest and highest position of a slide, LEAST:LARGEST, mm: height of its hinges above "
+            "those of the platform on the bed. It is {zero} with the tool in the middle of the bed",
+            "Lowest and highest position of a slide: height of its hinges above those of the\n"
+            "platform when the tool is on the bed.",
+            form="LEAST:LARGEST",
+        ),
+        Dimension(
+            "platform",
+            "Distance of the tool centre point from the hinges on the platform, mm",
+            "From the tool centre point to the hinges on the platform.",
+            usual="30",
+        ),
+        RODS_APART,
+        ROD_RADIUS,
+    )
+    letters: ClassVar[str] = "abc"
+    at_zero: ClassVar[str] = "with the tool in the middle of the bed"
+    growing: ClassVar[str] = "upwards"
+    read_legs: ClassVar[bool] = False
+
+    @property
+    def zero(self) -> float:
+        """Height of a slide in the mechanical zero: tool in the middle, on the bed, [m]."""
+        return math.sqrt(max(self.rod**2 - self.radius**2, 0.0))
+
+    @property
+    def box(self) -> tuple[tuple[float, float], ...]:
+        """Workspace: the stated one, or one of half the radius to each side that is reached, [m].
+
+        Whole centimetres, or whole millimetres on small machines.
+        """
+        if self.workspace is not None:
+            return self.workspace
+        step = 0.01 if self.radius >= 0.1 else 0.001
+        half = min(0.5 * self.radius, (FARTHEST * self.rod - self.radius) / math.sqrt(2.0))
+        half = step * math.floor(half / step + 0.5)
+        near = max(self.radius - math.sqrt(2.0) * half, 0.0)
+        top = min(self.radius, self.travel[1] - math.sqrt(self.rod**2 - near**2))
+        top = step * math.floor(top / step + CLOSE)
+        return (-half, half), (-half, half), (0.0, max(top, step))
+
+    def find_problem(self) -> tuple[str, str] | None:
+        """Name of the first impossible dimension, and why; None if all are possible."""
+        problem = find_length_problem("rod", "rods", self.rod)
+        if problem:
+            return problem
+        if not 0.2 * self.rod <= self.radius <= 0.9 * self.rod:
+            return "radius", (
+                f"delta radius of {in_mm(self.radius)} mm; expected {in_mm(0.2 * self.rod)} to "
+                f"{in_mm(0.9 * self.rod)} mm with rods of {in_mm(self.rod)} mm"
+            )
+        gaps = [
+            abs(math.remainder(a - b, 2.0 * math.pi))
+            for i, a in enumerate(self.angles)
+            for b in self.angles[:i]
+        ]
+        if not min(gaps) >= NEAREST_TOWERS - CLOSE:
+            shown = ", ".join(in_unit(a, "deg") for a in self.angles)
+            return "angles", (
+                f"towers at {shown}°; expected three directions, {NEAREST_TOWERS / DEG:g}° apart "
+                "at least"
+            )
+        lower, upper = self.travel
+        if not 0.0 < lower < self.zero < upper <= self.zero + 20.0 * self.rod:
+            return "travel", (
+                f"travel from {in_mm(lower)} to {in_mm(upper)} mm; expected it to be above 0 and "
+                f"to include {in_mm(self.zero)} mm, the position with the tool in the middle of "
+                "the bed"
+            )
+        if not 0.0 < self.platform <= self.rod:
+            return "platform", (
+                f"hinges {in_mm(self.platform)} mm from the tool centre point; expected more than "
+                f"0, to the rod length, {in_mm(self.rod)} mm"
+            )
+        return find_rods_problem(self.rods_apart, self.rod_radius, self.rod)
+
+    @property
+    def words(self) -> str:
+        """Dimensions in words, in mm."""
+        lower, upper = self.travel
+        return (
+            f"rods of {in_mm(self.rod)} mm, radius {in_mm(self.radius)} mm, slides "
+            f"{in_mm(lower)} to {in_mm(upper)} mm above the platform on the bed"
+        )
+
+    def legs(self) -> list[LegGeometry]:
+        """Legs a, b and c."""
+        legs = []
+        for (name, colour), angle in zip(coloured(self.letters), self.angles, strict=True):
+            outwards = np.array([math.cos(angle), math.sin(angle), 0.0])
+            frame = np.column_stack([-outwards, UP, np.cross(-outwards, UP)])
+            root = (self.radius + self.platform) * outwards + self.zero * UP
+            tip = self.platform * outwards
+            legs.append(
+                LegGeometry(name, frame, UP, self.zero, root, root, tip, self.travel, colour)
+            )
+        return legs
+
+    def urdf(self, name: str) -> str:
+        """URDF of the machine."""
+        tower, middle = self.travel[1] + 0.1, 0.5 * self.travel[1]
+        towers = [
+            Shape(
+                (0.02, 0.02, tower),
+                "frame",
+                (self.radius + self.platform + 0.03) * -leg.frame[:, 0] + middle * UP,
+            )
+            for leg in self.legs()
+        ]
+        bed = Shape((0.9 * self.radius, 0.006), "dark", -0.003 * UP)
+        plate = [Shape((self.platform, 0.008), "brass", 0.004 * UP), Shape((0.003,), "brass")]
+        slider = [Shape((0.03, 0.03, self.rods_apart), "dark")]
+        body = Body(self.rods_apart, self.rod_radius, [*towers, bed], slider, plate)
+        return machine_urdf(name, self.legs(), body, comment=self.title)
+
+    def yaml(self) -> str:
+        """YAML of the machine, with the parameters of delta firmware as named sums."""
+        towers = self.letters
+        parameters = {
+            # outwards; X of a slide's frame points to the middle
+            "radius": [f"-{k}_slide.x" for k in towers],
+            **{f"{k}_tower.radial": [f"-{k}_slide.x"] for k in towers},
+            **{f"{k}_tower.tangential": [f"{k}_slide.z"] for k in towers},
+            "rods.length": [
+                name for k in towers for name in (f"{k}_coupler.x", f"frame.{k}_rod_b_tip.x")
+            ],
+            **length_sums(towers),
+            # half the difference of both rods of an arm, which tilts the effector
+            **{
+                f"{k}_rods.difference": [f"{k}_coupler.x", f"-frame.{k}_rod_b_tip.x"]
+                for k in towers
+            },
+        }
+        return robot_yaml(
+            self.title,
+            letters=towers,
+            zero=self.zero,
+            rod_radius=self.rod_radius,
+            loops=platform_loops(towers),
+            parameters=parameters,
+            workspace=self.box,
+            tolerances="offset_mm: 4, translation_mm: 1, rotation_mrad: 5, scale_ppm: 500",
+        )

@@ -1,0 +1,219 @@
+"""Kinds of machines: closed forms, Pinocchio, and the packaged robots."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from lxml import etree
+from machines import place
+from pinocchio.rpy import rpyToMatrix
+from tolerances import CLOSED, KINEMATICS
+
+from orthocal import load_robot
+from orthocal.builder.biglide import Biglide
+from orthocal.builder.kinds import KINDS
+from orthocal.builder.linear_delta import LinearDelta
+from orthocal.builder.orthoglide import ORTHOGONAL, InclinedOrthoglide, Orthoglide
+from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.robot.loading import packaged_robots
+from orthocal.units import DEG
+
+POINTS = np.array([[0.0, 0.0, 0.0], [0.05, 0.02, 0.04], [-0.06, 0.05, 0.02], [0.01, -0.05, 0.05]])
+
+SINGLE = Biglide(rods_apart=0.0, attachment=0.0)
+"""Legs of one rod."""
+
+PACKAGED = {
+    "linear_delta": LinearDelta(),
+    "biglide": Biglide(),
+    "inclined_orthoglide": InclinedOrthoglide(),
+}
+
+
+def written(folder, machine, name="machine"):
+    """The robot of a machine, read from its files."""
+    folder = folder / name
+    folder.mkdir()
+    (folder / f"{name}.urdf").write_text(machine.urdf(name))
+    (folder / f"{name}.yaml").write_text(machine.yaml())
+    return load_robot(folder)
+
+
+@pytest.mark.parametrize("angles", [(210, 330, 90), (212, 329, 91)])
+def test_slides_of_a_delta_are_at_the_heights_of_the_textbook(tmp_path, angles):
+    delta = LinearDelta(angles=tuple(a * DEG for a in angles))
+    robot = written(tmp_path, delta)
+    drives = LoopClosure(robot).inverse(POINTS)
+    for k, angle in enumerate(delta.angles):
+        tower = delta.radius * np.array([np.cos(angle), np.sin(angle)])
+        apart = ((tower - POINTS[:, :2]) ** 2).sum(axis=1)
+        height = POINTS[:, 2] + np.sqrt(delta.rod**2 - apart)
+        assert np.abs(drives[:, k] - height).max() < CLOSED
+
+
+def slide_directions(machine):
+    """Unit vectors of the slides by the definition of the kind, shape (n, 3)."""
+    if isinstance(machine, Biglide):
+        return np.eye(3)[:2]
+    turns = np.arange(3) * 120 * DEG
+    level, up = np.cos(machine.elevation), np.sin(machine.elevation)
+    return np.column_stack([level * np.cos(turns), level * np.sin(turns), np.full(3, up)])
+
+
+@pytest.mark.parametrize(
+    "machine",
+    [
+        *(InclinedOrthoglide(elevation=angle * DEG) for angle in (20, 45, 70)),
+        Biglide(),
+        SINGLE,
+        Biglide(leg=0.2, travel=(0.1, 0.3), attachment=0.02, rods_apart=0.05),
+    ],
+)
+def test_slides_are_where_the_legs_of_fixed_length_end(tmp_path, machine):
+    """ρ = p·d + √(L² − |p − (p·d) d|²) along the slide's direction d, attachment or not."""
+    robot = written(tmp_path, machine)
+    directions = slide_directions(machine)
+    points = POINTS[:, : len(machine.coordinates)] * (machine.leg / 0.31025)
+    drives = LoopClosure(robot).inverse(points)
+    full = np.zeros((len(points), 3))
+    full[:, : points.shape[1]] = points
+    along = full @ directions.T
+    across = (full**2).sum(axis=1)[:, None] - along**2
+    assert np.abs(drives - along - np.sqrt(machine.leg**2 - across)).max() < CLOSED
+    assert np.abs(LoopClosure(robot).forward(drives) - full).max() < CLOSED
+
+
+@pytest.mark.parametrize("machine", [LinearDelta(), InclinedOrthoglide(), Biglide(), SINGLE])
+def test_named_lengths_and_radius_are_those_of_the_legs(tmp_path, machine):
+    """Each slide stays at its distance, rod length with its error, from the hinge on the tool."""
+    robot = written(tmp_path, machine)
+    drives = LoopClosure(robot).inverse(POINTS[:, : len(machine.coordinates)])
+    longer = dict(zip(machine.letters, (2e-3, -1e-3, 3e-3), strict=False))
+    wider = 4e-3 if isinstance(machine, LinearDelta) else 0.0
+    errors = {f"{k}_leg.length": v for k, v in longer.items()}
+    errors |= {"radius": wider} if wider else {}
+    tool = LoopClosure(robot, fixed=errors).forward(drives)
+    for leg, along in zip(machine.legs(), drives.T, strict=True):
+        outwards = -leg.frame[:, 0]
+        root = leg.root + wider * outwards + (along - leg.zero)[:, None] * leg.direction
+        length = np.linalg.norm(root - leg.tip - tool, axis=1)
+        assert length == pytest.approx(leg.length + longer[leg.name], abs=CLOSED)
+
+
+@pytest.mark.parametrize("machine", [LinearDelta(), InclinedOrthoglide(), Biglide(), SINGLE])
+def test_the_tool_is_where_pinocchio_closes_the_loops(tmp_path, machine):
+    robot = written(tmp_path, machine)
+    count = len(machine.coordinates)
+    drives = LoopClosure(robot).inverse(POINTS[:, :count])
+    for point, coordinates in zip(POINTS, drives, strict=True):
+        at = np.where(np.arange(3) < count, point, 0.0)
+        assert np.abs(place(robot, coordinates, "tcp") - at).max() < CLOSED
+
+
+def test_orthogonal_slides_make_an_orthoglide(tmp_path, orthoglide):
+    """Equal but for the orientation of the world."""
+    machine = InclinedOrthoglide(elevation=ORTHOGONAL)
+    robot = written(tmp_path, machine)
+    axes = np.column_stack([leg.direction for leg in machine.legs()])
+    assert np.abs(axes.T @ axes - np.eye(3)).max() < KINEMATICS
+    drives = LoopClosure(robot).inverse(POINTS)
+    assert np.abs(drives - LoopClosure(orthoglide).inverse(POINTS @ axes)).max() < CLOSED
+
+
+@pytest.mark.parametrize(
+    ("machine", "count"),
+    [
+        (Orthoglide(), 129),
+        (LinearDelta(), 129),
+        (InclinedOrthoglide(elevation=60 * DEG), 129),
+        (Biglide(), 52),
+        (SINGLE, 28),
+    ],
+)
+def test_the_complete_model_has_every_error_that_moves_something(tmp_path, machine, count):
+    assert len(written(tmp_path, machine).parameters.select_model("full")) == count
+
+
+@pytest.mark.parametrize("name", PACKAGED)
+def test_packaged_robots_are_made_from_their_dimensions(name):
+    folder = packaged_robots()[name]
+    assert (folder / f"{name}.urdf").read_text() == PACKAGED[name].urdf(name)
+    assert (folder / f"{name}.yaml").read_text() == PACKAGED[name].yaml()
+
+
+def numbers(element, key):
+    return np.array([float(v) for v in element.get(key, "0 0 0").split()])
+
+
+def drawn_points(visual):
+    """Corners of a box, ends of a cylinder with its radius, or centre and radius of a sphere."""
+    origin, shape = visual.find("origin"), visual.find("geometry")[0]
+    if shape.tag == "sphere":
+        return [(*numbers(origin, "xyz"), float(shape.get("radius")))]
+    turned = rpyToMatrix(numbers(origin, "rpy"))
+    if shape.tag == "cylinder":
+        half, size = np.array([[0, 0, 1], [0, 0, -1]]), float(shape.get("length"))
+        points, last = half * 0.5 * size, float(shape.get("radius"))
+    else:
+        corners = np.stack(np.meshgrid(*[[-0.5, 0.5]] * 3), axis=-1).reshape(-1, 3)
+        points, last = corners * numbers(shape, "size"), 0.0
+    placed = np.round(points @ turned.T + numbers(origin, "xyz"), 9) + 0.0
+    return sorted((*p, last) for p in placed.tolist())
+
+
+def test_the_packaged_orthoglide_is_one_of_the_kinds():
+    """Joints, placements, limits and drawings of the robot that was written by hand."""
+    folder, machine = packaged_robots()["orthoglide"], Orthoglide()
+    made = etree.fromstring(machine.urdf("orthoglide").encode())
+    packaged = etree.parse(str(folder / "orthoglide.urdf")).getroot()
+    for kind in ("joint", "link"):
+        pairs = list(zip(made.iterfind(kind), packaged.iterfind(kind), strict=True))
+        assert all(a.get("name") == b.get("name") for a, b in pairs)
+        if kind == "link":
+            for a, b in pairs:
+                drawn = [[drawn_points(v) for v in link.iterfind("visual")] for link in (a, b)]
+                assert drawn[0] == drawn[1], a.get("name")
+            continue
+        for a, b in pairs:
+            for tag in ("parent", "child", "axis", "limit"):
+                x, y = a.find(tag), b.find(tag)
+                assert (x is None) == (y is None)
+                assert x is None or dict(x.attrib) == dict(y.attrib), a.get("name")
+            x, y = a.find("origin"), b.find("origin")
+            assert numbers(x, "xyz") == pytest.approx(numbers(y, "xyz"), abs=1e-15)
+            turned = [rpyToMatrix(numbers(o, "rpy")) for o in (x, y)]
+            assert np.abs(turned[0] - turned[1]).max() < 1e-15
+    read = (folder / "orthoglide.yaml").read_text()
+    assert yaml.safe_load(machine.yaml()) == yaml.safe_load(read)
+
+
+@pytest.mark.parametrize(
+    ("machine", "name", "message"),
+    [
+        (InclinedOrthoglide(elevation=19.9 * DEG), "elevation", "slides at 19.9°; expected 20"),
+        (InclinedOrthoglide(leg=250.0), "leg", "legs of 250000 mm; expected 20 to 5000 mm"),
+        (LinearDelta(rod=280.0), "rod", "rods of 280000 mm"),
+        (LinearDelta(radius=0.27), "radius", "delta radius of 270 mm; expected 56 to 252 mm"),
+        (LinearDelta(angles=(0.0, 1.0, 3.0)), "angles", "towers at 0, 57.2957795, 171.887339°"),
+        (LinearDelta(angles=(0.0, float("nan"), 3.0)), "angles", "towers at 0, nan"),
+        (LinearDelta(travel=(0.3, 0.56)), "travel", "to include 242.487113 mm"),
+        (LinearDelta(platform=0.0), "platform", "hinges 0 mm from the tool centre point"),
+        (LinearDelta(rod_radius=0.04), "rod_radius", "rods of radius 40 mm, 50 mm apart"),
+        (replace(SINGLE, attachment=0.04), "rods_apart", "legs of one rod meet in the tool"),
+        (Biglide(rods_apart=0.001), "rod_radius", "rods of radius 5.5 mm, 1 mm apart"),
+    ],
+)
+def test_dimensions_that_make_no_machine_are_refused(machine, name, message):
+    found = machine.find_problem()
+    assert found is not None
+    assert (found[0], message in found[1]) == (name, True), found
+
+
+def test_kinds_and_their_usual_dimensions_are_possible():
+    for name, kind in KINDS.items():
+        assert kind.kind == name
+        assert kind().find_problem() is None
+    assert SINGLE.find_problem() is None
