@@ -104,6 +104,8 @@ class Dimensions(ABC):
     """Coordinates of the tool that the drives control."""
     at_zero: ClassVar[str] = "where the legs are parallel to their axes"
     """The mechanical zero, in words."""
+    usual_workspace: ClassVar[str] = "the largest cube of at most ±60 mm that the machine reaches"
+    """Workspace where none is stated, in words."""
     growing: ClassVar[str] = "outwards"
     """Direction in which a slide moves as its coordinate grows."""
     read_legs: ClassVar[bool] = True

@@ -94,6 +94,7 @@ class LinearDelta(Dimensions):
     )
     letters: ClassVar[str] = "abc"
     at_zero: ClassVar[str] = "with the tool in the middle of the bed"
+    usual_workspace: ClassVar[str] = "half the delta radius to each side, and up to the radius"
     growing: ClassVar[str] = "upwards"
     read_legs: ClassVar[bool] = False
 

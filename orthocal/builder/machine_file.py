@@ -133,7 +133,7 @@ def machine_text(dimensions: Dimensions, counting: tuple[Counting, ...]) -> str:
     usual = box_text([(-0.06, 0.06)] * len(kind.coordinates))
     lines += [
         f"# Limits of {kind.axes_words()} relative to the mechanical zero, where the tool works.",
-        "# Without them: the largest cube of at most ±60 mm that the machine reaches.",
+        f"# Without them: {kind.usual_workspace}.",
         f"workspace_mm: {box}" if box else f"# workspace_mm: {usual}",
         "# Joints of the controller: whether they count up or down as the coordinate of a slide",
         f"# grows, and what they show {kind.at_zero}",

@@ -126,7 +126,7 @@ def find_answers(kind: type[Dimensions], stated: Mapping[str, Stated]) -> Answer
         if question.key in stated:
             answers = add(stated[question.key])
         elif not terminal or not missing:
-            answers = add(Stated(question.option, (question.usual or "").format(zero=zero)))
+            answers = add(Stated(question.option, ""))
         else:
             answers = _ask_question(question, zero, add)
     return answers._replace(asked=bool(missing))
@@ -134,25 +134,26 @@ def find_answers(kind: type[Dimensions], stated: Mapping[str, Stated]) -> Answer
 
 def _ask_question(question: _Question, zero: str, add: Callable[[Stated], Answers]) -> Answers:
     """Answers with that to a question at the terminal."""
-    usual = None if question.usual is None else question.usual.format(zero=zero)
     words = question.words.format(zero=zero)
-    if usual is not None:
-        words = f"{words}. Enter alone: {usual}"
-    return _ask_until_valid(
-        words, question.option, lambda text: add(Stated(question.option, text or usual or ""))
-    )
+    if question.usual is not None:
+        words = f"{words}. Enter alone: {question.usual.format(zero=zero)}"
+    return _ask_until_valid(words, question.option, lambda text: add(Stated(question.option, text)))
 
 
 def _add(answers: Answers, question: _Question, stated: Stated) -> Answers:
-    """Answers with one more.
+    """Answers with one more; an empty one is the usual one.
 
     Raises:
         ParameterError: If the answer is missing or invalid, or contradicts earlier ones.
     """
-    if not stated.text:
-        raise ParameterError("found nothing; expected an answer", where=stated.option)
-    answers = _read(answers, question, stated)
     dimension = question.dimension
+    if not stated.text:
+        if question.usual is None:
+            raise ParameterError("found nothing; expected an answer", where=stated.option)
+        if dimension is None:  # joints are as the drives
+            return answers
+        stated = stated._replace(text=question.usual)
+    answers = _read(answers, question, stated)
     problem = answers.dimensions.find_problem()
     if dimension and problem and problem[0] == dimension.name:  # later ones have no answers yet
         value = getattr(answers.dimensions, dimension.name)
@@ -168,7 +169,7 @@ def _read(answers: Answers, question: _Question, stated: Stated) -> Answers:
         ParameterError: If it is malformed.
     """
     if question.dimension is None:
-        return answers._replace(counting=_read_counting(answers.counting, question.key, stated))
+        return answers._replace(counting=_read_counting(answers, question.key, stated))
     d = question.dimension
     parts = stated.text.split(d.separator) if d.separator else [stated.text]
     if len(parts) != d.count:
@@ -185,19 +186,18 @@ def _example(dimension: Dimension) -> str:
     return dimension.usual or "100:320"
 
 
-def _read_counting(
-    counting: tuple[Counting, ...], key: str, stated: Stated
-) -> tuple[Counting, ...]:
+def _read_counting(answers: Answers, key: str, stated: Stated) -> tuple[Counting, ...]:
     """Joints with an answer for all, or one for each.
 
     Raises:
         ParameterError: If the answer is invalid.
     """
-    option, count = stated.option, len(counting)
+    option, letters, counting = stated.option, answers.dimensions.letters, answers.counting
+    count = len(letters)
     parts = [part.strip() for part in stated.text.split(",")]
     if len(parts) not in (1, count):
         raise ParameterError(
-            f"has {len(parts)} parts; expected one for all, or one for each of the {count} joints",
+            f"has {len(parts)} parts; expected one for all, or one for each of {','.join(letters)}",
             where=option,
         )
     joints = list(zip(counting, parts * (count // len(parts)), strict=True))

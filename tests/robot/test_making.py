@@ -10,6 +10,7 @@ import yaml
 from tolerances import CLOSED_FORM
 
 from orthocal.builder.build import describe_machine, make_robot, remake_robot
+from orthocal.builder.kinds import KINDS
 from orthocal.builder.machine_file import MACHINE, Counting, read_machine
 from orthocal.builder.orthoglide import FEET, Orthoglide
 from orthocal.errors import RobotError
@@ -97,6 +98,43 @@ def test_a_machine_is_made_again_from_its_sizes_in_one_place(tmp_path):
     assert described.read_text().replace("offset_mm: 4,", "offset_mm: 10,").replace(
         "mine", ""
     ) == fresh.yaml.read_text().replace("mine.fresh", "")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_machines_of_every_kind_are_made_again_from_one_file(tmp_path, kind):
+    folder, usual = tmp_path / "mine", KINDS[kind]()
+    counting = tuple(Counting(k % 2 == 0, 0.01 * k) for k in range(len(usual.letters)))
+    robot = make_robot(usual, folder, counting=counting, effects=["backlash"])
+    assert robot.drive_zero == pytest.approx([usual.zero] * len(usual.letters))
+    assert [d.direction for d in robot.drives] == [1, -1, 1][: len(usual.letters)]
+    assert robot.effect_names == ("backlash",)
+    dimensions, read = read_machine(folder / MACHINE)
+    assert read == counting
+    for d in usual.keys:
+        value = getattr(dimensions, d.name)
+        assert value == pytest.approx(getattr(usual, d.name), rel=1e-9), d.key
+    before = {p.name: p.read_text() for p in folder.iterdir()}
+    assert remake_robot(folder).sha256 == robot.sha256
+    assert {p.name: p.read_text() for p in folder.iterdir()} == before
+
+
+def test_a_file_without_a_kind_is_of_an_orthoglide(tmp_path):
+    make_robot(SMALL, tmp_path / "mine")
+    file = tmp_path / "mine" / MACHINE
+    text = file.read_text()
+    file.write_text(text.replace("kind: orthoglide\n", ""))
+    assert read_machine(file)[0] == SMALL
+    file.write_text(text.replace("orthoglide", "hexaglide"))
+    with pytest.raises(RobotError, match=r"machine\.yaml: kind: found 'hexaglide'; expected ortho"):
+        read_machine(file)
+    file.write_text(text.replace("orthoglide", "[]"))
+    with pytest.raises(RobotError, match=r"machine\.yaml: kind: found \[\]; expected orthoglide"):
+        read_machine(file)
+    file.write_text(text.replace("orthoglide", "biglide").replace("  z_slide", "  # z_slide"))
+    assert read_machine(file)[0].find_problem() is None
+    file.write_text(text.replace("orthoglide", "biglide"))
+    with pytest.raises(RobotError, match=r"machine\.yaml: joints\.z_slide: unknown key"):
+        read_machine(file)
 
 
 @pytest.mark.parametrize(
