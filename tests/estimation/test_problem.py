@@ -103,7 +103,7 @@ def test_closure_rows_that_depend_on_others_are_named(root, tmp_path):
         text = (root / "tests/robots/biglide" / name).read_text()
         (folder / name).write_text(text.replace("{rows: [x, y]}", "{}"))
     (tmp_path / "plan.yaml").write_text(
-        "robot: biglide\npostures: {zero: {tcp_mm: [0, 0]}}\n"
+        "robot: ./biglide\npostures: {zero: {tcp_mm: [0, 0]}}\n"
         "setups:\n  yx: {leg: x, direction: y, section: {fraction: 0.5}}\n"
     )
     with pytest.raises(RobotError, match=r"closure rows depend on others: z of apex; leave them"):

@@ -285,7 +285,7 @@ def test_sheet_without_a_tool_has_joints_alone(root, tmp_path):
     yaml = folder / "biglide.yaml"
     yaml.write_text(re.sub(r"(?m)^ *tcp: .*$", "", yaml.read_text()))
     (tmp_path / "plan.yaml").write_text(
-        "robot: biglide\n"
+        "robot: ./biglide\n"
         "postures: {zero: {joints_mm: [200, 200]}, out: {joints_mm: [210, 195]}}\n"
         "setups: {yx: {leg: x, direction: y, section: {fraction: 0.5}}}\n"
     )
