@@ -38,7 +38,7 @@ def test_the_default_is_a_cube_of_60_mm(orthoglide):
 def test_a_machine_that_reaches_more_keeps_the_default_of_the_nominal_one(tmp_path):
     """Plans are made for the nominal machine, tool errors for the calibrated one."""
     lower, upper = 0.15, 0.34
-    robot = make_robot(Dimensions(leg=0.28, lower=lower, upper=upper), tmp_path / "small")
+    robot = make_robot(Orthoglide(leg=0.28, travel=(lower, upper)), tmp_path / "small")
     planned = find_workspace(robot)
     assert planned.half_side < 0.06
     assert np.array_equal(find_workspace(robot, lambda points: None).limits, planned.limits)
