@@ -17,6 +17,10 @@ ONE_ROD = {"a": ("{k}_bar", "{k}_end")}
 """Frames at both ends of a single rod."""
 
 
+MODELS = {"offsets": ("*.offset",), "lengths": ("*.offset", "*_leg.length")}
+"""Free errors of the models of every machine, besides full."""
+
+
 @dataclass(frozen=True, slots=True)
 class Loop:
     """A loop closure."""
@@ -81,16 +85,11 @@ def robot_yaml(
         workspace: Limits, [m].
         tolerances: Tolerances as YAML.
     """
+    usual = {**MODELS, **(models or {})}
     box = [] if workspace is None else [f"  workspace: {{box_mm: {box_text(workspace)}}}"]
-    others = {name: f"[{', '.join(map(repr, globs))}]" for name, globs in (models or {}).items()}
     lines = [
         f"# {title}",
-        "# Loops and drives, in the keys of the Gepetto extended URDF.",
-        "closed_loop:",
-        *(f"  - [{', '.join(loop.frames)}]" for loop in loops),
-        f"type: [{', '.join(loop.kind for loop in loops)}]",
-        f"name_mot: [{', '.join(f'{k}_slide' for k in letters)}]",
-        "",
+        *_gepetto_lines(letters, loops),
         "orthocal:",
         *box,
         "  # One entry for each pair of closed_loop, in its order. Rows that depend on others are",
@@ -111,12 +110,21 @@ def robot_yaml(
         f"  tolerances: {{{tolerances}}}",
         "  # Free errors of each model. complete: every error that moves a rod or the tool.",
         "  models:",
-        "    offsets: ['*.offset']",
-        "    lengths: ['*.offset', '*_leg.length']",
-        *(f"    {name}: {globs}" for name, globs in others.items()),
+        *(f"    {name}: [{', '.join(map(repr, globs))}]" for name, globs in usual.items()),
         "    full: complete",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _gepetto_lines(letters: str, loops: Sequence[Loop]) -> list[str]:
+    return [
+        "# Loops and drives, in the keys of the Gepetto extended URDF.",
+        "closed_loop:",
+        *(f"  - [{', '.join(loop.frames)}]" for loop in loops),
+        f"type: [{', '.join(loop.kind for loop in loops)}]",
+        f"name_mot: [{', '.join(f'{k}_slide' for k in letters)}]",
+        "",
+    ]
 
 
 def _rows(rows: Sequence[str]) -> str:
