@@ -1,18 +1,19 @@
-"""Offsets and backlash to enter into a controller that corrects nothing else.
+"""Offsets, backlash and errors of screws to enter into a controller that corrects nothing else.
 
 A machine whose legs and axes are off as well is not served best by its true offsets: others make up
 for a part of its other errors. Entered is what leaves the least error at the tool, over the region
 that it reaches.
 
-A backlash is entered where the readings determine it: where it, or its change, is larger than its
-expanded uncertainty, or where entering it lowers the expected tool error.
+A backlash or a periodic error of a screw is entered where the readings determine it: where it, or
+its change, is larger than its expanded uncertainty, or where entering it lowers the expected tool
+error.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -23,6 +24,8 @@ from orthocal.calibration.assessment_record import BacklashEntry, ControllerEntr
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.effects.compensation import Compensation, JointTrim
+from orthocal.effects.loading import robot_effects
+from orthocal.effects.screw import KINDS, Screw
 from orthocal.io.fields import read_only
 
 DECIDED = 1e-2
@@ -35,6 +38,13 @@ ENTERED_DECIMALS = 6
 WORTH_ENTERING = 0.05
 """Share by which the expected tool error must fall for the offsets to be entered. Also that by
 which it must fall for a correction of all errors to be recommended."""
+
+IN_TWO = math.sqrt(-2.0 * math.log(0.05)) / 1.96
+"""Radius of the ellipse that contains 95 % of two estimates, over the expanded uncertainty of one
+(1.25)."""
+
+POSITIONS = 64
+"""Positions, over two turns, at which a table is compared with a periodic error."""
 
 MOST_STEPS = 12
 
@@ -98,43 +108,165 @@ def compute_backlash(
     """
     by_name = {p.name: p for p in calibration.parameters}
     active = calibration.compensated_backlash.tolist()
-    entries = []
+    entries, changes, determined = [], [], []
     for drive, now in zip(calibration.robot.drives, active, strict=True):
         p = by_name.get(f"{drive.name}.backlash")
         if p is None or not (p.free or p.value):
             continue
         value, std = max(p.value, 0.0), p.std if p.free else 0.0
         scatter = p.std_scatter if p.free else 0.0
-        entries.append(BacklashEntry(drive.name, drive.unit, now, value, value, std, scatter))
-    unclear = [e.kept if _is_determined(calibration, e) else e for e in entries]
-    if _changes_tool(calibration, tool, unclear):
-        return tuple(entries)
-    return tuple(e if _is_determined(calibration, e) else e.kept for e in entries)
+        entry = BacklashEntry(drive.name, drive.unit, now, value, value, std, scatter)
+        half = float(calibration.expand(std, scatter))
+        entries.append(entry)
+        changes.append(_change_of(entry))
+        determined.append(max(value, abs(value - now)) > half)
+    entering = _choose_changes(calibration, tool, changes, determined)
+    return tuple(e if enter else e.kept for e, enter in zip(entries, entering, strict=True))
 
 
-def _is_determined(calibration: Calibration, entry: BacklashEntry) -> bool:
-    half = float(calibration.expand(entry.std, entry.std_scatter))
-    return max(entry.identified, abs(entry.identified - entry.active)) > half
+def _change_of(entry: BacklashEntry) -> dict[str, float]:
+    return {f"{entry.drive}.backlash": entry.change}
+
+
+def _choose_changes(
+    calibration: Calibration,
+    tool: CalibratedTool | None,
+    changes: Sequence[Mapping[str, float]],
+    determined: Sequence[bool],
+) -> Sequence[bool]:
+    """Whether to enter each change: if it is determined, or if the others lower the tool error.
+
+    Args:
+        calibration: The calibration.
+        tool: Its tool over the workspace; None if there is none.
+        changes: Change of what the controller corrects, parameter to amount, [SI].
+        determined: Whether each is larger than its expanded uncertainty.
+    """
+    unclear: dict[str, float] = {}
+    for change, known in zip(changes, determined, strict=True):
+        unclear |= {} if known else change
+    return [True] * len(changes) if _changes_tool(calibration, tool, unclear) else determined
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScrewEntry:
+    """Periodic error of a drive's screw, A sin(2πρ/lead) + B cos(2πρ/lead), for a table."""
+
+    drive: str
+    active: Array
+    """A and B that the controller corrects now, shape (2,), [m]."""
+    identified: Array
+    """A and B of the identified machine, shape (2,), [m]."""
+    enter: Array
+    """A and B to enter: `identified`, or those active now if the change is undetermined."""
+    uncertainty: float
+    """Expanded uncertainty of the amplitude, [m]."""
+
+    @property
+    def change(self) -> Array:
+        """Values to enter less the active ones, shape (2,), [m]."""
+        return self.enter - self.active
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameter to value to enter, [m]."""
+        return _by_parameter(self.drive, self.enter)
+
+
+def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
+    """Periodic errors of screws to enter, by the rule for backlash; empty without any.
+
+    An amplitude is determined if A and B are outside the ellipse that contains 95 % of their
+    estimates around 0, or around the active ones.
+    """
+    robot = calibration.robot
+    screw = next((e for e in robot_effects(robot) if isinstance(e, Screw)), None)
+    if screw is None:
+        return ()
+    errors, entries, determined = calibration.errors, [], []
+    for drive, active in zip(robot.drives, _compensated_screws(calibration, screw), strict=True):
+        names = [f"{drive.name}.{kind}" for kind in KINDS]
+        value = np.array([errors.get(name, 0.0) for name in names])
+        if not (value.any() or active.any()):
+            continue
+        half = _amplitude_uncertainty(calibration, names, value)
+        other = _amplitude_uncertainty(calibration, names, value - active)
+        entries.append(ScrewEntry(drive.name, active, value, value, half))
+        sizes = np.linalg.norm([value, value - active], axis=1)
+        determined.append(bool((sizes > IN_TWO * np.array([half, other])).any()))
+    changes = [_by_parameter(e.drive, e.change) for e in entries]
+    entering = _choose_changes(calibration, find_tool(calibration), changes, determined)
+    return tuple(
+        e if enter else replace(e, enter=e.active)
+        for e, enter in zip(entries, entering, strict=True)
+    )
+
+
+def _by_parameter(drive: str, values: Array) -> dict[str, float]:
+    return dict(zip((f"{drive}.{kind}" for kind in KINDS), values.tolist(), strict=True))
+
+
+def _amplitude_uncertainty(
+    calibration: Calibration, names: Sequence[str], amplitude: Array
+) -> float:
+    """Expanded uncertainty of A and B in the direction of an amplitude, [m].
+
+    Of the ellipse wᵀ C⁻¹ w = k² it is the radius in this direction; 0 if both are known.
+    """
+    free = [p.name for p in calibration.free]
+    at = [free.index(name) for name in names if name in free]
+    size = float(np.linalg.norm(amplitude))
+    if len(at) < len(names) or not size:
+        return 0.0
+    total, scatter = (
+        c[np.ix_(at, at)] for c in (calibration.total_covariance, calibration.noise_covariance)
+    )
+    unit = amplitude / size
+    std = 1.0 / math.sqrt(float(unit @ np.linalg.solve(total, unit)))
+    of_noise = math.sqrt(max(float(unit @ scatter @ unit), 0.0))
+    return float(calibration.expand(std, min(of_noise, std)))
+
+
+def _compensated_screws(calibration: Calibration, screw: Screw) -> Array:
+    """A and B that tables of the controller corrected while measuring, shape (n_drives, 2), [m]."""
+    robot, found = calibration.robot, []
+    for i, drive in enumerate(robot.drives):
+        displayed = np.tile(robot.drive_zero, (POSITIONS, 1))
+        if drive.unit == "m":
+            displayed[:, i] += np.linspace(-screw.lead, screw.lead, POSITIONS)
+        moved = calibration.displacement(displayed)[:, i]
+        phase = 2.0 * np.pi * (displayed[:, i] - calibration.active_offsets[i]) / screw.lead
+        waves = np.column_stack([np.sin(phase), np.cos(phase), np.ones(POSITIONS)])
+        found.append(-np.linalg.lstsq(waves, moved, rcond=None)[0][:2])
+    return np.array(found)
 
 
 def is_worth_changing(
     calibration: Calibration, tool: CalibratedTool | None, entries: Sequence[BacklashEntry]
 ) -> bool:
     """True if backlash is to be entered even where the offsets stay as they are."""
+    changes: dict[str, float] = {}
+    for e in entries:
+        changes |= _change_of(e)
     return any(
         abs(e.change) > float(calibration.expand(e.std, e.std_scatter)) for e in entries
-    ) or _changes_tool(calibration, tool, entries)
+    ) or _changes_tool(calibration, tool, changes)
 
 
 def _changes_tool(
-    calibration: Calibration, tool: CalibratedTool | None, entries: Sequence[BacklashEntry]
+    calibration: Calibration, tool: CalibratedTool | None, changes: Mapping[str, float]
 ) -> bool:
-    """True if changes of the compensated backlash lower the expected tool error enough.
+    """True if changes of what the controller corrects lower the expected tool error enough.
 
     That of a controller which corrects all other errors, to first order.
+
+    Args:
+        calibration: The calibration.
+        tool: Its tool over the workspace; None if there is none.
+        changes: Parameter to the change, [SI].
     """
     names = [] if tool is None else list(tool.free)
-    known = {f"{e.drive}.backlash": e.change for e in entries if e.change}
+    known = {n: change for n, change in changes.items() if change}
     at = [names.index(n) for n in known if n in names]
     if tool is None or not at or not np.isfinite(calibration.model_covariance).all():
         return False

@@ -91,7 +91,7 @@ def test_a_table_has_the_same_decision(plan):
     both = plan.with_effects(["backlash", "screw"])
     truth = {**TRUTH, "x_slide.screw_sin": 15e-6, "z_slide.screw_sin": 15e-6}
     session = simulate_session(both, truth, seed=3, sigma=NOISE).session
-    calibration = calibrate(session, "offsets", **QUICK)
+    calibration = calibrate(session, "full", **QUICK)
     found = by_drive(calibration)
     assert found["x"].enter > 0.0
     assert found["z"].enter == 0.0

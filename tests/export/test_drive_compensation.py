@@ -29,7 +29,7 @@ from orthocal import (
     simulate_session,
     write_calibration,
 )
-from orthocal.assessment.controller_entries import offsets_to_enter
+from orthocal.assessment.controller_entries import find_screws, offsets_to_enter
 from orthocal.effects.compensation import JointTrim
 from orthocal.export.approach_sides import ApproachSides, find_lags
 from orthocal.export.correction_field import CorrectionField
@@ -81,9 +81,18 @@ def calibration(tmp_path_factory):
     plan = load_plan(folder).with_controller(ACTIVE)
     session = simulate_session(plan, TRUTH, seed=4, sigma=0.5e-6).session
     found = calibrate(session, Choice("offsets"), solver="variable-projection")
-    # unmodelled errors leave some backlash undetermined, which the real machine here has as found
+    # unmodelled errors leave some backlash and waves undetermined, which the real machine here has
+    # as found
     entered = tuple(replace(e, enter=e.identified) for e in found.assessment.backlash)
-    return replace(found, assessment=replace(found.assessment, backlash=entered))
+    unmodelled = replace(found.unmodelled, leakage=0.0 * found.unmodelled.leakage)
+    stds = dict(zip((p.name for p in found.free), np.diag(found.model_covariance), strict=True))
+    parameters = (
+        replace(p, std=float(np.sqrt(stds[p.name]))) if p.free else p for p in found.parameters
+    )
+    assessment = replace(found.assessment, backlash=entered)
+    return replace(
+        found, assessment=assessment, unmodelled=unmodelled, parameters=tuple(parameters)
+    )
 
 
 def follow(calibration, motors):
@@ -264,6 +273,98 @@ def test_an_export_under_its_own_compensation_changes_nothing(under_tables):
     options = ExportOptions(module=False, latched=LATCHED, home_offsets=entered)
     again = export_calibration(under, "linuxcnc", anyway=True, options=options)
     assert np.abs(np.array(home_offsets(again["joints.ini"])) * MM - entered).max() < 2e-7
+    for e in find_screws(under):  # of straight lines between rows that are 0.106 of a turn apart
+        size = np.linalg.norm(e.identified)
+        assert e.active == pytest.approx(np.sinc(0.106) ** 2 * e.identified, abs=0.01 * size)
+
+
+@pytest.fixture(scope="module")
+def complete(tmp_path_factory):
+    """Calibration of all errors of a machine whose y screw is straight."""
+    effects = EFFECTS.replace("0.02", "0.04")
+    plan = load_plan(write_plan(tmp_path_factory.mktemp("screws") / "plan", effects=effects))
+    plan = plan.with_controller(np.zeros(3))
+    truth = {n: v for n, v in TRUTH.items() if not n.startswith("y_slide.screw")}
+    truth |= {"x_slide.screw_cos": -11e-6, "z_slide.screw_sin": -15e-6}
+    session = simulate_session(plan, truth, seed=4, sigma=1e-6).session
+    return calibrate(session, "full", solver="variable-projection")
+
+
+def test_a_periodic_error_is_entered_where_it_is_determined(complete):
+    """By the ellipse of A and B: against its probability, sampled."""
+    rng = np.random.default_rng(0)
+    names = [p.name for p in complete.free]
+    entries = find_screws(complete)
+    assert [e.enter.any() for e in entries] == [True, False, True]
+    for e in entries:
+        at = [names.index(f"{e.drive}.screw_{k}") for k in ("sin", "cos")]
+        covariance = complete.total_covariance[np.ix_(at, at)]
+        assert e.identified == pytest.approx([complete.free[i].value for i in at])
+        drawn = rng.multivariate_normal(np.zeros(2), covariance, 200_000)
+        inverse = np.linalg.inv(covariance)
+        drawn = np.einsum("ni,ij,nj->n", drawn, inverse, drawn)
+        farther = np.mean(drawn > e.identified @ inverse @ e.identified)
+        assert (farther < 0.05) == e.enter.any()
+    options = ExportOptions(module=False, latched=LATCHED, home_offsets=(0.3, 0.3, 0.3))
+    files = export_calibration(complete, "linuxcnc", anyway=True, options=options)
+    tables = sorted(name for name in files if name.endswith(".comp"))
+    assert tables == ["joint_0.comp", "joint_2.comp"]
+    listed = re.search(r"Periodic error of the screw left[^:]*:\*\* (.*)", files["README.md"])
+    (y,) = (e for e in entries if e.drive == "y_slide")
+    assert listed[1] == f"JOINT_1 (±{y.uncertainty / MM:.3f} mm)."
+    backlash = re.findall(r"^BACKLASH = (\S+)", files["joints.ini"], re.M)
+    assert len(backlash) == 1  # that of y, which has no table
+
+
+def test_an_undetermined_periodic_error_is_entered_if_that_lowers_the_tool_error(complete):
+    """All but the screws is known nearly, or hardly: the y screw then moves the tool more or less.
+
+    Rows and columns of the screws keep their covariance, so that x and z are determined.
+    """
+    names = [p.name for p in complete.free]
+    screws = np.array([".screw_" in name for name in names])
+    cross = screws[:, None] != screws[None]
+    for known, entered in ((3.0, False), (1e-3, True)):
+        covariance = np.array(complete.model_covariance)
+        covariance[np.ix_(~screws, ~screws)] *= known**2
+        covariance[cross] = 0.0
+        covariance[np.ix_(screws, screws)] *= 0.2
+        x, y, z = find_screws(replace(complete, model_covariance=covariance))
+        assert x.enter.any()
+        assert z.enter.any()
+        assert np.linalg.norm(y.identified) < 1.2 * y.uncertainty
+        assert y.enter.any() == entered
+
+
+def test_an_undetermined_change_leaves_a_table_as_it_is(complete, tmp_path):
+    """A session under the exported tables that says little: only of the z screw something new."""
+    options = ExportOptions(module=False, latched=LATCHED, home_offsets=(0.3, 0.3, 0.3))
+    files = export_calibration(complete, "linuxcnc", anyway=True, options=options)
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    session = replace(
+        complete.session,
+        compensation=read_ini(tmp_path / "joints.ini", complete.robot).compensation,
+        controller_offsets=tuple(offsets_to_enter(complete).tolist()),
+    )
+    kept = tuple(replace(e, active=e.enter) for e in complete.assessment.backlash)
+    under = replace(
+        complete,
+        session=session,
+        model_covariance=100.0 * complete.model_covariance,
+        assessment=replace(complete.assessment, backlash=kept),
+        parameters=tuple(
+            replace(p, value=p.value + 0.2 * MM * (p.name == "z_slide.screw_sin"))
+            for p in complete.parameters
+        ),
+    )
+    x, _, z = find_screws(under)
+    assert not x.change.any()
+    assert z.change.any()
+    options = replace(options, home_offsets=tuple(home_offsets(files["joints.ini"])))
+    again = export_calibration(under, "linuxcnc", anyway=True, options=options)
+    assert "joint_0.comp" not in again
+    assert "joint_2.comp" in again
 
 
 def test_module_and_tables_together_are_the_exact_correction(under_tables, tmp_path):

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array
-from orthocal.assessment.controller_entries import find_backlash
+from orthocal.assessment.controller_entries import find_backlash, find_screws
 from orthocal.calibration.calibration import Calibration
 from orthocal.effects.backlash import Backlash
 from orthocal.effects.compensation import JointTrim, table_name
@@ -199,24 +199,33 @@ def find_compensation(
 def tabulate(
     calibration: Calibration,
     compensation: Sequence[JointCompensation],
+    before: Sequence[JointCompensation],
     offsets: Array,
 ) -> tuple[JointCompensation, ...]:
-    """Tables of backlash and periodic errors, for joints whose screws have periodic errors.
+    """Tables of backlash and periodic errors, for joints with periodic errors worth entering.
 
     Args:
         calibration: The calibration.
         compensation: Compensation of backlash.
+        before: Compensation during the measurement; a table of which nothing changes stays.
         offsets: Offsets in the controller with which the tables are used, (n_drives,), [m, rad].
 
     Raises:
         ExportError: If a drive with a periodic error has no limits of travel.
     """
     robot = calibration.robot
-    periodic = find_periodic_errors(robot, calibration.errors)
+    screws = find_screws(calibration)
+    values = {name: v for e in screws for name, v in e.values.items()}
+    periodic = find_periodic_errors(robot, values)
     if periodic is None:
         return tuple(compensation)
+    changed = {e.drive for e in screws if e.change.any()}
+    changed |= {e.drive for e in find_backlash(calibration) if e.change}
     result = []
-    for i, (d, joint) in enumerate(zip(robot.drives, compensation, strict=True)):
+    for i, (d, joint, was) in enumerate(zip(robot.drives, compensation, before, strict=True)):
+        if was.table is not None and d.name not in changed:
+            result.append(was)
+            continue
         if not (periodic.sine[i] or periodic.cosine[i]):
             result.append(joint)
             continue

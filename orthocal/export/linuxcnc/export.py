@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 from orthocal.assessment.assess import assessment_of
-from orthocal.assessment.controller_entries import find_entries, offsets_to_enter
+from orthocal.assessment.controller_entries import find_entries, find_screws, offsets_to_enter
 from orthocal.calibration.calibration import Calibration
 from orthocal.effects.compensation import compensates_alike, format_table
 from orthocal.errors import ExportError, ParameterError
@@ -18,7 +18,6 @@ from orthocal.export.linuxcnc.drive_compensation import (
     compensate_beside_module,
     find_compensation,
     find_old_compensation,
-    find_periodic_errors,
     tabulate,
 )
 from orthocal.export.linuxcnc.home_offsets import find_homes
@@ -115,7 +114,7 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         _refuse_module_options(options)
         if not find_entries(calibration):
             raise ExportError("the calibration identified no offset: there is nothing to enter")
-        compensation = tabulate(calibration, compensation, offsets_to_enter(calibration))
+        compensation = tabulate(calibration, compensation, before, offsets_to_enter(calibration))
         _require_change(calibration, compensation, before)
         _require_home_offsets(options, [*before, *compensation])
         homes = find_homes(calibration, compensation, before, old=options.home_offsets)
@@ -205,6 +204,6 @@ def assumes_latching(calibration: Calibration, options: ExportOptions) -> bool:
     if options.latched is not None:
         return False
     old, new = (f(calibration, None) for f in (find_old_compensation, find_compensation))
-    if find_periodic_errors(calibration.robot, calibration.errors) is not None:
+    if not compensates_alike(old, new):
         return True
-    return not compensates_alike(old, new)
+    return any(e.change.any() for e in find_screws(calibration))

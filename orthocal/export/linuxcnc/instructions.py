@@ -10,6 +10,7 @@ from orthocal.assessment.controller_entries import (
     ENTERED_DECIMALS,
     find_backlash,
     find_entries,
+    find_screws,
     offsets_to_enter,
 )
 from orthocal.calibration.calibration import Calibration
@@ -204,18 +205,45 @@ def _describe_conditions(approximation: Approximation) -> str:
 
 def _describe_undetermined(calibration: Calibration) -> str:
     """Paragraph about drives whose change of backlash is not determined; empty without any."""
-    joints = {d.name: i for i, d in enumerate(calibration.robot.drives)}
+    return _describe_kept(
+        calibration,
+        "Backlash",
+        [
+            (e.drive, expanded_uncertainty(calibration, e))
+            for e in find_backlash(calibration)
+            if not e.change
+        ],
+    )
+
+
+def _describe_undetermined_screws(calibration: Calibration) -> str:
+    """The same about periodic errors of screws, of which tables are not written."""
+    screws = [e for e in find_screws(calibration) if not e.change.any()]
+    return _describe_kept(
+        calibration, "Periodic error of the screw", [(e.drive, e.uncertainty) for e in screws]
+    )
+
+
+def _describe_kept(
+    calibration: Calibration, what: str, uncertainties: Sequence[tuple[str, float]]
+) -> str:
+    """Paragraph about drives whose compensation stays; empty without any.
+
+    Args:
+        calibration: The calibration.
+        what: What is compensated.
+        uncertainties: Drives, and the expanded uncertainty of each, [m, rad].
+    """
+    joints = {d.name: (i, d) for i, d in enumerate(calibration.robot.drives)}
     texts = []
-    for e in find_backlash(calibration):
-        if e.change:
-            continue
-        unit, size = DRIVE_UNITS[e.unit]
-        half = format_fixed(expanded_uncertainty(calibration, e) / size, 3)
-        texts.append(f"JOINT_{joints[e.drive]} (±{half} {unit})")
+    for name, half in uncertainties:
+        i, drive = joints[name]
+        unit, size = DRIVE_UNITS[drive.unit]
+        texts.append(f"JOINT_{i} (±{format_fixed(half / size, 3)} {unit})")
     if not texts:
         return ""
     listed = ", ".join(texts)
-    return f"\n**Backlash left as it is, since its change is not determined:** {listed}.\n"
+    return f"\n**{what} left as it is, since its change is not determined:** {listed}.\n"
 
 
 def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, stated: bool) -> str:
@@ -257,7 +285,8 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, sta
         "unit": unit,
         "active": active,
         "compensation": _describe_compensation(homes, stated=stated)
-        + _describe_undetermined(calibration),
+        + _describe_undetermined(calibration)
+        + _describe_undetermined_screws(calibration),
     }
     return fill_template("home_offset.md", values)
 
