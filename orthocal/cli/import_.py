@@ -53,8 +53,9 @@ def import_(
         unit (mm|um|inch|cm|thou): Unit of readings without a unit.
         encoding: Encoding of the file: utf-8, utf-16, cp1252, cp850, mac-roman ...
         column (ROLE=HEADING): Role of a column: setup, posture, minus, cycle, approach,
-            temperature, time, reading, or 'reading 2' for cycles side by side; HEADING is its
-            heading, or its number such as #4.
+            temperature, time, reading, or 'reading 2' for cycles side by side; x, y and z of
+            points, 'nominal x' ... of their commanded points; HEADING is its heading, or its
+            number such as #4.
         fill: Copy an empty setup or posture from the row above.
         replace: Overwrite existing readings that differ.
         dry_run: Show the result without writing it.

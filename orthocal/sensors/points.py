@@ -229,7 +229,7 @@ class Points:
         return (
             "Set up the instrument. It must not move until all points of its setups are taken.",
             f"Mount the target at the tool, ({target}) mm from the tool centre point.",
-            "Export the points as a table with columns setup, posture, x_mm, y_mm, z_mm.",
+            "Export the points with posture, x, y and z as a table. `orthocal import` reads it.",
         )
 
     def frames(self, robot: Robot) -> Frames:

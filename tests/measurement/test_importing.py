@@ -329,7 +329,8 @@ FORMS = [
     text("no-such-decimal", ENGLISH, "--decimal: ',' is not a decimal sign; expected point, comma",
          decimal=","),
     text("no-such-role", ENGLISH, "--column: 'date' is not the role of a column; expected one of "
-         "setup, posture, minus, cycle, approach, temperature, time, reading, or reading 1, "
+         "setup, posture, minus, cycle, approach, temperature, time, reading, x, y, z, nominal x, "
+         "nominal y, nominal z, or reading 1, "
          "reading 2 ... for cycles side by side", columns={"date": "setup"}),
     text("no-such-column", ENGLISH, "{}: no row has the headings setup, posture and reading; row 1 "
          "has 'setup', 'posture', 'reading_mm' with comma as separator; assign columns by "

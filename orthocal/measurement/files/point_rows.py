@@ -109,6 +109,11 @@ class PointRows:
         """Names of all setups as in the files."""
         return list(dict.fromkeys(map(base_name, self.plan.setups)))
 
+    @property
+    def any(self) -> bool:
+        """True if the session has a setup of points."""
+        return bool(self._parts)
+
     def is_point(self, row: RawReading) -> bool:
         """True for a row of a setup of points."""
         return row.setup in self._parts

@@ -17,16 +17,37 @@ from orthocal.io.tables.cell import Row
 from orthocal.io.tables.numerals import tidy_text
 from orthocal.text import composed, shorten
 
-Role = Literal["setup", "posture", "minus", "cycle", "approach", "temperature", "time", "reading"]
-"""Role of a column."""
+Coordinate = Literal["x", "y", "z"]
+"""Role of a column with a coordinate of points."""
+
+Role = (
+    Literal["setup", "posture", "minus", "cycle", "approach", "temperature", "time", "reading"]
+    | Coordinate
+    | Literal["nominal x", "nominal y", "nominal z"]
+)
+"""Role of a column; nominal coordinates are those of a commanded point."""
 
 KEYS: tuple[Role, ...] = ("setup", "posture", "minus", "cycle")
 """Roles of columns that identify a reading."""
 
+NOMINAL: tuple[Role, ...] = ("nominal x", "nominal y", "nominal z")
+"""Roles of the commanded point that identifies a posture, in a session with points."""
+
 SINGLE: tuple[Role, ...] = (*KEYS, "approach", "temperature", "time")
 """Roles of one column at most."""
 
+POINT: tuple[Role, ...] = get_args(Coordinate)
+"""Roles of the columns of points, in place of readings."""
+
+LENGTHS: tuple[Role, ...] = ("reading", *POINT, *NOMINAL)
+"""Roles of columns that have a unit of length."""
+
+ROLES: tuple[Role, ...] = (*SINGLE, *LENGTHS)
+"""All roles, in the order of messages."""
+
 EXPECTED = "the headings setup, posture and reading"
+
+EXPECTED_POINTS = "the headings posture (or nominal x, y and z), x, y and z"
 
 WORDS: dict[Role, tuple[str, ...]] = {
     "setup": (
@@ -64,6 +85,18 @@ WORDS: dict[Role, tuple[str, ...]] = {
     ),
 }
 """Headings of every role, in lower case, with single blanks."""
+
+for _axis in POINT:
+    WORDS[_axis] = (
+        *(_axis, f"measured {_axis}", f"{_axis} measured", f"{_axis} meas", f"actual {_axis}"),
+        *(f"{_axis} actual", f"{_axis} coordinate", f"{_axis} position", f"target {_axis}"),
+        *(f"{_axis} ist", f"ist {_axis}", f"{_axis} koordinate"),
+    )
+    WORDS[cast(Role, f"nominal {_axis}")] = (
+        *(f"nominal {_axis}", f"{_axis} nominal", f"{_axis} nom", f"commanded {_axis}"),
+        *(f"{_axis} commanded", f"{_axis} command", f"{_axis} cmd", f"command {_axis}"),
+        *(f"{_axis} soll", f"soll {_axis}"),
+    )
 
 _ROLES = {word: role for role, words in WORDS.items() for word in words}
 
@@ -120,7 +153,8 @@ class Columns:
     single: Mapping[Role, int]
     """Indices of the columns with a role in SINGLE, in that order."""
     readings: Mapping[int, Heading]
-    """Indices of the columns of readings, with their headings."""
+    """Indices of the columns of readings and points, with their headings. Without a column of
+    postures also those of the commanded points."""
     extra: tuple[int, ...]
     """Columns with a heading that has no role."""
 
@@ -146,9 +180,9 @@ def read_heading(text: str) -> Heading | None:
         return Heading("temperature")
     words, unit = _split_unit(plain)
     heading = None if unit is None else _read_words(words)
-    if heading is None or heading.role != "reading":
+    if heading is None or heading.role not in LENGTHS:
         return None
-    return Heading("reading", heading.cycle, unit)
+    return Heading(heading.role, heading.cycle, unit)
 
 
 def split_degrees(text: str) -> tuple[str, Degrees | None]:
@@ -205,17 +239,30 @@ def _read_words(plain: str) -> Heading | None:
     return None
 
 
-def find_header(rows: Sequence[Row], assigned: Mapping[str, str] | None = None) -> int | None:
-    """Index of the first row with the headings of a table of readings; None if there is none."""
+def find_header(
+    rows: Sequence[Row], assigned: Mapping[str, str] | None = None, *, points: bool = False
+) -> int | None:
+    """Index of the first row with the headings of a table of readings; None if there is none.
+
+    Args:
+        rows: The first rows of a table.
+        assigned: As for `choose_columns`.
+        points: Whether the table may have points.
+    """
     for at, row in enumerate(rows):
         texts = [c.text for c in row.cells]
-        roles = {h.role for h in _read_headings(texts, assigned or {}) if h is not None}
+        headings = _read_headings(texts, assigned or {}, points)
+        roles = {h.role for h in headings if h is not None}
         if {"setup", "posture", "reading"} <= roles:
+            return at
+        if roles.issuperset(POINT) and ("posture" in roles or roles.issuperset(NOMINAL)):
             return at
     return None
 
 
-def _read_headings(texts: Sequence[str], assigned: Mapping[str, str]) -> list[Heading | None]:
+def _read_headings(
+    texts: Sequence[str], assigned: Mapping[str, str], points: bool
+) -> list[Heading | None]:
     """Meaning of every heading of a row; columns that the user assigned come first."""
     places = {key: _find_column(texts, name) for key, name in assigned.items()}
     by_index = {at[0]: parse_role(key) for key, at in places.items() if len(at) == 1}
@@ -226,7 +273,9 @@ def _read_headings(texts: Sequence[str], assigned: Mapping[str, str]) -> list[He
         if index in by_index:
             unit = heading.unit if heading and heading.unit else _split_unit(_normalize(text))[1]
             heading = Heading(by_index[index].role, by_index[index].cycle, unit)
-        elif heading is not None and heading.role in roles:
+        elif heading is not None and (
+            heading.role in roles or (heading.role in (*POINT, *NOMINAL) and not points)
+        ):
             heading = None
         headings.append(heading)
     return headings
@@ -238,12 +287,12 @@ def parse_role(key: str) -> Heading:
     Raises:
         SessionError: If it is not a role.
     """
-    match = re.fullmatch(r"([a-z]+)\s*([0-9]{1,4})?", key.strip().casefold())
+    match = re.fullmatch(r"((?:nominal )?[a-z]+)\s*([0-9]{1,4})?", key.strip().casefold())
     role = match[1] if match else ""
-    if match is None or role not in get_args(Role) or (match[2] and role != "reading"):
+    if match is None or role not in ROLES or (match[2] and role != "reading"):
         raise SessionError(
             f"'{shorten(key)}' is not the role of a column; expected one of "
-            f"{', '.join(get_args(Role))}, or reading 1, reading 2 ... for cycles side by side",
+            f"{', '.join(ROLES)}, or reading 1, reading 2 ... for cycles side by side",
             where="--column",
         )
     return Heading(cast("Role", role), int(match[2]) if match[2] else None)
@@ -266,13 +315,22 @@ def _find_column(texts: Sequence[str], name: str) -> list[int]:
     return exact or [i for i, text in enumerate(plain_texts) if text and text.casefold() == folded]
 
 
-def choose_columns(texts: Sequence[str], assigned: Mapping[str, str], *, where: str) -> Columns:
+def choose_columns(
+    texts: Sequence[str],
+    assigned: Mapping[str, str],
+    *,
+    where: str,
+    points: bool = False,
+    one_setup: bool = False,
+) -> Columns:
     """Assign a role to every column.
 
     Args:
         texts: Headings.
         assigned: Role, or `reading 2`, to the heading of its column, or its number such as `#4`.
         where: File and line, for messages.
+        points: Whether the table may have points. Their posture may be a commanded point.
+        one_setup: Whether the setup need not be stated.
 
     Raises:
         SessionError: If a role has no column, or several.
@@ -287,7 +345,9 @@ def choose_columns(texts: Sequence[str], assigned: Mapping[str, str], *, where: 
                 else f"is not among the headings {shown}"
             )
             raise SessionError(f"column '{shorten(name)}' {problem}", where=f"{where}: {key}")
-    headings = _read_headings(texts, assigned)
+    headings = _read_headings(texts, assigned, points)
+    known = {h.role for h in headings if h is not None}
+    optional = {"setup": one_setup, "posture": known.issuperset(NOMINAL)}
     single: dict[Role, int] = {}
     for role in SINGLE:
         places = [i for i, h in enumerate(headings) if h is not None and h.role == role]
@@ -295,19 +355,38 @@ def choose_columns(texts: Sequence[str], assigned: Mapping[str, str], *, where: 
             raise _several_columns(texts, places, role, where)
         if places:
             single[role] = places[0]
-        elif role in ("setup", "posture"):
+        elif not optional.get(role, True):
             raise SessionError(
                 f"no column has the role {role}; assign one by --column {role}=HEADING",
                 where=where,
             )
-    readings = {i: h for i, h in enumerate(headings) if h is not None and h.role == "reading"}
-    _check_readings(texts, readings, single.get("cycle"), where)
+    lengths = LENGTHS if "posture" not in single else ("reading", *POINT)
+    readings = {i: h for i, h in enumerate(headings) if h is not None and h.role in lengths}
+    of_readings = {i: h for i, h in readings.items() if h.role == "reading"}
+    has_points = _check_points(texts, readings, where)
+    if of_readings or not has_points:
+        _check_readings(texts, of_readings, single.get("cycle"), where)
     used = {*readings, *single.values()}
     return Columns(
         single=single,
         readings=readings,
         extra=tuple(i for i, text in enumerate(texts) if i not in used and text.strip()),
     )
+
+
+def _check_points(texts: Sequence[str], columns: Mapping[int, Heading], where: str) -> bool:
+    """Refuse missing and ambiguous columns of points; True if a table has points."""
+    places = {role: [i for i, h in columns.items() if h.role == role] for role in LENGTHS[1:]}
+    has_points = any(places[role] for role in POINT)
+    for role, of_role in places.items():
+        if len(of_role) > 1:
+            raise _several_columns(texts, of_role, role, where)
+        if not of_role and has_points and role in POINT:
+            raise SessionError(
+                f"no column has the role {role}; assign one by --column {role}=HEADING",
+                where=where,
+            )
+    return has_points
 
 
 def _check_readings(

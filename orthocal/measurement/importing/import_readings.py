@@ -6,17 +6,21 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import Any, Literal, cast, get_args
 
 from orthocal.arguments import require_kind
+from orthocal.arrays import Array
 from orthocal.errors import SessionError
 from orthocal.io.files import content_withheld_outside, exists, read_file, write_file
 from orthocal.io.tables.numerals import Sign
 from orthocal.io.tables.table import Table, read_table
-from orthocal.measurement.files.point_rows import require_no_points
+from orthocal.measurement.files.point_rows import PointRows
 from orthocal.measurement.files.readings_checks import check_readings, parse_row, parse_time
 from orthocal.measurement.files.readings_file import (
     CONDITIONS,
+    COORDINATES,
+    OF_POINTS,
+    REQUIRED,
     RawReading,
     format_readings,
     read_rows,
@@ -24,6 +28,7 @@ from orthocal.measurement.files.readings_file import (
 from orthocal.measurement.files.session_file import check_contacts, load_unread
 from orthocal.measurement.importing.headings import (
     EXPECTED,
+    EXPECTED_POINTS,
     UNITS,
     Columns,
     UnitName,
@@ -115,18 +120,18 @@ def import_readings(
     _check_options(options)
     path = Path(table)
     plan, readings_path = load_unread(session)
-    require_no_points(plan)
     content, columns, long_table = _read_long_table(path, plan, options)
-    readings, points = check_readings(long_table.rows, plan, file=path)
-    new = list(zip(long_table.rows, readings, strict=True))
+    _, points = check_readings(long_table.rows, plan, file=path)
+    new = [(row, parse_row(row, plan, points)) for row in long_table.rows]
     with content_withheld_outside((plan.path or Path(session)).parent, readings_path):
         existing = [
-            (row, parse_row(row, plan, points)[0])
+            (row, parse_row(row, plan, points))
             for row in _read_existing(readings_path, path, long_table, overwrite)
         ]
     merged, counts = _merge(existing, new, overwrite)
-    readings, _ = check_readings(merged, plan, file=readings_path)
-    check_contacts(replace(plan, readings=readings))
+    readings, points = check_readings(merged, plan, file=readings_path)
+    check_contacts(replace(plan, readings=readings, setups=points.setups, gauges=points.gauges))
+    required = {c for row in merged for c in (OF_POINTS if points.is_point(row) else REQUIRED)}
     return TableImport(
         options=options,
         table=content,
@@ -134,12 +139,12 @@ def import_readings(
         long_table=long_table,
         session=plan.path or Path(session),
         readings_path=readings_path,
-        text=format_readings(merged),
+        text=format_readings(merged, required=required),
         filled=counts["filled"],
         replaced=counts["replaced"],
         unchanged=counts["unchanged"],
         added=counts["added"],
-        empty=sum(not row.reading_mm for row in merged),
+        empty=sum(not _is_filled(row) for row in merged),
     )
 
 
@@ -147,30 +152,41 @@ def _read_long_table(
     path: Path, plan: Session, options: TableOptions
 ) -> tuple[Table, Columns, LongTable]:
     """Table of a file with the roles of its columns, and its long form."""
+    points = PointRows(plan)
     content = read_table(
         path,
         read_file(path, error=SessionError),
-        lambda rows: find_header(rows, options.columns),
-        expected=EXPECTED,
+        lambda rows: find_header(rows, options.columns, points=points.any),
+        expected=EXPECTED_POINTS if points.any else EXPECTED,
         sheet=options.sheet,
         separator=options.separator,
         encoding=options.encoding,
     )
     columns = choose_columns(
-        content.header, options.columns, where=content.place(content.header_line)
+        content.header,
+        options.columns,
+        where=content.place(content.header_line),
+        points=points.any,
+        one_setup=points.any and len(points.names) == 1,
     )
     if "time" not in options.columns:
         columns = _without_clock_times(content, columns)
     long_table = make_long_table(
         content,
         columns,
-        names={"setup": plan.setups, "posture": plan.postures},
+        names={"setup": points.names, "posture": plan.postures},
         decimal=cast("Sign | None", options.decimal),
         unit=cast("UnitName | None", options.unit),
         separator_known=options.separator is not None,
         fill=options.fill,
+        points=_commanded_points(plan),
     )
     return content, columns, long_table
+
+
+def _commanded_points(plan: Session) -> dict[str, Array]:
+    """Commanded point of each posture that has one, from the mechanical zero, (3,), [m]."""
+    return {n: p.values for n, p in plan.postures.items() if p.form == "tcp" and p.values.size == 3}
 
 
 def write_import(result: TableImport) -> None:
@@ -229,16 +245,26 @@ def _read_existing(
             "is the session's own table; --replace rewrites it with its readings only",
             where=str(table),
         )
-    rows = [replace(row, reading_mm="") for row in (*long_table.rows, *long_table.missing)]
+    empty: dict[str, Any] = dict.fromkeys(VALUES, "")
+    rows = [replace(row, **empty) for row in (*long_table.rows, *long_table.missing)]
     return sorted(rows, key=lambda row: row.line)
 
 
-_Row = tuple[RawReading, Reading]
-"""A row as text, and its reading."""
+VALUES = ("reading_mm", *COORDINATES)
+"""Columns of what was measured."""
+
+_Row = tuple[RawReading, Sequence[Reading]]
+"""A row as text, and its reading, or the three of a point."""
 
 
-def _key(reading: Reading) -> Key:
-    return reading.setup, reading.posture, reading.minus or "", reading.cycle
+def _is_filled(row: RawReading) -> bool:
+    """True if a row has a reading or a point."""
+    return any(getattr(row, column) for column in VALUES)
+
+
+def _key(row: _Row) -> Key:
+    text, (reading, *_) = row
+    return text.setup, reading.posture, reading.minus or "", reading.cycle
 
 
 def _merge(
@@ -254,13 +280,13 @@ def _merge(
     """
     pending: dict[Key, list[_Row]] = {}
     for row in new:
-        pending.setdefault(_key(row[1]), []).append(row)
-    places = Counter(_key(reading) for _, reading in existing)
+        pending.setdefault(_key(row), []).append(row)
+    places = Counter(map(_key, existing))
     rows: list[RawReading] = []
     counts: Counter[str] = Counter()
     differing: list[_Row] = []
     for row in existing:
-        key = _key(row[1])
+        key = _key(row)
         match = _match(row[0], pending.get(key, []), places[key] == 1)
         if match is None:
             rows.append(row[0])
@@ -317,24 +343,26 @@ def _match(row: RawReading, among: Sequence[_Row], alone: bool) -> _Row | None:
 def _change(row: _Row, match: _Row) -> Literal["replaced", "filled", "unchanged"]:
     """Effect of a new reading on an existing row."""
     (text, old), (_, new) = row, match
-    before, after = (astuple(r.conditions or Conditions()) for r in (old, new))
+    before, after = (astuple(r[0].conditions or Conditions()) for r in (old, new))
     pairs = list(zip(before, after, strict=True))
-    if (text.reading_mm and old.value != new.value) or any(
+    differs = [r.value for r in old] != [r.value for r in new]
+    if (_is_filled(text) and differs) or any(
         one is not None and other is not None and one != other for one, other in pairs
     ):
         return "replaced"
-    filled = not text.reading_mm or any(one is None and other is not None for one, other in pairs)
+    filled = not _is_filled(text) or any(one is None and other is not None for one, other in pairs)
     return "filled" if filled else "unchanged"
 
 
 def _update(row: RawReading, other: RawReading) -> RawReading:
     """An existing row with the reading and the stated conditions of another."""
     conditions = {name: getattr(other, name) or getattr(row, name) for name in CONDITIONS}
-    return replace(row, reading_mm=other.reading_mm, **conditions)
+    return replace(row, **{name: getattr(other, name) for name in VALUES}, **conditions)
 
 
 def _describe(row: RawReading) -> str:
     """Reading and conditions of a row, for messages."""
     temperature = f"{row.temperature_C} °C" if row.temperature_C else ""
-    parts = f"{row.reading_mm} mm" if row.reading_mm else "", row.approach, temperature, row.time
+    measured = ", ".join(text for name in VALUES if (text := getattr(row, name)))
+    parts = f"{measured} mm" if measured else "", row.approach, temperature, row.time
     return ", ".join(part for part in parts if part)

@@ -6,11 +6,15 @@ Cycles side by side become rows. Rows without a reading are skipped, each with i
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from decimal import Decimal, localcontext
 from itertools import chain
+from typing import Any
 
+import numpy as np
+
+from orthocal.arrays import Array
 from orthocal.errors import SessionError
 from orthocal.io.strict_yaml import LONGEST_NUMBER
 from orthocal.io.tables.cell import Cell, Row
@@ -32,15 +36,19 @@ from orthocal.measurement.files.readings_file import (
     require_whole_cells,
 )
 from orthocal.measurement.importing.headings import (
+    NOMINAL,
+    POINT,
     SINGLE,
     UNITS,
     Columns,
+    Heading,
     Role,
     UnitName,
     parse_unit,
     split_degrees,
 )
 from orthocal.text import composed, shorten
+from orthocal.units import MM
 
 NO_READING = "no reading"
 
@@ -51,6 +59,9 @@ SkippedRows = list[tuple[int, str]]
 """Lines of the table that are not imported, with the reason."""
 
 CHOOSE_SIGN = "choose one by --decimal comma or --decimal point"
+
+SAME_POINT_MM = 0.1
+"""Largest difference of each coordinate of a commanded point from that of its posture, [mm]."""
 
 LONGEST_NAME = 200
 """Maximum length of a name in a session."""
@@ -74,6 +85,7 @@ class Entry:
     value: Decimal | None = None
     """Value of a workbook's number."""
     unit: UnitName | None = None
+    role: Role = "reading"
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,56 +115,127 @@ def make_long_table(
     unit: UnitName | None = None,
     separator_known: bool = False,
     fill: bool = False,
+    points: Mapping[str, Array] | None = None,
 ) -> LongTable:
     """Convert a table to its long form.
 
     Args:
         table: The table.
         columns: Roles of its columns.
-        names: Names of the session for `setup` and `posture`. Upper case, and blanks in place of
+        names: Names of the session for `setup` and `posture`; the first setup is that of all rows
+            without a column of setups. Upper case, and blanks in place of
             underscores, make no difference.
         decimal: Decimal sign; inferred by default.
         unit: Unit of readings without a unit.
         separator_known: True if the user stated the separator.
         fill: True to copy an empty setup or posture from the row above.
+        points: Posture to its commanded point, (3,), [m], for tables that state points instead.
 
     Raises:
         SessionError: Naming the row, if a cell is not a number, has no unit, or is ambiguous.
     """
     require_whole_cells(table, columns, sure=separator_known or decimal == "point")
     skipped: SkippedRows = []
-    entries = list(_read_entries(table, columns, skipped, fill))
+    first_setup = next(iter(names["setup"]))
+    entries = list(_read_entries(table, columns, skipped, fill, first_setup))
     sign = _decide_decimal_sign(table, entries, decimal)
-    setups, postures = (_folded_names(names[role]) for role in ("setup", "posture"))
-    renamed: dict[str, str] = {}
-    units: dict[UnitName, None] = {}
-    unit_assumed = False
-    rows, missing = [], []
+    rows = _Rows(*(_folded_names(names[role]) for role in NAMED), skipped=skipped)
     for entry in entries:
-        row = _with_session_names(entry.row, setups, postures)
         if entry.number is None:
-            if row.setup in setups and row.posture in postures:
-                missing.append(row)
-            elif (row.line, NO_READING) not in skipped[-1:]:
-                skipped.append((row.line, NO_READING))
+            rows.skip(entry)
             continue
-        names_of_rows = zip(_names(entry.row), _names(row), strict=True)
-        renamed |= {old: new for old, new in names_of_rows if old != new}
         value = _parse_value(entry, sign.sign)
-        entry_unit = _choose_unit(entry, unit, table.header[entry.column])
-        units[entry_unit] = None
-        unit_assumed |= entry.unit is None
-        with localcontext(prec=2 * LONGEST_NUMBER):
-            rows.append(replace(row, reading_mm=mm_text(value * UNITS[entry_unit])))
+        rows.add(entry, value, _choose_unit(entry, unit, table.header[entry.column]))
     return LongTable(
-        rows=tuple(rows),
-        missing=tuple(missing),
+        rows=rows.located(points or {}),
+        missing=tuple(r for r in rows.missing if (r.line, r.cycle) not in rows.read),
         decimal=sign,
-        units=tuple(units),
-        unit_assumed=unit_assumed,
+        units=tuple(rows.units),
+        unit_assumed=any(e.number is not None and e.unit is None for e in entries),
         skipped=tuple(skipped),
-        renamed=tuple(renamed.items()),
+        renamed=tuple(rows.renamed.items()),
     )
+
+
+@dataclass
+class _Rows:
+    """Rows of a long table in the making: readings, and points of several cells."""
+
+    setups: Mapping[str, str]
+    """Names of the session by their folded form."""
+    postures: Mapping[str, str]
+    skipped: SkippedRows
+    read: dict[tuple[int, str], RawReading] = field(default_factory=dict)
+    """Line and cycle to the row."""
+    missing: list[RawReading] = field(default_factory=list)
+    commanded: dict[int, dict[Role, Decimal]] = field(default_factory=dict)
+    """Line to the commanded point, [mm]."""
+    units: dict[UnitName, None] = field(default_factory=dict)
+    renamed: dict[str, str] = field(default_factory=dict)
+
+    def skip(self, entry: Entry) -> None:
+        """Note an empty cell."""
+        row = _with_session_names(entry.row, self.setups, self.postures)
+        if row.setup in self.setups and row.posture in self.postures:
+            self.missing.append(row)
+        elif (row.line, NO_READING) not in self.skipped[-1:]:
+            self.skipped.append((row.line, NO_READING))
+
+    def add(self, entry: Entry, value: Decimal, unit: UnitName) -> None:
+        """Note a number."""
+        row = _with_session_names(entry.row, self.setups, self.postures)
+        names = zip(_names(entry.row), _names(row), strict=True)
+        self.renamed |= {old: new for old, new in names if old != new}
+        self.units[unit] = None
+        with localcontext(prec=2 * LONGEST_NUMBER):
+            value *= UNITS[unit]
+        if entry.role in NOMINAL:
+            self.commanded.setdefault(row.line, {})[entry.role] = value
+            return
+        key = row.line, row.cycle
+        cell: dict[str, Any] = {f"{entry.role}_mm": mm_text(value)}
+        self.read[key] = replace(self.read.get(key, row), **cell)
+
+    def located(self, points: Mapping[str, Array]) -> tuple[RawReading, ...]:
+        """The rows, those with a commanded point with the posture of that point.
+
+        Args:
+            points: Posture to its commanded point, shape (3,), [m].
+        """
+        return tuple(
+            replace(row, posture=_find_posture(self.commanded[row.line], points, row.where))
+            if row.line in self.commanded
+            else row
+            for row in self.read.values()
+        )
+
+
+def _find_posture(
+    commanded: Mapping[Role, Decimal], points: Mapping[str, Array], where: str
+) -> str:
+    """Posture of a commanded point.
+
+    Args:
+        commanded: Role to coordinate, [mm]; without those that are empty.
+        points: Posture to its commanded point, shape (3,), [m].
+        where: File and row, for messages.
+
+    Raises:
+        SessionError: If the point is incomplete, or that of no posture, or of several ones.
+    """
+    missing = next((role for role in NOMINAL if role not in commanded), None)
+    if missing is not None:
+        raise SessionError(f"{missing} is empty; expected a commanded point", where=where)
+    point = np.array([float(commanded[role]) for role in NOMINAL])
+    near = [n for n, p in points.items() if np.abs(p / MM - point).max() <= SAME_POINT_MM]
+    if len(near) != 1:
+        what = f"that of {' and '.join(near[:3])}" if near else "that of no posture"
+        raise SessionError(
+            f"the commanded point ({', '.join(f'{v:g}' for v in point)}) mm is {what}; expected "
+            f"one of the session within {SAME_POINT_MM:g} mm, from the mechanical zero",
+            where=where,
+        )
+    return near[0]
 
 
 def _names(row: RawReading) -> tuple[str, str, str]:
@@ -172,15 +255,25 @@ def _with_session_names(
 
 
 def _read_entries(
-    table: Table, columns: Columns, skipped: SkippedRows, fill: bool
+    table: Table, columns: Columns, skipped: SkippedRows, fill: bool, setup: str
 ) -> Iterator[Entry]:
-    """Cells of the columns of readings, row by row."""
+    """Cells of the columns of readings and points, row by row.
+
+    Args:
+        table: The table.
+        columns: Roles of its columns.
+        skipped: Receives the lines without a reading.
+        fill: As for `make_long_table`.
+        setup: Setup of all rows, if there is no column of setups.
+    """
     for column, top, _ in table.merged:
         if column in columns.readings:
             raise SessionError(
                 "is merged with cells below; expected one cell for each reading",
                 where=table.place(top, column),
             )
+    named = [role for role in NAMED if role in columns.single]
+    measured = [i for i, h in columns.readings.items() if h.role not in NOMINAL]
     above = dict.fromkeys(NAMED, "")
     units_below: dict[int, UnitName] = {}
     rows = table.fill_merged(columns.keys)
@@ -192,29 +285,32 @@ def _read_entries(
             rows = chain([first], rows)
         break
     for row in rows:
-        names = {role: _name(row.cell(columns.single[role])) for role in NAMED}
-        filled_cells = [i for i in columns.readings if not _is_missing(row.cell(i))]
+        names = {role: _name(row.cell(columns.single.get(role))) for role in NAMED}
+        if "setup" not in named:
+            names["setup"] = setup
+        filled_cells = [i for i in measured if not _is_missing(row.cell(i))]
         beyond = sum(not c.is_blank for c in row.cells[len(table.header) :])
         if beyond:
             skipped.append((row.line, f"{beyond} cells without a heading"))
-        if not filled_cells and not all(names.values()):
+        if not filled_cells and not all(names[role] for role in named):
             skipped.append((row.line, NO_READING))
             continue
         if fill:
             names = above = {role: name or above[role] for role, name in names.items()}
-        for role, name in names.items():
-            if not name:
+        for role in named:
+            if not names[role]:
                 raise SessionError(
                     f"has a reading but no {role}; --fill copies the {role} from the row above",
                     where=table.place(row.line),
                 )
-        cells = _read_optional_cells(table, row, columns) | {role: names[role] for role in NAMED}
-        for i, heading in columns.readings.items():
+        cells = _read_optional_cells(table, row, columns) | names
+        for i, heading in _of_row(columns, filled_cells).items():
             where = table.place(row.line, i)
             numbered = cells if heading.cycle is None else {**cells, "cycle": str(heading.cycle)}
-            entry = Entry(RawReading(where, row.line, **numbered), i, None)
-            if i not in filled_cells:
-                yield entry
+            entry = Entry(RawReading(where, row.line, **numbered), i, None, role=heading.role)
+            if _is_missing(row.cell(i)):
+                if heading.role not in NOMINAL:
+                    yield entry
                 continue
             number, value, unit = _read_number(row.cell(i), where)
             stated = heading.unit or units_below.get(i)
@@ -223,6 +319,15 @@ def _read_entries(
                     f"the reading is in {unit}, and its heading says {stated}", where=where
                 )
             yield replace(entry, number=number, value=value, unit=unit or stated)
+
+
+def _of_row(columns: Columns, filled: Sequence[int]) -> dict[int, Heading]:
+    """Columns of lengths that belong to a row: those of its point, or of its readings."""
+    point = any(columns.readings[i].role in POINT for i in filled)
+    if not filled:
+        point = not any(h.role == "reading" for h in columns.readings.values())
+    others: tuple[Role, ...] = ("reading",) if point else POINT
+    return {i: h for i, h in columns.readings.items() if h.role not in others}
 
 
 def _read_optional_cells(table: Table, row: Row, columns: Columns) -> dict[str, str]:

@@ -12,7 +12,7 @@ from orthocal.assessment.wording import counted
 from orthocal.io.tables.cell import column_letters
 from orthocal.io.tables.table import Table
 from orthocal.measurement.files.readings_file import RawReading, is_house
-from orthocal.measurement.importing.import_readings import TableImport
+from orthocal.measurement.importing.import_readings import VALUES, TableImport
 from orthocal.measurement.importing.printer_log import PrinterImport
 from orthocal.text import runs
 from orthocal.units import DEG, MM
@@ -101,11 +101,11 @@ def _describe_decimal_sign(result: TableImport) -> str:
 def _columns_by_role(result: TableImport) -> list[tuple[str, str]]:
     columns, table = result.columns, result.table
     roles = [(role, _describe_column(table, index)) for role, index in columns.single.items()]
-    readings = [
-        _describe_column(table, i) + (f" as cycle {h.cycle}" if h.cycle is not None else "")
-        for i, h in columns.readings.items()
-    ]
-    return [*roles, ("reading", ", ".join(readings))]
+    readings: dict[str, list[str]] = {}
+    for i, h in columns.readings.items():
+        cycle = f" as cycle {h.cycle}" if h.cycle is not None else ""
+        readings.setdefault(h.role, []).append(_describe_column(table, i) + cycle)
+    return [*roles, *((role, ", ".join(of_role)) for role, of_role in readings.items())]
 
 
 def _describe_column(table: Table, index: int) -> str:
@@ -152,7 +152,7 @@ def format_import_json(result: TableImport, *, written: bool) -> str:
                 "posture": row.posture,
                 "minus": row.minus or None,
                 "cycle": int(row.cycle or 1),
-                "reading_mm": float(row.reading_mm),
+                **{name: float(text) for name in VALUES if (text := getattr(row, name))},
                 **_conditions(row),
             }
             for row in long_table.rows
