@@ -53,9 +53,8 @@ def import_(
         unit (mm|um|inch|cm|thou): Unit of readings without a unit.
         encoding: Encoding of the file: utf-8, utf-16, cp1252, cp850, mac-roman ...
         column (ROLE=HEADING): Role of a column: setup, posture, minus, cycle, approach,
-            temperature, time, reading, or 'reading 2' for cycles side by side; x, y and z of
-            points, 'nominal x' ... of their commanded points; HEADING is its heading, or its
-            number such as #4.
+            temperature, time, reading, 'reading 2' of cycles side by side, x, y, z of points,
+            'nominal x' ... of commanded points; HEADING is its heading, or its number such as #4.
         fill: Copy an empty setup or posture from the row above.
         replace: Overwrite existing readings that differ.
         dry_run: Show the result without writing it.
@@ -64,7 +63,8 @@ def import_(
         radius_mm (MM): Marlin's log: largest distance from the middle that G33 or G29 probed.
     """
     if format or settings or radius_mm is not None or _is_printer_log(table, session):
-        _import_printer(table, session, format, settings or [], radius_mm, dry_run=dry_run)
+        settings = settings or []
+        _import_printer(table, session, format, settings, radius_mm, dry_run=dry_run, json=json)
         return
     options = orthocal.TableOptions(
         sheet=sheet,
@@ -115,21 +115,30 @@ def _import_printer(
     radius_mm: float | None,
     *,
     dry_run: bool,
+    json: bool,
 ) -> None:
     """Write the session of a printer's log."""
     from orthocal.measurement.importing.printer_log import import_printer_log, write_printer_import
-    from orthocal.output.text.import_report import describe_printer_import, printer_commands
+    from orthocal.output.text.import_report import (
+        describe_printer_import,
+        format_printer_json,
+        printer_commands,
+    )
 
     radius = None if radius_mm is None else radius_mm * MM
     result = import_printer_log(log, firmware=firmware, settings=settings, radius=radius)
-    if not dry_run:
-        write_printer_import(result, directory)
-    put_out(printable(describe_printer_import(result), keep="\n"))
+    written = None if dry_run else write_printer_import(result, directory)
+    deliver(
+        lambda: format_printer_json(result, log, written),
+        lambda: put_out(printable(describe_printer_import(result), keep="\n")),
+        json=json,
+    )
     if dry_run:
         put_note("Nothing written (--dry-run)")
         return
     put_note(f"Wrote {directory}")
-    put_out(printable(printer_commands(result, directory), keep="\n"))
+    if not json:
+        put_out(printable(printer_commands(result, directory), keep="\n"))
 
 
 def _parse_columns(assignments: list[str]) -> dict[str, str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from commands import run_orthocal
@@ -213,6 +215,20 @@ def test_the_command_writes_a_session_and_its_robot(tmp_path):
     again = run_orthocal(tmp_path, "import", log, tmp_path / "bed", "--format", "klipper")
     assert again.returncode == 2
     assert "exists" in again.stderr
+
+
+@pytest.mark.parametrize("words", [[], ["--dry-run"]], ids=["written", "tried"])
+def test_the_command_prints_json(tmp_path, words):
+    log = tmp_path / "printer.cfg"
+    log.write_text(write_log("klipper", odd(), rings(), np.zeros(41), -1.0))
+    done = run_orthocal(tmp_path, "import", log, tmp_path / "bed", "--json", *words)
+    document, direct = json.loads(done.stdout), import_printer_log(log)
+    carriages = [p["carriages_mm"] for p in document["points"]]
+    assert carriages == pytest.approx(direct.log.carriages / MM)
+    assert document["settings"]["rods_mm"] == pytest.approx([280.0, 280.4, 279.7])
+    written = None if words else str(tmp_path / "bed/session.yaml")
+    assert document["written"] == written
+    assert (tmp_path / "bed").exists() == (not words)
 
 
 def test_nothing_is_written_for_a_wrong_log(tmp_path):

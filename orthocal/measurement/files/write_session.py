@@ -145,11 +145,11 @@ def _controller_document(session: Session) -> dict[str, Any]:
             for i, joint in enumerate(session.compensation)
         ]
     if session.firmware is not None:
-        document["firmware"] = _firmware_document(session.firmware)
+        document["firmware"] = firmware_document(session.firmware)
     return document
 
 
-def _firmware_document(settings: DeltaSettings) -> dict[str, Any]:
+def firmware_document(settings: DeltaSettings) -> dict[str, Any]:
     """Settings of the firmware of a delta printer."""
     return {
         "name": settings.firmware,

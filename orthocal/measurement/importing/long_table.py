@@ -139,7 +139,8 @@ def make_long_table(
     first_setup = next(iter(names["setup"]))
     entries = list(_read_entries(table, columns, skipped, fill, first_setup))
     sign = _decide_decimal_sign(table, entries, decimal)
-    rows = _Rows(*(_folded_names(names[role]) for role in NAMED), skipped=skipped)
+    setups, postures = (_folded_names(names[role]) for role in NAMED)
+    rows = _Rows(setups, postures, skipped)
     for entry in entries:
         if entry.number is None:
             rows.skip(entry)
@@ -275,15 +276,7 @@ def _read_entries(
     named = [role for role in NAMED if role in columns.single]
     measured = [i for i, h in columns.readings.items() if h.role not in NOMINAL]
     above = dict.fromkeys(NAMED, "")
-    units_below: dict[int, UnitName] = {}
-    rows = table.fill_merged(columns.keys)
-    for first in rows:
-        units_below = _read_units_row(first, columns)
-        if units_below:
-            skipped.append((first.line, "units"))
-        else:
-            rows = chain([first], rows)
-        break
+    rows, units_below = _without_units_row(table, columns, skipped)
     for row in rows:
         names = {role: _name(row.cell(columns.single.get(role))) for role in NAMED}
         if "setup" not in named:
@@ -319,6 +312,20 @@ def _read_entries(
                     f"the reading is in {unit}, and its heading says {stated}", where=where
                 )
             yield replace(entry, number=number, value=value, unit=unit or stated)
+
+
+def _without_units_row(
+    table: Table, columns: Columns, skipped: SkippedRows
+) -> tuple[Iterable[Row], dict[int, UnitName]]:
+    """Rows below the headings and a row of units, and these units by column."""
+    rows = table.fill_merged(columns.keys)
+    for first in rows:
+        units = _read_units_row(first, columns)
+        if not units:
+            return chain([first], rows), {}
+        skipped.append((first.line, "units"))
+        return rows, units
+    return rows, {}
 
 
 def _of_row(columns: Columns, filled: Sequence[int]) -> dict[int, Heading]:

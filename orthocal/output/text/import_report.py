@@ -12,10 +12,11 @@ from orthocal.assessment.wording import counted
 from orthocal.io.tables.cell import column_letters
 from orthocal.io.tables.table import Table
 from orthocal.measurement.files.readings_file import RawReading, is_house
+from orthocal.measurement.files.write_session import firmware_document
 from orthocal.measurement.importing.import_readings import VALUES, TableImport
 from orthocal.measurement.importing.printer_log import PrinterImport
 from orthocal.text import runs
-from orthocal.units import DEG, MM
+from orthocal.units import DEG, MM, to_mm
 
 UNIT_SYMBOLS = {"um": "µm"}
 """Symbols of units that have another symbol than their name."""
@@ -194,6 +195,28 @@ def describe_printer_import(result: PrinterImport) -> str:
             *log.notes,
         ]
     )
+
+
+def format_printer_json(result: PrinterImport, path: Path, written: Path | None) -> str:
+    """Import of a printer's log as a JSON document.
+
+    Args:
+        result: The import.
+        path: The log.
+        written: The session.yaml; None if nothing was written.
+    """
+    log = result.log
+    document: dict[str, Any] = {
+        "log": str(path),
+        "settings": firmware_document(log.settings),
+        "points": [
+            {"carriages_mm": [to_mm(v) for v in carriages], "height_mm": to_mm(height)}
+            for carriages, height in zip(log.carriages.tolist(), log.heights.tolist(), strict=True)
+        ],
+        "notes": list(log.notes),
+        "written": None if written is None else str(written),
+    }
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
 def printer_commands(result: PrinterImport, directory: Path) -> str:
