@@ -25,12 +25,12 @@ from orthocal.units import MM, UM
 Field = Literal["now", "entered", "uncertainty"]
 
 TITLES: dict[Field, str] = {
-    "now": "Tool error now, workpiece aligned on the machine",
-    "entered": "Tool error with the offsets entered, workpiece aligned on the machine",
+    "now": "Tool error now, workpiece aligned",
+    "entered": "Tool error with the offsets entered, workpiece aligned",
     "uncertainty": "Uncertainty of the tool error, RMS, workpiece aligned",
 }
 
-AVERAGED = ", mean over the conditions of use"
+AVERAGED = ", mean over conditions"
 
 FINEST = 1e-3
 """Errors and differences of errors below this are zero, [µm]."""
