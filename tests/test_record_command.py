@@ -18,7 +18,7 @@ import pytest
 from commands import orthocal
 from made_mistakes import sound_session
 
-from orthocal import check_session, load_session, write_session
+from orthocal import check_session, load_session, simulate_session, write_session
 from orthocal.assessment.wording import review
 from orthocal.calibration.assessment_record import Place
 from orthocal.cli import recording
@@ -566,3 +566,44 @@ def test_the_clock_is_noted_where_it_runs(folder, run):
     # a reading of the first setup without a time: no more times there
     _, out, _ = run(folder, "clock", "again 2", "0.06")
     assert rows_of(folder)[-1]["time"] == ""
+
+
+TRACKER = """robot: orthoglide
+controller: {offsets_mm: [0, 0, 0]}
+gauge: {sigma_mm: 0.01}
+postures:
+"""
+
+
+def test_points_are_typed_predicted_and_doubted(tmp_path, run):
+    """Three numbers in a line, in any usual form; a slip of 1 mm is shown at once."""
+    corners = [(x, y, z) for x in (-50, 40) for y in (-50, 40) for z in (-40, 50)]
+    postures = "".join(f"  p{i}: {{tcp_mm: {list(p)}}}\n" for i, p in enumerate(corners))
+    text = f"{TRACKER}{postures}setups:\n  track: {{sensor: points, target_mm: [0, 0, -40]}}\n"
+    (tmp_path / "session.yaml").write_text(text)
+    shown = simulate_session(load_plan(tmp_path), {"x_slide.offset": 1e-3}, seed=2).session
+    points = shown.values.reshape(8, 3) / MM
+    forms = ["{:.3f} {:.3f} {:.3f}", "{:.3f}, {:.3f}, {:.3f}", "{:.3f};{:.3f};{:.3f}"]
+    typed = [forms[i % 3].format(*p) for i, p in enumerate(points[:-1])]
+    points[3] = points[3].round(2)
+    typed[3] = "{:.2f} {:.2f} {:.2f}".format(*points[3]).replace(".", ",")
+    slip = points[-1] + [0.0, 1.0, 0.0]
+    code, out, err = run(tmp_path, "", "1 2", *typed, forms[0].format(*slip), "back 9", "", "")
+    assert (code, err) == (0, "")
+    assert "Setup track, 1 of 1: 8 readings" in out
+    assert "Not recorded: type x, y and z of the point" in out
+    assert "Not recorded: '1 2' is no point" in out
+    differs = re.search(r"! Line 9 y differs by ([0-9.]+) mm. Check the point.", out)
+    assert float(differs[1]) == pytest.approx(1.0, abs=0.1)
+    recorded = [[float(row[f"{k}_mm"]) for k in "xyz"] for row in rows_of(tmp_path)]
+    assert np.array(recorded) == pytest.approx(np.vstack([points[:-1], slip]), abs=5e-4)
+
+
+def test_an_interrupted_recording_of_points_goes_on(tmp_path, run):
+    """One point does not determine the instrument's frame: the session opens all the same."""
+    postures = "".join(f"  p{i}: {{tcp_mm: [{i}, 0, {i}]}}\n" for i in range(3))
+    text = f"{TRACKER}{postures}setups:\n  track: {{sensor: points}}\n"
+    (tmp_path / "session.yaml").write_text(text)
+    assert "2 of 3 readings are missing: track lines 3, 4." in run(tmp_path, "1 2 3")[1]
+    code, out, _ = run(tmp_path, "4 5 6")
+    assert (code, "1 are recorded" in out, "track line 4" in out) == (0, True, True)

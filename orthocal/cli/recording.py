@@ -9,13 +9,14 @@ from contextlib import suppress
 
 import numpy as np
 
+from orthocal.arrays import Array
 from orthocal.assessment.judgement import find_warnings, is_doubtful, is_far, judge_session
 from orthocal.calibration.assessment_record import Finding
 from orthocal.cli.printing import put_out
 from orthocal.cli.recorded_conditions import RecordedConditions
 from orthocal.errors import OrthocalError, SessionError
 from orthocal.hypotheses.linear_model import linear_model
-from orthocal.io.tables.numerals import parse_typed_reading
+from orthocal.io.tables.numerals import parse_typed_point, parse_typed_reading
 from orthocal.measurement.recording import Recording
 from orthocal.output.text.recording import COMMANDS, RecordingText, find_rows
 from orthocal.runtime.interrupts import raised_interrupt
@@ -113,7 +114,8 @@ class Dialogue:
         prompt = "> "
         if self._asked is not None:
             row = self._recording.rows[self._asked]
-            prompt = printable(f"{row.setup} {row.posture} [mm]> ")
+            point = " x y z" * (len(self._recording.point(self._asked)) > 1)
+            prompt = printable(f"{self._text.name(row)} {row.posture}{point} [mm]> ")
             if len(prompt) > self._text.width // 2:
                 prompt = f"line {row.line} [mm]> "
             prompt = {None: prompt, "temperature": "temperature [°C]> "}.get(
@@ -151,7 +153,8 @@ class Dialogue:
                 self._command(word.lower(), arguments)
             else:
                 index = self._require_row()
-                self._record(index, parse_typed_reading(line))
+                point = len(self._recording.point(index)) > 1
+                self._record(index, (parse_typed_point if point else parse_typed_reading)(line))
         except SessionError as e:
             self._note(f"Not recorded: {e}.")
 
@@ -188,16 +191,18 @@ class Dialogue:
         if self._asked is None:
             raise _EndOfDialogue
         if not self._recording.rows[self._asked].is_read:
-            raise SessionError("type the reading of the dial, or `skip`, or `help`")
+            point = len(self._recording.point(self._asked)) > 1
+            what = "x, y and z of the point" if point else "the reading of the dial"
+            raise SessionError(f"type {what}, or `skip`, or `help`")
         self._ask_for_next()
 
-    def _record(self, index: int, value: float) -> None:
+    def _record(self, index: int, value: float | Array) -> None:
         """Record a reading, compare it with its prediction, and judge the readings if necessary."""
         recording = self._recording
         corrected = recording.rows[index].is_read
         recording.read(index, value, self._conditions.of(recording.rows[index]))
         row = recording.rows[index]
-        self._skipped.discard(row.key)
+        self._skipped -= {recording.rows[i].key for i in recording.point(index)}
         self._last = index
         self._say(self._text.confirmation(index))
         following = self._next
@@ -209,13 +214,19 @@ class Dialogue:
     def _is_doubtful(self, index: int) -> bool:
         """Print the prediction of a reading; whether the reading contradicts it.
 
-        Readings with a warning do not take part in the prediction.
+        Each coordinate of a point is predicted by the others as well. Readings with a warning do
+        not take part in the prediction.
         """
-        if not self._can_judge:
+        return any([self._contradicts(i) for i in self._recording.point(index)])
+
+    def _contradicts(self, index: int) -> bool:
+        """Print the prediction of a row; whether its value contradicts it."""
+        if not self._can_judge or not self._recording.is_located:
             return False
         rows = self._recording.rows
         doubts = (*self._warnings, *self._open)
-        doubted = {i for f in doubts for i in find_rows(f, rows)} - {index}
+        together = set(self._recording.point(index))
+        doubted = {i for f in doubts for i in find_rows(f, rows)} - together
         session = self._recording.measured(without=doubted)
         position = sum(r.is_read and i not in doubted for i, r in enumerate(rows[:index]))
         try:
@@ -239,7 +250,8 @@ class Dialogue:
             last: Index of the row that was just read.
         """
         recording = self._recording
-        if not self._can_judge or len(recording.missing) == len(recording.rows):
+        nothing = len(recording.missing) == len(recording.rows)
+        if not self._can_judge or nothing or not recording.is_located:
             self._warnings = self._open = ()
             return
         try:
@@ -337,6 +349,7 @@ class Dialogue:
             index = (len(rows) if self._asked is None else self._asked) - 1
         if index < 0:
             raise SessionError("this is the first line")
+        index = self._recording.point(index)[0]
         if rows[index].is_read:
             self._note_moved(index, "correct only what was mistyped")
         self._ask_for(index)
@@ -354,7 +367,9 @@ class Dialogue:
         rows = self._recording.rows
         if index is None:
             before = [i for i, r in enumerate(rows[: self._asked]) if r.is_read]
-            index = self._last if self._last is not None or not before else before[-1]
+            index = self._last
+            if index is None and before:
+                index = self._recording.point(before[-1])[0]
         if index is None:
             raise SessionError("nothing was read yet")
         if not rows[index].is_read:
@@ -368,16 +383,17 @@ class Dialogue:
     def _skip(self) -> None:
         index = self._require_row()
         if not self._recording.rows[index].is_read:
-            self._skipped.add(self._recording.rows[index].key)
+            rows = self._recording.rows
+            self._skipped |= {rows[i].key for i in self._recording.point(index)}
             self._say(f"  Skipped: line {self._recording.rows[index].line}")
         self._ask_for_next()
 
     def _drop(self, index: int | None) -> None:
         index = self._require_row() if index is None else index
-        row = self._recording.rows[index]
+        row, count = self._recording.rows[index], len(self._recording.point(index))
         self._recording.drop(index)
         if self._last is not None and self._last >= index:
-            self._last = None if self._last == index else self._last - 1
+            self._last = None if self._last == index else self._last - count
         self._note(
             f"Deleted: line {row.line}, {self._text.label(row)}. Other lines keep their numbers."
         )
@@ -389,13 +405,14 @@ class Dialogue:
         if index is None:
             raise SessionError("nothing was read yet")
         recording = self._recording
-        setup = recording.rows[index].setup
+        setup = self._text.name(recording.rows[index])
         recording.empty(index)
-        self._skipped -= {r.key for r in recording.rows if r.setup == setup}
+        of_setup = [i for i, r in enumerate(recording.rows) if self._text.name(r) == setup]
+        self._skipped -= {recording.rows[i].key for i in of_setup}
         self._shown, self._last = None, None
         self._note(f"Deleted: all readings of {setup}")
         self._judge()
-        self._ask_for(next(i for i, r in enumerate(recording.rows) if r.setup == setup))
+        self._ask_for(of_setup[0])
 
     def _note(self, text: str) -> None:
         """Print an indented paragraph."""

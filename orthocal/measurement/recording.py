@@ -20,18 +20,27 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from orthocal.arrays import Array
 from orthocal.errors import OrthocalError, OutputError, SessionError
 from orthocal.io.documents import Number, read_yaml, validate
 from orthocal.io.files import exists, read_file, sync_folder, write_file
 from orthocal.io.journal import Journal, open_journal_file
-from orthocal.measurement.files.point_rows import require_no_points
+from orthocal.measurement.files.point_rows import (
+    base_name,
+    find_point,
+    gather_points,
+    locate_stations,
+)
 from orthocal.measurement.files.readings_checks import check_conditions, check_range
 from orthocal.measurement.files.schema import LARGEST_READING_MM, MOST_READINGS
 from orthocal.measurement.files.session_file import load_rows
 from orthocal.measurement.files.write_session import readings_table
 from orthocal.runtime.interrupts import postponed_interrupt
+from orthocal.sensors.points import Coordinate
+from orthocal.sensors.protocol import largest_reading
 from orthocal.session.session import Conditions, Reading, ReadingKey, Session
 from orthocal.units import MM, to_mm
 
@@ -62,12 +71,14 @@ class Change(BaseModel):
 
     done: Literal["read", "emptied", "added", "dropped"]
     """A value was read for a row; all rows of its setup were emptied; a row that repeats it was
-    added at the end; it was deleted."""
-    rows: Annotated[list[ReadingKey], Field(min_length=1, max_length=2)]
-    """The row, and the added one."""
+    added at the end; it was deleted. The three rows of a point change together."""
+    rows: Annotated[list[ReadingKey], Field(min_length=1, max_length=6)]
+    """The row or the three of a point, then as many added ones."""
     reading_mm: Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)] | None = (
         None
     )
+    point_mm: Annotated[list[Coordinate], Field(min_length=3, max_length=3)] | None = None
+    """Readings of the three rows of a point."""
     conditions: Conditions | None = None
     """Stated with the value; those that are None stay what they were."""
 
@@ -86,30 +97,35 @@ def change_rows(rows: Sequence[Reading], change: Change) -> tuple[Reading, ...]:
     """
     indices = {row.key: i for i, row in enumerate(rows)}
     changed = list(rows)
-    key, *added = change.rows
-    if key not in indices:
-        raise SessionError(f"there is no row {' '.join(str(k) for k in key if k)}")
-    index = indices[key]
+    half = len(change.rows) // 2 if change.done == "added" else len(change.rows)
+    keys, added = change.rows[:half], change.rows[half:]
+    for key in keys:
+        if key not in indices:
+            raise SessionError(f"there is no row {' '.join(str(k) for k in key if k)}")
+    places = [indices[key] for key in keys]
     if change.done == "read":
-        if change.reading_mm is None:
+        values = change.point_mm or [v for v in (change.reading_mm,) if v is not None]
+        if len(values) != len(places):
             raise SessionError("the reading is missing")
-        row = changed[index]
-        conditions = _merge_conditions(row.conditions, change.conditions)
-        row = replace(row, value=change.reading_mm * MM, conditions=conditions)
-        if row.key != key and row.key in indices:
-            raise SessionError(f"{row.label_with_cycle} exists already")
-        changed[index] = row
+        for index, value in zip(places, values, strict=True):
+            row = rows[index]
+            conditions = _merge_conditions(row.conditions, change.conditions)
+            changed[index] = replace(row, value=value * MM, conditions=conditions)
+            if changed[index].key != row.key and changed[index].key in indices:
+                raise SessionError(f"{changed[index].label_with_cycle} exists already")
     elif change.done == "emptied":
-        changed = [_emptied(r) if r.setup == key[0] else r for r in changed]
+        setup = base_name(keys[0][0])
+        changed = [_emptied(r) if base_name(r.setup) == setup else r for r in changed]
     elif change.done == "dropped":
-        del changed[index]
+        changed = [row for i, row in enumerate(changed) if i not in places]
     else:
-        if len(added) != 1 or added[0] in indices:
+        if len(added) != len(keys) or any(key in indices for key in added):
             raise SessionError("the added row exists already, or is not named")
-        setup, posture, minus, cycle, *approach = added[0]
-        conditions = Conditions(approach[0]) if approach else None
-        new = Reading(setup, posture, minus, cycle, math.nan, conditions=conditions)
-        changed.append(replace(new, line=1 + max(r.line or 0 for r in rows)))
+        line = 1 + max(r.line or 0 for r in rows)
+        for setup, posture, minus, cycle, *approach in added:
+            conditions = Conditions(approach[0]) if approach else None
+            new = Reading(setup, posture, minus, cycle, math.nan, conditions=conditions)
+            changed.append(replace(new, line=line))
     return tuple(changed)
 
 
@@ -169,6 +185,16 @@ class Recording:
         """Indices of the rows without a reading."""
         return tuple(i for i, row in enumerate(self.rows) if not row.is_read)
 
+    @property
+    def count(self) -> int:
+        """Number of lines, each with a reading or a point."""
+        return len({row.line for row in self.rows})
+
+    @property
+    def missing_count(self) -> int:
+        """Number of lines without a reading."""
+        return len({self.rows[i].line for i in self.missing})
+
     def measured(self, *, without: Collection[int] = ()) -> Session:
         """The session with the rows that were read; gauges stay aligned as planned.
 
@@ -177,7 +203,22 @@ class Recording:
         """
         session = replace(self.session, readings=self.rows, sha256="")
         read = [row for i, row in enumerate(self.rows) if row.is_read and i not in without]
-        return session if len(read) == len(self.rows) else session.select(read)
+        measured = session if len(read) == len(self.rows) else session.select(read)
+        return locate_stations(measured, partial=True)
+
+    @property
+    def is_located(self) -> bool:
+        """True if the points so far determine their stations."""
+        read = [row for row in self.rows if row.is_read]
+        try:
+            locate_stations(replace(self.session, readings=tuple(read)))
+        except SessionError:
+            return False
+        return True
+
+    def point(self, index: int) -> list[int]:
+        """Indices of the rows that are read together with a row: the three of a point, or one."""
+        return find_point(self.rows, index)
 
     def next_empty(self, skipped: frozenset[ReadingKey] = frozenset()) -> int | None:
         """Index of the next row without a reading, except those that are skipped.
@@ -188,12 +229,12 @@ class Recording:
         empty = [i for i in self.missing if self.rows[i].key not in skipped]
         return min(empty, key=lambda i: (setups.index(self.rows[i].setup), i), default=None)
 
-    def read(self, index: int, value: float, conditions: Conditions | None = None) -> None:
-        """Record a reading; it is on disk when this returns.
+    def read(self, index: int, value: float | Array, conditions: Conditions | None = None) -> None:
+        """Record a reading or a point; it is on disk when this returns.
 
         Args:
             index: Index of the row.
-            value: Reading, [m].
+            value: Reading, [m]; of a point its coordinates in the station, shape (3,), [m].
             conditions: Conditions of the reading; those that are None stay as planned.
 
         Raises:
@@ -201,15 +242,21 @@ class Recording:
                 conditions.
             OutputError: If it cannot be written.
         """
-        row = self.rows[index]
-        gauge = self.session.gauges[self.session.setups[row.setup].gauge]
-        check_range(to_mm(value), gauge, row.minus is not None, row.label_with_cycle)
-        if conditions is not None:
-            check_conditions(
-                conditions, self.session.robot, row.minus is not None, row.label_with_cycle
-            )
-        reading = round(to_mm(value), DECIMALS)
-        self._apply(Change(done="read", rows=[row.key], reading_mm=reading, conditions=conditions))
+        rows = [self.rows[i] for i in self.point(index)]
+        setups = [self.session.setups[row.setup] for row in rows]
+        readings_mm = []
+        for row, setup in zip(rows, setups, strict=True):
+            along = getattr(setup.sensor, "along", None)
+            reading = to_mm(float(value if along is None else np.dot(along, value)))
+            gauge, difference = self.session.gauges[setup.gauge], row.minus is not None
+            largest = largest_reading(setup.sensor)
+            check_range(reading, gauge, difference, row.label_with_cycle, largest)
+            if conditions is not None:
+                check_conditions(conditions, self.session.robot, difference, row.label_with_cycle)
+            readings_mm.append(round(reading, DECIMALS))
+        keys: list[ReadingKey] = [row.key for row in rows]
+        of_point = {"point_mm": readings_mm} if len(rows) > 1 else {"reading_mm": readings_mm[0]}
+        self._apply(Change(done="read", rows=keys, conditions=conditions, **of_point))
 
     def repeat(self, index: int) -> int:
         """Add another cycle of a row after the last one, and return its index.
@@ -228,8 +275,10 @@ class Recording:
         cycle = 1 + max(r.cycle for r in of_setup if row.minus is not None or r.place == row.place)
         if any(r.cycle == cycle and (r.minus is None) != (row.minus is None) for r in of_setup):
             cycle = 1 + max(r.cycle for r in of_setup)
-        self._apply(Change(done="added", rows=[row.key, replace(_emptied(row), cycle=cycle).key]))
-        return len(self.rows) - 1
+        rows = [self.rows[i] for i in self.point(index)]
+        added = [replace(_emptied(r), cycle=cycle).key for r in rows]
+        self._apply(Change(done="added", rows=[*(r.key for r in rows), *added]))
+        return len(self.rows) - len(added)
 
     def drop(self, index: int) -> None:
         """Delete a row.
@@ -238,9 +287,10 @@ class Recording:
             SessionError: If it is the only one.
             OutputError: If it cannot be written.
         """
-        if len(self.rows) == 1:
+        rows = self.point(index)
+        if len(self.rows) == len(rows):
             raise SessionError("it is the only row; a session has at least one")
-        self._apply(Change(done="dropped", rows=[self.rows[index].key]))
+        self._apply(Change(done="dropped", rows=[self.rows[i].key for i in rows]))
 
     def empty(self, index: int) -> None:
         """Delete all readings of a row's setup, to be read again; the journal keeps them.
@@ -283,7 +333,6 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
         OutputError: If its directory cannot be written to.
     """
     session = load_rows(path)
-    require_no_points(session)
     csv = _csv_of(session)
     _files_to_add(session)  # refused before anything is written
     with open_journal_file(
@@ -381,7 +430,8 @@ def _table(rows: Sequence[Reading], session: Session) -> bytes:
         keepends=True
     )
     lines = [header]
-    for row, text in zip(rows, texts, strict=True):
+    firsts = [part[0] for part in gather_points(rows, session.setups)]
+    for row, text in zip(firsts, texts, strict=True):
         lines += ["\n"] * ((row.line or 0) - FIRST_LINE + 1 - len(lines))
         lines.append(text)
     return "".join(lines).encode()

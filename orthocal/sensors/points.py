@@ -229,7 +229,8 @@ class Points:
         return (
             "Set up the instrument. It must not move until all points of its setups are taken.",
             f"Mount the target at the tool, ({target}) mm from the tool centre point.",
-            "Export the points with posture, x, y and z as a table. `orthocal import` reads it.",
+            "Export the points with posture, x, y and z as a table for `orthocal import`, or type "
+            "them into `orthocal record`.",
         )
 
     def frames(self, robot: Robot) -> Frames:

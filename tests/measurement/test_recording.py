@@ -14,7 +14,7 @@ import time
 import numpy as np
 import pytest
 
-from orthocal import load_session
+from orthocal import load_session, simulate_session
 from orthocal.cli import record, recording
 from orthocal.errors import OrthocalError, OutputError, SessionError
 from orthocal.io.tables.numerals import parse_typed_reading
@@ -429,3 +429,94 @@ def test_numbers_as_people_type_them(text, value):
 def test_what_may_be_meant_otherwise_is_asked_back(text, message):
     with pytest.raises(SessionError, match=re.escape(message)):
         parse_typed_reading(text)
+
+
+POINTS = """robot: orthoglide
+controller: {offsets_mm: [0, 0, 0]}
+gauges: {tracker: {sigma_mm: 0.01}, dial: {sigma_mm: 0.005}}
+postures:
+"""
+AXES = "xyz"
+
+
+@pytest.fixture
+def tracked(tmp_path):
+    """Plan of a tracker and a dial, the points of a machine, (8, 3), [m], and its dial."""
+    corners = [(x, y, z) for x in (-50, 40) for y in (-50, 40) for z in (-40, 50)]
+    postures = "".join(f"  p{i}: {{tcp_mm: {list(p)}}}\n" for i, p in enumerate(corners))
+    names = ", ".join(f"p{i}" for i in range(8))
+    (tmp_path / "session.yaml").write_text(
+        f"{POINTS}{postures}setups:\n"
+        f"  track: {{sensor: points, gauge: tracker, target_mm: [0, 0, -40],\n"
+        f"    postures: [{names}]}}\n"
+        "  yx: {leg: x, direction: y, section: {fraction: 0.5}, gauge: dial,\n"
+        "    postures: [p1, p2]}\n"
+    )
+    shown = simulate_session(load_plan(tmp_path), {"x_slide.offset": 1e-3}, seed=2).session
+    return tmp_path, shown.values[:24].reshape(8, 3), shown.values[24:]
+
+
+def test_points_are_recorded_three_coordinates_at_once(tracked):
+    folder, points, dial = tracked
+    with open_recording(folder) as recording:
+        assert (recording.count, recording.missing_count) == (10, 10)
+        for point in points:
+            recording.read(recording.next_empty(), point)
+        for value in dial:
+            recording.read(recording.next_empty(), value)
+        assert recording.missing == ()
+        again = recording.repeat(3)
+        assert recording.point(again) == [26, 27, 28]
+        assert [r.line for r in recording.rows[26:]] == [12, 12, 12]
+        recording.read(again, points[1])
+        with pytest.raises(SessionError, match="100000"):
+            recording.read(again, np.array([0.0, 0.0, 101.0]))
+    session = load_session(folder)
+    assert session.values[:24].reshape(8, 3) == pytest.approx(points, abs=1e-12)
+    assert session.values[24:26] == pytest.approx(dial, abs=1e-12)
+    assert session.values[26:] == pytest.approx(points[1], abs=1e-12)
+
+
+def test_a_point_is_deleted_and_emptied_with_all_its_coordinates(tracked):
+    folder, points, dial = tracked
+    with open_recording(folder) as recording:
+        for point in points[:3]:
+            recording.read(recording.next_empty(), point)
+        recording.read(24, dial[0])
+        recording.drop(3)
+        assert (len(recording.rows), recording.count, recording.missing_count) == (23, 9, 6)
+        recording.empty(0)
+        assert [r.setup for r in recording.rows if r.is_read] == ["yx"]
+
+
+def test_a_killed_recording_of_points_is_restored(tracked, monkeypatch):
+    """The journal has a point before the CSV does: it comes back with all three coordinates."""
+    folder, points, _ = tracked
+
+    def die(*_):
+        raise KeyError
+
+    with open_recording(folder) as recording:
+        recording.read(recording.next_empty(), points[0])
+        monkeypatch.setattr(module, "_write", die)
+        monkeypatch.setattr(module.Recording, "close", lambda _: None)
+        with pytest.raises(KeyError):
+            recording.read(recording.next_empty(), points[1])
+    monkeypatch.undo()
+    with open_recording(folder) as recording:
+        assert recording.restored == 1
+        values = np.array([r.value for r in recording.rows[:6]]).reshape(2, 3)
+        assert values == pytest.approx(points[:2], abs=1e-12)
+
+
+def test_points_of_correlated_coordinates_are_recorded_as_typed(tracked):
+    """The rows are principal axes then; files and operator have x, y and z."""
+    folder, points, _ = tracked
+    file = folder / "session.yaml"
+    covariance = "covariance_um2: [[90, 40, 0], [40, 60, 5], [0, 5, 400]], "
+    file.write_text(file.read_text().replace("target_mm", covariance + "target_mm"))
+    with open_recording(folder) as recording:
+        assert [r.setup for r in recording.rows[:3]] == [f"track[{k}]" for k in (1, 2, 3)]
+        recording.read(0, points[0])
+    line = (folder / "readings.csv").read_text().splitlines()[1].split(",")
+    assert [float(v) for v in line if "." in v] == pytest.approx(points[0] / MM, abs=1e-8)

@@ -233,9 +233,10 @@ def _file_of(session: Session, label: str) -> str | None:
 def _lines(session: Session, e: Explanation) -> str:
     """Lines of readings.csv that an explanation concerns, with a colon; "" if unknown."""
     rows = [session.readings[i] for i in e.rows]
-    lines = sorted(r.line for r in rows if r.line is not None)
+    lines = [r.line for r in rows if r.line is not None]
     if not lines or len(lines) == len(session.readings):
         return ""
+    lines = sorted(set(lines))  # the coordinates of a point share theirs
     return f"{spans(lines, 'line')}: "
 
 

@@ -12,6 +12,9 @@ from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from typing import Literal
 
+import numpy as np
+
+from orthocal.arrays import Array
 from orthocal.errors import SessionError
 from orthocal.io.strict_yaml import LONGEST_NUMBER
 from orthocal.text import shorten
@@ -180,3 +183,25 @@ def parse_typed_reading(text: str) -> float:
         )
     value = float(digits.replace(",", ".")) * MM
     return (-value if sign == "-" else value) + 0.0
+
+
+def parse_typed_point(text: str) -> Array:
+    """Coordinates of a point that were typed, shape (3,), [m].
+
+    Args:
+        text: Three numbers in mm with blanks, semicolons or tabs between them, or with commas where
+            the numbers have decimal points.
+
+    Raises:
+        SessionError: If they are not three numbers.
+    """
+    for separator in (";", None, ","):
+        parts = [part.strip() for part in text.strip().rstrip(";,").split(separator)]
+        if len(parts) == 3:
+            break
+    else:
+        raise SessionError(
+            f"'{shorten(text.strip())}' is no point; expected x, y and z in mm with blanks between "
+            "them, such as 1.25 -3.5 40"
+        )
+    return np.array([parse_typed_reading(part.rstrip(",")) for part in parts])

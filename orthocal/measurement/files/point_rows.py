@@ -70,21 +70,6 @@ def split_points(session: Session) -> Session:
     return replace(session, setups=setups, gauges={n: gauges[n] for n in [*used, *gauges]})
 
 
-def require_no_points(session: Session) -> None:
-    """Refuse a session with points where readings are typed or imported one by one.
-
-    Raises:
-        SessionError: Naming the setup.
-    """
-    name = next((n for n, s in session.setups.items() if isinstance(s.sensor, Points)), None)
-    if name is not None:
-        raise SessionError(
-            "has points; save them with the columns setup, posture, x_mm, y_mm, z_mm as "
-            "readings.csv",
-            where=f"{session.path or 'session'}: setups.{base_name(name)}",
-        )
-
-
 @dataclass
 class PointRows:
     """Readings of rows with three coordinates."""
@@ -191,6 +176,23 @@ def gather_points(readings: Sequence[Reading], setups: Mapping[str, Setup]) -> l
     return [[r for _, r in part] for _, part in groupby(enumerate(readings), line)]
 
 
+def find_point(rows: Sequence[Reading], index: int) -> list[int]:
+    """Indices of the rows of one line: the three of a point, or one; in their order."""
+    row = rows[index]
+    place = base_name(row.setup), row.place[1:], row.cycle, row.line
+
+    def is_same(i: int) -> bool:
+        other = rows[i]
+        return (base_name(other.setup), other.place[1:], other.cycle, other.line) == place
+
+    first, last = index, index
+    while "[" in row.setup and first > 0 and is_same(first - 1):
+        first -= 1
+    while "[" in row.setup and last + 1 < len(rows) and is_same(last + 1):
+        last += 1
+    return list(range(first, last + 1))
+
+
 def point_of(part: Sequence[Reading], setups: Mapping[str, Setup]) -> Array:
     """Coordinates of a point in its station, from its three readings, shape (3,), [m]."""
     axes = np.array([cast(Points, setups[r.setup].sensor).along for r in part])
@@ -219,8 +221,12 @@ def is_of_row(name: str) -> bool:
     return len(name.partition("[")[2]) > len("x]")
 
 
-def locate_stations(session: Session) -> Session:
+def locate_stations(session: Session, *, partial: bool = False) -> Session:
     """Session whose stations of unknown frame begin at the best fit to the nominal machine.
+
+    Args:
+        session: The session; empty rows do not take part.
+        partial: Whether points may be missing: a station that they do not determine stays.
 
     Raises:
         SessionError: If the points of a station do not determine it.
@@ -249,6 +255,8 @@ def locate_stations(session: Session) -> Session:
         try:
             position, rotation = fit_station(np.array(points), np.array(targets))
         except SessionError as e:
+            if partial:
+                continue
             raise SessionError(
                 e.problem, where=f"{session.path or 'session'}: setups.{base}.{e.where}"
             ) from None

@@ -148,7 +148,7 @@ def load_rows(path: str | Path) -> Session:
     """
     file, content, keys = _read_keys(Path(path))
     if keys.readings is not None:
-        return locate_stations(_load_session(file, content, keys))
+        return locate_stations(_load_session(file, content, keys), partial=True)
     read = _read_setups(file, keys)
     count = keys.cycles * sum(len(s.postures or keys.postures) for s, _ in read.values())
     if count > MOST_READINGS:

@@ -7,10 +7,12 @@ import shlex
 import shutil
 import textwrap
 from collections.abc import Sequence
+from dataclasses import replace
 
 from orthocal.assessment.judgement import is_far
 from orthocal.assessment.wording import counted, joined, mm, name_direction
 from orthocal.calibration.assessment_record import Finding
+from orthocal.measurement.files.point_rows import base_name, point_of
 from orthocal.measurement.motion.approach import (
     approach_length,
     common_approach,
@@ -21,6 +23,7 @@ from orthocal.measurement.motion.motion import guide, set_dial
 from orthocal.measurement.recording import Recording
 from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
+from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import mounting_steps
 from orthocal.session.session import Conditions, Reading, Session, Setup
 from orthocal.text import printable, spans
@@ -125,13 +128,11 @@ class RecordingText:
         """Number of readings, state of the recording, and how to type readings."""
         recording, session, rows = self._recording, self._session, self._recording.rows
         restored = recording.restored
-        done = len(rows) - len(recording.missing)
+        every, done = recording.count, recording.count - recording.missing_count
         title = f"{session.title}: " if session.title else ""
-        count = counted(len({r.setup for r in rows}), "setup")
+        count = counted(len({base_name(r.setup) for r in rows}), "setup")
         state = "none is recorded yet" if not done else f"{done} are recorded"
-        parts = [
-            f"{title}{counted(len(rows), 'reading')} in {count} on {session.robot.name}; {state}."
-        ]
+        parts = [f"{title}{counted(every, 'reading')} in {count} on {session.robot.name}; {state}."]
         if restored:
             parts.append(
                 f"The last recording was interrupted; {counted(restored, 'change')} of it "
@@ -143,7 +144,7 @@ class RecordingText:
                 "content counts."
             )
         parts.append(
-            "Type the reading of the dial in mm. It is stored at once. `help` lists the commands. "
+            f"{self._what_to_type()} It is stored at once. `help` lists the commands. "
             "Lines are those of the sheet and of readings.csv."
         )
         length = approach_length(session)
@@ -155,24 +156,34 @@ class RecordingText:
         )
         return "\n".join(self.wrap(part) for part in parts)
 
+    def _what_to_type(self) -> str:
+        """Instruction for typing a reading or a point."""
+        points = [isinstance(s.sensor, Points) for s in self._session.setups.values()]
+        dial = "Type the reading of the dial in mm." if not all(points) else ""
+        point = "Type x, y and z of a point in mm, with blanks between them." if any(points) else ""
+        return f"{dial} {point}".strip()
+
     def setup(self, name: str) -> str:
         """Position of the gauge of a setup, and preparation of its dial."""
         session, rows = self._session, self._recording.rows
         setup = session.setups[name]
-        names = list(dict.fromkeys(r.setup for r in rows))
+        names = list(dict.fromkeys(base_name(r.setup) for r in rows))
         of_setup = [r for r in rows if r.setup == name]
         aligned, first = self._guidance.aligned_at[name], of_setup[0].minus or of_setup[0].posture
         go = "" if aligned == first else f"Then go to {first}. "
         title = (
-            f"Setup {name}, {names.index(name) + 1} of {len(names)}: "
+            f"Setup {self.name(of_setup[0])}, {names.index(base_name(name)) + 1} of {len(names)}: "
             f"{counted(len(of_setup), 'reading')}"
         )
-        parts = [f"Read: {setup.sensor.describe()}", self._stand(name), _gauge(session, setup)]
+        sensor = setup.sensor.in_file if isinstance(setup.sensor, Points) else setup.sensor
+        parts = [f"Read: {sensor.describe()}", self._stand(name), _gauge(session, setup)]
         if any(r.is_read for r in of_setup) and any(r.minus is None for r in of_setup):
             parts.append(
                 "This setup has readings. If the stand or the dial has moved since, `restart` the "
                 "setup."
             )
+        elif isinstance(setup.sensor, Points):
+            parts.append("From then on do not touch the instrument until the setup is complete.")
         else:
             parts.append(
                 f"Go to {aligned} and align the gauge. {go}"
@@ -185,7 +196,7 @@ class RecordingText:
                 "second."
             )
         lines = [self.wrap(title), *(self.wrap(part, indent="  ") for part in parts if part)]
-        if aligned != first:
+        if aligned != first and not isinstance(setup.sensor, Points):
             lines.append(self._coordinates(aligned, f"{aligned}: "))
         return "\n".join(lines)
 
@@ -209,24 +220,37 @@ class RecordingText:
 
     def label(self, row: Reading) -> str:
         """Setup, posture with the arrows of its approach, and the cycle from the second on."""
+        row = replace(row, setup=self.name(row))
         if row.approach is None:
             return row.label_with_cycle
         arrows = describe_approach(self._session.robot, row.approach)
         return f"{row.setup} {row.posture} {arrows}{f', cycle {row.cycle}' * (row.cycle > 1)}"
 
+    def name(self, row: Reading) -> str:
+        """Name of the setup of a row, as in the files."""
+        point = isinstance(self._session.setups[row.setup].sensor, Points)
+        return base_name(row.setup) if point else row.setup
+
+    def value(self, index: int) -> str:
+        """Reading of a row, or the coordinates of its point, in mm."""
+        part = [self._recording.rows[i] for i in self._recording.point(index)]
+        if len(part) == 1:
+            return show_mm(part[0].value)
+        return ", ".join(show_mm(v) for v in point_of(part, self._session.setups).tolist())
+
     def row(self, index: int) -> str:
         """Next reading, and the posture of the machine for it."""
         rows = self._recording.rows
         row = rows[index]
-        missing = len(self._recording.missing)
-        left = f" ({missing} of {len(rows)} missing)" if missing else ""
+        missing = self._recording.missing_count
+        left = f" ({missing} of {self._recording.count} missing)" if missing else ""
         lines = [self.wrap(f"Line {row.line}: {self.label(row)}{left}")]
         for posture in (row.posture, *([row.minus] if row.minus else [])):
             name = f"{posture}: " if row.minus else ""
             lines.append(self._coordinates(posture, name))
         if row.is_read:
             lines.append(
-                self.wrap(f"Recorded: {show_mm(row.value)} mm; Enter keeps it.", indent="  ")
+                self.wrap(f"Recorded: {self.value(index)} mm; Enter keeps it.", indent="  ")
             )
         return "\n".join(lines)
 
@@ -245,7 +269,7 @@ class RecordingText:
     def confirmation(self, index: int) -> str:
         """Confirmation that a reading is on disk."""
         row = self._recording.rows[index]
-        text = f"Recorded: line {row.line}, {self.label(row)}: {show_mm(row.value)} mm"
+        text = f"Recorded: line {row.line}, {self.label(row)}: {self.value(index)} mm"
         return self.wrap(text, indent="  ")
 
     def prediction(self, index: int, mean: float, std: float) -> str:
@@ -259,11 +283,15 @@ class RecordingText:
         if math.isinf(std):
             return ""
         row = self._recording.rows[index]
-        text = f"The other readings predict {format_fixed(mean / MM, 3)} ± {mm(2.0 * std)} mm."
+        of = ""
+        if self.name(row) != row.setup:  # a coordinate of a point
+            of = f" {row.setup.partition('[')[2].rstrip(']')}"
+        text = f"The other readings predict{of} {format_fixed(mean / MM, 3)} ± {mm(2.0 * std)} mm."
         lines = [self.wrap(text, indent="  ")]
         if is_far(row.value, mean, std):
-            differs = f"Line {row.line} differs by {mm(abs(row.value - mean))} mm. Check the dial."
-            lines.append(self.wrap(differs, indent="  ", first="! "))
+            differs = f"Line {row.line}{of} differs by {mm(abs(row.value - mean))} mm."
+            check = f"Check the {'point' if of else 'dial'}."
+            lines.append(self.wrap(f"{differs} {check}", indent="  ", first="! "))
         return "\n".join(lines)
 
     def warning(self, finding: Finding, *, last: int | None = None) -> str:
@@ -276,8 +304,12 @@ class RecordingText:
         rows = self._recording.rows
         indices = find_rows(finding, rows)
         first = [i for i in indices if i == last]
-        parts = [[rows[i].line or 0 for i in part] for part in (first, indices) if part]
-        if first and len(indices) > 1:
+        parts = [
+            list(dict.fromkeys(rows[i].line or 0 for i in part))
+            for part in (first, indices)
+            if part
+        ]
+        if first and len(parts[1]) > 1:
             parts[1].remove(parts[0][0])
             where = f" ({spans(parts[0], 'line')}; or {spans(parts[1], 'line')})"
         else:
@@ -305,10 +337,11 @@ class RecordingText:
         return "\n".join(
             self.wrap(
                 f"{r.line:>{last}}  {self.label(r)}: ".replace("  ", GLUE * 2)
-                + (f"{show_mm(r.value)}{GLUE}mm" if r.is_read else "not read"),
+                + (f"{self.value(i)}{GLUE}mm" if r.is_read else "not read"),
                 indent=" " * (last + 2),
             )
-            for r in rows
+            for i, r in enumerate(rows)
+            if self._recording.point(i)[0] == i
         )
 
     def list_commands(self) -> str:
@@ -325,7 +358,7 @@ class RecordingText:
 
     def state(self, warnings: Sequence[Finding]) -> str:
         """State of a recording in which no row is asked for, with all its warnings."""
-        skipped = len(self._recording.missing)
+        skipped = self._recording.missing_count
         state = f"{skipped} skipped." if skipped else "All readings are recorded."
         if warnings:
             state += " Check these first:"
@@ -343,17 +376,18 @@ class RecordingText:
         command = printable(shlex.quote(path))
         if recording.missing:
             parts = []
-            for setup in dict.fromkeys(rows[i].setup for i in recording.missing):
-                numbers = [rows[i].line or 0 for i in recording.missing if rows[i].setup == setup]
-                every = len(numbers) == sum(r.setup == setup for r in rows)
-                parts.append(f"{setup} {'all' if every else spans(numbers, 'line')}")
-            count = len(recording.missing)
+            for setup in dict.fromkeys(self.name(rows[i]) for i in recording.missing):
+                numbers = [rows[i].line for i in recording.missing if self.name(rows[i]) == setup]
+                every = len(numbers) == sum(self.name(r) == setup for r in rows)
+                which = spans(sorted({line or 0 for line in numbers}), "line")
+                parts.append(f"{setup} {'all' if every else which}")
+            count = recording.missing_count
             state = (
-                f"{count} of {counted(len(rows), 'reading')} {'is' if count == 1 else 'are'} "
+                f"{count} of {counted(recording.count, 'reading')} {'is' if count == 1 else 'are'} "
                 f"missing: {joined(parts)}."
             )
             return f"{self.wrap(state)}\nContinue with:\n  orthocal record {command}"
-        lines = [f"All {counted(len(rows), 'reading')} are recorded."]
+        lines = [f"All {counted(recording.count, 'reading')} are recorded."]
         if session.controller_offsets is None:
             keys = "offsets_mm" if session.robot.drives[0].unit == "m" else "offsets_deg"
             zeros = ", ".join("0" for _ in session.robot.drives)
@@ -387,7 +421,8 @@ def _gauge(session: Session, setup: Setup) -> str:
     if gauge.resolution is not None:
         facts.append(f"resolution {gauge.resolution / MM:g} mm")
     name = f" {setup.gauge}" if setup.gauge else ""
-    return f"Dial{name}: {', '.join(facts)}" if facts or name else ""
+    noun = "Instrument" if isinstance(setup.sensor, Points) else "Dial"
+    return ": ".join(t for t in (f"{noun}{name}", ", ".join(facts)) if t) if facts or name else ""
 
 
 def find_rows(finding: Finding, rows: Sequence[Reading]) -> list[int]:
