@@ -2,17 +2,24 @@
 
 new → record → check → calibrate → enter → record → validate → calibrate → export → LinuxCNC. The
 machine itself is simulated: all its errors at tolerance, dials as hands make them stand.
+
+With effects beside geometry: new → simulate → check → calibrate → compare → export → again →
+simulate → validate → calibrate both → correct. The part is made by the independent simulator.
 """
 
 from __future__ import annotations
 
 import csv
 import re
+import shutil
 
 import numpy as np
 import pytest
+from adjusting import aligned_rms
 from commands import run_orthocal
+from independent import Expansion, IndependentMachine, States
 from linuxcnc import Joint, require_linuxcnc, run_program
+from programs import read_polyline
 
 from orthocal import (
     Machine,
@@ -24,6 +31,7 @@ from orthocal import (
     simulate_session,
 )
 from orthocal.assessment.controller_entries import find_entries
+from orthocal.observation.simulate import collect_errors
 from orthocal.units import MM
 
 SIZES = """--leg-mm 250 --travel-mm 100:325 --attachment-mm 30 --rods-apart-mm 60 --rod-radius-mm 4
@@ -137,3 +145,105 @@ def test_linuxcnc_moves_the_machine_as_it_was_calibrated(walked):
     assert np.abs(off - exact).max() < 1e-9
     promised = assess_tool(two).after.sizes
     assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 3.0 * promised.absolute.rms
+
+
+WARM = "--tolerance *.offset_mm=2 --effects backlash,thermal --temperature 18:26"
+DAYS = "18:26", "19:27"
+"""Temperatures of the first and the last reading of both sessions, [°C]."""
+
+CUT_AT = 26.0
+"""[°C]"""
+
+HOLES = np.random.default_rng(4).uniform(-42.0, 42.0, (40, 3)).round(2)
+"""Holes of the part in the order of drilling, [mm]."""
+
+TAKEN_UP = 3
+"""Holes after which every drive has reversed."""
+
+
+@pytest.fixture(scope="module", params=[40e-6, 0.0], ids=["backlash", "no backlash"])
+def warmed(request, tmp_path_factory, without_plots):
+    """Two sessions on days that warm by 8 K, up to the corrected program.
+
+    With the directory, the backlash of each drive, and what was printed.
+    """
+    folder, said = tmp_path_factory.mktemp("warm"), {}
+    run(folder, "new", "mill", *SIZES.removesuffix("--effects none --paper").split(), *WARM.split())
+    truth = [f"--error={d}_slide.backlash_mm={request.param / MM:g}" for d in "xyz"]
+    draw = "--draw", "full", "--seed", SEED, *truth
+    run(folder, "simulate", "mill/first", *draw, "--temperature", DAYS[0], "--out", "one")
+    run(folder, "check", "one")
+    said["first"] = run(folder, "calibrate", "one", "--out", "first")
+    said["compare"] = " ".join(run(folder, "compare", "one").split())
+    home = "--offsets", "--home-offset", "0,0,0", "--latched=+,+,+"
+    run(folder, "export", "first", "--to", "linuxcnc", *home, "--out", "cnc")
+    run(folder, "again", "first", "--ini", "cnc/joints.ini", "--out", "mill/second")
+    same = "--errors", "one/truth.yaml", "--seed", SEED + 1
+    run(folder, "simulate", "mill/second", *same, "--temperature", DAYS[1], "--out", "two")
+    said["validate"] = " ".join(run(folder, "validate", "first", "two").split())
+    said["both"] = run(folder, "calibrate", "one", "two", "--out", "both")
+    drilled = [
+        f"N{n} {'G1' if n > 1 else 'G0'} X{x} Y{y} Z{z} F600"
+        for n, (x, y, z) in enumerate(HOLES, start=1)
+    ]
+    (folder / "part.ngc").write_text("\n".join(["G21 G90 G61", *drilled, "M2", ""]))
+    options = "--offsets", "active", "--temperature", CUT_AT
+    run(folder, "correct", "both", "part.ngc", *options, "--out", "good.ngc")
+    run(folder, "accuracy", "both", "--temperature", CUT_AT)
+    return folder, request.param, said
+
+
+def drill(folder, program, backlash):
+    """Error of the real holes after alignment of the part, RMS, [m].
+
+    The controller has nominal kinematics, the offsets and the backlash of the second session. The
+    machine is that of the independent simulator; its slides have play.
+    """
+    both, bare = load_calibration(folder / "both"), folder / "bare"
+    robot = both.robot
+    if not bare.exists():
+        bare.mkdir()
+        for name in ("mill.urdf", "mill.yaml"):
+            shutil.copy(folder / "mill" / name, bare)
+    lines = (folder / program).read_text().splitlines()
+    written = [(n, at) for n, points in read_polyline(lines).items() for at, _ in points if n]
+    motors = Machine(robot, {}).inverse(np.array([at for _, at in written]) * MM)
+    motors = motors - both.active_offsets
+    steps = np.diff(motors, axis=0, prepend=motors[:1])
+    moved = np.maximum.accumulate(np.where(steps, np.arange(len(steps))[:, None], 0), axis=0)
+    sides = np.sign(np.take_along_axis(steps, moved, axis=0))
+    slides = motors + 0.5 * sides * both.compensated_backlash
+    for k in range(1, len(slides)):
+        half = 0.5 * backlash
+        slides[k] = np.clip(slides[k - 1], slides[k] - half, slides[k] + half)
+    truth = collect_errors(robot, file=folder / "one/truth.yaml")
+    rigid = {n: v for n, v in truth.items() if not n.endswith(".backlash")}
+    machine = IndependentMachine(bare, rigid, expansion=Expansion())
+    states = States(slides, np.zeros_like(slides), np.full(len(slides), CUT_AT))
+    (reached,) = machine.tool(states)
+    last = {n: i for i, (n, _) in enumerate(written)}
+    holes = reached[[last[n] for n in range(1, len(HOLES) + 1)]]
+    return aligned_rms(holes[TAKEN_UP:], HOLES[TAKEN_UP:] * MM)
+
+
+@pytest.mark.slow
+def test_a_part_of_a_machine_with_effects_is_as_good_as_promised(warmed):
+    folder, backlash, said = warmed
+    with open(folder / "one/readings.csv") as file:
+        readings = list(csv.DictReader(file))
+    assert {r["approach"] for r in readings} == {"ppp", "nnn"}
+    assert {float(r["temperature_C"]) for r in readings} >= {18.0, 26.0}
+    first, both = (load_calibration(folder / name) for name in ("first", "both"))
+    supported = "Recommended effects: backlash" if backlash else "Recommended effects: none"
+    assert supported in said["compare"]
+    assert "The calibration is confirmed." in said["validate"]
+    for p in both.free:
+        if p.name.endswith(".backlash"):  # three of them, to 99.7 %
+            half = 1.5 * float(both.expand(p.std, p.std_scatter))
+            assert p.value == pytest.approx(backlash, abs=half)
+    entered = [e.enter for e in first.assessment.backlash]
+    assert both.compensated_backlash == pytest.approx(entered, abs=1e-7)
+    promised = both.assessment.tool.compensated
+    corrected, plain = (drill(folder, name, backlash) for name in ("good.ngc", "part.ngc"))
+    assert corrected < 1.15 * promised
+    assert corrected < 0.8 * plain

@@ -263,7 +263,11 @@ def _integrate_amounts(gram: Array, slope: Array, precision: Array, positive: Ma
     """Gain of log likelihood by amounts with a normal or half-normal prior, shape (g,).
 
     A half-normal amount a ≥ 0 has twice the density, and of its posterior N(m, s²) the part above
-    0 counts: ln 2 Φ(m/s). Several are treated as independent.
+    0 counts: ln 2 Φ(m/s). Several are treated as independent, which is much faster than their
+    joint probability (`statistics.distributions.log_positive_share`). Backlashes of three drives
+    correlate by 0.02 (66 readings) to 0.12 (the plan of `orthocal new`). ln evidence is then wrong
+    by up to 0.17 with backlash and 0.4 without, where EFFECT_CLEARLY needs 4.5. Of 240 simulated
+    machines none is judged otherwise.
 
     Args:
         gram: W V⁻¹ Wᵀ, shape (g, k, k).

@@ -26,9 +26,15 @@ from orthocal import (
 from orthocal.effects import registry
 from orthocal.errors import RobotError
 from orthocal.hypotheses.families.effects import find_effects, missing_effects
-from orthocal.hypotheses.likelihood import AmountPrior, build_likelihood
+from orthocal.hypotheses.likelihood import (
+    AmountPrior,
+    _integrate_amounts,
+    build_likelihood,
+    log_of_sum,
+)
 from orthocal.hypotheses.linear_model import LinearModel
-from orthocal.hypotheses.search import find_anomalies
+from orthocal.hypotheses.search import EFFECT_CLEARLY, find_anomalies
+from orthocal.statistics.distributions import log_positive_share
 
 EFFECTS = "backlash: {}, thermal: {}, drift: {}, screw: {lead_mm: 10}"
 GEOMETRY = {"x_slide.offset": 0.1e-3, "y_leg.length": 40e-6, "z_slide.offset": -0.2e-3}
@@ -243,6 +249,32 @@ def test_a_half_normal_amount_is_integrated_over():
 
         found = likelihood.score_set(deviation, [column[None]], priors=[prior]).log_likelihood
         assert np.exp(found) == pytest.approx(quad(likelihood_of, 0.0, 12.0)[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("slack", [0.0, 20e-6])
+def test_backlashes_of_several_drives_are_nearly_independent(plan, slack):
+    """Against the joint probability that all are positive: less than a ninth of what is needed."""
+    bare, machine = plan.with_effects([]), plan.with_effects(["backlash"])
+    model = LinearModel(bare)
+    about = model.at_reference(slopes=True)
+    (effect,) = (e for e in find_effects(model) if e.name == "backlash")
+    vectors = model.entries(effect.columns)
+    for seed in range(5):
+        errors = {f"{d}_slide.backlash": slack for d in "xyz"} | GEOMETRY
+        values = simulate_session(machine, errors, seed=seed).session.values
+        deviation = model.entries(values[None])[0] - about.expected
+        gram, slope = about.likelihood._gram(deviation, vectors)
+        precision, positive = np.ones(3), np.ones(3, bool)
+        found = _integrate_amounts(gram, slope, precision, positive)
+        free = _integrate_amounts(gram, slope, precision, ~positive)
+        inverse = np.linalg.inv(gram + np.eye(3))
+        means = (inverse @ slope[..., None])[..., 0]
+        shares = [log_positive_share(m, c) for m, c in zip(means, inverse, strict=True)]
+        joint = free + 3.0 * np.log(2.0) + shares
+        likelihood = about.likelihood
+        pairs = likelihood.log_densities(likelihood.products(deviation[None]))[0]
+        independent, exact = (log_of_sum(gain + pairs) for gain in (found, joint))
+        assert abs(independent - exact) < EFFECT_CLEARLY / 9.0
 
 
 @pytest.mark.slow
