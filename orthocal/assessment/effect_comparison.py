@@ -19,7 +19,7 @@ from orthocal.effects.registry import find_effect, order_effects
 from orthocal.errors import RobotError
 from orthocal.estimation.selection import complete_model
 from orthocal.hypotheses.families.effects import missing_effects, rows_without
-from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.hypotheses.linear_model import linear_model
 from orthocal.session.session import Session
 
 
@@ -84,7 +84,7 @@ def compare_effects(session: Session) -> EffectComparison | None:
         if trial not in known:
             with_them = session.with_effects((*computed, *trial))
             free = errors_of_no_model(with_them.robot)
-            errors = LinearModel(with_them, free=free).predict_left_out(session.values)
+            errors = linear_model(with_them, free=free).predict_left_out(session.values)
             rms = float(np.sqrt(np.mean(errors**2)))
             known[trial] = weigh_model(with_them, model, free=free)[0], rms
         return known[trial][0]

@@ -25,6 +25,7 @@ from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import describe_anomalies, describe_no_change
 from orthocal.calibration.assessment_record import Finding, Severity, Verdict
 from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
+from orthocal.hypotheses.anomaly import Anomalies
 from orthocal.hypotheses.families.sessions import detectable_changes
 from orthocal.hypotheses.linear_model import LinearModel, ModelLinearisation, linear_model
 from orthocal.hypotheses.search import find_anomalies
@@ -80,28 +81,32 @@ def rank(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     return tuple(sorted(findings, key=lambda f: _GRAVITY[f.severity]))
 
 
-def judge_session(session: Session) -> Judgement:
+def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Judgement:
     """Judge the readings of a session, or of several that were joined.
 
     Several models are calibrated from one session with one judgement, which `calibrate`, `assess`,
     `compare_models` and `check_session` receive.
 
+    Args:
+        session: The session.
+        anomalies: Of its readings, if they are known already.
+
     Raises:
         ClosureError: If the machine cannot reach a posture.
         RobotError: If the closures of the robot depend on each other.
     """
-    anomalies = _find_mistakes(session)
-    implausible = [f for f in find_implausible(session) if not (anomalies and f.kind in EXPLAINED)]
+    mistakes = _find_mistakes(session, anomalies)
+    implausible = [f for f in find_implausible(session) if not (mistakes and f.kind in EXPLAINED)]
     scale, beyond = AS_STATED, []
-    if verdict_of([*anomalies, *implausible]) == "enter":
+    if verdict_of([*mistakes, *implausible]) == "enter":
         scale = find_tolerance_scale(session)
         if scale.factor > LARGEST_SCALE:
             beyond = [words.beyond_tolerances(scale.factor, LARGEST_SCALE)]
         elif scale.factor > 1.0:
             beyond = [words.above_tolerances(scale.factor)]
-    unchanged = [] if anomalies or not session.joined else [_describe_detectable(session)]
+    unchanged = [] if mistakes or not session.joined else [_describe_detectable(session)]
     unshown = find_unshown_effects(session)
-    return Judgement(rank([*implausible, *anomalies, *unchanged, *beyond, *unshown]), scale)
+    return Judgement(rank([*implausible, *mistakes, *unchanged, *beyond, *unshown]), scale)
 
 
 def find_warnings(session: Session) -> tuple[Finding, ...]:
@@ -143,15 +148,15 @@ def is_far(value: float, mean: float, std: float) -> bool:
     return bool(abs(value - mean) > LARGEST_DEVIATION * std)
 
 
-def _find_mistakes(session: Session) -> list[Finding]:
+def _find_mistakes(session: Session, anomalies: Anomalies | None = None) -> list[Finding]:
     """Anomalies of a session; without any, gauges whose repeated readings scatter too much.
 
-    Nothing is sought if a gauge is impossible as stated.
+    Nothing is sought if a gauge is impossible as stated, or if the anomalies are known.
     """
     if impossible := list(find_impossible_gauges(session)):
         return impossible
-    anomalies = describe_anomalies(session, find_anomalies(session))
-    return anomalies or list(find_scattered(session))
+    findings = describe_anomalies(session, anomalies or find_anomalies(session))
+    return findings or list(find_scattered(session))
 
 
 def find_tolerance_scale(session: Session) -> ToleranceScale:

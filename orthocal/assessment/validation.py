@@ -50,7 +50,7 @@ from orthocal.calibration.refit import repeat_fit, restore_session
 from orthocal.effects.adjustment import subtract_amounts
 from orthocal.errors import SessionError
 from orthocal.estimation.fit import Fit
-from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomaly
+from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomalies, Anomaly
 from orthocal.hypotheses.search import find_anomalies
 from orthocal.io.fields import finite_or_none
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
@@ -203,11 +203,14 @@ def validate_calibration(
     session = join_sessions(measured)
     judgement, fit = judge_session(session), repeat_fit(calibration, session)
     refit = _assess_refit(fit, calibration, judgement)
-    mistake, changes, wrongly_entered = _find_changes(calibration, measured, judgement)
+    before = restore_session(calibration)
+    every = join_sessions([before, *measured])
+    anomalies = find_anomalies(every)
+    mistake, changes, wrongly_entered = _find_changes(before, every, anomalies, judgement)
     expected_rms, test = expect_rms(calibration, fit), judge_deviations(calibration, fit)
     lead = _agreement(refit, test, expected_rms, explained=bool(changes))
     confirmed = None if math.isnan(test.chance) else _is_confirmed(lead, changes, judgement)
-    joint = _join(calibration, session) if confirmed else None
+    joint = _calibrate_jointly(calibration, every, anomalies) if confirmed else None
     further = [] if joint is None else _find_further_change(joint)
     assessed = assessment_of(joint or refit)
     keep = wrongly_entered or (confirmed is not False and not further)
@@ -264,10 +267,11 @@ def _is_confirmed(lead: Finding, changes: Sequence[Finding], judgement: Judgemen
     return None if agrees and judgement.verdict != "enter" else agrees
 
 
-def _join(calibration: Calibration, session: Session) -> Calibration:
-    """Calibration from its readings and those of a new session, assessed."""
-    every = join_sessions([restore_session(calibration), session])
-    judgement = judge_session(every)
+def _calibrate_jointly(
+    calibration: Calibration, every: Session, anomalies: Anomalies
+) -> Calibration:
+    """Calibration from its readings and new ones, which are joined, assessed."""
+    judgement = judge_session(every, anomalies=anomalies)
     fit = repeat_fit(calibration, every, tolerance_scale=judgement.tolerance_scale)
     joint = assemble_calibration(fit)
     return replace(joint, assessment=assess(joint, every, judgement=judgement))
@@ -341,27 +345,25 @@ def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
 
 
 def _find_changes(
-    calibration: Calibration, measured: Sequence[Session], judgement: Judgement
+    before: Session, every: Session, anomalies: Anomalies, judgement: Judgement
 ) -> tuple[Anomaly | None, list[Finding], bool]:
     """Changes between the sessions of a calibration and new ones.
 
     Args:
-        calibration: The calibration.
-        measured: The new sessions, with their active offsets.
+        before: The sessions of the calibration.
+        every: They and the new ones, joined.
+        anomalies: Of all their readings.
         judgement: Judgement of the new sessions by themselves.
 
     Returns:
         The most likely change, all findings, and whether the offsets of the calibration were
         entered wrongly.
     """
-    before = restore_session(calibration)
-    every = join_sessions([before, *measured])
-    result = find_anomalies(every)
-    changes = tuple(a for a in result.found if a.between_sessions)
+    changes = tuple(a for a in anomalies.found if a.between_sessions)
     if not changes and judgement.verdict != "enter":  # its findings explain the readings
         return None, [], False
     mistake = next((a for a in changes if a.explanation.sessions), None)
-    findings = describe_anomalies(every, replace(result, found=changes))
+    findings = describe_anomalies(every, replace(anomalies, found=changes))
     if mistake is None:
         return None, findings, False
     new = {name.partition("/")[0] for name in list(every.setups)[len(before.setups) :]}

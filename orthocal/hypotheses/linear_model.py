@@ -120,21 +120,16 @@ class LinearModel:
 
     Args:
         session: A session, or several joined ones.
-        model: Name of the model of the errors that the machine may have; all by default.
-        free: Names of further errors.
+        names: Errors that the machine may have; all by default.
 
     Raises:
         RobotError: If closures of the robot depend on each other.
-        ParameterError: If the model or a name is unknown.
     """
 
-    def __init__(
-        self, session: Session, model: str | None = None, *, free: tuple[str, ...] = ()
-    ) -> None:
+    def __init__(self, session: Session, names: Sequence[str] | None = None) -> None:
         session = _refer_to_most_corrected(session)
-        parameters = session.robot.parameters
-        names = machine_errors(session.robot) if model is None else parameters.select_model(model)
-        selection = select_parameters(parameters, free=[*names, *free], prior=True)
+        free = machine_errors(session.robot) if names is None else names
+        selection = select_parameters(session.robot.parameters, free=free, prior=True)
         problem = CalibrationProblem(session, selection)
         self.problem = problem.with_noise_ratio(initial_noise_ratio(session, problem.observations))
         o = self.problem.observations
@@ -147,6 +142,7 @@ class LinearModel:
         self._counts = np.bincount(o.zero, minlength=o.n_zeros).astype(np.float64)
         self._incidence = self.problem.zero_incidence
         self._shared: dict[Hashable, object] = {}
+        self._kept_most_likely: list[tuple[bytes, ModelLinearisation]] = []
 
     def with_values(self, values: Array) -> LinearModel:
         """The model for other readings of the same rows, shape (n_rows,), [m]."""
@@ -293,13 +289,19 @@ class LinearModel:
     def most_likely(self, rows: Array) -> ModelLinearisation:
         """Linearise about the most likely machine, with the tolerances as prior.
 
+        The result for the last readings is kept: a judgement and a recommendation need it.
+
         Args:
             rows: Readings, shape (n_rows,), [m].
 
         Raises:
             ClosureError: If the nominal machine cannot reach a posture.
         """
-        return self._approach(self.entries(rows[None])[0], np.zeros(self.problem.observations.size))
+        key, kept = rows.tobytes(), self._kept_most_likely
+        if not kept or kept[0][0] != key:
+            entries = self.entries(rows[None])[0]
+            kept[:] = [(key, self._approach(entries, np.zeros_like(entries)))]
+        return kept[0][1]
 
     def predict_row(self, rows: Array, row: int) -> tuple[float, float]:
         """Predictive distribution of a reading, conditional on all other readings.
@@ -529,30 +531,36 @@ def linear_model(
 
     Args:
         session: As for `LinearModel`.
-        model: As for `LinearModel`.
-        free: As for `LinearModel`.
+        model: Name of the model of the errors that the machine may have; all by default.
+        free: Names of further errors.
 
     Raises:
-        ParameterError, RobotError: As for `LinearModel`.
+        RobotError: As for `LinearModel`.
+        ParameterError: If the model or a name is unknown.
     """
-    if len(session.gauges) > 1:  # their relative noise may come from the values
-        return LinearModel(session, model, free=free)
-    return _build(_Rows(session, model, free)).with_values(session.values)
+    robot = session.robot
+    names = machine_errors(robot) if model is None else robot.parameters.select_model(model)
+    return _build(_Rows(session, (*names, *free))).with_values(session.values)
 
 
 class _Rows:
-    """All of a session but the values of its readings; equal for the same objects."""
+    """All of a session but the values of its readings; equal for the same objects.
 
-    def __init__(self, session: Session, model: str | None, free: tuple[str, ...]) -> None:
-        self.session, self.model, self.free = session, model, free
+    The values of several gauges count: the ratio of their noise may come from them.
+    """
+
+    def __init__(self, session: Session, names: tuple[str, ...]) -> None:
+        self.session, self.names = session, names
         offsets = session.controller_offsets
+        gauges = {session.setups[r.setup].gauge for r in session.readings}
         same = (
             *(session.robot, session.postures, session.setups, *session.gauges.values()),
             *(session.compensation, session.firmware, session.adjusted, session.path),
         )
         self._key = (
             *map(id, same),
-            *(None if offsets is None else offsets.tobytes(), session.joined, model, free),
+            *(None if offsets is None else offsets.tobytes(), session.joined, names),
+            session.values.tobytes() if len(gauges) > 1 else None,
             tuple(
                 (r.setup, r.posture, r.minus, r.cycle, r.line, r.file, r.conditions)
                 for r in session.readings
@@ -568,7 +576,7 @@ class _Rows:
 
 @lru_cache(maxsize=KEPT)
 def _build(rows: _Rows) -> LinearModel:
-    return LinearModel(rows.session, rows.model, free=rows.free)
+    return LinearModel(rows.session, rows.names)
 
 
 def _refer_to_most_corrected(session: Session) -> Session:

@@ -201,8 +201,9 @@ class _Search:
         free = [t.shift for t in terms if t.shift is not None and not t.known]
         about, applied = start, np.zeros(len(free))
         if known or free:
-            base = self.sound.about
-            about = model.linearise(base.theta, known, base.passive, slopes=True)
+            about = base = self.sound.about
+            if known:
+                about = model.linearise(base.theta, known, base.passive, slopes=True)
         states = [self._evaluate_about(terms, about, applied)]
         for k in range(MOST_ROUNDS):
             state, about = states[-1], states[-1].about

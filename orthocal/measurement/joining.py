@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -14,6 +15,9 @@ from orthocal.errors import SessionError
 from orthocal.measurement.files.session_file import load_session
 from orthocal.session.session import Posture, Session, Setup
 from orthocal.text import composed
+
+KEPT = 4
+"""Joined sessions whose parts are kept."""
 
 Value = TypeVar("Value")
 
@@ -116,8 +120,12 @@ def _join_tolerances(sessions: Sequence[Session]) -> dict[str, float]:
     return tolerances
 
 
+@lru_cache(maxsize=KEPT)
 def split_sessions(session: Session) -> tuple[Session, ...]:
-    """Parts of a joined session, with their names in it; another session is its only part."""
+    """Parts of a joined session, with their names in it; another session is its only part.
+
+    The parts of the last sessions are kept, and with them what is known of the same parts.
+    """
     if not session.joined:
         return (session,)
     label = [r.setup.partition("/")[0] for r in session.readings]

@@ -14,7 +14,7 @@ from orthocal import load_plan, simulate_session
 from orthocal.assessment.recommendation import SCALES, weigh_model
 from orthocal.estimation.selection import complete_model
 from orthocal.hypotheses.likelihood import build_likelihood
-from orthocal.hypotheses.linear_model import LinearModel, ModelLinearisation
+from orthocal.hypotheses.linear_model import ModelLinearisation, linear_model
 from orthocal.statistics.distributions import LATTICE, log_positive_share
 
 DRAWS = 200_000
@@ -77,7 +77,7 @@ def backlash(tmp_path_factory):
 @pytest.mark.parametrize("scale", [1.0, float(SCALES[30])])
 def test_the_evidence_of_a_session_is_that_of_drawn_backlash(backlash, scale):
     """Mean over half-normal draws of the density with all other errors integrated out."""
-    model = LinearModel(backlash, complete_model(backlash.robot.parameters))
+    model = linear_model(backlash, complete_model(backlash.robot.parameters))
     near = model.most_likely(backlash.values)
     about = model.linearise(near.theta, (), near.passive, slopes=True)
     deviation = model.entries(backlash.values[None])[0] - about.expected
