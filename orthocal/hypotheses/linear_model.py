@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property, lru_cache
@@ -48,6 +49,9 @@ NEAR = 0.2
 
 FURTHEST = 6.0
 """Errors, in prior std, beyond which a hypothesis is not relinearised."""
+
+MOST_ENTRIES = 1600
+"""Entries of all points that are linearised together, for their memory."""
 
 MOST_STEPS = 8
 """Gauss-Newton steps to the most likely machine."""
@@ -111,6 +115,18 @@ class ModelLinearisation:
         rows = self.errors[positive]
         covariance = tolerance_scale**2 * (np.eye(len(rows)) - rows * known @ rows.T)
         return len(rows) * math.log(2.0) + log_positive_share(mean, covariance)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearisationPoint:
+    """A machine about which the model is linearised."""
+
+    theta: Array
+    """Errors less the reference, shape (n_free,), [prior std]."""
+    shifts: Sequence[MachineShift]
+    """Known differences of the machine in some of the sessions."""
+    start: Array
+    """Passive coordinates to start from, shape (n_states, n_passive), [m, rad]."""
 
 
 class LinearModel:
@@ -251,27 +267,97 @@ class LinearModel:
             ClosureError: If the machine cannot reach a posture.
             SessionError: If a predicted reading is not finite.
         """
-        problem, o = self.problem, self.problem.observations
-        n = len(self.labels)
-        each = np.array(
-            [
-                sum((s.direction for s in shifts if s.sessions[k]), np.zeros_like(theta))
-                for k in range(n)
-            ]
-        )
-        expected, jacobian, passive = np.empty(o.size), np.empty((o.size, theta.size)), start
-        machines, which = np.unique(each, axis=0, return_inverse=True)
-        which = which.ravel()
-        for m, shift in enumerate(machines):
-            at = problem.active_theta + (theta + shift) * problem.theta_scale
-            passive = problem.close(at, start=passive)
-            prediction, slope = problem.predict_and_jacobian(at, passive)
-            if len(machines) == 1:
-                expected, jacobian = prediction, slope
-            else:
-                entries = which[self.session_of_entry] == m
-                expected[entries], jacobian[entries] = prediction[entries], slope[entries]
-        require_finite(problem, expected, jacobian)
+        machines, of_session = self._machines(theta, shifts)
+        starts = None if start is None else np.broadcast_to(start, (len(machines), *start.shape))
+        return self._assemble(theta, of_session, *self._predict(machines, starts), slopes=slopes)
+
+    def linearise_all(
+        self, points: Sequence[LinearisationPoint], *, slopes: bool
+    ) -> list[ModelLinearisation | None]:
+        """Linearise the model about several points: half the time of one after the other.
+
+        Args:
+            points: The points.
+            slopes: Whether to keep the derivatives.
+
+        Returns:
+            The linearisations; None where a machine cannot reach a posture, or a predicted reading
+            is not finite.
+        """
+        size = max(1, MOST_ENTRIES // self.problem.observations.size)
+        return [
+            linear
+            for first in range(0, len(points), size)
+            for linear in self._linearise_some(points[first : first + size], slopes=slopes)
+        ]
+
+    def _linearise_some(
+        self, points: Sequence[LinearisationPoint], *, slopes: bool
+    ) -> Iterator[ModelLinearisation | None]:
+        """Linearise the model about a few points at once, or one by one if one of them fails."""
+        machines = [self._machines(p.theta, p.shifts) for p in points]
+        counts = [len(thetas) for thetas, _ in machines]
+        starts = np.repeat(np.array([p.start for p in points]), counts, axis=0)
+        together = None
+        if len(points) > 1:
+            with suppress(ClosureError, np.linalg.LinAlgError):
+                together = self._predict(np.concatenate([t for t, _ in machines]), starts)
+        first = 0
+        for point, (thetas, of_session) in zip(points, machines, strict=True):
+            part = slice(first, first := first + len(thetas))
+            try:
+                predicted = (
+                    self._predict(thetas, starts[part])
+                    if together is None
+                    else [values[part] for values in together]
+                )
+                yield self._assemble(point.theta, of_session, *predicted, slopes=slopes)
+            except (ClosureError, SessionError, np.linalg.LinAlgError):
+                yield None
+
+    def _machines(self, theta: Array, shifts: Sequence[MachineShift]) -> tuple[Array, Indices]:
+        """Different machines, shape (M, n_free), [SI], and that of each session, shape (K,)."""
+        each = [
+            sum((s.direction for s in shifts if s.sessions[k]), np.zeros_like(theta))
+            for k in range(len(self.labels))
+        ]
+        different = {shift.tobytes(): shift for shift in each}
+        place = {key: m for m, key in enumerate(different)}
+        errors = (theta + np.array(list(different.values()))) * self.problem.theta_scale
+        return self.problem.active_theta + errors, np.array([place[s.tobytes()] for s in each])
+
+    def _predict(self, machines: Array, starts: Array | None) -> tuple[Array, Array, Array]:
+        """Readings, their derivatives and the passive coordinates of machines.
+
+        Args:
+            machines: Shape (M, n_free), [SI].
+            starts: Passive coordinates to start from, shape (M, n_states, n_passive).
+
+        Returns:
+            Shapes (M, n_entries), (M, n_entries, n_free) and (M, n_states, n_passive).
+        """
+        passive = self.problem.close(machines, start=starts)
+        return *self.problem.predict_and_jacobian(machines, passive), passive
+
+    def _assemble(
+        self,
+        theta: Array,
+        of_session: Indices,
+        readings: Array,
+        jacobians: Array,
+        passive: Array,
+        *,
+        slopes: bool,
+    ) -> ModelLinearisation:
+        """Linearisation from the readings of the machine of each session.
+
+        Raises:
+            SessionError: If a predicted reading is not finite.
+        """
+        o, which = self.problem.observations, of_session[self.session_of_entry]
+        every = np.arange(o.size)
+        expected, jacobian = readings[which, every], jacobians[which, every]
+        require_finite(self.problem, expected, jacobian)
         jacobian = project_out_zeros(jacobian, o)
         likelihood, vectors, sizes = build_likelihood(
             jacobian, sigma=self.sigma, dof=self.dof, stated=self.stated
@@ -283,7 +369,7 @@ class LinearModel:
             vectors,
             sizes,
             theta,
-            np.asarray(passive),
+            passive[-1],
         )
 
     def most_likely(self, rows: Array) -> ModelLinearisation:

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.arrays import Array, Indices
-from orthocal.errors import ClosureError, SessionError
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, AnomalyKind
 from orthocal.hypotheses.families.artefacts import wrong_artefacts
 from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
@@ -29,7 +28,14 @@ from orthocal.hypotheses.families.sessions import MOST_DRIVES, changes_between_s
 from orthocal.hypotheses.families.single_reading import wrong_readings
 from orthocal.hypotheses.families.swapped_rows import swapped_rows
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
-from orthocal.hypotheses.hypothesis import Family, Rows, SystematicEffect, sparse_rows, to_dense
+from orthocal.hypotheses.hypothesis import (
+    Family,
+    MachineShift,
+    Rows,
+    SystematicEffect,
+    sparse_rows,
+    to_dense,
+)
 from orthocal.hypotheses.hypothesis_set import (
     HypothesisSet,
     Term,
@@ -48,6 +54,7 @@ from orthocal.hypotheses.linear_model import (
     FURTHEST,
     MOST_ROUNDS,
     NEAR,
+    LinearisationPoint,
     LinearModel,
     ModelLinearisation,
     linear_model,
@@ -190,46 +197,64 @@ class _Search:
         return state, near
 
     def evaluate(self, terms: Sequence[Term], start: ModelLinearisation) -> HypothesisSet:
-        """Score a set of hypotheses, linearised at the errors that it implies.
+        """Score a set of hypotheses as `evaluate_all` does."""
+        (state,) = self.evaluate_all([terms], start)
+        return state
+
+    def evaluate_all(
+        self, several: Iterable[Sequence[Term]], start: ModelLinearisation
+    ) -> list[HypothesisSet]:
+        """Score sets of hypotheses, each linearised at the errors that it implies.
 
         The first step may exceed FURTHEST, because readings are not linear over offsets of some mm:
         the nonlinear part looks like errors far beyond their tolerances. Such a step does not count
         unless the next step returns within FURTHEST. No step exceeds EXTREME.
         """
-        model = self.model
-        known = [t.shift for t in terms if t.shift is not None and t.known]
-        free = [t.shift for t in terms if t.shift is not None and not t.known]
-        about, applied = start, np.zeros(len(free))
-        if known or free:
-            about = base = self.sound.about
-            if known:
-                about = model.linearise(base.theta, known, base.passive, slopes=True)
-        states = [self._evaluate_about(terms, about, applied)]
+        tracks = [[self._begin(terms, start)] for terms in several]
+        moving = tracks
         for k in range(MOST_ROUNDS):
-            state, about = states[-1], states[-1].about
-            errors = about.errors_for(
-                state.remaining,
-                noise_scale=state.score.noise_scale,
-                tolerance_scale=state.score.tolerance_scale,
-            )
-            if np.abs(errors - about.theta).max(initial=0.0) < NEAR:
-                break
-            if not _is_near(errors) and (k or np.abs(errors).max() > EXTREME):
-                break
-            applied = np.array(
-                [a[0] for t, a in zip(terms, state.amounts, strict=True) if t.shift and not t.known]
-            )
-            shifts = [
-                replace(s, direction=s.direction * a) for s, a in zip(free, applied, strict=True)
-            ]
-            try:
-                about = model.linearise(
-                    errors, [*known, *shifts], about.passive, slopes=self.slopes
-                )
-            except (ClosureError, SessionError, np.linalg.LinAlgError):
-                break
-            states.append(self._evaluate_about(terms, about, applied))
-        return next((s for s in reversed(states[1:]) if _is_near(s.about.theta)), states[0])
+            points = [self._next_point(states[-1], first=k == 0) for states in moving]
+            steps = [(t, p) for t, p in zip(moving, points, strict=True) if p is not None]
+            abouts = self.model.linearise_all([p for _, p in steps], slopes=self.slopes)
+            moving = []
+            for (states, _), about in zip(steps, abouts, strict=True):
+                if about is not None:
+                    before = states[-1]
+                    states.append(self._evaluate_about(before.terms, about, _applied(before)))
+                    moving.append(states)
+        return [
+            next((s for s in reversed(states[1:]) if _is_near(s.about.theta)), states[0])
+            for states in tracks
+        ]
+
+    def _begin(self, terms: Sequence[Term], start: ModelLinearisation) -> HypothesisSet:
+        """A set of hypotheses about a start; with changes of the machine, about the sound one."""
+        about, free = start, [t for t in terms if _is_free(t)]
+        if any(t.shift is not None for t in terms):
+            about = base = self.sound.about
+            if known := _known_shifts(terms):
+                about = self.model.linearise(base.theta, known, base.passive, slopes=True)
+        return self._evaluate_about(terms, about, np.zeros(len(free)))
+
+    def _next_point(self, state: HypothesisSet, *, first: bool) -> LinearisationPoint | None:
+        """The errors that a set implies, to linearise about; None if they are near or too far."""
+        errors = state.about.errors_for(
+            state.remaining,
+            noise_scale=state.score.noise_scale,
+            tolerance_scale=state.score.tolerance_scale,
+        )
+        if np.abs(errors - state.about.theta).max(initial=0.0) < NEAR:
+            return None
+        if not _is_near(errors) and (not first or np.abs(errors).max() > EXTREME):
+            return None
+        free = [t.shift for t in state.terms if t.shift is not None and not t.known]
+        shifts = [
+            replace(s, direction=s.direction * a)
+            for s, a in zip(free, _applied(state), strict=True)
+        ]
+        return LinearisationPoint(
+            errors, [*_known_shifts(state.terms), *shifts], state.about.passive
+        )
 
     def _evaluate_about(
         self, terms: Sequence[Term], about: ModelLinearisation, applied: Array
@@ -310,7 +335,7 @@ class _Search:
             *pairs,
             *self._moved_together(state, scored, rows),
         ]
-        tried = [self.evaluate((*state.terms, *more), state.about) for more in chosen]
+        tried = self.evaluate_all([(*state.terms, *more) for more in chosen], state.about)
         likeliest = min(tried, key=negative_log_posterior)
         if not self.is_plausible(likeliest) and len(state.terms) + 2 <= MOST_ANOMALIES:
             tried += self._combine(state, single)
@@ -356,7 +381,7 @@ class _Search:
     def _combine(self, state: HypothesisSet, single: list[Term]) -> list[HypothesisSet]:
         """Sets with two of the most likely hypotheses, if neither suffices alone."""
         apart = combinations(distinct_terms(single)[:MOST_COMBINED], 2)
-        tried = [self.evaluate((*state.terms, *more), state.about) for more in apart]
+        tried = self.evaluate_all([(*state.terms, *more) for more in apart], state.about)
         if not tried:
             return []
         one, other = min(tried, key=negative_log_posterior).terms[-2:]
@@ -366,7 +391,7 @@ class _Search:
             for t in single
             if t is not out and not share_rows(t, partner) and share_rows(t, out)
         ]
-        return tried + [self.evaluate((*state.terms, *more), state.about) for more in others]
+        return tried + self.evaluate_all([(*state.terms, *more) for more in others], state.about)
 
     def is_plausible(self, state: HypothesisSet) -> bool:
         """True if a machine near its tolerances explains the corrected readings."""
@@ -377,11 +402,9 @@ class _Search:
     def _eliminate(self, state: HypothesisSet) -> HypothesisSet:
         """Remove hypotheses that the others make superfluous."""
         while len(state.terms) > 1:
-            fewer = [
-                (min(NEARLY, _needed(out)), self.evaluate(others, self.sound.about))
-                for out in state.terms
-                for others in [[t for t in state.terms if t is not out]]
-            ]
+            sets = [[t for t in state.terms if t is not out] for out in state.terms]
+            needed = [min(NEARLY, _needed(out)) for out in state.terms]
+            fewer = zip(needed, self.evaluate_all(sets, self.sound.about), strict=True)
             least, best = max(fewer, key=lambda pair: pair[1].log_posterior)
             if best.log_posterior < state.log_posterior - least:
                 break
@@ -592,6 +615,22 @@ class _Search:
             state.score.tolerance_scale,
             state.score.noise_scale,
         )
+
+
+def _is_free(term: Term) -> bool:
+    """True if a hypothesis changes the machine by an unknown amount."""
+    return term.shift is not None and not term.known
+
+
+def _known_shifts(terms: Sequence[Term]) -> list[MachineShift]:
+    """Changes of the machine by known amounts."""
+    return [t.shift for t in terms if t.shift is not None and t.known]
+
+
+def _applied(state: HypothesisSet) -> Array:
+    """Amounts of the changes of the machine by unknown ones, shape (n,)."""
+    pairs = zip(state.terms, state.amounts, strict=True)
+    return np.array([a[0] for t, a in pairs if _is_free(t)])
 
 
 def _is_near(errors: Array) -> bool:
