@@ -203,10 +203,9 @@ def validate_calibration(
     session = join_sessions(measured)
     judgement, fit = judge_session(session), repeat_fit(calibration, session)
     refit = _assess_refit(fit, calibration, judgement)
-    before = restore_session(calibration)
-    every = join_sessions([before, *measured])
+    every = join_sessions([restore_session(calibration), *measured])
     anomalies = find_anomalies(every)
-    mistake, changes, wrongly_entered = _find_changes(before, every, anomalies, judgement)
+    mistake, changes, wrongly_entered = _find_changes(every, anomalies, judgement)
     expected_rms, test = expect_rms(calibration, fit), judge_deviations(calibration, fit)
     lead = _agreement(refit, test, expected_rms, explained=bool(changes))
     confirmed = None if math.isnan(test.chance) else _is_confirmed(lead, changes, judgement)
@@ -345,13 +344,12 @@ def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
 
 
 def _find_changes(
-    before: Session, every: Session, anomalies: Anomalies, judgement: Judgement
+    every: Session, anomalies: Anomalies, judgement: Judgement
 ) -> tuple[Anomaly | None, list[Finding], bool]:
     """Changes between the sessions of a calibration and new ones.
 
     Args:
-        before: The sessions of the calibration.
-        every: They and the new ones, joined.
+        every: The session of the calibration and the new ones, joined.
         anomalies: Of all their readings.
         judgement: Judgement of the new sessions by themselves.
 
@@ -366,7 +364,7 @@ def _find_changes(
     findings = describe_anomalies(every, replace(anomalies, found=changes))
     if mistake is None:
         return None, findings, False
-    new = {name.partition("/")[0] for name in list(every.setups)[len(before.setups) :]}
+    new = {name.partition("/")[0] for name in list(every.setups)[len(every.parts[0].setups) :]}
     e = mistake.explanation
     return mistake, findings, e.kind in WRONGLY_ENTERED and e.sessions[0] in new
 

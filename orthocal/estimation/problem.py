@@ -101,6 +101,7 @@ class CalibrationProblem:
         Args:
             values: Readings of the session's rows, shape (n_rows,), [m].
         """
+        _ = self.closure, self.model, self._free_parameters  # built here, not in every copy
         other = copy.copy(self)
         other.session = self.session.with_values(np.asarray(values, dtype=np.float64))
         other.__dict__.pop("values", None)

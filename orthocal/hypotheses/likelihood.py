@@ -207,18 +207,17 @@ class Likelihood:
             for p, k in zip(chosen, sizes, strict=True)
         ]
         positive = np.concatenate([*signs, np.zeros(n_silent, bool)])
-        gains = []
-        for taus in grid:
-            precision = np.append(np.repeat(np.array(taus) ** -2.0, sizes), np.zeros(n_silent))
-            gains.append(_integrate_amounts(gram, slope, precision, positive))
-        every = logs + log_of_sum(np.array(gains), axis=0) - np.log(len(grid))
+        known = np.repeat(np.array(grid) ** -2.0, sizes, axis=1)
+        precision = np.hstack([known, np.zeros((len(grid), n_silent))])
+        gains = _integrate_amounts(gram, slope, precision, positive)
+        every = logs + log_of_sum(gains, axis=0) - np.log(len(grid))
         every = every + 0.5 * n_silent * np.log(2.0 * np.pi)
         # the amount of an effect that no entry shows is 0, with a standard deviation beyond all
         floor = 1e-12 * np.trace(gram, axis1=1, axis2=2) + (LARGEST_AMOUNT * self.sigma) ** -2
         gram = gram + floor[:, None, None] * np.eye(len(vectors))
-        likeliest = grid[int(np.argmax([log_of_sum(logs + g) for g in gains]))]
-        known = [t**-2.0 if p else 0.0 for p, t in zip(chosen, likeliest, strict=True)]
-        gram = gram + np.diag(np.append(np.repeat(known, sizes), np.zeros(n_silent)))
+        likeliest = grid[int(np.argmax(log_of_sum(logs + gains, axis=1)))]
+        chosen_precision = [t**-2.0 if p else 0.0 for p, t in zip(chosen, likeliest, strict=True)]
+        gram = gram + np.diag(np.append(np.repeat(chosen_precision, sizes), np.zeros(n_silent)))
         return self._best(every, np.linalg.solve(gram, slope[..., None])[..., 0], gram)
 
     def _best(self, logs: Array, amounts: Array, gram: Array) -> Score:
@@ -260,7 +259,7 @@ def _grid_of_stds(stds: Sequence[Array]) -> list[tuple[float, ...]]:
 
 
 def _integrate_amounts(gram: Array, slope: Array, precision: Array, positive: Mask) -> Array:
-    """Gain of log likelihood by amounts with a normal or half-normal prior, shape (g,).
+    """Gain of log likelihood by amounts with normal or half-normal priors, shape (t, g).
 
     A half-normal amount a ≥ 0 has twice the density, and of its posterior N(m, s²) the part above
     0 counts: ln 2 Φ(m/s). Several are treated as independent, which is much faster than their
@@ -272,18 +271,19 @@ def _integrate_amounts(gram: Array, slope: Array, precision: Array, positive: Ma
     Args:
         gram: W V⁻¹ Wᵀ, shape (g, k, k).
         slope: W V⁻¹ d, shape (g, k).
-        precision: Of the priors, 0 for a flat one, shape (k,).
+        precision: Of t sets of priors, 0 for a flat one, shape (t, k).
         positive: Mask of half-normal priors, shape (k,).
     """
-    full = gram + np.diag(precision)
-    solution = np.linalg.solve(full, slope[..., None])[..., 0]
-    gain = 0.5 * ((slope * solution).sum(axis=1) - np.linalg.slogdet(full)[1])
-    gain += 0.5 * np.log(precision[precision > 0.0]).sum()
+    full = gram + precision[:, None, :, None] * np.eye(precision.shape[1])
+    right = np.broadcast_to(slope[..., None], (*full.shape[:3], 1))
+    solution = np.linalg.solve(full, right)[..., 0]
+    gain = 0.5 * ((slope * solution).sum(axis=-1) - np.linalg.slogdet(full)[1])
+    gain += 0.5 * np.log(np.where(precision > 0.0, precision, 1.0)).sum(axis=1)[:, None]
     if positive.any():
-        stds = np.sqrt(np.diagonal(np.linalg.inv(full), axis1=1, axis2=2))
-        ratio = (solution / stds)[:, positive]
+        stds = np.sqrt(np.diagonal(np.linalg.inv(full), axis1=-2, axis2=-1))
+        ratio = (solution / stds)[..., positive]
         doubled = [math.erfc(-r / math.sqrt(2.0)) for r in ratio.ravel().tolist()]
-        gain += np.log(np.maximum(doubled, LEAST_CHANCE)).reshape(ratio.shape).sum(axis=1)
+        gain += np.log(np.maximum(doubled, LEAST_CHANCE)).reshape(ratio.shape).sum(axis=-1)
     return np.asarray(gain)
 
 

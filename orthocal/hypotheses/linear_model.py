@@ -296,20 +296,25 @@ class LinearModel:
     ) -> Iterator[ModelLinearisation | None]:
         """Linearise the model about a few points at once, or one by one if one of them fails."""
         machines = [self._machines(p.theta, p.shifts) for p in points]
-        counts = [len(thetas) for thetas, _ in machines]
-        starts = np.repeat(np.array([p.start for p in points]), counts, axis=0)
+        place: dict[tuple[bytes, int], int] = {}
+        rows = [
+            [place.setdefault((theta.tobytes(), id(p.start)), len(place)) for theta in thetas]
+            for p, (thetas, _) in zip(points, machines, strict=True)
+        ]
+        every = np.empty((len(place), self.problem.n_free))
+        starts = np.empty((len(place), *points[0].start.shape))
+        for point, (thetas, _), at in zip(points, machines, rows, strict=True):
+            every[at], starts[at] = thetas, point.start
         together = None
         if len(points) > 1:
             with suppress(ClosureError, np.linalg.LinAlgError):
-                together = self._predict(np.concatenate([t for t, _ in machines]), starts)
-        first = 0
-        for point, (thetas, of_session) in zip(points, machines, strict=True):
-            part = slice(first, first := first + len(thetas))
+                together = self._predict(every, starts)
+        for point, (thetas, of_session), at in zip(points, machines, rows, strict=True):
             try:
                 predicted = (
-                    self._predict(thetas, starts[part])
+                    self._predict(thetas, starts[at])
                     if together is None
-                    else [values[part] for values in together]
+                    else [values[at] for values in together]
                 )
                 yield self._assemble(point.theta, of_session, *predicted, slopes=slopes)
             except (ClosureError, SessionError, np.linalg.LinAlgError):

@@ -210,7 +210,7 @@ class _Search:
         the nonlinear part looks like errors far beyond their tolerances. Such a step does not count
         unless the next step returns within FURTHEST. No step exceeds EXTREME.
         """
-        tracks = [[self._begin(terms, start)] for terms in several]
+        tracks = [[state] for state in self._begin(list(several), start)]
         moving = tracks
         for k in range(MOST_ROUNDS):
             points = [self._next_point(states[-1], first=k == 0) for states in moving]
@@ -227,14 +227,26 @@ class _Search:
             for states in tracks
         ]
 
-    def _begin(self, terms: Sequence[Term], start: ModelLinearisation) -> HypothesisSet:
-        """A set of hypotheses about a start; with changes of the machine, about the sound one."""
-        about, free = start, [t for t in terms if _is_free(t)]
-        if any(t.shift is not None for t in terms):
-            about = base = self.sound.about
-            if known := _known_shifts(terms):
-                about = self.model.linearise(base.theta, known, base.passive, slopes=True)
-        return self._evaluate_about(terms, about, np.zeros(len(free)))
+    def _begin(
+        self, several: Sequence[Sequence[Term]], start: ModelLinearisation
+    ) -> list[HypothesisSet]:
+        """Sets of hypotheses about a start; those that change the machine about the sound one."""
+        model, shifts = self.model, [_known_shifts(terms) for terms in several]
+        if any(t.shift is not None for terms in several for t in terms):
+            sound = self.sound.about
+            points = [LinearisationPoint(sound.theta, s, sound.passive) for s in shifts if s]
+            shifted = iter(model.linearise_all(points, slopes=True))
+        states = []
+        for terms, known in zip(several, shifts, strict=True):
+            about = start
+            if known:
+                about = next(shifted) or model.linearise(
+                    sound.theta, known, sound.passive, slopes=True
+                )
+            elif any(map(_is_free, terms)):
+                about = sound
+            states.append(self._evaluate_about(terms, about, np.zeros(sum(map(_is_free, terms)))))
+        return states
 
     def _next_point(self, state: HypothesisSet, *, first: bool) -> LinearisationPoint | None:
         """The errors that a set implies, to linearise about; None if they are near or too far."""

@@ -1,0 +1,89 @@
+"""The linearised model about several machines at once, and what is kept of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from orthocal import join_sessions, load_session
+from orthocal.hypotheses import linear_model as module
+from orthocal.hypotheses.hypothesis import MachineShift
+from orthocal.hypotheses.linear_model import LinearisationPoint, LinearModel, linear_model
+from orthocal.measurement.joining import split_sessions
+
+
+@pytest.fixture(scope="module")
+def joined(root):
+    return join_sessions([load_session(root / f"examples/{n}") for n in ("raw-cycles", "workshop")])
+
+
+@pytest.fixture(scope="module")
+def model(joined):
+    return LinearModel(joined)
+
+
+def points(model, rng, *, unreachable=()):
+    """Machines with errors of half their tolerances, the last of them with changes."""
+    start, n = model.problem.active_passive, model.problem.n_free
+    changes = [
+        MachineShift(np.array([False, True]), rng.normal(size=n)),
+        MachineShift(np.array([True, False]), 0.3 * rng.normal(size=n)),
+    ]
+    return [
+        LinearisationPoint(
+            1e3 * np.ones(n) if i in unreachable else 0.5 * rng.normal(size=n),
+            changes[: max(0, i - 1)],
+            start,
+        )
+        for i in range(4)
+    ]
+
+
+@pytest.mark.parametrize(("unreachable", "most"), [((), 1600), ((), 100), ((1,), 1600)])
+def test_several_machines_are_linearised_as_each_alone(model, unreachable, most, monkeypatch):
+    monkeypatch.setattr(module, "MOST_ENTRIES", most)
+    chosen = points(model, np.random.default_rng(3), unreachable=unreachable)
+    together = model.linearise_all(chosen, slopes=True)
+    assert [i for i, one in enumerate(together) if one is None] == list(unreachable)
+    for point, found in zip(chosen, together, strict=True):
+        if found is None:
+            continue
+        alone = model.linearise(point.theta, point.shifts, point.start, slopes=True)
+        scale = np.abs(alone.slopes).max()
+        assert np.abs(found.slopes - alone.slopes).max() < 1e-12 * scale
+        assert np.abs(found.expected - alone.expected).max() < 1e-12 * scale
+        assert np.abs(found.passive - alone.passive).max() < 1e-12
+        assert np.array_equal(found.theta, point.theta)
+
+
+def test_a_change_concerns_the_readings_of_its_sessions(model):
+    plain, _, changed, _ = points(model, np.random.default_rng(3))
+    later = model.session_of_entry == 1
+    given = LinearisationPoint(plain.theta, changed.shifts, plain.start)
+    without, found = model.linearise_all([plain, given], slopes=True)
+    assert np.array_equal(found.slopes[~later], without.slopes[~later])
+    assert np.abs(found.slopes - without.slopes)[later].max() > 1e-8
+
+
+def test_the_model_of_the_same_rows_is_built_once(joined):
+    assert linear_model(joined).problem.model is linear_model(joined).problem.model
+    for one, other in zip(split_sessions(joined), split_sessions(joined), strict=True):
+        assert one is other
+        # the complete model by its name, and with other readings
+        named = linear_model(one.with_values(one.values + 1e-5), "full")
+        assert named.problem.model is linear_model(one).problem.model
+        assert np.array_equal(named.problem.session.values, one.values + 1e-5)
+    values = joined.values + 1e-5 * (np.arange(joined.values.size) % 3)
+    changed = linear_model(joined.with_values(values))
+    # their gauges' noise may come from the readings
+    assert changed.problem.model is not linear_model(joined).problem.model
+
+
+def test_the_most_likely_machine_is_that_of_the_readings(joined):
+    one, _ = split_sessions(joined)
+    first = linear_model(one).most_likely(one.values)
+    assert linear_model(one).most_likely(one.values) is first
+    other = linear_model(one).most_likely(1.1 * one.values)
+    assert np.abs(other.theta - first.theta).max() > 1e-3
+    again = LinearModel(one).most_likely(one.values)
+    assert np.abs(again.theta - first.theta).max() < 1e-9
