@@ -210,8 +210,7 @@ def validate_calibration(
     lead = _agreement(refit, test, expected_rms, explained=bool(changes))
     confirmed = None if math.isnan(test.chance) else _is_confirmed(lead, changes, judgement)
     joint = _calibrate_jointly(calibration, every, anomalies) if confirmed else None
-    further = [] if joint is None else _find_further_change(joint)
-    assessed = assessment_of(joint or refit)
+    further, assessed = _find_further_change(joint), assessment_of(joint or refit)
     keep = wrongly_entered or (confirmed is not False and not further)
     entries = find_entries(calibration) if keep else assessed.entries
     repetition = measure_repetition(calibration, refit)
@@ -404,8 +403,10 @@ def _agreement(
     return words.as_predicted(achieved, test.limit * achieved, numbers)
 
 
-def _find_further_change(joint: Calibration) -> list[Finding]:
-    """Finding about offsets that a calibration from all readings changes."""
+def _find_further_change(joint: Calibration | None) -> list[Finding]:
+    """Finding about offsets that a calibration from all readings changes; none without one."""
+    if joint is None:
+        return []
     judged = assessment_of(joint)
     if judged.keeps_offsets:
         return []
