@@ -1,6 +1,7 @@
 """Commands as a shell has them, run here: their imports and functions are those of one process.
 
 A process of its own begins the command line in `test_cli.py`, `test_streams.py`, `test_package.py`.
+Without `--workers` a command here begins no processes: tests occupy all cores.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import NamedTuple
 from unittest.mock import patch
 
 from orthocal.cli import main
+from orthocal.runtime import worker_pool
 
 
 class Done(NamedTuple):
@@ -32,7 +34,11 @@ def run_here(folder, act, *, argv=("orthocal",), typed=""):
     stdin = io.TextIOWrapper(io.BytesIO(typed.encode()), encoding="utf-8")
     code = 0
     with chdir(folder), redirect_stdout(out), redirect_stderr(err):
-        with patch.object(sys, "argv", list(argv)), patch.object(sys, "stdin", stdin):
+        with (
+            patch.object(sys, "argv", list(argv)),
+            patch.object(sys, "stdin", stdin),
+            patch.object(worker_pool, "available_cores", lambda: 1),
+        ):
             try:
                 act()
             except SystemExit as e:

@@ -66,5 +66,5 @@ def test_prepare_measure_calibrate_and_use(root, workplace):
 
 def test_study(root, workplace):
     words = ["study", "bootstrap", root / "examples/workshop", "--model", "offsets"]
-    words += ["--draws", 20, "--seed", 1]
+    words += ["--draws", 20, "--seed", 1, "--workers", 2]
     run(*words, "--out", "study", cwd=workplace)
