@@ -14,6 +14,8 @@ INSTALLED = $(VENV)/.installed
 TESTED = $(VENV)/.installed-test
 DOCUMENTED = $(VENV)/.installed-docs
 
+unexport PYTHONDONTWRITEBYTECODE  # processes of tests do not compile what others have compiled
+
 .PHONY: calibrate test benchmarks smoke check docs clean
 
 calibrate: $(INSTALLED)
@@ -21,7 +23,8 @@ calibrate: $(INSTALLED)
 
 test: $(TESTED)
 	$(MAKE) --jobs 2 --output-sync check benchmarks
-	$(VENV)/bin/python -m pytest --numprocesses $(WORKERS) --dist worksteal --ignore tests/benchmarks
+	$(VENV)/bin/python -m pytest --numprocesses $(WORKERS) --dist worksteal -m "not smoke" \
+	  --ignore tests/benchmarks
 
 benchmarks: $(TESTED)  # not among the other tests: they compare times
 	$(VENV)/bin/python -m pytest tests/benchmarks
@@ -30,6 +33,7 @@ check: $(TESTED)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
+	$(VENV)/bin/python -m pytest --collect-only -qq tests > /dev/null  # compiles them for all workers
 
 smoke: $(TESTED)
 	$(VENV)/bin/python .ci/smoke.py

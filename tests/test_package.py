@@ -72,6 +72,7 @@ def test_the_installed_wheel_calibrates_from_elsewhere(wheel, root, tmp_path):
         text=True,
         check=True,
     )
+    assert "Warning" not in done.stderr
     document = json.loads(done.stdout)
     assert document["parameters"][0]["value"] == pytest.approx(-0.5268e-3, abs=5e-6)
     assert document["robot"]["directory"] is None

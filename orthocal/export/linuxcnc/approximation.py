@@ -47,6 +47,9 @@ EXTRA_NODES = 3
 CHECKED = 1000
 """Number of checked points inside the region, and on its faces, edges and corners."""
 
+CHECKED_FIRST = 100
+"""Number of points at which degrees that are too low are refused, of those on the surface."""
+
 RESERVE = 1.1
 """Factor on the largest error at the checked points."""
 
@@ -61,6 +64,8 @@ WARMER = 15.0
 
 HEAVIER = 1.0
 """Change of the payload of which the effect is stated, [kg]."""
+
+EVERY = slice(None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -181,16 +186,25 @@ class _State:
     passive: Array
     """Passive coordinates there, from which loops are closed, (n_checks, n_passive), [m, rad]."""
 
-    def error(self, checks: Array, inverse: CorrectedInverse, *, cold: bool = False) -> float:
+    def error(
+        self,
+        checks: Array,
+        inverse: CorrectedInverse,
+        *,
+        cold: bool = False,
+        rows: slice = EVERY,
+    ) -> float:
         """Largest error at the checked points, [m]; infinite out of reach.
 
         Args:
             checks: Shape (n_checks, n), [m].
             inverse: The approximation.
             cold: Whether it does not know the temperature.
+            rows: Points that are checked.
         """
-        drives = inverse(checks, None if cold else self.temperature)
-        tip_error = _tip_error(self.tip, checks, drives, start=self.passive)
+        points = checks[rows]
+        drives = inverse(points, None if cold else self.temperature)
+        tip_error = _tip_error(self.tip, points, drives, start=self.passive[rows])
         return math.inf if tip_error is None else tip_error
 
 
@@ -238,19 +252,28 @@ def approximate(
         )
     form = find_nominal_form(robot, middle, half)
     corrections = np.asarray(states[0].drives) - form(middle + half * nodes)
-    change, best = _find_change(states), math.inf
+    change, refused = _find_change(states), list[CorrectedInverse]()
     for degree in range(1, most + 1):
         fit = PolynomialFit(nodes, total_degree(n, degree))
         thermal = None if change is None else change.fitted(fit, middle, half)
         inverse = CorrectedInverse(form, fit(middle, half, corrections), thermal)
-        error = RESERVE * max(state.error(checks, inverse) for state in states)
-        best = min(best, error)
-        if error <= within:
-            return _describe(calibration, states, inverse, checks, error, payload)
+        if _largest_error(states, checks, inverse, rows=slice(-CHECKED_FIRST, None)) <= within:
+            error = _largest_error(states, checks, inverse)
+            if error <= within:
+                return _describe(calibration, states, inverse, checks, error, payload)
+        refused.append(inverse)
+    best = min(_largest_error(states, checks, inverse) for inverse in refused)
     raise ExportError(
         f"no polynomial of a degree up to {most} keeps the tool within {within / UM:g} µm "
         f"over {describe_box(box)}; the best of them reaches {rounded_up(best / UM)} µm"
     )
+
+
+def _largest_error(
+    states: Sequence[_State], checks: Array, inverse: CorrectedInverse, *, rows: slice = EVERY
+) -> float:
+    """Largest error in all states at the checked points, with the reserve, [m]."""
+    return RESERVE * max(state.error(checks, inverse, rows=rows) for state in states)
 
 
 def _reach_states(
