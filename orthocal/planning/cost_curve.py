@@ -10,6 +10,7 @@ from itertools import islice
 import numpy as np
 
 from orthocal.errors import ParameterError
+from orthocal.planning.expected_error import Criterion, Expected
 from orthocal.planning.timed_search import TimedSearch
 
 ENOUGH = 0.05
@@ -67,6 +68,27 @@ def scale_curve(curve: Sequence[Stage], factor: float, rest: float) -> tuple[Sta
         rest: Error of what is not identified, [m].
     """
     return tuple(replace(s, error=factor * math.hypot(s.error, rest)) for s in curve)
+
+
+def find_scale(
+    searched: float, expected: Expected, nominal: Expected, criterion: Criterion
+) -> tuple[float, float]:
+    """Factor and additional error with which the search's error becomes the expected one.
+
+    Gauges on machines within their tolerances are less sensitive than on the nominal one, errors
+    that are not identified remain, and the search omits the readings that close a setup.
+
+    Args:
+        searched: Error after the same readings in the search.
+        expected: Expected error of machines within their tolerances.
+        nominal: The same about the nominal machine.
+        criterion: Criterion of the search.
+    """
+    rms = nominal.rms_by(criterion)
+    if math.isnan(rms):
+        return 1.0, 0.0
+    remainder = math.sqrt(max(rms**2 - searched**2, 0.0))
+    return expected.rms_by(criterion) / math.hypot(searched, remainder), remainder
 
 
 def find_enough(curve: Sequence[Stage]) -> Stage | None:

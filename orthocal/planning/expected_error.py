@@ -156,6 +156,22 @@ class ToolForecast:
         """Calibration problem of a session's readings."""
         return weigh_readings(CalibrationProblem(session, self.selection))
 
+    def prior_of(
+        self, problem: CalibrationProblem, state: Sequence[str], measured: Session | None
+    ) -> Array:
+        """Inverse covariance of the state before: from priors, and from measured readings.
+
+        Args:
+            problem: Problem whose free parameters include the state.
+            state: Names of its parameters.
+            measured: Existing readings.
+        """
+        index = [problem.free.index(name) for name in state]
+        prior = np.diag(np.maximum(problem.prior_precision[index], VAGUE))
+        if measured is None:
+            return np.asarray(prior)
+        return np.asarray(prior + _information(self.problem(measured), state, measured))
+
     def after(
         self,
         session: Session,
@@ -349,6 +365,26 @@ def _root(rows: Array) -> Array:
     values, vectors = np.linalg.eigh(rows.T @ rows)
     positive = values > values[-1] * 1e-14
     return np.asarray(vectors[:, positive] * np.sqrt(values[positive]))
+
+
+def _information(problem: CalibrationProblem, state: Sequence[str], measured: Session) -> Array:
+    """Information of a session about the state, its other parameters marginalised."""
+    _, jacobian = problem.predict_and_jacobian(problem.active_theta)
+    jacobian = project_out_zeros(jacobian, problem.observations)
+    information = jacobian.T @ jacobian / noise_of(measured) ** 2
+    others = [i for i, name in enumerate(problem.free) if name not in state]
+    state_columns = [problem.free.index(name) for name in state if name in problem.free]
+    where = [i for i, name in enumerate(state) if name in problem.free]
+    inner = information[np.ix_(others, others)] + np.diag(
+        np.maximum(problem.prior_precision[others], VAGUE)
+    )
+    cross = information[np.ix_(state_columns, others)]
+    shared = information[np.ix_(state_columns, state_columns)]
+    if others:
+        shared = shared - cross @ np.linalg.solve(inner, cross.T)
+    result = np.zeros((len(state), len(state)))
+    result[np.ix_(where, where)] = shared
+    return result
 
 
 def noise_of(session: Session) -> float:

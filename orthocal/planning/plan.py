@@ -10,13 +10,11 @@ from functools import partial
 
 import numpy as np
 
-from orthocal.arrays import Array
 from orthocal.assessment.effect_limits import EffectLimits, find_limits
 from orthocal.assessment.remaining_errors import RemainingError, rank_errors
 from orthocal.effects.loading import robot_effects, with_effects
 from orthocal.errors import ParameterError
 from orthocal.estimation.choice import Choice, resolve_choice
-from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.workspace import Workspace
 from orthocal.measurement.motion.approach import usual_approaches
 from orthocal.planning.candidates import (
@@ -32,6 +30,7 @@ from orthocal.planning.cost_curve import (
     Stage,
     compute_curve,
     find_enough,
+    find_scale,
     scale_curve,
 )
 from orthocal.planning.equipment import Equipment
@@ -46,13 +45,12 @@ from orthocal.planning.further_readings import FurtherReadings, find_further_rea
 from orthocal.planning.plan_comparison import Alternative, Comparison
 from orthocal.planning.planned_session import build_session
 from orthocal.planning.selection import KILLED, PlannedSetup, PlannedSetups, SetupSearch
+from orthocal.planning.sensor_gains import SensorGain, find_sensor_gains
 from orthocal.planning.timed_search import TimedSearch
 from orthocal.robot.model import Robot
 from orthocal.runtime.worker_pool import call_in_parallel, run_in_parallel, worker_budget
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.session.session import Purpose, Session
-from orthocal.statistics.information import VAGUE
-from orthocal.statistics.zeros import project_out_zeros
 
 MODEL = "full"
 """Model that a plan identifies by default: the complete machine with priors."""
@@ -109,6 +107,13 @@ class MeasuringPlan:
     """Limits of the effects beside geometry, before and after."""
     further: tuple[FurtherReadings, ...] = ()
     """Readings for the effects that this plan does not determine."""
+    complete: Session | None = None
+    """The readings with those that they complement, in the course of a day."""
+
+    def find_sensor_gains(self) -> tuple[SensorGain, ...]:
+        """Gains of an hour with each usual sensor after these readings, the largest first."""
+        session = self.session if self.complete is None else self.complete
+        return find_sensor_gains(self.forecast, session, self.expected)
 
     def find_remaining(self, *, count: int = 3) -> tuple[RemainingError, ...]:
         """Combinations of errors with the largest effect at the tool after these readings."""
@@ -237,7 +242,7 @@ def _plan(
     )
     search = SetupSearch.of(
         candidates,
-        _prior(candidates, forecast, measured),
+        forecast.prior_of(candidates.problem, candidates.state, measured),
         forecast.weigh(work.criterion, len(candidates.state)),
     )
     timed = TimedSearch(search, equipment.durations(session), equipment.once)
@@ -379,7 +384,7 @@ def _evaluate(
             killed=KILLED,
         )
     stage = Stage(setups, readings, minutes, planned.error)
-    factor, remainder = _scale(stage, expected, nominal, work.criterion)
+    factor, remainder = find_scale(stage.error, expected, nominal, work.criterion)
     return MeasuringPlan(
         session=plan,
         forecast=forecast,
@@ -397,53 +402,8 @@ def _evaluate(
         complements=measured is not None,
         effects=limits,
         further=find_further_readings(comparison, limits),
+        complete=joined,
     )
-
-
-def _scale(
-    stage: Stage, expected: Expected, nominal: Expected, criterion: Criterion
-) -> tuple[float, float]:
-    """Factor and additional error with which the search's error becomes the expected one.
-
-    Gauges on machines within their tolerances are less sensitive than on the nominal one, errors
-    that are not identified remain, and the search omits the readings that close a setup.
-    """
-    rms = nominal.rms_by(criterion)
-    if math.isnan(rms):
-        return 1.0, 0.0
-    remainder = math.sqrt(max(rms**2 - stage.error**2, 0.0))
-    return expected.rms_by(criterion) / math.hypot(stage.error, remainder), remainder
-
-
-def _prior(candidates: Candidates, forecast: ToolForecast, measured: Session | None) -> Array:
-    """Inverse covariance of the state before: from priors, and from measured readings."""
-    problem = candidates.problem
-    index = [problem.free.index(name) for name in candidates.state]
-    prior = np.diag(np.maximum(problem.prior_precision[index], VAGUE))
-    if measured is None:
-        return np.asarray(prior)
-    measured_problem = forecast.problem(measured)
-    return np.asarray(prior + _information(measured_problem, candidates.state, measured))
-
-
-def _information(problem: CalibrationProblem, state: Sequence[str], measured: Session) -> Array:
-    """Information of a session about the state, its other parameters marginalised."""
-    _, jacobian = problem.predict_and_jacobian(problem.active_theta)
-    jacobian = project_out_zeros(jacobian, problem.observations)
-    information = jacobian.T @ jacobian / noise_of(measured) ** 2
-    others = [i for i, name in enumerate(problem.free) if name not in state]
-    state_columns = [problem.free.index(name) for name in state if name in problem.free]
-    where = [i for i, name in enumerate(state) if name in problem.free]
-    inner = information[np.ix_(others, others)] + np.diag(
-        np.maximum(problem.prior_precision[others], VAGUE)
-    )
-    cross = information[np.ix_(state_columns, others)]
-    shared = information[np.ix_(state_columns, state_columns)]
-    if others:
-        shared = shared - cross @ np.linalg.solve(inner, cross.T)
-    result = np.zeros((len(state), len(state)))
-    result[np.ix_(where, where)] = shared
-    return result
 
 
 def _list_counts(

@@ -108,12 +108,14 @@ class Comparison:
 
     def list_alternatives(self) -> tuple[Alternative, ...]:
         """Plans with a finer dial, a blade, or one square block for each leg."""
+        sensors = [s for s in map(indicator_of, self.plan.setups.values()) if s is not None]
+        if not sensors:
+            return ()
         changes: list[tuple[str, Callable[[Session], Session]]] = [
             ("a dial of half the scatter and resolution", _with_finer_dial),
             ("each leg's gauges on one square block", _with_blocks),
         ]
-        sensors = map(indicator_of, self.plan.setups.values())
-        if any(s is not None and s.tip.form == "ball" for s in sensors):
+        if any(s.tip.form == "ball" for s in sensors):
             changes.append(("a blade instead of the ball", _with_blade))
         alternatives = []
         for name, change in changes:

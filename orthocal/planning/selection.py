@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import zip_longest
@@ -378,16 +378,19 @@ class Gains:
             completed.append((gain, PlannedSetup(which, chosen)))
         return [planned for _, planned in sorted(completed, key=lambda c: -c[0])]
 
-    def begin(self, count: int) -> list[tuple[int, tuple[int, int]]]:
+    def begin(
+        self, count: int, gauges: Collection[str] | None = None
+    ) -> list[tuple[int, tuple[int, int]]]:
         """Setups of each gauge whose best pair of readings gains most, with this pair.
 
         Args:
             count: Number of readings that the range of the gauge allows beside the first one.
+            gauges: Names of the gauges; by default all.
         """
         present = [
             (gain, which, pair)
-            for which in range(len(self.search.reduced))
-            if self._pairs(which, count).flat.size
+            for which, setup in enumerate(self.search.reduced)
+            if (gauges is None or setup.gauge in gauges) and self._pairs(which, count).flat.size
             for gain, pair in self._ranking_setup(which).best_pairs(self._pairs(which, count), 1)
         ]
         present.sort(key=lambda b: -b[0])

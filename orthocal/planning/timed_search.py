@@ -60,7 +60,7 @@ class TimedSearch:
 
     search: SetupSearch
     durations: Mapping[str, Duration]
-    """Of each gauge, by its name."""
+    """Of each gauge to use, by its name."""
     once: frozenset[str] = frozenset()
     """Gauges of which a plan has one setup at most: a bed does not move."""
 
@@ -136,6 +136,10 @@ class TimedSearch:
                 break
         return plan
 
+    def fill(self, minutes: float) -> PlannedSetups:
+        """Setups within a time, of the largest gain per minute, without exchanges."""
+        return self._fill(self.search.empty, minutes)
+
     def grow(self) -> Iterator[PlannedSetups]:
         """Plans with one setup more each, of the largest gain per minute."""
         plan = self.search.empty
@@ -172,13 +176,12 @@ class TimedSearch:
             name: 0 if name in used else d.most(minutes, READINGS[-1])
             for name, d in self.durations.items()
         }
-        if max(most.values()) < FEWEST:
+        able = {name for name, count in most.items() if count >= FEWEST}
+        if not able:
             return []
         gains, options = Gains.of(self.search, plan.information), list[_Option]()
-        for which, pair in gains.begin(FEWEST):
+        for which, pair in gains.begin(FEWEST, able):
             gauge = self.search.reduced[which].gauge
-            if most[gauge] < FEWEST:
-                continue
             reached, chosen = gains.setup(which, pair[0]).grow(pair, most[gauge])
             for count in {n for n in READINGS if n < len(chosen)} | {len(chosen)}:
                 duration = self.durations[gauge].of(count)

@@ -33,7 +33,7 @@ from orthocal.output.sheet.gauge_position import (
 from orthocal.output.sheet.pictures import draw_machine, draw_section, draw_tool
 from orthocal.output.text.layout import counted, true_minus
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import mounting_steps
+from orthocal.sensors.protocol import mounting_steps, tool_path
 from orthocal.session.session import Session, Setup
 from orthocal.units import DRIVE_UNITS, LIMIT, MM, format_fixed
 from orthocal.viewer.visuals import load_visuals
@@ -455,6 +455,13 @@ def _contact_rule(session: Session, motions: Sequence[SetupMotion]) -> str:
 def _approach_rule(session: Session, motions: Sequence[SetupMotion]) -> str:
     """Rule for the last motion to a posture, in joint numbers."""
     robot, length = session.robot, approach_length(session)
+    guided = [n for n, s in session.setups.items() if tool_path(s.sensor) is not None]
+    arcs = ""
+    if guided and not any(r.approach for r in session.readings):  # the table has no arrows
+        motions = [m for m in motions if m.setup not in guided]
+        arcs = "Around a fixed ball the programs move along arcs. If you jog, stay near the sphere."
+    if not motions:
+        return arcs
     arrows = {describe_approach(robot, s.approach) for m in motions for s in m.stops}
     jog = (
         f"If you jog, go {length} past the posture with every joint first, and come back to it in "
@@ -469,7 +476,7 @@ def _approach_rule(session: Session, motions: Sequence[SetupMotion]) -> str:
     (arrow,) = arrows
     return (
         f"Approach every posture from the same side: the last {length} go towards "
-        f"{_describe_arrow(robot, arrow)}. The programs do this. {jog}."
+        f"{_describe_arrow(robot, arrow)}. The programs do this. {jog}. {arcs}".rstrip()
     )
 
 

@@ -18,6 +18,7 @@ from orthocal.assessment.tool_error import (
     assess_tool,
     summarise_tool,
 )
+from orthocal.assessment.wording import tool_mm
 from orthocal.assessment.words.entries import (
     describe_compensated,
     describe_tool_error,
@@ -25,9 +26,13 @@ from orthocal.assessment.words.entries import (
     describe_use_parts,
 )
 from orthocal.calibration.calibration import Calibration
-from orthocal.errors import ClosureError, RobotError
+from orthocal.calibration.refit import restore_session
+from orthocal.errors import ClosureError, OrthocalError, RobotError
+from orthocal.estimation.selection import complete_model, select_parameters
 from orthocal.output.text.conditions import describe_conditions_of
 from orthocal.output.text.layout import noted, print_rich, table_of, um
+from orthocal.planning.expected_error import ToolForecast, state_noise
+from orthocal.planning.sensor_gains import SensorGain, find_sensor_gains
 from orthocal.units import MM, UM, read_limit
 
 POINT_COLUMNS = (
@@ -52,6 +57,9 @@ COLUMNS_NOTE = (
 UNCERTAINTY_NOTE = (
     "Uncertainty: RMS in space. Errors that were not identified are included with their tolerances."
 )
+
+NOTICEABLE = 0.02
+"""Relative reduction of a tool error below which a sensor is not listed."""
 
 MOST_PARTS = 5
 """Largest number of parameters that are listed of a combination."""
@@ -114,7 +122,51 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
                 )
                 notes += describe_use_parts(summary)
         notes += describe_remaining(find_remaining_errors(calibration, accuracy, count=2))
+        notes += _describe_sensors(calibration, accuracy)
     return noted(table_of(headers, cells), *notes)
+
+
+def _describe_sensors(calibration: Calibration, accuracy: ToolAccuracy) -> list[str]:
+    """Tool errors after an hour with each sensor that helps, as sentences.
+
+    For a controller that corrects all errors, to first order about the nominal machine.
+    """
+    if calibration.only_offsets:
+        return []
+    session = restore_session(calibration)
+    parameters, scale = session.robot.parameters, calibration.tolerance_scale
+    selection = select_parameters(
+        parameters, model=complete_model(parameters), tolerance_scale=scale
+    )
+    workspace = accuracy.workspace.once(accuracy.use.size)
+    try:
+        session = state_noise(session)
+        forecast = ToolForecast(session.robot, selection, workspace, use=accuracy.use)
+        expected = forecast.about_nominal(session)
+        gains = find_sensor_gains(forecast, session, expected)
+    except OrthocalError:  # the noise of the readings is unknown, or no drives command the tool
+        return []
+    return describe_gains(gains, expected.reported.rms)
+
+
+def helpful_gains(gains: Iterable[SensorGain], rms: float, least: float) -> list[SensorGain]:
+    """Sensors with which an hour reduces a tool error by a fraction, at least."""
+    return [gain for gain in gains if gain.rms < (1.0 - least) * rms]
+
+
+def describe_gains(gains: Iterable[SensorGain], rms: float) -> list[str]:
+    """Tool errors after another hour with each sensor that helps, in a sentence.
+
+    Args:
+        gains: Gains of the sensors.
+        rms: Expected tool error without them, [m].
+    """
+    shown = tool_mm(rms)
+    helpful = [g for g in helpful_gains(gains, rms, NOTICEABLE) if tool_mm(g.rms) != shown]
+    if not helpful:
+        return []
+    each = "; ".join(f"{tool_mm(gain.rms)} with {gain.words}" for gain in helpful)
+    return [f"Another hour, with all errors corrected: {each} (now {shown})."]
 
 
 def describe_remaining(errors: Iterable[RemainingError]) -> list[str]:

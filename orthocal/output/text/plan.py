@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -17,14 +18,25 @@ from orthocal.assessment.words.entries import describe_aligned
 from orthocal.kinematics.conditions import stated_use
 from orthocal.kinematics.workspace import find_workspace
 from orthocal.measurement.motion.approach import approach_length, describe_approach
-from orthocal.output.text.accuracy import describe_remaining
+from orthocal.output.text.accuracy import (
+    NOTICEABLE,
+    describe_gains,
+    describe_remaining,
+    helpful_gains,
+)
 from orthocal.output.text.layout import bullets, counted, plain, section, table_of
 from orthocal.planning.cost_curve import ENOUGH, HOUR, Stage
 from orthocal.planning.expected_error import Criterion, Expected
 from orthocal.planning.further_readings import FurtherReadings
 from orthocal.planning.plan import MeasuringPlan
 from orthocal.planning.plan_comparison import Alternative
+from orthocal.planning.sensor_gains import SensorGain
 from orthocal.robot.model import Robot
+from orthocal.sensors.ball_bar import BallBar
+from orthocal.sensors.leg_indicator import LegIndicator
+from orthocal.sensors.probe import Probe
+from orthocal.sensors.protocol import tool_path
+from orthocal.sensors.tool_indicator import ToolIndicator
 from orthocal.session.session import Reading, Session
 from orthocal.units import EDGE_UNITS, MM, UM
 
@@ -48,13 +60,27 @@ SOME_LOST = 0.01
 HELPFUL = 0.1
 """Relative reduction of the error by which another gauge helps."""
 
-NOTICEABLE = 0.02
-"""Relative reduction below which another gauge is not listed; the search is no better."""
-
 MOST_LISTED = 24
 """Largest number of setups that are listed one by one."""
 
 EVENLY = "evenly spaced"
+
+HOW_TO = {
+    LegIndicator.kind: ("In each setup at a leg mount the gauge so that it touches at `section`."),
+    BallBar.kind: (
+        "Ball bar: fix one ball on the table at the stated place and clamp the other to the tool. "
+        "Put the bar between them. The programs move along arcs around the fixed ball."
+    ),
+    ToolIndicator.kind: (
+        "Indicator at the tool: clamp the dial to the tool and align the artefact with the axes of "
+        "the machine by eye. It must not move until the setup is finished."
+    ),
+    Probe.kind: (
+        "Probe: move down in each posture until it triggers. Write the coordinates at the trigger "
+        "as the posture, and 0 as the reading."
+    ),
+}
+"""Instructions for the kinds of sensor of a plan."""
 
 OUT_OF_RANGE = "beyond the dial's range"
 
@@ -63,6 +89,7 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
     """Plan as rich renderables, its expected tool error first."""
     s, robot = plan.session, plan.session.robot
     remaining = describe_remaining(plan.find_remaining()) if details else []
+    gains = plan.find_sensor_gains()
     parts: list[RenderableType] = [
         Text(
             f"Plan for {robot.name}, model {plan.forecast.selection.label}: {describe_size(s)}, "
@@ -71,9 +98,10 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
         ),
         Text(),
         *map(Text, describe_expected(plan)),
+        *map(Text, _undetermined(plan, gains)),
         Text(_when_enough(plan)),
         section("Other plans in the same time", _alternatives(plan)),
-        section("Other gauges", bullets(_helps(plan))),
+        section("What would help", bullets(_helps(plan, gains))),
         *([section("Largest contributions", bullets(remaining))] if remaining else []),
         section("Setups", _setups(plan)),
         section("How to measure", bullets(_how_to_measure(plan))),
@@ -105,15 +133,23 @@ def describe_expected(plan: MeasuringPlan) -> list[str]:
             f"With offsets within their tolerances the tip misses the rod in {first.lost:.0%} of "
             "the readings. Enter offsets from a few readings first, or use a blade."
         )
-    if undetermined := _undetermined_offsets(plan):
-        lines.append(
-            f"These readings do not determine the offset of {joined(undetermined)}. Plan more time "
-            "or setups."
-        )
     further = {(f.limit.effect, f.limit.unit): _describe_further(f) for f in plan.further}
     for effect in plan.effects:
         lines.append(_describe_limits(effect) + further.get((effect.effect, effect.unit), ""))
     return lines
+
+
+def _undetermined(plan: MeasuringPlan, gains: Sequence[SensorGain]) -> list[str]:
+    """Offsets that the readings do not determine, and the sensor that helps, as sentences."""
+    drives = _undetermined_offsets(plan)
+    if not drives:
+        return []
+    helpful = helpful_gains(gains, plan.expected.reported.rms, HELPFUL)
+    remedy = "Plan more time or setups."
+    if helpful:
+        best = helpful[0]
+        remedy = f"Another hour with {best.words} would reduce the error to {tool_mm(best.rms)}."
+    return [f"These readings do not determine the offset of {joined(drives)}. {remedy}"]
 
 
 def _undetermined_offsets(plan: MeasuringPlan) -> list[str]:
@@ -158,18 +194,26 @@ def _describe_further(further: FurtherReadings) -> str:
 
 
 def _how_to_measure(plan: MeasuringPlan) -> list[str]:
-    """Instructions for the operator."""
-    length = approach_length(plan.session)
-    approach = f"Approach every posture from the same side: the last {length} in one direction."
-    if any(r.approach for r in plan.session.readings):
-        approach = (
+    """Instructions for the operator: for indicators at legs, and for each kind at the tool."""
+    session = plan.session
+    sensors = [setup.sensor for setup in session.setups.values()]
+    first = {sensor.kind: sensor for sensor in reversed(sensors)}
+    words = [HOW_TO[kind] for kind in HOW_TO if kind in first]
+    if any(setup.zero == "free" for setup in session.setups.values()):
+        words.append("Go to the first posture and set the dial to the middle of its range there.")
+    length = approach_length(session)
+    stated = any(r.approach for r in session.readings)
+    if any(tool_path(sensor) is None for sensor in sensors) and not stated:
+        words.append(
+            f"Approach every posture from the same side: the last {length} in one direction."
+        )
+    if stated:
+        words.append(
             f"Approach each posture as its arrows show: in the last {length} the displayed number "
             "of the joint grows (↑) or falls (↓). The programs do this."
         )
     return [
-        "In each setup mount the gauge so that it touches at `section`. Go to the first posture "
-        "and set the dial to the middle of its range there.",
-        approach,
+        *words,
         "Read the first posture again at the end of the setup (cycle 2). This reveals drift.",
     ]
 
@@ -298,23 +342,16 @@ def _alternatives(plan: MeasuringPlan) -> RenderableType:
     return table_of(headers, rows)
 
 
-def _helps(plan: MeasuringPlan) -> list[str]:
-    """Other gauges that reduce the error, the best first."""
+def _helps(plan: MeasuringPlan, gains: Sequence[SensorGain]) -> list[str]:
+    """Other gauges and sensors that reduce the error, the best first."""
     mine = plan.expected.reported.rms
     sizes = {a.name: a.expected.reported.rms for a in plan.helps if a.expected is not None}
     names = sorted(sizes, key=sizes.__getitem__)
     better = [n for n in names if sizes[n] < (1.0 - NOTICEABLE) * mine]
     texts = [f"The same readings with {n}: {tool_mm(sizes[n])}." for n in better]
-    if names and sizes[names[0]] > (1.0 - HELPFUL) * mine:
-        none = (
-            f"None of these gains {HELPFUL:.0%}"
-            if better
-            else f"None ({'; '.join(names)}) gains {NOTICEABLE:.0%}"
-        )
-        texts.append(
-            f"{none}. A smaller tool error needs another sensor, such as an indicator at the tool."
-        )
-    return texts
+    if names and not better:
+        texts.append(f"None ({'; '.join(names)}) gains {NOTICEABLE:.0%}.")
+    return texts + describe_gains(gains, mine)
 
 
 def _posture(reading: Reading, robot: Robot) -> str:

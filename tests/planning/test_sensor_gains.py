@@ -1,0 +1,84 @@
+"""Gains of an hour with each usual sensor, against plans with these sensors."""
+
+from __future__ import annotations
+
+import pytest
+
+from orthocal import calibrate, load_robot, plan_readings, simulate_session, summarize
+from orthocal.output.text.accuracy import render_tool
+from orthocal.output.text.layout import to_text
+from orthocal.planning.equipment import Equipment
+from orthocal.planning.owned_sensors import load_owned_sensor
+
+BAR = """sensor: ball_bar
+sigma_mm: 0.002
+resolution_mm: 0.001
+length_mm: 50
+length_tolerance_mm: unknown
+"""
+PLATE = """sensor: tool_indicator
+sigma_mm: 0.005
+resolution_mm: 0.01
+artefact: {kind: plate, flat_tolerance_mm: 0.003}
+"""
+QUICK = {"along": 5, "across": 0.0, "sections": (0.5,)}
+
+
+@pytest.fixture(scope="module")
+def legs():
+    robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 1.0})
+    return plan_readings(robot, equipment=Equipment(**QUICK), starts=1)
+
+
+def gain_of(gains, noun):
+    (gain,) = (g for g in gains if noun in g.words)
+    return gain
+
+
+@pytest.mark.parametrize(("noun", "text"), [("ball bar", BAR), ("plate", PLATE)])
+def test_a_gain_is_nearly_that_of_a_plan_with_the_sensor(tmp_path, legs, noun, text):
+    """By session, forecast of drawn machines and exchanges: a little better, at most."""
+    gain = gain_of(legs.find_sensor_gains(), noun)
+    (tmp_path / "own.yaml").write_text(text)
+    equipment = Equipment(owned=(load_owned_sensor(tmp_path / "own.yaml"),), **QUICK)
+    plan = plan_readings(
+        legs.session.robot, hours=1.0, equipment=equipment, measured=legs.session, starts=1
+    )
+    assert gain.minutes <= 60.0
+    assert 0.75 * gain.rms < plan.expected.reported.rms < 1.05 * gain.rms
+    assert gain.rms < 0.7 * legs.expected.reported.rms
+
+
+def test_sensors_are_ranked(legs):
+    gains = legs.find_sensor_gains()
+    assert [g.rms for g in gains] == sorted(g.rms for g in gains)
+    bar, square, legs_again = (gain_of(gains, n) for n in ("ball bar", "square", "at the legs"))
+    assert bar.rms < square.rms < legs_again.rms < legs.expected.reported.rms
+
+
+def test_where_leg_readings_determine_nothing_the_answer_names_the_sensor():
+    """Parallel slides: moving all drives moves the tool, and turns no leg."""
+    robot = load_robot("linear_delta").with_tolerances({"*.offset_mm": 0.5})
+    plan = plan_readings(robot, equipment=Equipment(**QUICK), starts=1)
+    best = plan.find_sensor_gains()[0]
+    assert "ball bar" in best.words
+    assert best.rms < 0.1 * plan.expected.reported.rms
+    words = " ".join(summarize(plan).split())
+    sentence = next(s for s in words.split(". ") if "do not determine the offset of" in s)
+    assert all(name in sentence for name in ("a_slide", "b_slide", "c_slide"))
+    assert f"Another hour with {best.words} would reduce the error to" in words
+
+
+def test_the_details_of_a_calibration_name_the_same_sensors(legs):
+    readings = simulate_session(legs.session, {"x_slide.offset": 0.2e-3}, seed=1).session
+    calibration = calibrate(readings)
+    text = " ".join(to_text(render_tool(calibration)).split())
+    assert "Another hour, with all errors corrected: " in text
+    assert "with a ball bar of 50 mm" in text
+    offsets = calibrate(readings, "offsets")
+    assert "Another hour" not in to_text(render_tool(offsets))
+
+
+def test_a_machine_without_places_at_the_tool_compares_dials(biglide):
+    plan = plan_readings(biglide, equipment=Equipment(**QUICK), starts=1)
+    assert {g.words for g in plan.find_sensor_gains()} <= {"a dial at the legs"}
