@@ -285,8 +285,8 @@ def test_the_default_workspace_keeps_clear_of_the_end_of_the_reach(tmp_path, leg
     space = find_workspace(robot)
     assert space.half_side == (0.06 if leg > 0.2 else pytest.approx(0.04, abs=0.02))
     drives = LoopClosure(robot).inverse(1.07 * space.points)
-    assert (drives >= sizes.lower).all()
-    assert (drives <= sizes.upper).all()
+    assert (drives >= sizes.travel[0]).all()
+    assert (drives <= sizes.travel[1]).all()
     forecast = ToolForecast(robot, Choice("full").select(robot.parameters))
     assert forecast.before.reported.largest < 0.5 * space.half_side
 

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import itertools
+import json
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import run_orthocal
+from threadpoolctl import threadpool_limits
 
-from orthocal import load_robot, plan_readings
+from orthocal import load_plan, load_robot, plan_readings, simulate_session, write_session
 from orthocal.effects.loading import with_effects
 from orthocal.errors import SessionError
 from orthocal.estimation.choice import resolve_choice
 from orthocal.measurement.motion.motion import plan_motion
+from orthocal.observation.simulate import draw_errors
 from orthocal.planning.equipment import Equipment, place_tool
 from orthocal.planning.expected_error import ToolForecast
 from orthocal.planning.owned_sensors import load_owned_sensor
@@ -191,6 +196,48 @@ def test_a_plan_for_a_linear_delta_with_a_bar_a_plate_and_a_probe(owned):
         (points >= robot.workspace[:, 0] - 1e-9) & (points <= robot.workspace[:, 1] + 1e-9)
     ).all()
     assert plan.expected.reported.rms < 0.05 * plan.known.reported.rms
+
+
+@pytest.mark.slow
+def test_a_plan_with_three_sensors_takes_twenty_seconds(owned):
+    """Processor seconds, with all places of the dial."""
+    robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 1.0})
+    sensors = owned(bar=BAR, square=SQUARE, plate=PLATE)
+    start = time.process_time()
+    with threadpool_limits(1):  # waiting threads count
+        plan = plan_readings(robot, hours=2.0, equipment=Equipment(owned=sensors))
+    assert time.process_time() - start < 20.0
+    assert plan.expected.reported.rms < 4.0e-6
+
+
+def test_a_plan_for_a_printer_is_measured_and_calibrated(tmp_path):
+    """From the command line: plan, simulated readings, calibration; the sheet names the steps."""
+    for name, text in (("bar", BAR), ("probe", PROBE)):
+        (tmp_path / f"{name}.yaml").write_text(text)
+    own = [word for name in ("bar", "probe") for word in ("--with", tmp_path / f"{name}.yaml")]
+    quick = ["--along", 5, "--across-mm", 0, "--sections", 0.5, "--starts", 2]
+    entered = ["--tolerance", "*.offset_mm=1"]
+    words = ["linear_delta", *own, *entered, "--hours", 1, *quick, "--out", tmp_path / "plan"]
+    code, text, _ = run_orthocal(".", "plan", *map(str, words))
+    assert code == 0
+    assert "Ball bar: " in text
+    assert "mount the gauge so that it touches at `section`" not in text
+    sheet = (tmp_path / "plan" / "sheet.html").read_text()
+    assert "arcs" in sheet
+    assert "as its arrows show" not in sheet
+    plan = load_plan(tmp_path / "plan")
+    names = plan.robot.parameters.select_model("full")
+    errors = draw_errors(plan.robot, names, seed=3)
+    readings = simulate_session(plan, errors, seed=3).session
+    write_session(readings, tmp_path / "measured")
+    code, text, _ = run_orthocal(".", "calibrate", tmp_path / "measured", "--json")
+    assert code == 0
+    forecast = ToolForecast(plan.robot, resolve_choice("full", None).select(plan.robot.parameters))
+    found = {p["name"]: p["value"] for p in json.loads(text)["parameters"]}
+    difference = np.array([found.get(n, 0.0) - errors[n] for n in forecast.names])
+    missed = forecast.align(forecast.jacobian @ difference)
+    rms = np.sqrt(forecast.workspace.weights @ (missed**2).sum(axis=1))
+    assert rms < 2.0 * forecast.about_nominal(plan).reported.rms
 
 
 def test_a_bed_is_probed_once_at_the_height_of_its_plane(owned):
