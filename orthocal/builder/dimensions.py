@@ -194,7 +194,7 @@ def in_mm(value: float) -> str:
 
 def in_unit(value: float, unit: str) -> str:
     """Number in mm or degrees, without the rounding error of the factor."""
-    return f"{round(value / UNITS[unit], 9) + 0.0:.9g}"
+    return f"{round(value / UNITS[unit], 9) + 0.0:.12g}"
 
 
 def box_text(box: Sequence[Sequence[float]] | None) -> str:

@@ -18,6 +18,7 @@ from orthocal.cli.options import (
     Gauge,
     Hours,
     Model,
+    Owned,
     Tolerances,
     WorkspaceMm,
     command,
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from orthocal.builder.dimensions import Dimensions
     from orthocal.builder.machine_file import Counting
     from orthocal.cli.dialogue import Stated
+    from orthocal.planning.first_plan import FixedPlan
 
 USUAL_OFFSET = 4.0
 """Tolerance of the zeros of a new machine, whose home switches were never measured, [mm]."""
@@ -44,6 +46,14 @@ EFFECTS = "backlash"
 
 FIRST = "first"
 """Directory of the first session, in that of the machine."""
+
+BED_WORDS = (
+    "All slides together move the tool without turning a leg, so that readings of the legs say "
+    "little about this machine. The plan measures the bed with the dial at the tool. The bed is "
+    "assumed to be flat to 0.02 mm (session.yaml). Name other sensors, such as a ball bar, by "
+    "--with FILE. For the log of a printer's probe use orthocal import."
+)
+"""What is said about the plan of a machine whose legs do not determine its offsets."""
 
 COMMENT = (
     "A plan. Print sheet.html and measure: run `orthocal record .` in this directory, or fill\n"
@@ -135,13 +145,15 @@ class FirstPlanOptions:
     Args:
         effects (EFFECTS): Effects beside geometry that the machine has, such as
             backlash,thermal, or none.
-        paper: Use the paper's seven postures and six setups; no search.
+        paper: Read each leg in the mechanical zero and at both ends of its axis, as in the paper;
+            no search.
     """
 
     workspace_mm: WorkspaceMm = None
     paper: bool = False
     hours: Hours = None
     gauge: Gauge = None
+    with_: Owned = None
     model: Model = None
     effects: str = EFFECTS
     temperature: Day = None
@@ -195,7 +207,7 @@ class _Design:
     effects: Sequence[str]
     tolerance_stated: bool
     """Whether the tolerance of the zeros of the joints was stated."""
-    plan: orthocal.MeasuringPlan | None
+    plan: orthocal.MeasuringPlan | FixedPlan | None
     """None for the paper's readings."""
     session: orthocal.Session
     files: dict[str, str]
@@ -210,13 +222,20 @@ def _design(name: str, dimensions: DimensionOptions, options: FirstPlanOptions) 
     """
     from orthocal.cli.dialogue import ask_tolerance, find_answers
     from orthocal.planning.equipment import load_dial
+    from orthocal.planning.owned_sensors import load_owned_sensor
 
-    equipment = orthocal.Equipment(temperatures=read_temperatures(options.temperature))
+    equipment = orthocal.Equipment(
+        temperatures=read_temperatures(options.temperature),
+        owned=tuple(load_owned_sensor(path) for path in options.with_ or ()),
+    )
     if options.gauge is not None:
         equipment = load_dial(options.gauge, equipment)
     effects = split_effects(options.effects) or []
-    machine, counting, asked = find_answers(dimensions.read_kind(), dimensions.by_key())
-    tolerance = options.tolerance
+    kind, tolerance = dimensions.read_kind(), options.tolerance
+    legs = kind.read_legs or bool(equipment.owned)
+    if not legs:
+        _require_bed(kind, options)
+    machine, counting, asked = find_answers(kind, dimensions.by_key())
     with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
         robot = _make_trial(machine, Path(trial) / name, counting, effects)
         if asked or options.workspace_mm is not None:
@@ -227,7 +246,8 @@ def _design(name: str, dimensions: DimensionOptions, options: FirstPlanOptions) 
             box = tuple((low, high) for low, high in robot.workspace.tolist())
             machine = replace(machine, workspace=box)
         tolerances = {"*.offset_mm": USUAL_OFFSET} | read_tolerances(tolerance, robot)
-        plan, session = _plan(robot, equipment, tolerances, options)
+        make = _plan if legs else _plan_bed
+        plan, session = make(robot, equipment, tolerances, options)
         put_note("orthocal: drawing the measuring sheet")
         return _Design(
             machine=machine,
@@ -357,12 +377,49 @@ def _plan(
     return plan, plan.session.with_controller(zeros)
 
 
-def _draw(plan: orthocal.MeasuringPlan | None, session: orthocal.Session) -> dict[str, str]:
+def _plan_bed(
+    robot: orthocal.Robot,
+    equipment: orthocal.Equipment,
+    tolerances: Mapping[str, float],
+    options: FirstPlanOptions,
+) -> tuple[FixedPlan, orthocal.Session]:
+    """Plan of the bed, of a machine whose legs do not determine its offsets."""
+    from orthocal.planning.first_plan import bed_plan, expect_fixed
+    from orthocal.planning.plan import MODEL
+    from orthocal.session.session import Purpose
+
+    choice = orthocal.Choice(options.model or MODEL)
+    session = bed_plan(robot.with_tolerances(tolerances), equipment)
+    session = replace(session, purpose=Purpose(choice.model))
+    plan = expect_fixed(session, choice, equipment)
+    return plan, session.with_controller([0.0] * len(robot.drives))
+
+
+def _require_bed(kind: type[Dimensions], options: FirstPlanOptions) -> None:
+    """Refuse options of plans with readings of the legs.
+
+    Raises:
+        ParameterError: If there is one.
+    """
+    for option, found in (("--paper", options.paper), ("--hours", options.hours is not None)):
+        if found:
+            raise ParameterError(
+                f"readings of the legs say little about a {kind.kind}, and the readings of its bed "
+                "are fixed; name other sensors by --with",
+                where=option,
+            )
+
+
+def _draw(
+    plan: orthocal.MeasuringPlan | FixedPlan | None, session: orthocal.Session
+) -> dict[str, str]:
     """Files beside session.yaml and readings.csv."""
     from orthocal.output.sheet.page import sheet_files
     from orthocal.output.text.plan import draw_plan, plan_json
 
-    drawn = {} if plan is None else {"plan.json": plan_json(plan), "plan.svg": draw_plan(plan)}
+    drawn: dict[str, str] = {}
+    if isinstance(plan, orthocal.MeasuringPlan):
+        drawn = {"plan.json": plan_json(plan), "plan.svg": draw_plan(plan)}
     return {**sheet_files(session), **drawn}
 
 
@@ -378,6 +435,8 @@ def _report(folder: Path, design: _Design) -> None:
             f"Plan: {size}, about {show_duration(plan.minutes)}.",
             *describe_expected(plan),
         ]
+    if design.plan is not None and not isinstance(design.plan, orthocal.MeasuringPlan):
+        lines += [BED_WORDS]
     programs = sum(name.endswith(".ngc") for name in design.files)
     lines += [
         f"Wrote {folder}: {design.machine.words}.",

@@ -210,6 +210,14 @@ Gauge = Annotated[
         "of 3 mm diameter.",
     ),
 ]
+Owned = Annotated[
+    list[Path] | None,
+    Option(
+        "--with",
+        metavar="FILE",
+        help="A sensor at the tool that you have, such as a ball bar or a square; repeatable.",
+    ),
+]
 Hours = Annotated[
     float | None,
     Option(metavar="HOURS", help="Time available for measuring; default: what 6 setups take."),

@@ -19,6 +19,7 @@ from orthocal.cli.options import (
     Json,
     Model,
     OptionalOutDirectory,
+    Owned,
     Positive,
     Seed,
     Tolerances,
@@ -40,15 +41,6 @@ from orthocal.cli.printing import deliver, put_note
 from orthocal.cli.sheet import sheet_or_problem
 from orthocal.errors import ParameterError
 from orthocal.units import MM
-
-Owned = Annotated[
-    list[Path] | None,
-    Option(
-        "--with",
-        metavar="FILE",
-        help="A sensor at the tool that you have, such as a ball bar or a square; repeatable.",
-    ),
-]
 
 FILES = ("session.yaml", "readings.csv", "plan.json", "plan.svg", "sheet.html")
 

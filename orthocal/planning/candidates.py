@@ -294,7 +294,7 @@ def _add_postures(
     points = points[reachable(robot, points)]
     if len(points) < FEWEST:
         raise ParameterError("the machine reaches no posture in it", where="plan: box")
-    names = [_name(p, robot, middle) for p in points]
+    names = [posture_name(p, robot, middle) for p in points]
     for name, posture in place_tool(robot, names, points).items():
         postures.setdefault(name, posture)
     return names
@@ -306,7 +306,7 @@ def _phases(robot: Robot, count: int) -> Array:
     return np.asarray(np.arange(count) % PHASES * (period / PHASES))
 
 
-def _name(point: Array, robot: Robot, middle: Array) -> str:
+def posture_name(point: Array, robot: Robot, middle: Array) -> str:
     """Name of a posture: displacement from the mechanical zero, such as x+60_y-10."""
     letters = "" if robot.tcp is None else ["xyz"[c] for c in robot.tcp.coordinates]
     parts = [
@@ -319,7 +319,7 @@ def _name(point: Array, robot: Robot, middle: Array) -> str:
 
 def _sensors(leg: Leg, equipment: Equipment) -> Iterator[tuple[str, LegIndicator]]:
     """Possible indicators at a leg, with names."""
-    for direction in _directions(leg):
+    for direction in directions_across(leg):
         word = direction if isinstance(direction, str) else "d"
         for part in equipment.sections:
             for sensor in equipment.list_sensors(leg, direction, part):
@@ -327,7 +327,7 @@ def _sensors(leg: Leg, equipment: Equipment) -> Iterator[tuple[str, LegIndicator
                 yield f"{word}{leg.name}{rod}_{part:g}", sensor
 
 
-def _directions(leg: Leg) -> list[Direction]:
+def directions_across(leg: Leg) -> list[Direction]:
     """Two directions across a leg, along axes of the world that are perpendicular to it."""
     directions: list[Direction] = [
         name for name, axis in zip("xyz", np.eye(3), strict=True) if abs(axis @ leg.axis) < 1e-6

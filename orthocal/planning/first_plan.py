@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from orthocal.arrays import Array
+from orthocal.assessment.effect_limits import EffectLimits, find_limits
 from orthocal.errors import ParameterError, RobotError
-from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.estimation.choice import Choice
+from orthocal.kinematics.workspace import find_workspace, tool_at_zero
 from orthocal.measurement.motion.approach import state_common_approach
+from orthocal.planning.candidates import ON_AXIS, directions_across, posture_name
 from orthocal.planning.equipment import Equipment, choose_box, place_tool
-from orthocal.robot.model import Robot
+from orthocal.planning.expected_error import Expected, ToolForecast, noise_of
+from orthocal.planning.further_readings import FurtherReadings
+from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.mounting import EXACT
-from orthocal.session.session import Gauge, Reading, Session, Setup
-from orthocal.units import MM
+from orthocal.sensors.tool_indicator import Artefact, ToolIndicator
+from orthocal.session.session import Conditions, Gauge, Reading, Session, Setup
+from orthocal.units import MM, read_limit
 
 CLEAR = 0.02
 """Least distance of a tip from a hinge, [m]; less on legs shorter than five times that."""
@@ -29,8 +35,59 @@ SECTIONS = (0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65)
 LEAST = 0.01
 """Least reach of the tool to either side of the mechanical zero, [m]."""
 
+BED = "bed"
+"""Name of the setup over a bed."""
+
+ON_BED = 5
+"""Positions along each side of a bed."""
+
+FLAT = 0.02 * MM
+"""Tolerance of the flatness of a bed of glass, or of a ground plate, [m]."""
+
 PAPER_GAUGE = Gauge(20e-6, 10e-6, None)
 """Repeatability 0.02 mm, resolution 10 µm (paper, section 4)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FixedPlan:
+    """Readings that were not searched, and the expected tool error after the calibration.
+
+    Fields as in `MeasuringPlan`.
+    """
+
+    session: Session
+    forecast: ToolForecast
+    minutes: float
+    known: Expected
+    expected: Expected
+    first_round: Expected
+    effects: tuple[EffectLimits, ...]
+    further: tuple[FurtherReadings, ...] = ()
+    complements: bool = False
+
+
+def expect_fixed(session: Session, choice: Choice, equipment: Equipment) -> FixedPlan:
+    """Expected tool error after a calibration from a session's readings.
+
+    Args:
+        session: The readings, of a robot with its tolerances.
+        choice: Errors to identify.
+        equipment: Gauge and time.
+
+    Raises:
+        ParameterError: If there is no such model.
+    """
+    forecast = ToolForecast(session.robot, choice.select(session.robot.parameters))
+    course = equipment.in_course(session)
+    return FixedPlan(
+        session=session,
+        forecast=forecast,
+        minutes=equipment.minutes_of(session),
+        known=forecast.before,
+        expected=forecast.after(course),
+        first_round=forecast.after(course, entered=False),
+        effects=find_limits(forecast.problem(course), noise_of(course)),
+    )
 
 
 class Displacements(NamedTuple):
@@ -91,10 +148,45 @@ def paper_plan(robot: Robot, equipment: Equipment) -> Session:
         RobotError: If the tool of the machine hardly moves.
     """
     equipment = first_equipment(robot, equipment)
-    usual = Displacements()
+    title = "Zero, largest and least of each leg"
     box = np.asarray(equipment.box) - tool_at_zero(robot)[:, None]
-    ends = np.clip(box, usual.minimum, usual.maximum)
-    return _read_legs(robot, equipment, ends, "Zero, largest and least of each leg", closing=True)
+    return _read_legs(robot, equipment, box, title, closing=True)
+
+
+def bed_plan(robot: Robot, equipment: Equipment) -> Session:
+    """Plan for machines whose legs do not determine their offsets: a dial at the tool over the bed.
+
+    The tool moves in the lowest plane of the workspace, on a square grid, and approaches the bed
+    from above: its drives count upwards. The setup ends with the posture where it began.
+
+    Args:
+        robot: The robot, with a tool that moves along x, y and z.
+        equipment: Gauge.
+
+    Raises:
+        ClosureError: If the machine does not reach a posture.
+    """
+    middle, box = tool_at_zero(robot), find_workspace(robot).limits
+    columns, rows = (
+        (STEP * np.round(np.linspace(low, high, ON_BED) / STEP)).tolist() for low, high in box[:2]
+    )
+    grid = [(x, y) for i, y in enumerate(rows) for x in columns[:: (-1) ** i] if x or y]
+    points = np.array([(x, y, box[2, 0]) for x, y in ((0.0, 0.0), *grid)])
+    points = (points + middle).round(9) + 0.0
+    names = [posture_name(p, robot, middle) for p in points]
+    length = float(np.ptp(box[:2], axis=1).max())
+    plate = Artefact("plate", length=length, form_std=read_limit(FLAT))
+    above = Conditions("n" * len(robot.drives))
+    readings = [Reading(BED, name, conditions=above) for name in names]
+    return Session(
+        robot=robot,
+        robot_reference=robot.name,
+        title="Dial at the tool over the bed",
+        gauges={"": equipment.gauge},
+        postures=place_tool(robot, names, points),
+        setups={BED: Setup(BED, ToolIndicator("-z", plate))},
+        readings=(*readings, replace(readings[0], cycle=2)),
+    )
 
 
 def build_paper_plan(robot: Robot, displacements: Displacements, gauge: Gauge) -> Session:
@@ -113,33 +205,43 @@ def build_paper_plan(robot: Robot, displacements: Displacements, gauge: Gauge) -
         )
     equipment = Equipment(gauge=gauge, tip=None, mounting=EXACT)
     ends = np.tile([displacements.minimum, displacements.maximum], (3, 1))
-    session = _read_legs(robot, equipment, ends, "The paper's plan", closing=False)
+    session = _read_legs(robot, equipment, ends, "The paper's plan", displacements, closing=False)
     return session.with_controller(np.zeros(len(robot.drives)))
 
 
 def _read_legs(
-    robot: Robot, equipment: Equipment, ends: Array, title: str, *, closing: bool
+    robot: Robot,
+    equipment: Equipment,
+    box: Array,
+    title: str,
+    usual: Displacements | None = None,
+    *,
+    closing: bool,
 ) -> Session:
     """Session in which each leg is read in the mechanical zero and at both ends of its axis.
 
     Args:
         robot: The robot.
         equipment: Gauge and tip.
-        ends: Least and largest displacement along each axis, shape (n_coordinates, 2), [m].
+        box: Limits of the displacements, shape (n_coordinates, 2), [m].
         title: Title of the session.
+        usual: Displacements along each axis, within these limits; by default the paper's.
         closing: Whether each setup ends with the zero, where it began.
     """
-    middle = tool_at_zero(robot)
+    middle, usual = tool_at_zero(robot), usual or Displacements()
     points, setups, readings = {"zero": middle}, {}, []
     for leg in robot.legs.values():
-        axis = int(np.abs(leg.axis).argmax())
-        extremes = {f"{'xyz'[axis]}_{name}": ends[axis, i] for name, i in (("max", 1), ("min", 0))}
-        for name, shift in extremes.items():
-            points[name] = middle + shift * np.eye(len(middle))[axis]
-        for k in (k for k in range(3) if k != axis):
-            setup = f"{'xyz'[k]}{leg.name}"
-            setups[setup] = Setup(setup, equipment.list_sensors(leg, "xyz"[k], 0.5)[0])
-            readings += [Reading(setup, posture) for posture in ("zero", *extremes)]
+        name, along = _axis_of(leg)
+        along = along[: len(middle)]
+        with np.errstate(divide="ignore"):
+            limits = np.sort(box / along[:, None], axis=1)
+        least, largest = float(np.nanmax(limits[:, 0])), float(np.nanmin(limits[:, 1]))
+        ends = {"max": min(usual.maximum, largest), "min": max(usual.minimum, least)}
+        points |= {f"{name}_{end}": middle + shift * along for end, shift in ends.items()}
+        for i, direction in enumerate(directions_across(leg), 1):
+            setup = f"{direction}{leg.name}" if isinstance(direction, str) else f"{leg.name}_{i}"
+            setups[setup] = Setup(setup, equipment.list_sensors(leg, direction, 0.5)[0])
+            readings += [Reading(setup, p) for p in ("zero", *(f"{name}_{end}" for end in ends))]
             readings += [Reading(setup, "zero", cycle=2)] if closing else []
     session = Session(
         robot=robot,
@@ -151,3 +253,14 @@ def _read_legs(
         readings=tuple(readings),
     )
     return state_common_approach(session)
+
+
+def _axis_of(leg: Leg) -> tuple[str, Array]:
+    """Name and unit vector of the axis of a leg, outwards; an axis of the world if it is along one.
+
+    Exact on an axis of the world, so that postures have whole coordinates.
+    """
+    axis = int(np.abs(leg.axis).argmax())
+    if abs(leg.axis[axis]) > ON_AXIS:
+        return "xyz"[axis], np.eye(3)[axis]
+    return leg.name, -leg.axis

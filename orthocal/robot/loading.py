@@ -377,12 +377,15 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
             pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
         )[:3]
         moved = np.abs(jacobian[:, robot.passive_index]).max(initial=0.0)
+        motion = jacobian[:, robot.drive_index].sum(axis=1)
+        motion /= max(float(np.linalg.norm(motion)), 1e-9)
         legs[name] = Leg(
             **line,
             axis=read_only(
                 _snap_to_axes((line["reference_tip"] - line["reference_root"]) / line["length"])
             ),
             root_driven=bool(moved < 1e-9),
+            root_motion=read_only(_snap_to_axes(motion)),
             rods=rods,
         )
     return legs

@@ -18,6 +18,9 @@ from orthocal.robot.frames import Placement, find_frame, place_frames
 from orthocal.robot.parameters import DeclaredErrors, ElementaryError, ParameterSet
 from orthocal.units import DRIVE_UNITS, InUnit, Unit
 
+ALONG = 0.02
+"""Sine of the largest angle between a slide and a leg that is parallel to it by design."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive(InUnit):
@@ -109,8 +112,17 @@ class Leg(Line):
     """Unit vector from root to tip in the nominal reference posture, shape (3,)."""
     root_driven: bool
     """True if no passive joint moves the root."""
+    root_motion: Array
+    """Direction of the root in the nominal reference posture as its drives grow, shape (3,); 0 if
+    they do not move it."""
     rods: Mapping[str, Rod]
     """Round rods that a gauge can touch, by name."""
+
+    @property
+    def follows_slide(self) -> bool:
+        """True if the leg is parallel to the motion of its root in the reference posture."""
+        across = np.cross(self.root_motion, self.axis)
+        return bool(self.root_motion.any() and np.abs(across).max() < ALONG)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

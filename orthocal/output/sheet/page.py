@@ -13,6 +13,7 @@ from orthocal.arrays import Array
 from orthocal.assessment.wording import name_direction
 from orthocal.effects.compensation import describe_trims
 from orthocal.io.html import escape, heading, page, paragraph, prose, table
+from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import approach_length, describe_approach
 from orthocal.measurement.motion.motion import (
     SetupMotion,
@@ -32,7 +33,7 @@ from orthocal.output.sheet.gauge_position import (
 )
 from orthocal.output.sheet.pictures import draw_machine, draw_section, draw_tool
 from orthocal.output.text.layout import counted, true_minus
-from orthocal.robot.model import Robot
+from orthocal.robot.model import ALONG, Robot
 from orthocal.sensors.protocol import mounting_steps, tool_path
 from orthocal.session.session import Session, Setup
 from orthocal.units import DRIVE_UNITS, LIMIT, MM, format_fixed
@@ -115,12 +116,12 @@ def _front(
     normal = "" if _is_corrected(session) else "A few mm are normal: the calibration finds them. "
     checks = [
         "Warm the machine up. Home it once. Do not home it again until all readings are taken.",
-        "Move the machine to its mechanical zero: each leg parallel to its axis, by eye. The "
+        f"Move the machine to its mechanical zero: {_zero_by_eye(robot)}, by eye. The "
         f"controller must show about {_joint_list(robot, robot.drive_zero)}. {normal}If a number "
         f"differs by more than {_largest_difference(robot)}, a dimension or the direction of "
         "counting is wrong: correct it in machine.yaml (`orthocal new DIRECTORY --again`) or in "
         f"the robot's YAML. Travel of the joints: {'; '.join(_travel(session))}.",
-        f"Jog each slide a little outwards. Its number must {_count_outwards(robot)}.",
+        f"Jog each slide a little {_growing(robot)}. Its number must {_count_outwards(robot)}.",
         _active_offsets(session),
         *([text] if (text := _compensation(session)) else []),
         "Check each rod and each hinge for play. The calibration does not remove play.",
@@ -431,8 +432,24 @@ def _compensation(session: Session) -> str:
     )
 
 
+def _zero_by_eye(robot: Robot) -> str:
+    """What the operator sees in the mechanical zero."""
+    if robot.tcp is None or all(leg.follows_slide for leg in robot.legs.values()):
+        return "each leg parallel to its axis"
+    at = zip(robot.tcp.coordinates, tool_at_zero(robot), strict=True)
+    words = ", ".join(f"{'xyz'[c]} {round(v / MM, 3) + 0.0:g}" for c, v in at)
+    return f"the tool at {words} mm"
+
+
+def _growing(robot: Robot) -> str:
+    """Direction in which the slides move as the coordinates of the drives grow."""
+    legs = robot.legs.values()
+    upwards = legs and all(leg.root_motion[2] > 1.0 - ALONG for leg in legs)
+    return "upwards" if upwards else "outwards"
+
+
 def _count_outwards(robot: Robot) -> str:
-    """Direction in which the joint numbers change if the slides move outwards."""
+    """Direction in which the joint numbers change if the coordinates of the drives grow."""
     verbs = {1: "grow", -1: "fall"}
     if len({d.direction for d in robot.drives}) == 1:
         return verbs[robot.drives[0].direction]

@@ -27,6 +27,7 @@ from orthocal.output.text.accuracy import (
 from orthocal.output.text.layout import bullets, counted, plain, section, table_of
 from orthocal.planning.cost_curve import ENOUGH, HOUR, Stage
 from orthocal.planning.expected_error import Criterion, Expected
+from orthocal.planning.first_plan import FixedPlan
 from orthocal.planning.further_readings import FurtherReadings
 from orthocal.planning.plan import MeasuringPlan
 from orthocal.planning.plan_comparison import Alternative
@@ -117,7 +118,7 @@ def describe_size(session: Session) -> str:
     return f"{counted(readings, 'reading')}{words} in {counted(setups, 'setup')}"
 
 
-def describe_expected(plan: MeasuringPlan) -> list[str]:
+def describe_expected(plan: MeasuringPlan | FixedPlan) -> list[str]:
     """Expected tool error with its conditions, and the readings that are impossible at first."""
     first, workspace = plan.first_round, plan.forecast.workspace
     expected, before, now = (tool_mm(e.reported.rms) for e in (plan.expected, first, plan.known))
@@ -139,7 +140,7 @@ def describe_expected(plan: MeasuringPlan) -> list[str]:
     return lines
 
 
-def _undetermined(plan: MeasuringPlan, gains: Sequence[SensorGain]) -> list[str]:
+def _undetermined(plan: MeasuringPlan | FixedPlan, gains: Sequence[SensorGain]) -> list[str]:
     """Offsets that the readings do not determine, and the sensor that helps, as sentences."""
     drives = _undetermined_offsets(plan)
     if not drives:
@@ -152,7 +153,7 @@ def _undetermined(plan: MeasuringPlan, gains: Sequence[SensorGain]) -> list[str]
     return [f"These readings do not determine the offset of {joined(drives)}. {remedy}"]
 
 
-def _undetermined_offsets(plan: MeasuringPlan) -> list[str]:
+def _undetermined_offsets(plan: MeasuringPlan | FixedPlan) -> list[str]:
     """Drives whose offset is as uncertain after the readings as before."""
     after = plan.expected
     stds = np.sqrt(np.diag(after.covariance))
