@@ -30,6 +30,9 @@ FARTHEST = 0.95
 NEAREST_TOWERS = 60.0 * DEG
 """Least angle between two towers, [rad]."""
 
+DELTA = ("*.offset", "radius", "*_tower.tangential", "*_rod_a.length", "*_rod_b.length")
+"""Free errors of the model `delta`: those of delta firmware, with all six rods."""
+
 CLOSE = 1e-9
 """[m]"""
 
@@ -205,11 +208,10 @@ class LinearDelta(Dimensions):
                 name for k in towers for name in (f"{k}_coupler.x", f"frame.{k}_rod_b_tip.x")
             ],
             **length_sums(towers),
-            # half the difference of both rods of an arm, which tilts the effector
-            **{
-                f"{k}_rods.difference": [f"{k}_coupler.x", f"-frame.{k}_rod_b_tip.x"]
-                for k in towers
-            },
+            # turns the effector about the rods of an arm
+            **{f"{k}_effector.tilt": [f"{k}_fork.rx"] for k in towers},
+            **{f"{k}_rod_a.length": [f"{k}_coupler.x"] for k in towers},
+            **{f"{k}_rod_b.length": [f"frame.{k}_rod_b_tip.x"] for k in towers},
         }
         return robot_yaml(
             self.title,
@@ -218,6 +220,7 @@ class LinearDelta(Dimensions):
             rod_radius=self.rod_radius,
             loops=platform_loops(towers),
             parameters=parameters,
+            models={"delta": DELTA},
             workspace=self.box,
             tolerances="offset_mm: 4, translation_mm: 1, rotation_mrad: 5, scale_ppm: 500",
         )

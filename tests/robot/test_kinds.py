@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import yaml
 from lxml import etree
-from machines import place
+from machines import frame_pose, place
+from pinocchio import log3
 from pinocchio.rpy import rpyToMatrix
 from tolerances import CLOSED, KINEMATICS
 
@@ -92,15 +93,26 @@ def test_named_lengths_and_radius_are_those_of_the_legs(tmp_path, machine):
     robot = written(tmp_path, machine)
     drives = LoopClosure(robot).inverse(POINTS[:, : len(machine.coordinates)])
     longer = dict(zip(machine.letters, (2e-3, -1e-3, 3e-3), strict=False))
-    wider = 4e-3 if isinstance(machine, LinearDelta) else 0.0
     errors = {f"{k}_leg.length": v for k, v in longer.items()}
-    errors |= {"radius": wider} if wider else {}
+    moved = dict.fromkeys(machine.letters, np.zeros(2))
+    if isinstance(machine, LinearDelta):
+        moved = {k: np.array([4e-3, v]) for k, v in zip("abc", (1e-3, -2e-3, 0.5e-3), strict=True)}
+        errors |= {"radius": 4e-3, **{f"{k}_tower.tangential": v[1] for k, v in moved.items()}}
     tool = LoopClosure(robot, fixed=errors).forward(drives)
     for leg, along in zip(machine.legs(), drives.T, strict=True):
-        outwards = -leg.frame[:, 0]
-        root = leg.root + wider * outwards + (along - leg.zero)[:, None] * leg.direction
+        aside = moved[leg.name] @ np.stack([-leg.frame[:, 0], leg.frame[:, 2]])
+        root = leg.root + aside + (along - leg.zero)[:, None] * leg.direction
         length = np.linalg.norm(root - leg.tip - tool, axis=1)
         assert length == pytest.approx(leg.length + longer[leg.name], abs=CLOSED)
+
+
+def test_tilts_turn_the_effector_about_the_rods_of_their_arms(tmp_path):
+    machine, tilts = LinearDelta(), {"a": 1e-3, "b": -2e-3, "c": 0.5e-3}
+    robot = written(tmp_path, machine)
+    errors = {f"{k}_effector.tilt": v for k, v in tilts.items()}
+    turned = log3(frame_pose(robot.with_errors(errors), robot.drive_zero, "tcp").rotation)
+    for leg in machine.legs():
+        assert turned @ leg.axes[:, 0] == pytest.approx(tilts[leg.name], abs=1e-5)
 
 
 @pytest.mark.parametrize("machine", [LinearDelta(), InclinedOrthoglide(), Biglide(), SINGLE])
