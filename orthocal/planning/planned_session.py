@@ -11,7 +11,7 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.measurement.motion.motion import state_path_approaches
-from orthocal.planning.candidates import Candidates
+from orthocal.planning.candidates import FEWEST, Candidates
 from orthocal.planning.selection import PlannedSetup
 from orthocal.session.session import Posture, Reading, Session, Setup
 
@@ -22,13 +22,35 @@ def build_session(
     """Session of planned setups, named, in the order of measuring.
 
     Each setup begins with the posture in which its gauge is aligned, continues with short motions,
-    and ends with the first posture.
+    and ends with the first posture. Postures in which a drive turns round on the path of the tool
+    are omitted if an effect depends on the side: it would be unknown.
     """
+    while True:
+        plan = _order_readings(candidates, planned, measured)
+        unclear = {
+            (r.setup, r.posture)
+            for r in plan.readings
+            if r.conditions is not None and "u" in (r.conditions.approach or "")
+        }
+        clear = [
+            _without(candidates, setup, {p for s, p in unclear if s == name})
+            for name, setup in zip(plan.setups, _in_order(candidates, planned), strict=True)
+        ]
+        if sum(len(s.chosen) for s in clear) == sum(len(s.chosen) for s in planned):
+            return plan
+        planned = clear
+
+
+def _without(candidates: Candidates, setup: PlannedSetup, postures: set[str]) -> PlannedSetup:
+    """Setup without some postures, if enough others are left."""
+    source, rows = candidates.session, candidates.setups[setup.candidate].rows
+    chosen = tuple(i for i in setup.chosen if source.readings[rows[i]].posture not in postures)
+    return setup if len(chosen) < FEWEST else replace(setup, chosen=chosen)
+
+
+def _in_order(candidates: Candidates, planned: Sequence[PlannedSetup]) -> list[PlannedSetup]:
+    """Setups in the order of measuring: by leg, then those of sensors at the tool."""
     source = candidates.session
-    used_names = set() if measured is None else set(measured.setups)
-    setups: dict[str, Setup] = {}
-    readings: list[Reading] = []
-    used: dict[str, Posture] = {}
     legs = list(source.robot.legs)
 
     def place(setup: PlannedSetup) -> tuple[int, str]:
@@ -36,7 +58,19 @@ def build_session(
         leg = source.setups[name].sensor.place[1]
         return (legs.index(leg) if leg in legs else len(legs), name)
 
-    for setup in sorted(planned, key=place):
+    return sorted(planned, key=place)
+
+
+def _order_readings(
+    candidates: Candidates, planned: Sequence[PlannedSetup], measured: Session | None
+) -> Session:
+    """Session of planned setups with the approaches that follow from their paths."""
+    source = candidates.session
+    used_names = set() if measured is None else set(measured.setups)
+    setups: dict[str, Setup] = {}
+    readings: list[Reading] = []
+    used: dict[str, Posture] = {}
+    for setup in _in_order(candidates, planned):
         candidate = candidates.setups[setup.candidate]
         name = _setup_name(candidate.name, {*used_names, *setups})
         rows = [source.readings[i] for i in candidate.rows[list(setup.chosen)]]
