@@ -334,16 +334,18 @@ def _joint(
 
 
 def _origin(owner: etree._Element, at: Array, turned: Array) -> None:
-    angles = [_exact_angle(float(v)) for v in pin.rpy.matrixToRpy(turned)]
-    rpy = " ".join(f"{v + 0.0:.17g}" for v in angles)
+    roll, pitch, yaw = (_exact_angle(float(v)) for v in pin.rpy.matrixToRpy(turned))
+    if abs(pitch) == QUARTER:  # only yaw ∓ roll matters
+        roll, yaw = 0.0, _exact_angle(yaw - roll if pitch > 0.0 else yaw + roll)
+    rpy = " ".join(f"{v + 0.0:.17g}" for v in (roll, pitch, yaw))
     etree.SubElement(owner, "origin", xyz=_numbers(at), rpy=rpy)
 
 
 def _exact_angle(angle: float) -> float:
-    """Angle, [rad]; a quarter turn exactly where it is one but for rounding."""
+    """Angle, [rad]; a quarter turn exactly where it is one but for rounding; π for −π."""
     quarters = round(angle / QUARTER)
-    exact = quarters * QUARTER
-    return exact if abs(angle - exact) < ROUNDING else angle
+    exact = (2 if quarters == -2 else quarters) * QUARTER
+    return exact if abs(angle - quarters * QUARTER) < ROUNDING else angle
 
 
 def _numbers(values: Sequence[float] | Array) -> str:

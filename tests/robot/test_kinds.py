@@ -195,9 +195,11 @@ def test_the_packaged_orthoglide_is_one_of_the_kinds():
                 assert (x is None) == (y is None)
                 assert x is None or dict(x.attrib) == dict(y.attrib), a.get("name")
             x, y = a.find("origin"), b.find("origin")
-            assert numbers(x, "xyz") == pytest.approx(numbers(y, "xyz"), abs=1e-15)
             turned = [rpyToMatrix(numbers(o, "rpy")) for o in (x, y)]
             assert np.abs(turned[0] - turned[1]).max() < 1e-15
+            for key in ("xyz", "rpy") if a.get("type") != "fixed" else ("xyz",):
+                # to the last bit: ties in plans depend on it
+                assert numbers(x, key).tolist() == numbers(y, key).tolist(), a.get("name")
     read = (folder / "orthoglide.yaml").read_text()
     assert yaml.safe_load(machine.yaml()) == yaml.safe_load(read)
 
