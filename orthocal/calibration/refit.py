@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Mask
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
 from orthocal.estimation.fit import Fit, find_mounting_covariance, fit_problem
@@ -22,7 +22,7 @@ from orthocal.estimation.weighting import SMALLEST_SIGMA
 from orthocal.io.fields import read_only
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions
 from orthocal.session.session import Gauge, Reading, Session, Setup
-from orthocal.statistics.information import decompose
+from orthocal.statistics.information import Information, decompose
 
 
 def repeat_calibration(calibration: Calibration, sessions: Given | Sequence[Given]) -> Calibration:
@@ -63,23 +63,63 @@ def restore_mounting_covariance(calibration: Calibration) -> Array:
 
     Shape (n_free, n_free), [SI]; zeros if the noise is unknown.
     """
+    problem = _recorded_problem(calibration)
+    if not math.isfinite(calibration.noise.sigma):
+        return np.zeros((problem.n_machine, problem.n_machine))
+    return find_mounting_covariance(
+        problem,
+        _recorded_information(calibration, problem),
+        sigma=max(calibration.noise.sigma, SMALLEST_SIGMA),
+        at_bound=_held(calibration),
+    )
+
+
+def restore_covariances(calibration: Calibration) -> tuple[Array, Array]:
+    """Covariance of the free errors of the machine and the nuisance parameters, from the record.
+
+    Returns:
+        The covariance, and its part that is due to noise, shape (n, n), [SI]; NaN if the noise is
+        unknown.
+    """
+    problem = _recorded_problem(calibration)
+    scale = np.outer(problem.theta_scale, problem.theta_scale)
+    if not math.isfinite(calibration.noise.sigma):
+        return np.full_like(scale, np.nan), np.full_like(scale, np.nan)
+    information = _recorded_information(calibration, problem)
+    both = (
+        compute(
+            sigma=max(calibration.noise.sigma, SMALLEST_SIGMA),
+            precision=problem.prior_precision,
+            at_bound=_held(calibration),
+        )
+        for compute in (information.covariance, information.noise_covariance)
+    )
+    covariance, of_noise = (np.asarray(scale * c) for c in both)
+    return covariance, of_noise
+
+
+def _recorded_problem(calibration: Calibration) -> CalibrationProblem:
+    """The solved problem, with the noise of each gauge."""
     session = restore_session(calibration)
     problem = _repeat_problem(calibration, session, calibration.tolerance_scale)
     if not math.isfinite(calibration.noise.sigma):
-        return np.zeros((problem.n_machine, problem.n_machine))
+        return problem
     noise = {g.name: g.noise / calibration.noise.sigma for g in calibration.gauges}
     of_setup = np.array([noise[s.gauge] for s in problem.session.setups.values()])
-    problem = problem.with_noise_ratio(of_setup[problem.observations.setup])
+    return problem.with_noise_ratio(of_setup[problem.observations.setup])
+
+
+def _recorded_information(calibration: Calibration, problem: CalibrationProblem) -> Information:
+    """Information of the readings at the estimate."""
     theta = np.array([p.value for p in (*calibration.free, *calibration.sensors)])
     _, jacobian = problem.predict_and_jacobian(theta)
-    return find_mounting_covariance(
-        problem,
-        decompose(jacobian, problem.observations),
-        sigma=max(calibration.noise.sigma, SMALLEST_SIGMA),
-        at_bound=np.array(
-            [p.at_bound for p in (*calibration.free, *calibration.sensors)], dtype=bool
-        ),
-    )
+    return decompose(jacobian, problem.observations)
+
+
+def _held(calibration: Calibration) -> Mask:
+    """Mask of the parameters that a bound holds, shape (n,)."""
+    held = [p.at_bound for p in (*calibration.free, *calibration.sensors)]
+    return np.array(held, dtype=bool)
 
 
 def _repeat_problem(

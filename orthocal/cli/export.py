@@ -22,7 +22,7 @@ from orthocal.cli.options import (
     read_vector,
 )
 from orthocal.cli.overwriting import mark_written, require_own_results
-from orthocal.cli.printing import put_note, write_results
+from orthocal.cli.printing import put_note, put_out, write_results
 from orthocal.errors import ParameterError
 from orthocal.io.files import exists
 from orthocal.units import DRIVE_UNITS, MM, UM
@@ -86,10 +86,22 @@ def export(
     files = orthocal.export_calibration(result, to, anyway=anyway, options=options)
     _require_free(out, files, force=force)
     write_results(out, mark_written(files))
+    if result.session.firmware is not None:
+        _show_settings(result, to)
     if "kinematics.ini" in files:
         _note_payload(result, payload)
     if to == "linuxcnc":
         _note_latching(result, options)
+
+
+def _show_settings(calibration: orthocal.Calibration, firmware: str) -> None:
+    """Print the new settings of a firmware, with their uncertainty."""
+    from orthocal.export.printer import describe_settings, fit_firmware
+    from orthocal.printers.firmwares import FIRMWARES
+
+    for known in FIRMWARES:
+        if firmware == known:
+            put_out(describe_settings(fit_firmware(calibration, known)))
 
 
 def _note_latching(calibration: orthocal.Calibration, options: orthocal.ExportOptions) -> None:

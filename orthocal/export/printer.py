@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import Rotation
 
 from orthocal.arrays import Array
@@ -24,7 +24,9 @@ from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.tool_error import assess_tool
 from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.refit import restore_covariances
 from orthocal.errors import ClosureError, ExportError
+from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace, box_workspace
 from orthocal.printers.firmwares import FIRMWARES
 from orthocal.printers.settings import DeltaSettings, FirmwareName
@@ -33,6 +35,9 @@ from orthocal.units import DEG, MM
 FIRST_LAYER = 10.0
 """Weight λ of the mean squared height of the first layer against that of the tool error. A print
 holds by its first layer: a weight of 10 makes it twice as flat for 5 % more tool error."""
+
+SLOPE_STEP = 1e-5
+"""Step of central differences, [m]."""
 
 RINGS = 6
 """Rings of points of the first layer."""
@@ -65,6 +70,24 @@ class FirmwareFit:
     """RMS tool error that the readings leave, [m]."""
     layer_unknown: float
     """RMS height of the first layer that they leave, [m]."""
+    rows: tuple[SettingRow, ...]
+    """The settings one by one: radius, rods, towers, endstops."""
+    gain: Array
+    """Derivative of the settings by the free errors of the machine and the nuisance parameters,
+    shape (10, n), [SI]."""
+
+
+@dataclass(frozen=True, slots=True)
+class SettingRow:
+    """A setting before and after, with its expanded uncertainty."""
+
+    name: str
+    now: float
+    new: float
+    uncertainty: float
+    """Expanded uncertainty of the new value; NaN if it is unknown."""
+    unit: str
+    """Unit of the numbers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,6 +101,15 @@ class _Targets:
     layer_points: Array
     """On the bed, shape (M, 3), [m]."""
     layer_carriages: Array
+    jacobian: Array
+    """Change of the points that the carriages reach, in the axes of the bed, by the free errors of
+    the machine and the nuisance parameters, shape (K, 3, n), [m per SI unit]."""
+    layer_jacobian: Array
+    """The same of `layer_points`, shape (M, 3, n)."""
+    by_drives: Array
+    """Change of the points by the carriages, in the axes of the bed, shape (K, 3, 3), [1]."""
+    layer_by_drives: Array
+    """The same of `layer_points`, shape (M, 3, 3)."""
 
 
 def fit_firmware(calibration: Calibration, firmware: FirmwareName) -> FirmwareFit:
@@ -104,12 +136,87 @@ def fit_firmware(calibration: Calibration, firmware: FirmwareName) -> FirmwareFi
     )
     settings = replace(_changed(present, found.x), firmware=firmware)
     tool = assessment_of(calibration).tool
+    moved = np.array(settings.homed) - present.homed
+    gain = _setting_gain(targets, settings, found, moved)
     return FirmwareFit(
         settings=settings,
         now=_measure(targets, present, np.zeros(3)),
-        new=_measure(targets, settings, np.array(settings.homed) - present.homed),
+        new=_measure(targets, settings, moved),
         tool_unknown=math.nan if tool is None else tool.compensated,
         layer_unknown=layer_unknown,
+        rows=_setting_rows(calibration, settings, gain),
+        gain=gain,
+    )
+
+
+def _slopes(settings: DeltaSettings, carriages: Array) -> Array:
+    """Derivative of what a firmware believes by its carriages, shape (K, 3, 3), [1]."""
+    steps = SLOPE_STEP * np.eye(3)
+    ends = [settings.forward(carriages + s) - settings.forward(carriages - s) for s in steps]
+    return np.stack(ends, axis=2) / (2.0 * SLOPE_STEP)
+
+
+def _setting_gain(
+    targets: _Targets, settings: DeltaSettings, found: OptimizeResult, moved: Array
+) -> Array:
+    """Derivative of the settings by the errors that were identified, shape (n_settings, n), [SI].
+
+    At the least squares Jᵀr = 0, so dx = −(JᵀJ)⁻¹ Jᵀ dr. With errors dθ more, the carriages that
+    bring the nozzle to a point change by dh = −(∂p/∂h)⁻¹ T dθ, T the sensitivity of the nozzle, and
+    what the firmware believes by dr = ∂f/∂h dh. Endstops follow from the homed carriages:
+    e = h − √(rod² − radius²).
+
+    Args:
+        targets: The points.
+        settings: The new settings.
+        found: The solved least squares.
+        moved: Change of the homed carriages, shape (3,), [m].
+    """
+    n = targets.jacobian.shape[-1]
+    believed, layer = (
+        _slopes(settings, carriages + moved) @ np.linalg.solve(by_drives, jacobian)
+        for carriages, by_drives, jacobian in (
+            (targets.carriages, targets.by_drives, targets.jacobian),
+            (targets.layer_carriages, targets.layer_by_drives, targets.layer_jacobian),
+        )
+    )
+    change = np.sqrt(targets.weights)[:, None, None] * believed
+    layer = math.sqrt(FIRST_LAYER / len(targets.layer_points)) * layer[:, 2]
+    change = np.concatenate([change.reshape(-1, n), layer])
+    gain = np.asarray(np.linalg.lstsq(found.jac, change, rcond=None)[0])
+    rods = np.array(settings.rods)[:, None] * gain[3:6] - settings.radius * gain[:1]
+    endstops = gain[6:9] - rods / settings.middle[:, None]
+    fixed = np.zeros((1, n))
+    return np.concatenate([gain[:1], gain[3:6], gain[1:3], fixed, endstops])
+
+
+def _setting_rows(
+    calibration: Calibration, settings: DeltaSettings, gain: Array
+) -> tuple[SettingRow, ...]:
+    """Settings before and after.
+
+    Args:
+        calibration: The calibration.
+        settings: The new settings.
+        gain: Derivative of radius, rods, angles and endstops, shape (10, n), [SI].
+    """
+    present = calibration.session.firmware or settings
+    uncertain = np.full(len(gain), np.nan)
+    if not calibration.unmodelled.prior_stds.size:
+        stds = [
+            np.sqrt(np.einsum("ij,jk,ik->i", gain, c, gain))
+            for c in restore_covariances(calibration)
+        ]
+        uncertain = calibration.expand(*stds)
+    values = [("radius", present.radius / MM, settings.radius / MM, MM, "mm")]
+    for name, size, unit in (("rods", MM, "mm"), ("angles", DEG, "°"), ("endstops", MM, "mm")):
+        words = {"rods": "rod", "angles": "direction of tower", "endstops": "endstop"}[name]
+        for k, tower in enumerate("abc"):
+            now, new = (getattr(s, name)[k] / size for s in (present, settings))
+            values.append((f"{words} {tower}", float(now), float(new), size, unit))
+    return tuple(
+        SettingRow(name, now, new, float(u) / size, unit)
+        for (name, now, new, size, unit), u in zip(values, uncertain.tolist(), strict=True)
     )
 
 
@@ -133,10 +240,23 @@ def _find_targets(calibration: Calibration) -> tuple[_Targets, float]:
         accuracy = assess_tool(calibration, Workspace.even(layer))
     except ClosureError as e:
         raise ExportError(f"the calibrated machine does not reach the bed: {e}") from None
-    unknown = math.nan
+    unknown, turn = math.nan, _bed_turn(calibration)
+    of_errors, of_drives = (
+        ToolSensitivity(robot, free=names, values=calibration.errors)
+        for names in (
+            [p.name for p in calibration.free],
+            [f"{d.name}.offset" for d in robot.drives],
+        )
+    )
+    jacobians = [
+        np.concatenate([tilt.T @ of_errors(c), -np.einsum("ijk,nj->nik", turn, p)], axis=2)
+        for p, c in ((space.points, carriages), (layer, layer_carriages))
+    ]
+    by_drives = [tilt.T @ of_drives(c) for c in (carriages, layer_carriages)]
     if accuracy.after is not None:
         unknown = math.sqrt(float(accuracy.after.aligned_covariance[:, 2, 2].mean()))
-    return _Targets(space.points, space.weights, carriages, layer, layer_carriages), unknown
+    parts = space.points, space.weights, carriages, layer, layer_carriages
+    return _Targets(*parts, *jacobians, *by_drives), unknown
 
 
 def _bed_tilt(calibration: Calibration) -> Array:
@@ -151,6 +271,21 @@ def _bed_tilt(calibration: Calibration) -> Array:
             yaw, roll = (value.get(f"setup.{setup.name}.{k}", 0.0) for k in ("yaw", "roll"))
             return np.asarray(Rotation.from_euler("xy", [roll, yaw]).as_matrix())
     raise ExportError("no setup measured the bed with a probe: the plane of the print is unknown")
+
+
+def _bed_turn(calibration: Calibration) -> Array:
+    """Derivative of the tilt of the bed by the nuisance parameters, (3, 3, n_nuisance), [1/rad].
+
+    Element i, j, k: change of coordinate i of a point by its coordinate j and parameter k.
+    """
+    turn = np.zeros((3, 3, len(calibration.sensors)))
+    for k, parameter in enumerate(calibration.sensors):
+        axis = {"roll": [1.0, 0.0, 0.0], "yaw": [0.0, 1.0, 0.0]}.get(
+            parameter.name.rpartition(".")[2]
+        )
+        if axis is not None:
+            turn[:, :, k] = np.cross(axis, np.eye(3)).T
+    return turn
 
 
 def _disc(limits: Array) -> Array:
@@ -243,22 +378,39 @@ STEPS: dict[FirmwareName, Sequence[str]] = {
 """How to enter the settings."""
 
 
+UNCERTAIN = (
+    "± is the uncertainty of a setting by itself (95 %). Settings compensate each other: with a "
+    "longer radius, longer rods are as flat."
+)
+
+
+def _plain(number: float) -> str:
+    return f"{number:.3f}" if math.isfinite(number) else ""
+
+
+def describe_settings(fit: FirmwareFit) -> str:
+    """Table of the settings, before and after, as text."""
+    lines = [f"  {'':20}{'now':>10}{'new':>10}{'±':>9}"]
+    lines += [
+        f"  {r.name:20}{r.now:10.3f}{r.new:10.3f}{_plain(r.uncertainty):>9}  {r.unit}"
+        for r in fit.rows
+    ]
+    return "\n".join(lines)
+
+
 def _page(calibration: Calibration, fit: FirmwareFit) -> str:
     """README.md: what to do, the values, what remains."""
-    settings, present = fit.settings, calibration.session.firmware
+    settings = fit.settings
     known = FIRMWARES[settings.firmware]
     steps = (
         *STEPS[settings.firmware],
         "Probe the bed again, and import the new log into another directory. The height of the "
         "probe (z offset) stays as it is: set it by paper as before.",
     )
-    rows = [("radius", settings.radius / MM, 0.0 if present is None else present.radius / MM, "mm")]
-    for name, size, unit in (("rods", MM, "mm"), ("angles", DEG, "°"), ("endstops", MM, "mm")):
-        words = {"rods": "rod", "angles": "direction of tower", "endstops": "endstop"}[name]
-        for k, tower in enumerate("abc"):
-            old = 0.0 if present is None else getattr(present, name)[k]
-            rows.append((f"{words} {tower}", getattr(settings, name)[k] / size, old / size, unit))
-    table = [f"| {name} | {old:.3f} | {new:.3f} | {unit} |" for name, new, old, unit in rows]
+    table = [
+        f"| {r.name} | {r.now:.3f} | {r.new:.3f} | {_plain(r.uncertainty)} | {r.unit} |"
+        for r in fit.rows
+    ]
     return "\n".join(
         [
             f"# Settings for {known.title}",
@@ -271,10 +423,11 @@ def _page(calibration: Calibration, fit: FirmwareFit) -> str:
             "",
             *(f"{i}. {step}" for i, step in enumerate(steps, start=1)),
             "",
-            "| | now | new | |",
-            "|---|---|---|---|",
+            "| | now | new | ± | |",
+            "|---|---|---|---|---|",
             *table,
             "",
+            *([] if calibration.unmodelled.prior_stds.size else [UNCERTAIN, ""]),
             "## What to expect",
             "",
             *_expectations(known.title, fit),

@@ -503,8 +503,8 @@ class LinearModel:
             problem = self.problem
             passive = self.at_reference(slopes=False).passive
             _, jacobian = problem.predict_and_jacobian(problem.active_theta, passive)
-            columns = (jacobian * problem.theta_scale)[:, problem.n_machine :]
-            return problem.observations.rows(columns * problem.noise_ratio[:, None]).T
+            columns = jacobian[:, problem.n_machine :] * problem.noise_ratio[:, None]
+            return problem.observations.rows(columns).T
 
         return self.share("nuisance", compute)
 

@@ -22,11 +22,12 @@ from orthocal import (
     load_session,
     write_calibration,
 )
+from orthocal.calibration.refit import restore_covariances
 from orthocal.export.printer import _find_targets, fit_firmware
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.measurement.importing.printer_log import import_printer_log
 from orthocal.printers.firmwares import FIRMWARES
-from orthocal.units import MM
+from orthocal.units import DEG, MM
 
 NOISE_MM = 0.02
 TRIGGER_MM = 1.85
@@ -35,6 +36,13 @@ PROMISE = 2.0
 """Ratio of an RMS height of the first layer to the promised one; that of a few unknown directions
 of the bed scatters by half."""
 
+
+SHARE = 0.2
+"""Part of the uncertainty by which estimates are displaced."""
+
+SECOND_ORDER = 0.1
+"""Part that the derivative omits, the curvature of residuals that are not 0: residuals of 0.2 mm
+times 1/(200 mm) beside a least eigenvalue of JᵀJ of 5e-3."""
 
 EXPRESSED = 2e-6
 """[m] A tower beside its direction is on a slightly larger radius, which three firmwares share."""
@@ -73,6 +81,9 @@ def test_walk_of_the_owner_of_a_printer(tmp_path, firmware):
     ):
         done = run_orthocal(tmp_path, *command)
         assert done.returncode == 0, done.stderr
+    shown = [line.split() for line in done.stdout.splitlines()]
+    assert shown[0] == ["now", "new", "±"]
+    assert len(shown) == 11
     lines = (tmp_path / "new" / FIRMWARES[firmware].file).read_text()
     new = read_settings(firmware, lines, m851=-TRIGGER_MM)
     before = printer.probe(settings, rings()) - TRIGGER_MM
@@ -132,6 +143,46 @@ def test_no_nearby_settings_are_better(calibrated):
                 assert cost(replace(s, **{name: tuple(values)}))[0] > best
     assert cost(replace(s, radius=s.radius + 0.05 * MM))[0] > best
     assert cost(replace(s, radius=s.radius - 0.05 * MM))[0] > best
+
+
+def test_uncertainty_of_the_settings(calibrated):
+    """Errors beside the identified ones change the settings as the derivative says."""
+    _, calibration = calibrated
+    fit = fit_firmware(calibration, "klipper")
+    covariance, _ = restore_covariances(calibration)
+    n = len(calibration.free)
+    assert covariance[:n, :n] == pytest.approx(calibration.model_covariance, rel=1e-6, abs=1e-18)
+    of_sensors = [p.std for p in calibration.sensors]
+    assert np.sqrt(np.diag(covariance)[n:]) == pytest.approx(of_sensors, rel=1e-6)
+    spread = 2.0 * np.sqrt(np.diag(fit.gain @ covariance @ fit.gain.T))
+    sizes = np.array([MM] * 4 + [DEG] * 3 + [MM] * 3)
+    stated = np.array([r.uncertainty for r in fit.rows])
+    assert (stated >= 0.99 * spread / sizes).all()
+    assert (stated < 1.3 * spread / sizes + 1e-12).all()  # Student's factor
+    rng = np.random.default_rng(3)
+    for _ in range(2):
+        errors = SHARE * rng.multivariate_normal(np.zeros(len(covariance)), covariance)
+        ends = [fit_firmware(_displaced(calibration, s * errors), "klipper") for s in (1.0, -1.0)]
+        new = np.array([[r.new for r in end.rows] for end in ends]) * sizes
+        change = 0.5 * (new[0] - new[1])
+        missed = np.abs(change - fit.gain @ errors)
+        assert (missed <= SECOND_ORDER * SHARE * spread + 1e-9).all()
+
+
+def _displaced(calibration, errors):
+    """The calibration with other estimates: those of the free errors and of the sensors."""
+    values = [p.value for p in (*calibration.free, *calibration.sensors)] + errors
+    n = len(calibration.free)
+    free = dict(zip([p.name for p in calibration.free], values, strict=False))
+    return replace(
+        calibration,
+        parameters=tuple(
+            replace(p, value=free.get(p.name, p.value)) for p in calibration.parameters
+        ),
+        sensors=tuple(
+            replace(p, value=v) for p, v in zip(calibration.sensors, values[n:], strict=True)
+        ),
+    )
 
 
 def test_a_machine_that_the_firmware_can_express_is_met(calibrated):
