@@ -51,7 +51,8 @@ class Workshop:
     def __init__(self, session, errors):
         self.session = session
         self.machine = session.robot.with_errors(errors)
-        self.frames = [frames(self.machine, p.drives) for p in session.postures.values()]
+        self.frames = {n: frames(self.machine, p.drives) for n, p in session.postures.items()}
+        self.stands = {}
         self.zero_drives = session.robot.drive_zero - session.active_offsets
         self.at_zero = frames(self.machine, self.zero_drives)
 
@@ -77,6 +78,18 @@ class Workshop:
 
     def read(self, setup, posture, crooked):
         """What a dial shows, [m]."""
+        key = setup, crooked
+        if key not in self.stands:
+            self.stands[key] = self._stand(setup, crooked)
+        rod, touching, ball, start, plunger, edge = self.stands[key]
+        places = self.frames[posture]
+        root, end = places[rod.root], places[rod.tip]
+        distance = _to_axis(root, end) if ball else _between(root, end, edge)
+        h = _touch(lambda h: distance(start + h * plunger), touching)
+        return (1.0 + crooked.scale) * h + crooked.zero
+
+    def _stand(self, setup, crooked):
+        """What a gauge touches, and how it stands."""
         sensor = self.session.setups[setup].sensor
         leg = self.session.robot.legs[sensor.leg]
         rod, axis = leg.rods[sensor.rod], leg.axis
@@ -90,13 +103,8 @@ class Workshop:
         assert sensor.section.form == "fraction"
         along = axis @ self.at_zero[leg.root] + sensor.section.value * leg.length
         start = (along + crooked.section) * axis + drawn + crooked.lateral * side
-        places = self.frames[list(self.session.postures).index(posture)]
-        root, end = places[rod.root], places[rod.tip]
         touching = rod.radius + sensor.tip.radius
-        ball = sensor.tip.form == "ball"
-        distance = _to_axis(root, end) if ball else _between(root, end, edge)
-        h = _touch(lambda h: distance(start + h * plunger), touching)
-        return (1.0 + crooked.scale) * h + crooked.zero
+        return rod, touching, sensor.tip.form == "ball", start, plunger, edge
 
 
 def _across(sensor, leg):

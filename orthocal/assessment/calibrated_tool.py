@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +18,9 @@ from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace, find_workspace
 from orthocal.robot.model import Robot
+
+KEPT = 4
+"""Calibrations whose tools are kept."""
 
 LIMIT_SLACK = 1e-9
 """By which a drive may seem to be beyond its travel, [m, rad]."""
@@ -105,8 +109,11 @@ class CalibratedTool:
         return np.concatenate(workspaces)
 
 
+@lru_cache(maxsize=KEPT)
 def find_tool(calibration: Calibration, use: UseSamples | None = None) -> CalibratedTool | None:
     """The tool over the workspace, or over the largest box of its shape that the machine reaches.
+
+    The tools of the last calibrations are kept: values to enter and tool errors need them.
 
     That is within all limits and reached by the nominal and the calibrated machine, with the
     offsets that were active while measuring and with the identified ones.

@@ -24,7 +24,7 @@ from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.robot_functions import robot_functions
 from orthocal.robot.model import Robot, require_commanded_tool, require_tcp
 
-MOST_TRANSMISSIONS = 8
+MOST_TRANSMISSIONS = 32
 """Tables of postures whose rod forces are remembered for one robot."""
 
 MOST_SOLUTIONS, MOST_KEPT = 16, 200

@@ -168,7 +168,8 @@ def test_it_is_that_of_sampled_machines_under_sampled_conditions(calibration, wo
     at = calibration.errors
     theta = np.array([at.get(n, 0.0) for n in names]) + errors
     nominal = nominal_closure(robot)
-    targets = nominal.forward(drives := nominal.inverse(workspace.points))
+    drives, passive = nominal.reach(workspace.points)  # other machines are near it
+    targets = nominal.tcp(drives, passive)
     commanded = {
         "now": drives - calibration.active_offsets,
         "entered": drives - entered_offsets(calibration),
@@ -185,9 +186,10 @@ def test_it_is_that_of_sampled_machines_under_sampled_conditions(calibration, wo
         for name, at_drives in commanded.items():
             sides = np.array([1.0 if s == "p" else -1.0 for s in c.approach])
             at_drives = at_drives + (sides * half if name == "entered" else 0.0)
-            fields[name].append(closure.forward(at_drives, theta=theta) - targets)
+            fields[name].append(closure.forward(at_drives, theta=theta, start=passive) - targets)
         corrected = calibration.machine.inverse(workspace.points, conditions=c)
-        fields["compensated"].append(closure.forward(corrected, theta=theta) - targets)
+        placed = closure.forward(corrected, theta=theta, start=passive)
+        fields["compensated"].append(placed - targets)
     expected = {name: getattr(figures, name) for name in fields if name != "unstated"}
     expected["unstated"] = figures.use.unstated
     for name, field in fields.items():
