@@ -26,6 +26,7 @@ from orthocal import (
     simulate_session,
     summarize,
 )
+from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.controller_entries import entered_offsets
 from orthocal.assessment.judgement import find_tolerance_scale
 from orthocal.assessment.remaining_errors import find_remaining_errors
@@ -310,6 +311,18 @@ def test_where_the_tool_is_now_by_pinocchio(calibrated):
     for i, d in enumerate(drives):
         tool = place(machine, d, "tcp", start=nominal_closure(machine).close(d))
         assert found.deviation[i] == pytest.approx(tool - points[i], abs=1e-9)
+
+
+def test_the_tool_of_a_calibration_is_placed_once(calibrated):
+    tool = find_tool(calibrated)
+    assert find_tool(calibrated) is tool
+    moved = tuple(
+        replace(p, value=p.value + 0.2e-3) if p.name == "x_slide.offset" else p
+        for p in calibrated.parameters
+    )
+    other = find_tool(replace(calibrated, parameters=moved))
+    at = calibrated.active_offsets
+    assert np.abs(other.deviation(at) - tool.deviation(at)).max() > 0.1e-3
 
 
 def test_what_is_entered_is_in_where_the_tool_is_then(calibrated):

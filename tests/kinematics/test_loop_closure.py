@@ -129,6 +129,20 @@ def test_far_postures_stay_in_the_branch_the_machine_is_built_in(orthoglide):
     assert np.abs(nominal_closure(orthoglide).forward(joints) - expected).max() < CLOSED_FORM
 
 
+def test_the_solution_at_points_is_that_of_the_machine_and_its_conditions(orthoglide):
+    """Whatever was solved for others before: the last solutions are kept."""
+    points = reachable_points(20, seed=7)
+    machines = [LoopClosure(orthoglide, fixed={"x_slide.offset": e}) for e in (0.0, 1e-3, 0.0)]
+    first, other, again = (np.hstack(m.reach(points)) for m in machines)
+    assert np.abs(first - other).max() > 0.9e-3
+    assert np.array_equal(first, again)
+    again[:] = 0.0  # a solution that is kept is nobody's to change
+    assert np.array_equal(np.hstack(machines[0].reach(points)), first)
+    assert np.abs(machines[0].forward(first[:, :3]) - points).max() < CLOSED_FORM
+    nominal_drives = machines[0].close(first[:, :3])
+    assert np.abs(nominal_drives - first[:, 3:]).max() < CLOSED_FORM
+
+
 def test_an_unreachable_posture_is_named_with_what_stays_open(orthoglide):
     joints = np.array([[0.31025] * 3, [0.7, 0.3, 0.3]])
     with pytest.raises(ClosureError, match="posture 'far' cannot be reached") as caught:
