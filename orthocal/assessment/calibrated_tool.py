@@ -22,6 +22,9 @@ from orthocal.robot.model import Robot
 KEPT = 4
 """Calibrations whose tools are kept."""
 
+MOST_DEVIATIONS = 8
+"""Deviations of tools that are kept."""
+
 LIMIT_SLACK = 1e-9
 """By which a drive may seem to be beyond its travel, [m, rad]."""
 
@@ -74,8 +77,10 @@ class CalibratedTool:
             offsets: In the controller, shape (n_drives,), [m, rad].
             names: What to call the points in messages.
         """
-        commanded = self.drives - np.asarray(offsets, dtype=np.float64)
-        return self._place(commanded + self.trims, names) - self.targets
+        at = np.asarray(offsets, dtype=np.float64)
+        if names is None:
+            return np.array(_deviation(self, at.tobytes()))
+        return self._place(self.drives - at + self.trims, names) - self.targets
 
     def deviation_unless_stated(self) -> Array:
         """Error of a controller that corrects all errors for the conditions of `UseConditions()`.
@@ -107,6 +112,12 @@ class CalibratedTool:
             for c, drives in zip(closures, commanded, strict=True)
         ]
         return np.concatenate(workspaces)
+
+
+@lru_cache(maxsize=MOST_DEVIATIONS)
+def _deviation(tool: CalibratedTool, offsets: bytes) -> Array:
+    """Deviation with offsets in the controller, of the last ones: several figures need it."""
+    return tool._place(tool.drives - np.frombuffer(offsets) + tool.trims, None) - tool.targets
 
 
 @lru_cache(maxsize=KEPT)
