@@ -16,6 +16,7 @@ import orthocal
 from orthocal import calibrate, draw_scene, load_session
 from orthocal.effects import registry as effect_registry
 from orthocal.errors import NotIdentifiableError
+from orthocal.observation.simulate import load_errors
 from orthocal.sensors import registry as sensor_registry
 from orthocal.session.session import Purpose
 
@@ -245,3 +246,16 @@ def test_the_session_that_a_page_shows_can_be_read(tmp_path):
     assert loaded.robot.parameters.stated == {"*.offset_mm": 4.0}
     with pytest.raises(NotIdentifiableError, match=r"do not determine z_slide\.offset"):
         calibrate(loaded, "offsets")  # "If readings leave an offset open, orthocal says so."
+
+
+@pytest.mark.parametrize("name", ["biglide", "inclined_orthoglide", "linear_delta"])
+def test_simulated_sessions_of_packaged_robots_give_the_truth(root, name):
+    """Each says that it is simulated, and the offsets to enter are within their uncertainty."""
+    folder = root / "examples" / name
+    assert (folder / "session.yaml").read_text().startswith("# Simulated readings, not measured.")
+    session = load_session(folder)
+    truth = load_errors(folder / "truth.yaml", session.robot)
+    found = calibrate(session)
+    for drive in session.robot.drives:
+        estimate = found[f"{drive.name}.offset"]
+        assert abs(estimate.value - truth[estimate.name]) < 3.0 * estimate.std

@@ -16,7 +16,7 @@ from commands import orthocal
 from folders import files_of
 from lxml import etree
 
-from orthocal import load_plan, load_robot
+from orthocal import calibrate, load_plan, load_robot
 from orthocal.builder.build import remake_robot
 from orthocal.builder.orthoglide import Orthoglide
 from orthocal.cli import dialogue as asking
@@ -406,3 +406,62 @@ def test_options_are_not_asked_for(monkeypatch):
     given["travel_mm"] = asking.Stated("--travel-mm", "10:20")
     with pytest.raises(ParameterError, match=r"--travel-mm: travel from 10 to 20 mm"):
         asking.find_answers(Orthoglide, given)
+
+
+USUAL = ["--travel-mm", "120:390", "--rod-radius-mm", "5.5", "--counts", "up", "--at-zero-mm", "0"]
+KINDS = {
+    "biglide": ["--leg-mm", "310.25", "--attachment-mm", "60", "--rods-apart-mm", "80", *USUAL],
+    "inclined-orthoglide": [
+        *("--dimension", "elevation_deg=45", "--dimension", "leg_mm=310.25"),
+        *("--attachment-mm", "40", "--rods-apart-mm", "80", *USUAL),
+    ],
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_machines_of_other_kinds_are_made_and_calibrated(tmp_path, kind):
+    """1.5 mm in the zero of a drive come back from exact readings of the legs."""
+    folder, out = tmp_path / "mill", tmp_path / "try"
+    code, said, _ = orthocal("new", folder, "--kind", kind, *KINDS[kind], "--paper")
+    assert code == 0
+    assert f"Wrote {folder}: " in said
+    robot = load_robot(folder)
+    name = robot.drives[1].name
+    error = ["--error", f"{name}.offset_mm=1.5", "--exact"]
+    assert orthocal("simulate", folder / "first", "--out", out, *error).returncode == 0
+    found = calibrate(out, "offsets")
+    for drive in robot.drives:
+        expected = 1.5e-3 if drive.name == name else 0.0
+        assert found[f"{drive.name}.offset"].value == pytest.approx(expected, abs=2e-6)
+    assert orthocal("new", folder, "--again").returncode == 0
+
+
+DELTA = [
+    *("--kind", "linear-delta", "--dimension", "rod_mm=280", "--dimension", "radius_mm=140"),
+    *("--travel-mm", "30:560", "--rods-apart-mm", "50", "--rod-radius-mm", "3"),
+]
+
+
+def test_the_first_plan_of_a_delta_is_its_bed_and_names_what_helps(tmp_path):
+    code, said, _ = orthocal("new", tmp_path / "delta", *DELTA)
+    assert code == 0
+    assert "Plan: 26 readings (1 closing) in 1 setup" in said
+    gains = re.search(r"Another hour, with all errors corrected: ([\d.]+) mm with (.*?);", said)
+    assert gains[2] == "a ball bar of 50 mm"
+    assert float(gains[1]) < 0.04
+    session = load_plan(tmp_path / "delta/first")
+    assert {s.sensor.kind for s in session.setups.values()} == {"tool_indicator"}
+    assert load_robot(tmp_path / "delta").workspace.tolist()[2] == [0.0, 0.14]
+
+
+def test_sensors_that_one_has_are_planned(tmp_path):
+    bar = "sensor: ball_bar\nsigma_mm: 0.002\nrange_mm: [-5, 5]\nlength_mm: 50\n"
+    (tmp_path / "bar.yaml").write_text(bar)
+    words = ["--with", tmp_path / "bar.yaml", "--hours", "0.5"]
+    code, said, err = orthocal("new", tmp_path / "delta", *DELTA, *words)
+    assert code == 0, err
+    session = load_plan(tmp_path / "delta/first")
+    assert "ball_bar" in {s.sensor.kind for s in session.setups.values()}
+    assert not any("u" in r.approach for r in session.readings)  # backlash needs a side
+    assert json.loads((tmp_path / "delta/first/plan.json").read_text())["setups"]
+    assert float(re.search(r"corrected: ([\d.]+) mm after", said)[1]) < 0.1

@@ -425,6 +425,7 @@ def _draw(
 
 def _report(folder: Path, design: _Design) -> None:
     """Print the expected tool error, the files and the next commands."""
+    from orthocal.output.text.accuracy import describe_gains
     from orthocal.output.text.layout import counted
     from orthocal.output.text.plan import describe_expected, describe_size, show_duration
 
@@ -435,8 +436,8 @@ def _report(folder: Path, design: _Design) -> None:
             f"Plan: {size}, about {show_duration(plan.minutes)}.",
             *describe_expected(plan),
         ]
-    if design.plan is not None and not isinstance(design.plan, orthocal.MeasuringPlan):
-        lines += [BED_WORDS]
+    if plan is not None and not isinstance(plan, orthocal.MeasuringPlan):
+        lines += [BED_WORDS, *describe_gains(plan.find_sensor_gains(), plan.expected.reported.rms)]
     programs = sum(name.endswith(".ngc") for name in design.files)
     lines += [
         f"Wrote {folder}: {design.machine.words}.",

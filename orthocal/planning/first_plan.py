@@ -17,6 +17,7 @@ from orthocal.planning.candidates import ON_AXIS, directions_across, posture_nam
 from orthocal.planning.equipment import Equipment, choose_box, place_tool
 from orthocal.planning.expected_error import Expected, ToolForecast, noise_of
 from orthocal.planning.further_readings import FurtherReadings
+from orthocal.planning.sensor_gains import SensorGain, find_sensor_gains
 from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.mounting import EXACT
 from orthocal.sensors.tool_indicator import Artefact, ToolIndicator
@@ -64,6 +65,10 @@ class FixedPlan:
     effects: tuple[EffectLimits, ...]
     further: tuple[FurtherReadings, ...] = ()
     complements: bool = False
+
+    def find_sensor_gains(self) -> tuple[SensorGain, ...]:
+        """Gains of an hour with each usual sensor, the largest first."""
+        return find_sensor_gains(self.forecast, self.session, self.expected)
 
 
 def expect_fixed(session: Session, choice: Choice, equipment: Equipment) -> FixedPlan:
