@@ -18,9 +18,12 @@ from orthocal.errors import SessionError
 from orthocal.estimation.choice import resolve_choice
 from orthocal.measurement.motion.motion import plan_motion
 from orthocal.observation.simulate import draw_errors
+from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.equipment import Equipment, place_tool
 from orthocal.planning.expected_error import ToolForecast
 from orthocal.planning.owned_sensors import load_owned_sensor
+from orthocal.planning.planned_session import _order_readings, build_session
+from orthocal.planning.selection import PlannedSetup
 from orthocal.planning.tool_candidates import list_tool_candidates
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Reading, Session, Setup
@@ -264,3 +267,21 @@ def test_the_minutes_of_a_sensor_are_those_of_its_file(owned):
     assert plan.minutes <= 120.0 + 1e-9
     times = [r.conditions.time for r in equipment.in_course(session).readings]
     assert (times[-1] - times[0]).total_seconds() / 60.0 > plan.minutes - 45.0
+
+
+def test_postures_in_which_a_drive_turns_round_are_omitted(owned):
+    """On the arcs of a bar a drive may turn round in a posture: backlash needs a side."""
+    robot = replace(with_effects(load_robot("linear_delta"), ["backlash"]), legs={})
+    equipment = Equipment(owned=owned(bar=BAR.replace("length_mm: 50", "length_mm: 60")))
+    session = list_candidates(robot, equipment)
+    forecast = ToolForecast(robot, resolve_choice("offsets", None).select(robot.parameters))
+    candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
+    count = len(candidates.setups[0].rows)
+    planned = [PlannedSetup(0, tuple(np.random.default_rng(0).permutation(count)[:12].tolist()))]
+    as_chosen = _order_readings(candidates, planned, None)
+    unclear = {r.posture for r in as_chosen.readings if "u" in r.conditions.approach}
+    assert unclear
+    plan = build_session(candidates, planned)
+    assert not any("u" in r.conditions.approach for r in plan.readings)
+    assert {r.posture for r in plan.readings} == {r.posture for r in as_chosen.readings} - unclear
+    assert plan.readings[-1].posture == plan.readings[0].posture
