@@ -31,7 +31,7 @@ def good(tmp_path_factory):
 
 
 def test_mutated_files_are_refused_or_good(good):
-    found = run(good, seed=2026, count=COUNT, jobs=min(os.cpu_count() or 1, 2), thorough=0.1)
+    found = run(good, seed=2026, count=COUNT, jobs=1, thorough=0.1)
     assert found.bad == []
     assert sum(found.outcomes.values()) == COUNT
     for kind in KINDS:  # else nothing was tried of it

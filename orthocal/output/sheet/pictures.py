@@ -57,6 +57,9 @@ GAP = 0.6
 COVERING = 5.0
 """Distance that a label moves to uncover 1 mm of a line, [mm]."""
 
+REACHES = (8.0, 32.0, math.inf)
+"""Distances within which the place of a label is sought, one after the other, [mm]."""
+
 CELL = 0.5
 """Side of the cells in which drawn points are counted, [mm]."""
 
@@ -219,33 +222,43 @@ class Picture:
         as distance. A label without any free place is left out.
         """
         count = self._count_drawn()
-        paper = np.array([self.width, self.height])
         placed: list[tuple[_Label, Box]] = []
         for label in self.labels:
-            half = label.half
-            low, high = half + GAP, paper - half - GAP
-            if (low > high).any():
-                continue
-            wanted = np.clip(label.wanted, low, high)
-            x, y = (
-                np.r_[w, np.arange(a, b, STEP)] for w, a, b in zip(wanted, low, high, strict=True)
-            )
-            centres = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-            for _, box in placed:
-                size = 0.5 * np.array([box.right - box.left, box.bottom - box.top])
-                middle = 0.5 * np.array([box.left + box.right, box.top + box.bottom])
-                apart = (np.abs(centres - middle) >= half + size + GAP).any(axis=1)
-                centres = centres[apart]
-            if not len(centres):
-                continue
-            first = np.floor((centres - half) / CELL).astype(int)
-            last = np.ceil((centres + half) / CELL).astype(int)
-            (a, b), (c, d) = first.T, last.T
-            covered = count[c, d] - count[a, d] - count[c, b] + count[a, b]
-            cost = np.linalg.norm(centres - label.wanted, axis=1) + COVERING * covered
-            best = centres[cost.argmin()]
-            placed.append((label, Box(*(best - half).tolist(), *(best + half).tolist())))
+            for reach in REACHES:
+                box, cost = self._place(label, placed, count, reach)
+                if cost <= reach:  # farther places cost more
+                    break
+            if box is not None:
+                placed.append((label, box))
         return placed
+
+    def _place(
+        self, label: _Label, placed: Sequence[tuple[_Label, Box]], count: Array, reach: float
+    ) -> tuple[Box | None, float]:
+        """Best free place of a label and its cost, [mm]; None without a place within reach."""
+        half = label.half
+        low, high = half + GAP, np.array([self.width, self.height]) - half - GAP
+        if (low > high).any():
+            return None, math.inf
+        wanted = np.clip(label.wanted, low, high)
+        lines = [np.r_[w, np.arange(a, b, STEP)] for w, a, b in zip(wanted, low, high, strict=True)]
+        x, y = (v[np.abs(v - w) <= reach] for v, w in zip(lines, label.wanted, strict=True))
+        centres = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        for _, box in placed:
+            size = 0.5 * np.array([box.right - box.left, box.bottom - box.top])
+            middle = 0.5 * np.array([box.left + box.right, box.top + box.bottom])
+            apart = (np.abs(centres - middle) >= half + size + GAP).any(axis=1)
+            centres = centres[apart]
+        if not len(centres):
+            return None, math.inf
+        first = np.floor((centres - half) / CELL).astype(int)
+        last = np.ceil((centres + half) / CELL).astype(int)
+        (a, b), (c, d) = first.T, last.T
+        covered = count[c, d] - count[a, d] - count[c, b] + count[a, b]
+        cost = np.linalg.norm(centres - label.wanted, axis=1) + COVERING * covered
+        best = int(cost.argmin())
+        box = Box(*(centres[best] - half).tolist(), *(centres[best] + half).tolist())
+        return box, float(cost[best])
 
     def _count_drawn(self) -> Array:
         """Number of drawn points between the upper left corner and each corner of the cells."""
