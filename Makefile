@@ -33,7 +33,8 @@ check: $(TESTED)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
-	$(VENV)/bin/python -m pytest --collect-only -qq tests > /dev/null  # compiles them for all workers
+	@# compiles the tests for all workers
+	$(VENV)/bin/python -m pytest --collect-only -qq > $(VENV)/tests || { cat $(VENV)/tests; false; }
 
 smoke: $(TESTED)
 	$(VENV)/bin/python .ci/smoke.py

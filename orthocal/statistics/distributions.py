@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from functools import lru_cache
 from statistics import NormalDist
 
 import numpy as np
@@ -87,6 +88,7 @@ def f_tail(dof: float, dof_below: float, value: float) -> float:
     return beta_share(0.5 * dof_below, 0.5 * dof, dof_below / (dof_below + dof * value))
 
 
+@lru_cache(maxsize=256)
 def t_quantile(dof: float, share: float) -> float:
     """Quantile of Student's t with some degrees of freedom, for a share above one half."""
 
