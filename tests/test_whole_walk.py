@@ -18,7 +18,7 @@ import pytest
 from adjusting import aligned_rms
 from commands import run_orthocal
 from independent import Expansion, IndependentMachine, States
-from linuxcnc import Joint, require_linuxcnc, run_program
+from linuxcnc import Joint, play, require_linuxcnc, run_program
 from programs import read_polyline
 
 from orthocal import (
@@ -161,19 +161,33 @@ TAKEN_UP = 3
 """Holes after which every drive has reversed."""
 
 
+@pytest.fixture(scope="module")
+def warm_mill(tmp_path_factory, without_plots):
+    """A machine with a plan for a day that warms by 8 K."""
+    folder = tmp_path_factory.mktemp("warm")
+    run(folder, "new", "mill", *SIZES.removesuffix("--effects none --paper").split(), *WARM.split())
+    return folder / "mill"
+
+
 @pytest.fixture(scope="module", params=[40e-6, 0.0], ids=["backlash", "no backlash"])
-def warmed(request, tmp_path_factory, without_plots):
+def warmed(request, tmp_path_factory, warm_mill):
     """Two sessions on days that warm by 8 K, up to the corrected program.
 
     With the directory, the backlash of each drive, and what was printed.
     """
-    folder, said = tmp_path_factory.mktemp("warm"), {}
-    run(folder, "new", "mill", *SIZES.removesuffix("--effects none --paper").split(), *WARM.split())
+    folder, said = tmp_path_factory.mktemp("warmed"), {}
+    shutil.copytree(warm_mill, folder / "mill")
+
+    def identify(name, *sessions):  # without its report
+        (folder / name).mkdir()
+        document = run(folder, "calibrate", *sessions, "--json")
+        (folder / name / "calibration.json").write_text(document)
+
     truth = [f"--error={d}_slide.backlash_mm={request.param / MM:g}" for d in "xyz"]
     draw = "--draw", "full", "--seed", SEED, *truth
     run(folder, "simulate", "mill/first", *draw, "--temperature", DAYS[0], "--out", "one")
     run(folder, "check", "one")
-    said["first"] = run(folder, "calibrate", "one", "--out", "first")
+    identify("first", "one")
     said["compare"] = " ".join(run(folder, "compare", "one").split())
     home = "--offsets", "--home-offset", "0,0,0", "--latched=+,+,+"
     run(folder, "export", "first", "--to", "linuxcnc", *home, "--out", "cnc")
@@ -181,7 +195,7 @@ def warmed(request, tmp_path_factory, without_plots):
     same = "--errors", "one/truth.yaml", "--seed", SEED + 1
     run(folder, "simulate", "mill/second", *same, "--temperature", DAYS[1], "--out", "two")
     said["validate"] = " ".join(run(folder, "validate", "first", "two").split())
-    said["both"] = run(folder, "calibrate", "one", "two", "--out", "both")
+    identify("both", "one", "two")
     drilled = [
         f"N{n} {'G1' if n > 1 else 'G0'} X{x} Y{y} Z{z} F600"
         for n, (x, y, z) in enumerate(HOLES, start=1)
@@ -213,9 +227,7 @@ def drill(folder, program, backlash):
     moved = np.maximum.accumulate(np.where(steps, np.arange(len(steps))[:, None], 0), axis=0)
     sides = np.sign(np.take_along_axis(steps, moved, axis=0))
     slides = motors + 0.5 * sides * both.compensated_backlash
-    for k in range(1, len(slides)):
-        half = 0.5 * backlash
-        slides[k] = np.clip(slides[k - 1], slides[k] - half, slides[k] + half)
+    slides = play(slides, np.full(slides.shape[1], backlash))
     truth = collect_errors(robot, file=folder / "one/truth.yaml")
     rigid = {n: v for n, v in truth.items() if not n.endswith(".backlash")}
     machine = IndependentMachine(bare, rigid, expansion=Expansion())
