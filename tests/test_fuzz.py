@@ -6,7 +6,6 @@ What a longer run found stands below as tests of their own.
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 import signal
