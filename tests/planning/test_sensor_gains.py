@@ -63,10 +63,12 @@ def test_where_leg_readings_determine_nothing_the_answer_names_the_sensor():
     best = plan.find_sensor_gains()[0]
     assert "ball bar" in best.words
     assert best.rms < 0.1 * plan.expected.reported.rms
-    words = " ".join(summarize(plan).split())
-    sentence = next(s for s in words.split(". ") if "do not determine the offset of" in s)
-    assert all(name in sentence for name in ("a_slide", "b_slide", "c_slide"))
-    assert f"Another hour with {best.words} would reduce the error to" in words
+    calibration = calibrate(simulate_session(plan.session, {"a_slide.offset": 3e-4}).session)
+    for result in (plan, calibration):
+        words = " ".join(summarize(result).split())
+        sentence = next(s for s in words.split(". ") if "do not determine the offset of" in s)
+        assert all(name in sentence for name in ("a_slide", "b_slide", "c_slide"))
+        assert f"Another hour with {best.words} would reduce the error to 0.017 mm" in words
 
 
 def test_the_details_of_a_calibration_name_the_same_sensors(legs):
@@ -75,6 +77,7 @@ def test_the_details_of_a_calibration_name_the_same_sensors(legs):
     text = " ".join(to_text(render_tool(calibration)).split())
     assert "Another hour, with all errors corrected: " in text
     assert "with a ball bar of 50 mm" in text
+    assert "do not determine" not in summarize(calibration)
     offsets = calibrate(readings, "offsets")
     assert "Another hour" not in to_text(render_tool(offsets))
 

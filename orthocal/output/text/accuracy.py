@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from rich.console import RenderableType
@@ -11,6 +12,7 @@ from rich.text import Text
 
 from orthocal.arrays import Array
 from orthocal.assessment.assess import assessment_of
+from orthocal.assessment.effect_limits import DETERMINED
 from orthocal.assessment.remaining_errors import RemainingError, find_remaining_errors
 from orthocal.assessment.tool_error import (
     ErrorSizes,
@@ -18,7 +20,7 @@ from orthocal.assessment.tool_error import (
     assess_tool,
     summarise_tool,
 )
-from orthocal.assessment.wording import tool_mm
+from orthocal.assessment.wording import joined, tool_mm
 from orthocal.assessment.words.entries import (
     describe_compensated,
     describe_tool_error,
@@ -57,6 +59,9 @@ COLUMNS_NOTE = (
 UNCERTAINTY_NOTE = (
     "Uncertainty: RMS in space. Errors that were not identified are included with their tolerances."
 )
+
+HELPFUL = 0.1
+"""Relative reduction of a tool error by which a sensor helps."""
 
 NOTICEABLE = 0.02
 """Relative reduction of a tool error below which a sensor is not listed."""
@@ -127,26 +132,59 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
 
 
 def _describe_sensors(calibration: Calibration, accuracy: ToolAccuracy) -> list[str]:
-    """Tool errors after an hour with each sensor that helps, as sentences.
+    """Tool errors after an hour with each sensor that helps, as sentences."""
+    rms, gains = _find_gains(calibration, accuracy)
+    return describe_gains(gains, rms)
 
-    For a controller that corrects all errors, to first order about the nominal machine.
+
+def describe_undetermined(calibration: Calibration) -> list[str]:
+    """Offsets that the readings do not determine, and the sensor that helps, as sentences."""
+    drives = [d.name for d in calibration.robot.drives]
+    free = {p.name: p for p in calibration.free if p.prior}
+    offsets = {d: free[f"{d}.offset"] for d in drives if f"{d}.offset" in free}
+    unknown = [d for d, p in offsets.items() if p.std > DETERMINED * p.prior_std]
+    if not unknown:
+        return []
+    rms, gains = _find_gains(calibration)
+    return [describe_remedy(unknown, gains, rms)]
+
+
+def describe_remedy(drives: Sequence[str], gains: Iterable[SensorGain], rms: float) -> str:
+    """Offsets that readings do not determine, and the sensor that helps most, as sentences."""
+    helpful, remedy = helpful_gains(gains, rms, HELPFUL), "Plan more time or setups."
+    if helpful:
+        best = helpful[0]
+        remedy = f"Another hour with {best.words} would reduce the error to {tool_mm(best.rms)}."
+    return f"These readings do not determine the offset of {joined(drives)}. {remedy}"
+
+
+def _find_gains(
+    calibration: Calibration, accuracy: ToolAccuracy | None = None
+) -> tuple[float, tuple[SensorGain, ...]]:
+    """Expected tool error with all errors corrected, [m], and gains of an hour with each sensor.
+
+    To first order about the nominal machine. No gains where they cannot be computed.
+
+    Args:
+        calibration: The calibration.
+        accuracy: Its tool errors over a region; by default the workspace of the robot.
     """
     if calibration.only_offsets:
-        return []
+        return math.nan, ()
     session = restore_session(calibration)
     parameters, scale = session.robot.parameters, calibration.tolerance_scale
     selection = select_parameters(
         parameters, model=complete_model(parameters), tolerance_scale=scale
     )
-    workspace = accuracy.workspace.once(accuracy.use.size)
+    use = None if accuracy is None else accuracy.use
+    workspace = None if accuracy is None else accuracy.workspace.once(accuracy.use.size)
     try:
         session = state_noise(session)
-        forecast = ToolForecast(session.robot, selection, workspace, use=accuracy.use)
+        forecast = ToolForecast(session.robot, selection, workspace, use=use)
         expected = forecast.about_nominal(session)
-        gains = find_sensor_gains(forecast, session, expected)
+        return expected.reported.rms, find_sensor_gains(forecast, session, expected)
     except OrthocalError:  # the noise of the readings is unknown, or no drives command the tool
-        return []
-    return describe_gains(gains, expected.reported.rms)
+        return math.nan, ()
 
 
 def helpful_gains(gains: Iterable[SensorGain], rms: float, least: float) -> list[SensorGain]:

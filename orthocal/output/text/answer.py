@@ -30,6 +30,7 @@ from orthocal.calibration.assessment_record import (
 )
 from orthocal.calibration.calibration import Calibration
 from orthocal.measurement.joining import name_within
+from orthocal.output.text.accuracy import describe_undetermined
 from orthocal.output.text.layout import (
     EXPANDED,
     bullets,
@@ -93,7 +94,8 @@ def render_answer(
     if assessment.backlash and assessment.decision.verdict != "reject":
         parts += [_indented(render_backlash(calibration)), Text()]
     parts += _tool(calibration, assessment)
-    parts.append(bullets([f.words for f in _listed(calibration, assessment)]))
+    notes = [f.words for f in _listed(calibration, assessment)]
+    parts.append(bullets([*notes, *describe_undetermined(calibration)]))
     return Group(*parts, render_next(*_next_step(calibration, assessment, saved)))
 
 

@@ -13,7 +13,7 @@ from rich.padding import Padding
 from rich.text import Text
 
 from orthocal.assessment.effect_limits import DETERMINED, EffectLimits
-from orthocal.assessment.wording import joined, tool_mm
+from orthocal.assessment.wording import tool_mm
 from orthocal.assessment.words.entries import describe_aligned
 from orthocal.kinematics.conditions import stated_use
 from orthocal.kinematics.workspace import find_workspace
@@ -22,7 +22,7 @@ from orthocal.output.text.accuracy import (
     NOTICEABLE,
     describe_gains,
     describe_remaining,
-    helpful_gains,
+    describe_remedy,
 )
 from orthocal.output.text.layout import bullets, counted, plain, section, table_of
 from orthocal.planning.cost_curve import ENOUGH, HOUR, Stage
@@ -57,9 +57,6 @@ PLAN_BASIS = {"travel_mm": "travel", "workspace_mm": "workspace"}
 
 SOME_LOST = 0.01
 """Fraction of impossible readings above which the plan says so."""
-
-HELPFUL = 0.1
-"""Relative reduction of the error by which another gauge helps."""
 
 MOST_LISTED = 24
 """Largest number of setups that are listed one by one."""
@@ -145,12 +142,7 @@ def _undetermined(plan: MeasuringPlan | FixedPlan, gains: Sequence[SensorGain]) 
     drives = _undetermined_offsets(plan)
     if not drives:
         return []
-    helpful = helpful_gains(gains, plan.expected.reported.rms, HELPFUL)
-    remedy = "Plan more time or setups."
-    if helpful:
-        best = helpful[0]
-        remedy = f"Another hour with {best.words} would reduce the error to {tool_mm(best.rms)}."
-    return [f"These readings do not determine the offset of {joined(drives)}. {remedy}"]
+    return [describe_remedy(drives, gains, plan.expected.reported.rms)]
 
 
 def _undetermined_offsets(plan: MeasuringPlan | FixedPlan) -> list[str]:
