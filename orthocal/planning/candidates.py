@@ -23,6 +23,7 @@ from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import nominal_sensitivity
 from orthocal.observation.observations import build_observations
 from orthocal.planning.equipment import Equipment, choose_box, place_tool, reachable
+from orthocal.planning.owned_sensors import DIAL
 from orthocal.planning.tool_candidates import list_tool_candidates
 from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.direction import Direction
@@ -55,9 +56,6 @@ ON_AXIS = 0.999
 
 ZERO_PRIOR = 0.01
 """Prior standard deviation of a gauge zero, [m]: large beside any reading."""
-
-DIAL = "dial"
-"""Name of the gauge for legs beside sensors at the tool."""
 
 FEWEST = 2
 """Fewest readings of a setup: one alone only determines the gauge zero."""

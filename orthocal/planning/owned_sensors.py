@@ -12,8 +12,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from orthocal.errors import SessionError
 from orthocal.io.documents import Number, read_yaml, validate
 from orthocal.measurement.files.schema import GaugeKeys
+from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Gauge
 from orthocal.statistics.noise import noise_floor
+
+DIAL = "dial"
+"""Name of the gauge for legs beside sensors at the tool."""
 
 SLACK = 1e-9
 """Minutes by which rounding may exceed a time."""
@@ -64,12 +68,24 @@ class DurationKeys(BaseModel):
         )
 
 
-PLACED = {
-    "ball_bar": ("centre_mm", "ball"),
-    "tool_indicator": ("direction",),
-    "probe": (),
+PLACED: Mapping[str, Mapping[str, Any]] = {
+    "ball_bar": {"centre_mm": [0.0, 0.0, 0.0], "ball": "ball"},
+    "tool_indicator": {"direction": "x"},
+    "probe": {},
 }
-"""Kinds of sensor that a plan places, with the keys that the plan chooses."""
+"""Kinds of sensor that a plan places, with the keys that the plan chooses, and values of them with
+which the other keys are checked."""
+
+PLACED_ARTEFACTS: Mapping[str, Mapping[str, Any]] = {
+    "square": {"along": "y", "name": "square"},
+    "straightedge": {"along": "y", "name": "edge"},
+    "plate": {},
+    "gauge_block": {"table_mm": 0.0},
+}
+"""Kinds of artefact, with such keys of them."""
+
+CHOSEN = ("gauge", "postures", "aligned_at")
+"""Keys of every setup that the plan chooses."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +112,7 @@ def load_owned_sensor(path: str | Path) -> OwnedSensor:
     """
     file = Path(path)
     data = read_yaml(file, error=SessionError)
-    if not isinstance(data, dict) or data.get("sensor") not in PLACED:
+    if not isinstance(data, dict) or data.get("sensor") not in list(PLACED):
         raise SessionError(
             f"expected the key sensor: {' or '.join(PLACED)}, and those of the sensor",
             where=str(file),
@@ -111,9 +127,25 @@ def load_owned_sensor(path: str | Path) -> OwnedSensor:
             "is missing; a plan needs the repeatability of the readings", where=f"{file}: sigma_mm"
         )
     keys = {k: v for k, v in data.items() if k not in gauge_keys or k in shared}
-    for key in PLACED[data["sensor"]]:
-        if key in keys:
-            raise SessionError("the plan chooses it; leave it out", where=f"{file}: {key}")
+    _require_keys(keys, file)
     name = "".join(c for c in file.stem if c.isalnum() or c in "_-") or "sensor"
     usual = DURATIONS[data["sensor"]]
     return OwnedSensor(name, gauge, keys, file, duration.to_duration(usual))
+
+
+def _require_keys(keys: Mapping[str, Any], file: Path) -> None:
+    """Refuse keys that the plan chooses, and values that no setup may have.
+
+    Raises:
+        SessionError: Naming file and key.
+    """
+    chosen = PLACED[keys["sensor"]]
+    complete, artefact = {**keys, **chosen}, keys.get("artefact")
+    given = [key for key in (*chosen, *CHOSEN) if key in keys]
+    if isinstance(artefact, Mapping) and artefact.get("kind") in list(PLACED_ARTEFACTS):
+        of_artefact = PLACED_ARTEFACTS[artefact["kind"]]
+        given += [f"artefact.{key}" for key in of_artefact if key in artefact]
+        complete["artefact"] = {**artefact, **of_artefact}
+    if given:
+        raise SessionError("the plan chooses it; leave it out", where=f"{file}: {given[0]}")
+    read_setup(complete, where=str(file), under="", error=SessionError)

@@ -11,11 +11,11 @@ from typing import Any
 from threadpoolctl import threadpool_limits
 
 from orthocal.errors import ParameterError
-from orthocal.planning.candidates import DIAL, list_candidates, measure_candidates
+from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.cost_curve import HOUR, find_scale
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import Expected, ToolForecast
-from orthocal.planning.owned_sensors import DURATIONS, Duration, OwnedSensor
+from orthocal.planning.owned_sensors import DIAL, DURATIONS, Duration, OwnedSensor
 from orthocal.planning.selection import SetupSearch
 from orthocal.planning.timed_search import TimedSearch
 from orthocal.planning.tool_candidates import list_tool_candidates

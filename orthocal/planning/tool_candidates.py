@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import can_approach, usual_approaches
 from orthocal.planning.equipment import choose_box, place_tool, reachable
-from orthocal.planning.owned_sensors import OwnedSensor
+from orthocal.planning.owned_sensors import DIAL, OwnedSensor
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import Sensor, default_zero, tool_path
 from orthocal.sensors.registry import read_setup
@@ -71,6 +71,12 @@ def list_tool_candidates(
     stated = robot.workspace if box is None else box
     limits, middle = choose_box(robot, stated), tool_at_zero(robot)
     gauges = {sensor.name: sensor.gauge for sensor in owned}
+    taken = [DIAL, *(sensor.name for sensor in owned)]
+    for sensor in owned:
+        if taken.count(sensor.name) > 1:
+            raise SessionError(
+                f"two gauges are named '{sensor.name}'; rename the file", where=str(sensor.file)
+            )
     postures: dict[str, Posture] = {}
     setups: dict[str, Setup] = {}
     readings: list[Reading] = []
@@ -80,13 +86,13 @@ def list_tool_candidates(
             reached = points[reachable(robot, points)]
             if len(reached) < 2:
                 continue
-            _, built = read_setup(
+            checked, built = read_setup(
                 {**sensor.keys, **keys}, where=str(sensor.file), under="", error=SessionError
             )
             names = [_name(p, middle) for p in reached]
             for posture, placed in place_tool(robot, names, reached).items():
                 postures.setdefault(posture, placed)
-            setups[name] = Setup(name, built, sensor.name, zero=default_zero(built))
+            setups[name] = Setup(name, built, sensor.name, zero=checked.zero or default_zero(built))
             readings += [
                 Reading(name, posture, conditions=conditions)
                 for posture, conditions in _approached(robot, built, names, reached)
@@ -126,20 +132,13 @@ def _places(
     if sensor.keys["sensor"] == "probe":
         yield from _beds(sensor, middle, box)
         return
-    artefact = sensor.keys.get("artefact")
-    kind = artefact.get("kind") if isinstance(artefact, Mapping) else None
     places = {
         "square": _edges,
         "straightedge": _edges,
         "plate": _plates,
         "gauge_block": _blocks,
     }
-    if kind not in places:
-        raise SessionError(
-            f"found {kind!r}; expected one of {', '.join(places)}",
-            where=f"{sensor.file}: artefact.kind",
-        )
-    yield from places[kind](sensor, middle, box)
+    yield from places[sensor.keys["artefact"]["kind"]](sensor, middle, box)
 
 
 def _bars(
@@ -172,10 +171,7 @@ def _beds(
     sensor: OwnedSensor, middle: Array, box: Array
 ) -> Iterator[tuple[str, dict[str, Any], Array]]:
     """Points of a bed, in whose plane the origin of the world lies."""
-    direction = str(sensor.keys.get("direction", "-z"))
-    if direction[-1:] not in list("xyz"):
-        direction = "-z"  # refused with the other keys
-    axis = "xyz".index(direction[-1])
+    axis = "xyz".index(str(sensor.keys.get("direction", "-z"))[-1])
     tip = np.array(sensor.keys.get("tool_mm", (0.0, 0.0, 0.0)))[axis] * MM
     points = _grid(middle, box, axis, 2.0 * float(np.ptp(box, axis=1).max()), ON_BED)
     points[:, axis] = -tip

@@ -172,6 +172,17 @@ def test_approaches_of_a_bar_follow_from_its_path(owned):
     ("text", "place"),
     [
         (BAR + "minutes_a_reading: -1\n", "minutes_a_reading"),
+        (BAR.replace("length_mm: 50", "length_mm: long"), "length_mm"),
+        (BAR.replace("length_mm: 50\n", ""), "length_mm"),
+        (BAR + "tool_mm: [1]\n", "tool_mm"),
+        (BAR + "postures: [zero]\n", "postures"),
+        (PLATE.replace("kind: plate", "kind: mirror"), "artefact"),
+        (PLATE.replace("length_mm: 150", "length_mm: -5"), "artefact.plate.length_mm"),
+        (SQUARE.replace("kind: square", "kind: square, along: x"), "artefact.along"),
+        (BLOCK.replace("height_mm: 50", "height_mm: high"), "artefact.gauge_block.height_mm"),
+        (PROBE + "tool_mm: low\n", "tool_mm"),
+        ("sensor: [probe]\n", ""),
+        ("- 1\n", ""),
         (BAR.replace("ball_bar", "leg"), ""),
         (BAR.replace("sigma_mm: 0.002\n", ""), "sigma_mm"),
         (BAR + "centre_mm: [0, 0, 0]\n", "centre_mm"),
@@ -285,3 +296,16 @@ def test_postures_in_which_a_drive_turns_round_are_omitted(owned):
     assert not any("u" in r.conditions.approach for r in plan.readings)
     assert {r.posture for r in plan.readings} == {r.posture for r in as_chosen.readings} - unclear
     assert plan.readings[-1].posture == plan.readings[0].posture
+
+
+@pytest.mark.parametrize("names", [("dial",), ("bar", "bar")])
+def test_gauges_of_one_name_are_refused(owned, orthoglide, names):
+    sensors = [sensor for name in names for sensor in owned(**{name: BAR})]
+    with pytest.raises(SessionError) as caught:
+        list_tool_candidates(orthoglide, sensors, None)
+    assert str(caught.value.where).endswith(f"{names[0]}.yaml")
+
+
+def test_a_zero_that_a_file_states(owned, orthoglide):
+    _, _, setups, _ = list_tool_candidates(orthoglide, owned(bar=BAR + "zero: free\n"), None)
+    assert {s.zero for s in setups.values()} == {"free"}
