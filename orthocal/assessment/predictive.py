@@ -56,9 +56,9 @@ class DeviationTest:
 def judge_deviations(calibration: Calibration, fit: Fit) -> DeviationTest:
     """Test of the deviations of a new session against their predictive distribution.
 
-    χ² = rᵀ V⁻¹ r with r = y - h(θ, 0), gauge zeros eliminated. It is an F statistic where the noise
-    was estimated. Without a prior the residuals of the calibration are the noise: they contain the
-    errors that its model omits.
+    χ² = rᵀ V⁻¹ r with r = y - h(θ, ν) + G ν and the mountings ν of the fit, gauge zeros eliminated.
+    It is an F statistic where the noise was estimated. Without a prior the residuals of the
+    calibration are the noise: they contain the errors that its model omits.
 
     Args:
         calibration: The calibration.
@@ -79,8 +79,11 @@ def judge_deviations(calibration: Calibration, fit: Fit) -> DeviationTest:
     )
     variances, directions = np.linalg.eigh(covariance)
     root = directions * np.sqrt(np.maximum(variances, 0.0))
-    theta = np.append([p.value for p in calibration.free], problem.prior_mean[n:])
-    deviation = project_out_zeros(problem.values - problem.predict(theta), o)
+    # about the mountings of the fit: a ball of a bar that is 1 mm beside its place is not linear
+    mounted = fit.solution.theta[n:]
+    theta = np.append([p.value for p in calibration.free], mounted)
+    as_stated = fit.jacobian[:, n:] @ ((problem.prior_mean[n:] - mounted) / scale[n:])
+    deviation = project_out_zeros(problem.values - problem.predict(theta) - as_stated, o)
     white = whiten(deviation, project_out_zeros(fit.jacobian, o) @ root, sigma=sigma)
     square = float(white @ white)
 

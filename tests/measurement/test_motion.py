@@ -418,12 +418,13 @@ CONTROLLER_STATES = {
 """Lines before the program; no two displacements in `all` cancel."""
 
 
-def _run_nominal(session, program, folder, before=((),), *, output=False):
+def _run_nominal(session, program, folder, before=((),), *, output=False, half_side=0.055):
     """A program on nominal legs, after lines of MDI; as `run_programs`."""
     robot = session.robot
-    anything = replace(session, gauges={"": replace(session.gauge, range=None)})
+    gauges = {n: replace(g, range=None) for n, g in session.gauges.items()}
+    anything = replace(session, gauges=gauges)
     exact = simulate_session(anything, {}, exact=True).session
-    options = ExportOptions(module=True, half_side=0.055)
+    options = ExportOptions(module=True, half_side=half_side)
     files = export_calibration(
         calibrate(exact, "offsets"), "linuxcnc", anyway=True, options=options
     )

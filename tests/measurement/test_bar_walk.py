@@ -1,0 +1,138 @@
+"""A builder's way with a dial and a home-made ball bar: from nothing to confirmed offsets.
+
+new → sheet for a logger → program driven in LinuxCNC → record → calibrate → export → again → record
+→ validate. The machine is simulated, with all its errors at tolerance.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from commands import run_orthocal
+from linuxcnc import require_linuxcnc
+from test_motion import _run_nominal
+
+from orthocal import (
+    Machine,
+    assess_tool,
+    draw_errors,
+    load_calibration,
+    load_plan,
+    simulate_session,
+)
+from orthocal.observation.model import predict_readings
+from orthocal.observation.observations import build_observations
+from orthocal.observation.sensor_groups import nuisance_parameters
+from orthocal.observation.simulate import show_readings
+from orthocal.sensors.ball_bar import BallBar
+from orthocal.units import MM
+
+SIZES = """--leg-mm 250 --travel-mm 100:325 --attachment-mm 30 --rods-apart-mm 60 --rod-radius-mm 4
+--counts up,down,up --at-zero-mm 0 --effects none --hours 2"""
+BAR = """sensor: ball_bar
+sigma_mm: 0.002
+resolution_mm: 0.001
+range_mm: [-2, 2]
+length_mm: 50
+length_tolerance_mm: unknown
+"""
+SEED = 2
+CARE = 0.5
+"""Part of the tolerances to which gauges are mounted, so that the dials stay in their range."""
+
+
+def run(folder, *words, typed=""):
+    done = run_orthocal(folder, *words, typed=typed)
+    assert done.returncode == 0, (words, done.stdout[-2000:], done.stderr)
+    return done.stdout
+
+
+def read(plan, errors, seed):
+    """Readings of a session, [m]: balls and dials are mounted anew, gauges stay the same."""
+    observations, rng = build_observations(plan), np.random.default_rng(seed)
+    drawn = []
+    for p in nuisance_parameters(plan).parameters:
+        own = np.random.default_rng([SEED, *p.name.encode()]).normal()
+        drawn.append(CARE * p.prior_std * (own if p.name.startswith("gauge.") else rng.normal()))
+    exact = predict_readings(plan, errors, observations=observations, nuisance=np.array(drawn))
+    shown, _ = show_readings(plan, observations, exact, rng=rng)
+    return observations.rows(shown)
+
+
+def measure(folder, session, errors, seed):
+    """Read a planned session on the machine, and type it in."""
+    shown = read(load_plan(folder / session), errors, seed)
+    typed = "".join(f"{v / MM:.3f}\n" for v in shown)
+    said = run(folder, "record", session, typed=typed + "\n")
+    assert f"All {len(shown)} readings are recorded." in said
+
+
+@pytest.fixture(scope="module")
+def machine(tmp_path_factory, without_plots):
+    """Directory with a planned machine, its plan with both sensors, and the machine's errors."""
+    folder = tmp_path_factory.mktemp("bar")
+    (folder / "bar.yaml").write_text(BAR)
+    tolerance = "*.offset_mm=1"
+    run(folder, "new", "mill", *SIZES.split(), "--tolerance", tolerance, "--with", "bar.yaml")
+    file = folder / "mill/first/session.yaml"
+    text = file.read_text()
+    assert "range_mm: [-2.0, 2.0]" in text  # to plan with; the dial itself has more
+    file.write_text(text.replace("range_mm: [-2.0, 2.0]", "range_mm: [-4.0, 4.0]"))
+    plan = load_plan(folder / "mill/first")
+    errors = draw_errors(plan.robot, ["*"], seed=SEED, tolerances={"*.offset_mm": 1.0})
+    kinds = {type(s.sensor).kind for s in plan.setups.values()}
+    assert kinds == {"leg", "ball_bar"}
+    return folder, plan, errors
+
+
+@pytest.mark.slow
+def test_a_bar_is_read_where_linuxcnc_triggers(machine, tmp_path):
+    """At each trigger the machine is where the bar shows the simulated reading of its line."""
+    require_linuxcnc()
+    folder, plan, errors = machine
+    words = ("--dwell", "0.3", "--trigger", "0", "--feed", "6000", "--approach-feed", "1500")
+    run(folder, "sheet", "mill/first", "--out", "auto", *words)
+    name = next(n for n, s in plan.setups.items() if isinstance(s.sensor, BallBar))
+    (file,) = (folder / "auto").glob(f"*-{name}.ngc")
+    recorded, _ = _run_nominal(plan, file.read_text(), tmp_path, output=True, half_side=0.065)
+    slides, output = recorded[:, :-1] * MM, recorded[:, -1]
+    rising = np.flatnonzero(np.diff(output, prepend=0.0) > 0.5)
+    sensor = plan.setups[name].sensor
+
+    def shown(errors, slides):
+        """Reading of the bar, by its definition."""
+        balls = Machine(plan.robot, errors).forward(slides) - np.array(sensor.centre)
+        return np.linalg.norm(balls, axis=1) - sensor.length
+
+    exact = simulate_session(plan, errors, exact=True).session
+    expected = [v for r, v in zip(exact.readings, exact.values, strict=True) if r.setup == name]
+    assert shown(errors, slides[rising]) == pytest.approx(expected, abs=1e-6)
+    # between the readings the bar stays on its sphere, from the first trigger to the last
+    on_path = shown({}, slides[rising[0] : rising[-1] : 20])
+    assert np.abs(on_path).max() < 20e-6
+
+
+@pytest.mark.slow
+def test_the_walk_ends_with_confirmed_offsets(machine):
+    folder, plan, errors = machine
+    measure(folder, "mill/first", errors, SEED)
+    said = run(folder, "calibrate", "mill/first", "--out", "one")
+    assert "Enter these offsets" in said
+    run(folder, "export", "one", "--to", "linuxcnc", "--offsets", "--out", "cnc")
+    assert "HOME_OFFSET" in (folder / "cnc/joints.ini").read_text()
+    run(folder, "again", "one", "--out", "second")
+    measure(folder, "second", errors, SEED + 1)
+    said = run(folder, "validate", "one", "second")
+    assert "onfirmed" in said
+    one = load_calibration(folder / "one")
+    entered = np.array([e.enter for e in one.assessment.entries])
+    tool = assess_tool(one)
+    nominal, real = Machine(plan.robot, {}), Machine(plan.robot, errors)
+
+    def size(offsets):
+        """RMS tool error of the real machine over the workspace after alignment, [m]."""
+        reached = real.forward(nominal.inverse(tool.targets) - offsets)
+        return tool.measure(reached - tool.targets).aligned.rms
+
+    assert size(entered) < 0.5 * size(np.zeros(3))
+    assert size(entered) == pytest.approx(one.assessment.tool.entered, rel=0.3)
