@@ -317,6 +317,11 @@ def name_values(calibration: Calibration) -> str:
 def render_values(calibration: Calibration) -> RenderableType:
     """Meaning of the values to enter, and those that the short answer does not list."""
     assessment = assessment_of(calibration)
+    if calibration.session.firmware is not None:
+        settings = (
+            "No offsets: the firmware has settings. `orthocal export` states them with their ±."
+        )
+        return noted(Text(settings), EXPANDED)
     if not assessment.entries:
         return noted(Text("None: no offset was identified."), EXPANDED)
     complete = assessment.decision.verdict != "reject" and calibration.only_offsets
