@@ -245,7 +245,7 @@ def _solve_until_settled(
         settled = not _depends_on_sigma(program) or _settled(floored_sigma(at.noise), sigma)
         if (balanced and settled) or not remaining:
             break
-        if balanced:
+        if not settled:  # first: the ratios depend on it
             sigma = floored_sigma(at.noise)
         else:
             problem = problem.with_noise_ratio(ratio)
@@ -266,16 +266,17 @@ def _solve_first(
     sigma, residual_sigma = _linearised_sigma(program, linear, repeatability)
     if start is not None:
         return program.solve(sigma=sigma, start=np.asarray(start)), sigma
-    try:
-        return program.solve(sigma=sigma, start=linear.solve(sigma=sigma)), sigma
-    except ClosureError:  # the linearised machine cannot reach a posture
-        return program.solve(sigma=sigma), sigma
-    except SolverError:
-        if not residual_sigma > sigma:
-            raise
-    # the unmodelled errors may be too large for the initial sigma
-    start = linear.solve(sigma=residual_sigma)
-    return program.solve(sigma=residual_sigma, start=start), residual_sigma
+    sigmas = [sigma]
+    if residual_sigma > sigma:  # unmodelled errors may be too large for the initial sigma
+        sigmas.append(residual_sigma)
+    for each in sigmas:
+        try:
+            return program.solve(sigma=each, start=linear.solve(sigma=each)), each
+        except ClosureError:  # the linearised machine cannot reach a posture
+            break
+        except SolverError:  # or shows no reading
+            continue
+    return program.solve(sigma=sigma), sigma
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from bounds import bound_um
 from machines import frame_pose
 from tolerances import CLOSED_FORM
 
-from orthocal import draw_errors, load_plan, load_session, write_session
+from orthocal import calibrate, draw_errors, load_plan, load_session, write_session
 from orthocal.assessment.tool_error import measure_uncertainty
 from orthocal.errors import SessionError
 from orthocal.estimation.problem import build_problem
@@ -163,3 +165,38 @@ def test_a_wrong_key_is_refused_by_name(tmp_path, old, new, place):
     with pytest.raises(SessionError) as caught:
         load_plan(file)
     assert place in str(caught.value.where)
+
+
+def test_noise_of_two_gauges_is_found_on_a_machine_far_from_its_nominal_one(tmp_path):
+    """Offsets of 7 mm bend the readings of a bar by far more than its noise."""
+    heights, ring = (40.0, 55.0, 70.0, 100.0), 2.0 * np.pi * np.arange(10) / 10
+    arms = {f"bar_{k}": np.sqrt(50.0**2 - (z - 70.0) ** 2) for k, z in enumerate(heights)}
+    points = {
+        f"{name}_{k}": [float(r * np.cos(a)), float(r * np.sin(a)), z]
+        for (name, r), z in zip(arms.items(), heights, strict=True)
+        for k, a in enumerate(ring)
+    }
+    points |= {"low": [50.0, -50.0, -100.0], "side": [-100.0, 0.0, -50.0]}
+    keys = {"sensor": "ball_bar", "centre_mm": [0, 0, 70], "centre_tolerance_mm": 2, "ball": "post"}
+    keys |= {"length_mm": 50, "length_tolerance_mm": "unknown", "gauge": "bar"}
+    setups = {n: {**keys, "postures": [p for p in points if p.startswith(n)]} for n in arms}
+    leg = {
+        "leg": "b",
+        "direction": [0.5, 0.75**0.5, 0],
+        "section": {"fraction": 0.5},
+        "gauge": "dial",
+    }
+    gauges = {"dial": {"sigma_mm": 0.005, "resolution_mm": 0.01, "range_mm": [-25, 25]}}
+    gauges["bar"] = {"sigma_mm": 0.002, "range_mm": [-25, 25]}
+    plan = {
+        "robot": "linear_delta",
+        "gauges": gauges,
+        "postures": {name: {"tcp_mm": point} for name, point in points.items()},
+        "setups": {"leg": leg | {"postures": ["low", "side"]}, **setups},
+    }
+    (tmp_path / "plan.yaml").write_text(json.dumps(plan))
+    errors = {"a_slide.offset": 6e-3, "b_slide.offset": -7e-3, "c_slide.offset": 3e-3}
+    session = simulate_session(load_plan(tmp_path / "plan.yaml"), errors, seed=1).session
+    found = calibrate(session, solver="variable-projection")
+    assert found.noise.source == "gauge"
+    assert found.noise.sigma == pytest.approx(np.hypot(5e-6, 1e-5 / np.sqrt(12.0)))
