@@ -179,6 +179,20 @@ def test_again_is_the_same_session_with_offsets_active(calibrated, experiment, t
     assert err == f"orthocal: {out}/session.yaml: exists already; --force overwrites it\n"
 
 
+def test_again_adds_changes_where_no_session_states_the_active_offsets(experiment, tmp_path):
+    """Entered as complete offsets, they would replace those of the controller."""
+    first = tmp_path / "first"
+    shutil.copytree(experiment, first)
+    text = (first / "session.yaml").read_text()
+    text = re.sub(r"(?m)^controller:.*\n", "", text)
+    (first / "session.yaml").write_text(text)
+    assert orthocal("calibrate", first, "--out", tmp_path / "one")[0] == 0
+    code, text, err = orthocal("again", tmp_path / "one", "--out", tmp_path / "second")
+    assert code == 0, err
+    assert "Add these to the active offsets" in text
+    assert "x_slide -0.527 mm" in text
+
+
 def test_the_printed_json_holds_what_the_file_holds_and_the_decision(experiment, tmp_path):
     code, out, _ = orthocal("calibrate", experiment, "--json", "--out", tmp_path)
     assert code == 0

@@ -80,13 +80,18 @@ def again(
     if amounts:
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
         put_out(f"The machine is expected with these adjustments: {settings}.")
-    put_out(_describe_entries(new))
+    put_out(_describe_entries(new, changes=result.session.controller_offsets is None))
     put_out(f"  orthocal record {out}\n  orthocal validate {calibration} {out}")
     put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, and sheet.html")
 
 
-def _describe_entries(new: orthocal.Session) -> str:
-    """What the controller corrects while a new session is read, in words."""
+def _describe_entries(new: orthocal.Session, *, changes: bool) -> str:
+    """What the controller corrects while a new session is read, in words.
+
+    Args:
+        new: The session.
+        changes: Whether its offsets count from those of the calibration, which are not known.
+    """
     from orthocal.effects.compensation import describe_trims
 
     offsets = ", ".join(
@@ -94,6 +99,12 @@ def _describe_entries(new: orthocal.Session) -> str:
         for d, v in zip(new.robot.drives, new.active_offsets.tolist(), strict=True)
     )
     text = f"Enter these offsets of the slides, home, and measure again: {offsets}."
+    if changes:
+        text = (
+            f"Add these to the active offsets of the slides, home, and measure again: {offsets}. "
+            "The new session.yaml states these changes, since the calibrated session states no "
+            "offsets (`controller`)."
+        )
     if down := [d.name for d in new.robot.drives if d.direction < 0]:
         text += f" The sign is reversed for joints that count down: {', '.join(down)}."
     if backlash := describe_trims(new.robot, new.compensation):

@@ -134,7 +134,7 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
 def _describe_sensors(calibration: Calibration, accuracy: ToolAccuracy) -> list[str]:
     """Tool errors after an hour with each sensor that helps, as sentences."""
     rms, gains = _find_gains(calibration, accuracy)
-    return describe_gains(gains, rms)
+    return describe_gains(gains, rms, now=False)
 
 
 def describe_undetermined(calibration: Calibration) -> list[str]:
@@ -192,19 +192,22 @@ def helpful_gains(gains: Iterable[SensorGain], rms: float, least: float) -> list
     return [gain for gain in gains if gain.rms < (1.0 - least) * rms]
 
 
-def describe_gains(gains: Iterable[SensorGain], rms: float) -> list[str]:
+def describe_gains(gains: Iterable[SensorGain], rms: float, *, now: bool = True) -> list[str]:
     """Tool errors after another hour with each sensor that helps, in a sentence.
 
     Args:
         gains: Gains of the sensors.
         rms: Expected tool error without them, [m].
+        now: Whether to state that error; beside that of a calibration, which is about the
+            calibrated machine, it would be another number for the same.
     """
     shown = tool_mm(rms)
     helpful = [g for g in helpful_gains(gains, rms, NOTICEABLE) if tool_mm(g.rms) != shown]
     if not helpful:
         return []
     each = "; ".join(f"{tool_mm(gain.rms)} with {gain.words}" for gain in helpful)
-    return [f"Another hour, with all errors corrected: {each} (now {shown})."]
+    without = f" (now {shown})" if now else ""
+    return [f"Another hour, with all errors corrected: {each}{without}."]
 
 
 def describe_remaining(errors: Iterable[RemainingError]) -> list[str]:

@@ -203,8 +203,8 @@ def _next_step(
         words = "correct the other errors, in LinuxCNC or in programs."
         if not unchanged:
             words = (
-                "correct all identified errors, in LinuxCNC or in programs, without entering these "
-                "offsets. If the controller corrects offsets only, enter them."
+                "if the controller corrects offsets only, enter them. Otherwise leave the offsets, "
+                "and correct all identified errors in LinuxCNC or in programs."
             )
         active = "" if unchanged else " --offsets active"
         return words, (
