@@ -111,9 +111,11 @@ def _join_tolerances(sessions: Sequence[Session]) -> dict[str, float]:
     for session in sessions:
         for key, value in session.robot.parameters.stated.items():
             if tolerances.setdefault(key, value) != value:
+                other = tolerances[key]
                 raise SessionError(
-                    f"is {value:g}; it is {tolerances[key]:g} in "
-                    f"{of[key].path or 'another session'}, and the machine is the same",
+                    f"is {value:g}; it is {other:g} in {of[key].path or 'another session'}, and "
+                    "the machine is the same; expected one value. "
+                    f"--tolerance '{key}={other:g}' states it for all sessions",
                     where=f"{session.path or 'session'}: calibration.tolerances.{key}",
                 )
             of.setdefault(key, session)

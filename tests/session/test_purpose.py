@@ -11,6 +11,7 @@ import pytest
 from orthocal import Choice, ParameterError, SessionError, calibrate, load_calibration
 from orthocal.calibration.file import write_calibration
 from orthocal.calibration.refit import repeat_calibration, restore_session
+from orthocal.cli.options import state_tolerances
 from orthocal.estimation.choice import resolve_choice
 from orthocal.measurement.files.session_file import load_session
 from orthocal.measurement.files.write_session import write_session
@@ -118,8 +119,11 @@ def test_one_machine_has_one_tolerance(raw_cycles, stated, tmp_path):
         join_sessions([stated, other])
     assert str(e.value) == (
         f"{other.path}: calibration.tolerances.*.offset_mm: is 4; it is 0.8 in {stated.path}, and "
-        "the machine is the same"
+        "the machine is the same; expected one value. --tolerance '*.offset_mm=0.8' states it for "
+        "all sessions"
     )
+    agreed = [state_tolerances(s, ["*.offset_mm=0.8"]) for s in (stated, other)]
+    assert join_sessions(agreed).robot.parameters.stated == TOLERANCES
 
 
 def test_a_worker_gets_them(stated):
