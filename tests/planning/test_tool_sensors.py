@@ -174,6 +174,7 @@ def test_approaches_of_a_bar_follow_from_its_path(owned):
         (BAR + "minutes_a_reading: -1\n", "minutes_a_reading"),
         (BAR.replace("length_mm: 50", "length_mm: long"), "length_mm"),
         (BAR.replace("length_mm: 50\n", ""), "length_mm"),
+        (BAR.replace("length_mm: 50", "lenght_mm: 50"), "lenght_mm"),
         (BAR + "tool_mm: [1]\n", "tool_mm"),
         (BAR + "postures: [zero]\n", "postures"),
         (PLATE.replace("kind: plate", "kind: mirror"), "artefact"),
