@@ -133,6 +133,8 @@ def _import_printer(
         lambda: put_out(printable(describe_printer_import(result), keep="\n")),
         json=json,
     )
+    for note in result.log.notes:
+        put_note(note)
     if dry_run:
         put_note("Nothing written (--dry-run)")
         return

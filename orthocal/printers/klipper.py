@@ -24,6 +24,7 @@ from orthocal.printers.log import (
     place_of,
     probed_log,
     require_points,
+    unstated_trigger,
     unusual_settings,
 )
 from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings
@@ -87,7 +88,9 @@ def read_log(text: str, *, where: str, radius: float | None = None) -> PrinterLo
     contacts = [numbers(m.groups(), where=where, name="probe") for m in _NEW_PROBE.finditer(text)]
     points = np.array([*nozzle, *contacts]).reshape(-1, 3) * MM
     points[len(nozzle) :] -= settings.probe  # there the point of contact is printed
-    return probed_log(settings, points, where=where, expected=EXPECTED)
+    name, keys = _probe_section(sections)
+    notes = [] if "z_offset" in keys else [unstated_trigger(f"z_offset in [{name}]")]
+    return probed_log(settings, points, where=where, expected=EXPECTED, notes=notes)
 
 
 def _read_run(run: re.Match[str], text: str, probe: Array, where: str) -> PrinterLog:
@@ -140,8 +143,8 @@ def _with_steps(
     stable = np.array([s for _, s in pairs])
     if stable.shape != (len(pairs), 3) or not np.isfinite(stable).all():
         raise SessionError("expected three step counts of each height", where=where)
-    if not any(settings.probe):  # no section of a probe: its height is that of its triggers
-        settings = replace(settings, probe=(0.0, 0.0, -pairs[-1][0] * MM))
+    if not settings.probe[2]:  # not stated: its height is that of its triggers
+        settings = replace(settings, probe=(*settings.probe[:2], -pairs[-1][0] * MM))
     heights = np.array([h for h, _ in pairs]) * MM + settings.probe[2]
     return PrinterLog(
         settings,
@@ -219,11 +222,15 @@ def _with_endstops(
 
 def _probe_offset(sections: Sections, where: str) -> Array:
     """Tip of the probe from the nozzle where it triggers, shape (3,), [m]; 0 if not stated."""
-    for name, keys in sections.items():
-        if name.split()[:1] and name.split()[0] in PROBES:
-            x, y, z = (_number(keys, f"{axis}_offset", where, name, default=0.0) for axis in "xyz")
-            return np.array([x, y, -z]) * MM
-    return np.zeros(3)
+    name, keys = _probe_section(sections)
+    x, y, z = (_number(keys, f"{axis}_offset", where, name, default=0.0) for axis in "xyz")
+    return np.array([x, y, 0.0 - z]) * MM
+
+
+def _probe_section(sections: Sections) -> tuple[str, Mapping[str, str]]:
+    """Name and keys of the first section of a probe; an empty [probe] without any."""
+    found = ((name, keys) for name, keys in sections.items() if name.split(" ")[0] in PROBES)
+    return next(found, ("probe", {}))
 
 
 def _step_lengths(sections: Sections, where: str) -> Array:

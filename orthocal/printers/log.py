@@ -112,6 +112,14 @@ def probed_log(
     )
 
 
+def unstated_trigger(key: str) -> str:
+    """Note on a log without the height at which the probe triggers, with its key."""
+    return (
+        f"The log and its settings state no {key}: heights are those of the probe's trigger. "
+        f"State {key} (0 if the nozzle is the probe), or the first layer is wrong by it."
+    )
+
+
 def unusual_settings(settings: DeltaSettings) -> Iterator[str]:
     """Notes on settings that more likely absorb other errors than describe the printer."""
     mean = float(np.mean(settings.rods))

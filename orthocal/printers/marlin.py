@@ -20,6 +20,7 @@ from orthocal.printers.log import (
     place_of,
     probed_log,
     require_points,
+    unstated_trigger,
 )
 from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings
 from orthocal.units import DEG, MM
@@ -86,7 +87,8 @@ def read_log(text: str, *, where: str, radius: float | None = None) -> PrinterLo
         points = _table(text, shown, radius, where) if shown else _grid(text, radius, where)
         nozzle = points - [0.0, 0.0, probe[2]]
         nozzle[:, :2] -= 0.0 if shown else probe[:2]  # G33 probes with the nozzle at the point
-    return probed_log(settings, nozzle, where=where, expected=EXPECTED)
+    notes = [] if "Z" in m851 else [unstated_trigger("M851 Z")]
+    return probed_log(settings, nozzle, where=where, expected=EXPECTED, notes=notes)
 
 
 def _settings(text: str, shown: re.Match[str] | None, probe: Array, where: str) -> DeltaSettings:

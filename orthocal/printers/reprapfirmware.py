@@ -20,6 +20,7 @@ from orthocal.printers.log import (
     place_of,
     probed_log,
     require_points,
+    unstated_trigger,
 )
 from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings
 from orthocal.units import DEG, MM
@@ -78,7 +79,8 @@ def read_log(text: str, *, where: str, radius: float | None = None) -> PrinterLo
     x, y, z = numbers([g31.get(k, "0") for k in "XYZ"], where=where, name="G31")
     nozzle = np.column_stack([points - [x, y], np.array(heights) + z]) * MM
     settings = _settings(text, np.array([x, y, -z]) * MM, where)
-    return probed_log(settings, nozzle, where=where, expected=EXPECTED)
+    notes = [] if "Z" in g31 else [unstated_trigger("G31 Z")]
+    return probed_log(settings, nozzle, where=where, expected=EXPECTED, notes=notes)
 
 
 def _points(text: str, where: str) -> Array:

@@ -119,6 +119,10 @@ class DeltaSettings:
         xy = base + slope * z[:, None]
         return np.column_stack([xy, z - xy @ np.array(self.tilts)])
 
+    def touched(self, carriages: ArrayLike) -> Array:
+        """Positions of the probe's tip, shape (K, 3), of coordinates of the carriages, [m]."""
+        return np.asarray(self.forward(carriages) + self.probe)
+
     def require_plausible(self, *, where: str) -> None:
         """Refuse settings that no printer has, such as those of a search that went astray.
 

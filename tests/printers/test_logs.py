@@ -81,6 +81,35 @@ def test_console_lines_of_klipper_old_and_new(probed):
     assert np.abs(np.array(old.settings.homed) - old.carriages - expected).max() < 1e-9
 
 
+@pytest.mark.parametrize(
+    ("firmware", "key"),
+    [("klipper", "z_offset"), ("marlin", "M851 Z"), ("reprapfirmware", "G31 Z")],
+)
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_probe_without_its_height_is_named(tmp_path, firmware, key, stated):
+    """On stderr: the first layer is wrong by that height."""
+    text = write_log(firmware, odd(), rings(), np.zeros(41), -1.0)
+    if firmware == "klipper":
+        points = "".join(f"probe at {x:.3f},{y:.3f} is z=1.0\n" for x, y in rings())
+        text = f"{write_settings('klipper', odd())}[bltouch]\nz_offset: 1.0\n{points}"
+    lines = [v for v in text.splitlines() if stated or key.split()[0] not in v]
+    (tmp_path / "log.txt").write_text("\n".join(lines) + "\n")
+    done = run_orthocal(tmp_path, "import", "log.txt", "bed")
+    assert done.returncode == 0, done.stderr
+    assert (key in done.stderr) == (not stated)
+    assert ("[bltouch]" in done.stderr) == (not stated and firmware == "klipper")
+
+
+def test_saved_heights_state_that_of_the_probe(probed):
+    """Beside the nozzle or not, with z_offset or without."""
+    text = write_log("klipper", odd(), rings(), np.full(41, 1.0), -1.0)
+    with_place = text.replace("z_offset: 1.0", "x_offset: 2")
+    for log in (probed(text), probed(text.replace("z_offset: 1.0", "")), probed(with_place)):
+        assert log.settings.probe[2] == pytest.approx(-1.0 * MM)
+        assert not log.notes
+        assert np.abs(log.heights).max() < 1e-12
+
+
 def test_a_calculation_in_klippy_log(probed):
     """It holds its own parameters, and heights measured by hand count as they are."""
     s = odd()
@@ -158,7 +187,7 @@ def test_reports_of_reprapfirmware(probed):
 
 
 ABSORBING = (
-    "M665 L180.19 R91.5 H240 A6.348 B-2.297 C-3.480 X0 Y0 Z0\nM666 X0 Y0 Z0\n"
+    "M851 Z0\nM665 L180.19 R91.5 H240 A6.348 B-2.297 C-3.480 X0 Y0 Z0\nM666 X0 Y0 Z0\n"
     "Bed X: 0 Y: 0 Z: 0.1\nBed X: 50 Y: 0 Z: 0.2\nBed X: 0 Y: 50 Z: 0.3\n"
 )
 """Trims of the rods as in Marlin #14910."""

@@ -176,13 +176,13 @@ def _conditions(row: RawReading) -> dict[str, str | float]:
 
 
 def describe_printer_import(result: PrinterImport) -> str:
-    """Firmware, settings and points of a printer's log, with its notes."""
+    """Firmware, settings and points of a printer's log."""
     log, mm = result.log, 1.0 / MM
     s = log.settings
     rods = ", ".join(f"{v * mm:.3f}" for v in s.rods)
     stops = ", ".join(f"{v * mm:.3f}" for v in s.endstops)
     turns = ", ".join(f"{v / DEG:.3f}" for v in s.angles)
-    heights = s.forward(log.carriages)[:, 2] - log.heights + s.probe[2]
+    heights = s.touched(log.carriages)[:, 2] - log.heights
     return "\n".join(
         [
             f"{counted(len(log.carriages), 'point')} of a bed, probed with {result.title}",
@@ -192,7 +192,6 @@ def describe_printer_import(result: PrinterImport) -> str:
             f"  endstops   {stops} mm",
             f"  heights    {heights.min() * mm:+.3f} to {heights.max() * mm:+.3f} mm, as the "
             "firmware sees them",
-            *log.notes,
         ]
     )
 
