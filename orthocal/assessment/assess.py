@@ -339,8 +339,9 @@ def _decide(findings: Sequence[Finding], *, firmware: bool, backlash: bool) -> D
         backlash: Whether there is backlash to enter.
     """
     verdict, lead = verdict_of(findings), findings[0]
+    headlines = words.FIRMWARE_HEADLINES if firmware else words.HEADLINES
     if verdict != "enter":
-        return Decision(verdict, words.HEADLINES[verdict], lead.text, lead.action)
+        return Decision(verdict, headlines[verdict], lead.text, lead.action)
     for kind, headline in KEEPING.items():
         finding = first_of(findings, kind)
         if finding is not None:
@@ -350,7 +351,5 @@ def _decide(findings: Sequence[Finding], *, firmware: bool, backlash: bool) -> D
     why = first_of(findings, *EXPLANATIONS)
     reason, action = ("", "") if why is None else (why.text, why.action)
     if firmware:
-        return Decision(verdict, words.FIRMWARE_HEADLINE, reason, words.FIRMWARE_STEP)
-    return Decision(
-        verdict, words.HEADLINES[verdict], reason, f"{words.NEXT_STEP} {action}".strip()
-    )
+        return Decision(verdict, headlines[verdict], reason, words.FIRMWARE_STEP)
+    return Decision(verdict, headlines[verdict], reason, f"{words.NEXT_STEP} {action}".strip())

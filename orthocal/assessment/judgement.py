@@ -101,7 +101,8 @@ def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Ju
     if verdict_of([*mistakes, *implausible]) == "enter":
         scale = find_tolerance_scale(session)
         if scale.factor > LARGEST_SCALE:
-            beyond = [words.beyond_tolerances(scale.factor, LARGEST_SCALE)]
+            printer = session.firmware is not None
+            beyond = [words.beyond_tolerances(scale.factor, LARGEST_SCALE, firmware=printer)]
         elif scale.factor > 1.0:
             beyond = [words.above_tolerances(scale.factor)]
     unchanged = [] if mistakes or not session.joined else [_describe_detectable(session)]

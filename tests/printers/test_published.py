@@ -7,6 +7,7 @@ Klipper #4755 (one mistyped value) are reports without data: such printers are s
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,8 @@ from klipper_peer import calibrate_as_klipper, locate
 from simulated_printer import Firmware, Printer, nominal, read_settings, rings, write_log
 
 from orthocal import Choice, calibrate, check_session
+from orthocal.assessment.assess import assess
+from orthocal.assessment.words.entries import FIRMWARE_HEADLINES
 from orthocal.export.printer import fit_firmware
 from orthocal.measurement.importing.printer_log import import_printer_log
 from orthocal.printers.firmwares import FIRMWARES
@@ -165,3 +168,22 @@ def test_one_mistyped_height_is_named(tmp_path):
     judged = check_session(import_printer_log(log).session)
     assert judged.decision.verdict != "enter"
     assert {p.posture for f in judged.findings for p in f.places} == {"p18"}
+    x, y = rings()[17]
+    found = re.search(r"x (-?[\d.]+), y (-?[\d.]+) mm", judged.decision.reason)
+    assert [float(v) for v in found.groups()] == pytest.approx([x, y], abs=0.06)
+    assert "orthocal record" not in "".join(f.action for f in judged.findings)
+
+
+def test_a_log_with_the_settings_of_another_printer_is_rejected(tmp_path):
+    """Nothing is said of offsets: the firmware takes settings."""
+    log = tmp_path / "log.txt"
+    log.write_text(write_log("klipper", nominal(), rings(), np.zeros(41), -1.0))
+    printer = Printer(import_printer_log(log).session.robot, {}, trigger=1.0)
+    z = printer.probe(nominal(), rings(), noise=0.02, rng=np.random.default_rng(1))
+    z += 2.5 * (np.hypot(*rings().T) / 80.0) ** 2  # as with a radius that differs by 12 mm
+    log.write_text(write_log("klipper", nominal(), rings(), z, -1.0))
+    decision = assess(calibrate(import_printer_log(log).session, solver="linearised")).decision
+    assert decision.verdict == "reject"
+    assert decision.headline == FIRMWARE_HEADLINES["reject"]
+    assert "settings" in decision.action
+    assert "adjust" not in decision.action

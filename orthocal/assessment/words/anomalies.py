@@ -237,11 +237,17 @@ def _lines(session: Session, e: Explanation) -> str:
     if not lines or len(lines) == len(session.readings):
         return ""
     lines = sorted(set(lines))  # the coordinates of a point share theirs
-    return f"{spans(lines, 'line')}: "
+    file = "" if session.firmware is None else " of readings.csv"  # not those of the log
+    return f"{spans(lines, 'line')}{file}: "
 
 
 def _row(session: Session, i: int) -> str:
-    return session.readings[i].label_with_cycle
+    """Setup, postures and cycle of a reading; where the bed was probed in a printer's log."""
+    reading = session.readings[i]
+    if session.firmware is None:
+        return reading.label_with_cycle
+    x, y = session.firmware.touched(session.postures[reading.posture].drives)[0, :2] / MM
+    return f"{reading.label_with_cycle} (x {x:.1f}, y {y:.1f} mm)"
 
 
 def _subject(session: Session, e: Explanation) -> str:
@@ -481,6 +487,8 @@ def _remedy(session: Session, e: Explanation) -> str:
 def _repeat(session: Session, *found: Explanation) -> str:
     """Repetition or omission of readings, with the command for the first of them."""
     rows = [session.readings[i] for e in found for i in e.rows]
+    if session.firmware is not None:
+        return "Probe the bed again and import that log, or leave out what is wrong."
     words = "Read it again" if len(rows) == 1 else "Look at these readings. Read them again"
     file = rows[0].file or session.readings_path
     if file is None or rows[0].line is None:

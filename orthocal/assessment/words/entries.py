@@ -20,8 +20,12 @@ HEADLINES: dict[Verdict, str] = {
 }
 """Headlines of the verdicts on a calibration."""
 
-FIRMWARE_HEADLINE = "Write new settings for the firmware, then probe again."
-"""Headline of a calibration of a printer whose firmware takes more than offsets."""
+FIRMWARE_HEADLINES: dict[Verdict, str] = {
+    "enter": "Write new settings for the firmware, then probe again.",
+    "review": "Check these points before you write new settings.",
+    "reject": "Write no settings from this log.",
+}
+"""Headlines of a calibration of a printer, whose firmware takes more than offsets."""
 
 FIRMWARE_STEP = "`orthocal export` writes the settings."
 """The next step with it."""

@@ -21,13 +21,19 @@ def wrong_dimensions(legs: str, nominal: float, measured: float) -> Finding:
     )
 
 
-def beyond_tolerances(scale: float, limit: float) -> Finding:
-    """Only many times the stated tolerances would explain the readings."""
+def beyond_tolerances(scale: float, limit: float, *, firmware: bool) -> Finding:
+    """Only many times the stated tolerances would explain the readings, or the log of a printer."""
+    check = (
+        "Check that the settings of the log are those with which it was probed, and its points."
+        if firmware
+        else "Check signs, lines and setups. If they are right, adjust the machine mechanically "
+        "first."
+    )
     return reject(
         "beyond tolerances",
         f"These readings need errors {times(scale)} the stated tolerances. Above {limit:g} times, "
         "the readings are wrong or the machine is out of adjustment.",
-        "Check signs, lines and setups. If they are right, adjust the machine mechanically first.",
+        check,
         tolerance_scale=scale,
     )
 
