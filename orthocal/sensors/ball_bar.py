@@ -155,9 +155,16 @@ class BallBar:
         x, y, z = (f"{v / MM:g}" for v in self.centre)
         length = f"{self.length / MM:g} mm"
         known = "It is known" if not self.length_std else "Its true length need not be known"
+        stays = ""
+        if self.ball is not None:
+            stays = (
+                " If it stays from an earlier setup, leave it, and jog around ball and post to the "
+                "alignment posture before you start the program."
+            )
         return (
-            "Mount one ball at the tool and the other on the table, at about "
-            f"X{x} Y{y} Z{z} mm from the tool centre point at the mechanical zero, by eye.",
+            "Mount one ball at the tool. Place the other, the fixed ball, on its post only after "
+            f"the tool stands in the alignment posture: at about X{x} Y{y} Z{z} mm from the tool "
+            f"centre point at the mechanical zero, by eye.{stays}",
             f"Put the bar between the balls. Its dial shows 0 at a length of {length}. {known}.",
             "Make the bar longer with your hand. The reading must grow. If it falls, reverse the "
             "sign of every reading of this setup.",

@@ -77,7 +77,7 @@ def read_program(text, robot):
         if code.startswith("G53 G1 "):
             position.update({w[0]: float(w[1:]) for w in code.split()[2:]})
             points.append([position[c] for c in "XYZ"])
-        elif code == "M0":
+        elif code == "M0" and points:
             pauses.append((np.array(points[-1]), np.array(joints)))
     return np.array(points), pauses
 
@@ -529,6 +529,27 @@ def test_a_ball_bar_keeps_its_length_between_its_readings(bar):
         assert [signs[k] for k in stop.approach] == np.where(known, np.sign(change), 0.0).tolist()
         assert np.linalg.norm(stop.approach_point - stop.point) == pytest.approx(0.5 * MM, rel=1e-4)
         assert stop.posture != before.posture
+
+
+@pytest.mark.parametrize("aligned_at", ["a", "c"])
+def test_a_program_waits_before_it_moves_where_a_fixed_ball_may_stand(bar, aligned_at):
+    """It names its first posture, in machine coordinates, where the ball stays."""
+    setups = {"bar": replace(bar.setups["bar"], aligned_at=aligned_at)}
+    session = replace(bar, setups=setups)
+    (motion,) = plan_motion(session)
+    options = ProgramOptions(shift_mm=(1.0, 2.0, 3.0), dwell=1.0)
+    lines = write_program(session, motion, options).splitlines()
+    pause = lines.index("M0")
+    assert pause < next(i for i, line in enumerate(lines) if line.startswith("G53"))
+    begin = motion.alignment or motion.stops[0]
+    assert begin.posture == aligned_at
+    assert (motion.alignment is None) == (aligned_at == "a")
+    at = np.array(bar.postures[aligned_at].values) / MM + [1.0, 2.0, 3.0]
+    for text in (lines[pause - 1], "".join(line for line in lines[:pause] if "jogged" in line)):
+        found = re.search(r"X([-\d.]+) Y([-\d.]+) Z([-\d.]+)", text)
+        assert [float(v) for v in found.groups()] == pytest.approx(at, abs=ROUNDED)
+    assert max(map(len, lines)) < 255
+    assert "\n".join(lines).isascii()
 
 
 def test_a_posture_is_passed_where_its_approach_has_the_other_direction(bar):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -54,6 +55,25 @@ def test_only_a_gauge_with_a_free_zero_is_set(files):
     assert "turn the bezel" not in bar
     assert "set the dial to 0" in files["01-plate.ngc"]
     assert "set the dial" not in files["02-bar.ngc"]
+
+
+def test_only_a_sheet_with_a_bar_warns_of_its_fixed_ball(plan, files):
+    """In the rules for programs, before the first motion, at the mounting and at the end."""
+    page = etree.HTML(files["sheet.html"])
+    (rules,) = (words(p) for p in page.iter("p") if words(p).startswith("Programs: "))
+    assert "fixed ball" in rules
+    plate, bar = (section(files, n) for n in (1, 2))
+    assert "fixed ball" not in words(plate)
+    move, mount, *_ = (words(step) for step in bar.findall(".//li"))
+    assert "tool at 50, 0, −20 mm" in move
+    assert "after the tool stands in the alignment posture" in mount
+    assert "same ball" in words(bar.findall("p")[-1])
+    alone = replace(
+        plan,
+        setups={"plate": plan.setups["plate"]},
+        readings=tuple(r for r in plan.readings if r.setup == "plate"),
+    )
+    assert "fixed ball" not in sheet_files(alone)["sheet.html"]
 
 
 def test_pictures_show_the_artefact_and_the_bar(files):

@@ -3,7 +3,8 @@
 A program starts at the mechanical zero, without a gauge. The first pause is in the alignment
 posture, where the gauge is mounted and aligned. Then there is one for each reading. For a logger,
 a program dwells and triggers it instead. It still pauses where the operator sets the dial or holds
-the plunger up.
+the plunger up. The fixed ball of a ball bar may stand on the way to the first posture: its program
+also pauses before its first motion, and starts in the first posture if the ball stays.
 
 Every motion is in machine coordinates (G53), so that work offsets (G54 to G59.3), G92 and a
 coordinate rotation have no effect. Coordinates are those of nominal kinematics; comments list the
@@ -22,8 +23,9 @@ from orthocal.errors import ParameterError
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.motion import SetupMotion, Stop, dial_zero, shown_joints
 from orthocal.robot.model import Robot
+from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.leg_indicator import BallIndicator
-from orthocal.sensors.protocol import mounting_steps
+from orthocal.sensors.protocol import Sensor, mounting_steps
 from orthocal.session.session import Session
 from orthocal.text import comment_safe, shorten
 from orthocal.units import DRIVE_UNITS, MM, format_fixed
@@ -55,7 +57,6 @@ LARGEST_SHIFT = 1e5
 """Largest coordinate of the machine's origin, [mm]."""
 
 PREAMBLE = (
-    "(Before start: gauge removed, machine at its mechanical zero)",
     "(Every motion is in machine coordinates: G53 G1 in G90)",
     "(Work offsets G54 to G59.3, G92 and rotation have no effect; G49 cancels the tool length)",
     "(Requires a controller that runs G53 with G1 at the programmed feed)",
@@ -144,23 +145,22 @@ def write_program(
         )
     name, setup = (comment_safe(text, LONGEST_NAME) for text in (robot.name, motion.setup))
     of_setup = session.setups[motion.setup]
+    sensor, gauge = of_setup.sensor, session.gauges[of_setup.gauge]
+    stops = motion.stops if motion.alignment is None else (motion.alignment, *motion.stops)
     lines = [
         f"(orthocal: {name}, setup {setup}, {motion.number} of {motion.count})",
-        f"({comment_safe(of_setup.sensor.describe(), 120)})",
+        f"({comment_safe(sensor.describe(), 120)})",
         f"(Machine coordinates, mm; tool at the mechanical zero: "
         f"{_words(robot, tool_at_zero(robot), options)})",
+        *_before_start(robot, sensor, stops[0], options),
         *PREAMBLE[:-1],
         *(["(Dwells at each reading: G4 P in seconds)"] if options.automatic else []),
         PREAMBLE[-1],
         f"F{options.feed:g}",
+        *_before_motion(robot, sensor, stops[0], options),
     ]
-    sensor, gauge = of_setup.sensor, session.gauges[of_setup.gauge]
-    ball = isinstance(sensor, BallIndicator)
-    mount = f"mount the gauge, {'centre its ball on the rod' if ball else 'align it'}"
-    if mounting_steps(sensor) is not None:
-        mount = "mount the gauge as the sheet shows"
+    mount = _mount(sensor)
     stated = any(r.approach for r in session.readings)
-    stops = motion.stops if motion.alignment is None else (motion.alignment, *motion.stops)
     for i, stop in enumerate(stops):
         zero = "0" if stop.role == "subtracted" else ""
         if stop is motion.stops[0] and stop.role == "reading" and of_setup.zero == "free":
@@ -179,8 +179,53 @@ def write_program(
         following = stops[i + 1] if i + 1 < len(stops) else None
         needs_hand = i == 0 or bool(zero or stop.lift)
         lines += _read(stop, following, options, needs_hand=needs_hand)
-    lines.append("(MSG, end: remove the gauge, then jog the machine to its mechanical zero)")
-    return "\n".join([*lines, "M2", ""])
+    return "\n".join([*lines, f"(MSG, end: {_end(sensor)})", "M2", ""])
+
+
+def _before_start(
+    robot: Robot, sensor: Sensor, first: Stop, options: ProgramOptions
+) -> tuple[str, ...]:
+    """Where the machine stands before the program: comments of its header."""
+    if not isinstance(sensor, BallBar):
+        return ("(Before start: gauge removed, machine at its mechanical zero)",)
+    return (
+        "(Before start: bar, fixed ball and its post removed, machine at its mechanical zero)",
+        "(Or, where ball and post stay from an earlier setup, machine jogged around them to "
+        f"{_words(robot, first.point, options)})",
+    )
+
+
+def _before_motion(
+    robot: Robot, sensor: Sensor, first: Stop, options: ProgramOptions
+) -> tuple[str, ...]:
+    """Pause before the first motion where a fixed ball may be in its way."""
+    if not isinstance(sensor, BallBar):
+        return ()
+    at = _words(robot, first.point, options)
+    return (
+        f"(MSG, before the first motion: remove fixed ball and post, or jog around them to {at})",
+        "M0",
+    )
+
+
+def _mount(sensor: Sensor) -> str:
+    """Instruction at the first pause after a motion."""
+    if isinstance(sensor, BallBar):
+        return "place the fixed ball unless it stands, then mount the bar as the sheet shows"
+    if mounting_steps(sensor) is not None:
+        return "mount the gauge as the sheet shows"
+    centre = isinstance(sensor, BallIndicator)
+    return f"mount the gauge, {'centre its ball on the rod' if centre else 'align it'}"
+
+
+def _end(sensor: Sensor) -> str:
+    """Instruction at the end of a program."""
+    if isinstance(sensor, BallBar):
+        return (
+            "remove bar, ball and post, then jog to the mechanical zero; if ball and post stay, "
+            "jog around them to the next setup"
+        )
+    return "remove the gauge, then jog the machine to its mechanical zero"
 
 
 def _read(

@@ -34,6 +34,7 @@ from orthocal.output.sheet.gauge_position import (
 from orthocal.output.sheet.pictures import draw_machine, draw_section, draw_tool
 from orthocal.output.text.layout import counted, true_minus
 from orthocal.robot.model import ALONG, Robot
+from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.protocol import mounting_steps, tool_path
 from orthocal.session.session import Session, Setup
 from orthocal.units import DRIVE_UNITS, LIMIT, MM, format_fixed
@@ -44,10 +45,26 @@ SHEET = "sheet.html"
 
 END = (
     "Compare the readings of the first posture with each other. If they differ by more than two "
-    "steps of the dial, repeat this setup: the gauge or the machine was displaced. Then remove the "
-    "gauge and jog the machine to its mechanical zero."
+    "steps of the dial, repeat this setup: the gauge or the machine was displaced. "
 )
-"""What to do after the readings of a setup."""
+"""Check after the readings of a setup."""
+
+REMOVE = "Then remove the gauge and jog the machine to its mechanical zero."
+"""What to do after the check."""
+
+REMOVE_BAR = (
+    "Then remove the bar. If a later setup uses the same ball, leave ball and post, and jog around "
+    "them to its first posture. Otherwise remove them before you jog to the mechanical zero."
+)
+"""The same for a ball bar."""
+
+BALL_IN_THE_WAY = (
+    " The fixed ball of a ball bar and its post may be in its way. Place them only after the tool "
+    "stands in the first posture. Where they stay for a later setup with the same ball, jog around "
+    "them to the first posture of its program before you start it, not to the mechanical zero. "
+    "Remove them before you start the program of another gauge."
+)
+"""Rule for programs of a session with a ball bar."""
 
 BY_EYE = 0.01
 """Angle between a leg and its axis that the eye does not see: half a degree, [rad]."""
@@ -148,7 +165,7 @@ def _front(
         + _numbered(rules)
         + heading("Setups, in this order", level=3)
         + table(headers, rows, left=3)
-        + (_programs(options) if with_programs else "")
+        + (_programs(options, with_bar=_has_bar(session)) if with_programs else "")
     )
 
 
@@ -168,7 +185,11 @@ def _largest_difference(robot: Robot) -> str:
     return " or ".join(f"{limit} {unit}" for unit, limit in largest.items())
 
 
-def _programs(options: ProgramOptions | None) -> str:
+def _has_bar(session: Session) -> bool:
+    return any(isinstance(s.sensor, BallBar) for s in session.setups.values())
+
+
+def _programs(options: ProgramOptions | None, *, with_bar: bool) -> str:
     """Advice for running the programs."""
     options = options or ProgramOptions()
     shift = options.shift_mm
@@ -185,7 +206,7 @@ def _programs(options: ProgramOptions | None) -> str:
         "Press cycle start to continue. Run the first "
         "program without a gauge and with a slow override. Before you start a program, remove the "
         "gauge and jog the machine to its mechanical zero: its first motion goes straight to the "
-        "first posture, and nothing may be in its way."
+        f"first posture, and nothing may be in its way.{BALL_IN_THE_WAY * with_bar}"
     )
 
 
@@ -199,13 +220,15 @@ def _setup(
 ) -> str:
     title = f"Setup {motion.number} of {motion.count}: {motion.setup}"
     program = f" Program: {program_name(motion)}." if with_program else ""
-    measured = session.setups[motion.setup].sensor.describe()
+    sensor = session.setups[motion.setup].sensor
+    measured = sensor.describe()
+    end = END + (REMOVE_BAR if isinstance(sensor, BallBar) else REMOVE)
     return (
         f'<section id="setup-{motion.number}">{heading(title)}'
         f"{paragraph(f'{measured}.{program}', kind='lead')}"
         f'<div class="pictures">{pictures}</div>'
         f"{_numbered(_steps(session, motion, gauge))}"
-        f"{_warnings(session, motion, gauge)}{_boxes(session, motion)}{paragraph(END)}</section>"
+        f"{_warnings(session, motion, gauge)}{_boxes(session, motion)}{paragraph(end)}</section>"
     )
 
 
@@ -246,12 +269,24 @@ def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[
         "reverse the sign of every reading of this setup.",
     )
     return [
-        f"{align}, {gauge.alignment}: {_joint_list(session.robot, gauge.drives)}.",
+        f"{align}, {gauge.alignment}: {_joint_list(session.robot, gauge.drives)}."
+        f"{_around_ball(gauge.setup, motion.alignment or first)}",
         *mounting,
         *go,
         _gauge_zero(session, gauge.setup, first),
         "Take the readings in the order below. The line numbers are those of readings.csv.",
     ]
+
+
+def _around_ball(setup: Setup, begin: Stop) -> str:
+    """Way to the alignment posture past a fixed ball, which may stand at the mechanical zero."""
+    if not isinstance(setup.sensor, BallBar) or begin.point is None:
+        return ""
+    at = ", ".join(_short(v) for v in begin.point)
+    return (
+        " If the fixed ball stands already, jog around ball and post to this posture (tool at "
+        f"{at} mm) before you start the program."
+    )
 
 
 def _across(gauge: GaugePosition) -> str:
