@@ -264,9 +264,9 @@ def test_backlashes_of_several_drives_are_nearly_independent(plan, slack):
         values = simulate_session(machine, errors, seed=seed).session.values
         deviation = model.entries(values[None])[0] - about.expected
         gram, slope = about.likelihood._gram(deviation, vectors)
-        precision, positive = np.ones(3), np.ones(3, bool)
-        found = _integrate_amounts(gram, slope, precision, positive)
-        free = _integrate_amounts(gram, slope, precision, ~positive)
+        precision, positive = np.ones((1, 3)), np.ones(3, bool)
+        (found,) = _integrate_amounts(gram, slope, precision, positive)
+        (free,) = _integrate_amounts(gram, slope, precision, ~positive)
         inverse = np.linalg.inv(gram + np.eye(3))
         means = (inverse @ slope[..., None])[..., 0]
         shares = [log_positive_share(m, c) for m, c in zip(means, inverse, strict=True)]

@@ -108,7 +108,7 @@ def test_a_line_is_read_as_by_an_edge_without_a_radius(tmp_path, root):
     for i in range(0, o.size, 7):
         setup = list(setups.values())[o.setup[i]]
         leg = session.robot.legs[setup.sensor.leg]
-        frames = workshop.frames[postures.index(postures[o.posture[i]])]
+        frames = workshop.frames[postures[o.posture[i]]]
         root_, tip = frames[leg.root], frames[leg.tip]
         d, a = np.eye(3)["xyz".index(setup.sensor.direction)], leg.axis
         s = np.cross(a, d)

@@ -21,7 +21,7 @@ from orthocal.session.session import Session
 if TYPE_CHECKING:
     from orthocal.hypotheses.linear_model import LinearModel
 
-LEAST_COLUMN = 1e-3
+LEAST_COLUMN = 0.5
 """Part of the noise by which one prior std of a placement must move the readings to be considered.
 """
 
