@@ -134,7 +134,7 @@ def _choose_changes(
     changes: Sequence[Mapping[str, float]],
     determined: Sequence[bool],
 ) -> Sequence[bool]:
-    """Whether to enter each change: if it is determined, or if the others lower the tool error.
+    """Decide on each change: entered if it is determined, or if the others lower the tool error.
 
     Args:
         calibration: The calibration.

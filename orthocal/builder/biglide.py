@@ -57,7 +57,7 @@ class Biglide(SlidingLegs):
 
     @property
     def single(self) -> bool:
-        """Whether a leg has one rod."""
+        """True if a leg has one rod."""
         return self.rods_apart == 0.0
 
     def find_problem(self) -> tuple[str, str] | None:

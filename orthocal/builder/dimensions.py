@@ -43,7 +43,7 @@ class Dimension:
 
     @property
     def count(self) -> int:
-        """How many numbers it has."""
+        """Number of values."""
         return self.form.count(self.separator) + 1 if self.separator else 1
 
     def to_si(self, numbers: Sequence[float]) -> Any:  # noqa: ANN401 - a float or a tuple
@@ -152,7 +152,7 @@ class Dimensions(ABC):
         """YAML of the machine: loops, drives, legs, parameters, tolerances and models."""
 
     def adjustments(self) -> str:
-        """What can be adjusted mechanically, as lines below `orthocal`; "" by default."""
+        """Mechanical adjustments, as lines below `orthocal`; "" by default."""
         return ""
 
     @classmethod

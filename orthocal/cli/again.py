@@ -86,7 +86,7 @@ def again(
 
 
 def _describe_entries(new: orthocal.Session, *, changes: bool) -> str:
-    """What the controller corrects while a new session is read, in words.
+    """Corrections of the controller while a new session is read, in words.
 
     Args:
         new: The session.

@@ -159,7 +159,7 @@ class Dialogue:
             self._note(f"Not recorded: {e}.")
 
     def _is_answer(self, word: str, arguments: list[str]) -> bool:
-        """Whether a line answers the question about a condition: no command and no more than it."""
+        """True if a line answers the question about a condition: no command and no more than it."""
         if arguments:
             return False
         if self._question == "approach" and word and not word.strip("pnu"):

@@ -323,7 +323,7 @@ class LoopClosure:
 
     @property
     def _depends_on_drives(self) -> bool:
-        """Whether conditions follow from the drive coordinates."""
+        """True if conditions follow from the drive coordinates."""
         return self._has_load or "coordinates" in self._functions.errors.conditions
 
     @property

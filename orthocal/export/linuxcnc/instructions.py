@@ -217,7 +217,7 @@ def _describe_undetermined(calibration: Calibration) -> str:
 
 
 def _describe_undetermined_screws(calibration: Calibration) -> str:
-    """The same about periodic errors of screws, of which tables are not written."""
+    """Periodic errors of screws that are not in the tables, because they are undetermined."""
     screws = [e for e in find_screws(calibration) if not e.change.any()]
     return _describe_kept(
         calibration, "Periodic error of the screw", [(e.drive, e.uncertainty) for e in screws]

@@ -185,7 +185,7 @@ def write_program(
 def _before_start(
     robot: Robot, sensor: Sensor, first: Stop, options: ProgramOptions
 ) -> tuple[str, ...]:
-    """Where the machine stands before the program: comments of its header."""
+    """Place of the machine before the program: comments of its header."""
     if not isinstance(sensor, BallBar):
         return ("(Before start: gauge removed, machine at its mechanical zero)",)
     return (
@@ -211,7 +211,7 @@ def _before_motion(
 def _mount(sensor: Sensor) -> str:
     """Instruction at the first pause after a motion."""
     if isinstance(sensor, BallBar):
-        return "place the fixed ball unless it stands, then mount the bar as the sheet shows"
+        return "place the fixed ball unless it is in place, then mount the bar as the sheet shows"
     if mounting_steps(sensor) is not None:
         return "mount the gauge as the sheet shows"
     centre = isinstance(sensor, BallIndicator)

@@ -284,7 +284,7 @@ def _around_ball(setup: Setup, begin: Stop) -> str:
         return ""
     at = ", ".join(_short(v) for v in begin.point)
     return (
-        " If the fixed ball stands already, jog around ball and post to this posture (tool at "
+        " If the fixed ball is in place already, jog around ball and post to this posture (tool at "
         f"{at} mm) before you start the program."
     )
 
@@ -468,7 +468,7 @@ def _compensation(session: Session) -> str:
 
 
 def _zero_by_eye(robot: Robot) -> str:
-    """What the operator sees in the mechanical zero."""
+    """The mechanical zero as the operator sees it."""
     if robot.tcp is None or all(leg.follows_slide for leg in robot.legs.values()):
         return "each leg parallel to its axis"
     at = zip(robot.tcp.coordinates, tool_at_zero(robot), strict=True)
