@@ -11,7 +11,7 @@ from pathlib import Path
 
 import openpyxl
 import pytest
-from hypothesis import event, given, settings
+from hypothesis import event, example, given, settings
 from hypothesis import strategies as st
 
 from orthocal.errors import SessionError
@@ -119,8 +119,13 @@ def read(content: bytes, **options) -> dict[tuple[str, str, int], Decimal]:
     return found
 
 
+UNQUOTED = b"setup,posture,cycle 1 [mm],cycle 2 [mm]\r\nxy,zero,1 000,000\r\n"
+"""One number with a decimal comma, or two cells."""
+
+
 @settings(max_examples=EXAMPLES, deadline=None)
 @given(tables())
+@example((UNQUOTED, {("xy", "zero", 1): Decimal("1000.000")}))
 def test_any_dialect_is_imported_exactly_or_refused(table):
     content, truth = table
     try:

@@ -321,7 +321,7 @@ def _is_grouped(row: Row, pairs: Collection[tuple[int, int]]) -> bool:
     return any(_WHOLE.fullmatch(a) and _GROUP.fullmatch(b) for a, b in cells)
 
 
-_WHOLE = re.compile(r"[-+\u2212\u2013]?[0-9]+")
+_WHOLE = re.compile(r"[-+\u2212\u2013]?[0-9]+(?:[\s'\u2019][0-9]{3})*")
 _DIGITS = re.compile(r"[0-9]+")
 _GROUP = re.compile(r"[0-9]{3}(\.[0-9]*)?")
 
