@@ -250,19 +250,25 @@ def test_switches_are_latched_in_positive_direction_unless_stated(calibration):
     assert np.abs(np.array(opposite) - home_offsets(lines) - backlash).max() < 5e-3
 
 
+def enter_export(calibration, folder, options):
+    """Session of a calibration with its export entered into the controller, and the files."""
+    files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
+    for name, text in files.items():
+        (folder / name).write_text(text)
+    session = replace(
+        calibration.session,
+        compensation=read_ini(folder / "joints.ini", calibration.robot).compensation,
+        controller_offsets=tuple(offsets_to_enter(calibration).tolist()),
+    )
+    return session, files
+
+
 @pytest.fixture(scope="module")
 def under_tables(calibration, tmp_path_factory):
     """Calibration of a session under exported tables, and its HOME_OFFSET."""
     folder, old = tmp_path_factory.mktemp("tables"), old_home_offsets(calibration)
     options = ExportOptions(module=False, latched=LATCHED, home_offsets=old)
-    files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
-    for name, text in files.items():
-        (folder / name).write_text(text)
-    record = replace(
-        calibration.session,
-        compensation=read_ini(folder / "joints.ini", calibration.robot).compensation,
-        controller_offsets=tuple(offsets_to_enter(calibration).tolist()),
-    )
+    record, files = enter_export(calibration, folder, options)
     entered = tuple(np.array(home_offsets(files["joints.ini"])) * MM)
     return replace(calibration, session=record), entered
 
@@ -339,14 +345,7 @@ def test_an_undetermined_periodic_error_is_entered_if_that_lowers_the_tool_error
 def test_an_undetermined_change_leaves_a_table_as_it_is(complete, tmp_path):
     """A session under the exported tables that says little: only of the z screw something new."""
     options = ExportOptions(module=False, latched=LATCHED, home_offsets=(0.3, 0.3, 0.3))
-    files = export_calibration(complete, "linuxcnc", anyway=True, options=options)
-    for name, text in files.items():
-        (tmp_path / name).write_text(text)
-    session = replace(
-        complete.session,
-        compensation=read_ini(tmp_path / "joints.ini", complete.robot).compensation,
-        controller_offsets=tuple(offsets_to_enter(complete).tolist()),
-    )
+    session, files = enter_export(complete, tmp_path, options)
     kept = tuple(replace(e, active=e.enter) for e in complete.assessment.backlash)
     under = replace(
         complete,
