@@ -340,6 +340,7 @@ def test_forward_and_inverse_take_conditions(folder, assessed):
 def test_what_is_assumed_is_said_with_its_cost(folder, assessed):
     code, out, note = run_orthocal(folder, "forward", ".", "joints.csv")
     assert code == 0
+    (folder / "points.csv").write_text(out)
     assert numbers(out) == pytest.approx(assessed.machine.forward([0.31025, 0.33, 0.3]) * 1e3)
     tool = assessed.assessment.tool
     assert "--approach" in note
