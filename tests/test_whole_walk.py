@@ -249,6 +249,8 @@ def test_a_part_of_a_machine_with_effects_is_as_good_as_promised(warmed):
     supported = "Recommended effects: backlash" if backlash else "Recommended effects: none"
     assert supported in said["compare"]
     assert "The calibration is confirmed." in said["validate"]
+    # the first alone corrects all errors, too, but from half of the readings
+    assert "orthocal calibrate one two --out two-calibration" in said["validate"]
     for p in both.free:
         if p.name.endswith(".backlash"):  # three of them, to 99.7 %
             half = 1.5 * float(both.expand(p.std, p.std_scatter))

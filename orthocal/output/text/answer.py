@@ -184,7 +184,7 @@ def _next_step(
     calibration: Calibration, assessment: Assessment, saved: Path | None
 ) -> tuple[str, tuple[str, ...]]:
     """The next action, and the commands for it."""
-    decision, tool, unchanged = assessment.decision, assessment.tool, assessment.keeps_offsets
+    decision, unchanged = assessment.decision, assessment.keeps_offsets
     if decision.verdict != "enter":
         return decision.action or "none.", ()
     if saved is None:
@@ -196,10 +196,7 @@ def _next_step(
             f"orthocal export {directory} --to {firmware.firmware} --out {new}",
         )
     directory, new, module = (quote_path(p) for p in (saved, f"{saved}-again", f"{saved}-linuxcnc"))
-    correct = (
-        not calibration.only_offsets and tool is not None and lowers(tool.entered, tool.compensated)
-    )
-    if correct and (unchanged or calibration.measured_again):
+    if gains_from_correction(calibration) and (unchanged or calibration.measured_again):
         words = "correct the other errors, in LinuxCNC or in programs."
         if not unchanged:
             words = (
@@ -221,6 +218,14 @@ def _next_step(
         f"orthocal again {directory} --out {new}",
         f"orthocal record {new}",
         f"orthocal validate {directory} {new}",
+    )
+
+
+def gains_from_correction(calibration: Calibration) -> bool:
+    """True if correcting all identified errors lowers the tool error beyond entered offsets."""
+    tool = assessment_of(calibration).tool
+    return (
+        not calibration.only_offsets and tool is not None and lowers(tool.entered, tool.compensated)
     )
 
 

@@ -13,6 +13,7 @@ from orthocal.calibration.assessment_record import FindingKind
 from orthocal.output.text.answer import (
     describe_conditions,
     entry_table,
+    gains_from_correction,
     quote_path,
     render_backlash,
     render_next,
@@ -67,14 +68,27 @@ def render_validation(
         parts.append(section(f"Offsets from {source}", Group(entry_table(answer), *backlash)))
     if complete:
         parts += _details(validation, all_rows=all_rows)
-    paths = [part.path for part in answer.session.parts]
-    if further and paths and None not in paths:
-        sessions = [quote_path(Path(path).parent) for path in paths if path is not None]
-        command = f"orthocal calibrate {' '.join(sessions)} --out {sessions[-1]}-calibration"
-        parts += [Text(), render_next("to use the better offsets:", [command])]
+    parts += _next_step(validation, further=further)
     if not complete:
         parts += [Text(MORE)]
     return Group(*parts)
+
+
+def _next_step(validation: Validation, *, further: bool) -> list[RenderableType]:
+    """The command that calibrates from all readings, where they improve the machine further."""
+    paths = [part.path for part in validation.answer.session.parts]
+    if not paths or None in paths:
+        return []
+    joint = validation.joint is not None and validation.assessment.decision.verdict == "enter"
+    if further:
+        words = "to use the better offsets:"
+    elif joint and gains_from_correction(validation.answer):
+        words = "to correct the other identified errors, too, calibrate from all readings:"
+    else:
+        return []
+    sessions = [quote_path(Path(path).parent) for path in paths if path is not None]
+    command = f"orthocal calibrate {' '.join(sessions)} --out {sessions[-1]}-calibration"
+    return [Text(), render_next(words, [command])]
 
 
 def _details(validation: Validation, *, all_rows: bool) -> list[RenderableType]:
