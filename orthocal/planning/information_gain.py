@@ -17,6 +17,7 @@ import numpy as np
 
 from orthocal.arrays import Array, Indices
 from orthocal.planning.candidates import CandidateSetup
+from orthocal.planning.ranking import first_largest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,7 +172,7 @@ class SetupGain:
             gains = self._begun_differences()[i, j] if self.aligned else self._differences(pairs)
         ranked: list[tuple[float, tuple[int, int]]] = []
         while True:
-            best = int(gains.argmax())
+            best = first_largest(gains)
             gain, pair = float(gains[best]), (int(i[best]), int(j[best]))
             if gain < 0.0:
                 return ranked
@@ -240,7 +241,7 @@ class SetupGain:
                 refused[chosen] = True
                 single = self._single_gains(effect, variance)
                 np.putmask(single, refused, -1.0)
-                best = int(single.argmax())
+                best = first_largest(single)
                 if refused[best]:
                     break
                 chosen.append(best)

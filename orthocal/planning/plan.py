@@ -44,6 +44,7 @@ from orthocal.planning.expected_error import (
 from orthocal.planning.further_readings import FurtherReadings, find_further_readings
 from orthocal.planning.plan_comparison import Alternative, Comparison
 from orthocal.planning.planned_session import build_session
+from orthocal.planning.ranking import best_of
 from orthocal.planning.selection import KILLED, PlannedSetup, PlannedSetups, SetupSearch
 from orthocal.planning.sensor_gains import SensorGain, find_sensor_gains
 from orthocal.planning.timed_search import TimedSearch
@@ -450,7 +451,7 @@ def _choose_counts(
     """Numbers of readings of each setup with the smallest error after one start."""
     work = partial(_quick_error, search, seed, options)
     errors = dict(run_in_parallel(work, range(len(options)), workers, killed=KILLED))
-    return options[min(range(len(options)), key=errors.__getitem__)]
+    return options[best_of(range(len(options)), lambda i: -errors[i])]
 
 
 def _quick_error(search: SetupSearch, seed: int, options: Sequence[list[int]], which: int) -> float:

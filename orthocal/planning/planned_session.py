@@ -105,7 +105,7 @@ def order_postures(points: Array) -> list[int]:
     Args:
         points: Tool positions, shape (n, n_coordinates), [m].
     """
-    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
+    distance = np.linalg.norm(points[:, None] - points[None], axis=2).round(9)  # [nm]
 
     def length(order: list[int]) -> float:
         return float(sum(distance[a, b] for a, b in pairwise([*order, order[0]])))

@@ -21,6 +21,7 @@ from orthocal.arrays import Array
 from orthocal.errors import ParameterError
 from orthocal.planning.candidates import FEWEST, AlignedParameter, Candidates, CandidateSetup
 from orthocal.planning.information_gain import Pairs, SetupGain
+from orthocal.planning.ranking import first_largest, is_less, sort_by
 from orthocal.runtime.worker_pool import run_in_parallel
 from orthocal.units import MM
 
@@ -160,7 +161,7 @@ class SetupSearch:
         for start, setups in run_in_parallel(work, range(starts), workers, killed=KILLED):
             done[start] = setups
             while reported in done:
-                if best is None or done[reported].error < best.error:
+                if best is None or is_less(done[reported].error, best.error):
                     best = done[reported]
                 reported += 1
                 if report is not None:
@@ -278,7 +279,7 @@ class SetupSearch:
                 continue
             information = others + self.information_of(new)
             error = self.error_of(information)
-            if error < best.error:
+            if is_less(error, best.error):
                 setups = (*plan.setups[:k], new, *plan.setups[k + 1 :])
                 best = PlannedSetups(setups, information, error)
         return best
@@ -364,7 +365,7 @@ class Gains:
         remainder = np.broadcast_to(chosen[1:], (len(first), len(chosen) - 1))
         sets = np.vstack([begun_with, np.column_stack([first, remainder])])
         able = sets[setup.reachable[sets[:, :1], sets].all(axis=1)]
-        best = int(self.setup(planned.candidate).gains(able).argmax())
+        best = first_largest(self.setup(planned.candidate).gains(able))
         return PlannedSetup(planned.candidate, tuple(able[best].tolist()))
 
     def rank(self, count: int) -> list[PlannedSetup]:
@@ -376,7 +377,7 @@ class Gains:
         for which, pair in self.begin(count):
             gain, chosen = self.setup(which, pair[0]).complete(pair, count)
             completed.append((gain, PlannedSetup(which, chosen)))
-        return [planned for _, planned in sorted(completed, key=lambda c: -c[0])]
+        return [planned for _, planned in sort_by(completed, lambda c: c[0])]
 
     def begin(
         self, count: int, gauges: Collection[str] | None = None
@@ -393,10 +394,9 @@ class Gains:
             if (gauges is None or setup.gauge in gauges) and self._pairs(which, count).flat.size
             for gain, pair in self._ranking_setup(which).best_pairs(self._pairs(which, count), 1)
         ]
-        present.sort(key=lambda b: -b[0])
         of_gauge: Counter[str] = Counter()
         begun = []
-        for _, which, pair in present:
+        for _, which, pair in sort_by(present, lambda p: p[0]):
             gauge = self.search.reduced[which].gauge
             of_gauge[gauge] += 1
             if of_gauge[gauge] <= MOST_COMPLETED:
@@ -425,7 +425,7 @@ class Gains:
                     setup.reachable[chosen[0]] if place else setup.reachable[:, others].all(axis=1)
                 )
                 allowed[others] = False
-                chosen[place] = int(np.where(allowed, gains[place], -1.0).argmax())
+                chosen[place] = first_largest(np.where(allowed, gains[place], -1.0))
                 if chosen[place] != old:
                     gains = gain.exchange_gains(chosen)
             if chosen == before:

@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 from orthocal.errors import ParameterError
 from orthocal.planning.candidates import FEWEST
 from orthocal.planning.owned_sensors import SLACK, Duration
+from orthocal.planning.ranking import best_of, sort_by
 from orthocal.planning.selection import (
     KILLED,
     LEAST_IMPROVEMENT,
@@ -52,6 +53,10 @@ class _Option(NamedTuple):
 def _rate(option: _Option) -> float:
     """Gain per minute."""
     return option.gain / max(option.minutes, SLACK)
+
+
+def _accuracy(plan: PlannedSetups) -> float:
+    return -plan.error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,7 +100,7 @@ class TimedSearch:
             done[which] = planned
             if report is not None:
                 report(len(done), planned.error)
-        best = min((done[i] for i in sorted(done)), key=lambda plan: plan.error)
+        best = best_of((done[i] for i in sorted(done)), _accuracy)
         if not best.setups:
             shortest = min(d.of(FEWEST) for d in self.durations.values())
             raise ParameterError(
@@ -118,7 +123,7 @@ class TimedSearch:
                 options = self._list_options(plan, 0.5 * minutes)
                 of_gauge = [o for o in options if self._gauge(o.planned) == first]
                 if of_gauge:
-                    best = max(of_gauge, key=lambda o: o.gain)
+                    best = best_of(of_gauge, lambda o: o.gain)
                     plan = self.search.plan_of([best.planned])
             plan = self._improve(self._fill(plan, minutes), minutes, together=1)
             if len(plan.setups) > MOST_PAIRED:
@@ -144,7 +149,7 @@ class TimedSearch:
         """Plans with one setup more each, of the largest gain per minute."""
         plan = self.search.empty
         while options := self._list_options(plan, UNLIMITED):
-            plan = self._with(plan, max(options, key=_rate).planned)
+            plan = self._with(plan, best_of(options, _rate).planned)
             yield plan
 
     def minutes(self, setups: Sequence[PlannedSetup]) -> float:
@@ -166,8 +171,7 @@ class TimedSearch:
             options = self._list_options(plan, left)
             if not options:
                 return plan
-            best = max(options, key=_rate)
-            plan = self._with(plan, best.planned)
+            plan = self._with(plan, best_of(options, _rate).planned)
 
     def _list_options(self, plan: PlannedSetups, minutes: float) -> list[_Option]:
         """Setups that fit into a time, with their gains beside those of a plan."""
@@ -201,11 +205,11 @@ class TimedSearch:
         options = self._list_options(without, minutes - self.minutes(others))
         if not options:
             return plan
-        rate = max(options, key=_rate).planned
+        rate = best_of(options, _rate).planned
         plans = [plan, self._fill(self._with(without, rate), minutes)]
         refined = self._refine(without, old[0] if len(old) == 1 else None, options)
         plans.append(self._fill(refined, minutes))
-        return min(plans, key=lambda p: p.error)
+        return best_of(plans, _accuracy)
 
     def _refine(
         self, without: PlannedSetups, old: PlannedSetup | None, options: Sequence[_Option]
@@ -213,7 +217,7 @@ class TimedSearch:
         """Plan with the best of several setups added, their readings exchanged."""
         gains = Gains.of(self.search, without.information)
         likely: dict[int, PlannedSetup] = {}
-        for option in sorted(options, key=lambda o: -o.gain):
+        for option in sort_by(options, lambda o: o.gain):
             likely.setdefault(option.planned.candidate, option.planned)
         tried = [*([] if old is None else [old]), *list(likely.values())[:MOST_REFINED]]
         best: PlannedSetups | None = None
@@ -221,7 +225,7 @@ class TimedSearch:
             new = gains.exchange_first(new)
             if best is None or gains.rough_error(new) <= best.error * (1.0 + ROUGH):
                 changed = self._with(without, new)
-                best = changed if best is None else min(best, changed, key=lambda p: p.error)
+                best = changed if best is None else best_of([best, changed], _accuracy)
         return without if best is None else best
 
 

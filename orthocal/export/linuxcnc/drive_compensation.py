@@ -27,7 +27,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array
-from orthocal.assessment.controller_entries import find_backlash, find_screws
+from orthocal.assessment.controller_entries import (
+    ENTERED_DECIMALS,
+    find_backlash,
+    find_screws,
+)
 from orthocal.calibration.calibration import Calibration
 from orthocal.effects.backlash import Backlash
 from orthocal.effects.compensation import JointTrim, table_name
@@ -186,7 +190,7 @@ def find_compensation(
         )
     if Backlash not in modelled:
         return old
-    enter = {e.drive: e.enter for e in find_backlash(calibration)}
+    enter = {e.drive: round(e.enter, ENTERED_DECIMALS) for e in find_backlash(calibration)}
     backlash = [
         enter.get(d.name, joint.backlash) for d, joint in zip(robot.drives, old, strict=True)
     ]
