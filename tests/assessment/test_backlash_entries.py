@@ -74,7 +74,9 @@ def test_every_output_has_the_same_decision(calibration, plan):
     written = dict(re.findall(r"\[JOINT_(\d)\][^\[]*?BACKLASH = (\S+)", lines["joints.ini"]))
     assert sorted(written) == ["0", "1"]
     for joint, drive in (("0", "x"), ("1", "y")):
-        assert float(written[joint]) * 1e-3 == pytest.approx(found[drive].enter, abs=1e-7)
+        assert float(written[joint]) * 1e-3 == pytest.approx(
+            round(found[drive].enter, 6), abs=1e-12
+        )
     half = f"±{expanded_uncertainty(calibration, found['z']) * 1e3:.3f} mm"
     assert f"JOINT_2 ({half})" in lines["README.md"]
     lags = _find_lags(calibration)

@@ -190,13 +190,30 @@ def find_compensation(
         )
     if Backlash not in modelled:
         return old
-    enter = {e.drive: round(e.enter, ENTERED_DECIMALS) for e in find_backlash(calibration)}
+    enter = {e.drive: e.enter for e in find_backlash(calibration)}
     backlash = [
         enter.get(d.name, joint.backlash) for d, joint in zip(robot.drives, old, strict=True)
     ]
     return tuple(
         JointCompensation(b if b >= SMALLEST else 0.0, None, joint.latched)
         for b, joint in zip(backlash, old, strict=True)
+    )
+
+
+def round_backlash(
+    compensation: Sequence[JointCompensation], before: Sequence[JointCompensation]
+) -> tuple[JointCompensation, ...]:
+    """Compensation with each BACKLASH to enter as it is printed; tables and old values stay.
+
+    Args:
+        compensation: Compensation to enter.
+        before: Compensation during the measurement.
+    """
+    return tuple(
+        joint
+        if joint.table is not None or joint.backlash == was.backlash
+        else replace(joint, backlash=round(joint.backlash, ENTERED_DECIMALS))
+        for joint, was in zip(compensation, before, strict=True)
     )
 
 

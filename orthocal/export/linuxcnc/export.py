@@ -18,6 +18,7 @@ from orthocal.export.linuxcnc.drive_compensation import (
     compensate_beside_module,
     find_compensation,
     find_old_compensation,
+    round_backlash,
     tabulate,
 )
 from orthocal.export.linuxcnc.home_offsets import find_homes
@@ -115,6 +116,7 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         if not find_entries(calibration):
             raise ExportError("the calibration identified no offset: there is nothing to enter")
         compensation = tabulate(calibration, compensation, before, offsets_to_enter(calibration))
+        compensation = round_backlash(compensation, before)
         _require_change(calibration, compensation, before)
         _require_home_offsets(options, [*before, *compensation])
         homes = find_homes(calibration, compensation, before, old=options.home_offsets)
@@ -124,6 +126,7 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
             **_write_tables(calibration, compensation, before),
         }
     compensation = compensate_beside_module(calibration, compensation, before)
+    compensation = round_backlash(compensation, before)
     if not compensates_alike(compensation, before):
         _require_home_offsets(options, before)
     homes = find_homes(calibration, compensation, before, old=options.home_offsets)
