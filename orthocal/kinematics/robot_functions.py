@@ -100,6 +100,11 @@ class RobotFunctions:
         zero = ca.SX(self.robot.reference_passive)
         return RobotFunctions(self.robot, passive=zero, placements=self.placements, reference=True)
 
+    @cached_property
+    def second(self) -> RobotFunctions:
+        """Functions in a second posture, with separate symbols of all coordinates."""
+        return RobotFunctions(self.robot, placements=self.placements)
+
     @property
     def n_twists(self) -> int:
         """Number of components of the twists of all moved placements."""

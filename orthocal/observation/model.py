@@ -71,9 +71,10 @@ class _Block:
     states: Indices
     """Shape (k,)."""
     entries: Indices
-    """Entries of each state, shape (k, m)."""
-    members: tuple[tuple[int, Indices, Indices], ...]
-    """Sensor groups: index; positions in `entries`, flat; and positions in the group, (n,) each."""
+    """Entries of each state, shape (k, m). The second postures of pairs follow all entries."""
+    members: tuple[tuple[int, bool, Indices, Indices], ...]
+    """Sensor groups: index; True for second postures of pairs; positions in `entries`, flat; and
+    positions in the group, (n,) each."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,10 +238,7 @@ class ObservationModel:
             size = max(1, MAX_PREDICTED // n_sets)
             for first in range(0, group.entries.size, size):
                 part = np.arange(first, min(first + size, group.entries.size))
-                states = self.observations.state[group.entries[part]]
-                (h,) = group.reading.value(
-                    *self._inputs(group, part, machines, states, q[:, states], nu)
-                )
+                (h,) = group.reading.value(*self._inputs(group, part, machines, q, nu))
                 result[:, group.entries[part]] = h.reshape(n_sets, part.size)
         return result if errors.ndim > 1 else result[0]
 
@@ -295,7 +293,6 @@ class ObservationModel:
         group: SensorGroup,
         part: Indices,
         machines: _Machines,
-        states: Indices,
         passive: Array,
         nuisance: Array,
     ) -> tuple[Array, ...]:
@@ -305,18 +302,25 @@ class ObservationModel:
             group: The group.
             part: Positions in the group, shape (n,).
             machines: The machines.
-            states: State of each of these entries, shape (n,).
-            passive: Passive coordinates there, shape (S, n, n_passive), [m, rad].
+            passive: Passive coordinates, shape (S, n_states, n_passive), [m, rad].
             nuisance: Shape (S, n_nuisance), [SI].
         """
         n_sets, n = len(passive), part.size
+        entries = group.entries[part]
+        states = self.observations.state[entries]
+
+        def coordinates(states: Indices) -> tuple[Array, Array]:
+            actuated = machines.actuated[:, states].reshape(n_sets * n, -1)
+            return actuated, passive[:, states].reshape(n_sets * n, -1)
+
+        of_second = coordinates(self.observations.second[entries]) if group.reading.pairs else ()
         return (
-            machines.actuated[:, states].reshape(n_sets * n, -1),
-            passive.reshape(n_sets * n, -1),
+            *coordinates(states),
             machines.placements(states),
             machines.reference[:, group.setups[part]].reshape(n_sets * n, -1),
             np.tile(group.constants[part], (n_sets, 1)),
             nuisance[:, group.nuisance[part]].reshape(n_sets * n, -1),
+            *of_second,
         )
 
     @cached_property
@@ -330,12 +334,16 @@ class ObservationModel:
 
     def blocks(self, n_sets: int) -> tuple[_Block, ...]:
         """All states with readings, by their number, for a batch of machines."""
-        o = self.observations
+        o, paired = self.observations, self.paired
         group, place = np.zeros((2, o.size), dtype=np.int64)
         for i, g in enumerate(self.groups):
             group[g.entries], place[g.entries] = i, np.arange(g.entries.size)
-        order = np.argsort(o.state, kind="stable")
-        states, starts, counts = np.unique(o.state[order], return_index=True, return_counts=True)
+        # of each sensor group the first postures, then the second ones
+        member = np.concatenate([2 * group, 2 * group[paired] + 1])
+        place = np.concatenate([place, place[paired]])
+        state = np.concatenate([o.state, o.second[paired]])
+        order = np.argsort(state, kind="stable")
+        states, starts, counts = np.unique(state[order], return_index=True, return_counts=True)
         blocks = []
         for m in np.unique(counts).tolist():
             chosen = np.flatnonzero(counts == m)
@@ -344,10 +352,27 @@ class ObservationModel:
                 at = chosen[first : first + size]
                 entries = order[starts[at][:, None] + np.arange(m)]
                 flat = entries.reshape(-1)
-                where = ((int(i), np.flatnonzero(group[flat] == i)) for i in np.unique(group[flat]))
-                members = tuple((i, w, place[flat[w]]) for i, w in where)
+                parts = [(int(i), np.flatnonzero(member[flat] == i)) for i in np.unique(member[flat])]
+                members = tuple((i // 2, i % 2 == 1, w, place[flat[w]]) for i, w in parts)
                 blocks.append(_Block(states[at], entries, members))
         return tuple(blocks)
+
+    @cached_property
+    def paired(self) -> Indices:
+        """Entries of pairs of postures, shape (n_pairs,)."""
+        return np.flatnonzero(self.observations.second >= 0)
+
+    def gather(self, values: Array) -> Array:
+        """Values of entries, shape (S, n, ...), of those with the second postures of pairs after.
+
+        The parts of a pair add up.
+        """
+        if not self.paired.size:
+            return values
+        n = self.observations.size
+        result = values[:, :n].copy()
+        result[:, self.paired] += values[:, n:]
+        return result
 
     @cached_property
     def _single_blocks(self) -> tuple[_Block, ...]:
@@ -423,7 +448,8 @@ class ReadingLinearisation:
         _, self._by_drive_errors = geometry.drive_derivatives(model.states.commands)
         _, self._by_reference = geometry.drive_derivatives(model.reference_commands)
         self._pattern = free.pattern
-        map_, n_sets, n = model.functions.errors, len(errors), model.observations.size
+        map_, n_sets = model.functions.errors, len(errors)
+        n = model.observations.size + model.paired.size
         sparse = n_sets == 1 and n >= MIN_SPARSE_ROWS
         self._twists = _TwistChain(map_, errors, model.states, free, sparse=sparse)
         self._by_machine = free.columns[map_.drive_errors]
@@ -445,6 +471,7 @@ class ReadingLinearisation:
             jacobian[:, entries, :n_machine] = self._machine_rows(block, closures, readings)
             jacobian[:, entries, n_machine:] = readings.by_nuisance
             self._blocks.append((block, closures))
+        reading, opening, jacobian = (model.gather(v) for v in (reading, opening, jacobian))
         aligned = np.flatnonzero(by_errors.any(axis=1))
         by_nuisance = jacobian[:, :, n_machine:]
         if aligned.size:
@@ -493,27 +520,35 @@ class ReadingLinearisation:
 
     def _evaluate_readings(self, block: _Block, passive: Array, nuisance: Array) -> _Readings:
         model, (k, m) = self._model, block.entries.shape
-        n_sets, q = len(passive), passive[:, block.states]
+        n_sets, n_passive = len(passive), passive.shape[2]
         n_drive_errors = self._by_drive_errors.shape[-1]
         by_twists: list[tuple[Indices, Indices, Array]] = []
         result = _Readings(
             np.empty((n_sets, k * m)),
             np.zeros((n_sets, k * m, n_drive_errors)),
-            np.zeros((n_sets, k * m, q.shape[2])),
+            np.zeros((n_sets, k * m, n_passive)),
             np.zeros((n_sets, k * m, nuisance.shape[1])),
             by_twists,
         )
-        for index, where, place in block.members:
-            group, at = model.groups[index], where // m
-            states, setups = block.states[at], group.setups[place]
-            inputs = model._inputs(group, place, self._machines, states, q[:, at], nuisance)
+        for index, of_second, where, place in block.members:
+            group, states = model.groups[index], block.states[where // m]
+            setups = group.setups[place]
+            inputs = model._inputs(group, place, self._machines, passive, nuisance)
             outputs = group.reading.jacobian(*inputs)
-            h, h_a, h_q, nonzeros, h_r, h_nu = (v.reshape(n_sets, where.size, -1) for v in outputs)
+            h, h_a, h_q, nonzeros, h_r, h_nu, *second = (
+                v.reshape(n_sets, where.size, -1) for v in outputs
+            )
+            if of_second:
+                h_a, h_q = second
             by_drive_errors = h_a[:, :, None] @ self._by_drive_errors[:, states]
+            result.by_passive[:, where] = h_q
+            if of_second:  # the other parts belong to the first posture
+                result.value[:, where] = 0.0
+                result.by_drive_errors[:, where] = by_drive_errors[:, :, 0]
+                continue
             by_drive_errors += h_r[:, :, None] @ self._by_reference[:, setups]
             result.value[:, where] = h[..., 0]
             result.by_drive_errors[:, where] = by_drive_errors[:, :, 0]
-            result.by_passive[:, where] = h_q
             result.by_nuisance[:, where[:, None], group.nuisance[place]] = h_nu
             _, columns = group.reading.jacobian.pattern("by_twists")
             by_twists.append((where, columns, nonzeros))

@@ -18,6 +18,7 @@ from orthocal.kinematics.conditions import APPROACH, UseConditions
 from orthocal.kinematics.error_map import error_map
 from orthocal.kinematics.loop_closure import LoopClosure, find_loads
 from orthocal.robot.model import Robot
+from orthocal.sensors.protocol import reads_pairs
 from orthocal.session.session import Conditions, Reading, Session
 
 TIME_OF_READING = 60.0
@@ -53,6 +54,8 @@ class States:
 class Observations:
     """Readings as the gauge showed them, one an entry; differences are split.
 
+    A reading of a pair of postures is one entry.
+
     Differences of one setup and cycle that share postures are equivalent to readings with one free
     zero: eliminating it gives their covariance, σ² [[2, 1], [1, 2]] for two differences from one
     posture. So every entry is a single reading with standard deviation σ.
@@ -77,6 +80,8 @@ class Observations:
     """Entry to subtract, or -1, shape (n_rows,)."""
     state: Indices
     """Index of the loop closure, shape (n,)."""
+    second: Indices
+    """Index of the loop closure in the second posture of a pair, or -1, shape (n,)."""
     place: Indices
     """Index of setup, posture and approach: entries with the same place repeat each other, (n,)."""
     conditions: Mapping[Condition, Array]
@@ -101,6 +106,7 @@ class Observations:
             setup=self.setup[chosen],
             posture=self.posture[chosen],
             state=self.state[chosen],
+            second=self.second[chosen],
             place=self.place[chosen],
             conditions={c: v[chosen] for c, v in self.conditions.items()},
             zero=self.zero[chosen],
@@ -160,6 +166,7 @@ def build_observations(session: Session) -> Observations:
     setups = {name: i for i, name in enumerate(session.setups)}
     postures = {name: i for i, name in enumerate(session.postures)}
     entries: list[tuple[int, int, int]] = []
+    pairs: dict[int, int] = {}  # entry to its second posture
     conditions: list[Conditions | None] = []
     # of a gauge by its setup, of a group of differences by setup, cycle and group
     zeros: dict[tuple[str] | tuple[str, int, str], int] = {}
@@ -183,19 +190,27 @@ def build_observations(session: Session) -> Observations:
         if r.minus is None:
             plus.append(add(r, r.posture, (r.setup,)))
             minus.append(-1)
+        elif is_pair(session, r):
+            plus.append(add(r, r.posture, (r.setup,)))
+            pairs[plus[-1]] = postures[r.minus]
+            minus.append(-1)
         else:
             plus.append(find(r, r.posture))
             minus.append(find(r, r.minus))
-    table = np.array(entries, dtype=np.int64).reshape(-1, 3)
-    values = _condition_values(session.robot, conditions, table[:, 0])
-    if "load" in error_map(session.robot).conditions:
-        values["load"] = _find_loads(session, table[:, 0], table[:, 1])
-    values["adjustment"] = adjustment_table(session)[table[:, 0]]
-    values["coordinates"] = drive_table(session)[table[:, 1]]
-    values["reference"] = session.zero_drives[table[:, 0]]
+    table, n = np.array(entries, dtype=np.int64).reshape(-1, 3), len(entries)
+    paired = np.array(list(pairs), dtype=np.int64)
+    of_second = table[paired]
+    of_second[:, 1] = list(pairs.values())
+    table = np.vstack([table, of_second])
+    conditions += [None] * paired.size
+    values = _all_conditions(session, conditions, table)
     trims = _find_trims(session, table[:, 0], table[:, 1], values["approach"])
     states, state = _find_states(session, table[:, 1], values, trims)
-    places = np.hstack([table[:, :2], values["approach"]])
+    require_common_placements(states, session, bool(pairs))
+    second = np.full(n, -1)
+    second[paired] = state[n:]
+    table, values = table[:n], {c: v[:n] for c, v in values.items()}
+    places = np.hstack([table[:, :2], values["approach"], second[:, None]])
     zero_setup, zero_real = tuple(k[0] for k in zeros), tuple(len(k) == 1 for k in zeros)
     absolute = [len(k) == 1 and session.setups[k[0]].zero == "known" for k in zeros]
     return Observations(
@@ -208,11 +223,31 @@ def build_observations(session: Session) -> Observations:
         zero_known=np.array(absolute, dtype=np.bool_),
         plus=np.array(plus, dtype=np.int64),
         minus=np.array(minus, dtype=np.int64),
-        state=state,
+        state=state[:n],
+        second=second,
         place=np.unique(places, axis=0, return_inverse=True)[1].reshape(-1),
         conditions=values,
         states=states,
     )
+
+
+def is_pair(session: Session, reading: Reading) -> bool:
+    """True for a reading of a pair of postures: a single reading, not a difference."""
+    return reading.minus is not None and reads_pairs(session.setups[reading.setup].sensor)
+
+
+def require_common_placements(states: States, session: Session, pairs: bool) -> None:
+    """Refuse pairs of postures on a machine whose placements differ between its postures.
+
+    Raises:
+        SessionError: Naming the session.
+    """
+    if pairs and len(states.variant_commands) > 1:
+        raise SessionError(
+            "has readings of pairs of postures, and effects that change the geometry between "
+            "postures; calibrate without these effects (--effects)",
+            where=str(session.path or "session"),
+        )
 
 
 def _difference_groups(session: Session) -> dict[tuple[str, int, str], str]:
@@ -226,9 +261,28 @@ def _difference_groups(session: Session) -> dict[tuple[str, int, str], str]:
         return node
 
     for r in session.readings:
-        if r.minus is not None:
+        if r.minus is not None and not is_pair(session, r):
             leader[find((r.setup, r.cycle, r.posture))] = find((r.setup, r.cycle, r.minus))
     return {node: find(node)[2] for node in list(leader)}
+
+
+def _all_conditions(
+    session: Session, stated: Sequence[Conditions | None], table: Indices
+) -> dict[Condition, Array]:
+    """Values of the conditions of entries, stated and computed, shape (n, size) each.
+
+    Args:
+        session: The session.
+        stated: Conditions of the entries as stated.
+        table: Setup, posture and zero of the entries, shape (n, 3).
+    """
+    values = _condition_values(session.robot, stated, table[:, 0])
+    if "load" in error_map(session.robot).conditions:
+        values["load"] = _find_loads(session, table[:, 0], table[:, 1])
+    values["adjustment"] = adjustment_table(session)[table[:, 0]]
+    values["coordinates"] = drive_table(session)[table[:, 1]]
+    values["reference"] = session.zero_drives[table[:, 0]]
+    return values
 
 
 def _condition_values(

@@ -30,26 +30,33 @@ from orthocal.sensors.protocol import Frames, Sensor, View, sensor_conditions
 
 INPUTS = ["actuated", "passive", "placements", "zero", "constants", "nuisance"]
 
+OF_SECOND = ["actuated_2", "passive_2"]
+"""Further inputs of a reading of a pair: coordinates in its second posture."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CompiledReading:
     """Functions of the reading of one kind of sensor.
 
     Their inputs: actuated and passive coordinates, placements, drives in the reference posture,
-    constants and nuisance parameters.
+    constants and nuisance parameters; for a pair of postures, actuated and passive coordinates in
+    the second one.
     """
 
     value: BatchFunction
     """h, [m]."""
     jacobian: BatchFunction
     """h; ∂h by actuated, passive, twists, reference drives and nuisance parameters, one row each;
-    the one by twists as nonzeros."""
+    the one by twists as nonzeros. For a pair, those by actuated and passive in the second posture
+    follow."""
     expression: ca.Function
     """The same with sparse rows, for use in other expressions."""
     name: str
     """Distinguishes it from other readings of the robot."""
     conditions: tuple[Condition, ...]
     """Conditions that follow the constants of the sensor among its inputs."""
+    pairs: bool
+    """Whether a reading belongs to a pair of postures."""
     probe: float | None
     """Value of the expression of a sensor from outside orthocal, at fixed arguments."""
 
@@ -92,6 +99,11 @@ class _Pattern:
         )
 
     @property
+    def pairs(self) -> bool:
+        """True if a reading belongs to a pair of postures."""
+        return bool(self.frames.in_second)
+
+    @property
     def name(self) -> str:
         """Distinguishes it from other patterns of the robot."""
         return repr(self._key[2:])
@@ -127,23 +139,30 @@ def _compile(pattern: _Pattern) -> CompiledReading:
         expression=jacobian,
         name=pattern.name,
         conditions=pattern.conditions,
+        pairs=pattern.pairs,
         probe=_probe(pattern) if source_digest(type(pattern.sensor)) else None,
     )
 
 
 def _build_value(pattern: _Pattern) -> ca.Function:
     inputs, outputs = pattern.expressions
-    return ca.Function("h", inputs, [ca.densify(outputs[0])], INPUTS, ["h"])
+    names = [*INPUTS, *OF_SECOND[: len(inputs) - len(INPUTS)]]
+    return ca.Function("h", inputs, [ca.densify(outputs[0])], names, ["h"])
 
 
 def _build_jacobian(pattern: _Pattern) -> ca.Function:
     inputs, outputs = pattern.expressions
-    labels = ["h", *(f"by_{n}" for n in ("actuated", "passive", "twists", "zero", "nuisance"))]
-    return ca.Function("jacobian", inputs, outputs, INPUTS, labels)
+    second = OF_SECOND[: len(inputs) - len(INPUTS)]
+    by = ("actuated", "passive", "twists", "zero", "nuisance", *second)
+    labels = ["h", *(f"by_{name}" for name in by)]
+    return ca.Function("jacobian", inputs, outputs, [*INPUTS, *second], labels)
 
 
 def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
-    """Inputs and outputs: h; ∂h by actuated, passive, twists, reference drives and nuisance."""
+    """Inputs and outputs: h; ∂h by actuated, passive, twists, reference drives and nuisance.
+
+    For a pair, coordinates in the second posture and ∂h by them follow.
+    """
     robot = pattern.robot
     here: RobotFunctions = robot_functions(robot)
     there = here.reference
@@ -152,6 +171,7 @@ def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
     trees = [
         *((here, robot.frame_id(f)) for f in pattern.frames.in_posture),
         *((there, robot.frame_id(f)) for f in pattern.frames.at_zero),
+        *((here.second, robot.frame_id(f)) for f in pattern.frames.in_second),
     ]
     poses, h = _sensor_expression(pattern, constants, nuisance)
     wrenches = [_wrench(h, pose) for pose in poses]
@@ -164,8 +184,8 @@ def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
     values = local(*(s for pose in at for s in (pose.rotation, pose.position)), constants, nuisance)
     value, by_unknowns = values[0], values[-1]
     n_d, n_p = here.actuated.numel(), here.passive.numel()
-    by_actuated, by_passive = ca.SX(1, n_d), ca.SX(1, n_p)
     by_zero, by_twists = ca.SX(1, n_d), ca.SX(1, here.n_twists)
+    by_coordinates = {m: (ca.SX(1, n_d), ca.SX(1, n_p)) for m, _ in trees if m is not there}
     for i, (machine, frame) in enumerate(trees):
         force, moment = values[1 + 2 * i], values[2 + 2 * i]
         joints, twists = machine.wrench_rows(frame, force.T, moment.T)
@@ -174,22 +194,29 @@ def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
         if machine is there:
             by_zero += actuated
         else:
-            by_actuated, by_passive = by_actuated + actuated, by_passive + passive
+            before = by_coordinates[machine]
+            by_coordinates[machine] = before[0] + actuated, before[1] + passive
     inputs = [*here.symbols, there.actuated, constants, nuisance]
-    return inputs, [value, by_actuated, by_passive, by_twists, by_zero, by_unknowns]
+    outputs = [value, *by_coordinates[here], by_twists, by_zero, by_unknowns]
+    if pattern.pairs:
+        inputs += [here.second.actuated, here.second.passive]
+        outputs += by_coordinates[here.second]
+    return inputs, outputs
 
 
 def _sensor_expression(
     pattern: _Pattern, constants: ca.SX, nuisance: ca.SX
 ) -> tuple[list[Pose], ca.SX]:
     """Symbols of a sensor's frames, and its reading as an expression of them."""
-    count = len(pattern.frames.in_posture)
-    poses = [
-        Pose(ca.SX.sym("rotation", 3, 3), ca.SX.sym("position", 3))
-        for _ in range(count + len(pattern.frames.at_zero))
+    parts = [
+        [Pose(ca.SX.sym("rotation", 3, 3), ca.SX.sym("position", 3)) for _ in names]
+        for names in (pattern.frames.in_posture, pattern.frames.at_zero, pattern.frames.in_second)
     ]
-    frames = poses[:count], poses[count:]
-    return poses, express_reading(pattern.robot, pattern.sensor, *frames, constants, nuisance)
+    frames, at_zero, second = parts
+    h = express_reading(
+        pattern.robot, pattern.sensor, frames, at_zero, constants, nuisance, second=second
+    )
+    return [*frames, *at_zero, *second], h
 
 
 def express_reading(
@@ -199,6 +226,8 @@ def express_reading(
     at_zero: Sequence[Pose],
     constants: ca.SX,
     nuisance: ca.SX,
+    *,
+    second: Sequence[Pose] = (),
 ) -> ca.SX:
     """Reading with the gauge zero at 0: the sensor's expression under the effects on readings.
 
@@ -209,6 +238,7 @@ def express_reading(
         at_zero: Poses of its frames in the zero posture.
         constants: Constants of the sensor, then the conditions of the reading.
         nuisance: Nuisance parameters of the sensor, then those of the effects.
+        second: Poses of its frames in the second posture of a pair.
     """
     names = reading_conditions(robot, sensor)
     sizes = [condition_size(robot, c) for c in names]
@@ -217,7 +247,7 @@ def express_reading(
     conditions = dict(zip(names, values[1:], strict=True))
     first = len(sensor.nuisance_parameters)
     of_sensor: dict[str, ca.SX] = {c: conditions[c] for c in sensor_conditions(sensor)}
-    view = View(frames, at_zero, values[0], nuisance[:first], of_sensor)
+    view = View(frames, at_zero, values[0], nuisance[:first], of_sensor, second)
     reading = sensor.expression(view, robot)
     for effect in reading_effects(robot):
         errors = {e.name: nuisance[first + i] for i, e in enumerate(effect.setup_errors)}

@@ -2,7 +2,8 @@
 
 A reading is an expression of the poses of some frames, in the posture and (for frames that move
 with drives alone) in the reference posture, of constants of the setup and of nuisance parameters.
-The gauge zero of the setup is added, unless it is known to be 0.
+The gauge zero of the setup is added, unless it is known to be 0. A reading of a pair of postures
+depends on the poses in both.
 """
 
 from __future__ import annotations
@@ -69,6 +70,8 @@ class View:
     """Values of its nuisance parameters, shape (n_nuisance,), [unit]."""
     conditions: Mapping[str, ca.SX] = field(default_factory=dict)
     """Conditions of the reading that it names under `conditions`."""
+    second: Sequence[Pose] = ()
+    """Poses of its frames in the second posture of a reading of a pair."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +80,8 @@ class Frames:
 
     in_posture: tuple[str, ...]
     at_zero: tuple[str, ...] = ()
+    in_second: tuple[str, ...] = ()
+    """Those in the second posture, for a sensor that reads pairs of postures."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,6 +159,9 @@ class Sensor(Protocol):
 
     # states_readings: ClassVar[bool], optional: whether readings are stated, not shown, so that
     # equal ones are no sign of a dial that sticks (`states_readings`)
+
+    # reads_pairs: ClassVar[bool], optional: whether a reading belongs to a pair of postures, that of
+    # its row and that in the column `minus`, so that it is no difference of two (`reads_pairs`)
 
     # zero: ClassVar[GaugeZero], optional: gauge zero of its setups unless they state another one;
     # "free" by default (`default_zero`)
@@ -262,6 +270,12 @@ def default_zero(sensor: Sensor) -> GaugeZero:
     """Gauge zero of a sensor's setups that state none."""
     zero: GaugeZero = getattr(sensor, "zero", "free")
     return zero
+
+
+def reads_pairs(sensor: Sensor) -> bool:
+    """True if a reading belongs to a pair of postures; such a row is a single reading."""
+    pairs: bool = getattr(sensor, "reads_pairs", False)
+    return pairs
 
 
 def states_readings(sensor: Sensor) -> bool:

@@ -17,6 +17,7 @@ from orthocal.io.documents import validate
 from orthocal.io.fields import As
 from orthocal.runtime.registry import Registry
 from orthocal.sensors.ball_bar import BallBar, BallBarKeys
+from orthocal.sensors.distance import Distance, DistanceKeys
 from orthocal.sensors.leg_indicator import LegIndicator, LegKeys
 from orthocal.sensors.points import PointKeys, Points
 from orthocal.sensors.probe import Probe, ProbeKeys
@@ -41,6 +42,7 @@ def _read_kind(name: str, offered: type[Sensor]) -> Kind:
 _PACKAGED: dict[str, Kind] = {
     DEFAULT: (LegKeys, LegIndicator.from_keys),
     BallBar.kind: (BallBarKeys, BallBar.from_keys),
+    Distance.kind: (DistanceKeys, Distance.from_keys),
     ToolIndicator.kind: (ToolIndicatorKeys, ToolIndicator.from_keys),
     Points.kind: (PointKeys, Points.from_keys),
     Probe.kind: (ProbeKeys, Probe.from_keys),

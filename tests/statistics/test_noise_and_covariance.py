@@ -42,6 +42,7 @@ def observations(setup, posture, zero):
         plus=np.arange(len(s)),
         minus=np.full(len(s), -1),
         state=p,
+        second=np.full(len(s), -1),
         place=place,
         conditions={},
         states=None,

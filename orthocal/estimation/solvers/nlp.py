@@ -201,6 +201,7 @@ class ProgramFunctions:
                 self._value_of[self.problem.n_machine + one.group.nuisance],
                 (self._n_theta + o.zero[entries])[:, None],
                 self._passive_variables(o.state[entries], one.passive_index),
+                self._passive_variables(o.second[entries], one.second_index),
             ]
         )
 
@@ -256,6 +257,8 @@ class ProgramFunctions:
             _columns(references[group.setups]),
             _columns(group.constants),
         ]
+        if group.reading.pairs:
+            separate.append(_columns(problem.states.commands[o.second[group.entries]]))
         of_machine, of_all = self._shared_arguments(shared, o.state[group.entries])
         common = [p[3 * o.size], p[3 * o.size + 2]]
         masks = [False] * len(separate) + [True] * len(common) + of_all
@@ -308,10 +311,10 @@ class ProgramFunctions:
         if exact:
             second += influence * self._reading_curvature(one, zero, prior_stds) / (-sigma * noise)
         symbolic = self._symbolic
-        passive = symbolic.passive[one.passive_index.tolist()]
-        inputs = [scaled, prior_stds, zero, passive, y, weight, noise]
-        inputs += [symbolic.command, symbolic.reference, one.constants, sigma, width]
-        inputs += symbolic.error_map.symbols
+        inputs = [scaled, prior_stds, zero, symbolic.passive_of(one), y, weight, noise]
+        inputs += [symbolic.command, symbolic.reference, one.constants]
+        inputs += [symbolic.second[0]] if one.group.reading.pairs else []
+        inputs += [sigma, width, *symbolic.error_map.symbols]
 
         def pick(rows: Indices, columns: Indices) -> ca.SX:
             return ca.vertcat(*(second[int(i), int(j)] for i, j in zip(rows, columns, strict=True)))
@@ -340,7 +343,7 @@ class ProgramFunctions:
         """Second derivatives of h by (θ̂, ν̂, ẑ, q̂)."""
         symbolic = self._symbolic
         theta = symbolic.theta[one.theta_index.tolist()]
-        passive = symbolic.passive[one.passive_index.tolist()]
+        passive = symbolic.passive_of(one)
         u = ca.vertcat(theta, one.nuisance, zero, passive)
         second, _ = ca.hessian(symbolic.direct_reading(one), u)
         ones = ca.SX.ones(theta.numel()), ca.SX.ones(1 + passive.numel())

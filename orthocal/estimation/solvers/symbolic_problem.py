@@ -29,6 +29,8 @@ class ReadingExpressions:
     group: SensorGroup
     passive_index: Indices
     """Indices of the passive coordinates that it depends on."""
+    second_index: Indices
+    """The same in the second posture of a pair; empty for a reading in one posture."""
     theta_index: Indices
     """Indices of the free parameters of the machine that it depends on."""
     constants: ca.SX
@@ -40,7 +42,7 @@ class ReadingExpressions:
     by_nuisance: ca.SX
     """∂h by the nuisance parameters, shape (1, n_nuisance)."""
     by_passive: ca.SX
-    """∂h/∂q̂ of the passive coordinates, shape (1, n), [m]."""
+    """∂h/∂q̂ of the passive coordinates, those of the second posture last, shape (1, n), [m]."""
     by_theta: ca.SX
     """∂h/∂θ̂ of the free parameters, shape (1, n), [m]."""
 
@@ -56,6 +58,7 @@ class SymbolicProblem:
         command: Symbol of the command of a posture, shape (n_command,).
         reference: Symbol of the command of the reference posture, shape (n_command,).
         passive: Symbol of q̂ of a posture, shape (n_passive,).
+        second: Symbols of command and q̂ of the second posture of a pair.
     """
 
     def __init__(self, problem: CalibrationProblem) -> None:
@@ -69,6 +72,7 @@ class SymbolicProblem:
         self.command = ca.SX.sym("command", n_command)
         self.reference = ca.SX.sym("reference", n_command)
         self.passive = ca.SX.sym("passive", problem.robot.passive_index.size)
+        self.second = ca.SX.sym("command_2", n_command), ca.SX.sym("passive_2", *self.passive.shape)
 
     @property
     def theta(self) -> ca.SX:
@@ -95,29 +99,48 @@ class SymbolicProblem:
         shared, scale = self.error_map, self.problem.passive_scale
         constants = ca.SX.sym("constants", group.constants.shape[1])
         nuisance = ca.SX.sym("nuisance", group.nuisance.shape[1])
-        h, h_a, h_q, h_t, h_r, h_nu = group.reading.expression(
+        command, passive = self.second
+        of_second = [shared.actuated(command), passive * scale] if group.reading.pairs else []
+        h, h_a, h_q, h_t, h_r, h_nu, *by_second = group.reading.expression(
             shared.actuated(self.command),
             self.passive * scale,
             shared.placements,
             shared.actuated(self.reference),
             constants,
             nuisance,
+            *of_second,
         )
         by_theta = shared.chain(h_t, h_a, self.command)
         by_theta += shared.chain(ca.SX(*h_t.shape), h_r, self.reference)
-        by_theta, by_passive = ca.sparsify(by_theta), ca.sparsify(h_q)
-        theta_index, passive_index = _columns_of(by_theta), _columns_of(by_passive)
+        h_q2 = ca.SX(1, 0)
+        if by_second:
+            h_a2, h_q2 = by_second
+            by_theta += shared.chain(ca.SX(*h_t.shape), h_a2, command)
+        by_theta, parts = ca.sparsify(by_theta), [ca.sparsify(h_q), ca.sparsify(h_q2)]
+        theta_index, indices = _columns_of(by_theta), [_columns_of(part) for part in parts]
+        by_passive = ca.horzcat(
+            *(
+                part[0, index.tolist()] * ca.SX(scale[index]).T
+                for part, index in zip(parts, indices, strict=True)
+            )
+        )
         return ReadingExpressions(
             group=group,
-            passive_index=passive_index,
+            passive_index=indices[0],
+            second_index=indices[1],
             theta_index=theta_index,
             constants=constants,
             nuisance=nuisance,
             reading=h,
             by_nuisance=h_nu,
-            by_passive=by_passive[0, passive_index.tolist()] * ca.SX(scale[passive_index]).T,
+            by_passive=by_passive,
             by_theta=by_theta[0, theta_index.tolist()],
         )
+
+    def passive_of(self, one: ReadingExpressions) -> ca.SX:
+        """Symbols of q̂ that a reading depends on, those of the second posture last."""
+        here, second = self.passive, self.second[1]
+        return ca.vertcat(here[one.passive_index.tolist()], second[one.second_index.tolist()])
 
     # ---- direct expressions of θ̂ and q̂, for second derivatives
 
@@ -132,17 +155,18 @@ class SymbolicProblem:
         robot, setups = self.problem.robot, list(self.problem.session.setups.values())
         sensor = setups[int(one.group.setups[0])].sensor
         frames = sensor.frames(robot)
-        poses, at_zero = (
+        kinds = frames.in_posture, frames.at_zero, frames.in_second
+        poses, at_zero, second = (
             [machine.frame_pose(f) for f in names]
-            for machine, names in zip(
-                self._machines, (frames.in_posture, frames.at_zero), strict=True
-            )
+            for machine, names in zip(self._machines, kinds, strict=True)
         )
-        return express_reading(robot, sensor, poses, at_zero, one.constants, one.nuisance)
+        return express_reading(
+            robot, sensor, poses, at_zero, one.constants, one.nuisance, second=second
+        )
 
     @cached_property
-    def _machines(self) -> tuple[SymbolicRobot, SymbolicRobot]:
-        """The machine in a posture and in the reference posture."""
+    def _machines(self) -> tuple[SymbolicRobot, SymbolicRobot, SymbolicRobot]:
+        """The machine in a posture, in the reference posture and in a second posture."""
         problem, robot, n = self.problem, self.problem.robot, len(self.problem.robot.drives)
         errors: dict[str, ca.SX | float] = dict(problem.fixed)
         names = problem.machine_selection.names
@@ -157,6 +181,7 @@ class SymbolicProblem:
         return (
             machine(self.command, self.passive * problem.passive_scale),
             machine(self.reference, ca.SX(robot.reference_passive)),
+            machine(self.second[0], self.second[1] * problem.passive_scale),
         )
 
 

@@ -1,0 +1,167 @@
+"""Distance between two places at which the tool printed or marked, measured by a calliper.
+
+A reading belongs to a pair of postures, that of its row and that in the column `minus`. With p and
+q the tool in both, w the width of the pillar that the calliper includes and s the error of scale,
+
+    h = (1 + s) (|p − q| + w)
+
+The distance is absolute. The scale is that of the calliper and of the shrinkage of the print.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
+
+import casadi as ca
+import numpy as np
+from pydantic import Field
+
+from orthocal.arrays import Array
+from orthocal.io.documents import Name, Number
+from orthocal.robot.model import Robot, require_tcp
+from orthocal.sensors.mounting import LARGEST_SCALE, SCALE
+from orthocal.sensors.protocol import (
+    Contact,
+    Frames,
+    GaugeZero,
+    NuisanceParameter,
+    Sensor,
+    SetupKeys,
+    View,
+    require_tool,
+)
+from orthocal.units import MM, read_limit, show_limit, tidy, to_mm
+
+LARGEST_MM = 5000.0
+"""Largest distance and width; a larger one has a wrong unit."""
+
+Width = Annotated[Number, Field(ge=-LARGEST_MM, le=LARGEST_MM)]
+Tolerance = Annotated[Number, Field(ge=0.0, le=LARGEST_MM)]
+
+
+class DistanceKeys(SetupKeys):
+    """Keys of a setup of distances, as in a session.yaml."""
+
+    width_mm: Width = 0.0
+    """Width of the pillar that the calliper includes, as measured."""
+    width_tolerance_mm: Tolerance = 0.0
+    scale_tolerance: Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)] = show_limit(SCALE)
+    """Of the calliper and of the shrinkage of the print."""
+    print: Name | None = None
+    """Name of the printed object, if several setups share its scale."""
+
+
+@dataclass(frozen=True, slots=True)
+class Distance:
+    """A distance between the tool's positions in two postures."""
+
+    width: float = 0.0
+    """Width of the pillar, [m]."""
+    width_std: float = 0.0
+    """Prior standard deviation of the width, [m]; 0 if it is known."""
+    scale_std: float = SCALE
+    """Prior standard deviation of the scale, [1]."""
+    print: str | None = None
+    """Name of the printed object that several setups share."""
+
+    kind: ClassVar[str] = "distance"
+    keys: ClassVar[type[SetupKeys]] = DistanceKeys
+    ideal: ClassVar[str] = "its nominal length"
+    zero: ClassVar[GaugeZero] = "known"
+    reads_pairs: ClassVar[bool] = True
+    states_readings: ClassVar[bool] = True
+    largest_reading: ClassVar[float] = LARGEST_MM * MM
+
+    @classmethod
+    def from_keys(cls, keys: DistanceKeys) -> Distance:
+        """Build from the keys of a session.yaml."""
+        return cls(
+            width=keys.width_mm * MM,
+            width_std=tidy(read_limit(keys.width_tolerance_mm) * MM),
+            scale_std=read_limit(keys.scale_tolerance),
+            print=keys.print,
+        )
+
+    def to_keys(self) -> dict[str, Any]:
+        """Keys for a session.yaml."""
+        keys: dict[str, Any] = {}
+        if self.width:
+            keys["width_mm"] = to_mm(self.width)
+        if self.width_std:
+            keys["width_tolerance_mm"] = tidy(show_limit(self.width_std) / MM)
+        if self.scale_std != SCALE:
+            keys["scale_tolerance"] = show_limit(self.scale_std)
+        if self.print is not None:
+            keys["print"] = self.print
+        return keys
+
+    def require_fit(self, robot: Robot, *, where: str) -> None:
+        """Refuse a robot without a tool.
+
+        Raises:
+            SessionError: Naming the key.
+        """
+        require_tool(robot, "a printed distance", where=where)
+
+    @property
+    def place(self) -> tuple[str, str]:
+        """The tool."""
+        return "tool", ""
+
+    def describe(self) -> str:
+        """Kind of distance."""
+        beyond = f", over a pillar of {self.width / MM:g} mm" if self.width else ""
+        return f"printed distance{beyond}"
+
+    @property
+    def mounting_steps(self) -> tuple[str, ...]:
+        """Steps of the operator."""
+        return (
+            "Print or mark the object at the positions of both postures, and let it cool down.",
+            "Measure the distance of both places by a calliper. The reading is what the calliper "
+            "shows, with the pillar that it includes.",
+        )
+
+    def frames(self, robot: Robot) -> Frames:
+        """The tool's frame in both postures."""
+        tool = (require_tcp(robot).frame,)
+        return Frames(tool, in_second=tool)
+
+    def constants(self, robot: Robot) -> Array:
+        """Width (1)."""
+        del robot
+        return np.array([self.width])
+
+    @property
+    def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
+        """Width and scale; those with a standard deviation above 0."""
+        owner = None if self.print is None else f"print.{self.print}"
+        parameters = (
+            NuisanceParameter("width", "m", self.width_std, nominal=self.width),
+            NuisanceParameter("scale", "1", self.scale_std, owner, of_gauge=owner is None),
+        )
+        return tuple(p for p in parameters if p.prior_std > 0.0)
+
+    def aligned_to(self, robot: Robot) -> Mapping[str, Sensor]:
+        """No parameter depends on the machine."""
+        del robot
+        return {}
+
+    def expression(self, view: View, robot: Robot) -> ca.SX:
+        """Length that the calliper shows, [m]."""
+        del robot
+        errors = {p.name: view.nuisance[i] for i, p in enumerate(self.nuisance_parameters)}
+        (here,), (there,) = view.frames, view.second
+        length = ca.norm_2(here.position - there.position)
+        shown = length + view.constants[0] + errors.get("width", 0.0)
+        return ca.SX((1.0 + errors.get("scale", 0.0)) * shown)
+
+    def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
+        """Tool in K postures; there is nothing to touch."""
+        del at_zero, robot
+        points = frames[0][:, :3, 3]
+        problems = [""] * len(points)
+        up, across = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
+        return Contact(points, up, across, problems, "width_mm", at_tool=True)
