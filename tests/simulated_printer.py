@@ -137,6 +137,45 @@ class Printer:
         return z if rng is None else z + noise * rng.normal(size=len(z))
 
 
+def printed_ends(scale=1.0):
+    """Both ends of the distances on Klipper's calibration object, shape (12, 2, 3), [mm].
+
+    From the pillar in the middle to the outer ones, then around; ridges 4.5 mm beside the pillars.
+    """
+    ends = []
+    directions = np.radians([210.0, 270.0, 330.0, 30.0, 90.0, 150.0])
+    for a in directions:
+        ends.append([[r * math.cos(a), r * math.sin(a), 0.0] for r in (69.5, 4.5)])
+    for a, b in zip(directions, np.concatenate([directions[2:], directions[:2]]), strict=True):
+        pillar = 65.0 * math.cos(a), 65.0 * math.sin(a)
+        ends.append(
+            [[pillar[0] + r * math.cos(b), pillar[1] + r * math.sin(b), 0.0] for r in (69.5, 4.5)]
+        )
+    return scale * np.array(ends)
+
+
+def distances(locate, settings, scale=1.0):
+    """Distances on the print, shape (12,), [mm]; `locate` maps travel to positions."""
+    p, q = (locate(settings.travel(printed_ends(scale)[:, k])) for k in (0, 1))
+    return np.sqrt(((p - q) ** 2).sum(axis=1))
+
+
+WIDTHS = np.array([8.89, 8.89, 8.98, 8.90, 8.98, 8.99, 8.98, 8.89, 9.04])
+"""Widths of the pillars in #5567, those in the middle first, [mm]."""
+
+CENTRE_WIDTHS = (0, 2, 1, 0, 2, 1)
+
+
+def write_analysis(lengths, widths=WIDTHS):
+    """`DELTA_ANALYZE` with the distances between ridges, [mm]."""
+    of = [*(widths[k] for k in CENTRE_WIDTHS), *widths[3:]]
+    shown = [f"{v + w:.2f}" for v, w in zip(lengths, of, strict=True)]
+    width = [f"{w:.2f}" for w in widths]
+    parts = {"CENTER_DISTS": shown[:6], "CENTER_PILLAR_WIDTHS": width[:3]}
+    parts |= {"OUTER_DISTS": shown[6:], "OUTER_PILLAR_WIDTHS": width[3:]}
+    return "".join(f"DELTA_ANALYZE {k}={','.join(v)}\n" for k, v in parts.items())
+
+
 def rings():
     """41 points on the bed, shape (41, 2), [mm]."""
     points = [(0.0, 0.0)]

@@ -265,7 +265,7 @@ def _scattered(session: Session, gauge: str) -> Finding | None:
     values = session.values
 
     def scatter(rows: NDArray[np.int64]) -> float:
-        single = 2.0 if session.readings[rows[0]].minus else 1.0
+        single = 1.0 + session.is_difference(session.readings[rows[0]])
         return float(((values[rows] - values[rows].mean()) ** 2).sum()) / single
 
     square, dof = sum(map(scatter, repeated)), sum(len(rows) - 1 for rows in repeated)

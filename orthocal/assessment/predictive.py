@@ -112,7 +112,7 @@ def expect_rms(calibration: Calibration, fit: Fit) -> float:
     slopes = project_out_zeros(fit.jacobian[:, :n] / problem.theta_scale[:n], problem.observations)
     square = max(float(np.trace(slopes @ by_gauges @ slopes.T)), 0.0)
     rows = problem.session.readings
-    per_row = sum(2.0 if r.minus else 1.0 for r in rows) / len(rows)
+    per_row = sum(1.0 + problem.session.is_difference(r) for r in rows) / len(rows)
     return math.sqrt(calibration.rms_after**2 + per_row * square / len(rows))
 
 

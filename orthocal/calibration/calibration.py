@@ -19,6 +19,7 @@ from orthocal.effects.compensation import displace_drives
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow, root_mean_square
 from orthocal.kinematics.conditions import APPROACH
 from orthocal.robot.model import Robot
+from orthocal.sensors.protocol import is_difference
 from orthocal.statistics.chance import bounded_interval, expanded_uncertainty
 
 
@@ -186,6 +187,11 @@ class Calibration(CalibrationRecord):
         """True if sessions with other offsets in the controller were joined."""
         active = tuple(self.active_offsets.tolist())
         return any(s.active is not None and s.active != active for s in self.setups)
+
+    def noise_factor(self, row: ResidualRow) -> float:
+        """Ratio of the standard deviations of a row and of one reading."""
+        sensor = next(s.sensor for s in self.setups if s.name == row.setup)
+        return math.sqrt(1.0 + is_difference(row.minus, sensor))
 
     def displacement(self, displayed: ArrayLike, approach: str | None = None) -> Array:
         """Displacement of the drives by what the controller compensated while measuring.

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from orthocal.arrays import Array, Indices, Mask
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.robot.parameters import Parameter
+from orthocal.sensors.protocol import reads_pairs
 from orthocal.session.session import Gauge, Session
 
 Key = TypeVar("Key")
@@ -212,8 +213,11 @@ class Rows:
         self.session = session
         self.values = session.values if values is None else values
         self.count = len(session.readings)
-        self.single = np.array([r.minus is None for r in session.readings], dtype=bool)
+        self.single = np.array([not session.is_difference(r) for r in session.readings], dtype=bool)
         """Whether a row is a reading as shown, not a difference."""
+        sensors = {name: setup.sensor for name, setup in session.setups.items()}
+        self.paired = np.array([reads_pairs(sensors[r.setup]) for r in session.readings], bool)
+        """Whether a row is a length between two postures: no dial is read posture by posture."""
 
     @cached_property
     def setups(self) -> dict[str, Indices]:

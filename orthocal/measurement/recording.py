@@ -248,11 +248,13 @@ class Recording:
         for row, setup in zip(rows, setups, strict=True):
             along = getattr(setup.sensor, "along", None)
             reading = to_mm(float(value if along is None else np.dot(along, value)))
-            gauge, difference = self.session.gauges[setup.gauge], row.minus is not None
+            gauge, difference = self.session.gauges[setup.gauge], self.session.is_difference(row)
             largest = largest_reading(setup.sensor)
             check_range(reading, gauge, difference, row.label_with_cycle, largest)
             if conditions is not None:
-                check_conditions(conditions, self.session.robot, difference, row.label_with_cycle)
+                check_conditions(
+                    conditions, self.session.robot, row.minus is not None, row.label_with_cycle
+                )
             readings_mm.append(round(reading, DECIMALS))
         keys: list[ReadingKey] = [row.key for row in rows]
         of_point = {"point_mm": readings_mm} if len(rows) > 1 else {"reading_mm": readings_mm[0]}

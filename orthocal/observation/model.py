@@ -352,7 +352,9 @@ class ObservationModel:
                 at = chosen[first : first + size]
                 entries = order[starts[at][:, None] + np.arange(m)]
                 flat = entries.reshape(-1)
-                parts = [(int(i), np.flatnonzero(member[flat] == i)) for i in np.unique(member[flat])]
+                parts = [
+                    (int(i), np.flatnonzero(member[flat] == i)) for i in np.unique(member[flat])
+                ]
                 members = tuple((i // 2, i % 2 == 1, w, place[flat[w]]) for i, w in parts)
                 blocks.append(_Block(states[at], entries, members))
         return tuple(blocks)

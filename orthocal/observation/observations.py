@@ -18,7 +18,6 @@ from orthocal.kinematics.conditions import APPROACH, UseConditions
 from orthocal.kinematics.error_map import error_map
 from orthocal.kinematics.loop_closure import LoopClosure, find_loads
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import reads_pairs
 from orthocal.session.session import Conditions, Reading, Session
 
 TIME_OF_READING = 60.0
@@ -190,7 +189,7 @@ def build_observations(session: Session) -> Observations:
         if r.minus is None:
             plus.append(add(r, r.posture, (r.setup,)))
             minus.append(-1)
-        elif is_pair(session, r):
+        elif not session.is_difference(r):
             plus.append(add(r, r.posture, (r.setup,)))
             pairs[plus[-1]] = postures[r.minus]
             minus.append(-1)
@@ -206,7 +205,7 @@ def build_observations(session: Session) -> Observations:
     values = _all_conditions(session, conditions, table)
     trims = _find_trims(session, table[:, 0], table[:, 1], values["approach"])
     states, state = _find_states(session, table[:, 1], values, trims)
-    require_common_placements(states, session, bool(pairs))
+    _require_common_placements(states, session, bool(pairs))
     second = np.full(n, -1)
     second[paired] = state[n:]
     table, values = table[:n], {c: v[:n] for c, v in values.items()}
@@ -231,12 +230,7 @@ def build_observations(session: Session) -> Observations:
     )
 
 
-def is_pair(session: Session, reading: Reading) -> bool:
-    """True for a reading of a pair of postures: a single reading, not a difference."""
-    return reading.minus is not None and reads_pairs(session.setups[reading.setup].sensor)
-
-
-def require_common_placements(states: States, session: Session, pairs: bool) -> None:
+def _require_common_placements(states: States, session: Session, pairs: bool) -> None:
     """Refuse pairs of postures on a machine whose placements differ between its postures.
 
     Raises:
@@ -261,7 +255,7 @@ def _difference_groups(session: Session) -> dict[tuple[str, int, str], str]:
         return node
 
     for r in session.readings:
-        if r.minus is not None and not is_pair(session, r):
+        if r.minus is not None and session.is_difference(r):
             leader[find((r.setup, r.cycle, r.posture))] = find((r.setup, r.cycle, r.minus))
     return {node: find(node)[2] for node in list(leader)}
 

@@ -208,7 +208,7 @@ def show_readings(
 def limits_of(plan: Session, reading: Reading) -> tuple[float, float] | None:
     """Lowest and highest possible value of a reading, [m]; None without a stated range."""
     limits = plan.gauges[plan.setups[reading.setup].gauge].range
-    if limits is None or reading.minus is None:
+    if limits is None or not plan.is_difference(reading):
         return limits
     return limits[0] - limits[1], limits[1] - limits[0]
 

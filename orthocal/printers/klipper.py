@@ -17,6 +17,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.errors import SessionError
 from orthocal.io.documents import parse_number
+from orthocal.printers.klipper_print import Distances, read_analysis, saved_distances
 from orthocal.printers.log import (
     NUMBER,
     PrinterLog,
@@ -75,6 +76,13 @@ def read_log(text: str, *, where: str, radius: float | None = None) -> PrinterLo
         SessionError: Naming the key or line.
     """
     del radius
+    log = _read_heights(text, where)
+    printed = read_analysis(text, log.settings, where=where)
+    return replace(log, distances=printed) if printed else log
+
+
+def _read_heights(text: str, where: str) -> PrinterLog:
+    """Settings and triggers, with the distances that were saved beside them."""
     sections = _sections(text)
     probe = _probe_offset(sections, where)
     if runs := list(_RUN.finditer(text)):
@@ -97,7 +105,8 @@ def _read_run(run: re.Match[str], text: str, probe: Array, where: str) -> Printe
     """A calculation in klippy.log, which lists its parameters and triggers."""
     at = place_of(text, run.start(), where)
     try:
-        heights, distances, values = (ast.literal_eval(v) for v in run.groups())
+        heights, lengths, values = (ast.literal_eval(v) for v in run.groups())
+        distances = [(float(d), [[*map(float, p)], [*map(float, q)]]) for d, p, q in lengths]
         pairs = [(float(h), (float(a), float(b), float(c))) for h, (a, b, c) in heights]
         value = {name: float(v) for name, v in values.items()}
         settings = _with_endstops(
@@ -115,23 +124,19 @@ def _read_run(run: re.Match[str], text: str, probe: Array, where: str) -> Printe
             "of heights, distances and parameters as Klipper writes them",
             where=at,
         ) from None
-    return _with_steps(pairs, [], len(distances), settings, steps, at)
+    return _with_steps(pairs, [], distances, settings, steps, at)
 
 
 def _with_steps(
     pairs: Pairs,
     manual: Pairs,
-    distances: int,
+    distances: Distances,
     settings: DeltaSettings,
     steps: Array,
     where: str,
 ) -> PrinterLog:
     """Log from stable positions."""
     notes = []
-    if distances:
-        notes.append(
-            f"{distances} distances measured on a print are not used: heights of the bed are."
-        )
     if manual and any(settings.probe[:2]):
         notes.append(
             f"{len(manual)} manual heights are not used: they are of the nozzle, beside the probe."
@@ -151,24 +156,33 @@ def _with_steps(
         np.array(settings.homed) - stable * steps,
         heights,
         (*notes, *unusual_settings(settings)),
+        saved_distances(settings, steps, distances, where=where),
     )
 
 
-def _saved_heights(saved: Mapping[str, str], where: str) -> tuple[Pairs, Pairs, int] | None:
-    """Heights of the probe, manual heights and number of distances; None without any."""
+def _saved_heights(saved: Mapping[str, str], where: str) -> tuple[Pairs, Pairs, Distances] | None:
+    """Heights of the probe, manual heights and distances; None without any."""
     found: list[Pairs] = []
     for prefix in ("height", "manual_height"):
         pairs: Pairs = []
         while (key := f"{prefix}{len(pairs)}") in saved:
-            at = f"{where}: [delta_calibrate] {key}_pos"
-            position = numbers(saved.get(f"{key}_pos", "").split(","), where=at, name="steps")
-            if len(position) != 3:
-                raise SessionError(f"found {len(position)} numbers; expected 3", where=at)
-            a, b, c = position
+            a, b, c = _saved_steps(saved, f"{key}_pos", where)
             pairs.append((_number(saved, key, where, "delta_calibrate"), (a, b, c)))
         found.append(pairs)
-    count = sum(re.fullmatch(r"distance\d+", key) is not None for key in saved)
-    return (found[0], found[1], count) if found[0] else None
+    distances: Distances = []
+    while (key := f"distance{len(distances)}") in saved:
+        ends = [_saved_steps(saved, f"{key}_pos{i}", where) for i in (1, 2)]
+        distances.append((_number(saved, key, where, "delta_calibrate"), ends))
+    return (found[0], found[1], distances) if found[0] else None
+
+
+def _saved_steps(saved: Mapping[str, str], key: str, where: str) -> list[float]:
+    """Stable position of a key."""
+    at = f"{where}: [delta_calibrate] {key}"
+    position = numbers(saved.get(key, "").split(","), where=at, name="steps")
+    if len(position) != 3:
+        raise SessionError(f"found {len(position)} numbers; expected 3", where=at)
+    return position
 
 
 def _settings(sections: Sections, probe: Array, where: str) -> DeltaSettings:

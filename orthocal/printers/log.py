@@ -32,6 +32,18 @@ LARGE_ANGLE = 2.0 * DEG
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class PrintedDistance:
+    """A distance measured by a calliper between two places of a print."""
+
+    name: str
+    """Of the distance: center_1, outer_3."""
+    length: float
+    """Measured length less the measured width of the pillar, [m]."""
+    carriages: Array
+    """Coordinates at its two ends, shape (2, 3), [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PrinterLog:
     """Content of a log."""
 
@@ -44,6 +56,7 @@ class PrinterLog:
     measured by hand."""
     notes: tuple[str, ...] = ()
     """What was left out or is unusual."""
+    distances: tuple[PrintedDistance, ...] = ()
 
 
 def numbers(texts: Sequence[str], *, where: str, name: str) -> list[float]:

@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import Field
 
 from orthocal.arrays import Array
-from orthocal.io.documents import Name, Number
+from orthocal.io.documents import Number
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.mounting import LARGEST_SCALE, SCALE
 from orthocal.sensors.protocol import (
@@ -48,9 +48,7 @@ class DistanceKeys(SetupKeys):
     """Width of the pillar that the calliper includes, as measured."""
     width_tolerance_mm: Tolerance = 0.0
     scale_tolerance: Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)] = show_limit(SCALE)
-    """Of the calliper and of the shrinkage of the print."""
-    print: Name | None = None
-    """Name of the printed object, if several setups share its scale."""
+    """Of the calliper and of the shrinkage of the print; setups with one gauge share the error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +61,6 @@ class Distance:
     """Prior standard deviation of the width, [m]; 0 if it is known."""
     scale_std: float = SCALE
     """Prior standard deviation of the scale, [1]."""
-    print: str | None = None
-    """Name of the printed object that several setups share."""
 
     kind: ClassVar[str] = "distance"
     keys: ClassVar[type[SetupKeys]] = DistanceKeys
@@ -81,7 +77,6 @@ class Distance:
             width=keys.width_mm * MM,
             width_std=tidy(read_limit(keys.width_tolerance_mm) * MM),
             scale_std=read_limit(keys.scale_tolerance),
-            print=keys.print,
         )
 
     def to_keys(self) -> dict[str, Any]:
@@ -93,8 +88,6 @@ class Distance:
             keys["width_tolerance_mm"] = tidy(show_limit(self.width_std) / MM)
         if self.scale_std != SCALE:
             keys["scale_tolerance"] = show_limit(self.scale_std)
-        if self.print is not None:
-            keys["print"] = self.print
         return keys
 
     def require_fit(self, robot: Robot, *, where: str) -> None:
@@ -137,10 +130,9 @@ class Distance:
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
         """Width and scale; those with a standard deviation above 0."""
-        owner = None if self.print is None else f"print.{self.print}"
         parameters = (
             NuisanceParameter("width", "m", self.width_std, nominal=self.width),
-            NuisanceParameter("scale", "1", self.scale_std, owner, of_gauge=owner is None),
+            NuisanceParameter("scale", "1", self.scale_std, of_gauge=True),
         )
         return tuple(p for p in parameters if p.prior_std > 0.0)
 

@@ -160,8 +160,8 @@ class Sensor(Protocol):
     # states_readings: ClassVar[bool], optional: whether readings are stated, not shown, so that
     # equal ones are no sign of a dial that sticks (`states_readings`)
 
-    # reads_pairs: ClassVar[bool], optional: whether a reading belongs to a pair of postures, that of
-    # its row and that in the column `minus`, so that it is no difference of two (`reads_pairs`)
+    # reads_pairs: ClassVar[bool], optional: whether a reading belongs to a pair of postures, that
+    # of its row and that in the column `minus`; it is no difference of two readings (`reads_pairs`)
 
     # zero: ClassVar[GaugeZero], optional: gauge zero of its setups unless they state another one;
     # "free" by default (`default_zero`)
@@ -276,6 +276,16 @@ def reads_pairs(sensor: Sensor) -> bool:
     """True if a reading belongs to a pair of postures; such a row is a single reading."""
     pairs: bool = getattr(sensor, "reads_pairs", False)
     return pairs
+
+
+def is_difference(minus: str | None, sensor: Sensor) -> bool:
+    """True for a row that is the difference of readings in two postures.
+
+    Args:
+        minus: Second posture of the row.
+        sensor: Sensor of its setup.
+    """
+    return minus is not None and not reads_pairs(sensor)
 
 
 def states_readings(sensor: Sensor) -> bool:

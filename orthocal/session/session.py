@@ -26,7 +26,7 @@ from orthocal.io.fields import CLOSED, read_only
 from orthocal.io.html import paragraph, table
 from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import GaugeZero, Sensor
+from orthocal.sensors.protocol import GaugeZero, Sensor, is_difference
 from orthocal.units import MM
 
 ALIKE = 9
@@ -317,7 +317,11 @@ class Session:
     @property
     def only_differences(self) -> bool:
         """True if every reading is a difference of two postures."""
-        return all(r.minus is not None for r in self.readings)
+        return all(map(self.is_difference, self.readings))
+
+    def is_difference(self, reading: Reading) -> bool:
+        """True for a difference of two postures, not for a single reading of one or of a pair."""
+        return is_difference(reading.minus, self.setups[reading.setup].sensor)
 
     def where(self, reading: Reading) -> str:
         """File and line of a reading, for messages."""

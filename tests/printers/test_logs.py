@@ -129,7 +129,9 @@ def test_a_calculation_in_klippy_log(probed):
     )
     assert np.abs(log.settings.forward(log.carriages) / MM - points[::-1]).max() < 1e-6
     assert log.heights == pytest.approx(np.array([-1.4, 0, 0, 0]) * MM)
-    assert "distances" in log.notes[0]
+    (distance,) = log.distances
+    assert distance.length == pytest.approx(74.0 * MM)
+    assert distance.carriages == pytest.approx(log.carriages[[1, 0]], abs=1e-12)
 
 
 def test_tables_of_g33_and_grids(probed):

@@ -244,7 +244,7 @@ def _lines(session: Session, e: Explanation) -> str:
 def _row(session: Session, i: int) -> str:
     """Setup, postures and cycle of a reading; where the bed was probed in a printer's log."""
     reading = session.readings[i]
-    if session.firmware is None:
+    if session.firmware is None or reading.minus is not None:
         return reading.label_with_cycle
     x, y = session.firmware.touched(session.postures[reading.posture].drives)[0, :2] / MM
     return f"{reading.label_with_cycle} (x {x:.1f}, y {y:.1f} mm)"
@@ -488,7 +488,10 @@ def _repeat(session: Session, *found: Explanation) -> str:
     """Repetition or omission of readings, with the command for the first of them."""
     rows = [session.readings[i] for e in found for i in e.rows]
     if session.firmware is not None:
-        return "Probe the bed again and import that log, or leave out what is wrong."
+        again = "Probe the bed again and import that log"
+        if all(r.minus is not None for r in rows):
+            again = "Measure again and correct the command DELTA_ANALYZE, then import the log again"
+        return f"{again}, or leave out what is wrong."
     words = "Read it again" if len(rows) == 1 else "Look at these readings. Read them again"
     file = rows[0].file or session.readings_path
     if file is None or rows[0].line is None:

@@ -40,11 +40,12 @@ def row_offsets(rows: Rows) -> Iterator[Family]:
     If a step is missed, the last row is empty or holds what belongs into the first of the rows;
     if one is written twice, the last reading is lost. The lost reading is of unknown size.
     """
-    segments = [indices for indices in rows.setups.values() if indices.size >= FEWEST]
+    setups = {n: i for n, i in rows.setups.items() if not rows.paired[i].any()}
+    segments = [indices for indices in setups.values() if indices.size >= FEWEST]
     segments += [
         indices
         for (name, _), indices in rows.cycles.items()
-        if FEWEST <= indices.size < rows.setups[name].size
+        if name in setups and FEWEST <= indices.size < setups[name].size
     ]
     if not segments:
         return

@@ -25,7 +25,8 @@ def wrong_readings(rows: Rows) -> Iterator[Family]:
     yield _outliers(rows, single)
     yield _multiplied(rows, single, (-1.0,), "reversed sign")
     yield _multiplied(rows, single, DECIMAL_POINTS, "decimal point")
-    yield _misread(rows, single)
+    if dials := [np.array([i]) for i in np.flatnonzero(~rows.paired)]:
+        yield _misread(rows, dials)
     several = [
         indices
         for (setup, *_), indices in rows.repeated.items()

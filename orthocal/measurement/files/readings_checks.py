@@ -16,7 +16,12 @@ from orthocal.measurement.files.readings_file import CONDITIONS, COORDINATES, Ra
 from orthocal.measurement.files.schema import MOST_READINGS
 from orthocal.robot.description import HIGHEST_C, LOWEST_C
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import LARGEST_READING, largest_reading
+from orthocal.sensors.protocol import (
+    LARGEST_READING,
+    is_difference,
+    largest_reading,
+    reads_pairs,
+)
 from orthocal.session.session import Conditions, Gauge, Reading, ReadingKey, Session
 from orthocal.text import shorten, spans
 from orthocal.units import MM
@@ -46,7 +51,8 @@ def check_readings(
     checked, points = _CheckedReadings(file), PointRows(plan)
     for row in rows:
         for reading in parse_row(row, plan, points):
-            checked.add(row, reading)
+            setup = points.setups[reading.setup]
+            checked.add(row, reading, of_pair=reads_pairs(setup.sensor))
     if not checked.readings:
         raise SessionError("holds no readings", where=str(file))
     return tuple(checked.readings), points
@@ -99,7 +105,8 @@ def parse_row(row: RawReading, plan: Session, points: PointRows) -> list[Reading
     for name, value in of_setups.items():
         setup = points.setups[name]
         largest = largest_reading(setup.sensor)
-        check_range(value / MM, points.gauges[setup.gauge], bool(row.minus), row.where, largest)
+        difference = is_difference(row.minus or None, setup.sensor)
+        check_range(value / MM, points.gauges[setup.gauge], difference, row.where, largest)
         reading = Reading(name, row.posture, row.minus or None, cycle, value, row.line)
         readings.append(replace(reading, conditions=conditions))
     return readings
@@ -127,8 +134,13 @@ class _CheckedReadings:
         self._absolute: set[tuple[str, int]] = set()
         self._differences: dict[tuple[str, int], dict[str, str]] = {}
 
-    def add(self, row: RawReading, reading: Reading) -> None:
+    def add(self, row: RawReading, reading: Reading, *, of_pair: bool) -> None:
         """Add a reading, if it agrees with those before it.
+
+        Args:
+            row: The row.
+            reading: Its reading.
+            of_pair: Whether it belongs to a pair of postures: such readings are independent.
 
         Raises:
             SessionError: Naming file and line.
@@ -144,7 +156,8 @@ class _CheckedReadings:
         self._check_zone(row, reading.conditions)
         if len(self.readings) >= MOST_READINGS:
             raise SessionError(f"holds more than {MOST_READINGS} readings", where=str(self._file))
-        self._check_form(reading, row.where)
+        if not of_pair:
+            self._check_form(reading, row.where)
         self.readings.append(reading)
 
     def _check_zone(self, row: RawReading, conditions: Conditions | None) -> None:
@@ -210,6 +223,13 @@ def _check_names(row: RawReading, plan: Session, points: PointRows) -> None:
         require_name(name, plan.postures, "posture", where=row.where)
     if row.minus == row.posture:
         raise SessionError(f"takes posture '{row.posture}' off itself", where=row.where)
+    setup = plan.setups.get(row.setup)
+    if setup is not None and reads_pairs(setup.sensor) and not row.minus:
+        raise SessionError(
+            f"minus is empty; expected the second posture of the pair: setup {row.setup} has a "
+            f"{setup.sensor.describe()}",
+            where=row.where,
+        )
 
 
 def read_conditions(row: RawReading, robot: Robot) -> Conditions | None:

@@ -38,7 +38,13 @@ from orthocal.measurement.files.session_robot import (
 )
 from orthocal.observation.contacts import locate_contacts
 from orthocal.robot.model import Robot
-from orthocal.sensors.protocol import NuisanceParameter, Sensor, SetupKeys, default_zero
+from orthocal.sensors.protocol import (
+    NuisanceParameter,
+    Sensor,
+    SetupKeys,
+    default_zero,
+    reads_pairs,
+)
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Gauge, Purpose, Reading, Session, Setup
 from orthocal.units import MM, show_limit
@@ -123,8 +129,9 @@ def _build_unread(file: Path, keys: SessionKeys) -> tuple[Session, Path]:
 def load_plan(path: str | Path) -> Session:
     """Read a plan: a session.yaml without `readings`; each planned reading is 0.
 
-    A setup is read in all postures, or in those its `postures` names; `cycles` times. A session
-    that has readings is a plan too: that of its rows, filled in or not.
+    A setup is read in all postures, or in those its `postures` names; `cycles` times. A sensor that
+    reads pairs of postures reads the first and second one, the third and fourth one and so on. A
+    session that has readings is a plan too: that of its rows, filled in or not.
 
     Raises:
         SessionError: Naming file and key.
@@ -162,15 +169,33 @@ def load_rows(path: str | Path) -> Session:
     for name in plan.setups:
         parts.setdefault(name if name in read else base_name(name), []).append(name)
     readings = tuple(
-        Reading(part, posture, None, cycle, math.nan)
-        for name, (setup, _) in read.items()
+        Reading(part, posture, minus, cycle, math.nan)
+        for name, (setup, sensor) in read.items()
         for cycle in range(1, keys.cycles + 1)
-        for posture in setup.postures or plan.postures
+        for posture, minus in _planned(name, sensor, [*(setup.postures or plan.postures)], file)
         for part in parts[name]
     )
     session = replace(plan, readings=readings)
     check_contacts(session)
     return session
+
+
+def _planned(
+    setup: str, sensor: Sensor, postures: list[str], file: Path
+) -> list[tuple[str, str | None]]:
+    """Planned postures of a setup; those of a pair are neighbours in its list.
+
+    Raises:
+        SessionError: If a posture has no partner.
+    """
+    if not reads_pairs(sensor):
+        return [(posture, None) for posture in postures]
+    if len(postures) % 2:
+        raise SessionError(
+            f"has {len(postures)} postures; expected pairs of postures",
+            where=f"{file}: setups.{setup}.postures",
+        )
+    return [*zip(postures[::2], postures[1::2], strict=True)]
 
 
 def read_purpose(

@@ -1,4 +1,7 @@
-"""Import of a printer's log: a robot of the firmware's dimensions, and a session of its bed."""
+"""Import of a printer's log: a robot of the firmware's dimensions, and a session of its bed.
+
+Distances measured on a print are a setup of their own.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from orthocal.arrays import Array
 from orthocal.builder.linear_delta import LinearDelta
 from orthocal.effects.loading import load_robot_content
 from orthocal.errors import SessionError
@@ -20,6 +24,7 @@ from orthocal.printers.firmwares import FIRMWARES, find_firmware, require_firmwa
 from orthocal.printers.log import PrinterLog
 from orthocal.printers.settings import DeltaSettings, FirmwareName
 from orthocal.robot.model import Robot
+from orthocal.sensors.distance import Distance
 from orthocal.sensors.probe import Probe
 from orthocal.sensors.tool_indicator import Artefact
 from orthocal.session.session import Gauge, Posture, Reading, Session, Setup
@@ -32,6 +37,21 @@ NOISE = 0.02 * MM
 
 TILT = 5e-3
 """Prior standard deviation of the bed's tilt against the towers, [rad]."""
+
+CALLIPER = 0.05 * MM
+"""Standard deviation of a distance less the width of its pillar, [m]: seams and blobs."""
+
+WIDTH = 0.025 * MM
+"""Standard deviation of the error that all widths of pillars have in common, [m]."""
+
+CALLIPER_STEP = 0.01 * MM
+"""Resolution of a calliper, [m]."""
+
+PRINT_SCALE = 0.001
+"""Standard deviation of the scale of calliper and print, [1]: plastic shrinks by some 0.2 %."""
+
+PRINT = "print"
+"""Name of the setup of distances."""
 
 ROOM = 10 * MM
 """Travel beyond the endstops and the lowest posture, [m]."""
@@ -114,10 +134,7 @@ def _session(log: PrinterLog, path: Path) -> Session:
     sets the height of the probe apart. So it has no tolerance, and heights of the bed are absolute.
     """
     robot = _robot(log)
-    postures = {
-        f"p{i + 1}": Posture(f"p{i + 1}", "joints", read_only(c), read_only(c))
-        for i, c in enumerate(log.carriages)
-    }
+    postures = {f"p{i + 1}": _posture(f"p{i + 1}", c) for i, c in enumerate(log.carriages)}
     x, y, z = log.settings.probe
     surface = Artefact("plate", direction_std=TILT, form_degree=4)
     setup = Setup("bed", Probe("-z", surface, (x, y, z), trigger_std=0.0), "", zero="known")
@@ -133,24 +150,42 @@ def _session(log: PrinterLog, path: Path) -> Session:
             where=str(path),
         )
     half = max(5 * MM, float(np.abs(log.heights).max()) + 5 * MM)
+    probe = Gauge(NOISE, None, (-half, half))
+    setups, gauges = {"bed": setup}, {"": probe}
+    if log.distances:
+        sensor = Distance(width_std=WIDTH, scale_std=PRINT_SCALE)
+        setups = {
+            "bed": replace(setup, gauge="probe"),
+            PRINT: Setup(PRINT, sensor, "calliper", zero="known"),
+        }
+        gauges = {"probe": probe, "calliper": Gauge(CALLIPER, CALLIPER_STEP)}
+        for d in log.distances:
+            names = f"{d.name}_far", f"{d.name}_near"
+            postures |= {n: _posture(n, c) for n, c in zip(names, d.carriages, strict=True)}
+            readings += (Reading(PRINT, *names, 1, d.length),)
     title = FIRMWARES[log.settings.firmware].title
     return Session(
         robot=robot,
         robot_reference=f"./{ROBOT}",
         title=f"Probed bed of a delta printer ({title})",
         source=f"Imported from {path.name}",
-        gauges={"": Gauge(NOISE, None, (-half, half))},
+        gauges=gauges,
         postures=postures,
-        setups={"bed": setup},
+        setups=setups,
         readings=readings,
         controller_offsets=read_only(np.zeros(3)),
         firmware=log.settings,
     )
 
 
+def _posture(name: str, carriages: Array) -> Posture:
+    return Posture(name, "joints", read_only(carriages), read_only(carriages))
+
+
 def _robot(log: PrinterLog) -> Robot:
     """Robot as designed: equal rods, towers 120° apart, the firmware's radius."""
-    machine = _design(log.settings, log.carriages.min(), log.carriages.max())
+    carriages = np.concatenate([log.carriages, *(d.carriages for d in log.distances)])
+    machine = _design(log.settings, carriages.min(), carriages.max())
     files = {f"{ROBOT}.urdf": machine.urdf(ROBOT), f"{ROBOT}.yaml": machine.yaml()}
     return load_robot_content(ROBOT, {name: text.encode() for name, text in files.items()})
 

@@ -110,7 +110,7 @@ def plot_setups(calibration: Calibration) -> Figure:
 def plot_spread(calibration: Calibration) -> Figure:
     """Normal quantile plot of the residuals, with the noise as a line."""
     word = _row_word(calibration)
-    single = np.array([_residual(r) / _noise_factor(r) for r in calibration.residuals])
+    single = np.array([_residual(r) / calibration.noise_factor(r) for r in calibration.residuals])
     values = np.sort(single) * calibration.row_factor / MM
     quantiles = special.ndtri((np.arange(values.size) + 0.5) / values.size)
     chosen = _thin(values.size)
@@ -141,13 +141,8 @@ def plot_spread(calibration: Calibration) -> Figure:
     return figure
 
 
-def _noise_factor(row: ResidualRow) -> float:
-    """Ratio of the standard deviations of a row and of one reading."""
-    return math.sqrt(2.0) if row.minus else 1.0
-
-
 def _row_sigma(calibration: Calibration, row: ResidualRow) -> float:
-    return calibration.sigma * _noise_factor(row) / calibration.row_factor
+    return calibration.sigma * calibration.noise_factor(row) / calibration.row_factor
 
 
 def _row_word(calibration: Calibration) -> str:

@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from orthocal.assessment.wording import counted
 from orthocal.io.tables.cell import column_letters
 from orthocal.io.tables.table import Table
@@ -15,6 +17,8 @@ from orthocal.measurement.files.readings_file import RawReading, is_house
 from orthocal.measurement.files.write_session import firmware_document
 from orthocal.measurement.importing.import_readings import VALUES, TableImport
 from orthocal.measurement.importing.printer_log import PrinterImport
+from orthocal.printers.log import PrintedDistance
+from orthocal.printers.settings import DeltaSettings
 from orthocal.text import runs
 from orthocal.units import DEG, MM, to_mm
 
@@ -183,6 +187,12 @@ def describe_printer_import(result: PrinterImport) -> str:
     stops = ", ".join(f"{v * mm:.3f}" for v in s.endstops)
     turns = ", ".join(f"{v / DEG:.3f}" for v in s.angles)
     heights = s.touched(log.carriages)[:, 2] - log.heights
+    printed = [
+        f"  distances  {len(log.distances)} on a print, measured less printed with these settings: "
+        f"{misfits.min() * mm:+.3f} to {misfits.max() * mm:+.3f} mm"
+        for misfits in [np.array([_misfit(s, d) for d in log.distances])]
+        if log.distances
+    ]
     return "\n".join(
         [
             f"{counted(len(log.carriages), 'point')} of a bed, probed with {result.title}",
@@ -192,8 +202,15 @@ def describe_printer_import(result: PrinterImport) -> str:
             f"  endstops   {stops} mm",
             f"  heights    {heights.min() * mm:+.3f} to {heights.max() * mm:+.3f} mm, as the "
             "firmware sees them",
+            *printed,
         ]
     )
+
+
+def _misfit(settings: DeltaSettings, distance: PrintedDistance) -> float:
+    """Measured distance less that of the settings, [m]."""
+    far, near = settings.forward(distance.carriages)
+    return distance.length - float(np.linalg.norm(far - near))
 
 
 def format_printer_json(result: PrinterImport, path: Path, written: Path | None) -> str:
@@ -211,6 +228,14 @@ def format_printer_json(result: PrinterImport, path: Path, written: Path | None)
         "points": [
             {"carriages_mm": [to_mm(v) for v in carriages], "height_mm": to_mm(height)}
             for carriages, height in zip(log.carriages.tolist(), log.heights.tolist(), strict=True)
+        ],
+        "distances": [
+            {
+                "name": d.name,
+                "length_mm": to_mm(d.length),
+                "carriages_mm": [[to_mm(v) for v in end] for end in d.carriages.tolist()],
+            }
+            for d in log.distances
         ],
         "notes": list(log.notes),
         "written": None if written is None else str(written),

@@ -190,7 +190,7 @@ class RecordingText:
                 f"{set_dial(session, setup.name)} From then on touch neither stand nor "
                 "dial until the setup is complete."
             )
-        if all(r.minus is not None for r in of_setup):
+        if all(map(session.is_difference, of_setup)):
             parts.append(
                 "Each line is a difference: the reading in its first posture minus that in its "
                 "second."

@@ -209,7 +209,7 @@ def render_readings(
         "measured [mm]": lambda r: signed(r.measured / MM),
         "before [mm]": lambda r: signed(r.deviation / MM),
         "after [mm]": lambda r: signed(r.residual / MM),
-        "in σ": lambda r: _ratio(r.residual, noise * (math.sqrt(2.0) if r.minus else 1.0)),
+        "in σ": lambda r: _ratio(r.residual, noise * calibration.noise_factor(r)),
         "studentised": lambda r: f"{r.studentised:+.1f}" if math.isfinite(r.studentised) else "",
         "influence": lambda r: f"{r.influence:.1f}",
     }

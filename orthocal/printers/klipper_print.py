@@ -1,0 +1,168 @@
+"""Distances on a print of Klipper's calibration object, as `DELTA_ANALYZE` takes them.
+
+The object has a pillar in the middle and six pillars on a circle of 65 mm, with ridges 4.5 mm
+beside the middle of a pillar. A calliper measures from the far side of one pillar to the far side
+of the other. Less the width of one pillar it is the distance of two ridges that face the same way.
+Source: klippy/extras/delta_calibrate.py and docs/Delta_Calibrate.md of Klipper.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from orthocal.arrays import Array
+from orthocal.errors import SessionError
+from orthocal.printers.log import PrintedDistance, numbers, place_of
+from orthocal.printers.settings import DeltaSettings
+from orthocal.units import DEG, MM
+
+ANGLES = np.array([210, 270, 330, 30, 90, 150]) * DEG
+"""Directions of the outer pillars from the middle, [rad]."""
+
+CIRCLE = 65 * MM
+RIDGE = 4.5 * MM
+"""Radius of the circle of pillars, and distance of a ridge from the middle of its pillar, [m]."""
+
+CENTRE_PILLARS = (0, 2, 1, 0, 2, 1)
+"""Width of the pillar in the middle across each direction."""
+
+AROUND = 2
+"""Directions between a pillar and the way from it to the next one."""
+
+COUNTS = {
+    "CENTER_DISTS": 6,
+    "CENTER_PILLAR_WIDTHS": 3,
+    "OUTER_DISTS": 6,
+    "OUTER_PILLAR_WIDTHS": 6,
+}
+"""Measurements of `DELTA_ANALYZE`, and how many numbers each has."""
+
+LARGEST_MM = 2000.0
+"""Largest length; a larger one has a wrong unit."""
+
+Distances = list[tuple[float, list[list[float]]]]
+"""Distances without pillars, [mm], and the stable positions at both ends, [steps]."""
+
+_COMMAND = re.compile(r"^[^\n;#]*\bDELTA_ANALYZE\b([^\n;#]*)", re.MULTILINE | re.IGNORECASE)
+_WORD = re.compile(r"\b([A-Z_]+)\s*=\s*(\[[^\]]*\]|[^\s=]*)", re.IGNORECASE)
+
+
+def read_analysis(text: str, settings: DeltaSettings, *, where: str) -> tuple[PrintedDistance, ...]:
+    """Distances of the commands `DELTA_ANALYZE` in a text; later values replace earlier ones.
+
+    Args:
+        text: The log.
+        settings: Settings with which the object was printed.
+        where: Name of the log, for messages.
+
+    Returns:
+        Twelve distances; none if the text has no measurement.
+
+    Raises:
+        SessionError: Naming the line, or the measurement that is missing.
+    """
+    values: dict[str, list[float]] = {}
+    for command in _COMMAND.finditer(text):
+        at = place_of(text, command.start(1), where)
+        for word in _WORD.finditer(command[1]):
+            name = word[1].upper()
+            if name in COUNTS or name == "SCALE":
+                values[name] = _lengths(name, word[2], at)
+    measured = [name for name in COUNTS if name in values]
+    if not measured:
+        return ()
+    if missing := [name for name in COUNTS if name not in values]:
+        raise SessionError(
+            f"DELTA_ANALYZE states {', '.join(measured)} without {', '.join(missing)}; expected "
+            "all four",
+            where=where,
+        )
+    (scale,) = values.get("SCALE", [1.0])
+    return _place(values, scale, settings)
+
+
+def _lengths(name: str, text: str, where: str) -> list[float]:
+    """Positive numbers of a word."""
+    parts = text.strip("[]").split(",")  # klippy.log has brackets
+    found, count = numbers(parts, where=where, name=name), COUNTS.get(name, 1)
+    if len(found) != count:
+        raise SessionError(f"{name} has {len(found)} numbers; expected {count}", where=where)
+    for value in found:
+        if not 0.0 < value <= LARGEST_MM:
+            raise SessionError(
+                f"{name} has {value:g}; expected numbers above 0 and at most {LARGEST_MM:g}",
+                where=where,
+            )
+    return found
+
+
+def _place(
+    values: dict[str, list[float]], scale: float, settings: DeltaSettings
+) -> tuple[PrintedDistance, ...]:
+    """Distances with the carriages at their ends."""
+    centre, outer = ends(scale)
+    rows = [
+        *zip(values["CENTER_DISTS"], CENTRE_PILLARS, centre, strict=True),
+        *zip(values["OUTER_DISTS"], range(6), outer, strict=True),
+    ]
+    result = []
+    for i, (length, pillar, points) in enumerate(rows):
+        part = "center" if i < len(centre) else "outer"
+        width = values[f"{part.upper()}_PILLAR_WIDTHS"][pillar]
+        result.append(
+            PrintedDistance(
+                f"{part}_{i % len(centre) + 1}",
+                (length - width) * MM,
+                settings.inverse(points),
+            )
+        )
+    return tuple(result)
+
+
+def ends(scale: float) -> tuple[Array, Array]:
+    """Nozzle at the far and the near end of each distance, shape (6, 2, 3) each, [m].
+
+    Args:
+        scale: Scale of the printed object.
+
+    Returns:
+        From the middle outwards, and from each outer pillar to the next one.
+    """
+    along = np.column_stack([np.cos(ANGLES), np.sin(ANGLES), np.zeros(len(ANGLES))])
+    ridges = scale * np.array([CIRCLE + RIDGE, RIDGE])
+    centre = ridges[:, None] * along[:, None]
+    around = np.roll(along, -AROUND, axis=0)
+    outer = scale * CIRCLE * along[:, None] + ridges[:, None] * around[:, None]
+    return centre, outer
+
+
+def saved_distances(
+    settings: DeltaSettings, steps: Array, distances: Distances, *, where: str
+) -> tuple[PrintedDistance, ...]:
+    """Distances that Klipper saved with stable positions; they are without pillars.
+
+    Args:
+        settings: The settings.
+        steps: Travel of the carriages by one step, shape (3,), [m].
+        distances: The distances.
+        where: Name of the log, for messages.
+
+    Raises:
+        SessionError: Naming the distance.
+    """
+    result = []
+    for i, (length, stable) in enumerate(distances):
+        positions = np.array(stable)
+        if positions.shape != (2, 3) or not np.isfinite(positions).all():
+            raise SessionError(f"distance {i}: expected three step counts at each end", where=where)
+        if not 0.0 < length <= LARGEST_MM:
+            raise SessionError(
+                f"distance {i} is {length:g}; expected a number above 0 and at most "
+                f"{LARGEST_MM:g} mm",
+                where=where,
+            )
+        carriages = np.array(settings.homed) - positions[::-1] * steps
+        result.append(PrintedDistance(f"distance_{i + 1}", length * MM, carriages))
+    return tuple(result)
