@@ -218,7 +218,9 @@ def test_the_distances_of_5567(printer):
     assert settings.radius / MM == pytest.approx(RADIUS, abs=1.5)
 
 
-@pytest.mark.parametrize("changed", [0, 3, 7])
+@pytest.mark.parametrize(
+    "changed", [pytest.param(k, marks=[pytest.mark.slow] * (k not in (0, 3, 7))) for k in range(12)]
+)
 def test_one_mistyped_distance_is_named(tmp_path, printer, changed):
     lengths = printer.shown + np.eye(12)[changed]
     printer.log.write_text(printer.heights + write_analysis(lengths))
