@@ -196,19 +196,8 @@ def build_observations(session: Session) -> Observations:
         else:
             plus.append(find(r, r.posture))
             minus.append(find(r, r.minus))
-    table, n = np.array(entries, dtype=np.int64).reshape(-1, 3), len(entries)
-    paired = np.array(list(pairs), dtype=np.int64)
-    of_second = table[paired]
-    of_second[:, 1] = list(pairs.values())
-    table = np.vstack([table, of_second])
-    conditions += [None] * paired.size
-    values = _all_conditions(session, conditions, table)
-    trims = _find_trims(session, table[:, 0], table[:, 1], values["approach"])
-    states, state = _find_states(session, table[:, 1], values, trims)
-    _require_common_placements(states, session, bool(pairs))
-    second = np.full(n, -1)
-    second[paired] = state[n:]
-    table, values = table[:n], {c: v[:n] for c, v in values.items()}
+    table = np.array(entries, dtype=np.int64).reshape(-1, 3)
+    values, states, state, second = _observe(session, conditions, table, pairs)
     places = np.hstack([table[:, :2], values["approach"], second[:, None]])
     zero_setup, zero_real = tuple(k[0] for k in zeros), tuple(len(k) == 1 for k in zeros)
     absolute = [len(k) == 1 and session.setups[k[0]].zero == "known" for k in zeros]
@@ -222,12 +211,42 @@ def build_observations(session: Session) -> Observations:
         zero_known=np.array(absolute, dtype=np.bool_),
         plus=np.array(plus, dtype=np.int64),
         minus=np.array(minus, dtype=np.int64),
-        state=state[:n],
+        state=state,
         second=second,
         place=np.unique(places, axis=0, return_inverse=True)[1].reshape(-1),
         conditions=values,
         states=states,
     )
+
+
+def _observe(
+    session: Session,
+    conditions: Sequence[Conditions | None],
+    table: Indices,
+    pairs: Mapping[int, int],
+) -> tuple[dict[Condition, Array], States, Indices, Indices]:
+    """Conditions of entries, loop closures, and the closures of each entry.
+
+    Args:
+        session: The session.
+        conditions: Conditions of the entries as stated.
+        table: Setup, posture and zero of the entries, shape (n, 3).
+        pairs: Entry of a pair of postures to its second posture.
+
+    Returns:
+        Conditions; the loop closures; that of each entry, shape (n,); that of its second posture.
+    """
+    n, paired = len(table), np.array(list(pairs), dtype=np.int64)
+    of_second = table[paired]
+    of_second[:, 1] = list(pairs.values())
+    both = np.vstack([table, of_second])
+    values = _all_conditions(session, [*conditions, *[None] * paired.size], both)
+    trims = _find_trims(session, both[:, 0], both[:, 1], values["approach"])
+    states, state = _find_states(session, both[:, 1], values, trims)
+    _require_common_placements(states, session, bool(pairs))
+    second = np.full(n, -1)
+    second[paired] = state[n:]
+    return {c: v[:n] for c, v in values.items()}, states, state[:n], second
 
 
 def _require_common_placements(states: States, session: Session, pairs: bool) -> None:

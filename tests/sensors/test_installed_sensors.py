@@ -87,5 +87,5 @@ def test_a_class_with_another_kind_is_refused(install):
 
 
 def test_without_such_packages_there_are_the_own_kinds():
-    own = {"leg", "ball_bar", "tool_indicator", "probe", "points"}
+    own = {"leg", "ball_bar", "tool_indicator", "probe", "points", "distance"}
     assert set(sensor_kinds()) == own | {e.name for e in entry_points(group=GROUP)}
