@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from unittest.mock import patch
 
@@ -88,9 +89,35 @@ def load_afresh(robot):
 @pytest.fixture(scope="module")
 def without_plots():
     """Pages have marks in place of plots, which take seconds and have tests of their own."""
+    with marked_plots():
+        yield
+
+
+@contextmanager
+def marked_plots():
+    """Marks in place of plots."""
     from orthocal.output.report.figure import Plot
 
     with patch.object(Plot, "__call__", lambda plot, *_, **__: f'<svg id="{plot.name}"/>'):
+        yield
+
+
+@pytest.fixture
+def without_sensor_gains():
+    """Plans and details without gains of usual sensors, which have tests of their own."""
+    with no_sensor_gains():
+        yield
+
+
+@contextmanager
+def no_sensor_gains():
+    """No gains of usual sensors: they are four searches of a plan each time."""
+    from orthocal.output.text import accuracy
+    from orthocal.planning import first_plan, plan
+
+    with ExitStack() as patches:
+        for module in (accuracy, first_plan, plan):
+            patches.enter_context(patch.object(module, "find_sensor_gains", lambda *_: ()))
         yield
 
 

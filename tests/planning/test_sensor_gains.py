@@ -7,8 +7,10 @@ import pytest
 from orthocal import calibrate, load_robot, plan_readings, simulate_session, summarize
 from orthocal.output.text.accuracy import render_tool
 from orthocal.output.text.layout import to_text
+from orthocal.planning import plan as planning
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.owned_sensors import load_owned_sensor
+from orthocal.planning.sensor_gains import find_sensor_gains
 
 BAR = """sensor: ball_bar
 sigma_mm: 0.002
@@ -30,15 +32,20 @@ def legs():
     return plan_readings(robot, equipment=Equipment(**QUICK), starts=1)
 
 
+@pytest.fixture(scope="module")
+def gains(legs):
+    return legs.find_sensor_gains()
+
+
 def gain_of(gains, noun):
     (gain,) = (g for g in gains if noun in g.words)
     return gain
 
 
 @pytest.mark.parametrize(("noun", "text"), [("ball bar", BAR), ("plate", PLATE)])
-def test_a_gain_is_nearly_that_of_a_plan_with_the_sensor(tmp_path, legs, noun, text):
+def test_a_gain_is_nearly_that_of_a_plan_with_the_sensor(tmp_path, legs, gains, noun, text):
     """By session, forecast of drawn machines and exchanges: a little better, at most."""
-    gain = gain_of(legs.find_sensor_gains(), noun)
+    gain = gain_of(gains, noun)
     (tmp_path / "own.yaml").write_text(text)
     equipment = Equipment(owned=(load_owned_sensor(tmp_path / "own.yaml"),), **QUICK)
     plan = plan_readings(
@@ -49,23 +56,30 @@ def test_a_gain_is_nearly_that_of_a_plan_with_the_sensor(tmp_path, legs, noun, t
     assert gain.rms < 0.7 * legs.expected.reported.rms
 
 
-def test_sensors_are_ranked(legs):
-    gains = legs.find_sensor_gains()
+def test_sensors_are_ranked(legs, gains):
     assert [g.rms for g in gains] == sorted(g.rms for g in gains)
     bar, square, legs_again = (gain_of(gains, n) for n in ("ball bar", "square", "at the legs"))
     assert bar.rms < square.rms < legs_again.rms < legs.expected.reported.rms
 
 
-def test_where_leg_readings_determine_nothing_the_answer_names_the_sensor():
+def test_where_leg_readings_determine_nothing_the_answer_names_the_sensor(monkeypatch):
     """Parallel slides: moving all drives moves the tool, and turns no leg."""
     robot = load_robot("linear_delta").with_tolerances({"*.offset_mm": 0.5})
     plan = plan_readings(robot, equipment=Equipment(**QUICK), starts=1)
-    best = plan.find_sensor_gains()[0]
+    shown = []
+
+    def record(*words):
+        shown.append(find_sensor_gains(*words))
+        return shown[-1]
+
+    monkeypatch.setattr(planning, "find_sensor_gains", record)
+    answer = summarize(plan)
+    ((best, *_),) = shown
     assert "ball bar" in best.words
     assert best.rms < 0.1 * plan.expected.reported.rms
     calibration = calibrate(simulate_session(plan.session, {"a_slide.offset": 3e-4}).session)
-    for result in (plan, calibration):
-        words = " ".join(summarize(result).split())
+    for text in (answer, summarize(calibration)):
+        words = " ".join(text.split())
         sentence = next(s for s in words.split(". ") if "do not determine the offset of" in s)
         assert all(name in sentence for name in ("a_slide", "b_slide", "c_slide"))
         assert f"Another hour with {best.words} would reduce the error to 0.017 mm" in words
