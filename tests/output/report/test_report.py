@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from calibrated import EXPERIMENT_2, calibrated, rename_setups, report_of
+from conftest import marked_plots
 from rich.console import Group
 from rich.panel import Panel
 from rich.text import Text
@@ -20,6 +21,8 @@ from orthocal.calibration.file import write_calibration
 from orthocal.io.html import items, paragraph, table
 from orthocal.output.report.page import _provenance, build_report
 from orthocal.output.text.layout import bullets, section, table_of, to_markup
+
+pytestmark = pytest.mark.usefixtures("without_sensor_gains")
 
 EVIL = '</script><script>alert("x")</script><img src=x onerror=alert(1)> & $x_{$'
 
@@ -154,7 +157,8 @@ def test_scene_is_embedded_whole(read):
 
 def test_full_model_shows_the_error_with_offsets_entered():
     found = calibrated("sweep", "full")
-    page = build_report(found)
+    with marked_plots():
+        page = build_report(found)
     assert "without any other correction" in page
     read = Reader(page)
     assert ["drive", "now", "enter", "±", "identified", "unit"] in read.rows
@@ -168,8 +172,9 @@ def test_full_model_shows_the_error_with_offsets_entered():
 def test_loaded_calibration_makes_the_same_report(calibration, tmp_path):
     path = write_calibration(calibration, tmp_path / "calibration.json")
     loaded = load_calibration(path)
-    assert build_report(loaded) == build_report(calibration, saved=tmp_path)
-    assert f"orthocal again {tmp_path} --out {tmp_path}-again" in build_report(loaded)
+    page = build_report(loaded)
+    assert page == build_report(calibration, saved=tmp_path)
+    assert f"orthocal again {tmp_path} --out {tmp_path}-again" in page
 
 
 def test_texts_from_files_are_escaped(raw_cycles):
