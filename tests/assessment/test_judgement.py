@@ -6,8 +6,6 @@ import json
 import math
 import shutil
 from dataclasses import replace
-from functools import cache
-from itertools import product
 from typing import get_args
 
 import numpy as np
@@ -152,20 +150,13 @@ def cases(cycles, workshop, table1, tmp_path_factory):
     return spoilt(cycles, workshop, table1, tmp_path_factory.mktemp("backlash") / "plan")
 
 
-@pytest.fixture(scope="module")
-def calibrated(cases):
-    """Calibrations by case and model, made once."""
-
-    @cache
-    def made(case, model):
-        # a copy is judged by itself
-        return calibrate(replace(cases[case][0]), model, solver="variable-projection")
-
-    return made
+def calibrated(cases, case, model="offsets"):
+    """Calibration of a copy of a case, which is judged by itself."""
+    return calibrate(replace(cases[case][0]), model, solver="variable-projection")
 
 
 @pytest.mark.parametrize("case", ["sound", "reversed sign", "experiment 1 as printed", "backlash"])
-def test_every_command_has_the_same_verdict(cases, calibrated, case, tmp_path):
+def test_every_command_has_the_same_verdict(cases, case, tmp_path):
     """One case for each verdict: in the document, as exit code, and by what is exported."""
     session, expected = cases[case]
     write_session(session, tmp_path / "session")
@@ -180,7 +171,7 @@ def test_every_command_has_the_same_verdict(cases, calibrated, case, tmp_path):
         decision = json.loads(done.stdout)["decision"]
         assert (decision["verdict"], decision["exit_code"]) == (expected, code)
         assert done.returncode == code
-    path = write_calibration(calibrated(case, "offsets"), tmp_path / "calibration.json")
+    path = write_calibration(calibrated(cases, case), tmp_path / "calibration.json")
     words = ["export", path, "--to", "yaml", "--out", tmp_path / "out"]
     assert run_orthocal(tmp_path, *words).returncode == code
     assert (tmp_path / "out").exists() == (expected == "enter")
@@ -190,14 +181,32 @@ def test_every_command_has_the_same_verdict(cases, calibrated, case, tmp_path):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_judgement_does_not_depend_on_the_model(cases, calibrated, case):
+def test_the_judgement_does_not_depend_on_the_model(cases, case, tmp_path):
+    """Each calibration has the findings of a check; they are of known kinds, and load again."""
     session, expected = cases[case]
     found = [f for f in check_session(session).findings if f.severity != "note"]
     for model in ("offsets", "full"):
-        assessment = calibrated(case, model).assessment
+        calibration = calibrated(cases, case, model)
+        assessment = calibration.assessment
         own = [f for f in assessment.findings if f.severity != "note"]
         assert [f.to_document() for f in own] == [f.to_document() for f in found]
         assert assessment.decision.verdict == expected
+        require_known_findings(calibration, tmp_path / f"{model}.json")
+
+
+def require_known_findings(calibration, path):
+    document = json.loads(result_json(calibration))
+    for finding in document["findings"]:
+        assert finding["kind"] in get_args(FindingKind)
+        assert finding["severity"] in get_args(Severity)
+        assert finding["text"].endswith((".", "?"))
+        for name in finding["numbers"]:
+            assert name in PURE or name.endswith(UNITS), name
+        for place in finding["places"]:
+            assert any(v is not None for v in place.values())
+    path.write_text(json.dumps(document))
+    loaded = load_calibration(path)
+    assert loaded.assessment.to_document() == calibration.assessment.to_document()
 
 
 def test_an_unfinished_session_is_checked_as_far_as_it_was_read(cycles, root, tmp_path):
@@ -273,24 +282,6 @@ def test_a_command_judges_once(root, command, monkeypatch):
         monkeypatch.setattr(module, "judge_session", count)
     assert run_orthocal(root, command, "examples/table1/experiment-2").returncode == 0
     assert len(sessions) == 1
-
-
-def test_findings_have_known_kinds_units_and_load_again(calibrated, tmp_path):
-    for case, model in product(CASES, ("offsets", "full")):
-        calibration = calibrated(case, model)
-        document = json.loads(result_json(calibration))
-        for finding in document["findings"]:
-            assert finding["kind"] in get_args(FindingKind)
-            assert finding["severity"] in get_args(Severity)
-            assert finding["text"].endswith((".", "?"))
-            for name in finding["numbers"]:
-                assert name in PURE or name.endswith(UNITS), name
-            for place in finding["places"]:
-                assert any(v is not None for v in place.values())
-        path = tmp_path / f"{case}.json"
-        path.write_text(json.dumps(document))
-        loaded = load_calibration(path)
-        assert loaded.assessment.to_document() == calibration.assessment.to_document()
 
 
 NOTES = {
