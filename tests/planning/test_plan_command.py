@@ -20,6 +20,8 @@ from orthocal.runtime import worker_pool as cores
 from orthocal.runtime.interrupts import INTERRUPTED
 from orthocal.session.session import Purpose
 
+pytestmark = pytest.mark.usefixtures("without_sensor_gains")
+
 QUICK = ["--along", "3", "--across-mm", "0", "--sections", "0.5", "--starts", "1"]
 DIAL = """sigma_mm: 0.002
 resolution_mm: 0.001
