@@ -34,6 +34,7 @@ from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import ToolForecast
 from orthocal.planning.first_plan import first_equipment
+from orthocal.planning.owned_sensors import load_owned_sensor
 from orthocal.planning.plan import plan_readings
 from orthocal.planning.selection import SetupSearch
 from orthocal.session.session import Conditions
@@ -83,6 +84,10 @@ of as many, its exchanges and starts among it, on one core."""
 BOTH_SIDES = 2.0
 """A plan that chooses the side of each reading, over one of a machine without backlash: there are
 twice as many candidates. 1.1 to 1.4 were measured; a plan of all starts took 8.5 s on one core."""
+
+THREE_SENSORS = 2.5
+"""A plan with a bar, a square and a plate over one with the bar alone. 0.7 was measured on a busy
+machine: a plan takes as many setups, whatever the sensors."""
 
 STUDIED = 4.0
 """Machines of a study a second, on one core, over calibrations by Ipopt one by one, which find
@@ -416,6 +421,28 @@ def test_a_plan_from_both_sides_takes_little_longer(orthoglide, record):
     ratio = fastest(lambda: plan(sided), repeats=2) / fastest(lambda: plan(orthoglide), repeats=2)
     record("plan_from_both_sides", ratio)
     assert ratio < BOTH_SIDES
+
+
+def test_a_plan_with_three_sensors_takes_little_longer_than_with_one(tmp_path, record):
+    robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 1.0})
+    dial = "sensor: tool_indicator\nsigma_mm: 0.005\nresolution_mm: 0.01\nrange_mm: [-5, 5]\n"
+    square = "straight_tolerance_mm: 0.002, square_tolerance_mrad: 0.02, length_mm: 150"
+    texts = {
+        "bar": "sensor: ball_bar\nsigma_mm: 0.002\nlength_mm: 50\nlength_tolerance_mm: unknown\n",
+        "square": f"{dial}artefact: {{kind: square, {square}}}\n",
+        "plate": f"{dial}artefact: {{kind: plate, flat_tolerance_mm: 0.003, length_mm: 150}}\n",
+    }
+    for name, text in texts.items():
+        (tmp_path / f"{name}.yaml").write_text(text)
+
+    def plan(*names):
+        owned = tuple(load_owned_sensor(tmp_path / f"{name}.yaml") for name in names)
+        equipment = Equipment(owned=owned, along=5, across=0.0, sections=(0.5,))
+        return plan_readings(robot, hours=2.0, equipment=equipment, starts=1)
+
+    three, one = (fastest(lambda n=n: plan(*n), repeats=1) for n in (texts, ("bar",)))
+    record("plan_with_three_sensors", three / one)
+    assert three < THREE_SENSORS * one
 
 
 def test_a_study_of_machines_is_faster_than_one_by_one(session, record):
