@@ -109,6 +109,7 @@ def test_a_fit_is_explained(raw_cycles, experiment_2, case):
     assert " ".join(found.text.split()) in " ".join(summarize(result, details=True).split())
 
 
+@pytest.mark.usefixtures("without_sensor_gains")
 def test_a_prior_marks_what_the_readings_leave_open():
     result = calibrated(EXPERIMENT_2, "lengths")
     text = summarize(result, details=True)
