@@ -10,12 +10,8 @@ from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 
 
-def bound_um(plan, space, *, offset_std=2e-3):
-    """RMS tool error of the complete model, workpiece aligned, [µm]; columns for free zeros."""
-    names = plan.robot.parameters.select_model("full")
-    problem = build_problem(plan, free=names, prior=True, prior_stds={"*.offset": offset_std})
-    n = problem.n_machine
-    _, jacobian = problem.predict_and_jacobian(np.zeros(problem.n_free))
+def posterior_covariance(plan, problem, jacobian):
+    """Covariance of all scaled parameters; columns for free zeros."""
     gauges = [plan.gauges[plan.setups[r.setup].gauge] for r in plan.readings]
     sigma = np.array([np.hypot(g.sigma, (g.resolution or 0.0) / np.sqrt(12.0)) for g in gauges])
     free = [name for name, s in plan.setups.items() if s.zero == "free"]
@@ -23,7 +19,16 @@ def bound_um(plan, space, *, offset_std=2e-3):
     design = np.hstack([jacobian, zeros.reshape(len(plan.readings), -1)]) / sigma[:, None]
     precision = np.zeros(design.shape[1])
     precision[: problem.n_free] = problem.prior_precision
-    posterior = np.linalg.inv(design.T @ design + np.diag(precision))[:n, :n]
+    return np.linalg.inv(design.T @ design + np.diag(precision))[: problem.n_free, : problem.n_free]
+
+
+def bound_um(plan, space, *, offset_std=2e-3):
+    """RMS tool error of the complete model, workpiece aligned, [µm]."""
+    names = plan.robot.parameters.select_model("full")
+    problem = build_problem(plan, free=names, prior=True, prior_stds={"*.offset": offset_std})
+    n = problem.n_machine
+    _, jacobian = problem.predict_and_jacobian(np.zeros(problem.n_free))
+    posterior = posterior_covariance(plan, problem, jacobian)[:n, :n]
     scale = problem.theta_scale[:n]
     drives = LoopClosure(plan.robot).inverse(space.points)
     tool = ToolSensitivity(plan.robot, free=problem.free[:n])(drives)
