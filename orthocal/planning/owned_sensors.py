@@ -112,6 +112,11 @@ def load_owned_sensor(path: str | Path) -> OwnedSensor:
     """
     file = Path(path)
     data = read_yaml(file, error=SessionError)
+    if isinstance(data, dict) and data.get("sensor") == "points":
+        raise SessionError(
+            "a plan does not place points; write their setup and postures into a session.yaml",
+            where=f"{file}: sensor",
+        )
     if not isinstance(data, dict) or data.get("sensor") not in list(PLACED):
         raise SessionError(
             f"expected the key sensor: {' or '.join(PLACED)}, and those of the sensor",

@@ -181,6 +181,7 @@ def test_approaches_of_a_bar_follow_from_its_path(owned):
         (BLOCK.replace("height_mm: 50", "height_mm: high"), "artefact.gauge_block.height_mm"),
         (PROBE + "tool_mm: low\n", "tool_mm"),
         ("sensor: [probe]\n", ""),
+        ("sensor: points\nsigma_mm: 0.01\n", "sensor"),
         ("- 1\n", ""),
         (BAR.replace("ball_bar", "leg"), ""),
         (BAR.replace("sigma_mm: 0.002\n", ""), "sigma_mm"),
