@@ -32,14 +32,34 @@ setups:
     tip: {blade: {width_mm: 50, radius_mm: 0.5}}}
 """
 
+TOOL_SENSORS = """robot: orthoglide
+controller: {offsets_mm: [0, 0, 0]}
+gauge: {sigma_mm: 0.005, range_mm: [-9, 9]}
+postures:
+  zero: {tcp_mm: [0, 0, 0]}
+  x_max: {tcp_mm: [60, 10, 0]}
+  y_max: {tcp_mm: [0, 60, -20]}
+  corner: {tcp_mm: [50, -40, 30]}
+setups:
+  bar: {sensor: ball_bar, centre_mm: [0, 0, -80], length_mm: 80, length_tolerance_mm: 1,
+    tool_mm: [3, -2, -40]}
+  arm: {sensor: tool_indicator, direction: y, tool_mm: [3, -2, -40], artefact: {kind: square,
+    name: s, along: x, straight_tolerance_mm: 0.01, square_tolerance_mrad: 0.5}}
+  plate: {sensor: tool_indicator, direction: -z, artefact: {kind: plate, flat_tolerance_mm: 0.01}}
+  bed: {sensor: probe, direction: -z, surface: {flat_tolerance_mm: 0.3, length_mm: 200}}
+"""
 
-@pytest.fixture(params=["sweep", "workshop", "several sensors"])
+
+@pytest.fixture(params=["sweep", "workshop", "tool", "several sensors"])
 def problem(request, root, tmp_path):
-    """Lines, balls aligned by eye, and three kinds of sensor with different noise."""
+    """Lines, balls aligned by eye, sensors at the tool, and three kinds with different noise."""
     if request.param == "sweep":
         yield build_problem(exact(load_session(root / "examples/sweep")), model="full")
     elif request.param == "workshop":
         yield build_problem(load_plan(root / "examples/workshop/plan.yaml"), model="full")
+    elif request.param == "tool":
+        (tmp_path / "plan.yaml").write_text(TOOL_SENSORS)
+        yield build_problem(load_plan(tmp_path / "plan.yaml"), model="full")
     else:
         registry.register_sensor(ToolCoordinate)
         (tmp_path / "plan.yaml").write_text(SEVERAL_SENSORS)
