@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from orthocal.gcode.interpreter import Interpreter
     from orthocal.gcode.path import Vector
     from orthocal.gcode.program import ProgramCorrector, Summary
+    from orthocal.kinematics.conditions import UseCondition
 
     Array = NDArray[np.float64]
 
@@ -62,6 +63,9 @@ BLOCK = 2**16
 
 LONGEST_COMMENT = 240
 """Largest number of characters of a comment; LinuxCNC reads lines of 252 bytes."""
+
+CONDITIONS: tuple[UseCondition, ...] = ("temperature", "payload")
+"""Conditions of use that a program has; the side of approach is that of its motions."""
 
 PROGRESS_VARIABLE = "AXIS_PROGRESS_BAR"
 """Environment variable with which LinuxCNC's window requests progress from a filter."""
@@ -143,7 +147,7 @@ def correct(
     correction = _prepare(result, options, controller, file)
     warning = warn_against_verdict(result)
     mark = f"{MARK}: calibration {_identify(calibration)}. Do not correct again."
-    comments = [mark, correction.for_controller, _describe_tip(controller.tip), warning]
+    comments = [mark, *correction.list_comments(), warning]
     source = _lines(program, file)
     with tempfile.TemporaryFile() as spool:  # nothing is written before all lines are corrected
         with _frozen():
@@ -199,6 +203,20 @@ class _Correction:
     for_controller: str
     """Offsets in the controller in words."""
 
+    def list_comments(self) -> list[str]:
+        """Controller and machine of the program, for its first lines; empty ones do not apply."""
+        from orthocal.output.text.conditions import describe_conditions_of
+
+        return [
+            self.for_controller,
+            self._describe_backlash(),
+            describe_conditions_of(self.result, self.conditions, fields=CONDITIONS),
+            _describe_tip(self.controller.tip),
+        ]
+
+    def _describe_backlash(self) -> str:
+        return _describe_backlash(self.result, self.lags, taken_up=self.sides is not None)
+
     def list_notes(self, warning: str) -> list[str]:
         """Notes about the corrected program; empty ones do not apply."""
         from orthocal.output.text.conditions import describe_assumed
@@ -208,8 +226,8 @@ class _Correction:
             _describe(summary, self.field, self.tolerance),
             self.for_controller,
             _describe_tip(self.controller.tip) or _describe_tools(tools),
-            describe_assumed(self.result, self.conditions, fields=("temperature", "payload")),
-            _describe_backlash(self.result, self.lags, taken_up=self.sides is not None),
+            describe_assumed(self.result, self.conditions, fields=CONDITIONS),
+            self._describe_backlash(),
             warning,
             _describe_uncorrected(self.interpreter.uncorrected, self.file),
             _describe_outside(summary, self.file, self.region),

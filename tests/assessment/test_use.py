@@ -400,6 +400,18 @@ def test_a_corrected_program_is_that_of_its_temperature_and_payload(folder, asse
     assert code == 0
     assert "--temperature" not in note
 
+    def head(text):
+        """Comments at the top of a program."""
+        return [line for line in text.splitlines() if line.startswith(";")]
+
+    (at_20,), (at_34,) = ([c for c in head(text) if "°C" in c] for text in (cold, warm))
+    assert "20 °C and no payload" in at_20
+    assert "34 °C and payload 4 kg" in at_34
+    assert any("controller must compensate the backlash" in c for c in head(warm))
+    code, taken_up, _ = run_orthocal(folder, *words[:-2])
+    assert code == 0
+    assert any("The controller must not compensate" in c for c in head(taken_up))
+
     def last(text):
         line = text.strip().splitlines()[-1]
         return np.array([float(re.search(rf"{k}(-?[\d.]+)", line)[1]) for k in "XYZ"]) * 1e-3

@@ -21,20 +21,19 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parents[1] / "effects"))
 
 import numpy as np
-from effect_machines import EFFECTS, SIGMA, EffectMachines, rms, write_plan
+from effect_machines import (
+    BESIDE_BOUND,
+    COST,
+    EFFECTS,
+    EffectMachines,
+    identify_nothing,
+    rms,
+    write_plan,
+)
 from scipy.stats import binom
-
-from orthocal.effects.protocol import NEUTRAL
-from orthocal.estimation.solvers.batch import BatchSolver
 
 WITHIN = 1.15
 """Largest ratio of the RMS tool error over machines to the predicted one."""
-
-BESIDE_BOUND = 1.2
-"""Largest ratio of the RMS tool error to that of the linear Bayesian estimate."""
-
-COST = 1.05
-"""Largest ratio of tool errors of machines without effects, with effects identified and without."""
 
 CASES = {**{name: (name,) for name in EFFECTS}, "all": EFFECTS}
 
@@ -69,19 +68,6 @@ def report(name, outcome):
         )
         kept &= covered >= low
     return kept
-
-
-def identify_nothing(folder, count):
-    """Tool errors of machines without effects, with effects identified and without, [m]."""
-    told = EffectMachines(folder, EFFECTS, temperature=NEUTRAL["temperature"])
-    plain = EffectMachines(folder, (), temperature=NEUTRAL["temperature"])
-    truth = plain.draw(np.random.default_rng(3), count)
-    values = plain.read(truth, np.random.default_rng(4))
-    errors = []
-    for model in (told, plain):
-        theta = BatchSolver(model.problem).solve(values, sigma=SIGMA).theta
-        errors.append(rms(model.tool_errors(plain.machines(truth), theta)))
-    return errors
 
 
 def main() -> None:

@@ -16,6 +16,7 @@ from independent import Expansion, Gauge, IndependentMachine, States
 
 from orthocal import load_plan
 from orthocal.assessment.tool_error import measure_deviations, measure_uncertainty
+from orthocal.effects.protocol import NEUTRAL
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.kinematics.loop_closure import LoopClosure
@@ -39,6 +40,12 @@ COOLEST, WARMEST, USED_AT = 17.0, 27.0, 22.0
 
 DETERMINED = 0.5
 """Variance over that of the prior below which a direction is determined by the readings."""
+
+BESIDE_BOUND = 1.2
+"""Largest ratio of the RMS tool error to that of the linear Bayesian estimate."""
+
+COST = 1.05
+"""Largest ratio of tool errors of machines without effects, with effects identified and without."""
 
 FIRST = datetime(2025, 3, 14, 8)
 BETWEEN = timedelta(minutes=1)
@@ -271,3 +278,16 @@ class EffectMachines:
             np.array(covered_backlash),
             int((solved.at_bound[:, :n][:, of_backlash] == -1).sum()),
         )
+
+
+def identify_nothing(folder, count):
+    """Tool errors of machines without effects, with effects identified and without, [m]."""
+    told = EffectMachines(folder, EFFECTS, temperature=NEUTRAL["temperature"])
+    plain = EffectMachines(folder, (), temperature=NEUTRAL["temperature"])
+    truth = plain.draw(np.random.default_rng(3), count)
+    values = plain.read(truth, np.random.default_rng(4))
+    errors = []
+    for model in (told, plain):
+        theta = BatchSolver(model.problem).solve(values, sigma=SIGMA).theta
+        errors.append(rms(model.tool_errors(plain.machines(truth), theta)))
+    return errors

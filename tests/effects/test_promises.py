@@ -9,7 +9,15 @@ from datetime import timedelta
 
 import numpy as np
 import pytest
-from effect_machines import EFFECTS, EffectMachines, rms, write_plan
+from effect_machines import (
+    BESIDE_BOUND,
+    COST,
+    EFFECTS,
+    EffectMachines,
+    identify_nothing,
+    rms,
+    write_plan,
+)
 from scipy.stats import binom
 
 MACHINES = 40
@@ -26,6 +34,7 @@ def check(outcome):
         low, high = binom.interval(0.99, covered.size, 0.95)
         assert low <= covered.sum() <= high
     assert outcome.ratio < TOOL
+    assert rms(outcome.found) < BESIDE_BOUND * outcome.bound
     least = binom.ppf(0.005, outcome.covered_backlash.size, 0.95)
     assert outcome.covered_backlash.sum() >= least
 
@@ -52,3 +61,9 @@ def test_eight_hours_with_drift_and_growth(tmp_path):
     machines = EffectMachines(folder, ("thermal", "drift"))
     truth = machines.draw(np.random.default_rng(13), MACHINES // 2)
     check(machines.identify(truth, np.random.default_rng(14)))
+
+
+@pytest.mark.slow
+def test_effects_cost_little_on_machines_without_them(tmp_path):
+    told, plain = identify_nothing(write_plan(tmp_path / "plan"), MACHINES)
+    assert told < COST * plain

@@ -49,10 +49,26 @@ def describe_assumed(
     )
 
 
-def describe_conditions_of(calibration: Calibration, conditions: UseConditions) -> str:
-    """Conditions of a tool error: as stated, otherwise as assumed; "" if none matters."""
+def describe_conditions_of(
+    calibration: Calibration,
+    conditions: UseConditions,
+    *,
+    fields: Collection[UseCondition] = tuple(CONDITION_OF),
+) -> str:
+    """Conditions of a tool error or a program: as stated, otherwise as assumed.
+
+    Args:
+        calibration: The calibration.
+        conditions: The stated conditions.
+        fields: Conditions that the command can take.
+
+    Returns:
+        "" for a machine that depends on none of them.
+    """
     words = []
     for name in effects_by_condition(calibration.robot):
+        if name not in fields:
+            continue
         value = getattr(conditions, name)
         unit = {"approach": "approach {}", "temperature": "{:g} °C", "payload": "payload {:g} kg"}
         stated = value is not None
