@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -418,16 +419,20 @@ CONTROLLER_STATES = {
 """Lines before the program; no two displacements in `all` cancel."""
 
 
-def _run_nominal(session, program, folder, before=((),), *, output=False, half_side=0.055):
-    """A program on nominal legs, after lines of MDI; as `run_programs`."""
-    robot = session.robot
+@cache
+def _export_nominal(session, half_side):
+    """Files of the module with nominal kinematics, from exact readings of a session."""
     gauges = {n: replace(g, range=None) for n, g in session.gauges.items()}
     anything = replace(session, gauges=gauges)
     exact = simulate_session(anything, {}, exact=True).session
     options = ExportOptions(module=True, half_side=half_side)
-    files = export_calibration(
-        calibrate(exact, "offsets"), "linuxcnc", anyway=True, options=options
-    )
+    return export_calibration(calibrate(exact, "offsets"), "linuxcnc", anyway=True, options=options)
+
+
+def _run_nominal(session, program, folder, before=((),), *, output=False, half_side=0.055):
+    """A program on nominal legs, after lines of MDI; as `run_programs`."""
+    robot = session.robot
+    files = _export_nominal(session, half_side)
     for name, text in files.items():
         (folder / name).write_text(text)
     switch = [d.zero / MM + 10.0 for d in robot.drives]
@@ -475,11 +480,11 @@ def test_linuxcnc_takes_up_backlash_from_the_stated_side(small, sided, tmp_path)
     assert actual[at] - slides[at] == pytest.approx(-backlash / 2.0 * sides, abs=1e-6)
 
 
-def test_linuxcnc_triggers_a_logger_in_every_posture_at_rest(unlimited, tmp_path):
+def test_linuxcnc_triggers_a_logger_in_every_posture_at_rest(small, unlimited, tmp_path):
     motion, dwell = plan_motion(unlimited)[0], 0.5
     options = ProgramOptions(6000.0, 1500.0, dwell=dwell, trigger="0")
     program = write_program(unlimited, motion, options)
-    recorded, (pauses,) = _run_nominal(unlimited, program, tmp_path, output=True)
+    recorded, (pauses,) = _run_nominal(small, program, tmp_path, output=True)
     slides, output = recorded[:, :-1], recorded[:, -1]
     assert len(pauses) == 1
     rising = np.flatnonzero(np.diff(output, prepend=0.0) > 0.5)
