@@ -88,8 +88,18 @@ def load_afresh(robot):
 
 @pytest.fixture(scope="module")
 def without_plots():
-    """Pages have marks in place of plots, which take seconds and have tests of their own."""
-    with marked_plots():
+    """Pages have marks in place of plots, and reports state no gains of other sensors.
+
+    Both take seconds and have tests of their own.
+    """
+    from orthocal.output.report import page
+    from orthocal.output.text import accuracy
+
+    def render_tool(calibration):
+        with patch.object(accuracy, "_describe_sensors", lambda *_: []):
+            return accuracy.render_tool(calibration)
+
+    with marked_plots(), patch.object(page, "render_tool", render_tool):
         yield
 
 
