@@ -190,6 +190,8 @@ class Calibration(CalibrationRecord):
 
     def noise_factor(self, row: ResidualRow) -> float:
         """Ratio of the standard deviations of a row and of one reading."""
+        if row.minus is None:
+            return 1.0
         sensor = next(s.sensor for s in self.setups if s.name == row.setup)
         return math.sqrt(1.0 + is_difference(row.minus, sensor))
 
