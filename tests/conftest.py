@@ -87,10 +87,10 @@ def load_afresh(robot):
 
 
 @pytest.fixture(scope="module")
-def without_plots():
-    """Pages have marks in place of plots, and reports state no gains of other sensors.
+def short_reports():
+    """Reports with marks in place of plots and without gains of usual sensors.
 
-    Both take seconds and have tests of their own.
+    Both take seconds and have tests of their own, the gains in `test_sensor_gains.py`.
     """
     from orthocal.output.report import page
     from orthocal.output.text import accuracy

@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[1]
 DIFFERENCES = ROOT / "examples/table1/experiment-2"
 CYCLES = ROOT / "examples/raw-cycles"
 
-pytestmark = pytest.mark.usefixtures("without_plots")
+pytestmark = pytest.mark.usefixtures("short_reports")
 
 PROGRAM = "G21 G0 X0 Y0 Z0\nG1 X1 F100\n"
 ESCAPES = {r"\n": "\n", r"\t": "\t", r"\s": " "}

@@ -26,7 +26,7 @@ from orthocal import (
 from orthocal.assessment.controller_entries import offsets_to_enter
 from orthocal.cli.run import PANELS, make_program
 
-pytestmark = pytest.mark.usefixtures("without_plots")
+pytestmark = pytest.mark.usefixtures("short_reports")
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def experiment(root):
 
 
 @pytest.fixture(scope="module")
-def written(experiment, tmp_path_factory, without_plots):
+def written(experiment, tmp_path_factory, short_reports):
     """What `calibrate` writes of the experiment."""
     folder = tmp_path_factory.mktemp("written") / "calibrated"
     assert orthocal("calibrate", experiment, "--out", folder).returncode == 0
@@ -120,7 +120,7 @@ def test_calibrate_prints_json_alone_on_stdout(experiment):
 
 
 @pytest.fixture(scope="module")
-def turned(root, tmp_path_factory, without_plots):
+def turned(root, tmp_path_factory, short_reports):
     """Directory of a calibration of readings with a reversed setup zx, and its answer."""
     folder = tmp_path_factory.mktemp("turned")
     session = load_session(root / "examples/raw-cycles")
@@ -467,7 +467,7 @@ def test_a_pipe_that_closes_early_is_no_error(root, experiment):
 
 
 @pytest.fixture(scope="module")
-def days(root, tmp_path_factory, without_plots):
+def days(root, tmp_path_factory, short_reports):
     """Directory of the sessions of two days and of their calibration, and its answer."""
     folder = tmp_path_factory.mktemp("days")
     plan, truth = root / "examples/raw-cycles/plan.yaml", root / "examples/raw-cycles/machine.yaml"

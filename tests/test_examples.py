@@ -20,7 +20,7 @@ from orthocal.observation.simulate import load_errors
 from orthocal.sensors import registry as sensor_registry
 from orthocal.session.session import Purpose
 
-pytestmark = pytest.mark.usefixtures("without_plots")
+pytestmark = pytest.mark.usefixtures("short_reports")
 
 SCRIPTS = sorted((ROOT / "examples").glob("[0-9]*.py"))
 
@@ -106,7 +106,7 @@ def test_the_python_of_a_page_runs(beside_examples, registries, page):
 
 
 @pytest.fixture(scope="module")
-def run_page(beside_examples, without_plots):
+def run_page(beside_examples, short_reports):
     """What each command of a page prints, run once, one after the other, as they stand."""
 
     @cache

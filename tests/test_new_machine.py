@@ -190,7 +190,7 @@ def test_readings_are_not_overwritten(copied):
 
 
 @pytest.fixture(scope="module")
-def planned(tmp_path_factory, without_plots):
+def planned(tmp_path_factory, short_reports):
     """A machine with a workspace and a tolerance by option, and a plan of a quarter of an hour."""
     mill = tmp_path_factory.mktemp("planned") / "mill"
     words = options(workspace_mm="40", tolerance="*.offset_mm=4", hours="0.25")

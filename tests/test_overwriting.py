@@ -11,7 +11,7 @@ from commands import run_orthocal
 from orthocal import write_calibration
 from orthocal.cli.overwriting import WRITTEN
 
-pytestmark = pytest.mark.usefixtures("without_plots")
+pytestmark = pytest.mark.usefixtures("short_reports")
 
 MINE = "# my notes about orthocal\n"
 PROGRAM = "G21 G90\nG0 X0 Y0 Z0\nG1 X10 Y-10 F300\nM2\n"
@@ -59,7 +59,8 @@ def test_a_result_replaces_its_own_alone(folder, words):
         done = run_orthocal(folder, *words)
         assert done.returncode == 2
         where = file.relative_to(folder)
-        assert f"{where}: exists, and orthocal did not write it; --force over" in done.stderr
+        refusal = f"{where}: exists, and orthocal did not write it; --force overwrites it"
+        assert refusal in done.stderr
         assert file.read_text() == MINE
         assert {p.name for p in out.iterdir()} <= {name, "calibration.json"}
         assert run_orthocal(folder, *words, "--force").returncode == 0

@@ -85,7 +85,7 @@ def test_strings_in_lists_of_a_json_are_looked_at_too(session):
         load_calibration(session)
 
 
-@pytest.mark.usefixtures("without_plots")
+@pytest.mark.usefixtures("short_reports")
 def test_summary_report_and_scene_show_a_title_that_turns_itself_about(session):
     calibration = calibrate(load_session(session))
     odd = replace(calibration, session=replace(calibration.session, title="live\u202eexe.\x9b31m"))

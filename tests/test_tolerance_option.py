@@ -25,7 +25,7 @@ QUICK = ["--along", 3, "--across-mm", 0, "--setups", 3, "--starts", 1, "--seed",
 
 
 @pytest.fixture(scope="module")
-def folder(root, tmp_path_factory, without_plots):
+def folder(root, tmp_path_factory, short_reports):
     """Experiments 2 and 3 without and with the key, and a calibration of each."""
     folder = tmp_path_factory.mktemp("tolerances")
     for number in (2, 3):

@@ -49,9 +49,6 @@ SCALES = np.geomspace(1.0, 30.0, 86)
 LARGEST_DEVIATION = 3.0
 """Standard deviations from its prediction beyond which a reading is doubtful."""
 
-EXPLAINED = ("finer than the gauge", "residuals too small", "scattered repeats", "sigma too large")
-"""Kinds that an anomaly with a name explains."""
-
 _GRAVITY: dict[Severity, int] = {"reject": 0, "review": 1, "note": 2}
 
 
@@ -96,7 +93,7 @@ def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Ju
         RobotError: If the closures of the robot depend on each other.
     """
     mistakes = _find_mistakes(session, anomalies)
-    implausible = [f for f in find_implausible(session) if not (mistakes and f.kind in EXPLAINED)]
+    implausible = find_implausible(session, explained=bool(mistakes))
     scale, beyond = AS_STATED, []
     if verdict_of([*mistakes, *implausible]) == "enter":
         scale = find_tolerance_scale(session)

@@ -65,18 +65,23 @@ NO_CHANCE = 1e-6
 """Probability below which repeated readings that differ are a mistake."""
 
 
-def find_implausible(session: Session) -> tuple[Finding, ...]:
+def find_implausible(session: Session, *, explained: bool = False) -> tuple[Finding, ...]:
     """Findings about units, dimensions, steps and noise.
 
     They depend on the readings and the robot alone, not on the model that is calibrated: residuals
     are those of a fit of offsets, which leaves more than any larger model does.
+
+    Args:
+        session: The session.
+        explained: Whether a mistake is named. It explains residuals and readings between the steps
+            of a gauge, which are not judged then.
     """
     findings: list[Finding | None] = [_legs(session.robot)]
     for part in split_sessions(session):
         problem = build_problem(part, model="offsets") if _has_offsets(part.robot) else None
-        findings += [_near(part), *find_finer(part)]
+        findings += [_near(part), *(() if explained else find_finer(part))]
         if problem is not None and part.readings:
-            findings += _by_fit(part, problem)
+            findings += _by_model(part, problem, fit=not explained)
     return tuple(f for f in findings if f is not None)
 
 
@@ -150,15 +155,19 @@ def _has_offsets(robot: Robot) -> bool:
     return "offsets" in robot.parameters.models
 
 
-def _by_fit(session: Session, problem: CalibrationProblem) -> Iterator[Finding | None]:
+def _by_model(
+    session: Session, problem: CalibrationProblem, *, fit: bool
+) -> Iterator[Finding | None]:
     """Findings from residuals: before any fit, and of a fit of offsets."""
     try:
         yield _dimensions(session, problem)
-        fit = fit_problem(problem, options=SolverOptions(solver="variable-projection"))
+        if not fit:
+            return
+        fitted = fit_problem(problem, options=SolverOptions(solver="variable-projection"))
     except (OrthocalError, np.linalg.LinAlgError):
         return  # readings that are no machine's are found otherwise
-    yield _too_small(session, fit)
-    yield _coarse(session, fit)
+    yield _too_small(session, fitted)
+    yield _coarse(session, fitted)
 
 
 def _dimensions(session: Session, problem: CalibrationProblem) -> Finding | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -87,14 +87,13 @@ def find_sensor_gains(
         OwnedSensor(name, FINE if name == BAR else ORDINARY, keys, Path(name), _duration(keys))
         for name, keys in KEYS.items()
     ]
-    owned = tuple(sensor for sensor in usual if _has_place(robot, sensor))
-    equipment = Equipment(
-        gauge=ORDINARY, along=5, across=0.0, sections=(0.5,), spare_range=0.0, owned=owned
-    )
     try:
-        listed = list_candidates(robot, equipment)
-    except ParameterError:  # neither legs nor places
-        return ()
+        equipment, listed = _list_candidates(robot, usual)
+    except ParameterError:  # a sensor without a place
+        try:
+            equipment, listed = _list_candidates(robot, [s for s in usual if _has_place(robot, s)])
+        except ParameterError:  # neither legs nor places
+            return ()
     candidates = measure_candidates(listed, forecast.problem(listed), spare_range=0.0)
     prior = forecast.prior_of(candidates.problem, candidates.state, session)
     search = SetupSearch.of(candidates, prior, forecast.weigh("aligned", len(candidates.state)))
@@ -116,6 +115,14 @@ def find_sensor_gains(
                 )
             )
     return tuple(sorted(gains, key=lambda gain: gain.rms))
+
+
+def _list_candidates(robot: Robot, owned: Sequence[OwnedSensor]) -> tuple[Equipment, Session]:
+    """Equipment of a dial and sensors, and the session of its candidates."""
+    equipment = Equipment(
+        gauge=ORDINARY, along=5, across=0.0, sections=(0.5,), spare_range=0.0, owned=tuple(owned)
+    )
+    return equipment, list_candidates(robot, equipment)
 
 
 def _duration(keys: Mapping[str, Any]) -> Duration:

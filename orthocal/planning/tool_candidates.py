@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.errors import ParameterError, SessionError
-from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import can_approach, usual_approaches
 from orthocal.planning.equipment import choose_box, place_tool, reachable
@@ -77,49 +77,69 @@ def list_tool_candidates(
             raise SessionError(
                 f"two gauges are named '{sensor.name}'; rename the file", where=str(sensor.file)
             )
+    places = [(sensor, *place) for sensor in owned for place in _places(sensor, middle, limits)]
+    positions = _Positions.of(robot, middle, np.concatenate([points for *_, points in places]))
     postures: dict[str, Posture] = {}
     setups: dict[str, Setup] = {}
     readings: list[Reading] = []
+    for sensor, name, keys, points in places:
+        reached = positions.names(points)
+        if len(reached) < 2:
+            continue
+        checked, built = read_setup(
+            {**sensor.keys, **keys}, where=str(sensor.file), under="", error=SessionError
+        )
+        postures.update((n, positions.postures[n]) for n in reached)
+        setups[name] = Setup(name, built, sensor.name, zero=checked.zero or default_zero(built))
+        readings += [
+            Reading(name, n, conditions=c) for n, c in positions.approached(built, reached)
+        ]
     for sensor in owned:
-        before = len(setups)
-        for name, keys, points in _places(sensor, middle, limits):
-            reached = points[reachable(robot, points)]
-            if len(reached) < 2:
-                continue
-            checked, built = read_setup(
-                {**sensor.keys, **keys}, where=str(sensor.file), under="", error=SessionError
-            )
-            names = [_name(p, middle) for p in reached]
-            for posture, placed in place_tool(robot, names, reached).items():
-                postures.setdefault(posture, placed)
-            setups[name] = Setup(name, built, sensor.name, zero=checked.zero or default_zero(built))
-            readings += [
-                Reading(name, posture, conditions=conditions)
-                for posture, conditions in _approached(robot, built, names, reached)
-            ]
-        if len(setups) == before:
+        if not any(setup.gauge == sensor.name for setup in setups.values()):
             raise ParameterError("the machine reaches no place for it", where=str(sensor.file))
     return gauges, postures, setups, readings
 
 
-def _approached(
-    robot: Robot, sensor: Sensor, names: Sequence[str], points: Array
-) -> list[tuple[str, Conditions | None]]:
-    """Postures with each approach that effects of the machine distinguish.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Positions:
+    """Tool positions of all places that the machine reaches: their loops are closed at once."""
 
-    Approaches of a sensor that prescribes the path of the tool follow from the complete plan.
-    """
-    unique = dict(zip(names, points, strict=True))
-    approaches = usual_approaches(robot)
-    if not approaches or tool_path(sensor) is not None:
-        return [(name, None) for name in unique]
-    drives = nominal_closure(robot).inverse(np.array(list(unique.values())))
-    return [
-        (name, Conditions(a))
-        for a in approaches
-        for name, able in zip(unique, can_approach(robot, drives, a), strict=True)
-        if able
-    ]
+    middle: Array
+    """Tool in the mechanical zero, shape (3,), [m]."""
+    postures: dict[str, Posture]
+    able: dict[str, frozenset[str]]
+    """Postures that can be approached so, by the approaches that effects distinguish."""
+
+    @staticmethod
+    def of(robot: Robot, middle: Array, points: Array) -> _Positions:
+        """Positions among tool positions of shape (n, 3), [m]."""
+        unique = np.unique(points.round(9), axis=0)
+        reached = unique[reachable(robot, unique)]
+        postures = place_tool(robot, [_name(p, middle) for p in reached], reached)
+        names, drives = np.array(list(postures)), np.array([p.drives for p in postures.values()])
+        able = {
+            a: frozenset(names[can_approach(robot, drives, a)].tolist())
+            for a in (usual_approaches(robot) if names.size else ())
+        }
+        return _Positions(middle, postures, able)
+
+    def names(self, points: Array) -> list[str]:
+        """Names of those of some positions that are reached, each once."""
+        names = dict.fromkeys(_name(p, self.middle) for p in points)
+        return [name for name in names if name in self.postures]
+
+    def approached(
+        self, sensor: Sensor, names: Sequence[str]
+    ) -> Iterator[tuple[str, Conditions | None]]:
+        """Postures with each approach that effects of the machine distinguish.
+
+        Approaches of a sensor that prescribes the path of the tool follow from the complete plan.
+        """
+        if not self.able or tool_path(sensor) is not None:
+            yield from ((name, None) for name in names)
+            return
+        for approach, able in self.able.items():
+            yield from ((name, Conditions(approach)) for name in names if name in able)
 
 
 def _places(

@@ -34,8 +34,8 @@ from orthocal.sensors.protocol import (
     NuisanceParameter,
     Sensor,
     SetupKeys,
+    ToolSensor,
     View,
-    require_tool,
 )
 from orthocal.units import MM, read_limit, show_limit, tidy, to_mm
 
@@ -74,7 +74,7 @@ class BallBarKeys(SetupKeys):
 
 
 @dataclass(frozen=True, slots=True)
-class BallBar:
+class BallBar(ToolSensor):
     """A ball bar between the tool and a fixed ball."""
 
     centre: tuple[float, float, float]
@@ -93,6 +93,7 @@ class BallBar:
     """Name of the fixed ball that several setups share."""
 
     kind: ClassVar[str] = "ball_bar"
+    noun: ClassVar[str] = "a ball bar"
     keys: ClassVar[type[SetupKeys]] = BallBarKeys
     ideal: ClassVar[str] = "its sphere"
     zero: ClassVar[GaugeZero] = "known"
@@ -130,19 +131,6 @@ class BallBar:
         if self.scale_std != SCALE:
             keys["scale_tolerance"] = show_limit(self.scale_std)
         return keys
-
-    def require_fit(self, robot: Robot, *, where: str) -> None:
-        """Refuse a robot without a tool.
-
-        Raises:
-            SessionError: Naming the key.
-        """
-        require_tool(robot, "a ball bar", where=where)
-
-    @property
-    def place(self) -> tuple[str, str]:
-        """The tool."""
-        return "tool", ""
 
     def describe(self) -> str:
         """Length and fixed ball."""
@@ -221,11 +209,6 @@ class BallBar:
             NuisanceParameter("scale", "1", self.scale_std, of_gauge=True),
         )
         return tuple(p for p in parameters if p.prior_std > 0.0)
-
-    def aligned_to(self, robot: Robot) -> Mapping[str, Sensor]:
-        """No parameter depends on the machine."""
-        del robot
-        return {}
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
         """Reading with the gauge zero at 0, [m]."""

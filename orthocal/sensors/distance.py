@@ -10,7 +10,7 @@ The distance is absolute. The scale is that of the calliper and of the shrinkage
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
@@ -27,10 +27,9 @@ from orthocal.sensors.protocol import (
     Frames,
     GaugeZero,
     NuisanceParameter,
-    Sensor,
     SetupKeys,
+    ToolSensor,
     View,
-    require_tool,
 )
 from orthocal.units import MM, read_limit, show_limit, tidy, to_mm
 
@@ -52,7 +51,7 @@ class DistanceKeys(SetupKeys):
 
 
 @dataclass(frozen=True, slots=True)
-class Distance:
+class Distance(ToolSensor):
     """A distance between the tool's positions in two postures."""
 
     width: float = 0.0
@@ -63,6 +62,7 @@ class Distance:
     """Prior standard deviation of the scale, [1]."""
 
     kind: ClassVar[str] = "distance"
+    noun: ClassVar[str] = "a printed distance"
     keys: ClassVar[type[SetupKeys]] = DistanceKeys
     ideal: ClassVar[str] = "its nominal length"
     zero: ClassVar[GaugeZero] = "known"
@@ -89,19 +89,6 @@ class Distance:
         if self.scale_std != SCALE:
             keys["scale_tolerance"] = show_limit(self.scale_std)
         return keys
-
-    def require_fit(self, robot: Robot, *, where: str) -> None:
-        """Refuse a robot without a tool.
-
-        Raises:
-            SessionError: Naming the key.
-        """
-        require_tool(robot, "a printed distance", where=where)
-
-    @property
-    def place(self) -> tuple[str, str]:
-        """The tool."""
-        return "tool", ""
 
     def describe(self) -> str:
         """Kind of distance."""
@@ -135,11 +122,6 @@ class Distance:
             NuisanceParameter("scale", "1", self.scale_std, of_gauge=True),
         )
         return tuple(p for p in parameters if p.prior_std > 0.0)
-
-    def aligned_to(self, robot: Robot) -> Mapping[str, Sensor]:
-        """No parameter depends on the machine."""
-        del robot
-        return {}
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
         """Length that the calliper shows, [m]."""

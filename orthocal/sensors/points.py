@@ -16,7 +16,7 @@ points to the nominal machine if the frame is unknown, and about the world's fra
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -35,10 +35,9 @@ from orthocal.sensors.protocol import (
     Frames,
     GaugeZero,
     NuisanceParameter,
-    Sensor,
     SetupKeys,
+    ToolSensor,
     View,
-    require_tool,
 )
 from orthocal.units import MM, MRAD, UM, read_limit, show_limit, tidy, to_mm
 
@@ -98,7 +97,7 @@ class PointKeys(SetupKeys):
 
 
 @dataclass(frozen=True, slots=True)
-class Points:
+class Points(ToolSensor):
     """Coordinates of a target at the tool, or the coordinate along one axis of the station."""
 
     target: Triple = (0.0, 0.0, 0.0)
@@ -117,6 +116,7 @@ class Points:
     """Rotation vector of the station, [rad]."""
 
     kind: ClassVar[str] = "points"
+    noun: ClassVar[str] = "a target"
     keys: ClassVar[type[SetupKeys]] = PointKeys
     ideal: ClassVar[str] = "its nominal position"
     zero: ClassVar[GaugeZero] = "known"
@@ -198,19 +198,6 @@ class Points:
             for i, label in enumerate(labels)
         }
 
-    def require_fit(self, robot: Robot, *, where: str) -> None:
-        """Refuse a robot without a tool.
-
-        Raises:
-            SessionError: Naming the key.
-        """
-        require_tool(robot, "a target", where=where)
-
-    @property
-    def place(self) -> tuple[str, str]:
-        """The tool."""
-        return "tool", ""
-
     def describe(self) -> str:
         """Coordinate and target."""
         target = ", ".join(f"{v / MM:g}" for v in self.target)
@@ -254,11 +241,6 @@ class Points:
             NuisanceParameter("scale", "1", self.scale_std, owner),
         )
         return tuple(p for p in parameters if p.prior_std > 0.0)
-
-    def aligned_to(self, robot: Robot) -> Mapping[str, Sensor]:
-        """No parameter depends on the machine."""
-        del robot
-        return {}
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
         """Coordinate along its axis, [m]."""

@@ -223,17 +223,35 @@ class Sensor(Protocol):
         """
 
 
-def require_tool(robot: Robot, noun: str, *, where: str) -> None:
-    """Refuse a robot without a tool for a sensor at the tool.
+class ToolSensor:
+    """Base of the sensors that measure the tool: of no leg, and with nothing aligned by eye."""
 
-    Raises:
-        SessionError: Naming the key; `where` is the setup's file and key.
-    """
-    if robot.tcp is None:
-        raise SessionError(
-            f"'{robot.name}' has no tool for {noun}; add orthocal.tcp to {robot.yaml}",
-            where=f"{where}.sensor",
-        )
+    __slots__ = ()
+
+    noun: ClassVar[str]
+    """The sensor in messages, with its article."""
+
+    def require_fit(self, robot: Robot, *, where: str) -> None:
+        """Refuse a robot without a tool.
+
+        Raises:
+            SessionError: Naming the key; `where` is the setup's file and key.
+        """
+        if robot.tcp is None:
+            raise SessionError(
+                f"'{robot.name}' has no tool for {self.noun}; add orthocal.tcp to {robot.yaml}",
+                where=f"{where}.sensor",
+            )
+
+    @property
+    def place(self) -> tuple[str, str]:
+        """The tool."""
+        return "tool", ""
+
+    def aligned_to(self, robot: Robot) -> Mapping[str, Sensor]:
+        """No parameter depends on the machine."""
+        del robot
+        return {}
 
 
 def sensor_conditions(sensor: Sensor) -> tuple[Condition, ...]:

@@ -37,8 +37,8 @@ from orthocal.sensors.protocol import (
     NuisanceParameter,
     Sensor,
     SetupKeys,
+    ToolSensor,
     View,
-    require_tool,
 )
 from orthocal.units import MM, MRAD, read_limit, show_limit, tidy, to_mm
 
@@ -168,7 +168,7 @@ class Artefact:
 
 
 @dataclass(frozen=True, slots=True)
-class ToolIndicator:
+class ToolIndicator(ToolSensor):
     """An indicator at the tool whose plunger touches an artefact on the table."""
 
     direction: str
@@ -180,6 +180,7 @@ class ToolIndicator:
     """Prior standard deviation of the dial's scale, [1]."""
 
     kind: ClassVar[str] = "tool_indicator"
+    noun: ClassVar[str] = "an indicator"
     keys: ClassVar[type[SetupKeys]] = ToolIndicatorKeys
     ideal: ClassVar[str] = "the artefact"
 
@@ -246,19 +247,6 @@ class ToolIndicator:
         if self.scale_std != SCALE:
             keys["scale_tolerance"] = show_limit(self.scale_std)
         return keys
-
-    def require_fit(self, robot: Robot, *, where: str) -> None:
-        """Refuse a robot without a tool.
-
-        Raises:
-            SessionError: Naming the key.
-        """
-        require_tool(robot, "an indicator", where=where)
-
-    @property
-    def place(self) -> tuple[str, str]:
-        """The tool."""
-        return "tool", ""
 
     def describe(self) -> str:
         """Direction of the plunger and artefact."""
@@ -350,11 +338,6 @@ class ToolIndicator:
             NuisanceParameter("scale", "1", self.scale_std, of_gauge=True),
         )
         return tuple(p for p in parameters if p.prior_std > 0.0)
-
-    def aligned_to(self, robot: Robot) -> Mapping[str, Sensor]:
-        """No parameter depends on the machine."""
-        del robot
-        return {}
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
         """Reading with the gauge zero at 0, [m]."""

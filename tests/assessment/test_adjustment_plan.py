@@ -226,7 +226,7 @@ def test_validation_expects_the_adjusted_machine(plan, machines, plans):
     assert validate_calibration(calibration, replace(after, adjusted=amounts)).confirmed is not True
 
 
-@pytest.mark.usefixtures("without_plots", "without_sensor_gains")
+@pytest.mark.usefixtures("short_reports", "without_sensor_gains")
 def test_the_command_and_the_report(machines, tmp_path):
     from test_cli import orthocal as run
 

@@ -300,7 +300,7 @@ def test_the_assessment_states_the_tool_error_in_use(assessed, tmp_path):
     assert again.use.unstated == tool.use.unstated
     text = " ".join(summarize(assessed).split())
     assert "used from both sides, 15…35 °C, payload 0…4 kg." in text
-    assert "With the controller's backlash as it is now: " in text
+    assert "With the controller's present backlash: " in text
     assert "Temperatures of 15…35 °C add" in text
     assert "A payload of 0…4 kg adds" in text
 

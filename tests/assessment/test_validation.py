@@ -267,6 +267,7 @@ def test_validate_and_calibrate_agree_on_the_same_session(root, name, model, see
         assert validated.std == pytest.approx(calibrated.std, rel=1e-4)
     judged = {f.kind for f in judge_session(session).findings}
     assert judged <= {f.kind for f in result.assessment.findings}
+    assert judged <= {f.kind for f in calibrate(session, model).assessment.findings}
 
 
 def test_a_change_that_leaves_the_offsets_is_seen_by_validate_alone(plan):

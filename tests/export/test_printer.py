@@ -68,7 +68,7 @@ def promised(page):
     return float(re.search(r"first layer of ([\d.e-]+) mm", page)[1])
 
 
-@pytest.mark.usefixtures("without_plots")
+@pytest.mark.usefixtures("short_reports")
 @pytest.mark.parametrize("firmware", FIRMWARES)
 def test_walk_of_the_owner_of_a_printer(tmp_path, firmware):
     """Paste a log, get an answer and lines; enter them; the bed is flat as promised."""

@@ -296,7 +296,7 @@ def test_simulated_readings_state_what_effects_need(planned, tmp_path):
     assert {c.approach for c in simulated()} == {"ppp"}
 
 
-@pytest.mark.usefixtures("without_plots", "without_sensor_gains")
+@pytest.mark.usefixtures("short_reports", "without_sensor_gains")
 def test_backlash_of_a_warm_day_from_plan_to_calibration(tmp_path):
     """Backlash of 0.04 mm, and a day that warms by 8 K: the commands as a user types them."""
     quick = ["--along", "5", "--across-mm", "0", "--sections", "0.5", "--starts", "1"]

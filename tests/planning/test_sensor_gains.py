@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from conftest import marked_plots
 
 from orthocal import calibrate, load_robot, plan_readings, simulate_session, summarize
+from orthocal.output.report.page import build_report
 from orthocal.output.text.accuracy import render_tool
 from orthocal.output.text.layout import to_text
 from orthocal.planning import plan as planning
@@ -85,12 +87,13 @@ def test_where_leg_readings_determine_nothing_the_answer_names_the_sensor(monkey
         assert f"Another hour with {best.words} would reduce the error to 0.017 mm" in words
 
 
-def test_the_details_of_a_calibration_name_the_same_sensors(legs):
+def test_the_report_of_a_calibration_names_the_same_sensors(legs):
     readings = simulate_session(legs.session, {"x_slide.offset": 0.2e-3}, seed=1).session
     calibration = calibrate(readings)
-    text = " ".join(to_text(render_tool(calibration)).split())
-    assert "Another hour, with all errors corrected: " in text
-    assert "with a ball bar of 50 mm" in text
+    with marked_plots():
+        page = " ".join(build_report(calibration).split())
+    assert "Another hour, with all errors corrected: " in page
+    assert "with a ball bar of 50 mm" in page
     assert "do not determine" not in summarize(calibration)
     offsets = calibrate(readings, "offsets")
     assert "Another hour" not in to_text(render_tool(offsets))

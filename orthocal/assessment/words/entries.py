@@ -237,7 +237,7 @@ def describe_use_parts(tool: ToolErrorSummary) -> list[str]:
 def describe_without_backlash(rms: float) -> str:
     """Sentence about the tool error with the present backlash of the controller, RMS, [m]."""
     return (
-        f"With the controller's backlash as it is now: {tool_mm(rms)}. Approach from one side "
+        f"With the controller's present backlash: {tool_mm(rms)}. Approach from one side "
         "avoids the difference."
     )
 

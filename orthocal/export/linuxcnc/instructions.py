@@ -243,7 +243,7 @@ def _describe_kept(
     if not texts:
         return ""
     listed = ", ".join(texts)
-    return f"\n**{what} left as it is, since its change is not determined:** {listed}.\n"
+    return f"\n**{what} unchanged, since its change is not determined:** {listed}.\n"
 
 
 def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, stated: bool) -> str:
