@@ -315,7 +315,7 @@ def test_a_periodic_error_is_entered_where_it_is_determined(complete):
     files = export_calibration(complete, "linuxcnc", anyway=True, options=options)
     tables = sorted(name for name in files if name.endswith(".comp"))
     assert tables == ["joint_0.comp", "joint_2.comp"]
-    listed = re.search(r"Periodic error of the screw left[^:]*:\*\* (.*)", files["README.md"])
+    listed = re.search(r"Periodic error of the screw unchanged[^:]*:\*\* (.*)", files["README.md"])
     (y,) = (e for e in entries if e.drive == "y_slide")
     assert listed[1] == f"JOINT_1 (±{y.uncertainty / MM:.3f} mm)."
     backlash = re.findall(r"^BACKLASH = (\S+)", files["joints.ini"], re.M)
