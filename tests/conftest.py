@@ -93,13 +93,9 @@ def short_reports():
     Both take seconds and have tests of their own, the gains in `test_sensor_gains.py`.
     """
     from orthocal.output.report import page
-    from orthocal.output.text import accuracy
+    from orthocal.output.text.accuracy import FurtherHour
 
-    def render_tool(calibration):
-        with patch.object(accuracy, "_describe_sensors", lambda *_: []):
-            return accuracy.render_tool(calibration)
-
-    with marked_plots(), patch.object(page, "render_tool", render_tool):
+    with marked_plots(), patch.object(page, "expect_further_hour", lambda _: FurtherHour(0.0, ())):
         yield
 
 

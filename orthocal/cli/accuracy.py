@@ -55,7 +55,11 @@ def accuracy(
     """
     from orthocal.kinematics.workspace import cube
     from orthocal.measurement.files.coordinate_tables import read_points
-    from orthocal.output.text.accuracy import accuracy_json, print_accuracy
+    from orthocal.output.text.accuracy import (
+        accuracy_json,
+        expect_further_hour,
+        print_accuracy,
+    )
 
     if half_side_mm is not None:
         require_between(half_side_mm, 0.0, 1e5, "--half-side-mm")
@@ -76,11 +80,13 @@ def accuracy(
     stated = conditions if conditions.stated else None
     with _cube_reached(result, half_side_mm):
         assessment = orthocal.assess_tool(result, workspace, names=names, conditions=stated)
-    deliver(
-        lambda: accuracy_json(result, assessment),
-        lambda: print_accuracy(result, assessment),
-        json=json,
-    )
+
+    def show() -> None:
+        special = workspace is not None or stated is not None
+        further = expect_further_hour(result, assessment if special else None)
+        print_accuracy(result, assessment, further)
+
+    deliver(lambda: accuracy_json(result, assessment), show, json=json)
 
 
 def _print_points(

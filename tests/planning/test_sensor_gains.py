@@ -7,8 +7,7 @@ from conftest import marked_plots
 
 from orthocal import calibrate, load_robot, plan_readings, simulate_session, summarize
 from orthocal.output.report.page import build_report
-from orthocal.output.text.accuracy import render_tool
-from orthocal.output.text.layout import to_text
+from orthocal.output.text import accuracy
 from orthocal.planning import plan as planning
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.owned_sensors import load_owned_sensor
@@ -85,6 +84,11 @@ def test_where_leg_readings_determine_nothing_the_answer_names_the_sensor(monkey
         sentence = next(s for s in words.split(". ") if "do not determine the offset of" in s)
         assert all(name in sentence for name in ("a_slide", "b_slide", "c_slide"))
         assert f"Another hour with {best.words} would reduce the error to 0.017 mm" in words
+    monkeypatch.setattr(accuracy, "find_sensor_gains", record)
+    details = " ".join(summarize(calibration, details=True).split())
+    assert len(shown) == 2  # one search for the remedy and for the gains of all sensors
+    assert "would reduce the error to 0.017 mm" in details
+    assert "0.017 mm with a ball bar" in details
 
 
 def test_the_report_of_a_calibration_names_the_same_sensors(legs):
@@ -96,7 +100,7 @@ def test_the_report_of_a_calibration_names_the_same_sensors(legs):
     assert "with a ball bar of 50 mm" in page
     assert "do not determine" not in summarize(calibration)
     offsets = calibrate(readings, "offsets")
-    assert "Another hour" not in to_text(render_tool(offsets))
+    assert "Another hour" not in summarize(offsets, details=True)
 
 
 def test_a_machine_without_places_at_the_tool_compares_dials(biglide):

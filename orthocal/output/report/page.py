@@ -33,7 +33,7 @@ from orthocal.output.report.reading_plots import (
 )
 from orthocal.output.report.tool_map import Field, plot_tool_map
 from orthocal.output.scene.drawing import draw_scene
-from orthocal.output.text.accuracy import render_tool
+from orthocal.output.text.accuracy import FurtherHour, expect_further_hour, render_accuracy
 from orthocal.output.text.adjustment import render_adjustments
 from orthocal.output.text.answer import (
     name_values,
@@ -103,9 +103,10 @@ def build_report(calibration: Calibration, *, saved: Path | None = None) -> str:
     if saved is None and calibration.path is not None:
         saved = calibration.path.parent
     saved = saved and saved.resolve()
+    further = expect_further_hour(calibration)
     sections = [
-        ("verdict", "Verdict", _verdict(calibration, saved)),
-        ("tool", "Tool error", _tool(calibration)),
+        ("verdict", "Verdict", _verdict(calibration, saved, further)),
+        ("tool", "Tool error", _tool(calibration, further)),
         *_adjustments(calibration, saved),
         ("fit", "Residuals", _fit(calibration)),
         ("residuals", "Readings", _readings(calibration)),
@@ -138,7 +139,7 @@ def write_report(calibration: Calibration, path: str | Path) -> Path:
     return Path(path)
 
 
-def _verdict(calibration: Calibration, saved: Path | None) -> str:
+def _verdict(calibration: Calibration, saved: Path | None, further: FurtherHour) -> str:
     before, after = calibration.rms_before, calibration.rms_after
     change = f" ({after / before - 1.0:+.0%})" if before > 1e-8 else ""
     fit = (
@@ -147,7 +148,7 @@ def _verdict(calibration: Calibration, saved: Path | None) -> str:
         f"{mm(calibration.largest_after)} mm after."
     )
     return (
-        to_markup(render_answer(calibration, heading=False, saved=saved))
+        to_markup(render_answer(calibration, heading=False, saved=saved, further=further))
         + heading(name_values(calibration), level=3)
         + to_markup(render_values(calibration))
         + paragraph(fit)
@@ -156,12 +157,13 @@ def _verdict(calibration: Calibration, saved: Path | None) -> str:
     )
 
 
-def _tool(calibration: Calibration) -> str:
-    words = to_markup(render_tool(calibration))
+def _tool(calibration: Calibration, further: FurtherHour) -> str:
     try:
-        return words + _maps(calibration, assess_tool(calibration))
-    except (ClosureError, RobotError):  # the text states the reason
-        return words
+        accuracy = assess_tool(calibration)
+    except (ClosureError, RobotError) as e:
+        return paragraph(f"The tool error cannot be computed: {e}.")
+    words = render_accuracy(calibration, accuracy, further)
+    return to_markup(words) + _maps(calibration, accuracy)
 
 
 def _adjustments(calibration: Calibration, saved: Path | None) -> list[tuple[str, str, str]]:

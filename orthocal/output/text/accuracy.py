@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from rich.console import RenderableType
@@ -70,25 +71,37 @@ MOST_PARTS = 5
 """Largest number of parameters that are listed of a combination."""
 
 
-def render_tool(calibration: Calibration) -> RenderableType:
+@dataclass(frozen=True, slots=True)
+class FurtherHour:
+    """Expected tool errors after another hour with each usual sensor, all errors corrected."""
+
+    rms: float
+    """Without it, [m]; NaN where it cannot be computed."""
+    gains: tuple[SensorGain, ...]
+
+
+def render_tool(calibration: Calibration, further: FurtherHour) -> RenderableType:
     """Tool errors over the workspace."""
     try:
-        return render_accuracy(calibration, assess_tool(calibration))
+        return render_accuracy(calibration, assess_tool(calibration), further)
     except (ClosureError, RobotError) as e:
         return Text(f"The tool error cannot be computed: {e}.")
 
 
-def print_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> None:
+def print_accuracy(calibration: Calibration, accuracy: ToolAccuracy, further: FurtherHour) -> None:
     """Print the tool errors over a region."""
-    print_rich(render_accuracy(calibration, accuracy))
+    print_rich(render_accuracy(calibration, accuracy, further))
 
 
-def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> RenderableType:
+def render_accuracy(
+    calibration: Calibration, accuracy: ToolAccuracy, further: FurtherHour
+) -> RenderableType:
     """Tool errors over a region.
 
     Args:
         calibration: The calibration.
         accuracy: Its tool errors.
+        further: Expected tool errors after another hour.
     """
     rows = [("identified error, now", accuracy.measure(accuracy.deviation))]
     keep = assessment_of(calibration).keeps_offsets
@@ -127,26 +140,27 @@ def render_accuracy(calibration: Calibration, accuracy: ToolAccuracy) -> Rendera
                 )
                 notes += describe_use_parts(summary)
         notes += describe_remaining(find_remaining_errors(calibration, accuracy, count=2))
-        notes += _describe_sensors(calibration, accuracy)
+        notes += describe_gains(further.gains, further.rms, now=False)
     return noted(table_of(headers, cells), *notes)
 
 
-def _describe_sensors(calibration: Calibration, accuracy: ToolAccuracy) -> list[str]:
-    """Tool errors after an hour with each sensor that helps, as sentences."""
-    rms, gains = _find_gains(calibration, accuracy)
-    return describe_gains(gains, rms, now=False)
+def describe_undetermined(
+    calibration: Calibration, further: FurtherHour | None = None
+) -> list[str]:
+    """Offsets that the readings do not determine, and the sensor that helps, as sentences.
 
-
-def describe_undetermined(calibration: Calibration) -> list[str]:
-    """Offsets that the readings do not determine, and the sensor that helps, as sentences."""
+    Args:
+        calibration: The calibration.
+        further: Expected tool errors after another hour; by default computed if needed.
+    """
     drives = [d.name for d in calibration.robot.drives]
     free = {p.name: p for p in calibration.free if p.prior}
     offsets = {d: free[f"{d}.offset"] for d in drives if f"{d}.offset" in free}
     unknown = [d for d, p in offsets.items() if p.std > DETERMINED * p.prior_std]
     if not unknown:
         return []
-    rms, gains = _find_gains(calibration)
-    return [describe_remedy(unknown, gains, rms)]
+    further = expect_further_hour(calibration) if further is None else further
+    return [describe_remedy(unknown, further.gains, further.rms)]
 
 
 def describe_remedy(drives: Sequence[str], gains: Iterable[SensorGain], rms: float) -> str:
@@ -158,19 +172,21 @@ def describe_remedy(drives: Sequence[str], gains: Iterable[SensorGain], rms: flo
     return f"These readings do not determine the offset of {joined(drives)}. {remedy}"
 
 
-def _find_gains(
+def expect_further_hour(
     calibration: Calibration, accuracy: ToolAccuracy | None = None
-) -> tuple[float, tuple[SensorGain, ...]]:
-    """Expected tool error with all errors corrected, [m], and gains of an hour with each sensor.
+) -> FurtherHour:
+    """Expected tool errors after another hour with each usual sensor, all errors corrected.
 
     To first order about the nominal machine. No gains where they cannot be computed.
 
     Args:
         calibration: The calibration.
-        accuracy: Its tool errors over a region; by default the workspace of the robot.
+        accuracy: Its tool errors over a stated region or under stated conditions; by default the
+            workspace of the robot and its conditions of use.
     """
+    nothing = FurtherHour(math.nan, ())
     if calibration.only_offsets:
-        return math.nan, ()
+        return nothing
     session = restore_session(calibration)
     parameters, scale = session.robot.parameters, calibration.tolerance_scale
     selection = select_parameters(
@@ -182,9 +198,10 @@ def _find_gains(
         session = state_noise(session)
         forecast = ToolForecast(session.robot, selection, workspace, use=use)
         expected = forecast.about_nominal(session)
-        return expected.reported.rms, find_sensor_gains(forecast, session, expected)
+        gains = find_sensor_gains(forecast, session, expected)
     except OrthocalError:  # the noise of the readings is unknown, or no drives command the tool
-        return math.nan, ()
+        return nothing
+    return FurtherHour(expected.reported.rms, gains)
 
 
 def helpful_gains(gains: Iterable[SensorGain], rms: float, least: float) -> list[SensorGain]:

@@ -30,7 +30,7 @@ from orthocal.calibration.assessment_record import (
 )
 from orthocal.calibration.calibration import Calibration
 from orthocal.measurement.joining import name_within
-from orthocal.output.text.accuracy import describe_undetermined
+from orthocal.output.text.accuracy import FurtherHour, describe_undetermined
 from orthocal.output.text.layout import (
     EXPANDED,
     bullets,
@@ -73,7 +73,11 @@ MORE = "--details prints all readings, residuals, parameters and tool errors."
 
 
 def render_answer(
-    calibration: Calibration, *, heading: bool = True, saved: Path | None = None
+    calibration: Calibration,
+    *,
+    heading: bool = True,
+    saved: Path | None = None,
+    further: FurtherHour | None = None,
 ) -> RenderableType:
     """The short answer.
 
@@ -81,6 +85,7 @@ def render_answer(
         calibration: The calibration.
         heading: Whether to begin with the machine and its readings.
         saved: Directory in which the calibration was written, for the next step.
+        further: Expected tool errors after another hour; by default computed if needed.
     """
     assessment = assessment_of(calibration)
     parts: list[RenderableType] = [render_subject(calibration), Text()] if heading else []
@@ -95,7 +100,7 @@ def render_answer(
         parts += [_indented(render_backlash(calibration)), Text()]
     parts += _tool(calibration, assessment)
     notes = [f.words for f in _listed(calibration, assessment)]
-    parts.append(bullets([*notes, *describe_undetermined(calibration)]))
+    parts.append(bullets([*notes, *describe_undetermined(calibration, further)]))
     return Group(*parts, render_next(*_next_step(calibration, assessment, saved)))
 
 

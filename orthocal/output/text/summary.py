@@ -99,19 +99,20 @@ def render_calibration(
     saved: Path | None = None,
 ) -> RenderableType:
     """A calibration as rich renderables: the short answer, and on demand the details."""
-    answer = render_answer(calibration, saved=saved)
     if not (details or all_rows):
-        return Group(answer, Text(MORE))
+        return Group(render_answer(calibration, saved=saved), Text(MORE))
     from orthocal.output.text import tables
-    from orthocal.output.text.accuracy import render_tool
+    from orthocal.output.text.accuracy import expect_further_hour, render_tool
 
+    further = expect_further_hour(calibration)
+    answer = render_answer(calibration, saved=saved, further=further)
     sections: dict[str, RenderableType | None] = {
         "Method": render_method(calibration),
         "Parameters": tables.render_parameters(calibration, all_rows=all_rows),
         "Readings": tables.render_readings(calibration, all_rows=all_rows),
         "Residuals": tables.render_fit(calibration),
         "Gauges and sensors": tables.render_sensors(calibration),
-        "Tool error": render_tool(calibration),
+        "Tool error": render_tool(calibration, further),
         "Findings": tables.render_findings(calibration),
         name_values(calibration): render_values(calibration),
         "For research": tables.render_identifiability(calibration, all_rows=all_rows),
