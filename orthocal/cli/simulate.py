@@ -6,7 +6,6 @@ import orthocal
 from orthocal.cli.files import state_conditions
 from orthocal.cli.options import (
     Day,
-    Effects,
     Error,
     Errors,
     Force,
@@ -32,7 +31,7 @@ def simulate(
     error: Error = None,
     errors: Errors = None,
     draw: str | None = None,
-    effects: Effects = None,
+    effects: str | None = None,
     temperature: Day = None,
     tolerance: Tolerances = None,
     exact: bool = False,
@@ -47,8 +46,11 @@ def simulate(
     Args:
         draw (MODEL|GLOBS): Draw normally distributed errors by their tolerances: of a model, or of
             names and globs.
+        effects (EFFECTS): Effects of the machine beside geometry, such as backlash,thermal, or
+            none; default: those that the plan states, else those of the robot.
         exact: Without noise, gauge zeros and rounding.
     """
+    from orthocal.observation.sensor_groups import nuisance_parameters
     from orthocal.observation.simulate import collect_errors, truth_document
     from orthocal.robot.parameters import errors_at
 
@@ -64,6 +66,7 @@ def simulate(
         file=errors,
         single=error or [],
         draw=draw,
+        nuisance=nuisance_parameters(planned).parameters,
         seed=seed,
     )
     simulated = orthocal.simulate_session(planned, true_errors, seed=seed, exact=exact)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
@@ -20,7 +20,7 @@ from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import Observations, build_observations
 from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.robot.model import Robot
-from orthocal.robot.parameters import errors_at
+from orthocal.robot.parameters import Parameter, ParameterSet, errors_at
 from orthocal.session.session import Reading, Session
 from orthocal.units import MM, to_mm
 
@@ -93,10 +93,12 @@ def simulate_session(
 
     Args:
         plan: Setups, postures and rows.
-        errors: Parameter name to value, [SI]; absent ones are 0.
-        seed: Seed of noise and gauge zeros.
+        errors: Parameter name to value, [SI]; absent ones are 0. Nuisance parameters of the plan's
+            setups are drawn where they are absent.
+        seed: Seed of noise, gauge zeros and nuisance parameters.
         sigma: Standard deviation of a reading, [m]; the plan's gauge by default.
-        exact: No noise, no mounting errors and no rounding; the first reading of each setup is 0.
+        exact: No noise, no rounding and no mounting errors but stated ones; the first reading of
+            each setup is 0.
 
     Raises:
         SessionError: If the noise is not stated, or a reading does not exist or leaves the gauge's
@@ -117,7 +119,11 @@ def simulate_session(
         normal = np.random.default_rng((seed, 1)).normal(size=len(nuisance))
         drawn = normal * [p.prior_std for p in nuisance]
         drawn = np.where([p.positive for p in nuisance], np.abs(drawn), drawn)
-    entries = predict_readings(plan, errors, observations=observations, nuisance=drawn)
+    truth = {p.name: errors.get(p.name, float(v)) for p, v in zip(nuisance, drawn, strict=True)}
+    of_machine = {name: value for name, value in errors.items() if name not in truth}
+    entries = predict_readings(
+        plan, of_machine, observations=observations, nuisance=np.array(list(truth.values()))
+    )
     entries, zeros = show_readings(plan, observations, entries, rng=rng, sigma=sigma, exact=exact)
     rows = observations.rows(entries)
     _require_readable(plan, rows)
@@ -132,8 +138,7 @@ def simulate_session(
         readings_path=None,
         seed=seed,
     )
-    truth = {p.name: float(v) for p, v in zip(nuisance, drawn, strict=True)}
-    return SimulatedSession(session, dict(errors), zeros, truth)
+    return SimulatedSession(session, of_machine, zeros, truth)
 
 
 def _require_readable(plan: Session, rows: Array) -> None:
@@ -249,7 +254,7 @@ def load_errors(path: str | Path, robot: Robot) -> dict[str, float]:
     file = Path(path)
     data = read_yaml(file, error=ParameterError)
     keys = validate(_TruthKeys, data, where=str(file), error=ParameterError)
-    return read_errors(keys.errors, robot, where=f"{file}: errors")
+    return read_errors(keys.errors, robot.parameters, where=f"{file}: errors")
 
 
 def collect_errors(
@@ -258,6 +263,7 @@ def collect_errors(
     file: Path | None = None,
     single: Sequence[str] = (),
     draw: str | None = None,
+    nuisance: Iterable[Parameter] = (),
     seed: int = 0,
 ) -> dict[str, float]:
     """Errors drawn from priors, from a file and from single values; later ones win.
@@ -267,6 +273,7 @@ def collect_errors(
         file: As for `load_errors`.
         single: Texts such as x_slide.offset_mm=1.2.
         draw: Model of the robot, or names and globs separated by commas, to draw.
+        nuisance: Nuisance parameters of a plan, which single values may state, too.
         seed: Seed of the random numbers.
 
     Raises:
@@ -293,18 +300,21 @@ def collect_errors(
             ) from None
     if file is not None:
         errors.update(load_errors(file, robot))
+    parameters = ParameterSet((), (*robot.parameters, *nuisance))
     for text in single:
         key, equals, number = text.partition("=")
         if not equals:
             raise ParameterError(f"found '{text}'; expected NAME=VALUE", where="--error")
         value = parse_number(number, where="--error", name=key, error=ParameterError)
-        errors.update(read_errors({key: value}, robot, where="--error"))
+        errors.update(read_errors({key: value}, parameters, where="--error"))
     if not errors:
         raise ParameterError("no errors: give them by --errors, --error or --draw")
     return errors
 
 
-def read_errors(values: Mapping[str, float], robot: Robot, *, where: str) -> dict[str, float]:
+def read_errors(
+    values: Mapping[str, float], parameters: ParameterSet, *, where: str
+) -> dict[str, float]:
     """Errors from keys that carry their unit, [SI].
 
     Raises:
@@ -313,7 +323,7 @@ def read_errors(values: Mapping[str, float], robot: Robot, *, where: str) -> dic
     errors: dict[str, float] = {}
     for key, value in values.items():
         with errors_at(where):
-            name, si = robot.parameters.read_quantity(key, value)
+            name, si = parameters.read_quantity(key, value)
         if name in errors:
             raise ParameterError(f"'{name}' is given twice", where=where)
         errors[name] = si

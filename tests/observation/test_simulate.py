@@ -13,6 +13,7 @@ from orthocal import draw_errors, load_plan, load_session, simulate_session
 from orthocal.errors import ParameterError, SessionError
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations
+from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.observation.simulate import collect_errors, load_errors, truth_document
 
 ERRORS = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
@@ -100,6 +101,26 @@ def test_errors_are_drawn_then_read_then_given(tmp_path, orthoglide):
     assert (
         found["z_slide.offset"] == draw_errors(orthoglide, ["*.offset"], seed=4)["z_slide.offset"]
     )
+
+
+def test_a_setup_has_the_nuisance_parameter_that_is_stated(plan):
+    """The others are drawn as without it."""
+    setup = next(iter(plan.setups))
+    name = f"setup.{setup}.roll"
+    nuisance = nuisance_parameters(plan).parameters
+    single = [f"{name}_mrad=200"]
+    mounting = collect_errors(plan.robot, single=single, nuisance=nuisance)
+    assert mounting == {name: pytest.approx(0.2)}
+    stated = simulate_session(plan, {**ERRORS, **mounting}, seed=3)
+    drawn = simulate_session(plan, ERRORS, seed=3)
+    assert stated.nuisance == {**drawn.nuisance, **mounting}
+    assert stated.errors == ERRORS
+    of_setup = np.array([r.setup == setup for r in plan.readings])
+    changed = stated.session.values != drawn.session.values
+    assert changed[of_setup].any()
+    assert not changed[~of_setup].any()
+    with pytest.raises(ParameterError, match="--error"):
+        collect_errors(plan.robot, single=single)
 
 
 def test_readings_beyond_the_gauge_are_refused(plan):
