@@ -29,9 +29,7 @@ from orthocal.io.documents import Number, read_yaml, validate
 from orthocal.io.files import exists, read_file, sync_folder, write_file
 from orthocal.io.journal import Journal, open_journal_file
 from orthocal.measurement.files.point_rows import (
-    base_name,
     find_point,
-    gather_points,
     locate_stations,
 )
 from orthocal.measurement.files.readings_checks import check_conditions, check_range
@@ -41,6 +39,7 @@ from orthocal.measurement.files.write_session import readings_table
 from orthocal.runtime.interrupts import postponed_interrupt
 from orthocal.sensors.points import Coordinate
 from orthocal.sensors.protocol import largest_reading
+from orthocal.session.points import base_name, gather_points
 from orthocal.session.session import Conditions, Reading, ReadingKey, Session
 from orthocal.units import MM, to_mm
 

@@ -12,6 +12,7 @@ import numpy as np
 from orthocal.effects.loading import neutral_values, robot_effects
 from orthocal.effects.protocol import Condition
 from orthocal.robot.model import Robot
+from orthocal.session.points import gather_points, names_in_files
 from orthocal.session.session import Conditions, Session
 
 MINUTES_A_SETUP = 10.0
@@ -42,7 +43,7 @@ def in_course(
 ) -> Session:
     """Session whose readings were taken one after the other on a day that warms or cools evenly.
 
-    Differences have no conditions.
+    Differences have no conditions. The coordinates of a point are read at once.
 
     Args:
         session: The session; approaches stay what they are.
@@ -51,13 +52,15 @@ def in_course(
         durations: Minutes to mount a gauge and to read it, by its name; by default usual ones.
         start: Time of the first reading.
     """
-    setups = [r.setup for r in session.readings]
+    lines = gather_points(session.readings, session.setups)
+    names = {n: names_in_files(s) for n, s in session.setups.items()}
+    setups = [names[line[0].setup][0] for line in lines]
     if not setups:
         return session
     usual, known = (MINUTES_A_SETUP, MINUTES_A_READING), durations or {}
-    of_setup = {n: known.get(s.gauge, usual) for n, s in session.setups.items()}
+    of_setup = {name: known.get(gauge, usual) for name, gauge in names.values()}
     steps = [of_setup[a][1] + of_setup[b][0] * (a != b) for a, b in pairwise(setups)]
-    minutes = np.cumsum([0.0, *steps])
+    minutes = np.repeat(np.cumsum([0.0, *steps]), [len(line) for line in lines])
     neutral = neutral_values(session.robot)["temperature"]
     first, last = temperatures or (neutral, neutral)
     warmth = np.interp(minutes, [0.0, max(float(minutes[-1]), 1e-9)], [first, last])

@@ -29,6 +29,7 @@ from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.direction import Direction
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.tips import Tip
+from orthocal.session.points import names_in_files
 from orthocal.session.session import Conditions, Gauge, Posture, Reading, Session, Setup
 from orthocal.statistics.noise import noise_floor
 from orthocal.units import MM
@@ -60,6 +61,9 @@ ZERO_PRIOR = 0.01
 FEWEST = 2
 """Fewest readings of a setup: one alone only determines the gauge zero."""
 
+FEWEST_POINTS = 4
+"""Fewest points of a setup: three determine the frame of the instrument."""
+
 MOST_CANDIDATES = 60_000
 
 
@@ -80,12 +84,13 @@ class CandidateSetup:
     name: str
     """Name in the session of candidates."""
     rows: Indices
-    """Rows of its readings, shape (m,)."""
+    """Row of each reading, the first one of a point, shape (m,)."""
     jacobian: Array
-    """Sensitivity of the readings to the state, shape (m, n_state), [m per prior std]; with the
-    gauge aligned on the mean of the postures."""
+    """Sensitivity of the readings to the state, shape (m width, n_state), [m per prior std]; with
+    the gauge aligned on the mean of the postures."""
     covariance: Array
-    """Covariance of the readings from the setup's nuisance parameters and zero, (m, m), [m²]."""
+    """Covariance of the readings from the setup's nuisance parameters and zero, shape
+    (m width, m width), [m²]."""
     reachable: NDArray[np.bool_]
     """Whether a gauge that begins in one reading (row) has another (column) in its range,
     shape (m, m)."""
@@ -94,10 +99,23 @@ class CandidateSetup:
     """Whether the gauge zero is known."""
     gauge: str = ""
     """Name of its gauge."""
+    width: int = 1
+    """Numbers that the gauge shows in a posture: 3 for a point, in successive rows."""
+
+    @property
+    def fewest(self) -> int:
+        """Fewest readings of a setup."""
+        return FEWEST if self.width == 1 else FEWEST_POINTS
+
+    def numbers(self, chosen: Sequence[int] | Indices) -> Indices:
+        """Indices in the Jacobian of some readings, shape (..., n_chosen width)."""
+        first = np.asarray(chosen, dtype=np.int64)[..., None] * self.width
+        every = first + np.arange(self.width)
+        return every.reshape(*every.shape[:-2], every.shape[-2] * self.width)
 
     def jacobian_of(self, chosen: Sequence[int]) -> Array:
-        """Jacobian of some readings, the gauge aligned in the first, (n_chosen, n_state)."""
-        rows = list(chosen)
+        """Jacobian of some readings, the gauge aligned in the first, (n_chosen width, n_state)."""
+        rows = self.numbers(chosen)
         jacobian = self.jacobian[rows]
         for a in self.aligned:
             jacobian = jacobian + np.outer(a.sensitivity[rows], a.jacobian[rows[0]])
@@ -165,12 +183,13 @@ def list_candidates(robot: Robot, equipment: Equipment, *, reference: str = "") 
         setups=setups,
         readings=tuple(readings),
     )
-    if session.readings:
-        session = _with_approaches(_touching(_with_lateral_positions(session)))
     gauges, further, of_tool, more = tool
+    if session.readings:  # the noise is that of the first gauge
+        session = _with_approaches(_touching(_with_lateral_positions(session)))
+        gauges = {**session.gauges, **gauges}
     return replace(
         session,
-        gauges={**session.gauges, **gauges},
+        gauges=gauges,
         postures={**session.postures, **further},
         setups={**session.setups, **of_tool},
         readings=(*session.readings, *more),
@@ -194,12 +213,14 @@ def measure_candidates(
     owners = [name.rpartition(".")[0] for name in problem.free]
     common = [i for i, owner in enumerate(owners) if i < n or owner not in private]
     setups, needed, aligned_of = [], [], _list_aligned(session, problem)
-    aligned_at = session.alignment_postures
-    for k, name in enumerate(session.setups):
-        rows = np.flatnonzero(o.setup == k)
-        if rows.size < FEWEST:
+    aligned_at, order = session.alignment_postures, list(session.setups)
+    for parts in _find_parts(session):
+        width, name = len(parts), parts[0].name
+        rows = np.flatnonzero(np.isin(o.setup, [order.index(p.name) for p in parts]))
+        if rows.size < FEWEST * width:
             continue
-        of_setup = [i for i in range(n, len(owners)) if owners[i] == f"setup.{name}"]
+        own = {f"setup.{part.name}" for part in parts}
+        of_setup = [i for i in range(n, len(owners)) if owners[i] in own]
         shared, mine = jacobian[rows][:, common], jacobian[rows][:, of_setup]
         aligned = []
         for index, seen in aligned_of.get(name, ()):
@@ -209,23 +230,34 @@ def measure_candidates(
             at = [session.readings[i].posture for i in rows].index(aligned_at[name])
             shared -= np.outer(sensitivity, moved[at])  # the session aligns the gauge there
             aligned.append(AlignedParameter(sensitivity, moved))
-        spread, ratio = mine @ mine.T, float(problem.noise_ratio[rows[0]])
-        absolute = session.setups[name].zero == "known"
-        of_gauge = session.setups[name].gauge
-        gauge = session.gauges[of_gauge]
-        # the operator places a fixed ball so that its first reading is in the middle of the range
-        unknown = spare_range * ratio * _difference_std(shared, spread)
-        needed.append(float(unknown.max()))
-        reachable = _find_reachable(gauge, ratio * h[rows], unknown)
-        covariance = spread + (0.0 if absolute else (ZERO_PRIOR / ratio) ** 2)
-        setups.append(
-            CandidateSetup(
-                name, rows, shared, covariance, reachable, tuple(aligned), absolute, of_gauge
-            )
+        covariance, absolute = mine @ mine.T, parts[0].zero == "known"
+        reachable = np.ones((rows.size // width, rows.size // width), dtype=np.bool_)
+        for c, part in enumerate(parts):
+            of_part, ratio = slice(c, None, width), float(problem.noise_ratio[rows[c]])
+            spread = covariance[of_part, of_part]
+            # the operator places a fixed ball so that its first reading is in the middle of the
+            # range
+            unknown = spare_range * ratio * _difference_std(shared[of_part], spread)
+            needed.append(float(unknown.max()))
+            gauge = session.gauges[part.gauge]
+            reachable &= _find_reachable(gauge, ratio * h[rows[of_part]], unknown)
+            spread += 0.0 if absolute else (ZERO_PRIOR / ratio) ** 2
+        candidate = CandidateSetup(
+            *(name, rows[::width], shared, covariance, reachable, tuple(aligned), absolute),
+            *(names_in_files(parts[0])[1], width),
         )
+        setups.append(candidate)
     state = tuple(problem.free[i] for i in common)
     typical = float(np.median(needed)) if needed else 0.0
     return Candidates(session, problem, tuple(setups), sigma, state, typical)
+
+
+def _find_parts(session: Session) -> list[list[Setup]]:
+    """Setups that are read together: the three of points, or one."""
+    parts: dict[str, list[Setup]] = {}
+    for setup in session.setups.values():
+        parts.setdefault(names_in_files(setup)[0], []).append(setup)
+    return list(parts.values())
 
 
 def _list_aligned(

@@ -36,7 +36,7 @@ class Stage:
 
 
 def compute_curve(search: TimedSearch, each: int | None, planned: int) -> tuple[Stage, ...]:
-    """Expected error after each setup, added one after the other.
+    """Expected error after each setup that is added, or enlarged.
 
     It depends on the number of setups of the plan in its length alone.
 
@@ -51,7 +51,8 @@ def compute_curve(search: TimedSearch, each: int | None, planned: int) -> tuple[
     try:
         for n, plan in enumerate(islice(grown, MOST_SETUPS), 1):
             readings = sum(len(s.chosen) for s in plan.setups)
-            stages.append(Stage(n, readings, search.minutes(plan.setups), plan.error))
+            setups = len(plan.setups)
+            stages.append(Stage(setups, readings, search.minutes(plan.setups), plan.error))
             if n >= fewest and find_enough(stages) is not None:
                 break
     except ParameterError:  # a setup of that many readings is not possible

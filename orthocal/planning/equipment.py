@@ -29,6 +29,7 @@ from orthocal.sensors.direction import Direction
 from orthocal.sensors.leg_indicator import LegIndicator, Section
 from orthocal.sensors.mounting import USUAL, Mounting, MountingKeys
 from orthocal.sensors.tips import Tip
+from orthocal.session.points import names_in_files, one_row_a_point
 from orthocal.session.session import Gauge, Posture, Session
 
 REACH = 0.1
@@ -113,17 +114,18 @@ class Equipment:
         """Duration of setups and readings with each gauge of a session."""
         usual = Duration(self.minutes_a_setup, self.minutes_a_reading)
         known = {sensor.name: sensor.duration for sensor in self.owned}
-        return {name: known.get(name, usual) for name in session.gauges}
+        used = [session.gauges, [names_in_files(s)[1] for s in session.setups.values()]]
+        return {name: known.get(name, usual) for name in itertools.chain(*used)}
 
     @property
     def once(self) -> frozenset[str]:
-        """Sensors of which a plan has one setup at most."""
-        return frozenset(s.name for s in self.owned if s.keys["sensor"] == "probe")
+        """Sensors of which a plan has one setup at most: they see the same in each."""
+        return frozenset(s.name for s in self.owned if s.keys["sensor"] in ("probe", "points"))
 
     def minutes_of(self, plan: Session) -> float:
         """Duration of a session's setups and readings."""
-        durations = self.durations(plan)
-        of_setup = {name: durations[setup.gauge] for name, setup in plan.setups.items()}
+        durations, plan = self.durations(plan), one_row_a_point(plan)
+        of_setup = {n: durations[names_in_files(s)[1]] for n, s in plan.setups.items()}
         setups = sum(duration.setup for duration in of_setup.values())
         return setups + sum(of_setup[r.setup].reading for r in plan.readings)
 

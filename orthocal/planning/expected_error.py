@@ -48,6 +48,9 @@ covariance of the parameters, in prior std."""
 
 CRITERIA: tuple[Criterion, ...] = ("aligned", "relative", "absolute", "worst", "A", "D", "E")
 
+OF_GAUGE = "gauge."
+"""Beginning of the names of parameters that all sessions with a gauge share."""
+
 WORST_POWER = 8.0
 """Power of the mean by which the largest variance of the points is approximated."""
 
@@ -368,13 +371,21 @@ def _root(rows: Array) -> Array:
 
 
 def _information(problem: CalibrationProblem, state: Sequence[str], measured: Session) -> Array:
-    """Information of a session about the state, its other parameters marginalised."""
+    """Information of a session about the state, its other parameters marginalised.
+
+    The places of a session's fixed balls and instruments are not those of further readings.
+    """
     _, jacobian = problem.predict_and_jacobian(problem.active_theta)
     jacobian = project_out_zeros(jacobian, problem.observations)
     information = jacobian.T @ jacobian / noise_of(measured) ** 2
-    others = [i for i, name in enumerate(problem.free) if name not in state]
-    state_columns = [problem.free.index(name) for name in state if name in problem.free]
-    where = [i for i, name in enumerate(state) if name in problem.free]
+    lasting = {
+        name
+        for i, name in enumerate(problem.free)
+        if name in state and (i < problem.n_machine or name.startswith(OF_GAUGE))
+    }
+    others = [i for i, name in enumerate(problem.free) if name not in lasting]
+    state_columns = [problem.free.index(name) for name in state if name in lasting]
+    where = [i for i, name in enumerate(state) if name in lasting]
     inner = information[np.ix_(others, others)] + np.diag(
         np.maximum(problem.prior_precision[others], VAGUE)
     )

@@ -5,7 +5,8 @@ the weight of the state at the tool, by
 
     tr[(V_SS + σ² I)⁻¹ Q_SS],  V = A C Aᵀ + D,  Q = A C T C Aᵀ
 
-with A the Jacobian of the readings and D the covariance from the setup's nuisance parameters.
+with A the Jacobian of the readings and D the covariance from the setup's nuisance parameters. A
+reading is one number (`SetupGain`) or a point of three (`PointGain`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocal.arrays import Array, Indices
 from orthocal.planning.candidates import CandidateSetup
@@ -266,3 +268,135 @@ class SetupGain:
         scale = np.maximum(variance, 0.0)
         scale += self.noise
         return np.asarray(np.vecdot(effect, effect) / scale)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointGain:
+    """Gain of points of one candidate setup, given all other information.
+
+    The methods are those of `SetupGain`; a point is a block of w rows of A. The instrument is not
+    aligned to the machine.
+    """
+
+    setup: CandidateSetup
+    spread: Array
+    """V, shape (m w, m w), [m²]."""
+    effect: Array
+    """A C R, shape (m w, p)."""
+    noise: float
+    """σ²."""
+
+    @staticmethod
+    def of(setup: CandidateSetup, covariance: Array, root: Array, sigma: float) -> PointGain:
+        """Gain of points; arguments as those of `SetupGain.of`."""
+        spread = setup.jacobian @ covariance @ setup.jacobian.T + setup.covariance
+        return PointGain(setup, spread, setup.jacobian @ root, sigma**2)
+
+    def begun(self, first: int) -> PointGain:
+        """Gain with a first point, which makes no difference."""
+        del first
+        return self
+
+    def gains(self, sets: Indices) -> Array:
+        """Gains of sets of points, shape (n_sets,)."""
+        at = self.setup.numbers(sets)
+        spread = self.spread[at[:, :, None], at[:, None, :]] + self.noise * np.eye(at.shape[1])
+        effect = self.effect[at]
+        return np.asarray((effect * np.linalg.solve(spread, effect)).sum(axis=(1, 2)))
+
+    def exchange_gains(self, rows: list[int]) -> Array:
+        """Gain of each point in place of each of those chosen, beside the others, shape (k, m).
+
+        As for single readings, with blocks: leaving point p out changes W by −W_·p W_pp⁻¹ W_p·.
+        """
+        at, k, w = self.setup.numbers(rows), len(rows), self.setup.width
+        inverse = np.linalg.inv(self.spread[np.ix_(at, at)] + self.noise * np.eye(at.size))
+        solved, weighted = inverse @ self.spread[at], inverse @ self.effect[at]
+        effect = self.effect - solved.T @ self.effect[at]
+        known = self.spread[at].reshape(k * w, -1, w), solved.reshape(k * w, -1, w)
+        spread = self._blocks(self.spread) - np.einsum("sib,sic->ibc", *known)
+        own = np.linalg.inv(self._blocks(np.asarray(inverse)))
+        of_point = solved.reshape(k, w, -1, w)
+        share = np.einsum("paib,pac->pibc", of_point, own)
+        weighted = weighted.reshape(k, w, -1)
+        rows_of_point = effect.reshape(-1, w, effect.shape[1])
+        cross = np.einsum("ibr,pcr->pibc", rows_of_point, weighted, optimize=True)
+        half = np.einsum("pibc,pidc->pibd", cross, share)
+        square = np.einsum("pcr,pdr->pcd", weighted, weighted)
+        gains = np.einsum("ibr,icr->ibc", rows_of_point, rows_of_point) + 2.0 * half
+        gains += np.einsum("pibc,pcd,pied->pibe", share, square, share, optimize=True)
+        spread = spread + np.einsum("pibc,pcid->pibd", share, of_point)
+        return self._trace(gains, spread)
+
+    def best_pairs(self, pairs: Pairs, most: int) -> list[tuple[float, tuple[int, int]]]:
+        """Points of largest gain, each with the best one beside it; the pairs share no point.
+
+        Args:
+            pairs: Possible pairs.
+            most: Number of pairs.
+        """
+        allowed = np.zeros_like(self.setup.reachable)
+        allowed.reshape(-1)[pairs.flat] = True
+        blocks = self.effect.reshape(len(allowed), -1, self.effect.shape[1])
+        gains = self._trace(np.einsum("ibr,icr->ibc", blocks, blocks), self._blocks(self.spread))
+        ranked: list[tuple[float, tuple[int, int]]] = []
+        while len(ranked) < most and allowed.any():
+            first = first_largest(np.where(allowed.any(axis=1), gains, -1.0))
+            both, (_, second) = self._grow((first,), 2, ~allowed[first])
+            ranked.append((both[-1], (first, second)))
+            allowed[[first, second]] = False
+            allowed[:, [first, second]] = False
+        return ranked
+
+    def complete(self, pair: tuple[int, int], count: int) -> tuple[float, tuple[int, ...]]:
+        """Add points greedily to a pair, with the gain of all of them."""
+        gains, chosen = self.grow(pair, count)
+        return gains[-1], chosen
+
+    def grow(self, pair: tuple[int, int], count: int) -> tuple[tuple[float, ...], tuple[int, ...]]:
+        """Add points greedily to a pair, with the gains of the first one, of two, and so on."""
+        return self._grow(pair, count, ~self.setup.reachable[pair[0]])
+
+    def _grow(
+        self, begun: tuple[int, ...], count: int, refused: NDArray[np.bool_]
+    ) -> tuple[tuple[float, ...], tuple[int, ...]]:
+        """Add points to others: each is w more columns of the Cholesky factor of V."""
+        w, effect, variance = self.setup.width, self.effect, self._blocks(self.spread)
+        steps = np.empty((count * w, len(self.spread)))
+        chosen, gains = list(begun), list[float]()
+        refused = refused.copy()
+        for k in range(count):
+            if k >= len(chosen):
+                refused[chosen] = True
+                blocks = effect.reshape(len(variance), w, -1)
+                single = self._trace(np.einsum("ibr,icr->ibc", blocks, blocks), variance)
+                best = first_largest(np.where(refused, -1.0, single))
+                if refused[best]:
+                    break
+                chosen.append(best)
+            at, before = self.setup.numbers([chosen[k]]), steps[: k * w]
+            column = self.spread[at] - before[:, at].T @ before
+            root = np.linalg.cholesky(column[:, at] + self.noise * np.eye(w))
+            step = steps[k * w : (k + 1) * w] = np.linalg.solve(root, column)
+            share = np.linalg.solve(root, effect[at])
+            gains.append(float(np.vdot(share, share)) + (gains[-1] if gains else 0.0))
+            effect = effect - step.T @ share
+            of_point = step.reshape(w, -1, w)
+            variance = variance - np.einsum("sib,sic->ibc", of_point, of_point)
+        return tuple(gains), tuple(chosen)
+
+    def _blocks(self, matrix: Array) -> Array:
+        """Blocks of each point on the diagonal of a matrix, shape (m, w, w)."""
+        w = self.setup.width
+        points = np.arange(len(matrix) // w)
+        return np.asarray(matrix.reshape(points.size, w, points.size, w)[points, :, points])
+
+    def _trace(self, gains: Array, spread: Array) -> Array:
+        """tr[(V + σ² I)⁻¹ Q] of blocks, shape (..., w, w) each."""
+        noise = self.noise * np.eye(self.setup.width)
+        solved = np.linalg.solve(spread + noise, gains)
+        return np.asarray(np.trace(solved, axis1=-2, axis2=-1))
+
+
+Gain = SetupGain | PointGain
+"""Gain of readings of one candidate setup."""

@@ -43,6 +43,7 @@ class Duration(NamedTuple):
 
 DURATIONS = {
     "ball_bar": Duration(10.0, 0.5),
+    "points": Duration(20.0, 0.5),
     "probe": Duration(2.0, 0.1),
     "tool_indicator": Duration(10.0, 0.5),
 }
@@ -72,6 +73,7 @@ PLACED: Mapping[str, Mapping[str, Any]] = {
     "ball_bar": {"centre_mm": [0.0, 0.0, 0.0], "ball": "ball"},
     "tool_indicator": {"direction": "x"},
     "probe": {},
+    "points": {"station": "station"},
 }
 """Kinds of sensor that a plan places, with the keys that the plan chooses, and values of them with
 which the other keys are checked."""
@@ -84,8 +86,8 @@ PLACED_ARTEFACTS: Mapping[str, Mapping[str, Any]] = {
 }
 """Kinds of artefact, with such keys of them."""
 
-CHOSEN = ("gauge", "postures", "aligned_at")
-"""Keys of every setup that the plan chooses."""
+CHOSEN = ("gauge", "postures", "aligned_at", "axis")
+"""Keys of every setup that the plan chooses, or that no file of a session may have."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,11 +114,6 @@ def load_owned_sensor(path: str | Path) -> OwnedSensor:
     """
     file = Path(path)
     data = read_yaml(file, error=SessionError)
-    if isinstance(data, dict) and data.get("sensor") == "points":
-        raise SessionError(
-            "a plan does not place points; write their setup and postures into a session.yaml",
-            where=f"{file}: sensor",
-        )
     if not isinstance(data, dict) or data.get("sensor") not in list(PLACED):
         raise SessionError(
             f"expected the key sensor: {' or '.join(PLACED)}, and those of the sensor",

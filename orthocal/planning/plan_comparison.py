@@ -17,6 +17,7 @@ from orthocal.planning.planned_session import build_session
 from orthocal.planning.selection import PlannedSetup
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.tips import Tip
+from orthocal.session.points import one_row_a_point
 from orthocal.session.session import Gauge, Session
 
 MIDDLE = 0.5
@@ -74,12 +75,14 @@ class Comparison:
         ends of the travel to either side, repeated. And evenly spaced postures on the same lines.
         """
         setups = self._middle_setups()
+        if not setups:
+            return ()
         count, total = len(self.plan.setups), len(self.plan.readings)
         if self.equipment.owned:  # setups of the paper's gauges in the same time
             minutes = self.equipment.minutes_of(self.plan)
             count = max(int(minutes / self.equipment.minutes(1, PAPER_READINGS)), 1)
             total = PAPER_READINGS * count
-        chosen = [setups[i % len(setups)] for i in range(count)] if setups else []
+        chosen = [setups[i % len(setups)] for i in range(count)]
         each = [total // count + (i < total % count) for i in range(count)]
         lines = [self._line(setup) for setup in chosen]
         plans = []
@@ -126,9 +129,9 @@ class Comparison:
         return tuple(alternatives)
 
     def _assess(self, name: str, session: Session, *, in_range: bool = True) -> Alternative:
-        minutes = self.equipment.minutes_of(session)
+        minutes, rows = self.equipment.minutes_of(session), one_row_a_point(session)
         expected = self._expect(session) if in_range else None
-        return Alternative(name, len(session.setups), len(session.readings), minutes, expected)
+        return Alternative(name, len(rows.setups), len(rows.readings), minutes, expected)
 
     def _middle_setups(self) -> list[CandidateSetup]:
         """Setups at mid-leg, with the tip on the rod in the mechanical zero."""

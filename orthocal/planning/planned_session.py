@@ -11,8 +11,9 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.measurement.motion.motion import state_path_approaches
-from orthocal.planning.candidates import FEWEST, Candidates
+from orthocal.planning.candidates import Candidates
 from orthocal.planning.selection import PlannedSetup
+from orthocal.session.points import base_name, names_in_files
 from orthocal.session.session import Posture, Reading, Session, Setup
 
 
@@ -27,14 +28,15 @@ def build_session(
     """
     while True:
         plan = _order_readings(candidates, planned, measured)
+        names = dict.fromkeys(names_in_files(s)[0] for s in plan.setups.values())
         unclear = {
-            (r.setup, r.posture)
+            (base_name(r.setup), r.posture)
             for r in plan.readings
             if r.conditions is not None and "u" in (r.conditions.approach or "")
         }
         clear = [
             _without(candidates, setup, {p for s, p in unclear if s == name})
-            for name, setup in zip(plan.setups, _in_order(candidates, planned), strict=True)
+            for name, setup in zip(names, _in_order(candidates, planned), strict=True)
         ]
         if sum(len(s.chosen) for s in clear) == sum(len(s.chosen) for s in planned):
             return plan
@@ -43,9 +45,10 @@ def build_session(
 
 def _without(candidates: Candidates, setup: PlannedSetup, postures: set[str]) -> PlannedSetup:
     """Setup without some postures, if enough others are left."""
-    source, rows = candidates.session, candidates.setups[setup.candidate].rows
-    chosen = tuple(i for i in setup.chosen if source.readings[rows[i]].posture not in postures)
-    return setup if len(chosen) < FEWEST else replace(setup, chosen=chosen)
+    source, candidate = candidates.session, candidates.setups[setup.candidate]
+    of_row = [source.readings[i].posture for i in candidate.rows]
+    chosen = tuple(i for i in setup.chosen if of_row[i] not in postures)
+    return setup if len(chosen) < candidate.fewest else replace(setup, chosen=chosen)
 
 
 def _in_order(candidates: Candidates, planned: Sequence[PlannedSetup]) -> list[PlannedSetup]:
@@ -66,27 +69,34 @@ def _order_readings(
 ) -> Session:
     """Session of planned setups with the approaches that follow from their paths."""
     source = candidates.session
-    used_names = set() if measured is None else set(measured.setups)
+    used_names = set() if measured is None else {base_name(name) for name in measured.setups}
     setups: dict[str, Setup] = {}
     readings: list[Reading] = []
     used: dict[str, Posture] = {}
     for setup in _in_order(candidates, planned):
         candidate = candidates.setups[setup.candidate]
-        name = _setup_name(candidate.name, {*used_names, *setups})
-        rows = [source.readings[i] for i in candidate.rows[list(setup.chosen)]]
-        points = np.array([source.postures[r.posture].values for r in rows])
-        setups[name] = replace(source.setups[candidate.name], name=name, aligned_at=rows[0].posture)
+        base, _ = names_in_files(source.setups[candidate.name])
+        name = _setup_name(base, used_names)
+        used_names.add(name)
+        lines = [source.readings[i : i + candidate.width] for i in candidate.rows[[*setup.chosen]]]
+        first = lines[0][0].posture
+        for r in lines[0]:
+            new = name + r.setup.removeprefix(base)
+            setups[new] = replace(source.setups[r.setup], name=new, aligned_at=first)
+        points = np.array([source.postures[r.posture].values for r, *_ in lines])
         cycles: Counter[tuple[str | None, ...]] = Counter()
-        for row in (*(rows[i] for i in order_postures(points)), rows[0]):
+        for row in (r for i in (*order_postures(points), 0) for r in lines[i]):
             cycles[row.place] += 1
-            readings.append(replace(row, setup=name, cycle=cycles[row.place]))
-        used.update((r.posture, source.postures[r.posture]) for r in rows)
+            new = name + row.setup.removeprefix(base)
+            readings.append(replace(row, setup=new, cycle=cycles[row.place]))
+        used.update((r.posture, source.postures[r.posture]) for r, *_ in lines)
+    gauges = {n for s in setups.values() for n in (s.gauge, names_in_files(s)[1])}
     plan = replace(
         source,
         title="Planned readings",
         setups=setups,
         readings=tuple(readings),
-        gauges={n: g for n, g in source.gauges.items() if n in {s.gauge for s in setups.values()}},
+        gauges={n: g for n, g in source.gauges.items() if n in gauges},
         postures={n: p for n, p in source.postures.items() if n in used},
     )
     if measured is None:

@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from orthocal.arrays import Array
 from orthocal.errors import ParameterError
 from orthocal.planning.candidates import FEWEST, AlignedParameter, Candidates, CandidateSetup
-from orthocal.planning.information_gain import Pairs, SetupGain
+from orthocal.planning.information_gain import Gain, Pairs, PointGain, SetupGain
 from orthocal.planning.ranking import first_largest, is_less, sort_by
 from orthocal.runtime.worker_pool import run_in_parallel
 from orthocal.units import MM
@@ -219,8 +219,8 @@ class SetupSearch:
         for planned in setups:
             if len(planned.chosen) < FEWEST:
                 raise ValueError(f"found {len(planned.chosen)} readings; expected {FEWEST} or more")
-            setup, rows = self.candidates.setups[planned.candidate], planned.chosen
-            jacobian, noise = setup.jacobian_of(rows), self.candidates.sigma**2
+            setup, noise = self.candidates.setups[planned.candidate], self.candidates.sigma**2
+            jacobian, rows = setup.jacobian_of(planned.chosen), setup.numbers(planned.chosen)
             spread = setup.covariance[np.ix_(rows, rows)] + noise * np.eye(len(rows))
             total += jacobian.T @ np.linalg.solve(spread, jacobian)
         return total
@@ -246,7 +246,7 @@ class SetupSearch:
         which = int(rng.integers(len(self.candidates.setups)))
         reachable = self.candidates.setups[which].reachable
         able = np.flatnonzero(reachable.sum(axis=1) >= count)
-        if not able.size:
+        if not able.size or count < self.candidates.setups[which].fewest:
             return None
         first = int(rng.choice(able))
         others = np.flatnonzero(reachable[first])
@@ -302,7 +302,7 @@ class Gains:
     """tr(T C); None where T depends on C."""
     averaged: bool
     """Whether setups are ranked with the alignment averaged over all postures."""
-    computed: dict[tuple[int, int | None, bool], SetupGain] = field(default_factory=dict)
+    computed: dict[tuple[int, int | None, bool], Gain] = field(default_factory=dict)
     """Gains so far, by candidate setup, first reading, and whether alignment is averaged."""
 
     @staticmethod
@@ -316,7 +316,7 @@ class Gains:
         averaged = search.candidates.count > FEW
         return Gains(search, known @ search.basis.T, known @ root, total, averaged)
 
-    def setup(self, which: int, first: int | None = None) -> SetupGain:
+    def setup(self, which: int, first: int | None = None) -> Gain:
         """Gain of a candidate setup, begun with one of its readings."""
         key = which, first if self.search.reduced[which].aligned else None, False
         if key not in self.computed:
@@ -326,7 +326,7 @@ class Gains:
             )
         return self.computed[key]
 
-    def _ranking_setup(self, which: int) -> SetupGain:
+    def _ranking_setup(self, which: int) -> Gain:
         """Gain for ranking: of many candidates with the alignment averaged over all postures.
 
         That takes half the time.
@@ -339,8 +339,9 @@ class Gains:
             self.computed[key] = self._compute(replace(reduced, aligned=()))
         return self.computed[key]
 
-    def _compute(self, setup: CandidateSetup) -> SetupGain:
-        return SetupGain.of(setup, self.covariance, self.root, self.search.candidates.sigma)
+    def _compute(self, setup: CandidateSetup) -> Gain:
+        kind = SetupGain if setup.width == 1 else PointGain
+        return kind.of(setup, self.covariance, self.root, self.search.candidates.sigma)
 
     def _pairs(self, which: int, count: int) -> Pairs:
         key, pairs = (which, count), self.search.pairs
@@ -375,6 +376,8 @@ class Gains:
         """
         completed = []
         for which, pair in self.begin(count):
+            if count < self.search.reduced[which].fewest:
+                continue
             gain, chosen = self.setup(which, pair[0]).complete(pair, count)
             completed.append((gain, PlannedSetup(which, chosen)))
         return [planned for _, planned in sort_by(completed, lambda c: c[0])]

@@ -50,6 +50,16 @@ class _Option(NamedTuple):
     planned: PlannedSetup
 
 
+class _Step(NamedTuple):
+    """A further setup of a growing plan."""
+
+    rate: float
+    """Gain per minute."""
+    others: tuple[PlannedSetup, ...]
+    """Setups that stay."""
+    planned: PlannedSetup
+
+
 def _rate(option: _Option) -> float:
     """Gain per minute."""
     return option.gain / max(option.minutes, SLACK)
@@ -146,11 +156,35 @@ class TimedSearch:
         return self._fill(self.search.empty, minutes)
 
     def grow(self) -> Iterator[PlannedSetups]:
-        """Plans with one setup more each, of the largest gain per minute."""
+        """Plans with one setup more each, or with more readings of a setup that can be used once.
+
+        Each step has the largest gain per minute.
+        """
         plan = self.search.empty
-        while options := self._list_options(plan, UNLIMITED):
-            plan = self._with(plan, best_of(options, _rate).planned)
+        while steps := [*self._additions(plan), *self._enlargements(plan)]:
+            step = best_of(steps, lambda s: s.rate)
+            plan = self._with(self.search.plan_of(step.others), step.planned)
             yield plan
+
+    def _additions(self, plan: PlannedSetups) -> Iterator[_Step]:
+        """Steps that add a setup to a plan."""
+        for option in self._list_options(plan, UNLIMITED):
+            yield _Step(_rate(option), plan.setups, option.planned)
+
+    def _enlargements(self, plan: PlannedSetups) -> Iterator[_Step]:
+        """Steps that give more readings to a setup that can be used once."""
+        for old in plan.setups:
+            gauge = self._gauge(old)
+            if gauge not in self.once:
+                continue
+            others = tuple(s for s in plan.setups if s is not old)
+            without = self.search.plan_of(others)
+            known, used = without.error**2 - plan.error**2, self.minutes([old])
+            alone = replace(self, durations={gauge: self.durations[gauge]})
+            for option in alone._list_options(without, UNLIMITED):
+                if len(option.planned.chosen) > len(old.chosen):
+                    further = max(option.minutes - used, SLACK)
+                    yield _Step((option.gain - known) / further, others, option.planned)
 
     def minutes(self, setups: Sequence[PlannedSetup]) -> float:
         """Minutes of setups with their closing readings."""
@@ -187,7 +221,8 @@ class TimedSearch:
         for which, pair in gains.begin(FEWEST, able):
             gauge = self.search.reduced[which].gauge
             reached, chosen = gains.setup(which, pair[0]).grow(pair, most[gauge])
-            for count in {n for n in READINGS if n < len(chosen)} | {len(chosen)}:
+            counts = {n for n in READINGS if n < len(chosen)} | {len(chosen)}
+            for count in counts - set(range(self.search.reduced[which].fewest)):
                 duration = self.durations[gauge].of(count)
                 planned = PlannedSetup(which, chosen[:count])
                 options.append(_Option(reached[count - 1], duration, planned))

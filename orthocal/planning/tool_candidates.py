@@ -16,8 +16,10 @@ from orthocal.measurement.motion.approach import can_approach, usual_approaches
 from orthocal.planning.equipment import choose_box, place_tool, reachable
 from orthocal.planning.owned_sensors import DIAL, OwnedSensor
 from orthocal.robot.model import Robot
+from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import Sensor, default_zero, tool_path
 from orthocal.sensors.registry import read_setup
+from orthocal.session.points import names_in_files, split_setup
 from orthocal.session.session import Conditions, Gauge, Posture, Reading, Setup
 from orthocal.units import MM
 
@@ -35,6 +37,9 @@ ON_PLATE = 5
 
 ON_BED = 11
 """Positions along each side of a bed."""
+
+ON_LINE = 5
+"""Positions of a target along each side of the box."""
 
 LEVELS = (-0.5, 0.0, 0.5)
 """Positions of an artefact across its surface, in the half sides of the box about its middle."""
@@ -90,12 +95,20 @@ def list_tool_candidates(
             {**sensor.keys, **keys}, where=str(sensor.file), under="", error=SessionError
         )
         postures.update((n, positions.postures[n]) for n in reached)
-        setups[name] = Setup(name, built, sensor.name, zero=checked.zero or default_zero(built))
+        setup = Setup(name, built, sensor.name, zero=checked.zero or default_zero(built))
+        parts = {name: setup}
+        if isinstance(built, Points):
+            parts, further = split_setup(setup, sensor.gauge)
+            gauges |= further
+        setups |= parts
         readings += [
-            Reading(name, n, conditions=c) for n, c in positions.approached(built, reached)
+            Reading(part, n, conditions=c)
+            for n, c in positions.approached(built, reached)
+            for part in parts
         ]
+    placed = {names_in_files(setup)[1] for setup in setups.values()}
     for sensor in owned:
-        if not any(setup.gauge == sensor.name for setup in setups.values()):
+        if sensor.name not in placed:
             raise ParameterError("the machine reaches no place for it", where=str(sensor.file))
     return gauges, postures, setups, readings
 
@@ -152,6 +165,9 @@ def _places(
     if sensor.keys["sensor"] == "probe":
         yield from _beds(sensor, middle, box)
         return
+    if sensor.keys["sensor"] == "points":
+        yield sensor.name, {}, _points(box)
+        return
     places = {
         "square": _edges,
         "straightedge": _edges,
@@ -196,6 +212,12 @@ def _beds(
     points = _grid(middle, box, axis, 2.0 * float(np.ptp(box, axis=1).max()), ON_BED)
     points[:, axis] = -tip
     yield sensor.name, {}, points
+
+
+def _points(box: Array) -> Array:
+    """Positions of a target in a box, shape (n, 3), [m]."""
+    lines = [np.round(np.linspace(low, high, ON_LINE) / STEP) * STEP for low, high in box.tolist()]
+    return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(box))
 
 
 def _edges(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from orthocal.planning.candidates import AlignedParameter, CandidateSetup
-from orthocal.planning.information_gain import Pairs, SetupGain
+from orthocal.planning.information_gain import Pairs, PointGain, SetupGain
 
 SIGMA, STATE, READINGS = 0.5, 5, 7
 
@@ -152,3 +152,79 @@ def test_gains_with_the_gauge_aligned_in_the_first_posture(seed):
             assert whole == pytest.approx(exact, rel=1e-10)
         alone = begin(kind, first).jacobian[[first, second]]
         assert kind.jacobian_of([first, second]) == pytest.approx(alone, abs=1e-14)
+
+
+POINTS, WIDE = 6, 3
+
+
+def draw_points(seed):
+    """A setup of points, each of three numbers, what others say of the state, what it does."""
+    rng = np.random.default_rng(seed)
+    rows = POINTS * WIDE
+    slopes, own = rng.normal(size=(rows, STATE)), rng.normal(size=(rows, 2))
+    together = np.ones((POINTS, POINTS), dtype=bool)
+    setup = CandidateSetup("k", np.arange(0, rows, WIDE), slopes, own @ own.T, together, width=WIDE)
+    says = rng.normal(size=(STATE, STATE))
+    return setup, says @ says.T + np.eye(STATE), rng.normal(size=(STATE, 2))
+
+
+@pytest.fixture(params=range(4))
+def drawn_points(request):
+    setup, information, root = draw_points(request.param)
+    covariance = np.linalg.inv(information)
+    gain = PointGain.of(setup, covariance, covariance @ root, SIGMA)
+
+    def reduction(points):
+        rows = [WIDE * i + c for i in points for c in range(WIDE)]
+        return left(setup, information, root, []) - left(setup, information, root, rows)
+
+    return gain, reduction
+
+
+def test_the_gain_of_points_is_the_reduction_of_the_error(drawn_points):
+    gain, reduction = drawn_points
+    for points in ([2], [0, 3], [5, 1, 4, 2]):
+        assert gain.gains(np.array([points])) == pytest.approx(reduction(points), rel=1e-9)
+
+
+def test_the_gain_of_a_point_in_place_of_another(drawn_points):
+    gain, reduction = drawn_points
+    points = [5, 1, 3]
+    gains = gain.exchange_gains(points)
+    for place in range(len(points)):
+        others = points[:place] + points[place + 1 :]
+        for more in set(range(POINTS)) - set(others):
+            expected = reduction([*others, more]) - reduction(others)
+            assert gains[place, more] == pytest.approx(expected, rel=1e-9)
+
+
+def test_points_are_completed_greedily_from_the_best_one(drawn_points):
+    gain, reduction = drawn_points
+    pairs = gain.best_pairs(Pairs.of(gain.setup, 2), 2)
+    (value, pair), (_, second) = pairs
+    assert value == pytest.approx(reduction(pair), rel=1e-9)
+    assert pair[0] == max(range(POINTS), key=lambda i: reduction([i]))
+    assert not set(pair) & set(second)
+    expected = [pair[0]]
+    while len(expected) < 4:
+        rest = [i for i in range(POINTS) if i not in expected]
+        expected.append(max(rest, key=lambda i: reduction([*expected, i])))
+    gains, chosen = gain.grow(pair, 4)
+    assert list(chosen) == expected
+    assert gains == pytest.approx([reduction(chosen[: k + 1]) for k in range(4)], rel=1e-9)
+
+
+def test_points_of_one_number_are_readings():
+    """A block of width one, with a known gauge zero, is the reading of `SetupGain`."""
+    setup, information, root = draw_points(0)
+    single = replace(setup, rows=np.arange(POINTS), jacobian=setup.jacobian[::WIDE], width=1,
+                     covariance=setup.covariance[::WIDE, ::WIDE], absolute=True)  # fmt: skip
+    covariance = np.linalg.inv(information)
+    both = [
+        kind.of(single, covariance, covariance @ root, SIGMA) for kind in (PointGain, SetupGain)
+    ]
+    one, other = (gain.exchange_gains([4, 0, 2]) for gain in both)
+    np.testing.assert_allclose(one, other, rtol=1e-9)
+    one, other = (gain.grow((1, 3), 5) for gain in both)
+    assert one[1] == other[1]
+    assert one[0] == pytest.approx(other[0], rel=1e-9)

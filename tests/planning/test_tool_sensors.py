@@ -10,18 +10,26 @@ import numpy as np
 import pytest
 from commands import run_orthocal
 
-from orthocal import load_plan, load_robot, plan_readings, simulate_session, write_session
+from orthocal import (
+    calibrate,
+    load_plan,
+    load_robot,
+    plan_readings,
+    simulate_session,
+    write_session,
+)
 from orthocal.effects.loading import with_effects
 from orthocal.errors import SessionError
 from orthocal.estimation.choice import resolve_choice
 from orthocal.measurement.motion.motion import plan_motion
 from orthocal.observation.simulate import draw_errors
+from orthocal.output.text.plan import plan_json
 from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.equipment import Equipment, place_tool
 from orthocal.planning.expected_error import ToolForecast
 from orthocal.planning.owned_sensors import load_owned_sensor
 from orthocal.planning.planned_session import _order_readings, build_session
-from orthocal.planning.selection import PlannedSetup
+from orthocal.planning.selection import PlannedSetup, SetupSearch
 from orthocal.planning.tool_candidates import list_tool_candidates
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Reading, Session, Setup
@@ -45,6 +53,8 @@ BLOCK = SQUARE.replace(
     "gauge_block, height_mm: 50, height_tolerance_mm: 0.0005",
 )
 PROBE = "sensor: probe\nsigma_mm: 0.01\n"
+TRACKER = "sensor: points\nsigma_mm: 0.01\ntarget_mm: [0, 0, -40]\n"
+CORRELATED = "covariance_um2: [[90, 40, 0], [40, 60, 0], [0, 0, 400]]\n"
 QUICK = {"along": 5, "across": 0.0, "sections": (0.5,)}
 
 
@@ -181,7 +191,9 @@ def test_approaches_of_a_bar_follow_from_its_path(owned):
         (BLOCK.replace("height_mm: 50", "height_mm: high"), "artefact.gauge_block.height_mm"),
         (PROBE + "tool_mm: low\n", "tool_mm"),
         ("sensor: [probe]\n", ""),
-        ("sensor: points\nsigma_mm: 0.01\n", "sensor"),
+        (TRACKER + "station: hall\n", "station"),
+        (TRACKER + "axis: {along: [1, 0, 0]}\n", "axis"),
+        (TRACKER + "frame: known\n", "frame"),
         ("- 1\n", ""),
         (BAR.replace("ball_bar", "leg"), ""),
         (BAR.replace("sigma_mm: 0.002\n", ""), "sigma_mm"),
@@ -306,3 +318,157 @@ def test_gauges_of_one_name_are_refused(owned, orthoglide, names):
 def test_a_zero_that_a_file_states(owned, orthoglide):
     _, _, setups, _ = list_tool_candidates(orthoglide, owned(bar=BAR + "zero: free\n"), None)
     assert {s.zero for s in setups.values()} == {"free"}
+
+
+def without_legs(**tolerances):
+    """A machine that a dial at the legs does not measure, so that plans have points alone."""
+    robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 1.0, **tolerances})
+    return replace(robot, legs={})
+
+
+@pytest.fixture
+def tracked(owned):
+    """A plan of half an hour with a tracker: 20 minutes to set it up and 19 points."""
+    return plan_readings(without_legs(), hours=0.5, equipment=Equipment(owned=owned(track=TRACKER)))
+
+
+@pytest.mark.parametrize(("keys", "labels"), [("", "xyz"), (CORRELATED, "123")])
+def test_candidates_of_points_are_three_readings_in_postures_over_the_workspace(
+    owned, orthoglide, keys, labels
+):
+    sensors = owned(track=TRACKER + keys)
+    gauges, postures, setups, readings = list_tool_candidates(orthoglide, sensors, None)
+    names = [f"track[{k}]" for k in labels]
+    assert list(setups) == names
+    assert {s.sensor.station for s in setups.values()} == {"track"}
+    assert {s.gauge for s in setups.values()} <= set(gauges)
+    assert [r.setup for r in readings] == names * len(postures)
+    points = np.array([p.values for p in postures.values()])
+    assert len(points) > 100
+    assert np.ptp(points, axis=0).min() > 0.15  # most of the reach along each axis
+
+
+def test_a_plan_of_points_is_one_setup_within_its_time(tracked):
+    session = tracked.session
+    assert list(session.setups) == ["track[x]", "track[y]", "track[z]"]
+    assert tracked.minutes == pytest.approx(20.0 + 20 * 0.5)
+    assert tracked.stage.setups == 1
+    assert tracked.stage.readings == 19
+    postures = [r.posture for r in session.readings]
+    assert postures[0::3] == postures[1::3] == postures[2::3]
+    assert len(set(postures)) == 19
+    assert postures[-1] == postures[0]
+    document = json.loads(plan_json(tracked))
+    assert [document[k] for k in ("setups", "readings", "closing_readings")] == [1, 19, 1]
+    times = [r.conditions.time for r in tracked.equipment.in_course(session).readings]
+    assert times[0::3] == times[1::3] == times[2::3]
+    assert (times[-1] - times[0]).total_seconds() == pytest.approx(19 * 30.0)
+
+
+@pytest.mark.parametrize("keys", ["", "frame: {tolerance_mm: 1, tolerance_mrad: 2}\n", CORRELATED])
+def test_the_search_of_points_agrees_with_the_forecast(owned, keys):
+    """The expected error of the chosen points by two ways of linear algebra."""
+    equipment = Equipment(owned=owned(track=TRACKER + keys))
+    robot = without_legs()
+    session = list_candidates(robot, equipment)
+    forecast = ToolForecast(robot, resolve_choice("lengths", None).select(robot.parameters))
+    candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
+    search = SetupSearch.of(
+        candidates,
+        forecast.prior_of(candidates.problem, candidates.state, None),
+        forecast.weigh("aligned", len(candidates.state)),
+    )
+    planned = search.choose([7], starts=1)
+    plan = build_session(candidates, planned.setups)
+    once = replace(plan, readings=tuple(r for r in plan.readings if r.cycle == 1))
+    assert len(once.readings) == 21
+    nominal = ToolForecast(
+        robot, resolve_choice("lengths", None).select(robot.parameters), others={}
+    ).about_nominal(once)
+    assert planned.error == pytest.approx(nominal.reported.rms, rel=1e-6)
+
+
+def test_an_instrument_stands_elsewhere_in_further_readings(owned):
+    """Information of measured points about the machine, not about the place of the instrument."""
+    robot = without_legs()
+    session = list_candidates(robot, Equipment(owned=owned(track=TRACKER)))
+    forecast = ToolForecast(robot, resolve_choice("lengths", None).select(robot.parameters))
+    problem = forecast.problem(session)
+    before, after = (forecast.prior_of(problem, problem.free, m) for m in (None, session))
+    gained = np.diag(after - before)
+    place = np.array([name.startswith("station.") for name in problem.free])
+    assert place.sum() == 6
+    assert (gained[place] == 0.0).all()
+    assert (gained[~place] > 0.0).all()
+
+
+def test_simulated_machines_keep_the_promise_of_points(tracked):
+    """All errors of the machine, an instrument anywhere in its frame."""
+    forecast, squares = tracked.forecast, []
+    for seed in range(8):
+        errors = draw_errors(tracked.session.robot, forecast.names, seed=seed)
+        measured = simulate_session(tracked.session, errors, seed=seed).session
+        found = calibrate(measured, solver="variable-projection")
+        values = {p.name: p.value for p in found.parameters}
+        missed = np.array([values.get(n, 0.0) - errors[n] for n in forecast.names])
+        field = forecast.align(forecast.jacobian @ missed)
+        squares.append(forecast.workspace.weights @ (field**2).sum(axis=1))
+    achieved, expected = np.sqrt(np.mean(squares)), tracked.expected.reported.rms
+    assert 0.75 * expected < achieved < 1.15 * expected
+
+
+def test_the_curve_grows_a_setup_that_can_be_used_once(tracked):
+    """More points instead of a second setup; the plan is not worse than the curve at its time."""
+    assert {stage.setups for stage in tracked.curve[1:]} == {1}
+    readings = [stage.readings for stage in tracked.curve]
+    assert readings == sorted(set(readings))
+    assert len(readings) > 3
+    minutes, errors = zip(*((s.minutes, s.error) for s in tracked.curve), strict=True)
+    assert tracked.stage.error < 1.01 * np.interp(tracked.minutes, minutes, errors)
+
+
+@pytest.mark.usefixtures("without_sensor_gains")
+def test_a_plan_of_points_is_measured_and_calibrated(tmp_path):
+    """From the command line: plan, sheet, a recorded point, simulated points, calibration."""
+    (tmp_path / "track.yaml").write_text(TRACKER + CORRELATED)
+    words = ["orthoglide", "--with", tmp_path / "track.yaml", "--hours", 0.6, "--starts", 2]
+    words += ["--along", 2, "--across-mm", 0, "--sections", 0.5]
+    words += ["--tolerance", "*.offset_mm=1", "--out", tmp_path / "plan"]
+    code, text, _ = run_orthocal(".", "plan", *map(str, words))
+    assert code == 0
+    assert "Points: " in text
+    plan = load_plan(tmp_path / "plan")
+    lines = len(plan.readings) // 3
+    assert (tmp_path / "plan" / "readings.csv").read_text().count("track,") == lines
+    programs = list((tmp_path / "plan").glob("*.ngc"))
+    assert [p.name for p in programs] == ["01-track.ngc"]
+    program = programs[0].read_text()
+    assert program.count(": read)") + program.count(", then read)") == lines - 1
+    assert f"(MSG, reading line {lines + 1}," in program
+    assert "dial" not in program
+    sheet = (tmp_path / "plan" / "sheet.html").read_text()
+    assert sheet.count("</section>") == 2
+    assert sheet.count('<td class="box"></td>') == 3 * lines
+    code, text, _ = run_orthocal(".", "record", str(tmp_path / "plan"), typed="1 2 3\n\n")
+    assert f"{lines - 1} of {lines} readings are missing" in text
+    measured = str(tmp_path / "measured")
+    simulated = [str(tmp_path / "plan"), "--out", measured, "--draw", "*", "--seed", "1"]
+    assert run_orthocal(".", "simulate", *simulated)[0] == 0
+    assert run_orthocal(".", "calibrate", measured, "--json")[0] == 0
+
+
+def test_points_beside_a_dial_come_back_from_their_files(owned, tmp_path):
+    """The principal axes of a covariance have their own gauges, the file the one that is stated."""
+    robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 1.0})
+    session = list_candidates(robot, Equipment(owned=owned(track=TRACKER + CORRELATED), **QUICK))
+    dial = next(r for r in session.readings if r.setup == "yx_a_0.5")
+    of_point = [r for r in session.readings if r.setup.startswith("track")][:12]
+    few = replace(session, robot_reference="orthoglide").select([dial, *of_point])
+    write_session(few, tmp_path / "few", blank=True)
+    again = load_plan(tmp_path / "few")
+    assert [(r.setup, r.posture) for r in again.readings] == [
+        (r.setup, r.posture) for r in few.readings
+    ]
+    assert {n: again.gauges[s.gauge].sigma for n, s in again.setups.items()} == pytest.approx(
+        {n: few.gauges[s.gauge].sigma for n, s in few.setups.items()}
+    )

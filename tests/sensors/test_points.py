@@ -128,7 +128,7 @@ def test_a_row_may_have_a_covariance_of_its_own(tmp_path):
         *("track[12]", "track[22]", "track[32]"),
         *("track[x3]", "track[y3]", "track[z3]"),
     ]
-    assert [found.gauges[f"track[{k}3]"].sigma for k in "xyz"] == [5e-6, 6e-6, 7e-6]
+    assert [found.gauges[f"[track[{k}3]]"].sigma for k in "xyz"] == [5e-6, 6e-6, 7e-6]
     write_session(found, tmp_path / "again")
     again = load_session(tmp_path / "again")
     np.testing.assert_allclose(again.values, found.values, atol=2e-9)

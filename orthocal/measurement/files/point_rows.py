@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import groupby
 from typing import cast
 
 import numpy as np
@@ -20,35 +19,9 @@ from orthocal.io.documents import parse_number
 from orthocal.measurement.files.readings_file import COORDINATES, COVARIANCES, RawReading
 from orthocal.observation.contacts import locate_contacts
 from orthocal.sensors.points import ABOUT_FIT, Points, fit_station, read_covariance
+from orthocal.session.points import base_name, gather_points, split_setup
 from orthocal.session.session import Gauge, Reading, Session, Setup
 from orthocal.units import MM, UM, tidy
-
-
-def base_name(name: str) -> str:
-    """Name in the files of a setup of points that was split; any other name as it is."""
-    return name.partition("[")[0]
-
-
-def split_setup(
-    base: Setup, gauge: Gauge, number: int = 0
-) -> tuple[dict[str, Setup], dict[str, Gauge]]:
-    """The three setups of a setup of points, and the gauges that they need in addition.
-
-    Args:
-        base: The setup as a session.yaml states it.
-        gauge: Its gauge.
-        number: Number of its covariance among those of its rows; 0 for that of the setup.
-    """
-    setups, gauges = {}, {}
-    sensor = cast(Points, base.sensor)
-    sensor = replace(sensor, station=sensor.station or base.name)
-    for label, (axis, std) in sensor.split().items():
-        name = f"{base.name}[{label}{number + 1 if number else ''}]"
-        setups[name] = replace(base, name=name, sensor=axis)
-        if std is not None:
-            setups[name] = replace(setups[name], gauge=name)
-            gauges[name] = replace(gauge, sigma=std, range=None)
-    return setups, gauges
 
 
 def split_points(session: Session) -> Session:
@@ -162,18 +135,6 @@ class PointRows:
             self.gauges |= gauges
             self._numbers[key] = tuple(setups)
         return self._numbers[key]
-
-
-def gather_points(readings: Sequence[Reading], setups: Mapping[str, Setup]) -> list[list[Reading]]:
-    """Readings of each line: three of a point, one of another sensor."""
-
-    def line(item: tuple[int, Reading]) -> object:
-        i, r = item
-        if not isinstance(setups[r.setup].sensor, Points):
-            return i
-        return base_name(r.setup), r.posture, r.cycle, r.conditions, r.line
-
-    return [[r for _, r in part] for _, part in groupby(enumerate(readings), line)]
 
 
 def find_point(rows: Sequence[Reading], index: int) -> list[int]:

@@ -25,7 +25,7 @@ from orthocal.io.files import (
     read_file,
     require_plain_name,
 )
-from orthocal.measurement.files.point_rows import base_name, locate_stations, split_points
+from orthocal.measurement.files.point_rows import locate_stations, split_points
 from orthocal.measurement.files.readings_checks import check_readings, require_name, require_read
 from orthocal.measurement.files.readings_file import read_rows
 from orthocal.measurement.files.schema import MOST_READINGS, CalibrationKeys, GaugeKeys, SessionKeys
@@ -46,6 +46,7 @@ from orthocal.sensors.protocol import (
     reads_pairs,
 )
 from orthocal.sensors.registry import read_setup
+from orthocal.session.points import base_name
 from orthocal.session.session import Gauge, Purpose, Reading, Session, Setup
 from orthocal.units import MM, show_limit
 

@@ -15,8 +15,6 @@ from orthocal.effects.compensation import format_table, table_name
 from orthocal.errors import SessionError
 from orthocal.io.files import exists, write_file, write_files
 from orthocal.measurement.files.point_rows import (
-    base_name,
-    gather_points,
     is_of_row,
     point_cells,
 )
@@ -34,6 +32,7 @@ from orthocal.robot.model import Robot
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import default_zero
 from orthocal.sensors.registry import write_sensor
+from orthocal.session.points import base_name, gather_points, names_in_files
 from orthocal.session.session import Conditions, Gauge, Posture, Purpose, Reading, Session, Setup
 from orthocal.units import DEG, DRIVE_UNITS, MM, tidy, to_mm, trim_zeros
 
@@ -68,9 +67,9 @@ def session_document(session: Session) -> dict[str, Any]:
     aligned_at = session.alignment_postures
     setups: dict[str, Any] = {}
     for setup in session.setups.values():
-        name, sensor, gauge = setup.name, setup.sensor, setup.gauge
+        (name, gauge), sensor = names_in_files(setup), setup.sensor
         if isinstance(sensor, Points):
-            name, gauge, sensor = base_name(name), "" if gauge == name else gauge, sensor.in_file
+            sensor = sensor.in_file
             if is_of_row(setup.name):
                 sensor = replace(sensor, covariance=None)
         setups.setdefault(

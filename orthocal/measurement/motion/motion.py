@@ -36,7 +36,8 @@ from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations, drive_table
 from orthocal.robot.model import Robot, require_tcp
-from orthocal.sensors.protocol import Contact, ToolPath, tool_path
+from orthocal.sensors.points import Points
+from orthocal.sensors.protocol import Contact, Sensor, ToolPath, tool_path
 from orthocal.session.session import Conditions, Gauge, Posture, Reading, Session
 from orthocal.units import MM
 
@@ -145,10 +146,12 @@ class SetupMotion:
     stops: tuple[Stop, ...]
     """Postures to read, and the first of them again."""
 
-    def closing(self, stop: Stop) -> str:
+    def closing(self, stop: Stop, sensor: Sensor) -> str:
         """Reading to expect when the first posture is read again; empty for other stops."""
         if stop.repeats is None:
             return ""
+        if isinstance(sensor, Points):
+            return f"the instrument must show the point of line {stop.repeats} again"
         first = "0" if self.stops[0].role == "subtracted" else f"the reading of line {stop.repeats}"
         return f"the dial must show {first} again"
 

@@ -171,7 +171,9 @@ def write_program(
             "read" if stop.role == "reading" else "",
         )
         instruction = ", then ".join(action for action in actions if action)
-        instruction = "; ".join(text for text in (instruction, motion.closing(stop)) if text)
+        instruction = "; ".join(
+            text for text in (instruction, motion.closing(stop, sensor)) if text
+        )
         side = f"; approach {stop.approach}" if stated else ""
         lines.append(f"({_label(stop)}{side}; joints {_joints(robot, stop)})")
         lines += _moves(robot, stop, options)

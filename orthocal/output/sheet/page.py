@@ -35,7 +35,9 @@ from orthocal.output.sheet.pictures import draw_machine, draw_section, draw_tool
 from orthocal.output.text.layout import counted, true_minus
 from orthocal.robot.model import ALONG, Robot
 from orthocal.sensors.ball_bar import BallBar
+from orthocal.sensors.points import AXES, Points
 from orthocal.sensors.protocol import mounting_steps, tool_path
+from orthocal.session.points import one_row_a_point
 from orthocal.session.session import Session, Setup
 from orthocal.units import DRIVE_UNITS, LIMIT, MM, format_fixed
 from orthocal.viewer.visuals import load_visuals
@@ -48,6 +50,12 @@ END = (
     "steps of the dial, repeat this setup: the gauge or the machine was displaced. "
 )
 """Check after the readings of a setup."""
+
+END_OF_POINTS = (
+    "Compare the points of the first posture with each other. If they differ by more than the "
+    "instrument scatters, repeat this setup: the instrument or the machine was displaced. "
+)
+"""The same for points."""
 
 REMOVE = "Then remove the gauge and jog the machine to its mechanical zero."
 """What to do after the check."""
@@ -88,6 +96,7 @@ def sheet_files(
         ParameterError: If a feed or a shift is out of range.
         RobotError: If the visuals of the robot cannot be loaded.
     """
+    session = one_row_a_point(session)
     motions = plan_motion(session)
     programs: dict[str, str] = {}
     if all(stop.point is not None for motion in motions for stop in motion.stops):
@@ -105,7 +114,7 @@ def sheet_files(
     style = (resources.files("orthocal.output.sheet") / "sheet.css").read_text(encoding="utf-8")
     front = _front(session, motions, options, with_programs=bool(programs))
     following = f"validate {shlex.quote(calibration)}" if _is_corrected(session) else "calibrate"
-    body = "\n".join([front, "".join(setups), _afterwards(f"orthocal {following} .")])
+    body = "\n".join([front, "".join(setups), _afterwards(session, f"orthocal {following} .")])
     return {SHEET: page(title, style, body), **programs}
 
 
@@ -222,7 +231,8 @@ def _setup(
     program = f" Program: {program_name(motion)}." if with_program else ""
     sensor = session.setups[motion.setup].sensor
     measured = sensor.describe()
-    end = END + (REMOVE_BAR if isinstance(sensor, BallBar) else REMOVE)
+    end = END_OF_POINTS if isinstance(sensor, Points) else END
+    end += REMOVE_BAR if isinstance(sensor, BallBar) else REMOVE
     return (
         f'<section id="setup-{motion.number}">{heading(title)}'
         f"{paragraph(f'{measured}.{program}', kind='lead')}"
@@ -235,6 +245,23 @@ def _setup(
 def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[str]:
     """Steps before the readings of a setup."""
     first = motion.stops[0]
+    start = f"{first.posture}: {_joint_list(session.robot, first.drives)}"
+    go = [f"Move to the first posture, {start}."]
+    align = "Move to the alignment posture"
+    if gauge.alignment == first.posture:
+        align, go = f"{align}, which is also the first posture", []
+    return [
+        f"{align}, {gauge.alignment}: {_joint_list(session.robot, gauge.drives)}."
+        f"{_around_ball(gauge.setup, motion.alignment or first)}",
+        *(mounting_steps(gauge.setup.sensor) or _mount_on_base(gauge)),
+        *go,
+        _gauge_zero(session, gauge.setup, first),
+        "Take the readings in the order below. The line numbers are those of readings.csv.",
+    ]
+
+
+def _mount_on_base(gauge: GaugePosition) -> tuple[str, ...]:
+    """Steps that mount an indicator on the base."""
     side = name_direction(gauge.contact.direction)
     opposite = name_direction(-gauge.contact.direction)
     place = " ".join(
@@ -256,26 +283,13 @@ def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[
         contact = "Its tip touches the line between the rods. "
     else:
         target = " ".join(gauge.setup.sensor.place).strip()
-    start = f"{first.posture}: {_joint_list(session.robot, first.drives)}"
-    go = [f"Move to the first posture, {start}."]
-    align = "Move to the alignment posture"
-    if gauge.alignment == first.posture:
-        align, go = f"{align}, which is also the first posture", []
-    mounting = mounting_steps(gauge.setup.sensor) or (
+    return (
         f"Mount the gauge on the base, on the {side} side of {target}. Point its plunger to "
         f"{opposite}. {contact}Contact point, from the tool centre point at the mechanical zero: "
         f"{place} mm.",
         f"Push the plunger in with a finger, towards {side}. The reading must grow. If it falls, "
         "reverse the sign of every reading of this setup.",
     )
-    return [
-        f"{align}, {gauge.alignment}: {_joint_list(session.robot, gauge.drives)}."
-        f"{_around_ball(gauge.setup, motion.alignment or first)}",
-        *mounting,
-        *go,
-        _gauge_zero(session, gauge.setup, first),
-        "Take the readings in the order below. The line numbers are those of readings.csv.",
-    ]
 
 
 def _around_ball(setup: Setup, begin: Stop) -> str:
@@ -342,6 +356,8 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
     approaches = any(r.approach for r in session.readings)
     to_note = _asked_for_each(session)
     letters = [] if robot.tcp is None or not tool else ["xyz"[c] for c in robot.tcp.coordinates]
+    sensor = session.setups[motion.setup].sensor
+    boxes = AXES if isinstance(sensor, Points) else ("reading",)
     expected = any(abs(s.expected) > VISIBLE for s in motion.stops)
     headers = [
         ("line", "number"),
@@ -350,7 +366,7 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
         *([(f"tool {', '.join(letters)} [mm]", "")] if letters else []),
         *((f"{d.name} [{DRIVE_UNITS[d.unit][0]}]", "number") for d in robot.drives),
         *([("perfect machine shows [mm]", "number")] if expected else []),
-        ("reading [mm]", ""),
+        *((f"{box} [mm]", "") for box in boxes),
         *((text, "") for text in to_note),
         ("remarks", ""),
     ]
@@ -366,9 +382,10 @@ def _boxes(session: Session, motion: SetupMotion) -> str:
         if expected:
             cells.append((_number(stop.expected / MM, 2, sign=True), "number"))
         body = "".join(f'<td class="{kind}">{escape(text)}</td>' for text, kind in cells)
-        box = "<td>set to 0</td>" if stop.role == "subtracted" else '<td class="box"></td>'
+        box = '<td class="box"></td>' * len(boxes)
+        box = "<td>set to 0</td>" if stop.role == "subtracted" else box
         box += '<td class="box condition"></td>' * len(to_note)
-        remark = escape(motion.closing(stop))
+        remark = escape(motion.closing(stop, sensor))
         rows.append(f'<tr>{body}{box}<td class="note">{remark}</td></tr>')
     kind, body = "boxes wide" if approaches or to_note else "boxes", "".join(rows)
     return f'<table class="{kind}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'
@@ -400,11 +417,14 @@ def _name(stop: Stop) -> str:
     return stop.posture if stop.line is None else f"line {stop.line}"
 
 
-def _afterwards(command: str) -> str:
+def _afterwards(session: Session, command: str) -> str:
+    points = [isinstance(s.sensor, Points) for s in session.setups.values()]
+    columns = ["reading_mm"] * (not all(points)) + ["x_mm, y_mm and z_mm"] * any(points)
     steps = [
         "Enter the readings with `orthocal record`, which checks each one at once. Or type them "
-        "into readings.csv, column reading_mm, in the order of its lines, and delete the lines "
-        "without a reading: an empty field is refused. `orthocal import` reads a spreadsheet.",
+        f"into readings.csv, column {' or '.join(columns)}, in the order of its lines, and delete "
+        "the lines without a reading: an empty field is refused. `orthocal import` reads a "
+        "spreadsheet.",
         "Run:",
     ]
     return (

@@ -478,7 +478,7 @@ def _draw_tool_path(picture: Picture, view: _View, gauge: GaugePosition) -> None
 def _draw_dial(
     picture: Picture, view: _View, gauge: GaugePosition, top: Array, dial: Array, *, radius: float
 ) -> None:
-    """Plunger, dial, and an arrow in the direction in which the dial grows.
+    """Plunger, dial, and an arrow in the direction in which the dial grows; no dial of points.
 
     Args:
         picture: The picture.
@@ -488,6 +488,8 @@ def _draw_dial(
         dial: Centre of the dial on paper, [mm].
         radius: Radius of the dial on paper, [mm].
     """
+    if not np.any(gauge.contact.direction):
+        return
     picture.line([top, dial], stroke="#fff", width=2.4)
     picture.line([top, dial], width=0.9)
     picture.circle(dial, radius, fill="#fff", width=0.9)

@@ -35,9 +35,11 @@ from orthocal.planning.sensor_gains import SensorGain
 from orthocal.robot.model import Robot
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.leg_indicator import LegIndicator
+from orthocal.sensors.points import Points
 from orthocal.sensors.probe import Probe
 from orthocal.sensors.protocol import tool_path
 from orthocal.sensors.tool_indicator import ToolIndicator
+from orthocal.session.points import one_row_a_point
 from orthocal.session.session import Reading, Session
 from orthocal.units import EDGE_UNITS, MM, UM
 
@@ -77,6 +79,10 @@ HOW_TO = {
         "Probe: move down in each posture until it triggers. Write the coordinates at the trigger "
         "as the posture, and 0 as the reading."
     ),
+    Points.kind: (
+        "Points: set up the instrument so that it sees the target in every posture, and fix the "
+        "target at the tool. Read x, y and z in each posture."
+    ),
 }
 """Instructions for the kinds of sensor of a plan."""
 
@@ -109,6 +115,7 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
 
 def describe_size(session: Session) -> str:
     """Numbers of readings and setups of a plan; readings are counted as on its sheet."""
+    session = one_row_a_point(session)
     closing = sum(r.cycle > 1 for r in session.readings)
     words = f" ({closing} closing)" if closing else ""
     readings, setups = len(session.readings), len(session.setups)
@@ -251,7 +258,7 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
         "criterion": plan.criterion,
         "travel_mm": basis["travel_mm"],
         "workspace_mm": None if box is None else np.round(box / MM, 6).tolist(),
-        "setups": len(plan.session.setups),
+        "setups": len(one_row_a_point(plan.session).setups),
         "readings": read,
         "closing_readings": closing,
         "minutes": plan.minutes,
@@ -302,8 +309,9 @@ def _unit(plan: MeasuringPlan) -> float:
 
 def _counts(plan: MeasuringPlan) -> tuple[int, int]:
     """Numbers of readings, and of those that close a setup."""
-    closing = sum(r.cycle > 1 for r in plan.session.readings)
-    return len(plan.session.readings) - closing, closing
+    readings = one_row_a_point(plan.session).readings
+    closing = sum(r.cycle > 1 for r in readings)
+    return len(readings) - closing, closing
 
 
 def _when_enough(plan: MeasuringPlan) -> str:
@@ -324,7 +332,7 @@ def _when_enough(plan: MeasuringPlan) -> str:
 
 
 def _alternatives(plan: MeasuringPlan) -> RenderableType:
-    s = plan.session
+    s = one_row_a_point(plan.session)
     this = Alternative("this plan", len(s.setups), len(s.readings), plan.minutes, plan.expected)
     rows = []
     for a in (this, *plan.compared):
@@ -354,7 +362,7 @@ def _posture(reading: Reading, robot: Robot) -> str:
 
 
 def _setups(plan: MeasuringPlan) -> RenderableType:
-    s = plan.session
+    s = one_row_a_point(plan.session)
     rows = [
         (
             setup.name,

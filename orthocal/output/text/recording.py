@@ -12,7 +12,7 @@ from dataclasses import replace
 from orthocal.assessment.judgement import is_far
 from orthocal.assessment.wording import counted, joined, mm, name_direction
 from orthocal.calibration.assessment_record import Finding
-from orthocal.measurement.files.point_rows import base_name, point_of
+from orthocal.measurement.files.point_rows import point_of
 from orthocal.measurement.motion.approach import (
     approach_length,
     common_approach,
@@ -25,6 +25,7 @@ from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import mounting_steps
+from orthocal.session.points import base_name
 from orthocal.session.session import Conditions, Reading, Session, Setup
 from orthocal.text import printable, spans
 from orthocal.units import DRIVE_UNITS, MM, format_fixed, to_mm, trim_zeros

@@ -1,0 +1,79 @@
+"""Setups of points in a session: three setups, one for each coordinate, that share their lines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import groupby
+from typing import cast
+
+from orthocal.sensors.points import Points
+from orthocal.session.session import Gauge, Reading, Session, Setup
+
+
+def base_name(name: str) -> str:
+    """Name in the files of a setup of points that was split; any other name as it is."""
+    return name.partition("[")[0]
+
+
+def names_in_files(setup: Setup) -> tuple[str, str]:
+    """Names in the files of a setup and of its gauge."""
+    if not isinstance(setup.sensor, Points):
+        return setup.name, setup.gauge
+    return base_name(setup.name), base_name(setup.gauge)
+
+
+def split_setup(
+    base: Setup, gauge: Gauge, number: int = 0
+) -> tuple[dict[str, Setup], dict[str, Gauge]]:
+    """The three setups of a setup of points, and the gauges that they need in addition.
+
+    Args:
+        base: The setup as a session.yaml states it.
+        gauge: Its gauge.
+        number: Number of its covariance among those of its rows; 0 for that of the setup.
+    """
+    setups, gauges = {}, {}
+    sensor = cast(Points, base.sensor)
+    sensor = replace(sensor, station=sensor.station or base.name)
+    for label, (axis, std) in sensor.split().items():
+        name = f"{base.name}[{label}{number + 1 if number else ''}]"
+        setups[name] = replace(base, name=name, sensor=axis)
+        if std is not None:
+            further = f"{base_name(base.gauge)}[{name}]"
+            setups[name] = replace(setups[name], gauge=further)
+            gauges[further] = replace(gauge, sigma=std, range=None)
+    return setups, gauges
+
+
+def gather_points(readings: Sequence[Reading], setups: Mapping[str, Setup]) -> list[list[Reading]]:
+    """Readings of each line: three of a point, one of another sensor."""
+
+    def line(item: tuple[int, Reading]) -> object:
+        i, r = item
+        if not isinstance(setups[r.setup].sensor, Points):
+            return i
+        return base_name(r.setup), r.posture, r.cycle, r.conditions, r.line
+
+    return [[r for _, r in part] for _, part in groupby(enumerate(readings), line)]
+
+
+def one_row_a_point(session: Session) -> Session:
+    """Session in which a setup of points and each of its lines are one, as in its files.
+
+    It says where the machine stops, not what the instrument shows: its points have no readings.
+    """
+    setups: dict[str, Setup] = {}
+    for setup in session.setups.values():
+        if isinstance(setup.sensor, Points):
+            name, _ = names_in_files(setup)
+            setups.setdefault(name, replace(setup, name=name, sensor=setup.sensor.in_file))
+        else:
+            setups[setup.name] = setup
+    if len(setups) == len(session.setups):
+        return session
+    lines = gather_points(session.readings, session.setups)
+    readings = tuple(
+        replace(r, setup=base_name(r.setup)) if r.setup not in setups else r for r, *_ in lines
+    )
+    return replace(session, setups=setups, readings=readings, sha256="")
