@@ -59,6 +59,9 @@ MOST_STEPS = 8
 SETTLED = 0.02
 """Change of the errors, in prior std, below which the most likely machine is found."""
 
+HIDDEN = 0.1
+"""Effect of a prior std on readings that counts as none, [σ]."""
+
 LEAST_SIGMA = 1e-9
 """Least standard deviation of a reading, [m]."""
 
@@ -173,12 +176,32 @@ class LinearModel:
         return cast(Result, self._shared[name])
 
     def at_reference(self, *, slopes: bool) -> ModelLinearisation:
-        """The model linearised about the machine without errors; errors as for `linearise`."""
+        """The model linearised about the machine without errors; errors as for `linearise`.
+
+        A nuisance parameter that changes readings noticeably, but to second order, such as the
+        height of a fixed ball across the plane of motion, has one standard deviation there.
+        """
 
         def linearise() -> ModelLinearisation:
-            return self.linearise(np.zeros(self.problem.n_free), (), None, slopes=slopes)
+            theta = np.zeros(self.problem.n_free)
+            about = self.linearise(theta, (), None, slopes=True)
+            theta[self._find_hidden(about)] = 1.0
+            if theta.any():
+                about = self.linearise(theta, (), about.passive, slopes=slopes)
+            return about if slopes else replace(about, slopes=np.empty((len(about.slopes), 0)))
 
         return self.share(("reference", slopes), linearise)
+
+    def _find_hidden(self, about: ModelLinearisation) -> Indices:
+        """Nuisance parameters without effect on readings at 0, but with one at their prior std."""
+        n = self.problem.n_machine
+        hidden = n + np.flatnonzero(np.abs(about.slopes[:, n:]).max(axis=0) < HIDDEN * self.sigma)
+        if not hidden.size:
+            return hidden
+        theta = np.zeros(self.problem.n_free)
+        theta[hidden] = 1.0
+        beside = self.linearise(theta, (), about.passive, slopes=True)
+        return np.asarray(hidden[np.abs(beside.slopes[:, hidden]).max(axis=0) > self.sigma])
 
     @property
     def offsets(self) -> dict[str, int]:

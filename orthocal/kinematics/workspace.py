@@ -362,10 +362,18 @@ def tool_at_zero(robot: Robot) -> Array:
     Raises:
         RobotError: If the robot has no tool centre point.
     """
-    passive = robot.reference_passive
-    position = nominal_closure(robot).tcp(robot.drive_zero, passive)
     coordinates = () if robot.tcp is None else robot.tcp.coordinates
-    return np.asarray(np.round(position[list(coordinates)], 12) + 0.0)  # the zero without rounding
+    return np.asarray(position_at_zero(robot)[list(coordinates)])
+
+
+def position_at_zero(robot: Robot) -> Array:
+    """Tool centre point in the nominal mechanical zero, in the world, shape (3,), [m].
+
+    Raises:
+        RobotError: If the robot has no tool centre point.
+    """
+    position = nominal_closure(robot).tcp(robot.drive_zero, robot.reference_passive)
+    return np.asarray(np.round(position, 12) + 0.0)  # the zero without rounding
 
 
 def describe_box(box: Array, letters: str = "xyz") -> str:

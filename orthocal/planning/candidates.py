@@ -22,7 +22,7 @@ from orthocal.measurement.motion.approach import can_approach, usual_approaches
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import nominal_sensitivity
 from orthocal.observation.observations import build_observations
-from orthocal.planning.equipment import Equipment, choose_box, place_tool, reachable
+from orthocal.planning.equipment import Equipment, choose_box, place_tool, posture_name, reachable
 from orthocal.planning.owned_sensors import DIAL
 from orthocal.planning.tool_candidates import list_tool_candidates
 from orthocal.robot.model import Leg, Robot
@@ -334,17 +334,6 @@ def _phases(robot: Robot, count: int) -> Array:
     """Fractions of a period by which positions along a leg are shifted, shape (count,), [m]."""
     period = next((e.period for e in robot_effects(robot) if e.period is not None), 0.0)
     return np.asarray(np.arange(count) % PHASES * (period / PHASES))
-
-
-def posture_name(point: Array, robot: Robot, middle: Array) -> str:
-    """Name of a posture: displacement from the mechanical zero, such as x+60_y-10."""
-    letters = "" if robot.tcp is None else ["xyz"[c] for c in robot.tcp.coordinates]
-    parts = [
-        f"{letter}{round(v / MM, 3):+g}"
-        for letter, v in zip(letters, point - middle, strict=True)
-        if abs(v) > 1e-9
-    ]
-    return "_".join(parts) or "zero"
 
 
 def _sensors(leg: Leg, equipment: Equipment) -> Iterator[tuple[str, LegIndicator]]:

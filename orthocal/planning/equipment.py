@@ -31,6 +31,7 @@ from orthocal.sensors.mounting import USUAL, Mounting, MountingKeys
 from orthocal.sensors.tips import Tip
 from orthocal.session.points import names_in_files, one_row_a_point
 from orthocal.session.session import Gauge, Posture, Session
+from orthocal.units import MM
 
 REACH = 0.1
 """Largest default distance of the tool from the mechanical zero, along each coordinate, [m]."""
@@ -207,6 +208,17 @@ def reachable(robot: Robot, points: Array) -> NDArray[np.bool_]:
     reached = np.asarray(((drives >= lower) & (drives <= upper)).all(axis=1))
     reached[list(failures)] = False
     return reached
+
+
+def posture_name(point: Array, robot: Robot, middle: Array) -> str:
+    """Name of a posture: displacement from the mechanical zero, such as x+60_y-10."""
+    letters = "" if robot.tcp is None else ["xyz"[c] for c in robot.tcp.coordinates]
+    parts = [
+        f"{letter}{round(v / MM, 3):+g}"
+        for letter, v in zip(letters, point - middle, strict=True)
+        if abs(v) > 1e-9
+    ]
+    return "_".join(parts) or "zero"
 
 
 def place_tool(robot: Robot, names: Sequence[str], points: Array) -> dict[str, Posture]:

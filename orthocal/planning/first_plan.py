@@ -13,8 +13,8 @@ from orthocal.errors import ParameterError, RobotError
 from orthocal.estimation.choice import Choice
 from orthocal.kinematics.workspace import find_workspace, tool_at_zero
 from orthocal.measurement.motion.approach import state_common_approach
-from orthocal.planning.candidates import ON_AXIS, directions_across, posture_name
-from orthocal.planning.equipment import Equipment, choose_box, place_tool
+from orthocal.planning.candidates import ON_AXIS, directions_across
+from orthocal.planning.equipment import Equipment, choose_box, place_tool, posture_name
 from orthocal.planning.expected_error import Expected, ToolForecast, noise_of
 from orthocal.planning.further_readings import FurtherReadings
 from orthocal.planning.sensor_gains import SensorGain, find_sensor_gains

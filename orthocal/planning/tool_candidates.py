@@ -11,11 +11,11 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.errors import ParameterError, SessionError
-from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.kinematics.workspace import position_at_zero, tool_at_zero
 from orthocal.measurement.motion.approach import can_approach, usual_approaches
-from orthocal.planning.equipment import choose_box, place_tool, reachable
+from orthocal.planning.equipment import choose_box, place_tool, posture_name, reachable
 from orthocal.planning.owned_sensors import DIAL, OwnedSensor
-from orthocal.robot.model import Robot
+from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import Sensor, default_zero, tool_path
 from orthocal.sensors.registry import read_setup
@@ -41,6 +41,9 @@ ON_BED = 11
 ON_LINE = 5
 """Positions of a target along each side of the box."""
 
+IN_PLANE = ("ball_bar", "points")
+"""Kinds of sensor for a tool that moves in a plane."""
+
 LEVELS = (-0.5, 0.0, 0.5)
 """Positions of an artefact across its surface, in the half sides of the box about its middle."""
 
@@ -60,19 +63,19 @@ def list_tool_candidates(
     """Gauges, postures, setups and readings of every place of the sensors.
 
     Args:
-        robot: The robot, with three tool coordinates.
+        robot: The robot, with two or three tool coordinates.
         owned: The available sensors.
         box: Limits of the tool's coordinates; by default the workspace that the robot states, or
             those of `choose_box`: a tool may not go below a bed.
 
     Raises:
-        ParameterError: If the machine has no three tool coordinates, or reaches no place.
+        ParameterError: If the machine has no two or three tool coordinates, or no place for a
+            sensor.
         SessionError: If the keys of a sensor are invalid.
     """
     if not owned:
         return {}, {}, {}, []
-    if robot.tcp is None or tuple(robot.tcp.coordinates) != (0, 1, 2):
-        raise ParameterError("need a tool that moves along x, y and z", where="--with")
+    _require_coordinates(robot, owned)
     stated = robot.workspace if box is None else box
     limits, middle = choose_box(robot, stated), tool_at_zero(robot)
     gauges = {sensor.name: sensor.gauge for sensor in owned}
@@ -82,7 +85,9 @@ def list_tool_candidates(
             raise SessionError(
                 f"two gauges are named '{sensor.name}'; rename the file", where=str(sensor.file)
             )
-    places = [(sensor, *place) for sensor in owned for place in _places(sensor, middle, limits)]
+    places = [
+        (sensor, *place) for sensor in owned for place in _places(sensor, robot, middle, limits)
+    ]
     positions = _Positions.of(robot, middle, np.concatenate([points for *_, points in places]))
     postures: dict[str, Posture] = {}
     setups: dict[str, Setup] = {}
@@ -113,32 +118,48 @@ def list_tool_candidates(
     return gauges, postures, setups, readings
 
 
+def _require_coordinates(robot: Robot, owned: Sequence[OwnedSensor]) -> None:
+    """Refuse sensors that need a tool that moves in space.
+
+    Raises:
+        ParameterError: Naming the file of the sensor.
+    """
+    count = 0 if robot.tcp is None else len(robot.tcp.coordinates)
+    for sensor in owned:
+        if count < (2 if sensor.keys["sensor"] in IN_PLANE else 3):
+            raise ParameterError(
+                "needs a tool that moves along x, y and z; in a plane: " + " or ".join(IN_PLANE),
+                where=str(sensor.file),
+            )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Positions:
     """Tool positions of all places that the machine reaches: their loops are closed at once."""
 
+    robot: Robot
     middle: Array
-    """Tool in the mechanical zero, shape (3,), [m]."""
+    """Tool in the mechanical zero, shape (n_coordinates,), [m]."""
     postures: dict[str, Posture]
     able: dict[str, frozenset[str]]
     """Postures that can be approached so, by the approaches that effects distinguish."""
 
     @staticmethod
     def of(robot: Robot, middle: Array, points: Array) -> _Positions:
-        """Positions among tool positions of shape (n, 3), [m]."""
+        """Positions among tool positions of shape (n, n_coordinates), [m]."""
         unique = np.unique(points.round(9), axis=0)
         reached = unique[reachable(robot, unique)]
-        postures = place_tool(robot, [_name(p, middle) for p in reached], reached)
+        postures = place_tool(robot, [posture_name(p, robot, middle) for p in reached], reached)
         names, drives = np.array(list(postures)), np.array([p.drives for p in postures.values()])
         able = {
             a: frozenset(names[can_approach(robot, drives, a)].tolist())
             for a in (usual_approaches(robot) if names.size else ())
         }
-        return _Positions(middle, postures, able)
+        return _Positions(robot, middle, postures, able)
 
     def names(self, points: Array) -> list[str]:
         """Names of those of some positions that are reached, each once."""
-        names = dict.fromkeys(_name(p, self.middle) for p in points)
+        names = dict.fromkeys(posture_name(p, self.robot, self.middle) for p in points)
         return [name for name in names if name in self.postures]
 
     def approached(
@@ -156,11 +177,11 @@ class _Positions:
 
 
 def _places(
-    sensor: OwnedSensor, middle: Array, box: Array
+    sensor: OwnedSensor, robot: Robot, middle: Array, box: Array
 ) -> Iterator[tuple[str, dict[str, Any], Array]]:
     """Name, keys and tool positions of each place of a sensor."""
     if sensor.keys["sensor"] == "ball_bar":
-        yield from _bars(sensor, middle, box)
+        yield from _bars(sensor, robot, box)
         return
     if sensor.keys["sensor"] == "probe":
         yield from _beds(sensor, middle, box)
@@ -178,26 +199,35 @@ def _places(
 
 
 def _bars(
-    sensor: OwnedSensor, middle: Array, box: Array
+    sensor: OwnedSensor, robot: Robot, box: Array
 ) -> Iterator[tuple[str, dict[str, Any], Array]]:
-    """Spheres about fixed balls: circles in planes through the ball and beside it."""
-    del middle
+    """Spheres about fixed balls: circles in planes through the ball and beside it.
+
+    A tool that moves in a plane has one circle about a ball in this plane.
+    """
+    coordinates, fixed = require_tcp(robot).coordinates, position_at_zero(robot)
+    unit, n = np.eye(3)[:, : len(coordinates)], len(coordinates)
+    places = np.array(BALLS) if n > 2 else np.unique(np.array(BALLS)[:, :n], axis=0)
+    planes = itertools.product(range(3), LATITUDES) if n > 2 else [(2, 0.0)]
+    planes = list(planes)
     length = float(sensor.keys.get("length_mm", 0.0)) * MM
     tool = np.array(sensor.keys.get("tool_mm", (0.0, 0.0, 0.0))) * MM
     half, centre = 0.5 * (box[:, 1] - box[:, 0]), box.mean(axis=1)
     angle = 2.0 * np.pi * np.arange(ON_CIRCLE) / ON_CIRCLE
-    for k, place in enumerate(BALLS):
-        ball = np.round((centre + np.array(place) * half) / STEP) * STEP
+    for k, place in enumerate(places):
+        ball = np.round((centre + place * half) / STEP) * STEP
         circles = []
-        for axis, share in itertools.product(range(3), LATITUDES):
+        for axis, share in planes:
             radius = length * np.sqrt(1.0 - share**2)
-            first, second = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
+            first, second = unit[(axis + 1) % 3], unit[(axis + 2) % 3]
             around = np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
-            circles.append(ball + share * length * np.eye(3)[axis] + radius * around)
+            circles.append(ball + share * length * unit[axis] + radius * around)
         points = np.unique(np.concatenate(circles).round(9), axis=0)
         inside = ((points >= box[:, 0]) & (points <= box[:, 1])).all(axis=1)
+        in_space = np.array(fixed)
+        in_space[list(coordinates)] = ball
         keys = {
-            "centre_mm": ((ball + tool) / MM).round(6).tolist(),
+            "centre_mm": ((in_space + tool) / MM).round(6).tolist(),
             "ball": f"{sensor.name}_{k + 1}",
         }
         yield f"{sensor.name}_{k}", keys, points[inside]
@@ -215,7 +245,7 @@ def _beds(
 
 
 def _points(box: Array) -> Array:
-    """Positions of a target in a box, shape (n, 3), [m]."""
+    """Positions of a target in a box, shape (n, n_coordinates), [m]."""
     lines = [np.round(np.linspace(low, high, ON_LINE) / STEP) * STEP for low, high in box.tolist()]
     return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(box))
 
@@ -290,13 +320,3 @@ def _grid(middle: Array, box: Array, axis: int, length: float, count: int) -> Ar
     sides = [_line(middle, box, k, length, count) for k in range(3) if k != axis]
     pairs = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
     return np.insert(pairs, axis, middle[axis], axis=1)
-
-
-def _name(point: Array, middle: Array) -> str:
-    """Name of a posture: displacement from the mechanical zero, such as x+60_y-10."""
-    parts = [
-        f"{letter}{round(v / MM, 3):+g}"
-        for letter, v in zip("xyz", point - middle, strict=True)
-        if abs(v) > 1e-9
-    ]
-    return "_".join(parts) or "zero"

@@ -158,25 +158,32 @@ class BallBar(ToolSensor):
             "sign of every reading of this setup.",
         )
 
-    def path(self, start: Array, end: Array) -> Array:
-        """Corners of a great arc about the fixed ball, on which the bar keeps its length.
+    def path(self, start: Array, end: Array, normal: Array | None = None) -> Array:
+        """Corners of an arc about the fixed ball, on which the bar keeps its length.
 
         Args:
             start: Tool centre point, shape (3,), [m].
             end: The same.
+            normal: Unit vector square to the plane in which the tool moves, shape (3,); None for a
+                tool that moves in space, along a great arc.
 
         Returns:
             Shape (n, 3), [m]; chords deviate from the arc by at most `SAGITTA`.
         """
         offset = np.array(self.tool) - np.array(self.centre)
         ends = np.array([start + offset, end + offset])
+        if normal is not None:  # about the foot of the fixed ball in the plane
+            beside = (ends[0] @ normal) * normal
+            ends, offset = ends - beside, offset - beside
         radii = np.linalg.norm(ends, axis=1)
         first, last = ends / np.maximum(radii, 1e-12)[:, None]
         across = last - (first @ last) * first
         if np.linalg.norm(across) < 1e-9:  # the same direction, or the opposite one
             across = np.linalg.svd(first[None])[2][-1]
+            if normal is not None:
+                across = np.cross(normal, first)
         across /= np.linalg.norm(across)
-        angle = np.arctan2(last @ across, first @ last)
+        angle = np.arctan2(abs(last @ across), first @ last)  # rounding may be negative
         step = 2.0 * np.arccos(1.0 - min(SAGITTA / radii.max(), 1.0))
         share = np.linspace(0.0, 1.0, max(math.ceil(angle / step), 1) + 1)[:, None]
         unit = np.cos(share * angle) * first + np.sin(share * angle) * across

@@ -27,9 +27,10 @@ GaugeZero = Literal["free", "known"]
 """Gauge zero of a setup: estimated from its readings, or known to be 0, so that its readings are
 absolute."""
 
-ToolPath = Callable[[Array, Array], Array]
-"""Corners of the path of the tool from one position to another, shape (n, n_coordinates), [m], with
-both ends."""
+ToolPath = Callable[..., Array]
+"""Corners of the path of the tool from one position to another, shape (3,), [m]: shape (n, 3), with
+both ends. A third argument is given for a tool that moves in a plane: a unit vector square to it,
+shape (3,)."""
 
 DIMENSION_STEP = 1e-6
 """Increment of a dimension for its effect on readings, [m]."""

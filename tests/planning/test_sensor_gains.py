@@ -103,6 +103,9 @@ def test_the_report_of_a_calibration_names_the_same_sensors(legs):
     assert "Another hour" not in summarize(offsets, details=True)
 
 
-def test_a_machine_without_places_at_the_tool_compares_dials(biglide):
+def test_a_machine_that_moves_in_a_plane_compares_a_dial_and_a_bar(biglide):
     plan = plan_readings(biglide, equipment=Equipment(**QUICK), starts=1)
-    assert {g.words for g in plan.find_sensor_gains()} <= {"a dial at the legs"}
+    assert {g.words for g in plan.find_sensor_gains()} == {
+        "a dial at the legs",
+        "a ball bar of 50 mm",
+    }

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from commands import run_orthocal
+from tolerances import SAME_OPTIMUM
 
 from orthocal import (
     calibrate,
@@ -18,19 +20,24 @@ from orthocal import (
     simulate_session,
     write_session,
 )
+from orthocal.assessment.judgement import judge_session
 from orthocal.effects.loading import with_effects
-from orthocal.errors import SessionError
+from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.choice import resolve_choice
+from orthocal.estimation.solvers.variable_projection import VariableProjection
+from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.measurement.motion.motion import plan_motion
+from orthocal.measurement.motion.motion_program import write_program
 from orthocal.observation.simulate import draw_errors
 from orthocal.output.text.plan import plan_json
 from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.equipment import Equipment, place_tool
-from orthocal.planning.expected_error import ToolForecast
+from orthocal.planning.expected_error import ToolForecast, noise_of
 from orthocal.planning.owned_sensors import load_owned_sensor
 from orthocal.planning.planned_session import _order_readings, build_session
 from orthocal.planning.selection import PlannedSetup, SetupSearch
 from orthocal.planning.tool_candidates import list_tool_candidates
+from orthocal.sensors.ball_bar import SAGITTA
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Reading, Session, Setup
 
@@ -472,3 +479,113 @@ def test_points_beside_a_dial_come_back_from_their_files(owned, tmp_path):
     assert {n: again.gauges[s.gauge].sigma for n, s in again.setups.items()} == pytest.approx(
         {n: few.gauges[s.gauge].sigma for n, s in few.setups.items()}
     )
+
+
+@pytest.fixture(scope="module")
+def planar(tmp_path_factory):
+    """A plan of an hour with a ball bar on a machine whose tool moves in a plane."""
+    file = tmp_path_factory.mktemp("planar") / "bar.yaml"
+    file.write_text(BAR)
+    robot = load_robot("biglide").with_tolerances({"*.offset_mm": 1.0})
+    equipment = Equipment(owned=(load_owned_sensor(file),), **QUICK)
+    return plan_readings(robot, hours=1.0, equipment=equipment)
+
+
+def bars_of(session):
+    return {n: s for n, s in session.setups.items() if s.gauge == "bar"}
+
+
+def test_a_bar_on_a_planar_machine_has_circles_in_the_plane_of_motion(planar):
+    session, bars = planar.session, bars_of(planar.session)
+    assert len(bars) >= 2
+    for name, setup in bars.items():
+        postures = {r.posture for r in session.readings if r.setup == name}
+        tool = LoopClosure(session.robot).forward(
+            np.array([session.postures[p].drives for p in postures])
+        )
+        centre = np.array(setup.sensor.centre)
+        np.testing.assert_allclose(tool[:, 2], centre[2], atol=1e-9)
+        np.testing.assert_allclose(np.linalg.norm(tool - centre, axis=1), 0.05, atol=1e-8)
+
+
+@pytest.mark.parametrize("depth", [0.0, 0.02])
+def test_programs_of_a_planar_bar_move_along_its_circle(planar, depth):
+    """From the second posture on: the tool approaches the first one freely.
+
+    The fixed ball may lie below the plane.
+    """
+    session, lower = planar.session, np.array([0.0, 0.0, depth])
+    setups = {
+        n: replace(s, sensor=replace(s.sensor, centre=tuple(s.sensor.centre - lower)))
+        for n, s in bars_of(session).items()
+    }
+    session = replace(session, setups={**session.setups, **setups})
+    for motion in plan_motion(session):
+        if motion.setup not in bars_of(session):
+            continue
+        program = write_program(session, motion)
+        moves = re.findall(r"G53 G1 X(\S+) Y(\S+) F", program)
+        assert len(moves) == program.count("\nG53 G1 ")
+        centre = 1e3 * np.array(session.setups[motion.setup].sensor.centre)
+        points = np.array(moves, dtype=float)[2:]
+        assert len(points) > 100
+        radii = np.linalg.norm(points - centre[:2], axis=1)
+        assert np.abs(radii - 50.0).max() < 1e3 * SAGITTA + 1e-4
+        steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        assert steps.max() < 5.0
+
+
+def test_planar_machines_keep_the_promise_of_a_bar(planar):
+    """100 machines, whose fixed balls lie off the plane of motion by 1 mm (standard deviation)."""
+    forecast, session = planar.forecast, planar.session
+    problem = forecast.problem(session)
+    program, n = VariableProjection(problem), problem.n_machine
+    squares = []
+    for seed in range(100):
+        errors = draw_errors(session.robot, forecast.names, seed=seed)
+        shown = simulate_session(session, errors, seed=seed).session
+        values = problem.observations.values(shown.values) / problem.noise_ratio
+        found = program.solve(sigma=noise_of(session), values=values)
+        missed = found.theta[:n] - np.array([errors[name] for name in problem.free[:n]])
+        field = forecast.align(forecast.jacobian @ missed)
+        squares.append(forecast.workspace.weights @ (field**2).sum(axis=1))
+    achieved, expected = np.sqrt(np.mean(squares)), planar.expected.reported.rms
+    assert expected < 4.5e-6
+    assert 0.85 * expected < achieved < 1.15 * expected
+
+
+@pytest.mark.parametrize("seed", [8, 14])
+def test_both_solvers_agree_where_a_ball_is_off_the_plane(planar, seed):
+    """Its height changes readings to second order: whole steps of Gauss-Newton do not converge."""
+    errors = draw_errors(planar.session.robot, planar.forecast.names, seed=seed)
+    session = simulate_session(planar.session, errors, seed=seed).session
+    one, other = (
+        {p.name: p.value for p in calibrate(session, solver=solver).parameters}
+        for solver in ("variable-projection", "ipopt")
+    )
+    for drive in session.robot.drives:
+        name = f"{drive.name}.offset"
+        assert one[name] == pytest.approx(other[name], abs=SAME_OPTIMUM)
+
+
+@pytest.mark.parametrize("text", [SQUARE, PLATE, PROBE])
+def test_sensors_that_need_three_coordinates_are_refused_on_a_planar_machine(owned, text):
+    with pytest.raises(ParameterError) as caught:
+        list_tool_candidates(load_robot("biglide"), owned(sensor=text), None)
+    assert str(caught.value.where).endswith("sensor.yaml")
+
+
+def test_points_on_a_planar_machine_lie_in_its_plane(owned):
+    robot = load_robot("biglide")
+    _, postures, setups, _ = list_tool_candidates(robot, owned(track=TRACKER), None)
+    assert list(setups) == ["track[x]", "track[y]", "track[z]"]
+    assert {len(p.values) for p in postures.values()} == {2}
+    assert len(postures) == 25
+
+
+@pytest.mark.parametrize("seed", [0, 10, 14, 18])
+def test_fixed_balls_off_the_plane_are_no_mistakes(planar, seed):
+    """Their heights, of up to 3.9 mm, look like other lengths of the bar to first order."""
+    errors = draw_errors(planar.session.robot, planar.forecast.names, seed=seed)
+    session = simulate_session(planar.session, errors, seed=seed).session
+    assert {f.severity for f in judge_session(session).findings} <= {"note"}

@@ -21,6 +21,7 @@ from orthocal.kinematics.workspace import cube
 from orthocal.observation.model import predict_readings
 from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.observation.simulate import simulate_session
+from orthocal.sensors.ball_bar import BallBar
 from orthocal.statistics.chance import confidence_factor
 
 RADIUS_MM, POINTS = 50.0, 16
@@ -200,3 +201,20 @@ def test_noise_of_two_gauges_is_found_on_a_machine_far_from_its_nominal_one(tmp_
     found = calibrate(session, solver="variable-projection")
     assert found.noise.source == "gauge"
     assert found.noise.sigma == pytest.approx(np.hypot(5e-6, 1e-5 / np.sqrt(12.0)))
+
+
+@pytest.mark.parametrize("height", [0.0, 0.02])
+@pytest.mark.parametrize("angle", [40.0, 180.0])
+def test_a_tool_that_moves_in_a_plane_stays_in_it(height, angle):
+    """An arc of the angle about the foot of the fixed ball, also to the opposite side."""
+    bar = BallBar((0.01, 0.02, 0.03 - height), 0.05)
+    foot, radius = np.array([0.01, 0.02, 0.03]), np.sqrt(0.05**2 - height**2)
+    ends = [
+        foot + radius * np.array([np.cos(a), np.sin(a), 0.0]) for a in np.deg2rad([15, 15 + angle])
+    ]
+    corners = bar.path(*ends, np.eye(3)[2])
+    np.testing.assert_allclose(corners[[0, -1]], ends, atol=CLOSED_FORM)
+    np.testing.assert_allclose(corners[:, 2], 0.03, atol=CLOSED_FORM)
+    np.testing.assert_allclose(np.linalg.norm(corners - bar.centre, axis=1), 0.05, atol=CLOSED_FORM)
+    length = np.linalg.norm(np.diff(corners, axis=0), axis=1).sum()
+    assert length == pytest.approx(radius * np.deg2rad(angle), rel=1e-3)

@@ -4,7 +4,8 @@ Passive joints and gauge zeros are eliminated. About the present θ the problem 
 a robust loss; this subproblem is solved completely, within the bounds. The passive joints follow
 the step to first order. If the loops stay nearly closed and the objective decreases, their opening
 is corrected in the next step. Otherwise the loops are closed and the step is halved until the
-objective decreases. The optimum is that of the complete program, which Ipopt solves.
+objective decreases. Steps that take back the last one are relaxed. The optimum is that of the
+complete program, which Ipopt solves.
 
 About a start that is far off, the first steps can be so long that they end in a local minimum.
 Where the result is far from its prior, or there is none, the problem is solved again with readings
@@ -36,6 +37,12 @@ RELAXATIONS = (16.0, 4.0, 1.0)
 """Factors on the standard deviation of the readings; each solution starts the next."""
 
 MOST_HALVINGS = 12
+
+OVERSHOOT = 0.5
+"""Part of a step that the next one takes back from which on steps are relaxed."""
+
+LEAST_SHARE = 0.1
+"""Smallest part of a relaxed step."""
 
 ROUNDING = 1e-12
 """Relative growth of the objective that counts as rounding."""
@@ -110,13 +117,15 @@ class VariableProjection(Program):
             ClosureError: If the solution cannot reach a posture.
         """
         most = self.options.max_iterations
-        sizes = np.full(3, np.inf)
+        sizes, before, share = np.full(3, np.inf), None, 1.0
         state, linear = begin
         for iterations in range(1, most + 1):
             jacobian = linear.jacobian
             jacobian /= task.sigma  # in place: it may be large, and is not used again
             step = task.step(state, jacobian)
             sizes = np.r_[np.abs(step).max(initial=0.0), sizes[:2]]
+            share = _relax(step, before, share)
+            before, step = step, share * step
             if follow and are_settled(sizes):
                 theta = np.clip(state.theta + step, task.low, task.high)
                 passive = state.passive + linear.follow(theta - state.theta)
@@ -125,8 +134,10 @@ class VariableProjection(Program):
             if followed is not None:
                 state, linear = followed
                 continue
+            whole = np.abs(step).max(initial=0.0)
             state, step = self._move(task, state, step)
             sizes[0] = np.abs(step).max(initial=0.0)
+            share *= sizes[0] / whole if whole else 1.0
             if are_settled(sizes):
                 return state, jacobian, iterations
             linear = task.linearise(state.theta, state.passive)
@@ -187,6 +198,25 @@ def are_settled(sizes: Array) -> Mask:
         last = np.where(np.isfinite(sizes[1]), sizes[0] / sizes[1], np.inf)
         before = np.where(np.isfinite(sizes[2]), sizes[1] / sizes[2], 0.0)
         return np.asarray((sizes[0] <= SETTLED) | (sizes[0] * np.maximum(last, before) <= SETTLED))
+
+
+def _relax(step: Array, before: Array | None, share: float) -> float:
+    """Share of a Gauss-Newton step to take, where the last one went too far (Aitken).
+
+    Gauss-Newton neglects the curvature of readings. Along a parameter that changes them to second
+    order only, such as a fixed ball across the plane of motion, steps alternate and may not shrink.
+
+    Args:
+        step: The step, shape (n_free,), [prior std].
+        before: The one before, all of it.
+        share: Share of it that was taken.
+    """
+    if before is None:
+        return 1.0
+    if share == 1.0 and not step @ before < -OVERSHOOT * (before @ before):
+        return 1.0
+    change = before - step
+    return float(np.clip(share * (before @ change) / (change @ change), LEAST_SHARE, 1.0))
 
 
 def _no_more_than(state: Iterate) -> float:

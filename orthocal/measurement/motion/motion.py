@@ -11,7 +11,7 @@ dial stays in its range.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, NamedTuple
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from orthocal.arrays import Array
 from orthocal.errors import ClosureError, SessionError
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
-from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.kinematics.workspace import position_at_zero, tool_at_zero
 from orthocal.measurement.motion.approach import (
     APPROACH,
     approach_length,
@@ -262,16 +262,38 @@ def _commands_tool(robot: Robot) -> bool:
     return robot.tcp is not None and len(robot.tcp.coordinates) == len(robot.drives)
 
 
+Path = Callable[[Array, Array], Array]
+"""Corners of the path of the tool between two coordinates, shape (n, n_coordinates), [m]."""
+
 Approaches = dict[tuple[str, str | None], Stop]
 """Posture and its stated approach, or None where none is stated, to the stop that reads it."""
 
 
-def _guided_setups(session: Session) -> dict[str, ToolPath]:
+def _guided_setups(session: Session) -> dict[str, Path]:
     """Setups whose sensor prescribes the path of the tool between its readings."""
     if not _commands_tool(session.robot):
         return {}
     paths = {name: tool_path(s.sensor) for name, s in session.setups.items()}
-    return {name: path for name, path in paths.items() if path is not None}
+    return {
+        name: _in_coordinates(session.robot, path)
+        for name, path in paths.items()
+        if path is not None
+    }
+
+
+def _in_coordinates(robot: Robot, path: ToolPath) -> Path:
+    """Path between coordinates that the drives control: in space, or in the plane of motion."""
+    coordinates = list(require_tcp(robot).coordinates)
+    others = [k for k in range(3) if k not in coordinates]
+    normal = [np.eye(3)[others[0]]] if len(others) == 1 else []
+    fixed = position_at_zero(robot)
+
+    def between(start: Array, end: Array) -> Array:
+        ends = np.array([fixed, fixed])
+        ends[:, coordinates] = start, end
+        return np.asarray(path(*ends, *normal)[:, coordinates])
+
+    return between
 
 
 def _stops_on_path(session: Session, setup: str) -> Approaches:
@@ -433,7 +455,7 @@ def _follow_stops(session: Session, setup: str, stops: Sequence[Stop]) -> list[S
     return _predict(session, setup, checked, paths)
 
 
-def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: ToolPath) -> list[Stop]:
+def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path) -> list[Stop]:
     """Stops on the path that a sensor prescribes, with their approaches and predicted readings.
 
     A reading whose stated approach has the opposite direction is passed first, and approached on
