@@ -22,6 +22,7 @@ AnomalyKind = Literal[
     "displaced gauge",
     "displaced artefact",
     "wrong dimension",
+    "readjusted dimension",
     "drift",
     "backlash",
     "thermal expansion",
@@ -77,7 +78,7 @@ class Explanation:
     """Setups that are concerned as a whole."""
     names: tuple[str, ...] = ()
     """Legs, gauges or postures that the scope refers to; a displaced artefact; the key of a wrong
-    dimension and its stated size in mm."""
+    dimension, its stated size in mm and, of a readjusted one, the session from which on."""
     cycle: int | None = None
     """The cycle, where one alone is concerned."""
     factor: float | None = None
@@ -85,8 +86,8 @@ class Explanation:
     amount: float | None = None
     """Amount by which the rows are too large, [m] (misread dial, outlier, displaced gauge; for a
     drift of the last row against the first; of other effects the range of what they add to the
-    rows); of `machine changed` the change, [SI]; of a wrong dimension its true less its stated
-    size, [m]."""
+    rows); of `machine changed` the change, [SI]; of a wrong or readjusted dimension its true
+    less its stated size, [m]."""
     std: float | None = None
     """Standard deviation of the amount, [SI]."""
     missing: bool | None = None

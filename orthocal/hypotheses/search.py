@@ -80,7 +80,7 @@ NEARLY = 3.0
 WORTH_REFITTING = 4.0
 """Least logarithm of the Bayes factor, to first order, of hypotheses that are linearised anew."""
 
-FAMILIES = 30.0
+FAMILIES = 31.0
 """Families of mistakes that share the prior probability; each effect is as likely as a family."""
 
 MOST_ANOMALIES = 4

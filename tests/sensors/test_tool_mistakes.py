@@ -11,6 +11,7 @@ from test_tool_indicator import AXES, STEPS, Plan
 
 from orthocal import draw_errors, simulate_session
 from orthocal.assessment.judgement import judge_session
+from orthocal.measurement.joining import join_sessions
 from orthocal.observation.model import predict_readings
 from orthocal.observation.sensor_groups import nuisance_parameters
 
@@ -152,3 +153,36 @@ def test_a_gauge_block_of_another_height_is_named(tmp_path, height):
     assert {p.setup for p in found.places} == {"block_y"}
     assert found.numbers["dimension_mm"] == pytest.approx(50.0, abs=0.05)
     assert found.numbers["stated_mm"] == height
+
+
+def two_sessions(folder, seed, *, change, renamed=False):
+    """Three circles of one bar on two days; before the second one it was readjusted, [m]."""
+    plan = circles(folder)
+    errors = errors_of(plan, seed)
+    first = simulate_session(plan, errors, seed=seed)
+    bar = {n: v for n, v in first.nuisance.items() if n.startswith("gauge.")}
+    second = simulate_session(plan, {**errors, **bar}, seed=seed + 100).session
+    if renamed:
+        setups = {n: replace(s, gauge="other") for n, s in second.setups.items()}
+        second = replace(second, gauges={"other": second.gauge}, setups=setups)
+    return join_sessions([first.session, second.with_values(np.array(second.values) - change)])
+
+
+@pytest.mark.parametrize("change", [60e-6, -0.3e-3])
+def test_a_bar_that_was_readjusted_between_sessions_is_named(tmp_path, change):
+    session = two_sessions(tmp_path, 1, change=change)
+    (found,) = warnings_of(session)
+    assert found.kind == "readjusted dimension"
+    assert {p.setup for p in found.places} == {"session-2/xy", "session-2/yz", "session-2/zx"}
+    assert found.numbers["dimension_mm"] == pytest.approx(50.0 + 1e3 * change, abs=0.01)
+    assert "before session session-2" in found.text
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_sessions_with_one_bar_are_not_accused(tmp_path, seed):
+    assert warnings_of(two_sessions(tmp_path, seed, change=0.0)) == []
+
+
+def test_a_bar_of_another_name_has_a_length_of_its_own(tmp_path):
+    """The remedy that the finding states."""
+    assert warnings_of(two_sessions(tmp_path, 1, change=-0.3e-3, renamed=True)) == []

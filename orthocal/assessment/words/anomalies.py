@@ -49,7 +49,7 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
         numbers["amount_um"] = (e.amount or 0.0) / UM
         action = _effect_remedy(session, result)
         return review(e.kind, text, action, _effect_places(session, e), **numbers)
-    if e.kind == "wrong dimension":
+    if e.kind in ("wrong dimension", "readjusted dimension"):
         numbers["dimension_mm"], numbers["stated_mm"] = _dimensions_mm(e)
     if anomaly.expected is not None:
         text += (
@@ -293,6 +293,7 @@ def _text(session: Session, e: Explanation) -> str:
         "displaced gauge": lambda: _displaced(session, e),
         "displaced artefact": lambda: _displaced_artefact(e),
         "wrong dimension": lambda: _other_dimension(session, e),
+        "readjusted dimension": lambda: _readjusted(e),
         "drift": lambda: _drifted(e),
         "backlash": lambda: (
             f"the drives have backlash: {_amounts(e)}. Readings differ by up to "
@@ -392,7 +393,7 @@ def _can_turn(e: Explanation) -> bool:
 
 
 def _dimensions_mm(e: Explanation) -> tuple[float, float]:
-    """True and stated size of a wrong dimension, [mm]."""
+    """True and stated size of a wrong or readjusted dimension, [mm]."""
     stated = float(e.names[1])
     return stated + (e.amount or 0.0) / MM, stated
 
@@ -402,6 +403,14 @@ def _other_dimension(session: Session, e: Explanation) -> str:
     true, stated = _dimensions_mm(e)
     what = e.names[0].rpartition(".")[2].removesuffix("_mm")
     return f"the {what} in {_subject(session, e)} is {plain(true)} mm, not {stated:g} mm"
+
+
+def _readjusted(e: Explanation) -> str:
+    """A dimension that differs from a session on, with both sizes."""
+    true, stated = _dimensions_mm(e)
+    what = e.names[0].rpartition(".")[2].removesuffix("_mm")
+    since = f" before session {e.names[2]}" if len(e.names) > 2 else ""
+    return f"the {what} was changed{since}: it is {plain(true)} mm there, not {stated:g} mm"
 
 
 def _swapped(session: Session, e: Explanation) -> str:
@@ -471,6 +480,9 @@ def _remedy(session: Session, e: Explanation) -> str:
         "displaced artefact": ("Check `reversed` of its setups. " if _can_turn(e) else "")
         + "If it was displaced, give it another name in the later setups.",
         "wrong dimension": f"If so, measure it, and correct `{''.join(e.names[:1])}`.",
+        "readjusted dimension": "If so, state the present "
+        f"`{''.join(e.names[:1])}` in that session. If it is unknown, give its gauge another name "
+        "there.",
         "inconsistent setup": "Check its leg, direction, section and the mounting of its gauge; "
         "then read it again, or leave it out.",
         "swapped rows": "If so, swap them back.",

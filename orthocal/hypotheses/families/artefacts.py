@@ -29,11 +29,14 @@ LEAST_COLUMN = 0.5
 def wrong_artefacts(model: LinearModel, rows: Rows) -> Iterator[Family]:
     """Artefacts displaced between setups, and dimensions that differ from the stated ones.
 
+    A dimension may differ in all setups of a gauge from a session on, such as the length of a bar.
+
     Args:
         model: The linearised model.
         rows: The rows.
     """
-    for family in (_displaced(model, rows), _other_dimensions(model, rows)):
+    families = _displaced(model, rows), _other_dimensions(model, rows), _readjusted(model, rows)
+    for family in families:
         if family is not None:
             yield family
 
@@ -102,6 +105,31 @@ def _other_dimensions(model: LinearModel, rows: Rows) -> Family | None:
                 )
             )
             shapes.append(change[at])
+    return Family.with_effects(rows, explanations, shapes) if explanations else None
+
+
+def _readjusted(model: LinearModel, rows: Rows) -> Family | None:
+    """A dimension that differs in several setups of a gauge from one session on."""
+    explanations: list[Explanation] = []
+    shapes: list[Array] = []
+    for size, changes in model.dimension_changes().items():
+        gauges: dict[str, list[str]] = {}
+        for name in changes:
+            gauge = rows.session.setups[name].gauge.partition("/")[2]
+            gauges.setdefault(gauge, []).append(name)
+        for of_gauge in gauges.values():
+            for k in range(1, len(model.order)):
+                later = [model.labels[i] for i in model.order[k:]]
+                setups = tuple(n for n in of_gauge if n.partition("/")[0] in later)
+                if not 1 < len(setups) < len(of_gauge):  # one setup: `_other_dimensions`
+                    continue
+                change = np.sum([changes[name] for name in setups], axis=0)
+                at = np.flatnonzero(change)
+                names, every = (*size, later[0]), tuple(at.tolist())
+                explanations.append(
+                    Explanation("readjusted dimension", "setups", every, setups, names)
+                )
+                shapes.append(change[at])
     return Family.with_effects(rows, explanations, shapes) if explanations else None
 
 
