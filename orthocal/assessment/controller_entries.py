@@ -229,7 +229,7 @@ def _amplitude_uncertainty(
 
 def _compensated_screws(calibration: Calibration, screw: Screw) -> Array:
     """A and B that tables of the controller corrected while measuring, shape (n_drives, 2), [m]."""
-    robot, found = calibration.robot, []
+    robot, waves_of_drives = calibration.robot, []
     for i, drive in enumerate(robot.drives):
         displayed = np.tile(robot.drive_zero, (POSITIONS, 1))
         if drive.unit == "m":
@@ -237,8 +237,8 @@ def _compensated_screws(calibration: Calibration, screw: Screw) -> Array:
         moved = calibration.displacement(displayed)[:, i]
         phase = 2.0 * np.pi * (displayed[:, i] - calibration.active_offsets[i]) / screw.lead
         waves = np.column_stack([np.sin(phase), np.cos(phase), np.ones(POSITIONS)])
-        found.append(-np.linalg.lstsq(waves, moved, rcond=None)[0][:2])
-    return np.array(found)
+        waves_of_drives.append(-np.linalg.lstsq(waves, moved, rcond=None)[0][:2])
+    return np.array(waves_of_drives)
 
 
 def is_worth_changing(

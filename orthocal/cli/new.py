@@ -401,8 +401,8 @@ def _require_bed(kind: type[Dimensions], options: FirstPlanOptions) -> None:
     Raises:
         ParameterError: If there is one.
     """
-    for option, found in (("--paper", options.paper), ("--hours", options.hours is not None)):
-        if found:
+    for option, stated in (("--paper", options.paper), ("--hours", options.hours is not None)):
+        if stated:
             raise ParameterError(
                 f"readings of the legs say little about a {kind.kind}, and the readings of its bed "
                 "are fixed; name other sensors by --with",

@@ -131,13 +131,13 @@ def fit_firmware(calibration: Calibration, firmware: FirmwareName) -> FirmwareFi
     targets, layer_unknown = _find_targets(calibration)
     free = 15 if FIRMWARES[firmware].tilts else 13
     start = np.zeros(free)
-    found = least_squares(
+    solution = least_squares(
         partial(_residuals, targets, present), start, x_scale=SCALES[:free], method="lm"
     )
-    settings = replace(_changed(present, found.x), firmware=firmware)
+    settings = replace(_changed(present, solution.x), firmware=firmware)
     tool = assessment_of(calibration).tool
     moved = np.array(settings.homed) - present.homed
-    gain = _setting_gain(targets, settings, found, moved)
+    gain = _setting_gain(targets, settings, solution, moved)
     return FirmwareFit(
         settings=settings,
         now=_measure(targets, present, np.zeros(3)),

@@ -35,10 +35,10 @@ class Duration(NamedTuple):
 
     def most(self, minutes: float, limit: int) -> int:
         """Largest number of readings of a setup within a time, beside the closing one."""
-        left = minutes - self.setup + SLACK
-        if left < self.reading * (limit + 1):
-            return max(int(left / self.reading) - 1, 0)
-        return limit if left > 0.0 else 0
+        available = minutes - self.setup + SLACK
+        if available < self.reading * (limit + 1):
+            return max(int(available / self.reading) - 1, 0)
+        return limit if available > 0.0 else 0
 
 
 DURATIONS = {

@@ -45,8 +45,8 @@ FIRMWARES: dict[FirmwareName, Firmware] = {
 
 def find_firmware(text: str) -> FirmwareName | None:
     """Firmware of a log, where it is certain."""
-    found = [name for name, firmware in FIRMWARES.items() if firmware.recognise(text)]
-    return found[0] if len(found) == 1 else None
+    recognised = [name for name, firmware in FIRMWARES.items() if firmware.recognise(text)]
+    return recognised[0] if len(recognised) == 1 else None
 
 
 def require_firmware(name: str, *, option: str) -> FirmwareName:

@@ -162,18 +162,18 @@ def _with_steps(
 
 def _saved_heights(saved: Mapping[str, str], where: str) -> tuple[Pairs, Pairs, Distances] | None:
     """Heights of the probe, manual heights and distances; None without any."""
-    found: list[Pairs] = []
+    pairs_by_kind: list[Pairs] = []
     for prefix in ("height", "manual_height"):
         pairs: Pairs = []
         while (key := f"{prefix}{len(pairs)}") in saved:
             a, b, c = _saved_steps(saved, f"{key}_pos", where)
             pairs.append((_number(saved, key, where, "delta_calibrate"), (a, b, c)))
-        found.append(pairs)
+        pairs_by_kind.append(pairs)
     distances: Distances = []
     while (key := f"distance{len(distances)}") in saved:
         ends = [_saved_steps(saved, f"{key}_pos{i}", where) for i in (1, 2)]
         distances.append((_number(saved, key, where, "delta_calibrate"), ends))
-    return (found[0], found[1], distances) if found[0] else None
+    return (pairs_by_kind[0], pairs_by_kind[1], distances) if pairs_by_kind[0] else None
 
 
 def _saved_steps(saved: Mapping[str, str], key: str, where: str) -> list[float]:
@@ -243,8 +243,8 @@ def _probe_offset(sections: Sections, where: str) -> Array:
 
 def _probe_section(sections: Sections) -> tuple[str, Mapping[str, str]]:
     """Name and keys of the first section of a probe; an empty [probe] without any."""
-    found = ((name, keys) for name, keys in sections.items() if name.split(" ")[0] in PROBES)
-    return next(found, ("probe", {}))
+    probes = ((name, keys) for name, keys in sections.items() if name.split(" ")[0] in PROBES)
+    return next(probes, ("probe", {}))
 
 
 def _step_lengths(sections: Sections, where: str) -> Array:

@@ -86,16 +86,16 @@ def read_analysis(text: str, settings: DeltaSettings, *, where: str) -> tuple[Pr
 def _lengths(name: str, text: str, where: str) -> list[float]:
     """Positive numbers of a word."""
     parts = text.strip("[]").split(",")  # klippy.log has brackets
-    found, count = numbers(parts, where=where, name=name), COUNTS.get(name, 1)
-    if len(found) != count:
-        raise SessionError(f"{name} has {len(found)} numbers; expected {count}", where=where)
-    for value in found:
+    values, count = numbers(parts, where=where, name=name), COUNTS.get(name, 1)
+    if len(values) != count:
+        raise SessionError(f"{name} has {len(values)} numbers; expected {count}", where=where)
+    for value in values:
         if not 0.0 < value <= LARGEST_MM:
             raise SessionError(
                 f"{name} has {value:g}; expected numbers above 0 and at most {LARGEST_MM:g}",
                 where=where,
             )
-    return found
+    return values
 
 
 def _place(

@@ -45,7 +45,9 @@ def plan_motion(stops: ArrayLike, *, count: int | None = None) -> Timeline:
     """
     points = np.atleast_2d(np.asarray(stops, dtype=np.float64))
     count = len(points) if count is None else count
-    rest, move, between = (45, 24, 8) if count <= 12 else (24, 15, 4) if count <= 40 else (12, 9, 2)
+    pause, move, between = (
+        (45, 24, 8) if count <= 12 else (24, 15, 4) if count <= 40 else (12, 9, 2)
+    )
     share = np.arange(1, between + 1) / (between + 1)
     eased = share**2 * (3.0 - 2.0 * share)
     moves = points[:-1, None] + eased[:, None] * np.diff(points, axis=0)[:, None]
@@ -53,8 +55,8 @@ def plan_motion(stops: ArrayLike, *, count: int | None = None) -> Timeline:
     drives = np.concatenate(
         [np.concatenate([resting[:-1], moves], axis=1).reshape(-1, points.shape[1]), resting[-1]]
     )
-    cycle = np.concatenate([[0.0, rest], rest + move * share])
-    starts = (rest + move) * np.arange(len(points))
+    cycle = np.concatenate([[0.0, pause], pause + move * share])
+    starts = (pause + move) * np.arange(len(points))
     times = (starts[:, None] + cycle).reshape(-1)[: len(drives)]
     return Timeline(drives, times, (2 + between) * np.arange(len(points)))
 

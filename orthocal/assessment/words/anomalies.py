@@ -73,9 +73,9 @@ def _effect_places(session: Session, e: Explanation) -> tuple[Place, ...]:
 
 
 def _effect_remedy(session: Session, result: Anomalies) -> str:
-    """Calibration with all effects that were found, beside those that the machine has."""
-    found = [a.explanation.effect for a in result.found if a.explanation.amounts]
-    robot = with_effects(session.robot, (*session.robot.effect_names, *found))
+    """Calibration with all effects that were missing, beside those that the machine has."""
+    missing = [a.explanation.effect for a in result.found if a.explanation.amounts]
+    robot = with_effects(session.robot, (*session.robot.effect_names, *missing))
     return identify_effects(robot.effect_names, errors_of_no_model(robot))
 
 
