@@ -141,7 +141,7 @@ class Section:
     def describe(self) -> str:
         """The position in words."""
         if self.form == "fraction":
-            return f"{self.value:g} of its length"
+            return f"{self.value:g} of its length from the slide"
         from_root = " from its hinge on the slide" if self.form == "from_root_mm" else ""
         return f"{'' if from_root else 'coordinate '}{self.value / MM:g} mm{from_root}"
 

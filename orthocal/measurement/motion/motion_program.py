@@ -21,6 +21,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.errors import ParameterError
 from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.measurement.motion.approach import describe_approach
 from orthocal.measurement.motion.motion import SetupMotion, Stop, dial_zero, shown_joints
 from orthocal.robot.model import Robot
 from orthocal.sensors.ball_bar import BallBar
@@ -63,6 +64,11 @@ PREAMBLE = (
     "(Cancel scaling and mirroring first. Run once without gauge at low feed override)",
     "G21 G90 G94 G40 G49",
 )
+
+SIGNS = str.maketrans("↑↓·", "+-0")
+"""Arrows of an approach in ASCII."""
+
+SIGNS_NOTE = "(Approach: + the number of the joint grows at the end, - it falls, 0 either)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,12 +153,14 @@ def write_program(
     of_setup = session.setups[motion.setup]
     sensor, gauge = of_setup.sensor, session.gauges[of_setup.gauge]
     stops = motion.stops if motion.alignment is None else (motion.alignment, *motion.stops)
+    stated = any(r.approach for r in session.readings)
     lines = [
         f"(orthocal: {name}, setup {setup}, {motion.number} of {motion.count})",
         f"({comment_safe(sensor.describe(), 120)})",
         f"(Machine coordinates, mm; tool at the mechanical zero: "
         f"{_words(robot, tool_at_zero(robot), options)})",
         *_before_start(robot, sensor, stops[0], options),
+        *([SIGNS_NOTE] if stated else []),
         *PREAMBLE[:-1],
         *(["(Dwells at each reading: G4 P in seconds)"] if options.automatic else []),
         PREAMBLE[-1],
@@ -160,7 +168,6 @@ def write_program(
         *_before_motion(robot, sensor, stops[0], options),
     ]
     mount = _mount(sensor)
-    stated = any(r.approach for r in session.readings)
     for i, stop in enumerate(stops):
         zero = "0" if stop.role == "subtracted" else ""
         if stop is motion.stops[0] and stop.role == "reading" and of_setup.zero == "free":
@@ -172,7 +179,8 @@ def write_program(
         )
         instruction = ", then ".join(action for action in actions if action)
         instruction = "; ".join(text for text in (instruction, motion.closing(stop)) if text)
-        side = f"; approach {stop.approach}" if stated else ""
+        signs = describe_approach(robot, stop.approach).translate(SIGNS)
+        side = f"; approach {signs}" if stated else ""
         lines.append(f"({_label(stop)}{side}; joints {_joints(robot, stop)})")
         lines += _moves(robot, stop, options)
         lines.append(f"(MSG, {_label(stop)}: {instruction})")
@@ -214,8 +222,8 @@ def _mount(sensor: Sensor) -> str:
         return "place the fixed ball unless it is in place, then mount the bar as the sheet shows"
     if mounting_steps(sensor) is not None:
         return "mount the gauge as the sheet shows"
-    centre = isinstance(sensor, BallIndicator)
-    return f"mount the gauge, {'centre its ball on the rod' if centre else 'align it'}"
+    align = "align its ball as the sheet shows" if isinstance(sensor, BallIndicator) else "align it"
+    return f"mount the gauge, {align}"
 
 
 def _end(sensor: Sensor) -> str:

@@ -214,8 +214,8 @@ class RecordingText:
             from_hinge = f", {distances[aligned] / MM:.1f} mm from the hinge on the slide"
         return (
             f"Stand: on the {side} side, so that the tip touches at ({at}) mm in {aligned}"
-            f"{from_hinge}. Push the plunger in: the reading must grow. If it falls, reverse "
-            "the sign of every reading of this setup."
+            f"{from_hinge}. Push the plunger in: the reading must grow. If it falls, enter "
+            "every reading of this setup with the opposite sign."
         )
 
     def label(self, row: Reading) -> str:
