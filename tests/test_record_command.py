@@ -162,6 +162,11 @@ TURNS = {
         ["0.30", "0.20"],
         "Line 2: yx zero (4 of 6 missing)",
     ),
+    "back after a repetition": (
+        ["0.1", "again", "0.11", "back", "0.12"],
+        ["0.10", *[""] * 5, "0.12"],
+        "Recorded: 0.11 mm; Enter keeps it.",
+    ),
     "back beyond": (["back"], [], "Not recorded: this is the first line."),
     "back to none": (["back 1"], [], "Not recorded: '1' is not a line; expected 2 to 7."),
     "back to a word": (["back to"], [], "Not recorded: 'to' is not a line; expected 2 to 7."),

@@ -346,13 +346,20 @@ class Dialogue:
     def _back(self, index: int | None) -> None:
         rows = self._recording.rows
         if index is None:
-            index = (len(rows) if self._asked is None else self._asked) - 1
+            index = self._before(len(rows) if self._asked is None else self._asked)
         if index < 0:
             raise SessionError("this is the first line")
         index = self._recording.point(index)[0]
         if rows[index].is_read:
             self._note_moved(index, "correct only what was mistyped")
         self._ask_for(index)
+
+    def _before(self, asked: int) -> int:
+        """Index of the reading that was typed last; from a line that is read, of the line above."""
+        rows = self._recording.rows
+        if self._last is not None and (asked == len(rows) or not rows[asked].is_read):
+            return self._last
+        return asked - 1
 
     def _note_moved(self, index: int, what: str) -> None:
         """Print what is still possible with the setup of a row, if another one was read since."""

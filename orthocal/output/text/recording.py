@@ -36,7 +36,7 @@ GLUE = "\u00a0"
 """Space at which no line ends."""
 
 COMMANDS = {
-    "back": "correct the line above; `back 7` line 7",
+    "back": "correct the reading before; `back 7` line 7",
     "again": "read the last line once more, as another cycle; `again 7` line 7",
     "skip": "leave this line empty for now",
     "drop": "delete this line from the session; `drop 7` line 7",
