@@ -193,7 +193,7 @@ def test_a_second_session_is_refused_as_the_adjustment_is(plan, tmp_path):
 def test_adjustments_that_are_not_worth_doing_are_details(machines, plans):
     _, calibration = machines[4]
     assert plans[4].judgement == "worthwhile"
-    uncertain = replace(plans[4], moved_uncertainty=1.0)
+    uncertain = replace(plans[4], displacement_uncertainty=1.0)
     assert uncertain.judgement == "uncertain gain"
 
     def show(plan, **options):

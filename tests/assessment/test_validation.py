@@ -64,7 +64,7 @@ def test_experiment_3_validates_experiment_2_as_in_the_paper(table1):
     assert result.as_expected
     assert result.nothing_to_change
     assert result.repetition.repeats is True
-    assert result.repetition.chance < 0.01
+    assert result.repetition.p_value < 0.01
     assert not result.offsets_stated
     decision = result.assessment.decision
     assert (decision.verdict, decision.exit_code) == ("enter", 0)
@@ -109,7 +109,7 @@ def test_a_right_calibration_with_noise_alone_does_not_repeat_its_residuals(plan
         entered = np.round([p.value * 1e3 for p in before.free], 3) * 1e-3
         after = simulate_session(with_offsets(plan, entered), TRUTH, seed=seed).session
         fit = repeat_fit(before, after)
-        probabilities.append(judge_deviations(before, fit).chance)
+        probabilities.append(judge_deviations(before, fit).p_value)
         repeats.append(measure_repetition(before, assemble_calibration(fit)).repeats)
     # 1 % and 5 % by construction: more than these of 20 have a chance below 1 %
     assert sum(p < BY_CHANCE for p in probabilities) <= 2
@@ -254,7 +254,7 @@ def test_validate_and_calibrate_agree_on_the_same_session(root, name, model, see
     result = validate_calibration(calibration, session)
     again = calibrate([first, session], model, solver="variable-projection").assessment
     assert result.confirmed
-    assert result.answer is result.joint
+    assert result.final_calibration is result.joint
     assert result.assessment.decision.verdict == again.decision.verdict == "enter"
     assert result.nothing_to_change is again.keeps_offsets
     stated = [e.enter for e in result.enter]
