@@ -70,9 +70,9 @@ def _residuals(calibration: Calibration) -> list[Finding]:
         return [excess(noise.cycles_sigma, "the scatter of repeated readings")]
     if stated is None:
         return [words.noise_from_residuals(calibration.sigma)]
-    if noise.leaves_more(stated):
+    if noise.exceeded_by_residuals(stated):
         return [excess(stated, "the stated noise of the gauge")]
-    if noise.leaves_less(stated):
+    if noise.exceeds_residuals(stated):
         return [words.gauge_overstated(noise.residual_sigma, stated)]
     return [words.fits_stated_noise(noise.residual_sigma)]
 

@@ -132,7 +132,7 @@ def _separate_noise(fit: Fit) -> float | None:
     gauge, scale = fit.problem.session.gauge, fit.problem.machine_selection.tolerance_scale
     if scale.factor == 1.0 or fit.noise.source != "residuals":
         return None
-    return fit.noise.apart_from_residuals(gauge.sigma, gauge.resolution)[0]
+    return fit.noise.without_residuals(gauge.sigma, gauge.resolution)[0]
 
 
 def _require_possible(estimates: Sequence[ParameterEstimate], iterations: int) -> None:

@@ -156,7 +156,7 @@ class Calibration(CalibrationRecord):
         dof = self.dof
         if scale.factor != 1.0 and self.unmodelled.names and noise.source == "residuals":
             session = self.session
-            _, dof = noise.apart_from_residuals(session.gauge_sigma, session.gauge_resolution)
+            _, dof = noise.without_residuals(session.gauge_sigma, session.gauge_resolution)
         return expanded_uncertainty(std, std_scatter, dof=dof, other_dof=scale.contrasts)
 
     @property
