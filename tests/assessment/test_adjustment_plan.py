@@ -139,7 +139,7 @@ def test_uncertainties_of_amounts_by_sampling(machines):
     deviation = search._without_offsets(search.tool.deviation(calibration.active_offsets))
     found = []
     for _ in range(200):
-        search._deviate(deviation + field @ (root @ rng.normal(size=n)))
+        search._set_deviation(deviation + field @ (root @ rng.normal(size=n)))
         found.append(search.fit(chosen)[chosen])
     assert np.std(found, axis=0) == pytest.approx(stated, rel=0.2)
 

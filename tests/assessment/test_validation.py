@@ -80,9 +80,9 @@ def test_experiment_3_validates_experiment_2_as_in_the_paper(table1):
 
 
 @pytest.mark.parametrize(
-    ("chance", "text"), [(0.22, "in 22 % of cases"), (1e-9, "in less than 0.01 % of cases")]
+    ("chance", "text"), [(0.22, "by chance 22 %"), (1e-9, "by chance below 0.01 %")]
 )
-def test_the_chance_of_a_repetition_is_a_share_of_cases(chance, text):
+def test_the_probability_of_a_repetition_is_printed(chance, text):
     assert text in describe_repetition(Repetition(6, 0.5, chance)).text
 
 
@@ -138,7 +138,7 @@ def test_offsets_that_were_not_identified_need_not_be_the_controllers(table1):
 @pytest.mark.parametrize("number", [2, 3])
 def test_the_readings_of_a_calibration_do_not_validate_it(table1, number):
     both = calibrate([table1[2], table1[3]])
-    with pytest.raises(SessionError, match="no validation"):
+    with pytest.raises(SessionError, match="belongs to the calibration itself"):
         validate_calibration(both, table1[number])
 
 

@@ -108,7 +108,7 @@ def describe_repetition(
     """
     r, where = repetition, f" in '{title}'" if title else ""
     numbers = {"rows": float(r.matched), "correlation": r.correlation, "chance": r.p_value}
-    probability = f"less than {100.0 * MIN_PRINTED:g} %"
+    probability = f"below {100.0 * MIN_PRINTED:g} %"
     if r.p_value >= MIN_PRINTED:
         probability = f"{100.0 * r.p_value:.2g} %"
     correlation = f"(correlation {r.correlation:.3f} over {r.matched} lines; probability by chance "
