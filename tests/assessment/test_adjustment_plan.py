@@ -108,7 +108,7 @@ def test_best_amounts_are_a_minimum(machines):
         for change in (-1e-5, 1e-5):
             trial = np.array(amounts)
             trial[i] += change
-            assert search.error(trial) > own or abs(trial[i]) > search.largest[i]
+            assert search.error(trial) > own or abs(trial[i]) > search.max_amounts[i]
 
 
 def test_the_effects_are_those_of_the_adjusted_machine(machines):
@@ -129,7 +129,7 @@ def test_uncertainties_of_amounts_by_sampling(machines):
     """Best amounts of machines as uncertain as the calibration says."""
     calibration = machines[4][1]
     search = search_of(calibration)
-    search.largest = np.full(15, 1.0)
+    search.max_amounts = np.full(15, 1.0)
     chosen = search.choose()[:2]
     stated = search.uncertainties(chosen) / 2.0
     root = np.linalg.cholesky(search._covariance() + 1e-24 * np.eye(len(search._covariance())))
