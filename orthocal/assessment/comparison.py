@@ -16,7 +16,7 @@ from orthocal.assessment.judgement import Judgement, judge_session, rank
 from orthocal.assessment.predictive import Repetition, measure_repetition
 from orthocal.assessment.recommendation import Recommendation, recommend_model
 from orthocal.assessment.scores import ModelResult, Score, Undetermined, score_model
-from orthocal.assessment.tool_error import ErrorSize
+from orthocal.assessment.tool_error import ErrorStatistics
 from orthocal.assessment.words import comparison as words
 from orthocal.assessment.words.entries import SESSION_HEADLINES
 from orthocal.assessment.words.validation import describe_repetition
@@ -307,7 +307,7 @@ def _result_document(result: ModelResult) -> dict[str, Any]:
             **{name: finite_or_none(getattr(s, name)) for name in CRITERIA},
         }
 
-    def size(s: ErrorSize | None) -> dict[str, float] | None:
+    def size(s: ErrorStatistics | None) -> dict[str, float] | None:
         if s is None:
             return None
         return {"rms": s.rms, "percentile_95": s.percentile_95, "largest": s.largest}

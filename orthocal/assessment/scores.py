@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.assessment.tool_error import ErrorSize, ToolAccuracy, assess_tool
+from orthocal.assessment.tool_error import ErrorStatistics, ToolAccuracy, assess_tool
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, NotIdentifiableError, RobotError, SolverError
@@ -78,7 +78,7 @@ class ModelResult:
     calibration: Calibration
     tool: ToolAccuracy | None
     """None for a robot without a tool centre point."""
-    linearisation_cost: ErrorSize | None
+    linearisation_cost: ErrorStatistics | None
     """Difference of the tool position between both estimates after alignment."""
 
 
@@ -205,7 +205,7 @@ def _predict_unseen(fit: Fit, linearisation: LinearProblem, method: Method) -> A
     return errors
 
 
-def _linearisation_cost(fit: Fit, tool: ToolAccuracy) -> ErrorSize:
+def _linearisation_cost(fit: Fit, tool: ToolAccuracy) -> ErrorStatistics:
     """Difference of the tool position between the linearised and the exact estimate."""
     change = np.zeros(len(tool.names))
     n = fit.problem.n_machine

@@ -62,7 +62,7 @@ SAMPLES = 500
 
 
 @dataclass(frozen=True, eq=False)
-class ErrorSize:
+class ErrorStatistics:
     """Statistics of position errors over a workspace, [m]."""
 
     rms: float
@@ -79,18 +79,18 @@ class ErrorSize:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ErrorSizes:
+class ToolErrorStatistics:
     """Statistics of a field of position errors: aligned, relative and absolute."""
 
-    aligned: ErrorSize | None
+    aligned: ErrorStatistics | None
     """With the best-fit translation and rotation removed; None if there are too few points."""
-    relative: ErrorSize
+    relative: ErrorStatistics
     """With the mean translation removed."""
-    absolute: ErrorSize
+    absolute: ErrorStatistics
     """Without alignment."""
 
     @property
-    def reported(self) -> ErrorSize:
+    def reported(self) -> ErrorStatistics:
         """Reported form: aligned, or relative if there are too few points."""
         return self.relative if self.aligned is None else self.aligned
 
@@ -103,7 +103,7 @@ class ToolUncertainty:
     """Covariance of the absolute position at each point, shape (C K, 3, 3), [m²]."""
     aligned_covariance: Array
     """Covariance at each point in the reported form, shape (C K, 3, 3), [m²]."""
-    sizes: ErrorSizes
+    sizes: ToolErrorStatistics
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,7 +159,7 @@ class ToolAccuracy:
         """
         return self.workspace.align(field, self.targets)
 
-    def measure(self, deviations: Array) -> ErrorSizes:
+    def measure(self, deviations: Array) -> ToolErrorStatistics:
         """Statistics of position errors of shape (C K, 3), [m]."""
         return measure_deviations(deviations, self.workspace, self.targets)
 
@@ -190,11 +190,15 @@ def measure_uncertainty(
     return ToolUncertainty(
         covariance=covariances["absolute"],
         aligned_covariance=covariances["relative" if few else "aligned"],
-        sizes=ErrorSizes(None if few else sizes["aligned"], sizes["relative"], sizes["absolute"]),
+        sizes=ToolErrorStatistics(
+            None if few else sizes["aligned"], sizes["relative"], sizes["absolute"]
+        ),
     )
 
 
-def measure_deviations(deviations: Array, workspace: Workspace, positions: Array) -> ErrorSizes:
+def measure_deviations(
+    deviations: Array, workspace: Workspace, positions: Array
+) -> ToolErrorStatistics:
     """Statistics of position errors.
 
     Args:
@@ -203,16 +207,16 @@ def measure_deviations(deviations: Array, workspace: Workspace, positions: Array
         positions: Tool positions, shape (K, 3), [m].
     """
 
-    def statistics(field: Array) -> ErrorSize:
+    def statistics(field: Array) -> ErrorStatistics:
         lengths = np.linalg.norm(field, axis=1)
-        return ErrorSize(
+        return ErrorStatistics(
             rms=float(np.sqrt(workspace.weights @ lengths**2)),
             largest=float(lengths.max()),
             find_percentile=partial(_length_percentile, field, workspace),
         )
 
     few = len(positions) < FEWEST_ALIGNED
-    return ErrorSizes(
+    return ToolErrorStatistics(
         aligned=None if few else statistics(workspace.remove_motion(deviations, positions)),
         relative=statistics(workspace.remove_shift(deviations)),
         absolute=statistics(deviations),
@@ -385,10 +389,10 @@ def _summarise_use(
     return ToolUse(**stated, parts=tuple(parts), unstated=math.hypot(unstated, compensated))
 
 
-def _normal_statistics(covariances: Array, workspace: Workspace) -> ErrorSize:
+def _normal_statistics(covariances: Array, workspace: Workspace) -> ErrorStatistics:
     """Statistics of normal errors with mean 0 and covariances of shape (K, 3, 3), [m²]."""
     mean_square = np.trace(covariances, axis1=1, axis2=2)
-    return ErrorSize(
+    return ErrorStatistics(
         rms=float(np.sqrt(workspace.weights @ mean_square)),
         largest=float(np.sqrt(mean_square.max())),
         find_percentile=partial(_sampled_percentile, covariances, workspace),

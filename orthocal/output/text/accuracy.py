@@ -16,8 +16,8 @@ from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.effect_limits import DETERMINED
 from orthocal.assessment.remaining_errors import RemainingError, find_remaining_errors
 from orthocal.assessment.tool_error import (
-    ErrorSizes,
     ToolAccuracy,
+    ToolErrorStatistics,
     assess_tool,
     summarise_tool,
 )
@@ -258,7 +258,7 @@ def format_points(rows: Array) -> str:
 def accuracy_json(calibration: Calibration, accuracy: ToolAccuracy) -> str:
     """Tool errors over a region as JSON, SI units."""
 
-    def sizes(field: ErrorSizes) -> dict[str, Any]:
+    def sizes(field: ToolErrorStatistics) -> dict[str, Any]:
         names = ("rms", "percentile_95", "largest")
         forms = {"aligned": field.aligned, "relative": field.relative, "absolute": field.absolute}
         return {
