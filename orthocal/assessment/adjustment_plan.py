@@ -162,7 +162,7 @@ def plan_adjustments(
         accuracy = assess_placed(adjusted, placed, entries, backlash)
         summary = summarise_tool(adjusted, accuracy)
         after = summary or before
-        search.correct(amounts, accuracy.error_after_offsets)
+        search.correct(amounts, accuracy.deviation_with_entries)
     return AdjustmentPlan(
         adjustments=search.order(chosen, amounts, after.entered),
         entries=entries,

@@ -125,7 +125,7 @@ class ToolAccuracy:
     """∂p/∂θ at every point, shape (C K, 3, n), [m per parameter unit]."""
     deviation: Array
     """Actual minus commanded tool position with the active offsets, shape (C K, 3), [m]."""
-    error_after_offsets: Array
+    deviation_with_entries: Array
     """Actual minus commanded tool position with the offsets and the backlash to enter, shape
     (C K, 3), [m]. The controller corrects nothing else."""
     before: ToolUncertainty
@@ -315,7 +315,7 @@ def assess_placed(
         names=free,
         jacobian=jacobian,
         deviation=read_only(tool.deviation(calibration.active_offsets, names=names)),
-        error_after_offsets=read_only(deviation),
+        deviation_with_entries=read_only(deviation),
         before=measure_uncertainty(jacobian, np.diag(prior_stds**2), workspace, targets),
         after=after,
         without_backlash=without_backlash,
@@ -335,7 +335,9 @@ def summarise_tool(calibration: Calibration, accuracy: ToolAccuracy) -> ToolErro
         return None
     uncertainty = accuracy.after.sizes
     compensated, absolute = uncertainty.reported.rms, uncertainty.absolute.rms
-    now, entered = (accuracy.measure(d) for d in (accuracy.deviation, accuracy.error_after_offsets))
+    now, entered = (
+        accuracy.measure(d) for d in (accuracy.deviation, accuracy.deviation_with_entries)
+    )
     deviation, without_backlash = accuracy.without_backlash, None
     if deviation is not None:
         without_backlash = math.hypot(accuracy.measure(deviation).reported.rms, compensated)
@@ -368,7 +370,7 @@ def _summarise_use(
     covariance = error_covariance(calibration)
     weights = accuracy.workspace.once(accuracy.use.size).weights
     deviation_changes, jacobian_changes = (
-        accuracy.use.changes(v) for v in (accuracy.error_after_offsets, accuracy.jacobian)
+        accuracy.use.changes(v) for v in (accuracy.deviation_with_entries, accuracy.jacobian)
     )
     parts = []
     for name, change in deviation_changes.items():

@@ -385,7 +385,7 @@ def test_a_stated_condition_leaves_the_others_as_they_are(assessed):
         {"approach", "payload"},
         set(),
     ]
-    sizes = [a.measure(a.error_after_offsets).aligned.rms for a in (from_one_side, at_25, both)]
+    sizes = [a.measure(a.deviation_with_entries).aligned.rms for a in (from_one_side, at_25, both)]
     assert sizes[0] < sizes[1] < sizes[2]
 
 

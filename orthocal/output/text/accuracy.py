@@ -106,7 +106,7 @@ def render_accuracy(
     rows = [("identified error, now", accuracy.measure(accuracy.deviation))]
     keep = assessment_of(calibration).keeps_offsets
     if not calibration.only_offsets and not keep:
-        entered = accuracy.measure(accuracy.error_after_offsets)
+        entered = accuracy.measure(accuracy.deviation_with_entries)
         rows.append(("identified error, offsets entered", entered))
     rows.append(("uncertainty before calibration", accuracy.before.sizes))
     scale = calibration.tolerance_scale.factor
@@ -274,7 +274,7 @@ def accuracy_json(calibration: Calibration, accuracy: ToolAccuracy) -> str:
         "points": len(accuracy.points),
         "box": None if accuracy.workspace.box is None else accuracy.workspace.box.tolist(),
         "deviation": sizes(accuracy.measure(accuracy.deviation)),
-        "offsets_entered": sizes(accuracy.measure(accuracy.error_after_offsets)),
+        "offsets_entered": sizes(accuracy.measure(accuracy.deviation_with_entries)),
         "uncertainty_before": sizes(accuracy.before.sizes),
         "uncertainty_after": None if after is None else sizes(after.sizes),
     }
