@@ -98,7 +98,7 @@ def find_held(calibration: Calibration) -> list[Finding]:
 
 def _linearisation(calibration: Calibration) -> list[Finding]:
     """Finding about the linearisation error, for the parameter with the largest part of its std."""
-    if not calibration.solver.tells_linearisation:
+    if not calibration.solver.shows_linearisation_error:
         return []
     p = max(calibration.free, key=lambda p: abs(p.value - p.linear) / max(p.std, 1e-300))
     if math.isnan(p.std) or p.std <= 0.0:

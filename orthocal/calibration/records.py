@@ -148,7 +148,7 @@ class SolverRecord:
     """Residual at which the loss changes from square to linear, [standard deviations]."""
 
     @property
-    def tells_linearisation(self) -> bool:
+    def shows_linearisation_error(self) -> bool:
         """True if the difference from the linearised estimate is the linearisation error.
 
         With a robust loss it is not, because the linearised estimate uses squares.

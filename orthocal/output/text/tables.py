@@ -53,7 +53,7 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
     linear = c.solver.name == "linearised"
     profiled = any(p.interval for p in c.free)
     by_noise = all_rows and any(p.std_scatter < p.std for p in c.free)
-    in_std = c.solver.tells_linearisation and not profiled
+    in_std = c.solver.shows_linearisation_error and not profiled
     shifts = in_std and not prior
     headers = (
         "parameter",
