@@ -19,7 +19,7 @@ from orthocal.estimation.linear import LinearProblem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.weighting import SMALLEST_SIGMA
-from orthocal.statistics.information import decompose, take_for_known
+from orthocal.statistics.information import assume_others_known, decompose
 from orthocal.statistics.zeros import project_out_zeros
 
 Method = Literal["linearised", "exact"]
@@ -113,7 +113,7 @@ def score_model(
     """
     fit = fit_problem(problem, options=options)
     linearisation = fit.linearisation
-    rank = take_for_known(linearisation.information, problem.n_machine).rank
+    rank = assume_others_known(linearisation.information, problem.n_machine).rank
     calibration = assemble_calibration(fit)
     tool = _assess(calibration)
     return ModelResult(

@@ -190,7 +190,7 @@ def marginalise(information: Information, n_first: int, *, sigma: float) -> Info
     return Information(sigma * remaining)
 
 
-def take_for_known(information: Information, n_first: int) -> Information:
+def assume_others_known(information: Information, n_first: int) -> Information:
     """Information about the first parameters if all others are known exactly."""
     return Information(information.factor[:, :n_first])
 
@@ -233,7 +233,7 @@ def require_identifiable(
         n for n, size in zip(names, (null**2).sum(axis=0), strict=True) if size > 1e-12
     )
     if undetermined:
-        information = take_for_known(information, len(names))
+        information = assume_others_known(information, len(names))
         advice = _advise(information, names, null)
         raise NotIdentifiableError(
             f"the readings do not determine {_list_some(undetermined)}: {information.rank} of "
