@@ -26,9 +26,9 @@ from orthocal.measurement.joining import name_within
 from orthocal.session.session import known_approach
 from orthocal.statistics.chance import BY_CHANCE
 from orthocal.statistics.distributions import (
-    beta_share,
     chi_square_tail,
     f_tail,
+    incomplete_beta,
     least_number,
 )
 from orthocal.statistics.information import whiten
@@ -156,7 +156,7 @@ def measure_repetition(first: Calibration, second: Calibration) -> Repetition:
     dimensions = matched - len(second.residuals) + second.noise.residual_dof
     p_value = math.nan
     if matched >= MIN_ROWS and dimensions > 1.0 and not math.isnan(correlation):
-        tail = 0.5 * (1.0 - beta_share(0.5, 0.5 * (dimensions - 1.0), cosine**2))
+        tail = 0.5 * (1.0 - incomplete_beta(0.5, 0.5 * (dimensions - 1.0), cosine**2))
         p_value = tail if cosine > 0.0 else 1.0 - tail
     return Repetition(matched, correlation, p_value)
 

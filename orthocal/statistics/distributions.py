@@ -86,7 +86,7 @@ def chi_square_tail(dof: float, value: float) -> float:
 
 def f_tail(dof: float, dof_below: float, value: float) -> float:
     """Probability that an F variable exceeds a value; `dof_below` belongs to the denominator."""
-    return beta_share(0.5 * dof_below, 0.5 * dof, dof_below / (dof_below + dof * value))
+    return incomplete_beta(0.5 * dof_below, 0.5 * dof, dof_below / (dof_below + dof * value))
 
 
 @lru_cache(maxsize=256)
@@ -94,17 +94,17 @@ def t_quantile(dof: float, share: float) -> float:
     """Quantile of Student's t distribution for a probability above one half."""
 
     def exceeds(t: float) -> bool:
-        return 1.0 - 0.5 * beta_share(0.5 * dof, 0.5, dof / (dof + t * t)) >= share
+        return 1.0 - 0.5 * incomplete_beta(0.5 * dof, 0.5, dof / (dof + t * t)) >= share
 
     return least_number(exceeds)
 
 
-def beta_share(a: float, b: float, x: float) -> float:
+def incomplete_beta(a: float, b: float, x: float) -> float:
     """Regularised incomplete beta function I_x(a, b)."""
     if not 0.0 < x < 1.0:
         return min(max(x, 0.0), 1.0)
     if x > (a + 1.0) / (a + b + 2.0):  # the fraction converges quickly for smaller x
-        return 1.0 - beta_share(b, a, 1.0 - x)
+        return 1.0 - incomplete_beta(b, a, 1.0 - x)
     logarithm = math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b)
     scale = math.exp(logarithm + a * math.log(x) + b * math.log1p(-x)) / a
 
