@@ -132,10 +132,10 @@ class ToolAccuracy:
     """Uncertainty from the priors alone."""
     after: ToolUncertainty | None
     """Uncertainty after the calibration; None if the noise is unknown."""
-    without_backlash: Array | None = None
+    deviation_without_backlash: Array | None = None
     """Actual minus commanded tool position with the offsets to enter and the present backlash,
     shape (C K, 3), [m]; None without backlash to enter."""
-    unstated: Array | None = None
+    deviation_ignoring_conditions: Array | None = None
     """Tool error if all errors are corrected for the reference conditions only, shape (C K, 3),
     [m]; None if the conditions do not vary."""
 
@@ -307,7 +307,12 @@ def assess_placed(
     backlash_entries = find_backlash(calibration) if backlash is None else backlash
     changes = backlash_changes(calibration, backlash_entries)
     deviation = tool.compensating(changes).deviation(offsets, names=names)
-    without_backlash = read_only(tool.deviation(offsets, names=names)) if changes.any() else None
+    deviation_without_backlash = None
+    if changes.any():
+        deviation_without_backlash = read_only(tool.deviation(offsets, names=names))
+    deviation_ignoring_conditions = None
+    if tool.use.varying:
+        deviation_ignoring_conditions = read_only(tool.deviation_ignoring_conditions())
     return ToolAccuracy(
         workspace=workspace,
         use=tool.use,
@@ -318,8 +323,8 @@ def assess_placed(
         deviation_with_entries=read_only(deviation),
         before=measure_uncertainty(jacobian, np.diag(prior_stds**2), workspace, targets),
         after=after,
-        without_backlash=without_backlash,
-        unstated=read_only(tool.deviation_ignoring_conditions()) if tool.use.varying else None,
+        deviation_without_backlash=deviation_without_backlash,
+        deviation_ignoring_conditions=deviation_ignoring_conditions,
     )
 
 
@@ -338,7 +343,7 @@ def summarise_tool(calibration: Calibration, accuracy: ToolAccuracy) -> ToolErro
     now, entered = (
         accuracy.measure(d) for d in (accuracy.deviation, accuracy.deviation_with_entries)
     )
-    deviation, without_backlash = accuracy.without_backlash, None
+    deviation, without_backlash = accuracy.deviation_without_backlash, None
     if deviation is not None:
         without_backlash = math.hypot(accuracy.measure(deviation).reported.rms, compensated)
     return ToolErrorSummary(
@@ -385,9 +390,9 @@ def _summarise_use(
                 uncertain=math.sqrt(max(float(variance), 0.0)),
             )
         )
-    unstated = (
-        0.0 if accuracy.unstated is None else accuracy.measure(accuracy.unstated).reported.rms
-    )
+    unstated, ignoring = 0.0, accuracy.deviation_ignoring_conditions
+    if ignoring is not None:
+        unstated = accuracy.measure(ignoring).reported.rms
     return ToolUse(**stated, parts=tuple(parts), unstated=math.hypot(unstated, compensated))
 
 

@@ -237,7 +237,7 @@ def test_stated_conditions_are_those_of_the_figures(calibration, workspace):
     drives = nominal_closure(calibration.robot).inverse(workspace.points)
     off = machine.forward(drives - calibration.active_offsets, conditions=use) - accuracy.targets
     assert np.abs(off - accuracy.deviation).max() < 1e-11
-    assert accuracy.unstated is None
+    assert accuracy.deviation_ignoring_conditions is None
     assert summarise_tool(calibration, accuracy).use is None
     with pytest.raises(ParameterError):
         assess_tool(calibration, workspace, conditions=UseConditions("pn"))
