@@ -210,7 +210,7 @@ class _ValuesToEnter:
     entries: tuple[ControllerEntry, ...]
     backlash: tuple[BacklashEntry, ...]
     keep: bool
-    """Whether the active offsets are kept."""
+    """True if the active offsets are kept."""
     tool: ToolErrorSummary | None
     """Tool error with these values; None if unknown."""
     best: ToolErrorSummary | None

@@ -150,14 +150,14 @@ def find_tool(calibration: Calibration, use: UseSamples | None = None) -> Calibr
     sensitivities = _sensitivities(calibration, use)
     identified_offsets = calibration.offsets
 
-    def reach(points: Array) -> None:
+    def require_reach(points: Array) -> None:
         drives, passive = nominal_closure(robot).reach(points)
         for offsets in (calibration.active_offsets, identified_offsets):
             _require_travel(robot, drives - offsets)
             sensitivities[0].closure.forward(drives - offsets, start=passive)
 
     try:
-        workspace = find_workspace(robot, reach)
+        workspace = find_workspace(robot, require_reach)
     except ClosureError:
         return None
     return _place(calibration, workspace, use, sensitivities)

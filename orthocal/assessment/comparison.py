@@ -201,6 +201,7 @@ def _score_with_prior(
 
 
 def _assess(comparison: Comparison) -> Assessment:
+    """Assessment of a comparison: judgement of the readings and findings about the models."""
     judgement, best = comparison.judgement, comparison.best
     notes = words.describe_recommendation(comparison.recommendation)
     notes += [words.not_determined(u.model, u.reason) for u in comparison.undetermined]
@@ -234,7 +235,7 @@ def _models_not_recommended(comparison: Comparison, best: ModelResult) -> list[F
     return [
         words.not_recommended(
             r.model,
-            recommendation.of(r.model) - recommendation.of(best.model),
+            recommendation.log_evidence_of(r.model) - recommendation.log_evidence_of(best.model),
             r.exact.unseen_rms,
             best.exact.unseen_rms,
         )
@@ -285,6 +286,7 @@ def find_known_noise(session: Session) -> KnownNoise:
 
 
 def _effects_document(comparison: EffectComparison) -> dict[str, Any]:
+    """Entries of the JSON document about effects."""
     return {
         "recommended": list(comparison.recommended),
         "weighed": [
@@ -300,6 +302,8 @@ def _effects_document(comparison: EffectComparison) -> dict[str, Any]:
 
 
 def _result_document(result: ModelResult) -> dict[str, Any]:
+    """Entries of the JSON document about one model."""
+
     def score(s: Score) -> dict[str, Any]:
         return {
             "estimates": dict(s.estimates),

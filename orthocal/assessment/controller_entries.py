@@ -118,13 +118,14 @@ def compute_backlash(
         )
         uncertainty = float(calibration.expand(std, std_scatter))
         entries.append(entry)
-        changes.append(_change_of(entry))
+        changes.append(_backlash_change(entry))
         determined.append(max(value, abs(value - active_backlash)) > uncertainty)
     entering = _choose_changes(calibration, tool, changes, determined)
     return tuple(e if enter else e.kept for e, enter in zip(entries, entering, strict=True))
 
 
-def _change_of(entry: BacklashEntry) -> dict[str, float]:
+def _backlash_change(entry: BacklashEntry) -> dict[str, float]:
+    """Parameter of the backlash of a drive to its change, [SI]."""
     return {f"{entry.drive}.backlash": entry.change}
 
 
@@ -171,7 +172,7 @@ class ScrewEntry:
     @property
     def values(self) -> dict[str, float]:
         """Parameter to value to enter, [m]."""
-        return _by_parameter(self.drive, self.enter)
+        return _screw_parameters(self.drive, self.enter)
 
 
 def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
@@ -196,7 +197,7 @@ def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
         amplitudes = np.linalg.norm([identified, identified - active], axis=1)
         limits = ELLIPSE_FACTOR * np.array([uncertainty, change_uncertainty])
         determined.append(bool((amplitudes > limits).any()))
-    changes = [_by_parameter(e.drive, e.change) for e in entries]
+    changes = [_screw_parameters(e.drive, e.change) for e in entries]
     entering = _choose_changes(calibration, find_tool(calibration), changes, determined)
     return tuple(
         e if enter else replace(e, enter=e.active)
@@ -204,7 +205,8 @@ def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
     )
 
 
-def _by_parameter(drive: str, values: Array) -> dict[str, float]:
+def _screw_parameters(drive: str, values: Array) -> dict[str, float]:
+    """Parameters A and B of the screw of a drive to their values, [m]."""
     return dict(zip((f"{drive}.{kind}" for kind in KINDS), values.tolist(), strict=True))
 
 
@@ -250,7 +252,7 @@ def is_worth_changing(
     """True if the backlash is worth entering although the offsets are kept."""
     changes: dict[str, float] = {}
     for e in entries:
-        changes |= _change_of(e)
+        changes |= _backlash_change(e)
     return any(
         abs(e.change) > float(calibration.expand(e.std, e.std_scatter)) for e in entries
     ) or _changes_tool(calibration, tool, changes)
@@ -341,13 +343,14 @@ def compute_entries(
             enter=float(enter[i]),
             std=float(std[i]),
             std_scatter=float(std_scatter[i]),
-            held=_hold(parts[0]) if tool is None and len(parts) == 1 else None,
+            held=_reason_held(parts[0]) if tool is None and len(parts) == 1 else None,
         )
         for i, parts in parameters_of_drive.items()
     )
 
 
-def _hold(p: ParameterEstimate) -> Literal["known", "lower bound", "upper bound"] | None:
+def _reason_held(p: ParameterEstimate) -> Literal["known", "lower bound", "upper bound"] | None:
+    """Reason why the readings do not determine a parameter; None if they do."""
     if not p.free:
         return "known"
     if p.at_bound is None:

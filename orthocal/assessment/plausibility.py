@@ -318,5 +318,6 @@ def describe_legs(lengths: dict[str, float]) -> str:
 
 
 def _rms(values: Array | Sequence[float]) -> float:
+    """RMS of values; 0 if there are none."""
     v = np.asarray(values)
     return float(np.sqrt(np.mean(v**2))) if v.size else 0.0

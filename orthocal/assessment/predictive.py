@@ -165,7 +165,8 @@ _Row = tuple[str, str, str | None, str | None]
 """Setup, posture and subtracted posture by their names in the session, and approach."""
 
 
-def _rows(calibration: Calibration) -> Iterator[tuple[_Row, ResidualRow]]:
+def _keyed_rows(calibration: Calibration) -> Iterator[tuple[_Row, ResidualRow]]:
+    """Rows of a calibration with keys that two sessions share."""
     joined = bool(calibration.session.parts)
     for r in calibration.residuals:
         setup, posture = (name_within(n, joined=joined) for n in (r.setup, r.posture))
@@ -178,7 +179,7 @@ def _correlate(first: Calibration, second: Calibration) -> tuple[int, float, flo
     means = []
     for calibration in (first, second):
         residuals_of_row: dict[_Row, list[float]] = defaultdict(list)
-        for key, r in _rows(calibration):
+        for key, r in _keyed_rows(calibration):
             residuals_of_row[key].append(r.residual)
         means.append({key: sum(v) / len(v) for key, v in residuals_of_row.items()})
     common = [key for key in means[0] if key in means[1]]

@@ -65,7 +65,7 @@ class Recommendation:
     scale_evidence: float
     """Log evidence of this scale relative to the stated tolerances; 0 if the scale is 1."""
 
-    def of(self, model: str) -> float:
+    def log_evidence_of(self, model: str) -> float:
         """Log evidence of a model relative to the complete model; NaN if it was not computed."""
         return next((e.log_evidence for e in self.evidence if e.model == model), math.nan)
 
@@ -86,6 +86,7 @@ def recommend_model(session: Session, models: Sequence[str] = ()) -> Recommendat
 
 @lru_cache(maxsize=CACHE_SIZE)
 def _recommend(session: Session, models: tuple[str, ...]) -> Recommendation:
+    """Recommended model; see `recommend_model`."""
     parameters = session.robot.parameters
     complete = complete_model(parameters)
     names = [m for m in dict.fromkeys(models or parameters.models) if m != complete]

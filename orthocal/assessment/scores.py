@@ -69,15 +69,15 @@ class ModelResult:
     effective: float
     """Effective number of parameters that the readings determine."""
     prior: bool
-    """Whether the tolerances are used as a prior."""
+    """True if the tolerances are used as a prior."""
     by_choice: bool
-    """Whether the prior is used, or not used, by choice; otherwise because the readings alone do
+    """True if the prior is used, or not used, by choice; False if it is used because readings do
     not determine the model."""
     linearised: Score
     exact: Score
     calibration: Calibration
     tool: ToolAccuracy | None
-    """None for a robot without a tool centre point."""
+    """Tool errors; None for a robot without a tool centre point."""
     linearisation_cost: ErrorStatistics | None
     """Difference of the tool position between both estimates after alignment."""
 
@@ -133,6 +133,7 @@ def score_model(
 
 
 def _assess(calibration: Calibration) -> ToolAccuracy | None:
+    """Tool errors; None if they cannot be computed."""
     try:
         return assess_tool(calibration)
     except (ClosureError, RobotError):  # no tool, or no reachable workspace
@@ -140,12 +141,14 @@ def _assess(calibration: Calibration) -> ToolAccuracy | None:
 
 
 def _effective(fit: Fit) -> float:
+    """Effective number of parameters of a fit."""
     return fit.information.effective_parameters(
         sigma=fit.sigma, precision=fit.problem.prior_precision
     )
 
 
 def _score(fit: Fit, linearisation: LinearProblem, method: Method, noise: float) -> Score:
+    """Score of one method; `noise` is the standard deviation of a reading, [m]."""
     problem, observations = fit.problem, fit.problem.observations
     theta = fit.linearised_theta if method == "linearised" else fit.solution.theta
     try:

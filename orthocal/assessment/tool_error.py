@@ -83,11 +83,11 @@ class ToolErrorStatistics:
     """Statistics of a field of position errors: aligned, relative and absolute."""
 
     aligned: ErrorStatistics | None
-    """With the best-fit translation and rotation removed; None if there are too few points."""
+    """Statistics after removing the best-fit translation and rotation; None for too few points."""
     relative: ErrorStatistics
-    """With the mean translation removed."""
+    """Statistics after removing the mean translation."""
     absolute: ErrorStatistics
-    """Without alignment."""
+    """Statistics without alignment."""
 
     @property
     def reported(self) -> ErrorStatistics:

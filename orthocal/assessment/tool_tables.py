@@ -95,6 +95,7 @@ def inverse_blocks(
 
 
 def _closure(calibration: Calibration, conditions: UseConditions | None) -> LoopClosure:
+    """Loop closures of the calibrated machine."""
     use = conditions or UseConditions()
     return LoopClosure(calibration.robot, fixed=calibration.errors, conditions=use)
 

@@ -85,10 +85,10 @@ class Validation:
     """Comparison of a new session with the predictions of a calibration."""
 
     confirmed: bool | None
-    """Whether the calibration is confirmed. None if it predicts nothing, or if the new readings
+    """True if the calibration is confirmed; None if it predicts nothing, or if the new readings
     agree with it but have anomalies."""
     offsets_stated: bool
-    """Whether the session states the active offsets; otherwise the calibrated ones are assumed."""
+    """True if the session states the active offsets; otherwise the calibrated ones are assumed."""
     expected_rms: float
     """Predicted RMS of the deviations, [m]."""
     expected_largest: float

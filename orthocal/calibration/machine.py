@@ -76,6 +76,7 @@ class Machine:
         return self._closure(conditions).inverse(points, names=names)
 
     def _closure(self, conditions: UseConditions | None) -> LoopClosure:
+        """Loop closures of the machine under conditions of use."""
         use = conditions or UseConditions()
         use.require_valid(self.robot)
         return LoopClosure(self.robot, fixed=self.errors, conditions=use)

@@ -93,7 +93,7 @@ class RobotRecord:
     effects: Many[str] | None = None
     """Chosen effects beside geometry; None for those of the robot's YAML."""
     adjusted: bool = False
-    """Whether sessions with different mechanical adjustments were calibrated together."""
+    """True if sessions with different mechanical adjustments were calibrated together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,7 +180,7 @@ class ParameterEstimate(InUnit):
     start: Number
     """Active value in the controller, the point of linearisation, [unit]."""
     prior: bool
-    """Whether its prior was used."""
+    """True if its prior was used."""
     mean: Number
     """Prior mean, [unit]."""
     lower: Number | None
@@ -275,7 +275,7 @@ class CalibrationRecord:
     session: SessionRecord
     model: str
     prior: bool
-    """Whether priors were used."""
+    """True if priors were used."""
     solver: SolverRecord
     parameters: Annotated[Many[ParameterEstimate], Field(min_length=1)]
     """Free parameters, then known parameters."""
@@ -291,7 +291,7 @@ class CalibrationRecord:
     identifiability: Identifiability
     """Resolvable directions and groups of inseparable parameters."""
     base: bool
-    """Whether free parameters are base parameters: values of linear combinations."""
+    """True if free parameters are base parameters: values of linear combinations."""
     noise: Noise
     """Noise of one reading of the first gauge."""
     rows_are_differences: bool

@@ -250,7 +250,7 @@ class Session:
     parts: tuple[Session, ...] = ()
     """Sessions that were joined into this one, if they are available."""
     joined: bool = False
-    """Whether sessions were joined. Names then begin with the name of their session and a slash."""
+    """True if sessions were joined. Names then begin with the name of their session and a slash."""
     purpose: Purpose | None = None
     """Model and free errors that the session states."""
     seed: int | None = None

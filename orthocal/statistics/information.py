@@ -46,6 +46,7 @@ class Information:
 
     @cached_property
     def _decomposition(self) -> tuple[Array, Array]:
+        """Singular values and right singular vectors."""
         _, values, directions = np.linalg.svd(self.factor, full_matrices=True)
         return np.append(values, np.zeros(len(directions) - len(values))), directions
 

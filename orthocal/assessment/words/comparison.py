@@ -23,7 +23,7 @@ def describe_recommendation(
         recommendation: The recommendation.
         identified: The identified model, which may be another one.
     """
-    evidence = recommendation.of(recommendation.model)
+    evidence = recommendation.log_evidence_of(recommendation.model)
     if evidence > 0.0:
         reason = (
             "The readings support it strongly against the complete model: the other errors are "
@@ -33,7 +33,7 @@ def describe_recommendation(
         reason = "It is the complete model, and the readings support no smaller one strongly."
     numbers = {"log_evidence": evidence}
     if identified is not None and identified != recommendation.model:
-        against = evidence - recommendation.of(identified)
+        against = evidence - recommendation.log_evidence_of(identified)
         if math.isfinite(against):  # clipped: huge if the stated noise is unrealistically small
             against = min(max(against, -LARGEST_NUMBER), LARGEST_NUMBER)
             numbers["log_evidence_against_chosen"] = against
