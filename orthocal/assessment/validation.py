@@ -205,13 +205,10 @@ def validate_calibration(
         SolverError: If the fit of the new readings does not converge.
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
-    calibration, new_sessions = _apply_tolerances_and_adjustments(
-        calibration, gather_sessions(sessions), tolerances or {}
-    )
+    gathered = gather_sessions(sessions)
+    calibration, new_sessions = _apply_stated(calibration, gathered, tolerances or {})
     measured = [_with_active_offsets(calibration, one) for one in new_sessions]
-    session = join_sessions(measured)
-    judgement, fit = judge_session(session), repeat_fit(calibration, session)
-    refit = _assess_refit(fit, calibration, judgement)
+    judgement, fit, refit = _refit(calibration, join_sessions(measured))
     all_sessions = join_sessions([restore_session(calibration), *measured])
     anomalies = find_anomalies(all_sessions)
     mistake, changes, wrongly_entered = _find_changes(all_sessions, anomalies, judgement)
@@ -219,19 +216,14 @@ def validate_calibration(
     agreement = _describe_agreement(refit, test, expected_rms, explained=bool(changes))
     confirmed = None if math.isnan(test.p_value) else _confirmation(agreement, changes, judgement)
     joint = _calibrate_jointly(calibration, all_sessions, anomalies) if confirmed else None
-    further_changes, assessment = _find_further_change(joint), assessment_of(joint or refit)
-    contradicted = confirmed is False  # not if the confirmation is unknown
-    keep = wrongly_entered or not (contradicted or further_changes)
-    entries = find_entries(calibration) if keep else assessment.entries
+    entries, notes = _choose_entries(
+        calibration, refit, joint, confirmed=confirmed, wrongly_entered=wrongly_entered
+    )
     repetition = measure_repetition(calibration, refit)
     stated = all(one.controller_offsets is not None for one in new_sessions)
-    notes = list(further_changes)
-    if not wrongly_entered:
-        notes += assessment.of_kind(*ENTRY_KINDS)
     exceeded = _is_expected(test.p_value) is False
-    notes.append(words.describe_repetition(repetition, exceeded=exceeded))
-    if not stated:
-        notes.append(words.controller_assumed())
+    notes += [words.describe_repetition(repetition, exceeded=exceeded)]
+    notes += [] if stated else [words.controller_assumed()]
     return Validation(
         confirmed=confirmed,
         offsets_stated=stated,
@@ -244,7 +236,7 @@ def validate_calibration(
         enter=entries,
         repetition=repetition,
         assessment=replace(
-            assessment,
+            assessment_of(joint or refit),
             decision=_decide(confirmed, judgement, agreement, changes),
             findings=rank([*judgement.findings, agreement, *changes, *notes]),
             entries=entries,
@@ -252,7 +244,7 @@ def validate_calibration(
     )
 
 
-def _apply_tolerances_and_adjustments(
+def _apply_stated(
     calibration: Calibration, sessions: Sequence[Session], tolerances: Mapping[str, float]
 ) -> tuple[Calibration, list[Session]]:
     """Calibration and new sessions with the stated tolerances and mechanical adjustments.
@@ -267,10 +259,15 @@ def _apply_tolerances_and_adjustments(
     return calibration, restated
 
 
-def _assess_refit(fit: Fit, calibration: Calibration, judgement: Judgement) -> Calibration:
-    """Assessed calibration of the new readings; its nominal readings are the predicted ones."""
+def _refit(calibration: Calibration, session: Session) -> tuple[Judgement, Fit, Calibration]:
+    """Judgement, fit and assessed calibration of new readings.
+
+    The nominal readings of the calibration are the predicted ones.
+    """
+    judgement, fit = judge_session(session), repeat_fit(calibration, session)
     refit = assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
-    return replace(refit, assessment=assess(refit, fit.problem.session, judgement=judgement))
+    refit = replace(refit, assessment=assess(refit, session, judgement=judgement))
+    return judgement, fit, refit
 
 
 def _confirmation(
@@ -419,6 +416,31 @@ def _describe_agreement(
             place=Place(line=worst.line, setup=worst.setup, posture=worst.postures),
         )
     return words.as_predicted(achieved, limit, numbers)
+
+
+def _choose_entries(
+    calibration: Calibration,
+    refit: Calibration,
+    joint: Calibration | None,
+    *,
+    confirmed: bool | None,
+    wrongly_entered: bool,
+) -> tuple[tuple[ControllerEntry, ...], list[Finding]]:
+    """Values to enter after the new readings, and findings about them.
+
+    Args:
+        calibration: The validated calibration.
+        refit: Fit of the new readings, assessed.
+        joint: Joint calibration; None if the calibration is not confirmed.
+        confirmed: Whether the calibration is confirmed; None if unknown.
+        wrongly_entered: Whether the offsets of the calibration were entered wrongly.
+    """
+    assessment, findings = assessment_of(joint or refit), _find_further_change(joint)
+    keep = wrongly_entered or (confirmed is not False and not findings)
+    entries = find_entries(calibration) if keep else assessment.entries
+    if not wrongly_entered:
+        findings += assessment.of_kind(*ENTRY_KINDS)
+    return entries, findings
 
 
 def _find_further_change(joint: Calibration | None) -> list[Finding]:

@@ -189,18 +189,16 @@ def build_accuracy_study(
     if chosen.effects is not None:
         session = session.with_effects(chosen.effects)
     machine_effects = session.robot.effect_names if effects is None else order_effects(effects)
-    session_of_machines = session.with_effects(machine_effects)
-    robot, fixed = session_of_machines.robot, dict(fixed or {})
+    plan = session.with_effects(machine_effects)
+    robot, fixed = plan.robot, dict(fixed or {})
     parameters = robot.parameters
     names = _select_drawn(drawn, fixed, parameters)
     stated_stds = parameters.read_tolerances(chosen.tolerances)
     stated_stds = {n: std for glob, std in stated_stds.items() for n in parameters.select([glob])}
-    chosen = replace(
-        chosen, effects=None, tolerances=_tolerances_of_model(chosen, session, session_of_machines)
-    )
+    chosen = replace(chosen, effects=None, tolerances=_tolerances_of_model(chosen, session, plan))
     chosen.select(session.robot.parameters)
     _require_noise(session)
-    require_conditions(session_of_machines, names)
+    require_conditions(plan, names)
     box = find_workspace(robot).limits if half_side is None else cube_limits(robot, half_side)
     return AccuracyStudy(
         session=session.with_values(np.zeros(len(session.readings))),

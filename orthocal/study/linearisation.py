@@ -292,27 +292,23 @@ def build_linearisation_study(
         along: One direction in place of random ones: a number for each error.
         sizes: Sizes in place of `largest` and `count`, [mm or mrad].
         displacements: Displacements of the paper's postures.
-        gauge: Gauge whose noise and resolution are compared; default: that of the session, or the
-            paper's.
+        gauge: Gauge of the comparison; default: that of the session, or the paper's.
         seed: Seed of the directions.
 
     Raises:
         ParameterError: If nothing can be identified, or a number is invalid.
-        SessionError: If the robot cannot be measured by the paper's plan.
+        RobotError: If the robot cannot be measured by the paper's plan.
     """
     robot = source if isinstance(source, Robot) else source.robot
     names = robot.parameters.select(free)
     if not {robot.parameters[n].unit for n in names} <= {"m", "rad"}:
         raise ParameterError("expected lengths and angles; a scale has no mm", where="--free")
-    displacements_or_none = None
+    paper_displacements = None
     if isinstance(source, Robot):
-        paper_displacements = displacements or Displacements()
-        source = build_paper_plan(source, paper_displacements, gauge or PAPER_GAUGE)
-        displacements_or_none = (
-            paper_displacements
-            if names == tuple(f"{d.name}.offset" for d in robot.drives)
-            else None
-        )
+        displacements = displacements or Displacements()
+        source = build_paper_plan(source, displacements, gauge or PAPER_GAUGE)
+        if names == tuple(f"{d.name}.offset" for d in robot.drives):
+            paper_displacements = displacements
     gauge = gauge or source.gauge
     if along is None:
         vectors = np.random.default_rng(seed).normal(size=(directions, len(names)))
@@ -327,7 +323,7 @@ def build_linearisation_study(
         free=tuple(names),
         sizes=tuple(float(f"{v:.4g}") for v in sizes),
         directions=tuple(tuple(v.tolist()) for v in unit_vectors),
-        displacements=displacements_or_none,
+        displacements=paper_displacements,
         sigma=noise_floor(gauge.sigma, gauge.resolution),
         resolution=gauge.resolution or 0.0,
     )
