@@ -252,7 +252,8 @@ def assess_tool(
     if conditions is not None:
         conditions.require_valid(calibration.robot)
         use = sample_use(calibration.robot, conditions)
-        use = use if use.varying else UseSamples((conditions,))
+        if not use.varying:  # one sample: the stated conditions, also those that no effect needs
+            use = UseSamples((conditions,))
     if workspace is None:
         return assess_placed(calibration, require_tool(calibration, find_tool(calibration, use)))
     placed = place_tool(calibration, workspace, use, names=names)

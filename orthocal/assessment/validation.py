@@ -469,7 +469,7 @@ def _decide(
     action is the first one of the anomalies, the changes and the agreement.
     """
     anomalies = [f for f in judgement.findings if f.severity != "note"][:1]
-    headlines = {True: words.CONFIRMED, False: words.NOT_CONFIRMED, None: words.UNKNOWN}
+    headlines = {True: words.CONFIRMED, False: words.NOT_CONFIRMED, None: words.INCONCLUSIVE}
     return Decision(
         verdict_of([*judgement.findings, agreement, *changes]),
         headlines[confirmed],

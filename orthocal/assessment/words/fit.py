@@ -161,21 +161,21 @@ def held_by_bound(parameter: ParameterEstimate, *, offset: bool) -> Finding:
     )
 
 
-def linearisation_error(p: ParameterEstimate, change: float, std: float) -> Finding:
+def linearisation_error(parameter: ParameterEstimate, change: float, std: float) -> Finding:
     """Finding about the difference of the linearised and the exact estimate of a parameter.
 
     Args:
-        p: Parameter with the largest difference relative to its standard deviation.
+        parameter: Parameter with the largest difference relative to its standard deviation.
         change: The difference, [SI].
         std: Standard deviation of the parameter, [SI].
     """
     return note(
         "linearisation error",
         "Most changed by linearisation, relative to its uncertainty: "
-        f"{p.name} by {plain(change * p.edge_factor)} {p.edge_unit}, {change / std:.2g} times its "
-        "standard deviation.",
+        f"{parameter.name} by {plain(change * parameter.edge_factor)} {parameter.edge_unit}, "
+        f"{change / std:.2g} times its standard deviation.",
         "",
-        named(p.name),
+        named(parameter.name),
         part_of_std=change / std,
     )
 

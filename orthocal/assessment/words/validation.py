@@ -10,7 +10,7 @@ from orthocal.calibration.assessment_record import ControllerEntry, Finding, Pla
 
 CONFIRMED = "The calibration is confirmed."
 NOT_CONFIRMED = "The calibration is not confirmed."
-UNKNOWN = "It is unknown whether the calibration is confirmed."
+INCONCLUSIVE = "The validation is inconclusive."
 
 MIN_PRINTED = 1e-4
 """Probability by chance below which only this limit is printed."""
