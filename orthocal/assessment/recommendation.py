@@ -125,7 +125,7 @@ def compute_log_evidence(
     """
     total, by_scale = 0.0, np.zeros(TOLERANCE_SCALES.size)
     for part in split_sessions(session):
-        if len(part.readings) < 2:  # one reading determines only the gauge zero
+        if len(part.readings) < 2:  # one reading usually determines only a gauge zero
             continue
         linear = linear_model(part, model, free=free)
         linearisation = linear.most_likely(part.values)
