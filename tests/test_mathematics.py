@@ -97,7 +97,7 @@ def test_covariance_at_the_tool():
     c = e @ calibration.model_covariance @ e.transpose(0, 2, 1)
     square = mean(c + direct @ direct.transpose(0, 2, 1))
     assert math.sqrt(square) == pytest.approx(accuracy.after.sizes.aligned.rms, rel=SAME_NUMBER)
-    eta, known = calibration.tolerance_scale, accuracy.measure(accuracy.error_after_offsets)
+    eta, known = calibration.tolerance_scale, accuracy.measure(accuracy.deviation_with_entries)
     total = math.sqrt(square + known.aligned.rms**2)
     assert total == pytest.approx(calibration.assessment.tool.entered, rel=SAME_NUMBER)
     without = math.sqrt(mean(e @ calibration.total_covariance @ e.transpose(0, 2, 1)))

@@ -28,10 +28,10 @@ from orthocal.estimation.weighting import (
 )
 from orthocal.statistics.information import (
     Information,
+    assume_others_known,
     decompose,
     marginalise,
     require_identifiable,
-    take_for_known,
 )
 from orthocal.statistics.noise import Noise, estimate_noise, estimate_repeatability
 from orthocal.statistics.zeros import project_out_zeros
@@ -501,7 +501,7 @@ def find_mounting_covariance(
     n, precision = problem.n_machine, problem.prior_precision
     at_bound = np.zeros(problem.n_free, dtype=np.bool_) if at_bound is None else at_bound
     total = information.covariance(sigma=sigma, precision=precision, at_bound=at_bound)
-    without_mounting = take_for_known(information, n).covariance(
+    without_mounting = assume_others_known(information, n).covariance(
         sigma=sigma, precision=precision[:n], at_bound=at_bound[:n]
     )
     scale = problem.theta_scale[:n]

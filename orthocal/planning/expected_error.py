@@ -16,8 +16,8 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.assessment.tool_error import (
-    ErrorSize,
-    ErrorSizes,
+    ErrorStatistics,
+    ToolErrorStatistics,
     ToolUncertainty,
     measure_uncertainty,
 )
@@ -74,12 +74,12 @@ class Expected:
     misses the rod."""
 
     @property
-    def sizes(self) -> ErrorSizes:
+    def sizes(self) -> ToolErrorStatistics:
         """Tool error in its three forms."""
         return self.tool.sizes
 
     @property
-    def reported(self) -> ErrorSize:
+    def reported(self) -> ErrorStatistics:
         """Tool error in the reported form."""
         return self.tool.sizes.reported
 

@@ -332,8 +332,8 @@ def test_what_is_entered_is_in_where_the_tool_is_then(calibrated):
     before, after = (
         assess_tool(c, points) for c in (calibrated, replace(calibrated, session=session))
     )
-    assert after.deviation == pytest.approx(before.error_after_offsets, abs=1e-12)
-    assert np.linalg.norm(before.deviation) > 5 * np.linalg.norm(before.error_after_offsets)
+    assert after.deviation == pytest.approx(before.deviation_with_entries, abs=1e-12)
+    assert np.linalg.norm(before.deviation) > 5 * np.linalg.norm(before.deviation_with_entries)
 
 
 def test_offsets_alone_are_as_good_as_the_machines_are(root):

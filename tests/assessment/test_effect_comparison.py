@@ -154,7 +154,7 @@ def test_the_evidence_counts_where_left_out_setups_disagree(session):
     none, best = found.weighed
     worse = replace(best, unseen_rms=1.5 * none.unseen_rms)
     said = [describe_effects(replace(found, weighed=(none, w)), 40)[0].text for w in (best, worse)]
-    assert ["the evidence counts" in text for text in said] == [False, True]
+    assert ["the evidence of all readings" in text for text in said] == [False, True]
 
 
 def test_the_answer_has_the_recommendation(session):

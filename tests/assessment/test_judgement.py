@@ -338,7 +338,7 @@ def test_the_tool_error_is_that_of_the_accuracy(workshop):
     calibration = calibrate(workshop, solver="variable-projection")
     tool, accuracy = calibration.assessment.tool, assess_tool(calibration)
     known = accuracy.after.sizes.reported.rms
-    left = accuracy.measure(accuracy.error_after_offsets).reported.rms
+    left = accuracy.measure(accuracy.deviation_with_entries).reported.rms
     assert tool.entered == pytest.approx(math.hypot(left, known), rel=1e-9)
     assert tool.compensated == pytest.approx(known, rel=1e-9)
     assert tool.region == "±60 mm"

@@ -237,7 +237,7 @@ def test_stated_conditions_are_those_of_the_figures(calibration, workspace):
     drives = nominal_closure(calibration.robot).inverse(workspace.points)
     off = machine.forward(drives - calibration.active_offsets, conditions=use) - accuracy.targets
     assert np.abs(off - accuracy.deviation).max() < 1e-11
-    assert accuracy.unstated is None
+    assert accuracy.deviation_ignoring_conditions is None
     assert summarise_tool(calibration, accuracy).use is None
     with pytest.raises(ParameterError):
         assess_tool(calibration, workspace, conditions=UseConditions("pn"))
@@ -385,7 +385,7 @@ def test_a_stated_condition_leaves_the_others_as_they_are(assessed):
         {"approach", "payload"},
         set(),
     ]
-    sizes = [a.measure(a.error_after_offsets).aligned.rms for a in (from_one_side, at_25, both)]
+    sizes = [a.measure(a.deviation_with_entries).aligned.rms for a in (from_one_side, at_25, both)]
     assert sizes[0] < sizes[1] < sizes[2]
 
 

@@ -137,7 +137,7 @@ def test_what_was_identified_is_validated(tmp_path, robot):
         confirmed.append(result.confirmed)
         # another dial, as it is predicted
         fit = repeat_fit(found, second.session)
-        chances.append(judge_deviations(found, fit).chance)
+        chances.append(judge_deviations(found, fit).p_value)
         achieved = repeat_calibration(found, second.session).rms_before
         sizes.append((expect_rms(found, fit), achieved))
     # one in a hundred is refused for its deviations

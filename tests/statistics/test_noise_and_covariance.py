@@ -121,7 +121,7 @@ def test_where_sigma_is_from(repeatability, square, dof, gauge, source, sigma):
     assert noise.source == source
     assert noise.sigma == pytest.approx(sigma, nan_ok=True)
     if repeatability[1] > 0:
-        assert noise.leaves_more(None) is (source == "residuals")
+        assert noise.exceeded_by_residuals(None) is (source == "residuals")
 
 
 @pytest.mark.parametrize("given", [True, False])
@@ -247,8 +247,8 @@ def test_the_chance_of_an_excess_over_cycles_is_an_f_test():
     ],
 )
 def test_residuals_against_the_noise_of_the_gauge(noise, gauge, more, less):
-    assert noise.leaves_more(gauge) is more
-    assert noise.leaves_less(gauge) is less
+    assert noise.exceeded_by_residuals(gauge) is more
+    assert noise.exceeds_residuals(gauge) is less
 
 
 def test_what_is_kept_of_information_is_as_if_the_rest_were_estimated_too():

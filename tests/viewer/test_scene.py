@@ -386,7 +386,7 @@ def test_errors_of_the_tool_are_those_of_the_calibration(full):
     targets = whole.targets[corners]
     for node, deviation in (
         (tool_errors.TOOL_NOW, whole.align(whole.deviation)[corners]),
-        (tool_errors.TOOL_ENTERED, whole.align(whole.error_after_offsets)[corners]),
+        (tool_errors.TOOL_ENTERED, whole.align(whole.deviation_with_entries)[corners]),
     ):
         for i in (0, 13, 26):
             pose = scene.pose(f"{node}/point {i + 1}")

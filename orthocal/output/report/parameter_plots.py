@@ -230,7 +230,7 @@ def plot_singular_values(calibration: Calibration) -> Figure | None:
 
 def _linearisation_shifts(calibration: Calibration) -> list[tuple[float, ParameterEstimate]]:
     """Exact less linearised estimates in σ, the largest first."""
-    if not calibration.solver.tells_linearisation:
+    if not calibration.solver.shows_linearisation_error:
         return []
     finite = [p for p in calibration.free if math.isfinite(p.std) and p.std > 0.0]
     shifts = [((p.value - p.linear) / p.std, p) for p in finite]

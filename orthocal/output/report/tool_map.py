@@ -77,7 +77,7 @@ def _error_parts(accuracy: ToolAccuracy, which: Field) -> Array:
         return accuracy.average(accuracy.align(accuracy.deviation)) / UM
     remaining = accuracy.after
     if which == "entered" or remaining is None:
-        return accuracy.average(accuracy.align(accuracy.error_after_offsets)) / UM
+        return accuracy.average(accuracy.align(accuracy.deviation_with_entries)) / UM
     variance = accuracy.average(np.trace(remaining.aligned_covariance, axis1=1, axis2=2))
     return np.asarray(np.sqrt(np.maximum(variance, 0.0))[:, None] / UM)
 

@@ -55,7 +55,7 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
     region = accuracy.workspace.words.removeprefix("the workspace ")
     now, entered = (
         accuracy.average(accuracy.align(d))
-        for d in (accuracy.deviation, accuracy.error_after_offsets)
+        for d in (accuracy.deviation, accuracy.deviation_with_entries)
     )
     now_largest, entered_largest = (_largest(d) for d in (now, entered))
     # RMS in space, as in all tables; axes of an ellipsoid are shorter

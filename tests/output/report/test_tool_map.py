@@ -122,7 +122,7 @@ def test_sizes_are_those_of_the_error_in_question(table1, accuracy):
     def sizes(which):
         return np.linalg.norm(tool_map._error_parts(accuracy, which), axis=1)
 
-    found = (accuracy.deviation, accuracy.error_after_offsets)
+    found = (accuracy.deviation, accuracy.deviation_with_entries)
     deviation, left = (np.linalg.norm(accuracy.align(v), axis=1) for v in found)
     np.testing.assert_allclose(sizes("now"), deviation * 1e6, rtol=GRID)
     np.testing.assert_allclose(sizes("entered"), left * 1e6, rtol=GRID)
