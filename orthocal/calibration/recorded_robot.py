@@ -221,7 +221,9 @@ def require_consistent(record: CalibrationRecord, robot: Robot, *, file: str) ->
         if row.conditions is not None:
             where = f"{file}: residuals[{i}].conditions"
             with _named(where):
-                check_conditions(row.conditions, robot, row.minus is not None, where)
+                check_conditions(
+                    row.conditions, robot, difference=row.minus is not None, where=where
+                )
 
 
 @contextmanager

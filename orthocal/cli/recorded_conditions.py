@@ -6,7 +6,7 @@ import sys
 from datetime import datetime
 
 from orthocal.io.tables.numerals import plain_minus
-from orthocal.measurement.files.readings_checks import parse_approach, parse_temperature
+from orthocal.measurement.files.readings_checks import parse_temperature, require_approach
 from orthocal.measurement.recording import Recording
 from orthocal.observation.conditions import needed_conditions
 from orthocal.session.session import Conditions, Reading
@@ -79,7 +79,8 @@ class RecordedConditions:
         """
         robot = self._recording.session.robot
         letters = text * len(robot.drives) if len(text) == 1 else text
-        self.approach = parse_approach(letters, robot, "the side")
+        require_approach(letters, robot, "the side")
+        self.approach = letters
 
     def of(self, row: Reading) -> Conditions | None:
         """Conditions of a reading that is typed now; None if nothing is stated."""

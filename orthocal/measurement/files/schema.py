@@ -1,4 +1,7 @@
-"""Keys of a session.yaml, with their units."""
+"""Keys of a session.yaml, with their units.
+
+The text of a validator's error is `key|problem` where the problem belongs to one key.
+"""
 
 from __future__ import annotations
 
@@ -16,41 +19,57 @@ from orthocal.sensors.tips import TipKeys
 from orthocal.session.session import Gauge
 from orthocal.units import DEG, MM, MRAD, Unit
 
-Vector = Annotated[list[Number], Field(min_length=1, max_length=12)]
+MAX_DRIVES = 12
+"""Largest number of drives, and of coordinates of a posture."""
+
+Coordinates = Annotated[list[Number], Field(min_length=1, max_length=MAX_DRIVES)]
 
 LARGEST_READING_MM = LARGEST_READING / MM
+"""Largest reading of any sensor, [mm]."""
 
 COARSEST_MM = 10.0
-"""No resolution and no standard deviation of an indicator is larger; a ruler's is 1 mm."""
+"""Largest accepted resolution or noise of a gauge, [mm] (a ruler: 1 mm)."""
 
 MOST_POSTURES = 5_000
-"""Postures of a session; each takes a closing of the loops and its variables in the program."""
+"""Largest number of postures of a session. Each adds a loop closure and its variables to the
+optimisation."""
 
 MOST_SETUPS = 1_000
-"""Setups of a session; each has an unknown zero of its own."""
+"""Largest number of setups of a session. Each adds a gauge zero."""
 
 MOST_READINGS = 50_000
 """Largest number of readings of a session or a plan, four times the largest that was tested. A
-calibration needs 10 kB for each."""
+calibration needs 10 kB per reading."""
 
 MOST_GAUGES = 100
-"""Gauges of a session."""
+"""Largest number of gauges of a session."""
 
 MOST_NAMES = 1_000
-"""Names or globs of errors; the largest robots have some hundred errors."""
+"""Largest number of names or globs of errors; the largest robots have some hundred errors."""
 
-GaugeLength = Annotated[PositiveNumber, Field(le=COARSEST_MM)]
-GaugeEnd = Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)]
+LARGEST_TRIM = 5.0
+"""Largest backlash or trim that a controller compensates, [mm] or degrees."""
+
+GaugeNoise = Annotated[PositiveNumber, Field(le=COARSEST_MM)]
+RangeLimit = Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)]
 
 Adjusted = Annotated[Number, Field(ge=-LARGEST_AMOUNT_MM, le=LARGEST_AMOUNT_MM)]
 
+BacklashValue = Annotated[Number, Field(ge=0.0, le=LARGEST_TRIM)]
+BacklashValues = Annotated[list[BacklashValue], Field(min_length=1, max_length=MAX_DRIVES)]
 
 OFFSET_KEYS: dict[str, tuple[Unit, float]] = {
     "offsets_mm": ("m", MM),
     "offsets_deg": ("rad", DEG),
     "offsets_mrad": ("rad", MRAD),
 }
-"""Keys of `controller` to the unit of the drives they are of, and the factor to it."""
+"""Offset keys of `controller`: SI unit of their drives and factor to SI."""
+
+BACKLASH_KEYS: dict[str, tuple[Unit, float]] = {
+    "backlash_mm": ("m", MM),
+    "backlash_deg": ("rad", DEG),
+}
+"""Backlash keys of `controller`: SI unit of their drives and factor to SI."""
 
 
 class _Keys(BaseModel):
@@ -58,15 +77,17 @@ class _Keys(BaseModel):
 
 
 class GaugeKeys(_Keys):
-    """The indicator."""
+    """A gauge."""
 
-    sigma_mm: GaugeLength | None = None
-    resolution_mm: GaugeLength | None = None
-    range_mm: Annotated[list[GaugeEnd], Field(min_length=2, max_length=2)] | None = None
+    sigma_mm: GaugeNoise | None = None
+    """Standard deviation of a reading."""
+    resolution_mm: GaugeNoise | None = None
+    range_mm: Annotated[list[RangeLimit], Field(min_length=2, max_length=2)] | None = None
+    """Lowest and highest reading."""
     tip: TipKeys | None = None
-    """What it touches with, in setups that do not say so themselves."""
+    """Tip; a setup may override it."""
     scale_tolerance: Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)] | None = None
-    """How well it shows a millimetre, likewise."""
+    """Tolerance of the scale factor, dimensionless; a setup may override it."""
 
     def to_gauge(self) -> Gauge:
         """The gauge in SI units."""
@@ -77,7 +98,8 @@ class GaugeKeys(_Keys):
         )
 
     @model_validator(mode="after")
-    def _range_rises(self) -> GaugeKeys:
+    def _require_increasing_range(self) -> GaugeKeys:
+        """Refuse a range whose lowest reading is not below the highest."""
         if self.range_mm is not None and not self.range_mm[0] < self.range_mm[1]:
             raise ValueError(f"range_mm|found {self.range_mm}; expected [lowest, highest]")
         return self
@@ -86,12 +108,16 @@ class GaugeKeys(_Keys):
 class PostureKeys(_Keys):
     """A commanded machine position."""
 
-    tcp_mm: Vector | None = None
-    joints_mm: Vector | None = None
-    joints_deg: Vector | None = None
+    tcp_mm: Coordinates | None = None
+    """Commanded coordinates of the tool centre point, from the mechanical zero."""
+    joints_mm: Coordinates | None = None
+    """Drive coordinates of a robot with prismatic drives, in the order of the drives."""
+    joints_deg: Coordinates | None = None
+    """Drive coordinates of a robot with revolute drives, in the order of the drives."""
 
     @model_validator(mode="after")
-    def _one_form(self) -> PostureKeys:
+    def _require_one_key(self) -> PostureKeys:
+        """Refuse a posture with several keys of coordinates, or with none."""
         stated = self.model_dump(exclude_none=True)
         if len(stated) != 1:
             shown = " and ".join(stated) or "none"
@@ -101,23 +127,10 @@ class PostureKeys(_Keys):
         return self
 
     @property
-    def stated(self) -> tuple[str, list[float]]:
+    def coordinates(self) -> tuple[str, list[float]]:
         """Key of the posture, and its coordinates in the key's unit."""
         ((key, values),) = self.model_dump(exclude_none=True).items()
         return key, values
-
-
-BACKLASH_KEYS: dict[str, tuple[Unit, float]] = {
-    "backlash_mm": ("m", MM),
-    "backlash_deg": ("rad", DEG),
-}
-"""Keys of `controller` for the compensated backlash, likewise."""
-
-LARGEST_TRIM = 5.0
-"""Largest backlash or trim that a controller compensates, mm or degrees."""
-
-Trim = Annotated[Number, Field(ge=0.0, le=LARGEST_TRIM)]
-Trims = Annotated[list[Trim], Field(min_length=1, max_length=12)]
 
 
 class FirmwareKeys(_Keys):
@@ -125,63 +138,75 @@ class FirmwareKeys(_Keys):
 
     name: FirmwareName
     radius_mm: PositiveNumber
+    """Horizontal distance between the ends of a rod with the nozzle in the middle."""
     rods_mm: tuple[PositiveNumber, PositiveNumber, PositiveNumber]
+    """Lengths of the rods of each tower."""
     angles_deg: Three = (210.0, 330.0, 90.0)
+    """Directions of the towers, anticlockwise from the x axis."""
     homed_mm: Three
     """Coordinates of the carriages at their endstops."""
     tilts: tuple[Number, Number] = (0.0, 0.0)
-    """Tilts of the bed, RepRapFirmware only."""
+    """Slopes of the bed along x and y, dimensionless; RepRapFirmware only."""
     probe_mm: Three = (0.0, 0.0, 0.0)
     """Tip of the probe from the nozzle."""
 
     @model_validator(mode="after")
-    def _rods_are_longer(self) -> FirmwareKeys:
+    def _require_long_rods(self) -> FirmwareKeys:
+        """Refuse rods that do not reach from the towers to the middle."""
         if min(self.rods_mm) <= self.radius_mm:
             raise ValueError(f"rods_mm|found {self.rods_mm}; expected more than the radius")
         return self
 
     def to_settings(self) -> DeltaSettings:
         """The settings in SI units."""
-        rods, angles, homed, probe = (
-            (a * unit, b * unit, c * unit)
-            for (a, b, c), unit in (
-                (self.rods_mm, MM),
-                (self.angles_deg, DEG),
-                (self.homed_mm, MM),
-                (self.probe_mm, MM),
-            )
+        return DeltaSettings(
+            self.name,
+            self.radius_mm * MM,
+            _scaled(self.rods_mm, MM),
+            _scaled(self.homed_mm, MM),
+            _scaled(self.angles_deg, DEG),
+            self.tilts,
+            _scaled(self.probe_mm, MM),
         )
-        return DeltaSettings(self.name, self.radius_mm * MM, rods, homed, angles, self.tilts, probe)
+
+
+def _scaled(values: Three, factor: float) -> Three:
+    a, b, c = values
+    return a * factor, b * factor, c * factor
 
 
 class ControllerKeys(_Keys):
-    """Corrections of the controller: one number per drive of the kind, in their order."""
+    """Active corrections of the controller.
 
-    offsets_mm: Vector | None = None
-    """Of prismatic drives."""
-    offsets_deg: Vector | None = None
-    """Of revolute drives."""
-    offsets_mrad: Vector | None = None
-    """The same."""
-    backlash_mm: Trims | None = None
-    """Backlash that it takes up, of prismatic drives."""
-    backlash_deg: Trims | None = None
-    """Of revolute drives."""
-    comp_file: Annotated[list[str | None], Field(min_length=1, max_length=12)] | None = None
+    A list has one number per prismatic or revolute drive, in the order of the robot's drives.
+    """
+
+    offsets_mm: Coordinates | None = None
+    """Active offsets of prismatic drives."""
+    offsets_deg: Coordinates | None = None
+    """Active offsets of revolute drives."""
+    offsets_mrad: Coordinates | None = None
+    """Active offsets of revolute drives, instead of `offsets_deg`."""
+    backlash_mm: BacklashValues | None = None
+    """Compensated backlash of prismatic drives."""
+    backlash_deg: BacklashValues | None = None
+    """Compensated backlash of revolute drives."""
+    comp_file: Annotated[list[str | None], Field(min_length=1, max_length=MAX_DRIVES)] | None = None
     """Table of trims for each drive (COMP_FILE of LinuxCNC, type 1); null for none."""
     firmware: FirmwareKeys | None = None
-    """Firmware of a delta printer, in whose coordinates the postures are."""
+    """Firmware of a delta printer, in whose coordinates the postures are stated."""
 
     @property
-    def stated(self) -> list[str]:
-        """The keys of offsets that are given."""
+    def offset_keys(self) -> list[str]:
+        """Offset keys that are stated."""
         return [key for key in OFFSET_KEYS if getattr(self, key) is not None]
 
     @model_validator(mode="after")
-    def _one_form_a_kind(self) -> ControllerKeys:
+    def _require_one_angle_unit(self) -> ControllerKeys:
+        """Refuse offsets of revolute drives in two units, and keys without a value."""
         if not self.model_dump(exclude_none=True):
             raise ValueError(f"found none; expected {', '.join(type(self).model_fields)}")
-        if {"offsets_deg", "offsets_mrad"} <= set(self.stated):
+        if {"offsets_deg", "offsets_mrad"} <= set(self.offset_keys):
             raise ValueError("found offsets_deg and offsets_mrad; expected one of them")
         return self
 
@@ -192,45 +217,49 @@ class CalibrationKeys(_Keys):
     model: str | None = None
     """A model of the robot's YAML."""
     free: Annotated[list[str], Field(max_length=MOST_NAMES)] = []
-    """Names or globs that are free too, or instead of a model."""
+    """Names or globs of errors that are free in addition to a model, or without one."""
     tolerances: Annotated[dict[str, PositiveNumber], Field(max_length=MOST_NAMES)] = {}
-    """Name or glob with its unit to another tolerance than the robot's, ±2 standard deviations."""
+    """Tolerances (±2 prior standard deviations) that replace those of the robot. A key is a name or
+    glob of errors with the suffix of its unit."""
     effects: Annotated[list[str], Field(max_length=MOST_NAMES)] | None = None
-    """Effects beside geometry; by default those that the robot's YAML names."""
+    """Effects beside geometry; by default those of the robot's YAML."""
 
 
 class SessionKeys(_Keys):
-    """A session.yaml, or a plan: the same without `readings`."""
+    """Keys of a session.yaml, or of a plan, which has no `readings`."""
 
     robot: str
+    """Name of a packaged robot, or path to its directory."""
     title: str = ""
     source: str = ""
-    gauge: GaugeKeys = None  # type: ignore[assignment] # absent; what is given has keys
-    """Of a session with one gauge."""
-    gauges: Annotated[dict[Name, GaugeKeys], Field(min_length=1, max_length=MOST_GAUGES)] = None  # type: ignore[assignment] # likewise
-    """Of a session with several; its setups name theirs."""
+    gauge: GaugeKeys = None  # type: ignore[assignment] # None if absent; null in a file is refused
+    """The gauge of a session with one gauge."""
+    gauges: Annotated[dict[Name, GaugeKeys], Field(min_length=1, max_length=MOST_GAUGES)] = None  # type: ignore[assignment] # as for `gauge`
+    """Gauges by name of a session with several; each setup names its gauge."""
     postures: Annotated[dict[Name, PostureKeys], Field(min_length=1, max_length=MOST_POSTURES)]
     payload_kg: Annotated[Number, Field(ge=0.0, le=HEAVIEST_KG)] = 0.0
     """Mass on the tool during the measurement."""
     controller: ControllerKeys | None = None
     adjusted_mm: Annotated[dict[Name, Adjusted], Field(max_length=MOST_NAMES)] = {}
-    """Mechanical adjustments since the machine was built, name to amount."""
+    """Amounts of the mechanical adjustments since the machine was built, by name."""
     calibration: CalibrationKeys | None = None
     setups: Annotated[dict[Name, dict[str, Any]], Field(min_length=1, max_length=MOST_SETUPS)]
-    """What each may say is the sensor's own affair; see `orthocal.sensors.registry`."""
+    """Keys of each setup by name; validated by its sensor, see `orthocal.sensors.registry`."""
     cycles: Annotated[int, Field(ge=1, le=1000)] = 1
-    """In a plan: how often the postures are gone through."""
+    """Number of cycles of all postures in a plan."""
     readings: str | None = None
+    """File name of the readings.csv."""
     seed: Count | None = None
     """Seed of simulated readings."""
 
     @property
     def named_gauges(self) -> dict[str, GaugeKeys]:
-        """Gauges by name; that of a session with one may have the name ""."""
+        """Gauges by name; the gauge under `gauge` is named ""."""
         return self.gauges or {"": self.gauge or GaugeKeys()}
 
     @model_validator(mode="after")
-    def _one_form_of_gauges(self) -> SessionKeys:
+    def _require_one_gauge_key(self) -> SessionKeys:
+        """Refuse both `gauge` and `gauges`."""
         if self.gauge is not None and self.gauges is not None:
             raise ValueError("found gauge and gauges; expected one of them")
         return self

@@ -1,8 +1,8 @@
-"""Postures and controller offsets of a session, checked against its robot."""
+"""Postures and controller settings of a session, checked against its robot."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,39 +21,48 @@ from orthocal.measurement.files.schema import (
     SessionKeys,
 )
 from orthocal.printers.settings import DeltaSettings
-from orthocal.robot.model import Robot
+from orthocal.robot.model import Drive, Robot
 from orthocal.session.session import Posture, PostureForm
 from orthocal.units import DRIVE_UNITS, MM, Unit
 
+KINDS: dict[Unit, str] = {"m": "prismatic", "rad": "revolute"}
+"""Kind of a drive by the unit of its coordinate."""
 
-def require_given_zero(robot: Robot, where: str) -> None:
-    """Refuse a robot without a stated mechanical zero: legs, sections and offsets count from it.
+ROUNDING = 1e-9
+"""Excess over a limit of travel that may be a rounding error, [m, rad]."""
+
+
+def require_mechanical_zero(robot: Robot, where: str) -> None:
+    """Refuse a robot whose mechanical zero was computed instead of stated.
+
+    Legs, sections and offsets refer to the mechanical zero.
 
     Args:
         robot: The robot.
         where: File and key that name it, for messages.
 
     Raises:
-        SessionError: With the zeros that were found, which may be adopted.
+        SessionError: If the zero is not stated; lists the computed zeros, ready to copy.
     """
-    zeros = [
-        f"{d.name}.zero_{unit} ({d.zero / size:.6g} was found)"
-        for d in robot.drives
-        for unit, size in [DRIVE_UNITS[d.unit]]
-        if d.zero_computed
-    ]
+    zeros = [_state_zero(drive) for drive in robot.drives if drive.zero_computed]
     if zeros:
         raise SessionError(
-            f"'{robot.name}' cannot be posed with its drives at 0, and its mechanical zero is not "
-            f"stated; add to orthocal.drives in {robot.yaml}: {', '.join(zeros)}",
+            f"the mechanical zero of '{robot.name}' is not stated, and its drives do not reach 0; "
+            f"add to orthocal.drives in {robot.yaml}: {', '.join(zeros)}",
             where=where,
         )
+
+
+def _state_zero(drive: Drive) -> str:
+    """Key and value of the mechanical zero of a drive."""
+    unit, factor = DRIVE_UNITS[drive.unit]
+    return f"{drive.name}.zero_{unit}: {drive.zero / factor:.6g}"
 
 
 def build_postures(
     keys: SessionKeys, robot: Robot, offsets: Array | None, file: Path
 ) -> dict[str, Posture]:
-    """Postures with their commanded drive coordinates, by the nominal inverse kinematics.
+    """Postures with their drive coordinates, by the nominal inverse kinematics.
 
     Args:
         keys: Keys of the session.yaml.
@@ -66,35 +75,38 @@ def build_postures(
     """
     closure = nominal_closure(robot)
     active = np.zeros(len(robot.drives)) if offsets is None else offsets
-    stated = [] if keys.controller is None else keys.controller.stated
-    values = {n: _read_posture(p, robot, f"{file}: postures.{n}") for n, p in keys.postures.items()}
-    points = {name: point for name, (form, point) in values.items() if form == "tcp"}
+    offset_keys = [] if keys.controller is None else keys.controller.offset_keys
+    stated = {n: _read_posture(p, robot, f"{file}: postures.{n}") for n, p in keys.postures.items()}
+    points = {name: values for name, (form, values) in stated.items() if form == "tcp"}
     try:
-        commanded = {name: v for name, (_, v) in values.items()}
+        commanded = {name: values for name, (_, values) in stated.items()}
         if points:
             joints = closure.inverse(np.array(list(points.values())), names=list(points))
             commanded |= dict(zip(points, joints, strict=True))
         for name, drives in commanded.items():
-            _check_travel(robot, drives, f"postures.{name}: ", file)
-            key = f"controller.{' and '.join(stated)}: in posture '{name}' "
-            _check_travel(robot, drives - active, key, file)
+            _check_travel(robot, drives, where=f"{file}: postures.{name}")
+            # the controller subtracts the active offsets: its encoders are at commanded − active
+            where = f"{file}: controller.{' and '.join(offset_keys)}"
+            _check_travel(robot, drives - active, where=where, posture=name)
         closure.close(np.array(list(commanded.values())), names=list(commanded))
     except ClosureError as e:
         raise SessionError(e.reason, where=f"{file}: postures.{e.posture}") from None
     return {
-        name: Posture(name, form, read_only(v), read_only(commanded[name] - active))
-        for name, (form, v) in values.items()
+        name: Posture(name, form, read_only(values), read_only(commanded[name] - active))
+        for name, (form, values) in stated.items()
     }
 
 
 def _read_posture(keys: PostureKeys, robot: Robot, where: str) -> tuple[PostureForm, Array]:
-    """Form and coordinates of a posture, [m, rad]."""
-    key, values = keys.stated
+    """Form and coordinates of a posture, shape (n_drives,), [m, rad]."""
+    key, values = keys.coordinates
     count = len(robot.drives)
     if key == "tcp_mm":
         if robot.tcp is None or len(robot.tcp.coordinates) != count:
             raise SessionError(
-                f"{robot.name} cannot be commanded by its tool; give joints", where=where
+                f"{robot.name} has no tool coordinate for every drive; state joints_mm or "
+                "joints_deg",
+                where=where,
             )
         if len(values) != count:
             raise SessionError(
@@ -102,138 +114,183 @@ def _read_posture(keys: PostureKeys, robot: Robot, where: str) -> tuple[PostureF
             )
         return "tcp", np.array(values) * MM
     where = f"{where}.{key}"
-    if len(values) != count:
-        names = ", ".join(d.name for d in robot.drives)
-        raise SessionError(
-            f"has {len(values)} numbers; expected {count}, one a drive: {names}", where=where
-        )
+    _require_count(values, "numbers", robot.drives, where=where)
     unit = "m" if key == "joints_mm" else "rad"
     for drive in robot.drives:
         if drive.unit != unit:
+            mixed = len({d.unit for d in robot.drives}) > 1
+            expected = "tcp_mm" if mixed else f"joints_{DRIVE_UNITS[drive.unit][0]}"
             raise SessionError(
-                f"drive {drive.name} is in {DRIVE_UNITS[drive.unit][0]}", where=where
+                f"drive {drive.name} is {KINDS[drive.unit]}; use {expected}", where=where
             )
     return "joints", np.array(values) * MM if unit == "m" else np.deg2rad(values)
 
 
-def _check_travel(robot: Robot, drives: Array, key: str, file: Path) -> None:
-    """Refuse drive coordinates beyond a drive's travel, in the numbers of the controller."""
+def _require_count(
+    values: Sequence[object],
+    noun: str,
+    drives: Sequence[Drive],
+    *,
+    where: str,
+    each: str = "drive",
+    remark: str = "",
+) -> None:
+    """Refuse a list without exactly one item per drive.
+
+    Args:
+        values: The list.
+        noun: Name of its items in the plural.
+        drives: The drives.
+        where: File and key, for messages.
+        each: Kind of the drives.
+        remark: End of the message.
+
+    Raises:
+        SessionError: If the numbers of items and drives differ.
+    """
+    if len(values) != len(drives):
+        names = ", ".join(d.name for d in drives)
+        raise SessionError(
+            f"has {len(values)} {noun}; expected {len(drives)}, one per {each}: {names}{remark}",
+            where=where,
+        )
+
+
+def _check_travel(robot: Robot, drives: Array, *, where: str, posture: str | None = None) -> None:
+    """Refuse drive coordinates beyond a drive's travel.
+
+    Args:
+        robot: The robot.
+        drives: Drive coordinates, shape (n_drives,), [m, rad].
+        where: File and key, for messages.
+        posture: Name of the posture, if the key does not contain it.
+
+    Raises:
+        SessionError: If a drive does not reach its coordinate; the message has the joint
+            coordinates of the controller.
+    """
+    prefix = "" if posture is None else f"in posture '{posture}' "
     for drive, value in zip(robot.drives, drives, strict=True):
-        if not drive.lower - 1e-9 <= value <= drive.upper + 1e-9:
-            unit, size = DRIVE_UNITS[drive.unit]
-            number, low, high = (v / size for v in (drive.to_joint(value), *drive.joint_limits))
+        if not drive.lower - ROUNDING <= value <= drive.upper + ROUNDING:
+            unit, factor = DRIVE_UNITS[drive.unit]
+            number, low, high = (v / factor for v in (drive.to_joint(value), *drive.joint_limits))
             raise SessionError(
-                f"{key}{drive.name} would be at {number:.2f} {unit}; it reaches from {low:g} to "
+                f"{prefix}{drive.name} would be at {number:.3f} {unit}; it reaches from {low:g} to "
                 f"{high:g} {unit}",
-                where=str(file),
+                where=where,
             )
 
 
 def build_offsets(keys: ControllerKeys | None, robot: Robot, where: str) -> Array | None:
-    """Offsets that are active in the controller; None where not stated.
+    """Active offsets, shape (n_drives,), [m, rad]; None if not stated.
 
-    Arguments, result and errors are those of `_read_drive_values`.
+    Args:
+        keys: Keys under `controller`; None if absent.
+        robot: The robot.
+        where: File and key, for messages.
+
+    Raises:
+        SessionError: If numbers and drives do not match.
     """
-    return None if keys is None else _read_drive_values(keys, OFFSET_KEYS, robot, where)
+    return None if keys is None else _read_drive_values(keys, OFFSET_KEYS, "offset", robot, where)
 
 
 def build_compensation(
     keys: ControllerKeys | None, robot: Robot, *, folder: Path, where: str
 ) -> Compensation:
-    """Backlash and errors of screws that the controller compensates; empty for none.
+    """Backlash and errors of screws that the controller compensates; empty if it does not.
 
     Args:
-        keys: What the session says, None for nothing.
+        keys: Keys under `controller`; None if absent.
         robot: The robot.
-        folder: Directory of the session, from which names of tables count.
+        folder: Directory of the session, to which names of tables are relative.
         where: File and key, for messages.
 
     Raises:
-        SessionError: If there are not as many numbers or tables as drives, or a table is wrong.
+        SessionError: If numbers or tables and drives do not match, or a table is wrong.
     """
     if keys is None:
         return ()
-    backlash = _read_drive_values(keys, BACKLASH_KEYS, robot, where)
+    backlash = _read_drive_values(keys, BACKLASH_KEYS, "backlash", robot, where)
     if backlash is None and keys.comp_file is None:
         return ()
     names = keys.comp_file or [None] * len(robot.drives)
-    if len(names) != len(robot.drives):
-        drives = ", ".join(d.name for d in robot.drives)
-        raise SessionError(
-            f"has {len(names)} names; expected {len(robot.drives)}, one a drive ({drives}), with "
-            "null for a drive without a table",
-            where=f"{where}.comp_file",
-        )
+    table_key = f"{where}.comp_file"
+    remark = "; null for a drive without a table"
+    _require_count(names, "names", robot.drives, where=table_key, remark=remark)
     values = np.zeros(len(names)) if backlash is None else backlash
-    where = f"{where}.comp_file"
     tables = (
-        None if name is None else read_trims(folder, name, drive, where)
+        None if name is None else read_trims(folder, name, drive, table_key)
         for name, drive in zip(names, robot.drives, strict=True)
     )
     return tuple(JointTrim(float(v), table) for v, table in zip(values, tables, strict=True))
 
 
 def build_firmware(keys: ControllerKeys | None, robot: Robot, where: str) -> DeltaSettings | None:
-    """Settings of the firmware of a delta printer; None where not stated.
+    """Settings of the firmware of a delta printer; None if not stated.
 
     Raises:
-        SessionError: If the robot does not have three drives along lines.
+        SessionError: If the robot does not have three prismatic drives.
     """
     if keys is None or keys.firmware is None:
         return None
     if [d.unit for d in robot.drives] != ["m"] * 3:
         raise SessionError(
-            f"{robot.name} is no delta printer; expected a robot with three slides",
+            f"{robot.name} is not a delta printer; expected three prismatic drives",
             where=f"{where}.firmware",
         )
     return keys.firmware.to_settings()
 
 
 def _read_drive_values(
-    keys: ControllerKeys, kinds: Mapping[str, tuple[Unit, float]], robot: Robot, where: str
+    keys: ControllerKeys,
+    key_units: Mapping[str, tuple[Unit, float]],
+    quantity: str,
+    robot: Robot,
+    where: str,
 ) -> Array | None:
-    """Numbers for all drives from keys of which each has those of the drives of its kind.
+    """Assemble one value per drive from the keys for prismatic and revolute drives.
 
     Args:
-        keys: What the session says.
-        kinds: Keys with the unit of their drives and the factor to it.
+        keys: Keys under `controller`.
+        key_units: Keys of the quantity, with the SI unit of their drives and the factor to SI.
+        quantity: Name of the quantity, for messages.
         robot: The robot.
         where: File and key, for messages.
 
     Returns:
-        Shape (n_drives,), [m, rad], or None where none of the keys is stated.
+        Shape (n_drives,), [m, rad]; None if no key is stated.
 
     Raises:
-        SessionError: If a drive has no number, or a number no drive.
+        SessionError: If numbers and drives do not match.
     """
-    stated = [key for key in kinds if getattr(keys, key) is not None]
+    stated = [key for key in key_units if getattr(keys, key) is not None]
     if not stated:
         return None
     result = np.zeros(len(robot.drives))
     units: set[str] = set()
     for key in stated:
-        values, (unit, factor) = getattr(keys, key), kinds[key]
-        drives = [i for i, d in enumerate(robot.drives) if d.unit == unit]
-        kind = "prismatic" if unit == "m" else "revolute"
-        if not drives:
-            fitting = " or ".join(k for k, (u, _) in kinds.items() if u != unit)
+        values, (unit, factor) = getattr(keys, key), key_units[key]
+        indices = [i for i, d in enumerate(robot.drives) if d.unit == unit]
+        if not indices:
+            expected = " or ".join(k for k, (u, _) in key_units.items() if u != unit)
             raise SessionError(
-                f"{robot.name} has no {kind} drive; expected {fitting}", where=f"{where}.{key}"
-            )
-        if len(values) != len(drives):
-            names = ", ".join(robot.drives[i].name for i in drives)
-            one = "drive" if len(drives) == len(robot.drives) else f"{kind} drive"
-            raise SessionError(
-                f"has {len(values)} numbers; expected {len(drives)}, one a {one}: {names}",
+                f"{robot.name} has no {KINDS[unit]} drive; expected {expected}",
                 where=f"{where}.{key}",
             )
-        result[drives] = np.array(values) * factor
+        _require_count(
+            values,
+            "numbers",
+            [robot.drives[i] for i in indices],
+            where=f"{where}.{key}",
+            each="drive" if len(indices) == len(robot.drives) else f"{KINDS[unit]} drive",
+        )
+        result[indices] = np.array(values) * factor
         units.add(unit)
     for drive in robot.drives:
         if drive.unit not in units:
-            expected = " or ".join(k for k, (unit, _) in kinds.items() if unit == drive.unit)
-            what = stated[0].partition("_")[0].removesuffix("s")
+            expected = " or ".join(k for k, (unit, _) in key_units.items() if unit == drive.unit)
             raise SessionError(
-                f"states no {what} of {drive.name}; expected {expected}, too", where=where
+                f"the {quantity} of drive {drive.name} is missing; add {expected}", where=where
             )
     return read_only(result)
