@@ -51,12 +51,12 @@ class Row:
     line: int
     """Number of the row, from 1, as in an editor or a spreadsheet program."""
     cells: tuple[Cell, ...]
-    """Cells without the blank ones at the end."""
+    """Cells without blank cells at the end."""
     width: int
     """Number of cells, including blank ones at the end."""
 
     def cell(self, index: int | None) -> Cell:
-        """The cell of a column; a blank cell beyond the end."""
+        """Cell of a column; blank beyond the end of the row or without an index."""
         return self.cells[index] if index is not None and index < len(self.cells) else BLANK
 
 
