@@ -67,7 +67,7 @@ def test_a_ball_touches_where_solids_do():
     for _ in range(COUNT // 10):
         a, u, d, r, ball = draw(rng)
         c = a + rng.uniform(-0.2, 0.2) * u + rng.uniform(-0.01, 0.01, 3)
-        found = evaluate(touch_by_ball, at=a, along=2.0 * u, radius=r + ball, tip=c, direction=d)
+        found = evaluate(touch_by_ball, point=a, along=2.0 * u, radius=r + ball, tip=c, direction=d)
         expected = come_near(moving(distance_to_axis, c, d, a, u), r + ball, 0.05)
         if expected is None:
             missed += 1
@@ -88,7 +88,7 @@ def test_a_blade_touches_where_solids_do():
         c = a + rng.uniform(-0.2, 0.2) * u + rng.uniform(-0.01, 0.01, 3)
         r = max(r, 1e-5)
         found = evaluate(
-            touch_by_blade, at=a, along=0.3 * u, radius=r, edge=-2.0 * e, tip=c, direction=d
+            touch_by_blade, point=a, along=0.3 * u, radius=r, edge=-2.0 * e, tip=c, direction=d
         )
         expected = come_near(moving(distance_of_lines, c, d, e, a, u), r, 0.2)
         assert found == pytest.approx(expected, abs=AGREED)
@@ -106,7 +106,13 @@ def test_without_a_radius_a_blade_reads_the_axis_in_the_edges_plane():
         crossing = a + (plane - a[0]) / u[0] * u
         tip = np.array([plane, 0.0, 0.0])
         found = evaluate(
-            touch_by_blade, at=a, along=u, radius=0.0, edge=np.cross(axis, d), tip=tip, direction=d
+            touch_by_blade,
+            point=a,
+            along=u,
+            radius=0.0,
+            edge=np.cross(axis, d),
+            tip=tip,
+            direction=d,
         )
         assert found == pytest.approx(crossing[1], abs=1e-12)
 
