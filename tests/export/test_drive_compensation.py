@@ -580,10 +580,10 @@ def test_motions_are_divided_where_a_drive_reverses():
     )
     sides = Plain()
     parts = split_at_reversals(paths, sides)
-    assert parts.of.tolist() == [0, *[1] * 4, 2]
+    assert parts.motion.tolist() == [0, *[1] * 4, 2]
     assert parts.first[1:5] == pytest.approx([0.0, 0.25, 0.5, 0.75], abs=1e-6)
     assert parts.sides.astype(int).tolist() == [
         *([1, 0, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 1]),
     ]
-    assert parts.turned.all()
+    assert parts.reversed.all()
     assert sides.last.tolist() == [-1.0, 1.0, 1.0]
