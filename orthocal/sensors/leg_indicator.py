@@ -414,27 +414,37 @@ class LegIndicator:
             normals /= np.linalg.norm(normals, axis=1)[:, None]
         surface = feet + (radius - self.tip.radius) * normals
         distances = np.einsum("ki,ki->k", feet - roots, units)
+        surface[~np.isfinite(h)] = start
         problems = []
         for k, distance in enumerate(distances.tolist()):
-            problem = ""
             if not np.isfinite(h[k]):
-                surface[k] = start
-                problem = (
+                problems.append(
                     f"the ball would pass the rod: it is {abs(lateral[k]) / MM:.1f} mm beside its "
                     f"axis, and they touch up to {radius / MM:.1f} mm"
                 )
-            elif off_middle[k] > 0.5 * self.tip.width and self.tip.form == "blade":
-                problem = (
-                    f"the blade would slide off: it would touch {off_middle[k] / MM:.1f} mm from "
-                    f"its middle, and is {self.tip.width / MM:.1f} mm wide"
-                )
-            elif not 0.0 <= distance <= lengths[k]:
-                problem = (
-                    f"the gauge would touch at {distance / MM:.1f} mm from the root; the rod "
-                    f"reaches from 0 to {lengths[k] / MM:.1f} mm"
-                )
-            problems.append(problem)
+            else:
+                problems.append(self._contact_problem(off_middle[k], distance, lengths[k]))
         return surface, problems
+
+    def _contact_problem(self, off_middle: float, distance: float, length: float) -> str:
+        """Reason why the tip cannot touch a rod; empty if it can.
+
+        Args:
+            off_middle: Distance of the contact from the middle of the blade, [m].
+            distance: Distance of the contact from the root of the rod, [m].
+            length: Length of the rod, [m].
+        """
+        if off_middle > 0.5 * self.tip.width and self.tip.form == "blade":
+            return (
+                f"the blade would slide off: it would touch {off_middle / MM:.1f} mm from its "
+                f"middle, and is {self.tip.width / MM:.1f} mm wide"
+            )
+        if not 0.0 <= distance <= length:
+            return (
+                f"the gauge would touch at {distance / MM:.1f} mm from the root; the rod reaches "
+                f"from 0 to {length / MM:.1f} mm"
+            )
+        return ""
 
     def plane(self, robot: Robot, *, where: str = "") -> tuple[float, bool]:
         """Plane of the section across the leg, a · p = c or a · p = c + a · root.

@@ -195,7 +195,7 @@ def test_each_key_has_the_drives_of_its_kind(tmp_path):
     [
         (
             "{offsets_mm: [1, 2, 3], offsets_deg: [3]}",
-            "controller.offsets_mm: has 3 numbers; expected 2, one per prismatic drive: slide, lift",
+            "has 3 numbers; expected 2, one per prismatic drive: slide, lift",
         ),
         (
             "{offsets_mm: [1, 2]}",
