@@ -136,7 +136,7 @@ def mm_text(value: Decimal) -> str:
     return trim_zeros(f"{value:f}") if -30 < value.adjusted() < 30 else f"{value:e}"
 
 
-def is_house(header: Iterable[str]) -> bool:
+def has_standard_headings(header: Iterable[str]) -> bool:
     """True for the exact headings of a readings.csv."""
     names = [composed(name.strip()) for name in header]
     required, optional = _schema(names)
@@ -151,13 +151,13 @@ def _schema(header: Collection[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def decide_sign(
-    cells: Sequence[Numeral], *, house: bool, advice: str, place: Callable[[int], str]
+    cells: Sequence[Numeral], *, standard: bool, advice: str, place: Callable[[int], str]
 ) -> DecimalSign:
     """Common decimal sign of the readings of a table.
 
     Args:
         cells: The readings.
-        house: Whether the headings are those of a readings.csv; then a point is a decimal point.
+        standard: Whether the headings are those of a readings.csv; then a point is a decimal point.
         advice: Action for the user in case of an ambiguous sign.
         place: Function from a line to file and line, for messages.
 
@@ -175,7 +175,7 @@ def decide_sign(
             where=place(sign.rival.line),
         )
     ambiguous_cells = (
-        c for c in cells if _is_ambiguous(c.text) and not (house and "," not in c.text)
+        c for c in cells if _is_ambiguous(c.text) and not (standard and "," not in c.text)
     )
     ambiguous = next(ambiguous_cells, None)
     if ambiguous is None:
@@ -214,7 +214,7 @@ def read_rows(path: Path, content: bytes) -> Iterator[RawReading]:
     except SessionError:
         return _plain_rows(path, content)
     first_line = decoded.text.partition("\n")[0]
-    if any(is_house(first_line.split(separator)) for separator in ",;"):
+    if any(has_standard_headings(first_line.split(separator)) for separator in ",;"):
         if decoded.encoding != "utf-8":
             content = decoded.text.encode()
         return _plain_rows(path, content)
@@ -260,7 +260,7 @@ def _plain_sign(cells: Sequence[Numeral], path: Path) -> Sign | None:
     if not any("," in cell.text for cell in cells) or infer_decimal_sign(cells).contradictory:
         return "point"
     return decide_sign(
-        cells, house=True, advice=SIGN_ADVICE, place=lambda line: f"{path}:{line}"
+        cells, standard=True, advice=SIGN_ADVICE, place=lambda line: f"{path}:{line}"
     ).sign
 
 
@@ -308,7 +308,10 @@ def _table_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
     (reading,) = columns.readings
     numerals = [Numeral(row.cell(reading).text, row.line) for row in table.rows]
     sign = decide_sign(
-        numerals, house=is_house(table.header), advice=SIGN_ADVICE, place=table.place
+        numerals,
+        standard=has_standard_headings(table.header),
+        advice=SIGN_ADVICE,
+        place=table.place,
     ).sign
     width = len(table.header)
     for row in table.rows:
@@ -362,7 +365,7 @@ def require_unsplit_numbers(
         return
     readings = list(columns.readings)
     texts = [row.cell(i).text for row in table.rows for i in readings]
-    separator_known = separator_known or is_house(table.header)
+    separator_known = separator_known or has_standard_headings(table.header)
     sign_known = separator_known or any("." in t or "," in t for t in texts)
     pairs = {(i, i + 1) for i in readings} | {(i - 1, i) for i in readings if i}
     pairs -= {(i - 1, i) for i in readings if i - 1 in columns.keys}

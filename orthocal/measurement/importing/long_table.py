@@ -31,7 +31,7 @@ from orthocal.io.tables.table import Table
 from orthocal.measurement.files.readings_file import (
     RawReading,
     decide_sign,
-    is_house,
+    has_standard_headings,
     mm_text,
     require_unsplit_numbers,
 )
@@ -457,7 +457,10 @@ def _decide_decimal_sign(table: Table, entries: list[Entry], stated: Sign | None
         Numeral(e.number, e.row.line) for e in entries if e.number is not None and e.value is None
     ]
     return decide_sign(
-        numerals, house=is_house(table.header), advice=SIGN_ADVICE, place=table.place
+        numerals,
+        standard=has_standard_headings(table.header),
+        advice=SIGN_ADVICE,
+        place=table.place,
     )
 
 
