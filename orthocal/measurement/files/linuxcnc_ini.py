@@ -15,7 +15,7 @@ from orthocal.errors import ParameterError, SessionError
 from orthocal.io.documents import parse_number, read_text
 from orthocal.io.fields import read_only
 from orthocal.io.files import content_withheld_outside
-from orthocal.measurement.files.schema import LARGEST_TRIM
+from orthocal.measurement.files.session_keys import LARGEST_TRIM
 from orthocal.robot.model import Drive, Robot
 from orthocal.units import DRIVE_UNITS
 

@@ -12,7 +12,7 @@ from orthocal.io.documents import parse_number
 from orthocal.kinematics.conditions import find_approach_problem
 from orthocal.measurement.files.point_rows import PointRows
 from orthocal.measurement.files.readings_file import CONDITIONS, COORDINATES, RawReading
-from orthocal.measurement.files.schema import MOST_READINGS
+from orthocal.measurement.files.session_keys import MOST_READINGS
 from orthocal.robot.description import HIGHEST_C, LOWEST_C
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import (

@@ -31,7 +31,7 @@ from orthocal.io.tables.numerals import (
 )
 from orthocal.io.tables.table import Table, read_table
 from orthocal.io.tables.workbook import ZIP_SIGNATURE
-from orthocal.measurement.files.schema import MOST_READINGS
+from orthocal.measurement.files.session_keys import MOST_READINGS
 from orthocal.measurement.importing.headings import EXPECTED, Columns, choose_columns, find_header
 from orthocal.text import composed, shorten
 from orthocal.units import trim_zeros

@@ -28,7 +28,12 @@ from orthocal.io.files import (
 from orthocal.measurement.files.point_rows import base_name, locate_stations, split_points
 from orthocal.measurement.files.readings_checks import check_readings, require_name, require_read
 from orthocal.measurement.files.readings_file import read_rows
-from orthocal.measurement.files.schema import MOST_READINGS, CalibrationKeys, GaugeKeys, SessionKeys
+from orthocal.measurement.files.session_keys import (
+    MOST_READINGS,
+    CalibrationKeys,
+    GaugeKeys,
+    SessionKeys,
+)
 from orthocal.measurement.files.session_robot import (
     build_compensation,
     build_firmware,

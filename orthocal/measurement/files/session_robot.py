@@ -13,7 +13,7 @@ from orthocal.errors import ClosureError, SessionError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.measurement.files.linuxcnc_ini import read_trims
-from orthocal.measurement.files.schema import (
+from orthocal.measurement.files.session_keys import (
     BACKLASH_KEYS,
     OFFSET_KEYS,
     ControllerKeys,

@@ -18,7 +18,7 @@ from orthocal.errors import SessionError
 from orthocal.io.documents import read_text
 from orthocal.io.fields import read_only
 from orthocal.io.files import exists
-from orthocal.measurement.files.schema import LARGEST_READING_MM
+from orthocal.measurement.files.session_keys import LARGEST_READING_MM
 from orthocal.measurement.files.write_session import write_session
 from orthocal.printers.firmwares import FIRMWARES, find_firmware, require_firmware
 from orthocal.printers.log import PrinterLog
