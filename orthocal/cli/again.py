@@ -56,7 +56,7 @@ def again(
     """
     from orthocal.assessment.controller_entries import compensation_to_enter
     from orthocal.export.formats import require_entering
-    from orthocal.measurement.files.linuxcnc_ini import read_ini
+    from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
     require_new_session(out, FILES, force=force)
     result = orthocal.load_calibration(calibration)
@@ -68,7 +68,7 @@ def again(
     if ini is None:
         new = replace(new, compensation=compensation_to_enter(result) or new.compensation)
     else:
-        new = replace(new, compensation=read_ini(ini, result.robot).compensation)
+        new = replace(new, compensation=read_controller_joints(ini, result.robot).compensation)
     comment = (
         "A plan: enter these offsets, then run `orthocal record .` in this directory, or fill in\n"
         "readings.csv. Compare the readings with the calibration by `orthocal validate`."

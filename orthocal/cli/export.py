@@ -155,9 +155,9 @@ def _read_joints(
         ParameterError: If the compensation differs, or such an option is stated.
     """
     from orthocal.effects.compensation import compensates_alike
-    from orthocal.measurement.files.linuxcnc_ini import read_ini
+    from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
-    joints = read_ini(path, calibration.robot)
+    joints = read_controller_joints(path, calibration.robot)
     for option, value in stated.items():
         if value is not None and (option != "--latched" or joints.latched is not None):
             raise ParameterError("is stated by --ini, too; state one of them", where=option)

@@ -433,7 +433,7 @@ def _scale_of(leg_mm: float) -> float:
 
 
 def _parameter_globs(texts: list[str] | None, robot: orthocal.Robot) -> tuple[str, ...] | None:
-    """Globs of error parameters; the name of a model stands for the globs of the model."""
+    """Globs of error parameters; the name of a model is replaced by the globs of the model."""
     models = robot.parameters.models
     globs = split_globs(texts)
     patterns = [robot.parameters.patterns(g) if g in models else (g,) for g in globs]

@@ -88,7 +88,7 @@ class Paths:
     """Indices of e₁ and e₂, shape (n, 2)."""
 
     @classmethod
-    def of(cls, motions: Sequence[Motion]) -> Paths:
+    def from_motions(cls, motions: Sequence[Motion]) -> Paths:
         """Curves of a list of motions."""
         base = np.array([m.start for m in motions], dtype=np.float64).reshape(-1, 3)
         slope = np.array([m.end for m in motions], dtype=np.float64).reshape(-1, 3) - base
@@ -116,7 +116,7 @@ class Paths:
         """Largest radius of each curve, 0 for lines, shape (n,), [m]."""
         return np.asarray(np.maximum(self.radius[:, 0], self.radius.sum(axis=1)))
 
-    def leave(self, region: Array) -> NDArray[np.bool_]:
+    def leaves_region(self, region: Array) -> NDArray[np.bool_]:
         """Mask of the curves that end outside a box, or leave it on an arc, shape (n,).
 
         Args:

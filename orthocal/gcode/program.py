@@ -148,9 +148,9 @@ class ProgramCorrector:
         """Corrected text of a block."""
         moving = [s for s in steps if isinstance(s, Step) and s.motion is not None]
         motions = [s.motion for s in moving if s.motion is not None]
-        paths = Paths.of(motions)
+        paths = Paths.from_motions(motions)
         if self.summary.outside is None and self._region is not None and moving:
-            leaving = np.flatnonzero(paths.leave(self._region))
+            leaving = np.flatnonzero(paths.leaves_region(self._region))
             if leaving.size:
                 self.summary.outside = moving[leaving[0]].line.number
         results = iter(

@@ -70,23 +70,23 @@ Number = Annotated[
     Field(allow_inf_nan=False),
     AfterValidator(_refuse_huge),
 ]
-"""A number within ±LARGEST_NUMBER; YAML's yes and no are not numbers."""
+"""Number within ±LARGEST_NUMBER; yes and no of YAML are not numbers."""
 
 Count = Annotated[int, Field(ge=0, le=10**9)]
-"""A whole number from 0 to 10⁹."""
+"""Whole number from 0 to 10⁹."""
 
 PositiveNumber = Annotated[Number, Field(gt=0.0), _at_least(SMALLEST_POSITIVE)]
-"""A number from SMALLEST_POSITIVE to LARGEST_NUMBER."""
+"""Number from SMALLEST_POSITIVE to LARGEST_NUMBER."""
 
 Name = Annotated[
     str,
     Field(min_length=1, max_length=200, pattern=r"^[^,;\s\"]+$"),
     AfterValidator(composed),
 ]
-"""A name that needs no quotes in a CSV file."""
+"""Name that needs no quotes in a CSV file."""
 
 PositiveInSI = Annotated[Number, Field(gt=0.0), _at_least(SMALLEST_IN_SI)]
-"""A positive number in SI units that users state in mm, mrad or ppm."""
+"""Positive number in SI units that users state in mm, mrad or ppm."""
 
 MOST_JSON_VALUES = 2_000_000
 """Largest number of keys and values of a JSON file; a calibration has forty per reading."""

@@ -25,18 +25,18 @@ Given = Session | str | Path
 """A session, or the path to one."""
 
 
-def gather_sessions(given: Given | Sequence[Given]) -> list[Session]:
+def gather_sessions(sources: Given | Sequence[Given]) -> list[Session]:
     """List of one or several sessions; paths are loaded.
 
     Raises:
         SessionError: If a path does not lead to a valid session.
         TypeError: If an argument has another type.
     """
-    sources = [given] if isinstance(given, Session | str | Path) else given
-    require_kind(sources, (list, tuple), expected="a Session, the path to one, or a list of them")
-    for source in sources:
+    listed = [sources] if isinstance(sources, Session | str | Path) else sources
+    require_kind(listed, (list, tuple), expected="a Session, the path to one, or a list of them")
+    for source in listed:
         require_kind(source, (Session, str, Path), expected="a Session, or the path to one")
-    return [source if isinstance(source, Session) else load_session(source) for source in sources]
+    return [source if isinstance(source, Session) else load_session(source) for source in listed]
 
 
 def join_sessions(sessions: Sequence[Session]) -> Session:

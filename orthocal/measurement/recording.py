@@ -64,7 +64,7 @@ BUSY = "these readings are being recorded by another process; one at a time"
 
 
 class Change(BaseModel):
-    """A change of the rows."""
+    """Change of the rows of a recording."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
@@ -147,7 +147,7 @@ def _emptied(row: Reading) -> Reading:
 
 
 class Recording:
-    """A session that is being measured, locked against other recordings.
+    """Session that is being measured, locked against other recordings.
 
     Args:
         session: The session at the start of the recording.
@@ -177,7 +177,7 @@ class Recording:
 
     @property
     def path(self) -> Path:
-        """The readings.csv."""
+        """Path of the readings.csv."""
         return _csv_of(self.session)
 
     @property

@@ -46,7 +46,7 @@ BLANK = Cell("")
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A row with at least one cell that is not blank."""
+    """Row with at least one cell that is not blank."""
 
     line: int
     """Number of the row, from 1, as in an editor or a spreadsheet program."""

@@ -49,7 +49,7 @@ MOST_PARTS = 2_000
 """Maximum number of parts of a workbook."""
 
 MOST_TAGS = 5 * MOST_CELLS
-"""Maximum number of XML tags of a part; a cell takes four, with a formula six."""
+"""Maximum number of XML tags of a part; a cell has four, with a formula six."""
 
 LONGEST_FORMAT = 255
 """Maximum length of a number format, as in Excel."""
@@ -84,7 +84,7 @@ MergedCells = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A worksheet."""
+    """Worksheet of a workbook."""
 
     name: str
     rows: tuple[Row, ...]

@@ -41,7 +41,7 @@ class ControllerJoints:
     """BACKLASH and COMP_FILE; empty if no joint has any."""
 
 
-def read_ini(path: Path, robot: Robot) -> ControllerJoints:
+def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
     """Joints of a LinuxCNC machine: JOINT_0 is the first drive, and so on.
 
     Args:
@@ -108,7 +108,7 @@ def _read_joint(
             raise ParameterError(
                 f"COMP_FILE_TYPE is {numbers['COMP_FILE_TYPE']:g}; expected 1", where=where
             )
-        table = read_trims(folder, name, drive, where)
+        table = read_comp_file(folder, name, drive, where)
     latch = None
     if "HOME_LATCH_VEL" in keys:
         latch = -1 if numbers["HOME_LATCH_VEL"] < 0.0 else 1
@@ -129,7 +129,7 @@ def _read_sections(path: Path) -> Mapping[str, Mapping[str, str]]:
     return sections
 
 
-def read_trims(folder: Path, name: str, drive: Drive, where: str) -> Array:
+def read_comp_file(folder: Path, name: str, drive: Drive, where: str) -> Array:
     """Table of a COMP_FILE of type 1: position, forward trim, reverse trim.
 
     The content of a file outside the directory is not quoted in messages.

@@ -77,7 +77,7 @@ class _Keys(BaseModel):
 
 
 class GaugeKeys(_Keys):
-    """A gauge."""
+    """Keys of a gauge."""
 
     sigma_mm: GaugeNoise | None = None
     """Standard deviation of a reading."""
@@ -90,7 +90,7 @@ class GaugeKeys(_Keys):
     """Tolerance of the scale factor, dimensionless; a setup may override it."""
 
     def to_gauge(self) -> Gauge:
-        """The gauge in SI units."""
+        """Gauge in SI units."""
         return Gauge(
             None if self.sigma_mm is None else self.sigma_mm * MM,
             None if self.resolution_mm is None else self.resolution_mm * MM,
@@ -106,7 +106,7 @@ class GaugeKeys(_Keys):
 
 
 class PostureKeys(_Keys):
-    """A commanded machine position."""
+    """Keys of a posture: commanded tool coordinates or drive coordinates."""
 
     tcp_mm: Coordinates | None = None
     """Commanded coordinates of the tool centre point, from the mechanical zero."""
@@ -158,7 +158,7 @@ class FirmwareKeys(_Keys):
         return self
 
     def to_settings(self) -> DeltaSettings:
-        """The settings in SI units."""
+        """Settings in SI units."""
         return DeltaSettings(
             self.name,
             self.radius_mm * MM,
@@ -215,7 +215,7 @@ class CalibrationKeys(_Keys):
     """Model, free errors and tolerances of the calibration."""
 
     model: str | None = None
-    """A model of the robot's YAML."""
+    """Name of a model of the robot's YAML."""
     free: Annotated[list[str], Field(max_length=MOST_NAMES)] = []
     """Names or globs of errors that are free in addition to a model, or without one."""
     tolerances: Annotated[dict[str, PositiveNumber], Field(max_length=MOST_NAMES)] = {}
@@ -233,7 +233,7 @@ class SessionKeys(_Keys):
     title: str = ""
     source: str = ""
     gauge: GaugeKeys = None  # type: ignore[assignment] # None if absent; null in a file is refused
-    """The gauge of a session with one gauge."""
+    """Gauge of a session with one gauge."""
     gauges: Annotated[dict[Name, GaugeKeys], Field(min_length=1, max_length=MOST_GAUGES)] = None  # type: ignore[assignment] # as for `gauge`
     """Gauges by name of a session with several; each setup names its gauge."""
     postures: Annotated[dict[Name, PostureKeys], Field(min_length=1, max_length=MOST_POSTURES)]

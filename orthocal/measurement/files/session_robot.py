@@ -12,7 +12,7 @@ from orthocal.effects.compensation import Compensation, JointTrim
 from orthocal.errors import ClosureError, SessionError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.measurement.files.linuxcnc_ini import read_trims
+from orthocal.measurement.files.linuxcnc_ini import read_comp_file
 from orthocal.measurement.files.session_keys import (
     BACKLASH_KEYS,
     OFFSET_KEYS,
@@ -220,7 +220,7 @@ def build_compensation(
     _require_count(names, "names", robot.drives, where=table_key, remark=remark)
     values = np.zeros(len(names)) if backlash is None else backlash
     tables = (
-        None if name is None else read_trims(folder, name, drive, table_key)
+        None if name is None else read_comp_file(folder, name, drive, table_key)
         for name, drive in zip(names, robot.drives, strict=True)
     )
     return tuple(JointTrim(float(v), table) for v, table in zip(values, tables, strict=True))

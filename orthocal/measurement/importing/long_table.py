@@ -411,7 +411,7 @@ def _read_units_row(row: Row, columns: Columns) -> dict[int, UnitName]:
 
 def _name(cell: Cell) -> str:
     """Name of a cell; empty for a dash."""
-    if len(cell.text) > 2 * LONGEST_NAME:  # normalising takes quadratic time
+    if len(cell.text) > 2 * LONGEST_NAME:  # normalising needs quadratic time
         return cell.text
     text = composed(" ".join(tidy_text(cell.text).split()))
     return "" if plain_minus(text) in ("-", "—") else text
@@ -481,7 +481,7 @@ def _parse_value(entry: Entry, sign: Sign | None) -> Decimal:
 
 
 def _choose_unit(entry: Entry, stated: UnitName | None, heading: str) -> UnitName:
-    """Unit of a cell: its own, that of its heading, or the stated one."""
+    """Unit of a cell or its heading, or the unit of the option `--unit`."""
     where = entry.row.where
     if stated and entry.unit and stated != entry.unit:
         raise SessionError(

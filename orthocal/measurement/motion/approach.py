@@ -99,9 +99,10 @@ def describe_approach(robot: Robot, approach: str) -> str:
 
 
 def name_approach(motion: Array) -> str:
-    """Approach with a given last motion of the drives, shape (n_drives,), [m, rad].
+    """Letters of the approach of a last motion; u for a drive that moves less than LEAST_MOTION.
 
-    The letter is u for a drive that moves less than LEAST_MOTION.
+    Args:
+        motion: Motion of the drives, shape (n_drives,), [m, rad].
     """
     return "".join(
         "u" if abs(v) < LEAST_MOTION else "p" if v > 0.0 else "n" for v in motion.tolist()
