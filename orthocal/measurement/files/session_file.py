@@ -28,19 +28,18 @@ from orthocal.io.files import (
 from orthocal.measurement.files.point_rows import base_name, locate_stations, split_points
 from orthocal.measurement.files.readings_checks import check_readings, require_name, require_read
 from orthocal.measurement.files.readings_file import read_rows
+from orthocal.measurement.files.session_controller import (
+    build_compensation,
+    build_firmware,
+    build_offsets,
+)
 from orthocal.measurement.files.session_keys import (
     MOST_READINGS,
     CalibrationKeys,
     GaugeKeys,
     SessionKeys,
 )
-from orthocal.measurement.files.session_robot import (
-    build_compensation,
-    build_firmware,
-    build_offsets,
-    build_postures,
-    require_mechanical_zero,
-)
+from orthocal.measurement.files.session_postures import build_postures, require_mechanical_zero
 from orthocal.observation.contacts import locate_contacts
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import (
