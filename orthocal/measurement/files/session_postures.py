@@ -35,8 +35,8 @@ def require_mechanical_zero(robot: Robot, where: str) -> None:
     zeros = [_state_zero(drive) for drive in robot.drives if drive.zero_computed]
     if zeros:
         raise SessionError(
-            f"the mechanical zero of '{robot.name}' is not stated, and its drives do not reach 0; "
-            f"add to orthocal.drives in {robot.yaml}: {', '.join(zeros)}",
+            f"the mechanical zero of '{robot.name}' is not stated, and its loops do not close with "
+            f"the drives at 0; add to orthocal.drives in {robot.yaml}: {', '.join(zeros)}",
             where=where,
         )
 
