@@ -51,8 +51,8 @@ class Correction(Protocol):
             points: Desired tool positions, shape (k, 3), [m].
 
         Returns:
-            Points to command, shape (k, 3), [m], and reasons by the index of points out of reach.
-            After the first one, other points may be missing.
+            Points to command, shape (k, 3), [m], and reasons by the index of refused points. The
+            first of them is out of reach; later points may be refused without a check.
         """
 
 

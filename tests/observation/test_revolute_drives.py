@@ -222,7 +222,8 @@ def test_a_session_needs_a_zero_that_is_given(tmp_path):
     folder = write_wide_linkage(tmp_path / "wide", legs)
     message = (
         r"robot: the mechanical zero of 'wide' is not stated, and its loops do not close with "
-        r"the drives at 0; add to orthocal.drives in .*wide.yaml: motor_a.zero_deg: -?\d+\.\d+, motor_b"
+        r"the drives at 0; add to orthocal.drives in .*wide.yaml: "
+        r"motor_a.zero_deg: -?\d+\.\d+, motor_b"
     )
     with pytest.raises(SessionError, match=message):
         load_plan(write_plan(tmp_path / "plan", folder))
