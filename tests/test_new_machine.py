@@ -141,7 +141,7 @@ def test_a_posture_beyond_the_travel_is_named_with_the_controllers_number(copied
     file.write_text(text.replace("tcp_mm: [0.0, 60.0, 0.0]", "joints_mm: [250.0, 330.0, 250.0]"))
     code, _, err = orthocal("check", copied / "first")
     assert code == 2
-    assert "y_slide would be at -80.00 mm; it reaches from -70 to 150 mm" in err
+    assert "y_slide would be at -80.000 mm; it reaches from -70 to 150 mm" in err
 
 
 def test_what_is_read_on_it_calibrates_it(made, tmp_path):

@@ -222,7 +222,9 @@ def require_consistent(record: CalibrationRecord, robot: Robot, *, file: str) ->
         if row.conditions is not None:
             where = f"{file}: residuals[{i}].conditions"
             with _errors_at(where):
-                check_conditions(row.conditions, robot, row.minus is not None, where)
+                check_conditions(
+                    row.conditions, robot, difference=row.minus is not None, where=where
+                )
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
-from orthocal.measurement.files.schema import GaugeKeys
+from orthocal.measurement.files.session_keys import GaugeKeys
 from orthocal.observation.conditions import MINUTES_A_READING, MINUTES_A_SETUP, in_course
 from orthocal.planning.expected_error import state_noise
 from orthocal.planning.owned_sensors import Duration, OwnedSensor

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from orthocal.errors import SessionError
 from orthocal.io.documents import Number, read_yaml, validate
-from orthocal.measurement.files.schema import GaugeKeys
+from orthocal.measurement.files.session_keys import GaugeKeys
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Gauge
 from orthocal.statistics.noise import noise_floor

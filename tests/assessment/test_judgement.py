@@ -242,7 +242,7 @@ def test_an_unfinished_session_is_checked_as_far_as_it_was_read(cycles, root, tm
     path.write_text("\n".join([lines[0], *(x.rpartition(",")[0] + "," for x in lines[1:])]) + "\n")
     done = run_orthocal(tmp_path, "check", ".")
     assert (done.returncode, done.stdout) == (2, "")
-    assert "nothing was read yet" in done.stderr
+    assert "no reading is entered yet" in done.stderr
 
 
 def test_readings_are_judged_once(cycles, monkeypatch):

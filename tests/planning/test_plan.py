@@ -172,7 +172,7 @@ def test_a_setup_begins_and_ends_with_the_alignment_posture(planned):
 def test_a_folder_is_ready_to_measure(planned, tmp_path):
     path = write_session(planned.session, tmp_path / "monday", blank=True)
     with pytest.raises(
-        SessionError, match=r"readings.csv: nothing was read yet; `orthocal record` takes"
+        SessionError, match=r"readings.csv: no reading is entered yet; run `orthocal record`"
     ):
         load_session(path)
     again = load_plan(path)

@@ -1,10 +1,10 @@
 """G-code programs that move the machine through a setup and pause (M0) where the operator acts.
 
 A program starts at the mechanical zero, without a gauge. The first pause is in the alignment
-posture, where the gauge is mounted and aligned. Then there is one for each reading. For a logger,
-a program dwells and triggers it instead. It still pauses where the operator sets the dial or holds
-the plunger up. The fixed ball of a ball bar may stand on the way to the first posture: its program
-also pauses before its first motion, and starts in the first posture if the ball stays.
+posture, where the operator mounts and aligns the gauge. A pause for each reading follows. With a
+logger, a program dwells and triggers it instead. It still pauses where the operator sets the dial
+or holds the plunger up. The fixed ball of a ball bar may be in the way of the first motion. So its
+program also pauses before this motion, and starts in the first posture if the ball stays mounted.
 
 Every motion is in machine coordinates (G53), so that work offsets (G54 to G59.3), G92 and a
 coordinate rotation have no effect. Coordinates are those of nominal kinematics; comments list the
@@ -39,23 +39,23 @@ DECIMALS = 4
 LONGEST_NAME = 40
 """Largest length of a name in a comment: controllers read lines of 80 to 256 characters."""
 
-FASTEST = 20_000.0
+LARGEST_FEED = 20_000.0
 """Largest feed, [mm/min]."""
 
 LONGEST_DWELL = 600.0
 """Longest dwell at a reading, [s]."""
 
-SETTLE = 1.0
-"""Dwell before a trigger, unless another one is stated, [s]."""
+SETTLING_TIME = 1.0
+"""Dwell before a trigger if none is stated, [s]."""
 
-PULSE = 0.1
-"""Length of a pulse of a digital output, [s]."""
+PULSE_TIME = 0.1
+"""Duration of a pulse of a digital output, [s]."""
 
 TRIGGER = re.compile(r"(?P<output>[0-9]|[1-5][0-9]|6[0-3])|M1[0-9][0-9]")
 """Digital output of LinuxCNC, or an M-code of the user."""
 
 LARGEST_SHIFT = 1e5
-"""Largest coordinate of the machine's origin, [mm]."""
+"""Largest machine coordinate of the world's origin, [mm]."""
 
 PREAMBLE = (
     "(Every motion is in machine coordinates: G53 G1 in G90)",
@@ -86,16 +86,16 @@ class ProgramOptions:
     shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Machine coordinates (G53) of the world's origin, [mm]."""
     dwell: float | None = None
-    """Time at each reading in place of a pause, [s]; None for a pause."""
+    """Dwell at each reading instead of a pause, [s]; None for a pause."""
     trigger: str | None = None
-    """Trigger of a logger at the end of that time: an M-code from M100 to M199, or the number of a
-    digital output that gives a pulse."""
+    """Trigger of a logger at the end of the dwell: an M-code from M100 to M199, or the number of a
+    digital output for a pulse."""
 
     def __post_init__(self) -> None:
         for name, feed in (("--feed", self.feed), ("--approach-feed", self.approach_feed)):
-            if not 1.0 <= feed <= FASTEST:
+            if not 1.0 <= feed <= LARGEST_FEED:
                 raise ParameterError(
-                    f"found {feed:g}; expected 1 to {FASTEST:g} mm/min", where=name
+                    f"found {feed:g}; expected 1 to {LARGEST_FEED:g} mm/min", where=name
                 )
         if not all(abs(v) <= LARGEST_SHIFT for v in self.shift_mm):
             raise ParameterError(
@@ -114,18 +114,18 @@ class ProgramOptions:
 
     @property
     def automatic(self) -> bool:
-        """True if readings need no operator."""
+        """True if the program dwells or triggers a logger instead of a pause."""
         return self.dwell is not None or self.trigger is not None
 
     @property
     def reading_lines(self) -> list[str]:
-        """Lines at a reading without an operator."""
-        lines = [f"G4 P{SETTLE if self.dwell is None else self.dwell:g}"]
+        """Lines of G-code at a reading without an operator."""
+        lines = [f"G4 P{SETTLING_TIME if self.dwell is None else self.dwell:g}"]
         if self.trigger is None:
             return lines
         if TRIGGER.fullmatch(self.trigger)["output"] is None:  # type: ignore[index] # checked above
             return [*lines, self.trigger]
-        return [*lines, f"M64 P{self.trigger}", f"G4 P{PULSE:g}", f"M65 P{self.trigger}"]
+        return [*lines, f"M64 P{self.trigger}", f"G4 P{PULSE_TIME:g}", f"M65 P{self.trigger}"]
 
 
 def program_name(motion: SetupMotion) -> str:
@@ -139,8 +139,13 @@ def write_program(
 ) -> str:
     """Program of a setup.
 
+    Args:
+        session: The session.
+        motion: Path through the setup.
+        options: Options of the program.
+
     Raises:
-        ParameterError: If the drives command no tool.
+        ParameterError: If the drives do not command the tool.
     """
     options = options or ProgramOptions()
     robot = session.robot
@@ -193,7 +198,7 @@ def write_program(
 def _before_start(
     robot: Robot, sensor: Sensor, first: Stop, options: ProgramOptions
 ) -> tuple[str, ...]:
-    """Place of the machine before the program: comments of its header."""
+    """Comments of the header about the position of the machine before the start."""
     if not isinstance(sensor, BallBar):
         return ("(Before start: gauge removed, machine at its mechanical zero)",)
     return (
@@ -206,12 +211,13 @@ def _before_start(
 def _before_motion(
     robot: Robot, sensor: Sensor, first: Stop, options: ProgramOptions
 ) -> tuple[str, ...]:
-    """Pause before the first motion where a fixed ball may be in its way."""
+    """Pause before the first motion of a ball bar, whose fixed ball may be in the way."""
     if not isinstance(sensor, BallBar):
         return ()
-    at = _words(robot, first.point, options)
+    start = _words(robot, first.point, options)
     return (
-        f"(MSG, before the first motion: remove fixed ball and post, or jog around them to {at})",
+        "(MSG, before the first motion: remove fixed ball and post, or jog around them to "
+        f"{start})",
         "M0",
     )
 
@@ -242,8 +248,8 @@ def _read(
     """Pause for the operator, or dwell and trigger of a logger.
 
     Args:
-        stop: The posture.
-        following: The next one.
+        stop: Stop in the posture to read.
+        following: The next stop; None after the last one.
         options: Options of the program.
         needs_hand: Whether the operator has to act before the reading.
     """
@@ -266,7 +272,7 @@ def _moves(robot: Robot, stop: Stop, options: ProgramOptions) -> list[str]:
 
 
 def _words(robot: Robot, point: Array | None, options: ProgramOptions) -> str:
-    """Coordinates of a point in machine coordinates."""
+    """G-code words of a point in machine coordinates, [mm]."""
     coordinates = () if robot.tcp is None else robot.tcp.coordinates
     return " ".join(
         f"{LETTERS[c]}{format_fixed(v + options.shift_mm[c], DECIMALS)}"
