@@ -85,8 +85,8 @@ def calibrate(
             optimum in less time; `linearised`, one step about the active offsets; or
             SolverOptions.
         profile: Names or globs of free parameters whose profile-likelihood intervals are computed.
-        start: Initial values of the free errors of the machine, shape (n_machine,), [SI]; by
-            default the linearised solution.
+        start: Initial values of the free errors of the machine, shape (n_machine,), [SI]; nuisance
+            parameters then start at 0. By default all parameters start at the linearised solution.
         judgement: Judgement of these sessions with these effects and tolerances, if it was computed
             already.
 

@@ -124,15 +124,18 @@ class Calibration(CalibrationRecord):
 
     @property
     def row_factor(self) -> float:
-        """Ratio of the standard deviations of a row and a reading: √2 for differences only."""
+        """Factor from the noise of one reading to `sigma`: √2 if all rows are differences, else 1.
+
+        For the rows of a mixed session see `noise_factor`.
+        """
         return math.sqrt(2.0) if self.rows_are_differences else 1.0
 
     @property
     def total_covariance(self) -> Array:
         """Total covariance of `free`, shape (n_machine, n_machine), [SI].
 
-        Sum of the covariances from noise and priors (`model_covariance`) and from unmodelled errors
-        (`unmodelled.bias_covariance`).
+        From noise and priors (`model_covariance`) and from unmodelled errors with their priors,
+        which the tolerance scale multiplies (`unmodelled.bias_covariance`).
         """
         return np.asarray(self.model_covariance + self.unmodelled.bias_covariance)
 
@@ -189,7 +192,7 @@ class Calibration(CalibrationRecord):
         return any(s.active is not None and s.active != active for s in self.setups)
 
     def noise_factor(self, row: ResidualRow) -> float:
-        """Ratio of the standard deviations of a row and a reading."""
+        """Standard deviation of this row over that of one reading: √2 for a difference, else 1."""
         if row.minus is None:
             return 1.0
         sensor = next(s.sensor for s in self.setups if s.name == row.setup)

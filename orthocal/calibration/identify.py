@@ -53,8 +53,8 @@ def identify(
             optimum in less time; `linearised`, one step about the active offsets; or
             SolverOptions.
         profile: Names or globs of free parameters whose profile-likelihood intervals are computed.
-        start: Initial values of the free errors of the machine, shape (n_machine,), [SI]; by
-            default the linearised solution.
+        start: Initial values of the free errors of the machine, shape (n_machine,), [SI]; nuisance
+            parameters then start at 0. By default all parameters start at the linearised solution.
         find_scale: Function that returns the tolerance scale of the session; by default the
             stated tolerances are used.
 
