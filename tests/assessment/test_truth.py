@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from folders import session_folder
 from gauges import exact
+from intervals import assert_coverage
 from machines import place, reading_by_pinocchio
 from models import JOINTS
 
@@ -159,7 +160,7 @@ def test_the_covariance_of_the_full_model_is_that_of_300_calibrations(root):
     # variances, one by one: chi-squared with 300 degrees of freedom, 126 times
     assert np.abs(np.mean(z**2, axis=0) - 1.0).max() < 4.5 * np.sqrt(2.0 / n)
     assert np.abs(z.mean(axis=0)).max() < 4.5 / np.sqrt(n)
+    assert_coverage(z)
     inside = np.abs(np.array(scaled)) < confidence_factor(np.inf)
-    assert 0.93 < inside.mean() < 0.97
     for index in (0, 1, 2, problem.free.index("x_slide.ry"), problem.free.index("y_wrist.y")):
         assert inside[:, index].mean() == pytest.approx(0.95, abs=0.05)

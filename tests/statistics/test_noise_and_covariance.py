@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gauges import exact
+from intervals import assert_coverage
 from models import TRUTH
 from scipy import stats
 from tolerances import KINEMATICS
@@ -182,7 +183,7 @@ def test_predicted_covariance_is_that_of_many_simulated_calibrations(root, model
     problem = build_problem(plan, model=model)
     rng = np.random.default_rng(0)
     # as the prior says, where there is one
-    truths = rng.normal(size=(300, problem.n_free))
+    truths = rng.normal(size=(340, problem.n_free))
     entries, _, reached = problem.simulate(truths * problem.theta_scale)
     assert reached.all()
     measured = entries + sigma * rng.normal(size=entries.shape)
@@ -205,8 +206,7 @@ def test_predicted_covariance_is_that_of_many_simulated_calibrations(root, model
     edge = np.sqrt(z.shape[1] / n)
     assert (1 - edge) ** 2 - 0.1 < spread.min()
     assert spread.max() < (1 + edge) ** 2 + 0.1
-    inside = np.mean(np.abs(z) < confidence_factor(np.inf))
-    assert 0.93 < inside < 0.97
+    assert_coverage(z)
 
 
 @pytest.mark.parametrize("rows", [4, 9, 40])
