@@ -79,7 +79,7 @@ def again(
     orthocal.write_session(new, out, comment=comment, extra=sheet, blank=True)
     if amounts:
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
-        put_out(f"The machine is expected with these adjustments: {settings}.")
+        put_out(f"Set these adjustments before you measure: {settings}.")
     put_out(_describe_entries(new, changes=result.session.controller_offsets is None))
     put_out(f"  orthocal record {out}\n  orthocal validate {calibration} {out}")
     put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, and sheet.html")
@@ -109,8 +109,8 @@ def _describe_entries(new: orthocal.Session, *, changes: bool) -> str:
         text += f" The sign is reversed for joints that count down: {', '.join(down)}."
     if backlash := describe_trims(new.robot, new.compensation):
         text += (
-            f"\nThe controller is expected to compensate this backlash: {backlash}. If it does "
-            "not, remove it from `controller` in session.yaml."
+            f"\nCheck that the controller compensates this backlash: {backlash}. If it does not, "
+            "remove it from `controller` in session.yaml."
         )
     return text
 

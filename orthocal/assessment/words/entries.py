@@ -101,7 +101,10 @@ def no_change_needed(
     text = "No offset changes by more than its uncertainty."
     if best is not None:
         numbers |= {"now_um": best.now / UM, "best_um": best.entered / UM}
-        text = f"Other offsets would lower the expected tool error by less than {share:.0%}."
+        text = (
+            "Keep the active offsets: others would lower the expected tool error by less than "
+            f"{share:.0%}."
+        )
     return note("no change needed", text, "", named(*drives), **numbers)
 
 
@@ -112,7 +115,8 @@ def must_change(drives: Sequence[str]) -> Finding:
 
 def not_significant(drives: Sequence[str]) -> Finding:
     """Finding about offsets that change by less than their uncertainty."""
-    return note("not significant", _describe_change(drives, "less"), "", named(*drives))
+    text = f"{_describe_change(drives, 'less')} The tool error depends on all offsets together."
+    return note("not significant", text, "", named(*drives))
 
 
 def _describe_change(drives: Sequence[str], compared: str) -> str:
@@ -213,7 +217,7 @@ def describe_use_parts(tool: ToolErrorSummary) -> list[str]:
     lines = []
     for part in tool.use.parts:
         if part.condition == "approach" and tool.without_backlash is not None:
-            if tool.without_backlash - tool.entered >= 0.5 * UM:
+            if tool_mm(tool.without_backlash) != tool_mm(tool.entered):
                 lines.append(describe_without_backlash(tool.without_backlash))
             continue
         without = math.sqrt(max(tool.entered**2 - part.size**2, 0.0))

@@ -52,7 +52,7 @@ def larger_than_predicted(
     """
     text = (
         f"The new readings deviate from the predictions by {mm(achieved)} mm RMS, more than their "
-        f"uncertainty (limit for deviations of this pattern: {mm(limit)} mm)."
+        f"uncertainty (for this pattern at most {mm(limit)} mm)."
     )
     action = ""
     if refit is not None:
@@ -71,7 +71,7 @@ def as_predicted(achieved: float, limit: float, numbers: Mapping[str, float]) ->
     return note(
         "as predicted",
         f"The new readings agree with the predictions: they deviate by {mm(achieved)} mm RMS, "
-        f"within their uncertainty (limit for deviations of this pattern: {mm(limit)} mm).",
+        f"within their uncertainty (for this pattern at most {mm(limit)} mm).",
         **numbers,
     )
 
