@@ -113,7 +113,7 @@ class EffectSearch:
             for f, evidence in found._score(found.sound, families)
             if f.systematic
         }
-        needed = search.EFFECT_CLEARLY - np.log(search.FAMILIES)
+        needed = search.CLEAR_EFFECT_LOG_BAYES - np.log(search.N_FAMILIES)
         clear = sorted((n for n in scores if scores[n] >= needed), key=lambda n: -scores[n])
         gain = self._evidence(self.true, self.about, values)
         return Named(gain - self._evidence(found.model, self.start, values), tuple(clear))
