@@ -26,7 +26,7 @@ from orthocal.output.report.figure import (
     plot,
     scale_log,
 )
-from orthocal.planning.cost_curve import ENOUGH, HOUR
+from orthocal.planning.cost_curve import HOUR, HOURLY_GAIN
 from orthocal.planning.plan import MeasuringPlan
 from orthocal.study.bootstrap import BootstrapSummary
 from orthocal.study.linearisation import LinearisationSummary
@@ -185,7 +185,7 @@ def plot_plan(plan: MeasuringPlan, unit: float) -> Figure:
                 look: Look = {"color": colour, "label": other.name}
                 axes.plot(other.minutes / HOUR, errors[-1], marker, **look)
     if plan.enough is not None:
-        label = f"another hour gains < {ENOUGH:.0%}"
+        label = f"another hour gains < {HOURLY_GAIN:.0%}"
         axes.axvline(plan.enough.minutes / HOUR, color="#999999", linestyle=":", label=label)
     scale_log(axes, "y", np.array(errors))
     axes.set_xlim(left=0.0)
