@@ -1,8 +1,8 @@
 """Search for anomalies: all hypotheses are compared by one marginal likelihood.
 
-Families share the prior probability equally, and so do the hypotheses of each family. The Bayes
-factor of their mixture against no anomaly exceeds e^c by chance in at most one of e^c sound
-sessions (Markov's inequality), whatever the number of hypotheses. Anomalies are added one by one
+Families share the prior probability equally, and so do the hypotheses of each family. In at most
+one of e^c sound sessions the Bayes factor of their mixture against no anomaly exceeds e^c (Markov's
+inequality). This does not depend on the number of hypotheses. Anomalies are added one by one
 (forward selection), in small sessions also in pairs (`pairs.py`). Anomalies that others explain are
 removed again (backward elimination). The most likely hypotheses are relinearised.
 """

@@ -236,9 +236,8 @@ def _list_aligned(
     """Nuisance parameters that are aligned to the machine.
 
     Returns:
-        Setup to pairs of the parameter's index among the free parameters, and its sensitivity to
-        the machine's parameters in the posture of each reading, shape (m, n_machine), [SI per prior
-        std].
+        Pairs by setup: index among the free parameters; and sensitivity to the machine's parameters
+        in the posture of each reading, shape (m, n_machine), [SI per prior std].
     """
     by_parameter: dict[str, dict[str, Setup]] = {}
     for name, setup in session.setups.items():

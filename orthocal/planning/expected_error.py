@@ -43,9 +43,9 @@ from orthocal.statistics.noise import estimate_repeatability, noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 
 Criterion = Literal["aligned", "relative", "absolute", "worst", "A", "D", "E"]
-"""Criterion of a plan: the RMS tool error in its three forms, the error at the worst point with
-translation and rotation removed, or the trace (A), determinant (D) or largest eigenvalue (E) of the
-covariance of the parameters, in prior std."""
+"""Criterion of a plan. `aligned`, `relative`, `absolute`: RMS tool error. `worst`: error at the
+worst point with translation and rotation removed. A, D, E: trace, determinant or largest eigenvalue
+of the covariance of the parameters, in prior std."""
 
 CRITERIA: tuple[Criterion, ...] = ("aligned", "relative", "absolute", "worst", "A", "D", "E")
 

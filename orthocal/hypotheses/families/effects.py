@@ -56,6 +56,7 @@ def find_effects(model: LinearModel) -> list[SystematicEffect]:
 
 
 def _find_effects(model: LinearModel) -> list[SystematicEffect]:
+    """Linearised effects with their visible parameters."""
     session, effects = model.problem.session, []
     for name in missing_effects(session):
         lacking = rows_without(session, name)

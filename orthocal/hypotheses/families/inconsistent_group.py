@@ -29,6 +29,7 @@ def inconsistent_groups(rows: Rows) -> Iterator[Family]:
 
 
 def _setups(rows: Rows) -> Family | None:
+    """Setups whose readings are wrong by independent amounts; None with fewer than 3 setups."""
     if not 2 < len(rows.setups) <= MAX_GROUPS:
         return None
     explanations, groups = [], []
@@ -44,6 +45,7 @@ def _setups(rows: Rows) -> Family | None:
 
 
 def _postures(rows: Rows) -> Family | None:
+    """Postures whose readings in all setups are wrong by independent amounts; None with few."""
     by_label: dict[str, list[Indices]] = {}
     for indices in rows.repeated.values():
         by_label.setdefault(rows.posture(int(indices[0])), []).append(indices)
