@@ -100,7 +100,9 @@ class EffectSearch:
         self.search = search._Search(bare, LinearModel(bare))
         self.start, self.rows = self.search.sound.about, bare
         self.true = LinearModel(plan.with_effects([effect] if effect else []))
-        self.about = self.true.linearise(np.zeros(self.true.problem.n_free), (), None, slopes=False)
+        self.about = self.true.linearise(
+            np.zeros(self.true.problem.n_free), (), None, keep_jacobian=False
+        )
 
     def name(self, values):
         """What is named in the readings of a machine, shape (n_rows,), [m]."""

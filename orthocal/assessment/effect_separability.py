@@ -108,11 +108,11 @@ def _alike(session: Session) -> Iterator[Finding]:
     """Parameters of effects that change the readings alike."""
     free = errors_of_no_model(session.robot)
     model = linear_model(session, free=free)
-    about = model.at_reference(slopes=True)
+    about = model.at_reference(keep_jacobian=True)
     effects = {e.name: e for e in measurable_effects(session.robot)}
     members = _members(session, model.problem.free)
     every = [i for indices in members.values() for i in indices]
-    columns, others = about.slopes[:, every], np.delete(about.slopes, every, axis=1)
+    columns, others = about.jacobian[:, every], np.delete(about.jacobian, every, axis=1)
     normal = others.T @ others + model.sigma**2 * np.eye(others.shape[1])
     white = columns - others @ np.linalg.solve(normal, others.T @ columns)
     information = columns.T @ white / model.sigma**2

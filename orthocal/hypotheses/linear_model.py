@@ -72,7 +72,7 @@ class ModelLinearisation:
 
     expected: Array
     """Predictions for the reference machine, to first order, shape (n_entries,), [m]."""
-    slopes: Array
+    jacobian: Array
     """Jacobian ∂h per prior std of each error, shape (n_entries, n_free), [m]; shape (n_entries, 0)
     if not requested."""
     likelihood: Likelihood
@@ -178,13 +178,15 @@ class LinearModel:
             self._shared[name] = compute()
         return cast(Result, self._shared[name])
 
-    def at_reference(self, *, slopes: bool) -> ModelLinearisation:
+    def at_reference(self, *, keep_jacobian: bool) -> ModelLinearisation:
         """Linearisation about the machine without errors, cached; raises as `linearise` does."""
 
         def linearise() -> ModelLinearisation:
-            return self.linearise(np.zeros(self.problem.n_free), (), None, slopes=slopes)
+            return self.linearise(
+                np.zeros(self.problem.n_free), (), None, keep_jacobian=keep_jacobian
+            )
 
-        return self.share(("reference", slopes), linearise)
+        return self.share(("reference", keep_jacobian), linearise)
 
     @property
     def offsets(self) -> dict[str, int]:
@@ -253,7 +255,12 @@ class LinearModel:
         return np.asarray(project_out_zeros(np.ascontiguousarray(entries.T), o).T)
 
     def linearise(
-        self, theta: Array, shifts: Sequence[MachineShift], start: Array | None, *, slopes: bool
+        self,
+        theta: Array,
+        shifts: Sequence[MachineShift],
+        start: Array | None,
+        *,
+        keep_jacobian: bool,
     ) -> ModelLinearisation:
         """Linearise the model.
 
@@ -261,7 +268,7 @@ class LinearModel:
             theta: Errors minus those of the reference, shape (n_free,), [prior std].
             shifts: Known differences of the machine in some of the sessions.
             start: Passive coordinates to start from, shape (n_states, n_passive), [m, rad].
-            slopes: Whether the result includes the Jacobian.
+            keep_jacobian: Whether the result includes the Jacobian.
 
         Raises:
             ClosureError: If the machine cannot reach a posture.
@@ -269,16 +276,18 @@ class LinearModel:
         """
         machines, of_session = self._machines(theta, shifts)
         starts = None if start is None else np.broadcast_to(start, (len(machines), *start.shape))
-        return self._assemble(theta, of_session, *self._predict(machines, starts), slopes=slopes)
+        return self._assemble(
+            theta, of_session, *self._predict(machines, starts), keep_jacobian=keep_jacobian
+        )
 
     def linearise_all(
-        self, points: Sequence[LinearisationPoint], *, slopes: bool
+        self, points: Sequence[LinearisationPoint], *, keep_jacobian: bool
     ) -> list[ModelLinearisation | None]:
         """Linearise the model about several points, in half the time of separate calls.
 
         Args:
             points: The points.
-            slopes: Whether the results include the Jacobian.
+            keep_jacobian: Whether the results include the Jacobian.
 
         Returns:
             The linearisations; None if a machine cannot reach a posture or a predicted reading is
@@ -288,11 +297,13 @@ class LinearModel:
         return [
             linearisation
             for first in range(0, len(points), size)
-            for linearisation in self._linearise_block(points[first : first + size], slopes=slopes)
+            for linearisation in self._linearise_block(
+                points[first : first + size], keep_jacobian=keep_jacobian
+            )
         ]
 
     def _linearise_block(
-        self, points: Sequence[LinearisationPoint], *, slopes: bool
+        self, points: Sequence[LinearisationPoint], *, keep_jacobian: bool
     ) -> Iterator[ModelLinearisation | None]:
         """Linearise the model about a few points at once, or one by one if one of them fails."""
         machines = [self._machines(p.theta, p.shifts) for p in points]
@@ -316,7 +327,9 @@ class LinearModel:
                     if predictions is None
                     else [values[m] for values in predictions]
                 )
-                yield self._assemble(point.theta, of_session, *predicted, slopes=slopes)
+                yield self._assemble(
+                    point.theta, of_session, *predicted, keep_jacobian=keep_jacobian
+                )
             except (ClosureError, SessionError, np.linalg.LinAlgError):
                 yield None
 
@@ -358,7 +371,7 @@ class LinearModel:
         jacobians: Array,
         passive: Array,
         *,
-        slopes: bool,
+        keep_jacobian: bool,
     ) -> ModelLinearisation:
         """Linearisation from the predictions of the machine of each session.
 
@@ -375,7 +388,7 @@ class LinearModel:
         )
         return ModelLinearisation(
             project_out_zeros(expected, o) - jacobian @ theta,
-            jacobian if slopes else np.empty((o.size, 0)),
+            jacobian if keep_jacobian else np.empty((o.size, 0)),
             likelihood,
             vectors,
             sizes,
@@ -437,15 +450,15 @@ class LinearModel:
             ClosureError: If the nominal machine cannot reach a posture.
         """
         near = self.most_likely(rows)
-        about = self.linearise(near.theta, (), near.passive, slopes=True)
+        about = self.linearise(near.theta, (), near.passive, keep_jacobian=True)
         deviation = self.entries(rows[None])[0] - about.expected
         o, errors = self.problem.observations, np.zeros(deviation.size)
         for setup in np.unique(o.setup):
             left_out = o.setup == setup
-            jacobian = about.slopes[~left_out]
+            jacobian = about.jacobian[~left_out]
             normal = jacobian.T @ jacobian + self.sigma**2 * np.eye(jacobian.shape[1])
             theta = np.linalg.solve(normal, jacobian.T @ deviation[~left_out])
-            errors[left_out] = deviation[left_out] - about.slopes[left_out] @ theta
+            errors[left_out] = deviation[left_out] - about.jacobian[left_out] @ theta
         return o.rows(errors * self.problem.noise_ratio)
 
     def _approach(self, entries: Array, effect: Array) -> ModelLinearisation:
@@ -459,7 +472,7 @@ class LinearModel:
             entries: Readings, zeros projected out, shape (n_entries,), [m].
             effect: Effect per unit, zeros projected out, shape (n_entries,); 0 without an effect.
         """
-        about = self.at_reference(slopes=False)
+        about = self.at_reference(keep_jacobian=False)
         for _ in range(MAX_STEPS):
             deviation = entries - about.expected
             (amount,), _ = about.likelihood.estimate_amounts(deviation, effect[None])
@@ -467,7 +480,7 @@ class LinearModel:
             if not np.abs(errors - about.theta).max(initial=0.0) > CONVERGED_CHANGE:
                 break
             try:
-                about = self.linearise(errors, (), about.passive, slopes=False)
+                about = self.linearise(errors, (), about.passive, keep_jacobian=False)
             except (ClosureError, SessionError, np.linalg.LinAlgError):
                 break
         return about
@@ -511,7 +524,7 @@ class LinearModel:
 
         def compute() -> Array:
             problem = self.problem
-            passive = self.at_reference(slopes=False).passive
+            passive = self.at_reference(keep_jacobian=False).passive
             _, jacobian = problem.predict_and_jacobian(problem.active_theta, passive)
             columns = jacobian[:, problem.n_machine :] * problem.noise_ratio[:, None]
             return problem.observations.rows(columns).T
@@ -539,7 +552,7 @@ class LinearModel:
             if not enlarged:
                 return {}
             other = replace(session, setups={**session.setups, **enlarged})
-            passive = self.at_reference(slopes=False).passive
+            passive = self.at_reference(keep_jacobian=False).passive
             stated, changed = (
                 o.rows(predict_readings(s, observations=o, passive=passive))
                 for s in (session, other)
@@ -555,7 +568,7 @@ class LinearModel:
 
     def shift_entries(self, about: ModelLinearisation, shift: MachineShift) -> Array:
         """Effect of a machine shift on the entries, zeros projected out, (n_entries,), [m]."""
-        change = np.asarray(about.slopes @ shift.direction)
+        change = np.asarray(about.jacobian @ shift.direction)
         change = np.where(shift.sessions[self.session_of_entry], change, 0.0)
         return np.asarray(self.project(change[None])[0])
 

@@ -151,9 +151,9 @@ class _Search:
         self.session = session
         self.model = model
         self.values = session.values
-        self.slopes = len(model.labels) > 1
+        self.keep_jacobian = len(model.labels) > 1
         self.effects = find_effects(model)
-        start = model.at_reference(slopes=self.slopes)
+        start = model.at_reference(keep_jacobian=self.keep_jacobian)
         self.sound = self.evaluate((), start)
 
     def run(self) -> Anomalies:
@@ -219,7 +219,9 @@ class _Search:
         for k in range(MAX_RELINEARISATIONS):
             points = [self._next_point(states[-1], first=k == 0) for states in unfinished]
             steps = [(t, p) for t, p in zip(unfinished, points, strict=True) if p is not None]
-            abouts = self.model.linearise_all([p for _, p in steps], slopes=self.slopes)
+            abouts = self.model.linearise_all(
+                [p for _, p in steps], keep_jacobian=self.keep_jacobian
+            )
             unfinished = []
             for (states, _), about in zip(steps, abouts, strict=True):
                 if about is not None:
@@ -242,13 +244,13 @@ class _Search:
         if any(t.shift is not None for terms in term_sets for t in terms):
             sound = self.sound.about
             points = [LinearisationPoint(sound.theta, s, sound.passive) for s in shifts if s]
-            shifted = iter(model.linearise_all(points, slopes=True))
+            shifted = iter(model.linearise_all(points, keep_jacobian=True))
         states = []
         for terms, known in zip(term_sets, shifts, strict=True):
             about = start
             if known:
                 about = next(shifted) or model.linearise(
-                    sound.theta, known, sound.passive, slopes=True
+                    sound.theta, known, sound.passive, keep_jacobian=True
                 )
             elif any(map(_is_unknown_shift, terms)):
                 about = sound

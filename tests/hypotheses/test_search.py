@@ -250,7 +250,7 @@ def test_tails_by_cumulative_sums_equal_those_written_out(cycles):
     session = join_sessions([cycles, cycles])
     assert len(session.readings) > MAX_DENSE_COLUMNS  # fewer rows are written out
     model, rows = LinearModel(session), Rows(session)
-    about = model.linearise(np.zeros(model.problem.n_free), (), None, slopes=False)
+    about = model.linearise(np.zeros(model.problem.n_free), (), None, keep_jacobian=False)
     deviation = model.entries(session.values[None])[0] - about.expected
     tested = 0
     for family in (*displaced_gauges(rows, model.sigma), *row_offsets(rows)):

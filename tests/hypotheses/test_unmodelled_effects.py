@@ -256,7 +256,7 @@ def test_backlashes_of_several_drives_are_nearly_independent(plan, slack):
     """Against the joint probability that all are positive: less than a ninth of what is needed."""
     bare, machine = plan.with_effects([]), plan.with_effects(["backlash"])
     model = LinearModel(bare)
-    about = model.at_reference(slopes=True)
+    about = model.at_reference(keep_jacobian=True)
     (effect,) = (e for e in find_effects(model) if e.name == "backlash")
     vectors = model.entries(effect.columns)
     for seed in range(5):

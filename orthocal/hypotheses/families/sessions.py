@@ -220,7 +220,7 @@ def detectable_changes(session: Session) -> dict[str, float]:
     if len(model.labels) < 2 or model.dof < 1:
         return {}
     problem, offsets = model.problem, model.offsets
-    about = model.at_reference(slopes=True)
+    about = model.at_reference(keep_jacobian=True)
     changes = dict.fromkeys(offsets, 0.0)
     sessions = np.arange(len(model.labels))
     steps = [np.isin(sessions, later) for later, apart in divide_sessions(model.order) if not apart]
