@@ -201,7 +201,8 @@ def _parts(
     directions, problem = about.likelihood.directions, model.problem
     along = directions @ deviation
     square = max(float(deviation @ deviation - along @ along), 0.0) / noise**2
-    slopes = about.sizes[:, None] * about.errors.T / noise  # along each direction, by each error
+    # change along each direction per prior std of each error, relative to the noise
+    slopes = about.singular_values[:, None] * about.error_directions.T / noise
     known, n = problem.robot.parameters, problem.n_machine
     machine = slopes[:, :n]
     names = problem.free[:n]

@@ -76,9 +76,9 @@ class ModelLinearisation:
     """Jacobian ∂h per prior std of each error, shape (n_entries, n_free), [m]; shape (n_entries, 0)
     if not requested."""
     likelihood: Likelihood
-    errors: Array
+    error_directions: Array
     """Errors per principal direction, shape (n_free, r), [prior std]."""
-    sizes: Array
+    singular_values: Array
     """Singular values, shape (r,), [m]."""
     theta: Array
     """Errors at the point of linearisation minus those of the reference, (n_free,), [prior std]."""
@@ -96,9 +96,9 @@ class ModelLinearisation:
             noise_scale: Noise scale s.
         """
         e2 = tolerance_scale**2
-        variance = e2 * self.sizes**2 + (noise_scale * self.likelihood.sigma) ** 2
+        variance = e2 * self.singular_values**2 + (noise_scale * self.likelihood.sigma) ** 2
         along = self.likelihood.directions @ deviation
-        return np.asarray(self.errors @ (e2 * self.sizes / variance * along))
+        return np.asarray(self.error_directions @ (e2 * self.singular_values / variance * along))
 
     def log_positive_share(
         self, deviation: Array, positive: Mask, *, tolerance_scale: float, noise_scale: float
@@ -116,9 +116,9 @@ class ModelLinearisation:
         """
         scales = {"tolerance_scale": tolerance_scale, "noise_scale": noise_scale}
         mean = self.errors_for(deviation, **scales)[positive]
-        resolved = tolerance_scale**2 * self.sizes**2
+        resolved = tolerance_scale**2 * self.singular_values**2
         resolved /= resolved + (noise_scale * self.likelihood.sigma) ** 2
-        rows = self.errors[positive]
+        rows = self.error_directions[positive]
         covariance = tolerance_scale**2 * (np.eye(len(rows)) - rows * resolved @ rows.T)
         return len(rows) * math.log(2.0) + log_positive_share(mean, covariance)
 
@@ -383,15 +383,15 @@ class LinearModel:
         expected, jacobian = readings[machine, entry], jacobians[machine, entry]
         require_finite(self.problem, expected, jacobian)
         jacobian = project_out_zeros(jacobian, o)
-        likelihood, vectors, sizes = build_likelihood(
+        likelihood, error_directions, singular_values = build_likelihood(
             jacobian, sigma=self.sigma, dof=self.dof, stated=self.stated
         )
         return ModelLinearisation(
             project_out_zeros(expected, o) - jacobian @ theta,
             jacobian if keep_jacobian else np.empty((o.size, 0)),
             likelihood,
-            vectors,
-            sizes,
+            error_directions,
+            singular_values,
             theta,
             passive[-1],
         )
@@ -634,7 +634,7 @@ class LinearModel:
             about: The linearisation.
         """
         errors = about.errors_for(deviation)
-        along = about.sizes * (about.errors.T @ errors)
+        along = about.singular_values * (about.error_directions.T @ errors)
         residuals = (deviation - along @ about.likelihood.directions) * self.problem.noise_ratio
         return float(np.sqrt(np.mean(self.problem.observations.rows(residuals) ** 2)))
 
