@@ -155,7 +155,7 @@ class ToolForecast:
 
     def problem(self, session: Session) -> CalibrationProblem:
         """Calibration problem of a session's readings."""
-        return weigh_readings(CalibrationProblem(session, self.selection))
+        return with_gauge_noise(CalibrationProblem(session, self.selection))
 
     def prior_information(
         self, problem: CalibrationProblem, state: Sequence[str], measured: Session | None
@@ -247,7 +247,7 @@ class ToolForecast:
             return None
         n = len(self.selection.names)
         stds = dict(zip(self.others, self.prior_stds[n:].tolist(), strict=True))
-        problem = weigh_readings(
+        problem = with_gauge_noise(
             build_problem(session, free=self.others, prior=True, prior_stds=stds)
         )
         _, jacobian = problem.predict_and_jacobian(np.zeros(problem.n_free))
@@ -424,7 +424,7 @@ def noise_of(session: Session) -> float:
     return noise_floor(session.gauge.sigma, session.gauge.resolution)
 
 
-def weigh_readings(problem: CalibrationProblem) -> CalibrationProblem:
+def with_gauge_noise(problem: CalibrationProblem) -> CalibrationProblem:
     """Problem with noise ratios from the stated repeatability of the gauges."""
     session = problem.session
     groups = split_by_gauge(session, problem.observations)
