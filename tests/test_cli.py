@@ -80,7 +80,7 @@ def test_view_writes_a_page_of_anything(calibrated, experiment, root, tmp_path):
         (calibrated, "Machine, calibrated"),
         (calibrated / "calibration.json", "Machine, calibrated"),
         (experiment, "Machine, nominal"),
-        (root / "tests/sessions/lines/plan.yaml", "none taken yet"),
+        (root / "tests/sessions/lines/plan.yaml", "none measured yet"),
         ("orthoglide", "Mechanical zero"),
         (root / "tests/robots/fivebar", "motor_a"),
     ):

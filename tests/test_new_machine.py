@@ -286,7 +286,7 @@ def test_a_directory_with_files_of_two_robots_is_refused(copied):
 def test_dimensions_alone_are_no_robot(copied):
     (copied / "mill.yaml").unlink()
     code, _, err = orthocal("new", copied, "--again")
-    assert (code, "contains no YAML of a robot beside machine.yaml" in err) == (2, True)
+    assert (code, "contains machine.yaml but no YAML of a robot" in err) == (2, True)
 
 
 def test_entries_of_joints_that_count_down_are_described(made, tmp_path):

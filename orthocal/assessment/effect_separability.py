@@ -111,13 +111,13 @@ def _inseparable(session: Session) -> Iterator[Finding]:
     """Findings about parameters of effects that are inseparable."""
     free = errors_of_no_model(session.robot)
     model = linear_model(session, free=free)
-    linearisation = model.at_reference(slopes=True)
+    linearisation = model.at_reference(keep_jacobian=True)
     effects = {e.name: e for e in measurable_effects(session.robot)}
     indices_of_effects = _members(session, model.problem.free)
     effect_columns = [i for indices in indices_of_effects.values() for i in indices]
     effect_slopes, other_slopes = (
-        linearisation.slopes[:, effect_columns],
-        np.delete(linearisation.slopes, effect_columns, axis=1),
+        linearisation.jacobian[:, effect_columns],
+        np.delete(linearisation.jacobian, effect_columns, axis=1),
     )
     normal = other_slopes.T @ other_slopes + model.sigma**2 * np.eye(other_slopes.shape[1])
     whitened = effect_slopes - other_slopes @ np.linalg.solve(

@@ -215,7 +215,7 @@ def _independent_contrasts(
     components = directions @ deviation
     rest_square = max(float(deviation @ deviation - components @ components), 0.0) / noise**2
     # derivatives of the components with respect to the errors, in prior standard deviations
-    slopes = linearisation.sizes[:, None] * linearisation.errors.T / noise
+    slopes = linearisation.singular_values[:, None] * linearisation.error_directions.T / noise
     parameters, n = problem.robot.parameters, problem.n_machine
     machine = slopes[:, :n]
     names = problem.free[:n]

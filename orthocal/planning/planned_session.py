@@ -11,7 +11,7 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.measurement.motion.motion import state_path_approaches
-from orthocal.planning.candidates import FEWEST, Candidates
+from orthocal.planning.candidates import MIN_READINGS, Candidates
 from orthocal.planning.selection import PlannedSetup
 from orthocal.session.session import Posture, Reading, Session, Setup
 
@@ -19,37 +19,37 @@ from orthocal.session.session import Posture, Reading, Session, Setup
 def build_session(
     candidates: Candidates, planned: Sequence[PlannedSetup], measured: Session | None = None
 ) -> Session:
-    """Session of planned setups, named, in the order of measuring.
+    """Session of named setups and readings in the order of measuring.
 
     Each setup begins with the posture in which its gauge is aligned, continues with short motions,
-    and ends with the first posture. Postures in which a drive turns round on the path of the tool
-    are omitted if an effect depends on the side: it would be unknown.
+    and ends with the first posture. If an effect depends on the approach, postures in which a drive
+    reverses on the path of the tool are omitted, because their approach is unknown.
     """
     while True:
         plan = _order_readings(candidates, planned, measured)
-        unclear = {
+        unknown_approach = {
             (r.setup, r.posture)
             for r in plan.readings
             if r.conditions is not None and "u" in (r.conditions.approach or "")
         }
-        clear = [
-            _without(candidates, setup, {p for s, p in unclear if s == name})
+        reduced = [
+            _without(candidates, setup, {p for s, p in unknown_approach if s == name})
             for name, setup in zip(plan.setups, _in_order(candidates, planned), strict=True)
         ]
-        if sum(len(s.chosen) for s in clear) == sum(len(s.chosen) for s in planned):
+        if sum(len(s.chosen) for s in reduced) == sum(len(s.chosen) for s in planned):
             return plan
-        planned = clear
+        planned = reduced
 
 
 def _without(candidates: Candidates, setup: PlannedSetup, postures: set[str]) -> PlannedSetup:
-    """Setup without some postures, if enough others are left."""
+    """Setup without some postures; unchanged if fewer than MIN_READINGS would remain."""
     source, rows = candidates.session, candidates.setups[setup.candidate].rows
     chosen = tuple(i for i in setup.chosen if source.readings[rows[i]].posture not in postures)
-    return setup if len(chosen) < FEWEST else replace(setup, chosen=chosen)
+    return setup if len(chosen) < MIN_READINGS else replace(setup, chosen=chosen)
 
 
 def _in_order(candidates: Candidates, planned: Sequence[PlannedSetup]) -> list[PlannedSetup]:
-    """Setups in the order of measuring: by leg, then those of sensors at the tool."""
+    """Setups in the order of measuring: at the legs, then with sensors at the tool."""
     source = candidates.session
     legs = list(source.robot.legs)
 
@@ -66,13 +66,13 @@ def _order_readings(
 ) -> Session:
     """Session of planned setups with the approaches that follow from their paths."""
     source = candidates.session
-    used_names = set() if measured is None else set(measured.setups)
+    measured_names = set() if measured is None else set(measured.setups)
     setups: dict[str, Setup] = {}
     readings: list[Reading] = []
-    used: dict[str, Posture] = {}
+    postures: dict[str, Posture] = {}
     for setup in _in_order(candidates, planned):
         candidate = candidates.setups[setup.candidate]
-        name = _setup_name(candidate.name, {*used_names, *setups})
+        name = _setup_name(candidate.name, {*measured_names, *setups})
         rows = [source.readings[i] for i in candidate.rows[list(setup.chosen)]]
         points = np.array([source.postures[r.posture].values for r in rows])
         setups[name] = replace(source.setups[candidate.name], name=name, aligned_at=rows[0].posture)
@@ -80,14 +80,14 @@ def _order_readings(
         for row in (*(rows[i] for i in order_postures(points)), rows[0]):
             cycles[row.place] += 1
             readings.append(replace(row, setup=name, cycle=cycles[row.place]))
-        used.update((r.posture, source.postures[r.posture]) for r in rows)
+        postures.update((r.posture, source.postures[r.posture]) for r in rows)
     plan = replace(
         source,
         title="Planned readings",
         setups=setups,
         readings=tuple(readings),
         gauges={n: g for n, g in source.gauges.items() if n in {s.gauge for s in setups.values()}},
-        postures={n: p for n, p in source.postures.items() if n in used},
+        postures={n: p for n, p in source.postures.items() if n in postures},
     )
     if measured is None:
         return state_path_approaches(plan)
@@ -100,7 +100,8 @@ def _order_readings(
 def order_postures(points: Array) -> list[int]:
     """Order of points on a short closed path that begins with the first one.
 
-    The nearest point next, then parts are reversed while that shortens the path (2-opt).
+    Each point is followed by the nearest one. Then parts are reversed while this shortens the path
+    (2-opt).
 
     Args:
         points: Tool positions, shape (n, n_coordinates), [m].

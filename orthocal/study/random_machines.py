@@ -27,7 +27,7 @@ from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import Workspace, gauss_box
 from orthocal.observation.simulate import limits_of, show_readings
-from orthocal.planning.expected_error import noise_of, weigh_readings
+from orthocal.planning.expected_error import noise_of, with_gauge_noise
 from orthocal.robot.model import Robot
 from orthocal.session.session import Session
 
@@ -61,7 +61,7 @@ class MachineModel:
     def of(session: Session, choice: Choice, *, sigma: float) -> MachineModel:
         """Build the model for a choice of errors."""
         problem = CalibrationProblem(session, choice.select(session.robot.parameters))
-        problem = weigh_readings(problem)
+        problem = with_gauge_noise(problem)
         return MachineModel(problem, BatchSolver(problem), sigma)
 
     @property

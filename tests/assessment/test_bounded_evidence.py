@@ -79,7 +79,7 @@ def test_the_evidence_of_a_session_is_that_of_drawn_backlash(backlash, scale):
     """Mean over half-normal draws of the density with all other errors integrated out."""
     model = linear_model(backlash, complete_model(backlash.robot.parameters))
     near = model.most_likely(backlash.values)
-    about = model.linearise(near.theta, (), near.passive, slopes=True)
+    about = model.linearise(near.theta, (), near.passive, keep_jacobian=True)
     deviation = model.entries(backlash.values[None])[0] - about.expected
     positive = np.array([p.positive for p in model.problem.parameters])
     assert positive.sum() == 3
@@ -89,11 +89,11 @@ def test_the_evidence_of_a_session_is_that_of_drawn_backlash(backlash, scale):
     # zeros are projected out: coordinates within what is left
     values, vectors = np.linalg.eigh(np.eye(deviation.size) - _zero_means(model))
     within = vectors[:, values > 0.5]
-    others = scale * within.T @ about.slopes[:, ~positive]
+    others = scale * within.T @ about.jacobian[:, ~positive]
     covariance = others @ others.T + model.sigma**2 * np.eye(within.shape[1])
     root = np.linalg.cholesky(covariance)
     white = np.linalg.solve(root, within.T @ deviation)
-    slopes = np.linalg.solve(root, within.T @ about.slopes[:, positive])
+    slopes = np.linalg.solve(root, within.T @ about.jacobian[:, positive])
     # draws of the prior over those of a normal distribution about the estimate
     normal = slopes.T @ slopes + np.eye(3) / scale**2
     estimate = np.linalg.solve(normal, slopes.T @ white)

@@ -409,7 +409,10 @@ def test_a_plan_is_chosen_faster_than_by_trying(orthoglide, record):
     candidates = measure_candidates(session, forecast.problem(session), spare_range=3.0)
     size = sum(len(k.rows) for k in candidates.setups)
     assert size > 5_000
-    prior, weigh = np.eye(len(candidates.state)), forecast.weigh("aligned", len(candidates.state))
+    prior, weigh = (
+        np.eye(len(candidates.state)),
+        forecast.weight_of("aligned", len(candidates.state)),
+    )
     counts = [9] * 4 + [8] * 8
     began = time.perf_counter()
     search = SetupSearch.of(candidates, prior, weigh)

@@ -420,7 +420,7 @@ def test_module_with_backlash_states_what_it_leaves(calibration):
     """The phase of the periodic error, shifted by half of the backlash."""
     options = ExportOptions(module=True, latched=LATCHED)
     page = export_calibration(calibration, "linuxcnc", anyway=True, options=options)["README.md"]
-    stated = float(re.search(r"On a side it is off by up to ([\d.]+) µm", page)[1])
+    stated = float(re.search(r"On one side the error is up to ([\d.]+) µm", page)[1])
     periodic = find_periodic_errors(calibration.robot, calibration.errors)
     half = [0.5 * calibration.errors[f"{d.name}.backlash"] for d in calibration.robot.drives]
     at = np.linspace(0.2, 0.21, 4001)[:, None] * np.ones(3)

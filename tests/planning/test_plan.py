@@ -74,7 +74,7 @@ def test_plans_are_better_than_manual_ones(orthoglide, tip, setups, each, most):
     session = list_candidates(orthoglide, equipment)
     candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
     n = len(candidates.state)
-    search = SetupSearch.of(candidates, np.eye(n), forecast.weigh("aligned", n))
+    search = SetupSearch.of(candidates, np.eye(n), forecast.weight_of("aligned", n))
     found = search.choose([each] * setups, starts=4 if each == 3 else 1)
     assert round(found.error * 1e6, 1) <= most
 
@@ -203,7 +203,7 @@ def test_sections_near_the_tool_are_best_for_the_papers_six_equations(orthoglide
     # the gauge's section is where the leg still is with the tool at its far end
     candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
     n = len(candidates.state)
-    search = SetupSearch.of(candidates, 1e-8 * np.eye(n), forecast.weigh("A", n))
+    search = SetupSearch.of(candidates, 1e-8 * np.eye(n), forecast.weight_of("A", n))
     found = search.choose([2] * 6)
     chosen = [session.setups[candidates.setups[s.candidate].name].sensor for s in found.setups]
     assert {s.section.value for s in chosen} == {0.8}
@@ -296,7 +296,7 @@ def make_search(robot, equipment):
     session = list_candidates(robot, equipment)
     candidates = measure_candidates(session, forecast.problem(session), spare_range=3.0)
     n = len(candidates.state)
-    return SetupSearch.of(candidates, np.eye(n), forecast.weigh("aligned", n))
+    return SetupSearch.of(candidates, np.eye(n), forecast.weight_of("aligned", n))
 
 
 def test_the_memory_of_a_plan_is_released_with_it(orthoglide):

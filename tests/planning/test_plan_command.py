@@ -196,7 +196,7 @@ def test_each_criterion_is_better_met_by_its_own_plan(orthoglide, for_the_headli
     own, other = plan_for(orthoglide, criterion), for_the_headline
     assert own.criterion == criterion
     stage = len(own.session.setups)
-    found = own.forecast.weigh(criterion, len(own.forecast.selection.names))
+    found = own.forecast.weight_of(criterion, len(own.forecast.selection.names))
     for plan in (own, other):
         assert plan.curve[stage].error > 0.0
     n = len(own.forecast.selection.names)

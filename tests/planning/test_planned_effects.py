@@ -28,7 +28,7 @@ from orthocal.planning.candidates import list_candidates
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import noise_of
 from orthocal.planning.first_plan import first_equipment, paper_plan
-from orthocal.planning.further_readings import WAITS
+from orthocal.planning.further_readings import WAITING_TIMES
 from orthocal.planning.plan import plan_readings
 from orthocal.session.session import Gauge
 from orthocal.units import MM, PPM, UM
@@ -201,7 +201,7 @@ def test_further_readings_for_effects_that_a_plan_does_not_determine(orthoglide)
     readings = [r for r in plan.session.readings if r.setup == plan.session.readings[0].setup]
     last = FEW.minutes_a_reading * (len(readings) - 1)
     std, noise = 0.25, noise_of(plan.session) / UM
-    for wait in (w for w in WAITS if w <= further["drift"].wait):
+    for wait in (w for w in WAITING_TIMES if w <= further["drift"].wait):
         times = np.array([0.0, last, last + wait])
         slope = noise / np.sqrt(((times - times.mean()) ** 2).sum())
         limit = 2.0 / np.sqrt(1.0 / std**2 + 1.0 / slope**2)
