@@ -228,6 +228,7 @@ def test_the_distances_of_5567(printer, first, verdict, off):
     assert settings.radius / MM == pytest.approx(RADIUS, abs=0.15)
 
 
+@pytest.mark.slow
 def test_the_first_outer_distance_of_5567_is_the_likeliest_mistake(printer):
     """It is the only distance whose omission makes the others plausible, and is 0.8 mm short. Its
     odds are 300 : 1; a reading is accused from 1,100 : 1 on."""
