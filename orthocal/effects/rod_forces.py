@@ -20,6 +20,7 @@ import pinocchio as pin
 from orthocal.arrays import Array
 from orthocal.effects.protocol import Placement
 from orthocal.effects.rods import stretch_rod
+from orthocal.robot.closing import RANK_TOLERANCE
 from orthocal.robot.frames import carriers
 from orthocal.robot.model import Robot, require_tcp
 
@@ -83,7 +84,7 @@ class RodForces:
         if closed.shape[1] == closed.shape[2]:
             closing = np.linalg.solve(closed, tool)
         else:
-            closing = np.linalg.pinv(closed, rcond=1e-10) @ tool
+            closing = np.linalg.pinv(closed, rcond=RANK_TOLERANCE) @ tool
         along = self._closing_forces(closing, axes)
         result = np.zeros((len(coordinates), len(self._rods), 3))
         for i, d in self._displacements:

@@ -40,6 +40,7 @@ from orthocal.observation.sensor_groups import (
     group_sensors,
     nuisance_parameters,
 )
+from orthocal.robot.closing import RANK_TOLERANCE
 from orthocal.session.session import Session
 
 MAX_POSTURES, MAX_READINGS = 64, 640
@@ -644,7 +645,7 @@ class _TwistChain:
         by = np.where(self._place >= 0, rows[:, :, self._place], 0.0)
         by = by.reshape(*rows.shape[:2], -1, 1, 6) @ varying.right[:, variant]
         local = by.reshape(*rows.shape[:2], -1)
-        curved = (local[:, :, None, varying.rows] @ varying.curved[:, variant])[:, :, 0]
+        curved = (local[:, :, None, varying.rows] @ varying.jacobian[:, variant])[:, :, 0]
         return np.asarray(local @ varying.constant + curved @ varying.columns)
 
     def follow(self, change: Array) -> Array:
@@ -660,7 +661,7 @@ class _TwistChain:
             return result
         result = np.repeat(result, varying.right.shape[1], axis=1)
         local = np.repeat((varying.constant @ change)[:, None], result.shape[1], axis=1)
-        curved = varying.curved @ (varying.columns @ change)[:, None]
+        curved = varying.jacobian @ (varying.columns @ change)[:, None]
         local[:, :, varying.rows] += curved
         moved = varying.right @ local.reshape(*local.shape[:2], -1, 6, 1)
         result[:, :, self._of_varying] = moved.reshape(*local.shape[:2], -1)
@@ -719,4 +720,4 @@ def _inverse(matrices: ArrayLike) -> Array:
     m: Array = np.asarray(matrices)
     if m.shape[-2] == m.shape[-1]:
         return np.asarray(np.linalg.inv(m))
-    return np.asarray(np.linalg.pinv(m, rcond=1e-10))
+    return np.asarray(np.linalg.pinv(m, rcond=RANK_TOLERANCE))

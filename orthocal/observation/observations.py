@@ -382,7 +382,7 @@ def _find_states(
     of_state = rows[:, 0].astype(np.int64)
     moved = drives[of_state] + rows[:, 1 : 1 + drives.shape[1]]
     commands = np.hstack([moved, rows[:, 1 + drives.shape[1] :]])
-    commands = map_.at_own_coordinates(commands)
+    commands = map_.with_coordinates(commands)
     first, variant = np.zeros(1, dtype=np.int64), np.zeros(len(rows), dtype=np.int64)
     if map_.of_placements.any():
         values = commands[:, map_.of_placements]

@@ -14,6 +14,7 @@ import pinocchio as pin
 
 from orthocal.arrays import Array
 from orthocal.errors import ClosureError
+from orthocal.robot.closing import RANK_TOLERANCE
 from orthocal.robot.frames import Placement, carriers
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import ElementaryError
@@ -148,5 +149,5 @@ def _sensitivity(
         rows.append(relative[list(closure.rows)])
     points = [motion(data.oMf[f].translation)[:3] * masks[f] for f in observed]
     g, p, n = np.vstack(rows), np.vstack(points), 6 * len(owners)
-    following = np.linalg.lstsq(g[:, n:], -g[:, :n], rcond=1e-10)[0]
+    following = np.linalg.lstsq(g[:, n:], -g[:, :n], rcond=RANK_TOLERANCE)[0]
     return np.asarray(p[:, :n] + p[:, n:] @ following)
