@@ -38,7 +38,6 @@ from orthocal.calibration.assessment_record import (
     UsePart,
 )
 from orthocal.calibration.calibration import Calibration
-from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.conditions import (
     UseConditions,
@@ -47,6 +46,7 @@ from orthocal.kinematics.conditions import (
     sample_use,
     stated_use,
 )
+from orthocal.kinematics.reachable_box import no_workspace_error
 from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
 from orthocal.robot.model import require_commanded_tool
 
@@ -164,7 +164,7 @@ def measure_uncertainty(
     """
     fields = {
         "absolute": jacobian,
-        "relative": workspace.remove_shift(jacobian),
+        "relative": workspace.remove_translation(jacobian),
         "aligned": workspace.remove_motion(jacobian, positions),
     }
     n = len(covariance)
@@ -201,7 +201,7 @@ def measure_deviations(deviations: Array, workspace: Workspace, positions: Array
     few = len(positions) < FEWEST_ALIGNED
     return ErrorSizes(
         aligned=None if few else size(workspace.remove_motion(deviations, positions)),
-        relative=size(workspace.remove_shift(deviations)),
+        relative=size(workspace.remove_translation(deviations)),
         absolute=size(deviations),
     )
 
@@ -228,7 +228,7 @@ def assess_tool(
 
     Raises:
         RobotError: If the robot has no tool centre point, or its drives do not command it.
-        ClosureError: If the machine cannot reach a point, or its tool hardly moves at all.
+        ClosureError: If the machine cannot reach a point, or no box of ±1 mm.
         ParameterError: If a condition is out of range, or nothing depends on it.
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
@@ -248,15 +248,11 @@ def require_tool(calibration: Calibration, tool: CalibratedTool | None) -> Calib
 
     Raises:
         RobotError: If the robot has no tool centre point, or its drives do not command it.
-        ClosureError: If its tool hardly moves at all.
+        ClosureError: If no box of ±1 mm can be reached.
     """
     require_commanded_tool(calibration.robot)
     if tool is None:
-        raise ClosureError(
-            "cannot be reached: there is no region around it, not even of a millimetre, that the "
-            "machine reaches within its limits",
-            posture="mechanical zero",
-        )
+        raise no_workspace_error()
     return tool
 
 
@@ -375,13 +371,13 @@ def _spread_size(covariances: Array, workspace: Workspace) -> ErrorSize:
 
 def _length_percentile(field: Array, workspace: Workspace) -> float:
     """95 % quantile of the lengths of a field, shape (K, 3)."""
-    parts, weights = workspace.spread(field)
+    parts, weights = workspace.interpolate_to_cells(field)
     return _weighted_percentile(np.linalg.norm(parts, axis=1), weights)
 
 
 def _drawn_percentile(covariances: Array, workspace: Workspace) -> float:
     """95 % quantile of normal errors, by sampling; covariances have the shape (K, 3, 3)."""
-    parts, weights = workspace.spread(covariances)
+    parts, weights = workspace.interpolate_to_cells(covariances)
     values, vectors = np.linalg.eigh(parts)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     draws = np.random.default_rng(0).normal(size=(3, DRAWS))

@@ -92,7 +92,7 @@ def test_readings_are_distances_between_the_balls(tmp_path):
     [("unknown", "known", 5.5), ("0", "known", 4.5), ("0", "free", 5.5)],
 )
 def test_bounds_beside_the_papers_readings(tmp_path, orthoglide, length, zero, published):
-    space = cube(orthoglide, points_a_side=5)
+    space = cube(orthoglide, points_per_side=5)
     found = bound_um(circles(tmp_path, length=length, zero=zero, legs=True), space)
     assert found == pytest.approx(published, rel=0.10)
 
@@ -103,7 +103,7 @@ def test_tool_errors_and_intervals_of_machines_with_all_errors(tmp_path):
     plan = circles(tmp_path)
     robot = plan.robot
     problem = build_problem(plan, model="full", prior_stds={"*.offset": 0.5e-3})
-    n, scale, space = problem.n_machine, problem.theta_scale, cube(robot, points_a_side=5)
+    n, scale, space = problem.n_machine, problem.theta_scale, cube(robot, points_per_side=5)
     names = problem.free[:n]
     closure, drives = LoopClosure(robot, free=names), LoopClosure(robot).inverse(space.points)
     program = VariableProjection(problem)

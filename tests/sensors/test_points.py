@@ -139,7 +139,7 @@ def test_a_row_may_have_a_covariance_of_its_own(tmp_path):
 def test_a_tracker_alone_identifies_the_complete_model(tmp_path, orthoglide):
     """40 machines with all errors, seen from an arbitrary station; closed loops."""
     plan = grid(tmp_path)
-    robot, space = plan.robot, cube(orthoglide, points_a_side=5)
+    robot, space = plan.robot, cube(orthoglide, points_per_side=5)
     problem = build_problem(plan, model="full", prior_stds={"*.offset": 0.5e-3})
     n, scale = problem.n_machine, problem.theta_scale
     names = problem.free[:n]

@@ -223,7 +223,7 @@ def test_bounds_beside_the_papers_readings(tmp_path, orthoglide, parts, design):
     plan.legs()
     for part in parts:
         getattr(plan, part)()
-    found = bound_um(plan.load(tmp_path), cube(orthoglide, points_a_side=5))
+    found = bound_um(plan.load(tmp_path), cube(orthoglide, points_per_side=5))
     assert found == pytest.approx(design, rel=0.1)
 
 
@@ -235,7 +235,7 @@ def test_tool_errors_and_intervals_of_machines_with_all_errors(tmp_path, parts):
     for part in parts:
         getattr(made, part)()
     plan = made.load(tmp_path)
-    robot, space = plan.robot, cube(plan.robot, points_a_side=5)
+    robot, space = plan.robot, cube(plan.robot, points_per_side=5)
     problem = build_problem(plan, model="full", prior_stds={"*.offset": 0.5e-3})
     n, scale = problem.n_machine, problem.theta_scale[: problem.n_machine]
     names = problem.free[:n]
