@@ -25,7 +25,7 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.effects.compensation import Compensation, JointTrim
 from orthocal.effects.loading import robot_effects
-from orthocal.effects.screw import KINDS, Screw
+from orthocal.effects.screw import SCREW_COMPONENTS, Screw
 from orthocal.io.fields import read_only
 
 DECIDED = 1e-2
@@ -185,7 +185,7 @@ def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
         return ()
     errors, entries, determined = calibration.errors, [], []
     for drive, active in zip(robot.drives, _compensated_screws(calibration, screw), strict=True):
-        names = [f"{drive.name}.{kind}" for kind in KINDS]
+        names = [f"{drive.name}.{kind}" for kind in SCREW_COMPONENTS]
         value = np.array([errors.get(name, 0.0) for name in names])
         if not (value.any() or active.any()):
             continue
@@ -203,7 +203,7 @@ def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
 
 
 def _by_parameter(drive: str, values: Array) -> dict[str, float]:
-    return dict(zip((f"{drive}.{kind}" for kind in KINDS), values.tolist(), strict=True))
+    return dict(zip((f"{drive}.{kind}" for kind in SCREW_COMPONENTS), values.tolist(), strict=True))
 
 
 def _amplitude_uncertainty(

@@ -21,7 +21,11 @@ from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.files.schema import GaugeKeys
-from orthocal.observation.conditions import MINUTES_A_READING, MINUTES_A_SETUP, in_course
+from orthocal.observation.conditions import (
+    MINUTES_PER_READING,
+    MINUTES_PER_SETUP,
+    schedule_readings,
+)
 from orthocal.planning.expected_error import state_noise
 from orthocal.planning.owned_sensors import Duration, OwnedSensor
 from orthocal.robot.model import Leg, Robot, require_commanded_tool
@@ -79,8 +83,8 @@ class Equipment:
     spare_range: float = SPARE_RANGE
     """Standard deviations of readings, before the machine is calibrated, for which the gauge's
     range has room."""
-    minutes_a_setup: float = MINUTES_A_SETUP
-    minutes_a_reading: float = MINUTES_A_READING
+    minutes_a_setup: float = MINUTES_PER_SETUP
+    minutes_a_reading: float = MINUTES_PER_READING
     temperatures: tuple[float, float] | None = None
     """Temperature at the first and at the last reading, [°C]; by default that at which the nominal
     dimensions hold."""
@@ -129,7 +133,9 @@ class Equipment:
 
     def in_course(self, plan: Session) -> Session:
         """Planned readings with the times and temperatures at which they will be taken."""
-        return in_course(plan, temperatures=self.temperatures, durations=self.durations(plan))
+        return schedule_readings(
+            plan, temperatures=self.temperatures, durations=self.durations(plan)
+        )
 
 
 @cached_per_robot(maxsize=8)
