@@ -131,7 +131,7 @@ def test_a_list_is_a_value_and_its_tolerance(orthoglide):
 )
 def test_one_name_in_two_units_is_refused(orthoglide, kind, values):
     stated = dict(zip(("x_slide.offset_mm", "x_slide.offset_um"), values, strict=True))
-    with pytest.raises(ParameterError, match=f"{kind}: 'x_slide.offset' is given twice"):
+    with pytest.raises(ParameterError, match=f"{kind}: 'x_slide.offset' is stated twice"):
         Choice(**{kind: stated}).select(orthoglide.parameters)
 
 

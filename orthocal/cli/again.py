@@ -154,7 +154,7 @@ def _read_amounts(
             raise ParameterError(f"found '{part}'; expected NAME=MM, or plan", where=where)
         require_adjustment(calibration.robot, name, where=where, error=ParameterError)
         if name in amounts:
-            raise ParameterError(f"'{name}' is given twice", where=where)
+            raise ParameterError(f"'{name}' is stated twice", where=where)
         amount = read_number(value, where, name)
         require_between(amount, -LARGEST_AMOUNT_MM, LARGEST_AMOUNT_MM, where)
         amounts[name] = amount * MM

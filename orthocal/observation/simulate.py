@@ -341,7 +341,7 @@ def read_errors(
         with errors_at(where):
             name, si = parameters.read_quantity(key, value)
         if name in errors:
-            raise ParameterError(f"'{name}' is given twice", where=where)
+            raise ParameterError(f"'{name}' is stated twice", where=where)
         errors[name] = si
     return errors
 
