@@ -117,7 +117,7 @@ def test_a_list_is_a_value_and_its_tolerance(orthoglide):
     found = [c.select(orthoglide.parameters) for c in choices]
     assert np.array_equal(found[0].mean, found[1].mean)
     assert np.array_equal(found[0].prior_stds, found[1].prior_stds)
-    with pytest.raises(ParameterError, match="give y_slide"):
+    with pytest.raises(ParameterError, match="state y_slide"):
         replace(choices[1], base=True).select(orthoglide.parameters)
 
 

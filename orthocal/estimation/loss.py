@@ -60,29 +60,29 @@ class Loss:
         return self.kind == "huber"
 
     def value(self, r: Values, width: Values | None = None) -> Values:
-        """ρ(r) of residuals in standard deviations; arguments as for all functions of a residual.
+        """Cost ρ(r) of residuals. `influence`, `weight` and `curvature` have the same arguments.
 
         Args:
-            r: An array or an expression of any shape.
+            r: Residuals, array or expression of any shape, [standard deviations].
             width: k as an expression; `width` by default.
         """
         # not k² (√… − 1), which loses all digits of a small r
         return r**2 / (1.0 + self._root(r, width)) if self.robust else 0.5 * r**2
 
     def influence(self, r: Values, width: Values | None = None) -> Values:
-        """ρ'(r)."""
+        """Influence ρ'(r) of residuals."""
         return r / self._root(r, width) if self.robust else r
 
     def weight(self, r: Values, width: Values | None = None) -> Values:
-        """ρ'(r)/r, the weight of a squared residual, 1 at 0."""
+        """Weight ρ'(r)/r of squared residuals, 1 at 0."""
         return 1.0 / self._root(r, width) if self.robust else r**0
 
     def curvature(self, r: Values, width: Values | None = None) -> Values:
-        """ρ''(r), 1 at 0."""
+        """Curvature ρ''(r) of the cost, 1 at 0."""
         return self._root(r, width) ** -3 if self.robust else r**0
 
     def _root(self, r: Values, width: Values | None) -> Values:
-        """√(1 + (r/k)²)."""
+        """Root √(1 + (r/k)²) of the pseudo-Huber loss."""
         return (1.0 + (r / (self.width if width is None else width)) ** 2) ** 0.5
 
     def centres(self, values: Array, group: Indices, count: int, *, weights: Array) -> Array:

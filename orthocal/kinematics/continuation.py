@@ -74,7 +74,7 @@ class System:
 
     Attributes:
         shortest: Use the shortest steps that close the loops, for robots with free motions. Their
-            Jacobians are singular up to rounding, so that solving them gives no useful step.
+            Jacobians are singular up to rounding, so that solving them does not give a useful step.
         units: Metres per unit of x, shape (n_x,).
         lower: Lower bounds of x, shape (n_x,).
         upper: Upper bounds of x, shape (n_x,).
@@ -310,10 +310,10 @@ class _Path:
                 f"which the loops are assembled, {done:.0%} of the way"
             )
         else:
-            at = self._geometry.at(np.array([i]), len(self._points))
+            geometry = self._geometry.at(np.array([i]), len(self._points))
             reason = (
                 "cannot be reached: the loops stay open by "
-                f"{self._system.describe(last[0], target[0], at)}, {done:.0%} of the way "
+                f"{self._system.describe(last[0], target[0], geometry)}, {done:.0%} of the way "
                 "from the mechanical zero"
             )
         self._refuse(i, reason, float(worst[0]))
@@ -331,8 +331,9 @@ class _Path:
 
     def _refuse_singular(self, x: Array, rows: NDArray[np.intp]) -> None:
         """Refuse solutions with free motions, the most singular one first."""
-        system, at = self._system, self._geometry.at(rows, len(self._points))
-        _, jacobians = system.evaluate(x[rows], system.prepare(self._targets[rows], at), at)
+        system, geometry = self._system, self._geometry.at(rows, len(self._points))
+        prepared = system.prepare(self._targets[rows], geometry)
+        _, jacobians = system.evaluate(x[rows], prepared, geometry)
         values = np.linalg.svd(jacobians / system.units, compute_uv=False)
         smallest = values[:, system.n_x - 1] if values.shape[1] >= system.n_x else 0.0
         largest = values.max(axis=1, initial=0.0)  # without closures there are no values
@@ -363,8 +364,8 @@ class _Path:
         prepared = system.prepare(p, self._geometry.at(points, len(self._points)))
 
         def evaluate(rows: NDArray[np.intp], x: Array) -> tuple[Array, Array, Array]:
-            at = self._geometry.at(points[rows], len(self._points))
-            residuals, jacobians = system.evaluate(x, prepared[rows], at)
+            geometry = self._geometry.at(points[rows], len(self._points))
+            residuals, jacobians = system.evaluate(x, prepared[rows], geometry)
             return residuals, jacobians, np.abs(residuals).max(axis=1, initial=0.0)
 
         residuals, jacobians, worst = evaluate(np.arange(len(x)), x)

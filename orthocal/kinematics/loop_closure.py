@@ -146,15 +146,15 @@ class LoopClosure:
         Args:
             drives: Shape (K, n_drives) or (n_drives,), [m, rad].
             theta: Values of the free parameters; 0 by default.
-            start: As for `close`.
+            start: Start values of the passive coordinates; the reference posture by default.
             names: Names of the postures, for messages.
-            failures: As for `close`.
+            failures: Filled with the postures that cannot be reached; by default the first raises.
 
         Returns:
             Shape (K, 3) or (3,), [m]; a batch has S in front.
 
         Raises:
-            ClosureError: As `close`.
+            ClosureError: If a posture cannot be reached or is singular.
             RobotError: If the robot has no tool centre point.
         """
         d, single = self._as_commands(drives)
@@ -174,7 +174,7 @@ class LoopClosure:
         Args:
             points: Commanded coordinates of the tool, shape (K, n_drives) or (n_drives,), [m].
             names: Names of the postures, for messages.
-            failures: As for `close`.
+            failures: Filled with the points that cannot be reached; by default the first raises.
 
         Returns:
             Shape (K, n_drives) or (n_drives,), [m, rad].
@@ -198,17 +198,18 @@ class LoopClosure:
         """All joint coordinates that bring the tool centre point of one machine to points.
 
         Args:
-            points: As for `inverse`, shape (K, n_drives).
+            points: Commanded coordinates of the tool, shape (K, n_drives), [m].
             start: Start values of drive and passive coordinates, shape
                 (K, n_drives + n_passive); the reference posture by default.
-            names: As for `inverse`.
-            failures: As for `inverse`.
+            names: Names of the postures, for messages.
+            failures: Filled with the points that cannot be reached; by default the first raises.
 
         Returns:
             Drive coordinates, shape (K, n_drives), and passive ones, shape (K, n_passive).
 
         Raises:
-            ClosureError, RobotError: As `inverse`.
+            ClosureError: If a point cannot be reached.
+            RobotError: If the robot has no tool centre point with as many coordinates as drives.
         """
         n = len(self.robot.drives)
         if not self._depends_on_drives:
@@ -269,8 +270,8 @@ class LoopClosure:
         Args:
             drives: Commanded drive coordinates, shape (K, n_drives) or (n_drives,), [m, rad].
             passive: Passive coordinates that `close` returns for these drives.
-            theta: As for `close`.
-            errors: As for `close`.
+            theta: Values of the free parameters; 0 by default.
+            errors: All elementary errors, instead of theta.
 
         Returns:
             Shape (K, 3) or (3,), [m]; a batch has S in front.

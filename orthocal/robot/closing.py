@@ -133,8 +133,8 @@ def describe_opening(residual: ArrayLike, rotations: ArrayLike) -> str:
         rotations: Mask of the rows that are rotations, shape (m,).
     """
     r, mask = np.abs(np.asarray(residual)), np.asarray(rotations, dtype=bool)
-    parts = [(largest(r[~mask]), "mm"), (largest(r[mask]), "mrad")]
-    shown = [part for part in parts if part[0] > SMALLEST_SHOWN] or parts[:1]
+    openings = [(largest(r[~mask]), "mm"), (largest(r[mask]), "mrad")]
+    shown = [opening for opening in openings if opening[0] > SMALLEST_SHOWN] or openings[:1]
     return " and ".join(f"{_three_digits(size * 1e3)} {unit}" for size, unit in shown)
 
 

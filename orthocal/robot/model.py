@@ -295,12 +295,11 @@ class Robot:
         Returns:
             Shape (..., nv).
         """
-        d = np.asarray(drives, dtype=np.float64)
-        p = np.asarray(passive, dtype=np.float64)
-        full = np.zeros((*d.shape[:-1], self.model.nv))
-        full[..., self.drive_index] = d * self.drive_gain
-        full[..., self.passive_index] = p
-        return full
+        commanded = np.asarray(drives, dtype=np.float64)
+        result = np.zeros((*commanded.shape[:-1], self.model.nv))
+        result[..., self.drive_index] = commanded * self.drive_gain
+        result[..., self.passive_index] = np.asarray(passive, dtype=np.float64)
+        return result
 
     def close_with_pinocchio(self, drives: ArrayLike, start: ArrayLike) -> Array:
         """Solve the loop closures of one posture by damped least squares on Pinocchio models.

@@ -198,10 +198,10 @@ def cross_validate_setups(fit: Fit) -> Array:
                 require_determined(problem, decompose(jacobian, o))
             except NotIdentifiableError:
                 continue
-        others = factor[~deleted][:, free] / fit.sigma
+        remaining = factor[~deleted][:, free] / fit.sigma
         change = np.zeros(problem.n_free)
         change[free] = -np.linalg.solve(
-            others.T @ others + precision,
+            remaining.T @ remaining + precision,
             factor[deleted][:, free].T @ weighted_residual[deleted],
         )
         prediction_error = project_out_zeros(fit.residual - fit.jacobian @ change, o)

@@ -17,7 +17,7 @@ from orthocal.errors import ClosureError, NotIdentifiableError, SolverError
 from orthocal.estimation.fit import Fit
 from orthocal.statistics.chance import confidence_factor
 
-SETTLED = 1e-3
+END_TOLERANCE = 1e-3
 """Tolerance of the ends of an interval, [standard deviations]."""
 
 MAX_TRIALS = 12
@@ -102,4 +102,4 @@ def _find_end(fit: Fit, index: int, factor: float, side: float) -> float:
         )
     from scipy.optimize import brentq
 
-    return centre + side * float(brentq(excess, inside, outside, xtol=SETTLED * std))
+    return centre + side * float(brentq(excess, inside, outside, xtol=END_TOLERANCE * std))
