@@ -4,9 +4,12 @@ Each effect is one file. It reads its keys of the robot's YAML and returns CasAD
 parameters and of the conditions of a reading. Predicted readings, loop closures, the program for
 Ipopt and all derivatives use these expressions.
 
-An effect may act on the coordinate of a drive (backlash, periodic errors of screws), on the length
-of a rod (thermal expansion, compliance), on a placement (geometry) and on a reading (drift of a
-gauge).
+An effect may act on
+
+- the coordinate of a drive: backlash, periodic errors of screws
+- the length of a rod: thermal expansion, compliance
+- a placement: geometry
+- a reading: drift of a gauge
 """
 
 from __future__ import annotations

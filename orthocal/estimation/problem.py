@@ -44,9 +44,9 @@ class CalibrationProblem:
 
     The free parameters are errors of the machine, then nuisance parameters of the sensors, as
     deviations from the manual alignment. An entry is a single reading; a difference has two.
-    Readings are divided by the ratio of their gauge's noise to that of the first gauge ("metres of
-    the first gauge"), so that all have equal standard deviations. With one gauge they are
-    in metres.
+    Readings are divided by the ratio of their gauge's noise to that of the first gauge, so that all
+    have equal standard deviations. Their unit is "metres of the first gauge": metres if there is
+    only one gauge.
 
     Args:
         session: The session, or several joined ones.
@@ -403,6 +403,7 @@ class CalibrationProblem:
 
     @cached_property
     def _free_parameters(self) -> FreeParameters:
+        """Free parameters in the form of the observation model."""
         return self.model.parametrise(self.errors_per_theta, self.theta_scale[self.n_machine :])
 
     @cached_property

@@ -1,7 +1,7 @@
 """Scale of the tolerances: the factor by which the errors of a machine exceed them.
 
-One factor η, estimated from the readings (`assessment/judgement.py`), multiplies the prior standard
-deviations of all errors of the geometry except offsets, whether they are estimated or not.
+One factor η multiplies the prior standard deviations of all errors of the geometry except offsets,
+whether they are estimated or not. It is estimated from the readings (`assessment/judgement.py`).
 """
 
 from __future__ import annotations

@@ -70,6 +70,7 @@ def cached_function(robot: Robot, name: str, build: Callable[[], ca.Function]) -
 
 @lru_cache(maxsize=MAX_FUNCTIONS)
 def _load_or_build(recipe: _Recipe) -> ca.Function:
+    """Load a function from disk, or build and store it."""
     function = _load(recipe.key)
     if function is None:
         function = recipe.build()
@@ -78,6 +79,7 @@ def _load_or_build(recipe: _Recipe) -> ca.Function:
 
 
 def _load(key: str) -> ca.Function | None:
+    """Load a function from disk; None if it is absent or unreadable."""
     content = disk_cache.load(key)
     if content is None:
         return None
@@ -88,6 +90,7 @@ def _load(key: str) -> ca.Function | None:
 
 
 def _save(key: str, function: ca.Function) -> None:
+    """Store a function on disk if it can be serialised."""
     try:
         text = function.serialize()
     except RuntimeError:  # some functions cannot be serialised

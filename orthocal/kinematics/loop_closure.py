@@ -476,6 +476,7 @@ class _UnitRodForces:
         return self._cached(np.ascontiguousarray(drives).tobytes())
 
     def _compute(self, content: bytes) -> Array:
+        """Forces for the bytes of drive coordinates."""
         robot, n = self._robot, len(self._robot.drives)
         drives = np.frombuffer(content).reshape(-1, n)
         result = np.zeros((len(drives), len(robot.rods), 3))

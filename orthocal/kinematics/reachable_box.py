@@ -46,11 +46,11 @@ def find_workspace(robot: Robot, require_reach: RequireReach | None = None) -> W
     """Workspace of a robot, or of a machine that must reach it.
 
     The workspace is the box in the robot's YAML. Without one it is the largest cube of at most
-    ±60 mm that the nominal machine reaches with a margin of 8 %, because other machines of these
-    dimensions reach less. If `require_reach` refuses this box, it is the largest similar box.
+    ±60 mm that the nominal machine reaches with a margin of 8 %. The margin is for other machines
+    of these dimensions, which may reach less. If `require_reach` refuses this box, it is the
+    largest similar box.
 
-    The largest distance of the faces of a box that was reduced is a multiple of 1 mm, or of 0.1 mm
-    below 10 mm.
+    The largest limit of a reduced box is a multiple of 1 mm, or of 0.1 mm below 10 mm.
 
     Args:
         robot: The robot.

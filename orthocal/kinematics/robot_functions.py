@@ -172,6 +172,7 @@ class RobotFunctions:
         return self._function("closure_expressions", self._jacobian_outputs, sparse=(0, 1, 2, 3))
 
     def _jacobian_outputs(self) -> list[ca.SX]:
+        """Residual g, ∂g/∂actuated, ∂g/∂passive and ∂g/∂ξ."""
         joints, twists = self._closure_derivatives
         return [self.closure, *self.split(joints), twists]
 

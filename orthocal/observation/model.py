@@ -1,7 +1,7 @@
 """Observation model: predicted readings h(q, θ, ν) and their derivatives.
 
-A reading depends on the geometry of the machine (errors θ), on the passive coordinates q that close
-the loops, and on nuisance parameters ν of its sensor. Gauge zeros are not part of the model. Near
+A reading depends on the errors θ of the machine, on the passive coordinates q that close the loops,
+and on nuisance parameters ν of its sensor. Gauge zeros are not part of the model. Near
 closed loops, g(q, θ) ≈ 0, the implicit function theorem gives
 
     dq = −g_q⁻¹ (g + g_θ dθ),  J = h_θ − h_q g_q⁻¹ g_θ

@@ -139,4 +139,5 @@ def describe_opening(residual: ArrayLike, rotations: ArrayLike) -> str:
 
 
 def _three_digits(value: float) -> str:
+    """Number with three significant digits, without exponent above 1000."""
     return f"{value:.0f}" if value >= 1000.0 else f"{value:.3g}"

@@ -20,6 +20,7 @@ class LinearisedProgram(Program):
     kind = "linearised"
 
     def _solve(self, data: SolverInput) -> Solution:
+        """Solve the linearised problem for one set of readings."""
         problem = self.problem
         task = Task(problem, self.options.loss, data)
         active = task.at(problem.active_theta / problem.theta_scale, data.start_passive)

@@ -8,7 +8,8 @@ the objective decreases. The optimum is that of the complete program, which Ipop
 
 From start values far from the optimum, the first steps can be so long that they end in a local
 minimum. If the result is far from its prior, or the solver does not converge, the problem is solved
-again with readings of lower weight first, which shortens the steps. The better optimum is returned.
+again. Readings then have lower weights first, which shortens the steps. The better optimum is
+returned.
 """
 
 from __future__ import annotations

@@ -110,6 +110,7 @@ class BatchFunction:
 
     @cached_property
     def _n_instructions(self) -> int:
+        """Number of instructions of the function."""
         return int(self.function.n_instructions())
 
     @cached_property

@@ -376,28 +376,35 @@ class _Source:
         self._put(f"br label %{head}\n{end}:")
 
     def _at(self, array: str, index: str, kind: str) -> str:
+        """Address of an element of an array."""
         return self._new(f"getelementptr {kind}, ptr {array}, i64 {index}")
 
     def _load(self, kind: str, place: str) -> str:
+        """Value at an address."""
         align = ", align 8" if kind == self._row else ""
         return self._new(f"load {kind}, ptr {place}{align}")
 
     def _store(self, kind: str, value: str, place: str) -> None:
+        """Store a value at an address."""
         align = ", align 8" if kind == self._row else ""
         self._put(f"store {kind} {value}, ptr {place}{align}")
 
     def _new(self, instruction: str) -> str:
+        """Name of the result of a new instruction."""
         name = self._name()
         self._put(f"{name} = {instruction}")
         return name
 
     def _name(self) -> str:
+        """New name of a variable."""
         self._names += 1
         return f"%v{self._names}"
 
     def _label(self) -> str:
+        """New label of a block."""
         self._names += 1
         return f"b{self._names}"
 
     def _put(self, line: str) -> None:
+        """Add a line to the source."""
         self._lines.append(line)
