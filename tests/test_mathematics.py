@@ -24,8 +24,8 @@ from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.loop_closure import nominal_closure
+from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.sensitivity import ToolSensitivity
-from orthocal.kinematics.workspace import find_workspace
 from orthocal.robot.model import joint_axis
 from orthocal.robot.parameters import AXES
 from orthocal.sensors.leg_indicator import Section

@@ -22,7 +22,7 @@ from orthocal.builder.orthoglide import Orthoglide
 from orthocal.cli import dialogue as asking
 from orthocal.errors import ClosureError, ParameterError
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.kinematics.workspace import find_workspace
+from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.output.scene.drawing import draw_scene
 from orthocal.session.session import Purpose
 
@@ -256,7 +256,7 @@ def test_a_workspace_out_of_reach_is_refused_and_nothing_is_written(copied):
     code, _, err = orthocal("new", copied, "--again")
     assert code == 2
     assert err.startswith(f"orthocal: {file}: workspace_mm: the machine does not reach the workspa")
-    assert "; it reaches ±" in err
+    assert "; the largest box of this shape is ±" in err
     assert files_of(copied) == before
 
 

@@ -15,8 +15,9 @@ from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.conditions import APPROACH, UseConditions, UseSamples, sample_use
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
+from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.sensitivity import ToolSensitivity
-from orthocal.kinematics.workspace import Workspace, find_workspace
+from orthocal.kinematics.workspace import Workspace
 from orthocal.robot.model import Robot
 
 TOOL_CACHE_SIZE = 4

@@ -23,7 +23,7 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.effects.compensation import Compensation, JointTrim
 from orthocal.effects.loading import robot_effects
-from orthocal.effects.screw import KINDS, Screw
+from orthocal.effects.screw import SCREW_COMPONENTS, Screw
 from orthocal.io.fields import read_only
 
 ALIGNED_SHARE = 1e-2
@@ -187,7 +187,7 @@ def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
         return ()
     errors, entries, determined = calibration.errors, [], []
     for drive, active in zip(robot.drives, _compensated_screws(calibration, screw), strict=True):
-        names = [f"{drive.name}.{kind}" for kind in KINDS]
+        names = [f"{drive.name}.{kind}" for kind in SCREW_COMPONENTS]
         identified = np.array([errors.get(name, 0.0) for name in names])
         if not (identified.any() or active.any()):
             continue
@@ -207,7 +207,7 @@ def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
 
 def _screw_parameters(drive: str, values: Array) -> dict[str, float]:
     """Parameters A and B of the screw of a drive to their values, [m]."""
-    return dict(zip((f"{drive}.{kind}" for kind in KINDS), values.tolist(), strict=True))
+    return dict(zip((f"{drive}.{kind}" for kind in SCREW_COMPONENTS), values.tolist(), strict=True))
 
 
 def _amplitude_uncertainty(

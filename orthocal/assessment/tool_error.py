@@ -41,7 +41,6 @@ from orthocal.calibration.assessment_record import (
     UsePart,
 )
 from orthocal.calibration.calibration import Calibration
-from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.conditions import (
     UseConditions,
@@ -50,6 +49,7 @@ from orthocal.kinematics.conditions import (
     sample_use,
     stated_use,
 )
+from orthocal.kinematics.reachable_box import no_workspace_error
 from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
 from orthocal.robot.model import require_commanded_tool
 
@@ -177,7 +177,7 @@ def measure_uncertainty(
     """
     fields = {
         "absolute": jacobian,
-        "relative": workspace.remove_shift(jacobian),
+        "relative": workspace.remove_translation(jacobian),
         "aligned": workspace.remove_motion(jacobian, positions),
     }
     n = len(covariance)
@@ -218,7 +218,7 @@ def measure_deviations(
     few = len(positions) < FEWEST_ALIGNED
     return ToolErrorStatistics(
         aligned=None if few else statistics(workspace.remove_motion(deviations, positions)),
-        relative=statistics(workspace.remove_shift(deviations)),
+        relative=statistics(workspace.remove_translation(deviations)),
         absolute=statistics(deviations),
     )
 
@@ -269,11 +269,7 @@ def require_tool(calibration: Calibration, tool: CalibratedTool | None) -> Calib
     """
     require_commanded_tool(calibration.robot)
     if tool is None:
-        raise ClosureError(
-            "cannot be reached: there is no region around it, not even of a millimetre, that the "
-            "machine reaches within its limits",
-            posture="mechanical zero",
-        )
+        raise no_workspace_error()
     return tool
 
 
@@ -409,13 +405,13 @@ def _normal_statistics(covariances: Array, workspace: Workspace) -> ErrorStatist
 
 def _length_percentile(field: Array, workspace: Workspace) -> float:
     """95 % quantile of the lengths of position errors, shape (K, 3)."""
-    errors, weights = workspace.spread(field)
+    errors, weights = workspace.interpolate_to_cells(field)
     return _weighted_percentile_95(np.linalg.norm(errors, axis=1), weights)
 
 
 def _sampled_percentile(covariances: Array, workspace: Workspace) -> float:
     """95 % quantile of the lengths of normal errors by sampling; covariances (K, 3, 3)."""
-    interpolated, weights = workspace.spread(covariances)
+    interpolated, weights = workspace.interpolate_to_cells(covariances)
     values, vectors = np.linalg.eigh(interpolated)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     samples = np.random.default_rng(0).normal(size=(3, SAMPLES))

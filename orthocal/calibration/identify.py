@@ -101,7 +101,7 @@ def _read_start(start: ArrayLike, problem: CalibrationProblem) -> Array:
         ValueError: If there is not one finite number for each free error of the machine.
     """
     n = problem.n_machine
-    rows, _ = as_rows(start, n, "free parameters to start from")
+    rows, _ = as_rows(start, n, "start values")
     if rows.shape != (1, n) or not np.isfinite(rows).all():
         raise ValueError(f"expected {n} finite numbers to start from")
     return np.append(rows[0], np.zeros(problem.n_free - n))

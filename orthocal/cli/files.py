@@ -87,10 +87,10 @@ def state_conditions(
             plan.
     """
     from orthocal.measurement.motion.approach import state_common_approach
-    from orthocal.observation.conditions import in_course, needed_conditions
+    from orthocal.observation.conditions import needed_conditions, schedule_readings
 
     needed = {"temperature", "time"} & set(needed_conditions(plan.robot))
     stated = any(getattr(r.conditions, name, None) for r in plan.readings for name in needed)
     if temperatures is not None or (needed and not stated):
-        plan = in_course(plan, temperatures=temperatures)
+        plan = schedule_readings(plan, temperatures=temperatures)
     return state_common_approach(plan)

@@ -338,7 +338,8 @@ def _with_workspace(robot: orthocal.Robot, option: str | None) -> orthocal.Robot
         ParameterError: If the machine does not reach the workspace.
     """
     from orthocal.cli.dialogue import ask_workspace
-    from orthocal.kinematics.workspace import describe_box, find_workspace
+    from orthocal.kinematics.reachable_box import find_workspace
+    from orthocal.kinematics.workspace import describe_box
 
     if option is not None:
         return replace(robot, workspace=read_workspace(option, robot))
@@ -462,11 +463,12 @@ def _make_again(folder: Path) -> None:
         typer.Exit: With code 3 if a plan is outdated.
     """
     from orthocal.builder.build import remake_robot
-    from orthocal.kinematics.workspace import find_unreached
+    from orthocal.kinematics.reachable_box import describe_unreachable_box
     from orthocal.output.sheet.page import SHEET
 
     def check(robot: orthocal.Robot) -> None:
-        problem = "" if robot.workspace is None else find_unreached(robot, robot.workspace)
+        box = robot.workspace
+        problem = "" if box is None else describe_unreachable_box(robot, box)
         if problem:
             raise RobotError(problem, where=f"{folder / 'machine.yaml'}: workspace_mm")
 

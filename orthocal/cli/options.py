@@ -433,10 +433,11 @@ def read_workspace(text: str, robot: orthocal.Robot, *, where: str = "--workspac
     Raises:
         ParameterError: If the text is not a box, or the machine does not reach it.
     """
-    from orthocal.kinematics.workspace import coordinate_letters, find_unreached
+    from orthocal.kinematics.reachable_box import describe_unreachable_box
+    from orthocal.kinematics.workspace import coordinate_letters
 
     box = read_box(text, coordinate_letters(robot), where=where)
-    problem = find_unreached(robot, box)
+    problem = describe_unreachable_box(robot, box)
     if problem:
         raise ParameterError(problem, where=where)
     return box

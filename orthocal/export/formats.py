@@ -18,7 +18,7 @@ from orthocal.export.linuxcnc.export import OPTIONS, ExportOptions, export_linux
 from orthocal.export.printer import export_printer
 from orthocal.export.urdf import export_urdf
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.kinematics.workspace import even_grid
+from orthocal.kinematics.workspace import uniform_grid
 from orthocal.printers.firmwares import FIRMWARES
 from orthocal.units import MM, format_fixed, tidy
 
@@ -62,7 +62,7 @@ def export_corrections(calibration: Calibration) -> dict[str, str]:
     tool, robot = find_tool(calibration), calibration.robot
     if tool is None or robot.tcp is None:
         raise ExportError("the machine has no tool that its drives command over a region")
-    points = even_grid(robot, tool.workspace.limits, points_a_side=POINTS_PER_SIDE)
+    points = uniform_grid(robot, tool.workspace.limits, points_per_side=POINTS_PER_SIDE)
     coordinates = list(robot.tcp.coordinates)
     try:
         drives = calibration.machine.inverse(points) + entered_offsets(calibration)

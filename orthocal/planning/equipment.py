@@ -21,7 +21,11 @@ from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.files.session_keys import GaugeKeys
-from orthocal.observation.conditions import MINUTES_A_READING, MINUTES_A_SETUP, in_course
+from orthocal.observation.conditions import (
+    MINUTES_PER_READING,
+    MINUTES_PER_SETUP,
+    schedule_readings,
+)
 from orthocal.planning.expected_error import state_noise
 from orthocal.planning.owned_sensors import Duration, OwnedSensor
 from orthocal.robot.model import Leg, Robot, require_commanded_tool
@@ -81,8 +85,8 @@ class Equipment:
     """Largest displacement of the tool to either side across a leg's direction, [m]."""
     spare_range: float = SPARE_RANGE
     """Prior standard deviations of readings that must fit into the gauge's range."""
-    minutes_a_setup: float = MINUTES_A_SETUP
-    minutes_a_reading: float = MINUTES_A_READING
+    minutes_a_setup: float = MINUTES_PER_SETUP
+    minutes_a_reading: float = MINUTES_PER_READING
     temperatures: tuple[float, float] | None = None
     """Temperatures at the first and at the last reading, [°C]; by default the reference temperature
     of the nominal dimensions."""
@@ -131,7 +135,9 @@ class Equipment:
 
     def in_course(self, plan: Session) -> Session:
         """Planned readings with their expected times and temperatures."""
-        return in_course(plan, temperatures=self.temperatures, durations=self.durations(plan))
+        return schedule_readings(
+            plan, temperatures=self.temperatures, durations=self.durations(plan)
+        )
 
 
 @cached_per_robot(maxsize=8)

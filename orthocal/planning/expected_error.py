@@ -29,11 +29,9 @@ from orthocal.estimation.selection import Selection
 from orthocal.estimation.weighting import split_by_gauge
 from orthocal.kinematics.conditions import UseSamples, effects_by_condition, sample_use
 from orthocal.kinematics.loop_closure import nominal_closure
+from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.sensitivity import ToolSensitivity
-from orthocal.kinematics.workspace import (
-    Workspace,
-    find_workspace,
-)
+from orthocal.kinematics.workspace import Workspace
 from orthocal.observation.observations import build_observations
 from orthocal.robot.model import Robot
 from orthocal.runtime.worker_pool import call_in_parallel, current_worker_budget
@@ -330,7 +328,7 @@ class ToolForecast:
         if criterion in ("aligned", "worst"):
             field = self.align(scaled)
         elif criterion == "relative":
-            field = self.workspace.remove_shift(scaled)
+            field = self.workspace.remove_translation(scaled)
         else:
             field = scaled
         padded = np.zeros((*field.shape[:2], n_state))

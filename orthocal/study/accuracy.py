@@ -21,7 +21,8 @@ from orthocal.effects.registry import order_effects
 from orthocal.errors import ClosureError, SessionError
 from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.estimation.selection import Selection
-from orthocal.kinematics.workspace import cube_limits, find_workspace
+from orthocal.kinematics.reachable_box import find_workspace
+from orthocal.kinematics.workspace import cube_limits
 from orthocal.observation.observations import require_conditions
 from orthocal.planning.expected_error import Expected, ToolForecast
 from orthocal.robot.model import Robot
@@ -121,7 +122,7 @@ class AccuracyStudy(Study):
             "before_um": rms(other_fields[0]),
             "tool_um": rms(aligned),
             **({"tool_all_effects_um": rms(other_fields[1])} if self.ignored else {}),
-            "tool_shift_out_um": rms(tool.workspace.remove_shift(after)),
+            "tool_shift_out_um": rms(tool.workspace.remove_translation(after)),
             "tool_absolute_um": rms(after),
             "tool_worst_um": list(np.sqrt((aligned**2).sum(axis=1).max(axis=0)) / UM),
             **dict(column for pair in pairs for column in pair),

@@ -42,7 +42,7 @@ class Machines:
         self.plan = exact(load_plan(session_folder(root, name) / "plan.yaml"))
         self.problem = build_problem(self.plan, free=JOINTS, prior=True, prior_stds=IN_SI)
         self.batch = BatchSolver(self.problem)
-        self.workspace = cube(self.plan.robot, points_a_side=5)
+        self.workspace = cube(self.plan.robot, points_per_side=5)
         closure = LoopClosure(self.plan.robot)
         self.drives = closure.inverse(self.workspace.points)
         self.closure = LoopClosure(self.plan.robot, free=self.problem.free)
@@ -108,7 +108,7 @@ def test_perfect_readings_give_the_tool_where_they_determine_it(machines):
     accuracy = assess_tool(assemble_calibration(fit), m.workspace)
     error = m.tool(fit.solution.theta) - m.tool(truth)
     error -= m.workspace.weights @ error
-    jacobian = m.workspace.remove_shift(accuracy.jacobian)[:, :, : problem.n_free]
+    jacobian = m.workspace.remove_translation(accuracy.jacobian)[:, :, : problem.n_free]
     posterior = jacobian @ fit.covariance() @ jacobian.transpose(0, 2, 1)
     spread = np.sqrt(np.diagonal(posterior, axis1=1, axis2=2))
     determined = spread < 0.3e-6

@@ -70,7 +70,7 @@ def test_the_error_at_the_tool_is_what_is_predicted(root, name, offsets_mm, most
         plan = on_rods(plan)
     robot = plan.robot
     problem = build_problem(plan, model="full", prior_stds={"*.offset": 2e-3})
-    n, scale, space = problem.n_machine, problem.theta_scale, cube(robot, points_a_side=5)
+    n, scale, space = problem.n_machine, problem.theta_scale, cube(robot, points_per_side=5)
     names = problem.free[:n]
     closure = LoopClosure(robot, free=names)
     drives = LoopClosure(robot).inverse(space.points)

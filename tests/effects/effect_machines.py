@@ -131,7 +131,7 @@ class EffectMachines:
         self.problem = build_problem(self.plan, model="full", prior=True, prior_stds=OFFSETS)
         robot = self.plan.robot
         closure = LoopClosure(robot)
-        points = np.repeat(cube(robot, points_a_side=3).points, 2, axis=0)
+        points = np.repeat(cube(robot, points_per_side=3).points, 2, axis=0)
         sides = np.sign(np.random.default_rng(0).normal(size=(len(points) // 2, 3)))
         used_at = USED_AT if temperature is None else temperature
         self.used = States(

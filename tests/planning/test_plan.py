@@ -26,7 +26,8 @@ from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.kinematics.loop_closure import LoopClosure
-from orthocal.kinematics.workspace import cube, find_workspace
+from orthocal.kinematics.reachable_box import find_workspace
+from orthocal.kinematics.workspace import cube
 from orthocal.measurement.files.write_session import write_session
 from orthocal.measurement.joining import join_sessions
 from orthocal.output.text.plan import OUT_OF_RANGE, plan_json
@@ -69,7 +70,7 @@ def test_plans_are_better_than_manual_ones(orthoglide, tip, setups, each, most):
         gauge=DIAL, tip=tip, mounting=Mounting(lateral=0.0), sections=sections, box=box, along=9
     )
     forecast = ToolForecast(
-        orthoglide, choice.select(orthoglide.parameters), cube(orthoglide, points_a_side=5)
+        orthoglide, choice.select(orthoglide.parameters), cube(orthoglide, points_per_side=5)
     )
     session = list_candidates(orthoglide, equipment)
     candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)

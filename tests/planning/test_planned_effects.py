@@ -22,7 +22,7 @@ from orthocal.effects.loading import with_effects
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.measurement.motion.approach import can_approach, describe_approach
-from orthocal.observation.conditions import MORNING, in_course
+from orthocal.observation.conditions import MORNING, schedule_readings
 from orthocal.observation.model import predict_readings
 from orthocal.planning.candidates import list_candidates
 from orthocal.planning.equipment import Equipment
@@ -218,7 +218,7 @@ def test_further_readings_for_effects_that_a_plan_does_not_determine(orthoglide)
 
 
 def test_a_day_by_the_clock(planned):
-    session = in_course(planned.session, temperatures=(20.0, 28.0))
+    session = schedule_readings(planned.session, temperatures=(20.0, 28.0))
     times = [r.conditions.time for r in session.readings]
     setups = [r.setup for r in session.readings]
     assert times[0] == MORNING

@@ -88,7 +88,7 @@ def test_readings_are_distances_between_the_balls(tmp_path):
     [("unknown", "known", 5.5), ("0", "known", 4.5), ("0", "free", 5.5)],
 )
 def test_bounds_beside_the_papers_readings(tmp_path, orthoglide, length, zero, published):
-    space = cube(orthoglide, points_a_side=5)
+    space = cube(orthoglide, points_per_side=5)
     found = bound_um(circles(tmp_path, length=length, zero=zero, legs=True), space)
     assert found == pytest.approx(published, rel=0.10)
 
@@ -107,7 +107,7 @@ def test_tool_errors_and_intervals_of_machines_with_all_errors(tmp_path, orthogl
         centre, (length, scale) = truth[:, None, len(names) : -2], truth[:, -2:].T[:, :, None]
         return (1.0 + scale) * (np.linalg.norm(balls - centre, axis=2) - RADIUS_MM * MM - length)
 
-    space = cube(orthoglide, points_a_side=5)
+    space = cube(orthoglide, points_per_side=5)
     assert_promises(calibrate_machines(plan, space, count=95, read=read))
 
 

@@ -132,7 +132,7 @@ def test_a_row_may_have_a_covariance_of_its_own(tmp_path):
 @pytest.mark.slow
 def test_a_tracker_alone_identifies_the_complete_model(tmp_path, orthoglide):
     """Machines with all errors; the readings determine 12 axes of each."""
-    outcome = calibrate_machines(grid(tmp_path), cube(orthoglide, points_a_side=5), count=90)
+    outcome = calibrate_machines(grid(tmp_path), cube(orthoglide, points_per_side=5), count=90)
     assert_promises(outcome)
     assert outcome.predicted < SIGMA
     assert outcome.bound == pytest.approx(outcome.predicted, rel=0.05)

@@ -217,7 +217,7 @@ def test_bounds_beside_the_papers_readings(tmp_path, orthoglide, parts, design):
     plan.legs()
     for part in parts:
         getattr(plan, part)()
-    found = bound_um(plan.load(tmp_path), cube(orthoglide, points_a_side=5))
+    found = bound_um(plan.load(tmp_path), cube(orthoglide, points_per_side=5))
     assert found == pytest.approx(design, rel=0.1)
 
 
@@ -232,7 +232,7 @@ def test_tool_errors_and_intervals_of_machines_with_all_errors(tmp_path, orthogl
     made = Plan()
     for part in parts:
         getattr(made, part)()
-    space = cube(orthoglide, points_a_side=5)
+    space = cube(orthoglide, points_per_side=5)
     assert_promises(calibrate_machines(made.load(tmp_path), space, count=count))
 
 

@@ -36,7 +36,7 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.effects.backlash import Backlash
 from orthocal.effects.compensation import JointTrim, table_name
 from orthocal.effects.loading import robot_effects
-from orthocal.effects.screw import KINDS, Screw
+from orthocal.effects.screw import SCREW_COMPONENTS, Screw
 from orthocal.errors import ExportError, ParameterError
 from orthocal.io.fields import read_only
 from orthocal.robot.model import Robot
@@ -91,7 +91,8 @@ def find_periodic_errors(robot: Robot, errors: Mapping[str, float]) -> PeriodicE
     if screw is None:
         return None
     sine, cosine = (
-        np.array([errors.get(f"{d.name}.{kind}", 0.0) for d in robot.drives]) for kind in KINDS
+        np.array([errors.get(f"{d.name}.{kind}", 0.0) for d in robot.drives])
+        for kind in SCREW_COMPONENTS
     )
     if np.hypot(sine, cosine).max() < NEGLIGIBLE:
         return None

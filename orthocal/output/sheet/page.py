@@ -33,7 +33,7 @@ from orthocal.output.sheet.gauge_position import (
 )
 from orthocal.output.sheet.pictures import draw_machine, draw_section, draw_tool
 from orthocal.output.text.layout import counted, true_minus
-from orthocal.robot.model import ALONG, Robot
+from orthocal.robot.model import PARALLEL_SINE, Robot
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.protocol import mounting_steps, tool_path
 from orthocal.session.session import Session, Setup
@@ -482,7 +482,7 @@ def _zero_by_eye(robot: Robot) -> str:
 def _growing(robot: Robot) -> str:
     """Direction in which the slides move as the coordinates of the drives grow."""
     legs = robot.legs.values()
-    upwards = legs and all(leg.root_motion[2] > 1.0 - ALONG for leg in legs)
+    upwards = legs and all(leg.root_motion[2] > 1.0 - PARALLEL_SINE for leg in legs)
     return "upwards" if upwards else "outwards"
 
 

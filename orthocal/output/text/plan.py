@@ -16,7 +16,7 @@ from orthocal.assessment.effect_limits import DETERMINED, EffectLimits
 from orthocal.assessment.wording import tool_mm
 from orthocal.assessment.words.entries import describe_aligned
 from orthocal.kinematics.conditions import stated_use
-from orthocal.kinematics.workspace import find_workspace
+from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.measurement.motion.approach import approach_length, describe_approach
 from orthocal.output.text.accuracy import (
     NOTICEABLE,
