@@ -58,8 +58,10 @@ COLUMNS_NOTE = (
 )
 
 UNCERTAINTY_NOTE = (
-    "Uncertainty: RMS in space. Errors that were not identified are included with their tolerances."
+    "Uncertainty: RMS in space. Errors that were not identified are included with their tolerances"
+    "{}."
 )
+"""Note about the uncertainties; {} is the tolerance scale in words, or empty."""
 
 HELPFUL = 0.1
 """Relative reduction of a tool error by which a sensor helps."""
@@ -109,10 +111,8 @@ def render_accuracy(
         entered = accuracy.measure(accuracy.deviation_with_entries)
         rows.append(("identified error, offsets entered", entered))
     rows.append(("uncertainty before calibration", accuracy.before.sizes))
-    scale = calibration.tolerance_scale.factor
-    scaled = f" (tolerances × {scale:.1f})" if scale > 1.0 else ""
     if accuracy.after is not None:
-        rows.append((f"uncertainty after calibration{scaled}", accuracy.after.sizes))
+        rows.append(("uncertainty after calibration", accuracy.after.sizes))
     cells = []
     for name, sizes in rows:
         a = sizes.aligned
@@ -128,7 +128,9 @@ def render_accuracy(
             "The uncertainty after calibration is unknown, because the noise of the readings is."
         )
     else:
-        notes.append(UNCERTAINTY_NOTE)
+        scale = calibration.tolerance_scale.factor
+        scaled = f", after the calibration times {scale:.1f}" if scale > 1.0 else ""
+        notes.append(UNCERTAINTY_NOTE.format(scaled))
         summary = summarise_tool(calibration, accuracy)
         if summary is not None:
             notes.append(describe_tool_error(summary, keep=keep))

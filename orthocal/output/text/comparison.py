@@ -126,7 +126,7 @@ def _scores(comparison: Comparison) -> RenderableType:
         "effective: number of parameters that the readings determine",
         "AICc, BIC: lower is better; ln evidence (0: complete model): higher is better",
         "CV: cross-validation, RMS error of predicting each setup from all others",
-        "uncertainty: of the tool after calibration, RMS, workpiece aligned, stated tolerances",
+        "uncertainty: of the tool after calibration, RMS, workpiece aligned",
     )
 
 
