@@ -97,7 +97,7 @@ def test_view_writes_a_page_of_anything(calibrated, experiment, root, tmp_path):
 @pytest.mark.parametrize(
     ("browser", "words"),
     [
-        ("/nowhere/chromium", "a picture needs Chromium, and there is none"),
+        ("/nowhere/chromium", "a picture needs Chromium, which was not found"),
         ("false", "false took no picture"),
     ],
 )

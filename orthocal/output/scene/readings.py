@@ -53,7 +53,7 @@ DIAL_RADIUS = 0.034
 FIRST_ARROW, NEXT_ARROW = 0.42, 0.6
 """Distances from a contact to the first arrow and between arrows, in radii of a dial."""
 
-MAX_FULL_SIZE_GAUGES = 9
+MAX_FULL_SIZE = 9
 """Most gauges that are drawn in full size."""
 
 MAX_ALL_LABELLED = 8
@@ -94,9 +94,7 @@ def draw_readings(
     longest = max((abs(_deviation(r, node)) for node in nodes for r in measured.rows), default=0.0)
     if longest > NEGLIGIBLE:
         scene.arrow_scale = round_scale(LONGEST_ARROW * drawing.size / longest)
-    dial = (
-        DIAL_RADIUS * drawing.size * min(1.0, math.sqrt(MAX_FULL_SIZE_GAUGES / max(len(setups), 1)))
-    )
+    dial = DIAL_RADIUS * drawing.size * min(1.0, math.sqrt(MAX_FULL_SIZE / max(len(setups), 1)))
     labelled = _labelled_setups(setups, measured, contacts)
     for i, setup in enumerate(setups):
         contact, point = contacts[setup.name], contacts[setup.name].points[0]
