@@ -43,8 +43,9 @@ DIFFERENCE_STEP = 1e-5
 RINGS = 6
 """Number of rings of points of the first layer."""
 
-UNKNOWN_SCALES = (MM, *(10 * MM,) * 3, *(MM,) * 6, 10 * MM, MM, MM, MM, MM)
-"""Scales of the unknowns of the fit."""
+UNKNOWN_SCALES = (MM, *(10.0 * MM,) * 2, *(MM,) * 6, 10.0 * MM, *(MM,) * 4)
+"""Scales of the unknowns of the fit, as in `_residuals`: radius, angles a and b, rods, homed
+carriages, rotation and translation of the print, tilts, [m, rad]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,10 +140,9 @@ def fit_firmware(calibration: Calibration, firmware: FirmwareName) -> FirmwareFi
             "`orthocal import LOG DIRECTORY` makes a session with them"
         )
     targets, layer_unknown = _find_targets(calibration)
-    free = 15 if FIRMWARES[firmware].tilts else 13
-    start = np.zeros(free)
+    scales = UNKNOWN_SCALES if FIRMWARES[firmware].tilts else UNKNOWN_SCALES[:-2]
     solution = least_squares(
-        partial(_residuals, targets, present), start, x_scale=UNKNOWN_SCALES[:free], method="lm"
+        partial(_residuals, targets, present), np.zeros(len(scales)), x_scale=scales, method="lm"
     )
     settings = replace(_changed(present, solution.x), firmware=firmware)
     tool = assessment_of(calibration).tool
@@ -319,7 +319,7 @@ def _changed(settings: DeltaSettings, x: Array) -> DeltaSettings:
     """
     rods, homed = np.array(settings.rods) + x[3:6], np.array(settings.homed) + x[6:9]
     a, b, c = settings.angles
-    tilts = (settings.tilts[0] + x[12], settings.tilts[1] + x[13]) if len(x) > 13 else (0.0, 0.0)
+    tilts = (settings.tilts[0] + x[12], settings.tilts[1] + x[13]) if len(x) > 12 else (0.0, 0.0)
     return replace(
         settings,
         radius=settings.radius + x[0],
