@@ -414,10 +414,10 @@ class LegIndicator:
             normals /= np.linalg.norm(normals, axis=1)[:, None]
         surface = feet + (radius - self.tip.radius) * normals
         distances = np.einsum("ki,ki->k", feet - roots, units)
-        surface[~np.isfinite(h)] = start
         problems = []
         for k, distance in enumerate(distances.tolist()):
             if not np.isfinite(h[k]):
+                surface[k] = start
                 problems.append(
                     f"the ball would pass the rod: it is {abs(lateral[k]) / MM:.1f} mm beside its "
                     f"axis, and they touch up to {radius / MM:.1f} mm"
