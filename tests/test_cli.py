@@ -261,7 +261,7 @@ def test_compare_has_the_verdict_of_the_readings_as_exit_code(experiment, root):
     code, out, err = orthocal("compare", experiment, "--repeat", repeat)
     assert (code, err) == (0, "")
     assert "Recommended model: full." in out
-    assert "Whether the residuals repeat in 'Experiment 3" in " ".join(out.split())
+    assert "unknown whether the residuals repeat in 'Experiment 3" in " ".join(out.split())
     code, out, _ = orthocal(
         "compare", root / "examples/raw-cycles", "--models", "offsets,lengths", "--json"
     )
