@@ -10,7 +10,7 @@ import numpy as np
 from orthocal import draw_errors, simulate_session
 from orthocal.errors import OrthocalError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
-from orthocal.hypotheses.anomaly import ORDERED, Explanation
+from orthocal.hypotheses.anomaly import PERSISTENT, Explanation
 
 MM = 1e-3
 SIZES = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
@@ -364,6 +364,6 @@ def is_named(explanation: Explanation, made: Made) -> bool:
     if explanation.kind not in made.kinds:
         return False
     rows = set(explanation.rows)
-    if explanation.kind in ORDERED:  # a row more or less
+    if explanation.kind in PERSISTENT:  # a row more or less
         return len(rows ^ made.rows) <= 1
     return rows == made.rows or (len(made.rows) == 2 and len(rows) == 1 and rows < made.rows)

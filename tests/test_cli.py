@@ -80,7 +80,7 @@ def test_view_writes_a_page_of_anything(calibrated, experiment, root, tmp_path):
         (calibrated, "Machine, calibrated"),
         (calibrated / "calibration.json", "Machine, calibrated"),
         (experiment, "Machine, nominal"),
-        (root / "tests/sessions/lines/plan.yaml", "none taken yet"),
+        (root / "tests/sessions/lines/plan.yaml", "none measured yet"),
         ("orthoglide", "Mechanical zero"),
         (root / "tests/robots/fivebar", "motor_a"),
     ):
@@ -97,7 +97,7 @@ def test_view_writes_a_page_of_anything(calibrated, experiment, root, tmp_path):
 @pytest.mark.parametrize(
     ("browser", "words"),
     [
-        ("/nowhere/chromium", "a picture needs Chromium, and there is none"),
+        ("/nowhere/chromium", "a picture needs Chromium, which was not found"),
         ("false", "false took no picture"),
     ],
 )
@@ -261,7 +261,7 @@ def test_compare_has_the_verdict_of_the_readings_as_exit_code(experiment, root):
     code, out, err = orthocal("compare", experiment, "--repeat", repeat)
     assert (code, err) == (0, "")
     assert "Recommended model: full." in out
-    assert "Whether the residuals repeat in 'Experiment 3" in " ".join(out.split())
+    assert "unknown whether the residuals repeat in 'Experiment 3" in " ".join(out.split())
     code, out, _ = orthocal(
         "compare", root / "examples/raw-cycles", "--models", "offsets,lengths", "--json"
     )

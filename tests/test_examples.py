@@ -215,7 +215,7 @@ def test_what_is_said_of_the_papers_readings_is_what_the_example_prints(run_exam
     kept = {label: sizes[1] for label, sizes in rows.items()}
     first = f"{kept['first round, offsets']:.2f} mm | {kept['first round, full']:.2f} mm"
     again = f"{kept['offsets entered, offsets']:.2f} mm | {kept['offsets entered, full']:.3f} mm"
-    assert f"| the paper's 18 readings | {first} |" in text
+    assert f"| 18 readings: zero, maximum and minimum in six setups | {first} |" in text
     assert f"| 18 more, with these offsets entered | {again} |" in text
     promised, left = rows["as of a line, exactly"]
     assert left > 1.4 * promised  # a wrong gauge promises too much

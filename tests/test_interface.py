@@ -68,8 +68,11 @@ OTHER_ARGUMENTS = [
     ({"solver": 5}, "found a int; expected a solver's name, or SolverOptions(...)"),
     ({"solver": {}}, "found a dict; expected a solver's name, or SolverOptions(...)"),
     ({"loss": 5}, "found a int; expected a loss's name, or Loss(...)"),
-    ({"start": [1]}, "found the shape (1,); expected 3 free parameters to start from a row"),
-    ({"start": "a"}, "found str; expected 3 free parameters to start from a row"),
+    (
+        {"start": [1]},
+        "found the shape (1,); expected 3 start values per row",
+    ),
+    ({"start": "a"}, "found str; expected 3 start values per row"),
     ({"start": [0.0, 0.0, np.nan]}, "expected 3 finite numbers to start from"),
 ]
 
@@ -114,7 +117,7 @@ def test_a_list_is_a_value_and_its_tolerance(orthoglide):
     found = [c.select(orthoglide.parameters) for c in choices]
     assert np.array_equal(found[0].mean, found[1].mean)
     assert np.array_equal(found[0].prior_stds, found[1].prior_stds)
-    with pytest.raises(ParameterError, match="give y_slide"):
+    with pytest.raises(ParameterError, match="state y_slide"):
         replace(choices[1], base=True).select(orthoglide.parameters)
 
 
@@ -128,7 +131,7 @@ def test_a_list_is_a_value_and_its_tolerance(orthoglide):
 )
 def test_one_name_in_two_units_is_refused(orthoglide, kind, values):
     stated = dict(zip(("x_slide.offset_mm", "x_slide.offset_um"), values, strict=True))
-    with pytest.raises(ParameterError, match=f"{kind}: 'x_slide.offset' is given twice"):
+    with pytest.raises(ParameterError, match=f"{kind}: 'x_slide.offset' is stated twice"):
         Choice(**{kind: stated}).select(orthoglide.parameters)
 
 
@@ -173,7 +176,7 @@ def test_coordinates_of_other_shapes(value, calibration, orthoglide):
         closure.inverse,
         lambda v: closure.tcp(v, v),
     ):
-        with pytest.raises(ValueError, match=r"expected 3 .* a row"):
+        with pytest.raises(ValueError, match=r"expected 3 .* per row"):
             act(value)
 
 
@@ -186,11 +189,11 @@ def test_names_theta_and_start_of_other_lengths(calibration, orthoglide):
     zero = orthoglide.drive_zero
     with pytest.raises(ValueError, match="found 1 names for 2 rows"):
         calibration.machine.forward([zero, zero], names=["a"])
-    with pytest.raises(ValueError, match="expected 1 values of the free parameters a row"):
+    with pytest.raises(ValueError, match="expected 1 values of the free parameters per row"):
         LoopClosure(orthoglide, free=["x_slide.offset"]).close(zero, theta=[1.0, 2.0])
-    with pytest.raises(ValueError, match="expected 18 start values a row"):
+    with pytest.raises(ValueError, match="expected 18 start values per row"):
         LoopClosure(orthoglide).close(zero, start=[1.0, 2.0])
-    with pytest.raises(ValueError, match="expected 18 passive coordinates a row"):
+    with pytest.raises(ValueError, match="expected 18 passive coordinates per row"):
         LoopClosure(orthoglide).tcp(zero, [1.0])
     with pytest.raises(TypeError, match="expected a Robot"):
         LoopClosure(5)

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from conftest import ROOT
+from scipy.optimize import brentq
 from tolerances import KINEMATICS, LAST_SIGMA, SAME_NUMBER
 
 import orthocal
@@ -18,12 +19,13 @@ from orthocal.assessment.tool_error import assess_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.estimation.diagnostics.unmodelled import error_jacobian
 from orthocal.estimation.fit import Fit, fit_problem
+from orthocal.estimation.linear import leg_parallelism_matrix, solve_equation_8
 from orthocal.estimation.loss import Loss
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.kinematics.loop_closure import nominal_closure
+from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.sensitivity import ToolSensitivity
-from orthocal.kinematics.workspace import find_workspace
 from orthocal.robot.model import joint_axis
 from orthocal.robot.parameters import AXES
 from orthocal.sensors.leg_indicator import Section
@@ -72,7 +74,7 @@ def test_covariance_bias_and_expanded_uncertainty():
 
     u, s = np.sqrt(np.diag(calibration.total_covariance)), np.sqrt(np.diag(noise)[:n])
     t = t_quantile(eta.contrasts, 0.975)
-    assert f"$t_\\eta = {t:.2f}$" in PAGE
+    assert f"differences have {eta.contrasts:.2f} of them, so $k_\\eta = {t:.2f}$" in PAGE
     expanded = np.sqrt(4.0 * s**2 + t**2 * (u**2 - s**2))
     np.testing.assert_allclose(expanded, calibration.expanded_uncertainties, rtol=SAME_NUMBER)
     effective = problem.n_free - np.trace(prior @ scaled)
@@ -97,13 +99,13 @@ def test_covariance_at_the_tool():
     c = e @ calibration.model_covariance @ e.transpose(0, 2, 1)
     square = mean(c + direct @ direct.transpose(0, 2, 1))
     assert math.sqrt(square) == pytest.approx(accuracy.after.sizes.aligned.rms, rel=SAME_NUMBER)
-    eta, known = calibration.tolerance_scale, accuracy.measure(accuracy.error_after_offsets)
+    eta, known = calibration.tolerance_scale, accuracy.measure(accuracy.deviation_with_entries)
     total = math.sqrt(square + known.aligned.rms**2)
     assert total == pytest.approx(calibration.assessment.tool.entered, rel=SAME_NUMBER)
     without = math.sqrt(mean(e @ calibration.total_covariance @ e.transpose(0, 2, 1)))
     text = f"gives {without * 1e6:.0f} µm instead of {math.sqrt(square) * 1e6:.0f} µm"
     assert text in PAGE
-    text = f"from {eta.contrasts:.1f} contrasts. Its tool error is {total * 1e6:.0f} µm with it"
+    text = f"from {eta.contrasts:.2f} contrasts. Its tool error is {total * 1e6:.0f} µm with it"
     assert f"$\\eta = {eta.factor:.1f}$ {text}" in PAGE
 
 
@@ -165,6 +167,31 @@ def test_offsets_with_the_section_at_the_slide_and_in_the_world():
 
     assert shown(session) in PAGE
     assert shown(replace(session, setups=setups)) in PAGE
+
+
+def test_other_displacements_with_the_same_residuals_have_other_offsets():
+    """The residuals of the six equations depend on c/b alone, and the offsets scale with 1/b."""
+    differences = np.array([-0.43, -0.37, 0.42, -0.18, -1.14, -0.70]) * 1e-3
+
+    def equations(most, least):
+        return leg_parallelism_matrix(
+            length=0.31025, displacement_max=most, displacement_min=least, rows=6
+        )
+
+    def ratio(most, least):
+        b, c = equations(most, least)[0, :2]
+        return c / b
+
+    assumed = ratio(0.06, -0.1)
+    residuals = solve_equation_8(equations(0.06, -0.1), differences).residuals
+    assert f"$c/b = {assumed:.4f}$" in PAGE
+    for most, low, high in ((0.04, -0.1, -0.06), (0.06, -0.11, -0.09), (0.08, -0.14, -0.1)):
+        least = brentq(lambda x, most=most: ratio(most, x) - assumed, low, high, xtol=1e-15)
+        matrix = equations(most, least)
+        found = solve_equation_8(matrix, differences)
+        np.testing.assert_allclose(found.residuals, residuals, atol=KINEMATICS)
+        offsets = ", ".join(f"{v * 1e3:.3f}".replace("-", "−") for v in found.offsets)
+        assert f"| {matrix[0, 0]:.3f} | {offsets} |" in PAGE
 
 
 def by_offsets_and_lengths(name):

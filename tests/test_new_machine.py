@@ -22,7 +22,7 @@ from orthocal.builder.orthoglide import Orthoglide
 from orthocal.cli import dialogue as asking
 from orthocal.errors import ClosureError, ParameterError
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.kinematics.workspace import find_workspace
+from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.output.scene.drawing import draw_scene
 from orthocal.session.session import Purpose
 
@@ -141,7 +141,7 @@ def test_a_posture_beyond_the_travel_is_named_with_the_controllers_number(copied
     file.write_text(text.replace("tcp_mm: [0.0, 60.0, 0.0]", "joints_mm: [250.0, 330.0, 250.0]"))
     code, _, err = orthocal("check", copied / "first")
     assert code == 2
-    assert "y_slide would be at -80.00 mm; it reaches from -70 to 150 mm" in err
+    assert "y_slide would be at -80.000 mm; it reaches from -70 to 150 mm" in err
 
 
 def test_what_is_read_on_it_calibrates_it(made, tmp_path):
@@ -256,7 +256,7 @@ def test_a_workspace_out_of_reach_is_refused_and_nothing_is_written(copied):
     code, _, err = orthocal("new", copied, "--again")
     assert code == 2
     assert err.startswith(f"orthocal: {file}: workspace_mm: the machine does not reach the workspa")
-    assert "; it reaches ±" in err
+    assert "; the largest box of this shape is ±" in err
     assert files_of(copied) == before
 
 
@@ -286,7 +286,7 @@ def test_a_directory_with_files_of_two_robots_is_refused(copied):
 def test_dimensions_alone_are_no_robot(copied):
     (copied / "mill.yaml").unlink()
     code, _, err = orthocal("new", copied, "--again")
-    assert (code, "contains no YAML of a robot beside machine.yaml" in err) == (2, True)
+    assert (code, "contains machine.yaml but no YAML of a robot" in err) == (2, True)
 
 
 def test_entries_of_joints_that_count_down_are_described(made, tmp_path):

@@ -111,9 +111,9 @@ def test_what_is_shown_of_a_setup_and_a_posture(folder, run):
     # the middle of the leg is at 310.25 + 40 − 310.25/2 mm; rod a 40 mm above it, of 5.5 mm radius
     for words in (
         "Monday: 6 readings in 2 setups on orthoglide; none is recorded yet.",
-        "Setup yx, 1 of 2: 3 readings Read: leg x, gauge in y, at 0.5 of its length,",
+        "Setup yx, 1 of 2: 3 readings Read: leg x, gauge in y, at 0.5 of its length from the slide",
         "Stand: on the +y side, so that the tip touches at (195.1, 5.5, 40.0) mm in zero, 155.1 mm",
-        "Push the plunger in: the reading must grow. If it falls, reverse the sign of every",
+        "Push the plunger in: the reading must grow. If it falls, enter every reading of",
         "Dial: -5 to 5 mm, resolution 0.01 mm",
         "Go to zero and align the gauge. Press the plunger in to half of its travel, about 5 mm.",
         "Line 2: yx zero (6 of 6 missing)",
@@ -161,6 +161,11 @@ TURNS = {
         ["0.1", "0.2", "back 2", "0.3"],
         ["0.30", "0.20"],
         "Line 2: yx zero (4 of 6 missing)",
+    ),
+    "back after a repetition": (
+        ["0.1", "again", "0.11", "back", "0.12"],
+        ["0.10", *[""] * 5, "0.12"],
+        "Recorded: 0.11 mm; Enter keeps it.",
     ),
     "back beyond": (["back"], [], "Not recorded: this is the first line."),
     "back to none": (["back 1"], [], "Not recorded: '1' is not a line; expected 2 to 7."),

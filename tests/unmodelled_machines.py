@@ -100,7 +100,9 @@ class EffectSearch:
         self.search = search._Search(bare, LinearModel(bare))
         self.start, self.rows = self.search.sound.about, bare
         self.true = LinearModel(plan.with_effects([effect] if effect else []))
-        self.about = self.true.linearise(np.zeros(self.true.problem.n_free), (), None, slopes=False)
+        self.about = self.true.linearise(
+            np.zeros(self.true.problem.n_free), (), None, keep_jacobian=False
+        )
 
     def name(self, values):
         """What is named in the readings of a machine, shape (n_rows,), [m]."""
@@ -113,7 +115,7 @@ class EffectSearch:
             for f, evidence in found._score(found.sound, families)
             if f.systematic
         }
-        needed = search.EFFECT_CLEARLY - np.log(search.FAMILIES)
+        needed = search.CLEAR_EFFECT_LOG_BAYES - np.log(search.N_FAMILIES)
         clear = sorted((n for n in scores if scores[n] >= needed), key=lambda n: -scores[n])
         gain = self._evidence(self.true, self.about, values)
         return Named(gain - self._evidence(found.model, self.start, values), tuple(clear))

@@ -1,18 +1,15 @@
-"""Plan of mechanical adjustments: which feet, shims and threads to set, by how much.
+"""Plan of mechanical adjustments: amounts by which to set feet, shims and threads.
 
-The amounts a make the expected tool error least, with the offsets entered again afterwards. To
-first order the deviation of the tool after alignment of the workpiece is
+The amounts a minimise the expected tool error with offsets x that are entered again afterwards:
 
-    d + A a − D x,   x = the offsets that leave least of it
+    min over a, x of  |d + A a − D x|² + Σ |A_i|² s_i²(a_i) + U²,   s_i = `Adjustment.setting_std`
 
-with d the deviation of the calibrated machine. Its uncertainty U does not depend on a, but amounts
-are set with errors, of which those of the lever arms are proportional to them. Least is
+d + A a − D x is the deviation of the tool to first order, after alignment of the workpiece, with d
+that of the calibrated machine. The uncertainty U of d does not depend on a. Amounts are set with
+errors; those of the lever arms are proportional to a.
 
-    |d + A a − D x|² + Σ |A_i|² s_i²(a_i) + U²,   s_i = `Adjustment.setting_std`
-
-The fewest adjustments that bring the most come first: forward selection with exchange. Amounts are
-rounded to what can be set. The loops of the adjusted machine are closed exactly before a figure is
-reported.
+Forward selection with exchange finds few adjustments with a large gain. Amounts are rounded to
+steps that can be set. Before figures are reported the loops of the adjusted machine are closed.
 """
 
 from __future__ import annotations
@@ -41,7 +38,7 @@ from orthocal.assessment.controller_entries import (
     entered_offsets,
     find_backlash,
     solve_in_order,
-    weigh_field,
+    weighted_fields,
 )
 from orthocal.assessment.tool_error import assess_placed, require_tool, summarise_tool
 from orthocal.calibration.adjusting import adjust_calibration
@@ -53,16 +50,16 @@ from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.statistics import chance
 
 LEAST_GAIN = 0.04
-"""Reduction of the expected tool error that a further adjustment must bring."""
+"""Relative reduction of the expected tool error below which no adjustment is added."""
 
 WORTHWHILE = 0.15
-"""Reduction of the expected tool error below which no adjustment is advised."""
+"""Relative reduction of the expected tool error below which no adjustment is advised."""
 
-MOST_ROUNDS = 5
-"""Corrections of the amounts on the nonlinear machine."""
+MAX_CORRECTIONS = 5
+"""Largest number of corrections of the amounts on the nonlinear machine."""
 
 Judgement = Literal["worthwhile", "small gain", "uncertain gain"]
-"""Whether adjusting is worth doing: the gain is large enough, and larger than its uncertainty."""
+"""Judgement of the gain: large enough, too small, or smaller than its uncertainty."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +68,7 @@ class PlannedAdjustment:
 
     adjustment: Adjustment
     amount: float
-    """Rounded to what can be set, [m]."""
+    """Amount, rounded to a multiple of the smallest step, [m]."""
     uncertainty: float
     """Expanded uncertainty of the best amount, [m]; NaN if unknown."""
     tool_error: float
@@ -86,17 +83,17 @@ class PlannedAdjustment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdjustmentPlan:
-    """Mechanical adjustments of a calibrated machine, in their order."""
+    """Mechanical adjustments of a calibrated machine, in the order in which to set them."""
 
     adjustments: tuple[PlannedAdjustment, ...]
-    """The one that brings the most comes first; empty if none brings LEAST_GAIN."""
+    """The adjustment with the largest gain comes first; empty if no gain reaches LEAST_GAIN."""
     entries: tuple[ControllerEntry, ...]
     """Offsets to enter afterwards."""
     before: ToolErrorSummary
     """Expected tool error of the present machine."""
     after: ToolErrorSummary
     """Expected tool error after the adjustments."""
-    moved_uncertainty: float
+    displacement_uncertainty: float
     """Uncertainty of the displacement of the tool, RMS after alignment, one σ, [m]."""
 
     @property
@@ -114,16 +111,15 @@ class AdjustmentPlan:
         """Judgement of the gain by the adjustments."""
         if self.gain < WORTHWHILE:
             return "small gain"
-        moved = math.sqrt(self.before.entered**2 - self.after.entered**2)
-        return (
-            "worthwhile" if moved > chance.COVERAGE * self.moved_uncertainty else "uncertain gain"
-        )
+        removed = math.sqrt(self.before.entered**2 - self.after.entered**2)
+        significant = removed > chance.COVERAGE * self.displacement_uncertainty
+        return "worthwhile" if significant else "uncertain gain"
 
 
 def plan_adjustments(
     calibration: Calibration, *, among: Sequence[str] | None = None
 ) -> AdjustmentPlan:
-    """Mechanical adjustments that reduce the expected tool error of a calibrated machine most.
+    """Plan the mechanical adjustments that reduce the expected tool error most.
 
     Args:
         calibration: The calibration.
@@ -155,7 +151,7 @@ def plan_adjustments(
     search = _Search(calibration, tool.compensating(changes), candidates, before.compensated)
     chosen = search.choose()
     amounts, after, entries = np.zeros(len(candidates)), before, assessment_of(calibration).entries
-    for _ in range(MOST_ROUNDS if chosen else 0):
+    for _ in range(MAX_CORRECTIONS if chosen else 0):
         improved = search.round(chosen, search.fit(chosen))
         if np.array_equal(improved, amounts):
             break
@@ -166,18 +162,18 @@ def plan_adjustments(
         accuracy = assess_placed(adjusted, placed, entries, backlash)
         summary = summarise_tool(adjusted, accuracy)
         after = summary or before
-        search.correct(amounts, accuracy.error_after_offsets)
+        search.correct(amounts, accuracy.deviation_with_entries)
     return AdjustmentPlan(
         adjustments=search.order(chosen, amounts, after.entered),
         entries=entries,
         before=before,
         after=after,
-        moved_uncertainty=search.moved_uncertainty(chosen),
+        displacement_uncertainty=search.displacement_uncertainty(chosen),
     )
 
 
 class _Search:
-    """Choice of adjustments on the linearised machine, the effect of offsets projected out.
+    """Choice of adjustments on the linearised machine with the best offsets.
 
     Args:
         calibration: The calibration.
@@ -199,62 +195,74 @@ class _Search:
         offsets = [f"{drives[i].name}.offset" for i in offset_columns]
         names = [*offsets, *(a.parameter for a in candidates)]
         commanded = tool.drives - calibration.active_offsets
-        under = (
+        sensitivities = (
             ToolSensitivity(robot, free=names, values=calibration.errors, conditions=c)
             for c in tool.use.conditions
         )
-        field = np.concatenate([sensitivity(commanded) for sensitivity in under])
-        self._by_offsets = weigh_field(tool, field[:, :, : len(offsets)])
+        field = np.concatenate([sensitivity(commanded) for sensitivity in sensitivities])
+        self._offset_effects = weighted_fields(tool, field[:, :, : len(offsets)])
         self.effects = self._without_offsets(field[:, :, len(offsets) :])
-        self._deviate(self._without_offsets(tool.deviation(entered_offsets(calibration))))
+        self._set_deviation(self._without_offsets(tool.deviation(entered_offsets(calibration))))
         self.floor = floor
-        self.largest = np.array([a.largest for a in candidates])
+        self.max_amounts = np.array([a.largest for a in candidates])
         self.steps = np.array([a.step for a in candidates])
         self._rounding = np.array([a.rounding_std for a in candidates])
 
-    def _deviate(self, deviation: Array) -> None:
-        """State the deviation without adjustments, shape (3 K,), [m].
+    def _set_deviation(self, deviation: Array) -> None:
+        """Set the deviation without adjustments, shape (3 K,), [m].
 
-        Lengths of |d + A a| follow from the triangle of [A d], which is much smaller.
+        The lengths |d + A a| are computed from the R factor of [A d], which is much smaller.
         """
-        triangle: Array = np.linalg.qr(np.column_stack([self.effects, deviation])).R
-        self._columns, self._deviation = triangle[:, :-1], triangle[:, -1]
-        self._sizes = np.linalg.norm(self._columns, axis=0)
+        r_factor: Array = np.linalg.qr(np.column_stack([self.effects, deviation])).R
+        self._columns, self._deviation = r_factor[:, :-1], r_factor[:, -1]
+        self._column_norms = np.linalg.norm(self._columns, axis=0)
 
     def _without_offsets(self, field: Array) -> Array:
         """Field after alignment and with the best offsets, shape (3 K, ...) of (K, 3, ...), [m]."""
-        fields, offsets = weigh_field(self.tool, field), self._by_offsets
-        if not offsets[0].size:
-            return fields[0]
-        return np.asarray(fields[0] - offsets[0] @ solve_in_order(*offsets, *fields))
+        weighted, offset_effects = weighted_fields(self.tool, field), self._offset_effects
+        if not offset_effects[0].size:
+            return weighted[0]
+        return np.asarray(
+            weighted[0] - offset_effects[0] @ solve_in_order(*offset_effects, *weighted)
+        )
 
     def named(self, amounts: Array) -> dict[str, float]:
-        """Amounts that are not 0 by the names of the adjustments."""
+        """Adjustment to its amount, [m], for amounts that are not 0."""
         return {a.name: float(v) for a, v in zip(self.candidates, amounts, strict=True) if v != 0.0}
 
     def error(self, amounts: Array) -> float:
-        """Expected tool error with given amounts, to first order, [m]."""
+        """Expected tool error after adjustments, to first order, [m].
+
+        Args:
+            amounts: Shape (n_candidates,), [m].
+        """
         deviation = self._deviation + self._columns @ amounts
-        spread = np.hypot(self._rounding * (amounts != 0.0), LEVER_SHARE * amounts) * self._sizes
-        return math.hypot(*(float(np.linalg.norm(v)) for v in (deviation, spread)), self.floor)
+        setting_errors = (
+            np.hypot(self._rounding * (amounts != 0.0), LEVER_SHARE * amounts) * self._column_norms
+        )
+        return math.hypot(
+            *(float(np.linalg.norm(v)) for v in (deviation, setting_errors)), self.floor
+        )
 
     def fit(self, chosen: Iterable[int]) -> Array:
         """Best amounts of some adjustments within their limits, shape (n_candidates,), [m]."""
-        at, amounts = list(chosen), np.zeros(len(self.candidates))
-        if at:
-            limit = self.largest[at]
-            rows = np.vstack([self._columns[:, at], np.diag(LEVER_SHARE * self._sizes[at])])
-            right = np.append(-self._deviation, np.zeros(len(at)))
-            amounts[at] = lsq_linear(rows * limit, right, (-1.0, 1.0)).x * limit
+        columns, amounts = list(chosen), np.zeros(len(self.candidates))
+        if columns:
+            limit = self.max_amounts[columns]
+            rows = np.vstack(
+                [self._columns[:, columns], np.diag(LEVER_SHARE * self._column_norms[columns])]
+            )
+            right = np.append(-self._deviation, np.zeros(len(columns)))
+            amounts[columns] = lsq_linear(rows * limit, right, (-1.0, 1.0)).x * limit
         return amounts
 
     def choose(self) -> list[int]:
-        """Indices of the fewest adjustments that bring the most: forward selection, exchange."""
+        """Indices of the adjustments to set, by forward selection with exchange."""
         chosen: list[int] = []
         current = self.error(self.fit(chosen))
         while True:
             others = [i for i in range(len(self.candidates)) if i not in chosen]
-            for count in (1, 2):  # the two feet of a slide may bring something together only
+            for count in (1, 2):  # the two feet of a slide may have a gain only together
                 trials = [[*chosen, *more] for more in itertools.combinations(others, count)]
                 if not trials:
                     return chosen
@@ -282,66 +290,69 @@ class _Search:
         return chosen
 
     def round(self, chosen: Sequence[int], amounts: Array) -> Array:
-        """Amounts in whole steps; single steps are exchanged as long as the error decreases."""
+        """Amounts in whole steps, changed by single steps as long as the error decreases."""
         steps = self.steps
-        most = np.floor(self.largest / steps * (1.0 + 1e-12))
-        counts = np.clip(np.round(amounts / steps), -most, most)
+        max_counts = np.floor(self.max_amounts / steps * (1.0 + 1e-12))
+        counts = np.clip(np.round(amounts / steps), -max_counts, max_counts)
         best, improved = self.error(counts * steps), True
         while improved:
             improved = False
             for i, change in itertools.product(chosen, (-1.0, 1.0)):
                 trial = np.array(counts)
-                trial[i] = np.clip(trial[i] + change, -most[i], most[i])
+                trial[i] = np.clip(trial[i] + change, -max_counts[i], max_counts[i])
                 error = self.error(trial * steps)
                 if error < best * (1.0 - 1e-12):
                     counts, best, improved = trial, error, True
         return np.asarray(counts * steps)
 
     def correct(self, amounts: Array, exact: Array) -> None:
-        """Move the linearised deviation so that it is exact for given amounts.
+        """Shift the linearised deviation so that it is exact for these amounts.
 
         Args:
             amounts: Shape (n_candidates,), [m].
-            exact: Deviation of the machine with these amounts and the best offsets, shape (K, 3).
+            exact: Deviation of the machine with these amounts and the best offsets, shape (K, 3),
+                [m].
         """
-        aligned, _ = weigh_field(self.tool, exact)
-        self._deviate(aligned - self.effects @ amounts)
+        aligned, _ = weighted_fields(self.tool, exact)
+        self._set_deviation(aligned - self.effects @ amounts)
 
     def _gain(self, chosen: Sequence[int]) -> Array:
-        """Derivative of the best amounts by the parameters, shape (n_chosen, n), [SI]."""
+        """Derivative of the best amounts with respect to the errors, shape (n_chosen, n), [SI]."""
         n = len(self.calibration.free) + len(self.calibration.unmodelled.names)
-        by_errors = self._without_offsets(self.tool.jacobian[:, :, :n])
+        error_effects = self._without_offsets(self.tool.jacobian[:, :, :n])
         effects = self.effects[:, chosen]
-        normal = effects.T @ effects + np.diag((LEVER_SHARE * self._sizes[chosen]) ** 2)
-        return np.asarray(-np.linalg.solve(normal, effects.T @ by_errors))
+        normal = effects.T @ effects + np.diag((LEVER_SHARE * self._column_norms[chosen]) ** 2)
+        return np.asarray(-np.linalg.solve(normal, effects.T @ error_effects))
 
     def _covariance(self) -> Array:
         return error_covariance(self.calibration)
 
     def uncertainties(self, chosen: Sequence[int]) -> Array:
-        """Expanded uncertainty of the best amount of each adjustment, shape (n_chosen,), [m]."""
+        """Expanded uncertainties of the best amounts, shape (n_chosen,), [m]."""
         gain = self._gain(chosen)
-        scatter = gain[:, : len(self.calibration.free)]
-        total, of_noise = (
+        gain_of_free = gain[:, : len(self.calibration.free)]
+        std, std_scatter = (
             np.sqrt(np.maximum(np.diag(g @ c @ g.T), 0.0))
             for g, c in (
                 (gain, self._covariance()),
-                (scatter, self.calibration.noise_covariance),
+                (gain_of_free, self.calibration.noise_covariance),
             )
         )
-        return self.calibration.expand(total, of_noise)
+        return self.calibration.expand(std, std_scatter)
 
-    def moved_uncertainty(self, chosen: Sequence[int]) -> float:
-        """Standard deviation of the field by which the tool moves, RMS after alignment, [m]."""
+    def displacement_uncertainty(self, chosen: Sequence[int]) -> float:
+        """Standard deviation of the displacement of the tool, RMS after alignment, [m]."""
         if not chosen:
             return 0.0
-        moved = self.effects[:, chosen] @ self._gain(chosen)
-        return math.sqrt(max(float(np.trace(moved @ self._covariance() @ moved.T)), 0.0))
+        displacement = self.effects[:, chosen] @ self._gain(chosen)
+        return math.sqrt(
+            max(float(np.trace(displacement @ self._covariance() @ displacement.T)), 0.0)
+        )
 
     def order(
         self, chosen: Sequence[int], amounts: Array, after: float
     ) -> tuple[PlannedAdjustment, ...]:
-        """The adjustments in the order of what they bring.
+        """Adjustments in the order of their gain.
 
         Args:
             chosen: Indices of the adjustments.
@@ -354,18 +365,19 @@ class _Search:
             zip(chosen, self.uncertainties(chosen).tolist(), strict=True)
         )
         pending = [i for i in chosen if amounts[i] != 0.0]
-        at, planned = np.zeros_like(amounts), []
+        amounts_set, planned = np.zeros_like(amounts), []
         while pending:
             trials = {
-                i: self.error(np.where(np.arange(at.size) == i, amounts, at)) for i in pending
+                i: self.error(np.where(np.arange(amounts_set.size) == i, amounts, amounts_set))
+                for i in pending
             }
             best = min(trials, key=trials.__getitem__)
             pending.remove(best)
-            at[best] = amounts[best]
-            error = trials[best] if pending else after
+            amounts_set[best] = amounts[best]
+            tool_error = trials[best] if pending else after
             planned.append(
                 PlannedAdjustment(
-                    self.candidates[best], float(amounts[best]), uncertainty[best], error
+                    self.candidates[best], float(amounts[best]), uncertainty[best], tool_error
                 )
             )
         return tuple(planned)

@@ -1,4 +1,4 @@
-"""Assessment of a calibration: one verdict, its findings, what to enter, the tool error."""
+"""Assessment of a calibration: verdict, findings, values to enter and tool error."""
 
 from __future__ import annotations
 
@@ -54,14 +54,14 @@ EXPLANATIONS: tuple[FindingKind, ...] = (
     "gauge overstated",
     "fits",
 )
-"""Kinds of which the first explains the decision to enter."""
+"""Kinds of findings that explain the decision to enter; the first that is found is quoted."""
 
 KEEPING: dict[FindingKind, str] = {
     "no offset": words.NOTHING_HEADLINE,
     "no change needed": words.KEEP_HEADLINE,
     "nothing moved": words.KEEP_HEADLINE,
 }
-"""Kinds of notes that leave nothing to enter, and their headlines."""
+"""Kinds of notes without anything to enter, and the headlines of the decision."""
 
 
 def calibrate(
@@ -78,16 +78,17 @@ def calibrate(
 
     Args:
         sessions: The session, or the path to one; or several, which are fitted together.
-        choice: Which errors are free and what is known of them; or the name of a model. By default
-            what the session states, otherwise the complete model with priors.
+        choice: Free errors, known errors and priors; or the name of a model. By default the choice
+            that the session states, otherwise the complete model with priors.
         loss: `squares` (the default), `huber` (pseudo-Huber), or a Loss with another width.
         solver: `ipopt` on the complete program, the reference; `variable-projection`, the same
             optimum in less time; `linearised`, one step about the active offsets; or
             SolverOptions.
-        profile: Names or globs of free parameters whose profile-likelihood intervals are wanted.
-        start: Initial values of the free errors of the machine, shape (n_machine,), [SI]; by
-            default the linearised solution.
-        judgement: Of these sessions with these effects and tolerances, if it is known already.
+        profile: Names or globs of free parameters whose profile-likelihood intervals are computed.
+        start: Initial values of the free errors of the machine, shape (n_machine,), [SI]; nuisance
+            parameters then start at 0. By default all parameters start at the linearised solution.
+        judgement: Judgement of these sessions with these effects and tolerances, if it was computed
+            already.
 
     Returns:
         The calibration with its assessment.
@@ -100,12 +101,12 @@ def calibrate(
         TypeError: If an argument is of another kind.
         ValueError: If `start` does not have one number for each free error of the machine.
     """
-    judged = [] if judgement is None else [judgement]
+    judgements = [] if judgement is None else [judgement]
 
     def find_scale(session: Session) -> ToleranceScale:
-        if not judged:
-            judged.append(judge_session(session))
-        return judged[0].tolerance_scale
+        if not judgements:
+            judgements.append(judge_session(session))
+        return judgements[0].tolerance_scale
 
     calibration, session = identify(
         sessions,
@@ -116,7 +117,7 @@ def calibrate(
         start=start,
         find_scale=find_scale,
     )
-    return replace(calibration, assessment=assess(calibration, session, judgement=judged[0]))
+    return replace(calibration, assessment=assess(calibration, session, judgement=judgements[0]))
 
 
 def assess(
@@ -126,31 +127,31 @@ def assess(
     judgement: Judgement | None = None,
     recommendation: Recommendation | None = None,
 ) -> Assessment:
-    """Judge a calibration: verdict, findings, what to enter, the tool error.
+    """Judge a calibration: verdict, findings, values to enter and tool error.
 
     Args:
         calibration: The calibration.
-        session: The session, or the joined sessions, that it was made from; by default as the
-            calibration keeps them.
-        judgement: Of that session, if it is known already.
-        recommendation: Of a model for that session, if it is known already.
+        session: The session, or the joined sessions, that it was made from; by default those
+            recorded in the calibration.
+        judgement: Judgement of that session, if it was computed already.
+        recommendation: Recommended model for that session, if it was computed already.
 
     Raises:
         ClosureError: If the machine cannot reach a posture.
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
-    measured = session or restore_session(calibration)
+    session_used = session or restore_session(calibration)
     if judgement is None:
-        judgement = judge_session(measured)
-    chosen = _choose(calibration)
+        judgement = judge_session(session_used)
+    chosen = _choose_values(calibration)
     entries, tool, keep = chosen.entries, chosen.tool, chosen.keep
-    firmware = calibration.session.firmware is not None  # takes settings, no offsets
+    firmware = calibration.session.firmware is not None  # settings are written, no offsets entered
     notes = [
         *find_fit_findings(calibration),
         *([_no_change_needed(calibration, entries, chosen.best)] if keep else []),
         *([] if firmware else _entry_findings(calibration, entries, tool, keep=keep)),
         *describe_recommendation(
-            recommendation or recommend_model(measured), chosen=calibration.model
+            recommendation or recommend_model(session_used), identified=calibration.model
         ),
         *chosen.unreached,
     ]
@@ -169,20 +170,20 @@ def assess(
 
 
 def assessment_of(calibration: Calibration) -> Assessment:
-    """The assessment of a calibration: as recorded, otherwise computed."""
+    """Assessment of a calibration, as recorded; computed if there is none."""
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
     return calibration.assessment or assess(calibration)
 
 
 def check_session(session: Session, *, judgement: Judgement | None = None) -> Assessment:
-    """The assessment of readings before anything is calibrated from them.
+    """Assess readings before anything is calibrated from them.
 
     Args:
-        session: The session; readings that are missing (NaN) are counted, and the others judged.
-        judgement: Of its readings, if it is known already.
+        session: The session. Missing readings (NaN) are counted; the others are judged.
+        judgement: Judgement of its readings, if it was computed already.
 
     Raises:
-        SessionError: If all are missing.
+        SessionError: If all readings are missing.
     """
     require_kind(session, Session, expected="a Session, such as load_session(...)")
     missing = [words.readings_missing(session)] if np.isnan(session.values).any() else []
@@ -193,9 +194,8 @@ def check_session(session: Session, *, judgement: Judgement | None = None) -> As
     findings = rank([*judgement.findings, *missing])
     if judgement.verdict == "enter":
         within = judgement.tolerance_scale.factor == 1.0
-        findings = rank(
-            [*findings, words.no_anomaly(len(session.readings), within_tolerances=within)]
-        )
+        no_anomaly = words.no_anomaly(len(session.readings), within_tolerances=within)
+        findings = rank([*findings, no_anomaly])
     lead = next((f for f in findings if f.severity != "note"), findings[-1])
     decision = Decision(
         judgement.verdict, words.SESSION_HEADLINES[judgement.verdict], lead.text, lead.action
@@ -204,79 +204,85 @@ def check_session(session: Session, *, judgement: Judgement | None = None) -> As
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Chosen:
+class _ValuesToEnter:
     """Values to enter, and the tool error with them."""
 
     entries: tuple[ControllerEntry, ...]
     backlash: tuple[BacklashEntry, ...]
     keep: bool
-    """Whether the offsets stay as they are."""
+    """True if the active offsets are kept."""
     tool: ToolErrorSummary | None
+    """Tool error with these values; None if unknown."""
     best: ToolErrorSummary | None
-    """With the best offsets."""
+    """Tool error with the best offsets; None if unknown."""
     unreached: list[Finding]
+    """Reason why the tool error is unknown."""
 
 
-def _choose(calibration: Calibration) -> _Chosen:
-    """Choose offsets and backlash to enter: those that are worth entering."""
-    placed = find_tool(calibration)
-    backlash = compute_backlash(calibration, placed)
+def _choose_values(calibration: Calibration) -> _ValuesToEnter:
+    """Offsets and backlash that are worth entering."""
+    calibrated_tool = find_tool(calibration)
+    backlash = compute_backlash(calibration, calibrated_tool)
     changes = backlash_changes(calibration, backlash)
-    entries = compute_entries(calibration, placed and placed.compensating(changes))
-    best, unreached = _tool(calibration, placed, entries, backlash)
-    stay = tuple(e.kept for e in entries)
-    now = None if best is None else best.now
+    entries = compute_entries(
+        calibration, calibrated_tool and calibrated_tool.compensating(changes)
+    )
+    best, unreached = _summarise_tool(calibration, calibrated_tool, entries, backlash)
+    active_entries = tuple(e.kept for e in entries)
+    error_now = None if best is None else best.now
     if changes.any() and best is not None:
-        staying, _ = _tool(calibration, placed, stay, backlash)
-        now = None if staying is None else staying.entered
-    firmware = calibration.session.firmware is not None  # its settings correct more than offsets
-    keep = not firmware and _keeps(calibration, entries, now, best)
+        summary_of_active, _ = _summarise_tool(
+            calibration, calibrated_tool, active_entries, backlash
+        )
+        error_now = None if summary_of_active is None else summary_of_active.entered
+    firmware = calibration.session.firmware is not None  # settings correct more than offsets
+    keep = not firmware and _keeps_offsets(calibration, entries, error_now, best)
     if entries and not keep:
-        return _Chosen(entries, backlash, keep, best, best, unreached)
-    if not is_worth_changing(calibration, placed, backlash):
+        return _ValuesToEnter(entries, backlash, keep, best, best, unreached)
+    if not is_worth_changing(calibration, calibrated_tool, backlash):
         backlash = tuple(e.kept for e in backlash)
-    tool, _ = _tool(calibration, placed, stay, backlash)
-    return _Chosen(stay, backlash, keep, tool, best, unreached)
+    tool, _ = _summarise_tool(calibration, calibrated_tool, active_entries, backlash)
+    return _ValuesToEnter(active_entries, backlash, keep, tool, best, unreached)
 
 
-def _tool(
+def _summarise_tool(
     calibration: Calibration,
-    placed: CalibratedTool | None,
+    calibrated_tool: CalibratedTool | None,
     entries: Sequence[ControllerEntry],
     backlash: Sequence[BacklashEntry],
 ) -> tuple[ToolErrorSummary | None, list[Finding]]:
-    """The expected tool error, or why it is unknown."""
+    """Expected tool error; None and the reason if it is unknown."""
     try:
-        tool = require_tool(calibration, placed)
-        accuracy = assess_placed(calibration, tool, entries, backlash)
+        placed = require_tool(calibration, calibrated_tool)
+        accuracy = assess_placed(calibration, placed, entries, backlash)
     except (ClosureError, RobotError) as e:
         return None, [words.out_of_reach(str(e))]
     return summarise_tool(calibration, accuracy), []
 
 
-def _keeps(
+def _keeps_offsets(
     calibration: Calibration,
     entries: Sequence[ControllerEntry],
     now: float | None,
-    tool: ToolErrorSummary | None,
+    best: ToolErrorSummary | None,
 ) -> bool:
-    """True if the offsets stay as they are: entering them gains too little at the tool.
+    """True if the active offsets are kept, as others reduce the tool error too little.
 
     Args:
         calibration: The calibration.
         entries: Offsets with the least tool error.
-        now: Tool error with the active ones, [m]; None if unknown.
-        tool: The tool error with them; None without a tool to judge by: then significance decides.
+        now: Tool error with the active offsets, [m]; None if unknown.
+        best: Tool error with the best offsets. If it is None, significance decides.
     """
     if not entries:
         return False
-    if tool is not None and now is not None:
-        return not lowers(now, tool.entered)
-    known = _by_readings(entries)
-    return bool(known) and not any(is_significant(calibration, e) for e in known)
+    if best is not None and now is not None:
+        return not lowers(now, best.entered)
+    determined = _determined_by_readings(entries)
+    return bool(determined) and not any(is_significant(calibration, e) for e in determined)
 
 
-def _by_readings(entries: Sequence[ControllerEntry]) -> list[ControllerEntry]:
+def _determined_by_readings(entries: Sequence[ControllerEntry]) -> list[ControllerEntry]:
     """Entries whose values and uncertainties the readings determine."""
     return [e for e in entries if e.held is None and math.isfinite(e.std)]
 
@@ -284,11 +290,11 @@ def _by_readings(entries: Sequence[ControllerEntry]) -> list[ControllerEntry]:
 def _no_change_needed(
     calibration: Calibration, entries: Sequence[ControllerEntry], best: ToolErrorSummary | None
 ) -> Finding:
-    """Finding that the offsets stay as they are; `best` is the tool error with the best ones."""
-    ratios = [abs(e.best_change) / e.std for e in _by_readings(entries) if e.std > 0.0]
+    """Finding that the offsets are kept; `best` is the tool error with the best ones."""
+    ratios = [abs(e.best_change) / e.std for e in _determined_by_readings(entries) if e.std > 0.0]
     drives = [e.drive for e in entries]
-    share = WORTH_ENTERING
-    return words.no_change_needed(drives, max(ratios, default=0.0), best, share=share)
+    min_reduction = WORTH_ENTERING
+    return words.no_change_needed(drives, max(ratios, default=0.0), best, share=min_reduction)
 
 
 def _entry_findings(
@@ -303,21 +309,24 @@ def _entry_findings(
     Args:
         calibration: The calibration.
         entries: The offsets to enter.
-        tool: The tool error with them; None if unknown.
-        keep: Whether they are the active ones.
+        tool: Tool error with these offsets; None if unknown.
+        keep: Whether the offsets to enter are the active ones.
     """
-    expected = [] if tool is None else [words.tool_error(tool, keep=keep or not entries)]
+    findings = [] if tool is None else [words.tool_error(tool, keep=keep or not entries)]
     if not entries:
-        return [words.no_offset(), *expected]
+        return [words.no_offset(), *findings]
     if entries[0].active is None:
-        expected.append(words.controller_not_stated([e.drive for e in entries], keep=keep))
+        findings.append(words.controller_not_stated([e.drive for e in entries], keep=keep))
     elif not calibration.session.parts and any(e.active for e in entries):
-        expected.append(words.earlier_readings())
-    known = _by_readings(entries)
-    large = [e.drive for e in known if is_significant(calibration, e)]
-    small = [e.drive for e in known if e.drive not in large]
-    findings = [words.must_change(large)] if large else []
-    return [*expected, *findings, *([words.not_significant(small)] if small else [])]
+        findings.append(words.earlier_readings())
+    determined = _determined_by_readings(entries)
+    significant = [e.drive for e in determined if is_significant(calibration, e)]
+    insignificant = [e.drive for e in determined if e.drive not in significant]
+    if significant:
+        findings.append(words.must_change(significant))
+    if insignificant:
+        findings.append(words.not_significant(insignificant))
+    return findings
 
 
 def is_significant(calibration: Calibration, entry: ControllerEntry) -> bool:
@@ -326,16 +335,16 @@ def is_significant(calibration: Calibration, entry: ControllerEntry) -> bool:
 
 
 def expanded_uncertainty(calibration: Calibration, entry: ControllerEntry | BacklashEntry) -> float:
-    """Expanded uncertainty of the best value to enter, [unit]; see `Calibration.expand`."""
+    """Expanded uncertainty of the best value to enter, [unit of the drive]."""
     return float(calibration.expand(entry.std, entry.std_scatter))
 
 
 def _decide(findings: Sequence[Finding], *, firmware: bool, backlash: bool) -> Decision:
-    """The one decision: the gravest finding decides; nothing against entering means enter.
+    """Decision by the gravest finding; to enter the values if no finding is against it.
 
     Args:
         findings: All findings, the gravest first.
-        firmware: Whether the session is of a controller whose settings are calibrated.
+        firmware: Whether settings of a printer's firmware are calibrated.
         backlash: Whether there is backlash to enter.
     """
     verdict, lead = verdict_of(findings), findings[0]
@@ -348,8 +357,8 @@ def _decide(findings: Sequence[Finding], *, firmware: bool, backlash: bool) -> D
             if backlash:
                 headline = f"{headline} {words.BACKLASH_HEADLINE}"
             return Decision(verdict, headline, finding.text, finding.action)
-    why = first_of(findings, *EXPLANATIONS)
-    reason, action = ("", "") if why is None else (why.text, why.action)
+    explanation = first_of(findings, *EXPLANATIONS)
+    reason, action = ("", "") if explanation is None else (explanation.text, explanation.action)
     if firmware:
         return Decision(verdict, headlines[verdict], reason, words.FIRMWARE_STEP)
     return Decision(verdict, headlines[verdict], reason, f"{words.NEXT_STEP} {action}".strip())

@@ -1,4 +1,4 @@
-"""The tool of a calibrated machine: over which region, and how it answers to errors."""
+"""Tool of a calibrated machine: its positions over a workspace and their sensitivities."""
 
 from __future__ import annotations
 
@@ -15,42 +15,50 @@ from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.conditions import APPROACH, UseConditions, UseSamples, sample_use
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
+from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.sensitivity import ToolSensitivity
-from orthocal.kinematics.workspace import Workspace, find_workspace
+from orthocal.kinematics.workspace import Workspace
 from orthocal.robot.model import Robot
 
-KEPT = 4
-"""Calibrations whose tools are kept."""
+TOOL_CACHE_SIZE = 4
+"""Number of calibrations whose tools are cached."""
 
-MOST_DEVIATIONS = 8
-"""Deviations of tools that are kept."""
+DEVIATION_CACHE_SIZE = 8
+"""Number of cached deviations of tools."""
 
 LIMIT_SLACK = 1e-9
-"""By which a drive may seem to be beyond its travel, [m, rad]."""
+"""Rounding error by which a drive may exceed its travel, [m, rad]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibratedTool:
-    """The tool of a calibrated machine at commanded points, under C conditions of use in turn."""
+    """Tool of a calibrated machine at K commanded points under C conditions of use.
+
+    Arrays with C K rows hold all points under the first condition, then under the second etc.
+    """
 
     workspace: Workspace
-    """The points, once for each of the conditions."""
+    """The C K points."""
     use: UseSamples
     """The conditions."""
     targets: Array
-    """Where a nominal machine's tool would be, shape (C K, 3), [m]."""
+    """Commanded tool positions: those of the nominal machine, shape (C K, 3), [m]."""
     drives: Array
     """Drive coordinates of a nominal machine, shape (K, n_drives), [m, rad]."""
     passive: Array
-    """Its passive coordinates, shape (K, n_passive), [m, rad]: others are near."""
+    """Passive coordinates of a nominal machine, shape (K, n_passive), [m, rad]. Those of the
+    calibrated machine are close to them."""
     sensitivities: tuple[ToolSensitivity, ...]
-    """Under each of the conditions."""
+    """Sensitivity of the tool under each of the conditions."""
     trims: Array
-    """Displacement of the drives by what the controller compensates, (C, K, n_drives), [m, rad]."""
+    """Displacement of the drives by the controller's compensation, shape (C, K, n_drives),
+    [m, rad]."""
     trims_unstated: Array
-    """The same where the side of approach is not stated, shape (K, n_drives), [m, rad]."""
+    """Displacement of the drives by the controller's compensation if the side of approach is not
+    stated, shape (K, n_drives), [m, rad]."""
     jacobian: Array
-    """∂p/∂θ there, with the offsets active while measuring, shape (C K, 3, n), [m per unit]."""
+    """∂p/∂θ with the offsets that were active while measuring, shape (C K, 3, n),
+    [m per parameter unit]."""
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -58,102 +66,102 @@ class CalibratedTool:
         return self.sensitivities[0].free
 
     def compensating(self, backlash: Array) -> CalibratedTool:
-        """The tool with a controller that takes up more backlash.
+        """Tool with a controller that compensates more backlash.
 
         Args:
-            backlash: Change of the compensated backlash of each drive, (n_drives,), [m, rad].
+            backlash: Change of the compensated backlash of each drive, shape (n_drives,), [m, rad].
         """
         if not backlash.any():
             return self
-        unknown = "u" * backlash.size
-        sides = [[APPROACH[s] for s in c.approach or unknown] for c in self.use.conditions]
+        unstated = "u" * backlash.size
+        sides = [[APPROACH[s] for s in c.approach or unstated] for c in self.use.conditions]
         trims = self.trims + 0.5 * np.array(sides)[:, None, :] * backlash
         return replace(self, trims=read_only(trims))
 
     def deviation(self, offsets: ArrayLike, *, names: Sequence[str] | None = None) -> Array:
-        """Actual less commanded position of the tool, shape (C K, 3), [m].
+        """Actual minus commanded position of the tool, shape (C K, 3), [m].
 
         Args:
-            offsets: In the controller, shape (n_drives,), [m, rad].
-            names: What to call the points in messages.
+            offsets: Offsets in the controller, shape (n_drives,), [m, rad].
+            names: Names of the points, for messages.
         """
-        at = np.asarray(offsets, dtype=np.float64)
+        offset_array = np.asarray(offsets, dtype=np.float64)
         if names is None:
-            return np.array(_deviation(self, at.tobytes()))
-        return self._place(self.drives - at + self.trims, names) - self.targets
+            return np.array(_deviation(self, offset_array.tobytes()))
+        return self._place(self.drives - offset_array + self.trims, names) - self.targets
 
-    def deviation_unless_stated(self) -> Array:
-        """Error of a controller that corrects all errors for the conditions of `UseConditions()`.
-
-        Shape (C K, 3), [m].
-        """
-        closure, points = self.middle, self.workspace.points[: len(self.drives)]
+    def deviation_ignoring_conditions(self) -> Array:
+        """Tool error if all errors are corrected for `UseConditions()`, shape (C K, 3), [m]."""
+        closure, points = self.closure_of_reference, self.workspace.points[: len(self.drives)]
         commanded, passive = closure.reach(points)
         reached = closure.tcp(commanded, passive)
         commanded = commanded + self.trims - self.trims_unstated
         return self._place(commanded, None) - np.tile(reached, (self.use.size, 1))
 
     @property
-    def middle(self) -> LoopClosure:
-        """Closures of the machine under conditions that are not stated."""
+    def closure_of_reference(self) -> LoopClosure:
+        """Closures of the machine under the reference conditions, `UseConditions()`."""
         closure = self.sensitivities[0].closure
         return LoopClosure(closure.robot, fixed=closure.fixed, conditions=UseConditions())
 
     def _place(self, commanded: Array, names: Sequence[str] | None) -> Array:
-        """Tool under each of the conditions at its drive coordinates, shape (C K, 3), [m].
+        """Tool positions under each of the conditions, shape (C K, 3), [m].
 
         Args:
-            commanded: Shape (C, K, n_drives), [m, rad].
-            names: What to call the points in messages.
+            commanded: Drive coordinates, shape (C, K, n_drives), [m, rad].
+            names: Names of the points, for messages.
         """
         closures = (s.closure for s in self.sensitivities)
-        workspaces = [
+        positions = [
             c.forward(drives, start=self.passive, names=names)
             for c, drives in zip(closures, commanded, strict=True)
         ]
-        return np.concatenate(workspaces)
+        return np.concatenate(positions)
 
 
-@lru_cache(maxsize=MOST_DEVIATIONS)
+@lru_cache(maxsize=DEVIATION_CACHE_SIZE)
 def _deviation(tool: CalibratedTool, offsets: bytes) -> Array:
-    """Deviation with offsets in the controller, of the last ones: several figures need it."""
+    """Deviation with offsets in the controller, shape (C K, 3), [m].
+
+    Cached, because several figures need it. Offsets are bytes, as arrays are not hashable.
+    """
     return tool._place(tool.drives - np.frombuffer(offsets) + tool.trims, None) - tool.targets
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=TOOL_CACHE_SIZE)
 def find_tool(calibration: Calibration, use: UseSamples | None = None) -> CalibratedTool | None:
-    """The tool over the workspace, or over the largest box of its shape that the machine reaches.
+    """Tool over the workspace, or over the largest reachable box of its shape.
 
-    The tools of the last calibrations are kept: values to enter and tool errors need them.
-
-    That is within all limits and reached by the nominal and the calibrated machine, with the
+    The box is within all limits and reached by the nominal and the calibrated machine, with the
     offsets that were active while measuring and with the identified ones.
+
+    Cached, because values to enter and tool errors need it.
 
     Args:
         calibration: The calibration.
-        use: Conditions of use; those that the robot's YAML states by default.
+        use: Conditions of use; by default those that the robot's YAML states.
 
     Returns:
-        None for a robot whose drives do not command a tool, or whose tool hardly moves.
+        None if the drives do not command a tool, or if no box of ±1 mm can be reached.
     """
     robot = calibration.robot
     if robot.tcp is None or len(robot.tcp.coordinates) != len(robot.drives):
         return None
     use = sample_use(robot) if use is None else use
     sensitivities = _sensitivities(calibration, use)
-    identified = calibration.offsets
+    identified_offsets = calibration.offsets
 
-    def reach(points: Array) -> None:
+    def require_reach(points: Array) -> None:
         drives, passive = nominal_closure(robot).reach(points)
-        for offsets in (calibration.active_offsets, identified):
+        for offsets in (calibration.active_offsets, identified_offsets):
             _require_travel(robot, drives - offsets)
             sensitivities[0].closure.forward(drives - offsets, start=passive)
 
     try:
-        space = find_workspace(robot, reach)
+        workspace = find_workspace(robot, require_reach)
     except ClosureError:
         return None
-    return _place(calibration, space, use, sensitivities)
+    return _place(calibration, workspace, use, sensitivities)
 
 
 def place_tool(
@@ -163,26 +171,26 @@ def place_tool(
     *,
     names: Sequence[str] | None = None,
 ) -> CalibratedTool:
-    """The tool of a calibrated machine over given points.
+    """Tool of a calibrated machine at commanded points.
 
     Args:
         calibration: The calibration.
         workspace: The points.
-        use: Conditions of use; those that the robot's YAML states by default.
-        names: What to call the points in messages.
+        use: Conditions of use; by default those that the robot's YAML states.
+        names: Names of the points, for messages.
 
     Raises:
         RobotError: If the robot has no tool centre point, or the drives do not command it.
         ClosureError: If a point cannot be reached.
     """
-    named = names or [f"point {i + 1}" for i in range(len(workspace.points))]
+    point_names = names or [f"point {i + 1}" for i in range(len(workspace.points))]
     samples = sample_use(calibration.robot) if use is None else use
     sensitivities = _sensitivities(calibration, samples)
-    return _place(calibration, workspace, samples, sensitivities, named)
+    return _place(calibration, workspace, samples, sensitivities, point_names)
 
 
 def _sensitivities(calibration: Calibration, use: UseSamples) -> tuple[ToolSensitivity, ...]:
-    """Tool sensitivity by the free parameters, the unmodelled errors and the remaining offsets."""
+    """Sensitivity of the tool to free parameters, unmodelled errors and the remaining offsets."""
     robot, errors = calibration.robot, calibration.errors
     free = [*(p.name for p in calibration.free), *calibration.unmodelled.names]
     is_offset = [row.any() for row in calibration.offset_weights]
@@ -195,20 +203,21 @@ def _sensitivities(calibration: Calibration, use: UseSamples) -> tuple[ToolSensi
 
 def _place(
     calibration: Calibration,
-    space: Workspace,
+    workspace: Workspace,
     use: UseSamples,
     sensitivities: tuple[ToolSensitivity, ...],
     names: Sequence[str] | None = None,
 ) -> CalibratedTool:
+    """Tool at the points of a workspace; arguments as for `place_tool`."""
     nominal = nominal_closure(calibration.robot)
-    drives, passive = nominal.reach(space.points, names=names)
+    drives, passive = nominal.reach(workspace.points, names=names)
     commanded = drives - calibration.active_offsets
     jacobians = []
     for sensitivity in sensitivities:
         closed = sensitivity.closure.close(commanded, start=passive, names=names)
         jacobians.append(sensitivity(commanded, passive=closed))
     return CalibratedTool(
-        workspace=space.repeat(use.size),
+        workspace=workspace.repeat(use.size),
         use=use,
         targets=read_only(np.tile(nominal.tcp(drives, passive), (use.size, 1))),
         drives=read_only(drives),
@@ -228,16 +237,17 @@ def _require_travel(robot: Robot, drives: Array) -> None:
 
 
 def error_covariance(calibration: Calibration) -> Array:
-    """Covariance of what the estimate has wrong, free and unmodelled parameters in turn, [SI].
+    """Covariance of the errors of the estimate, free parameters before unmodelled ones, [SI].
 
-    With e = θ − θ̂ it is −L θᵤ and the estimate's own scatter for the free ones, θᵤ for the others.
+    Unmodelled errors θᵤ ~ N(0, V) bias the estimate by L θᵤ (leakage L). With C the covariance of
+    the free parameters without unmodelled errors it is [[C + L V Lᵀ, −L V], [−V Lᵀ, V]].
     """
     unmodelled = calibration.unmodelled
     variance = unmodelled.prior_stds**2
-    taken_on = unmodelled.leakage * variance
+    cross = unmodelled.leakage * variance
     return np.block(
         [
-            [calibration.model_covariance + taken_on @ unmodelled.leakage.T, -taken_on],
-            [-taken_on.T, np.diag(variance)],
+            [calibration.model_covariance + cross @ unmodelled.leakage.T, -cross],
+            [-cross.T, np.diag(variance)],
         ]
     )

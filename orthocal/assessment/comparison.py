@@ -1,4 +1,4 @@
-"""Models of one machine side by side on one session, each linearised and exact."""
+"""Comparison of models of one machine on one session, each linearised and exact."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from orthocal.assessment.judgement import Judgement, judge_session, rank
 from orthocal.assessment.predictive import Repetition, measure_repetition
 from orthocal.assessment.recommendation import Recommendation, recommend_model
 from orthocal.assessment.scores import ModelResult, Score, Undetermined, score_model
-from orthocal.assessment.tool_error import ErrorSize
+from orthocal.assessment.tool_error import ErrorStatistics
 from orthocal.assessment.words import comparison as words
 from orthocal.assessment.words.entries import SESSION_HEADLINES
 from orthocal.assessment.words.validation import describe_repetition
@@ -36,19 +36,19 @@ CRITERIA = ("rms", "chi_square", "dof", "aicc", "bic", "unseen_rms")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """Models of one robot side by side on one session."""
+    """Comparison of models of one robot on one session."""
 
     title: str
     labels: tuple[str, ...]
-    """Labels of the readings of the session."""
+    """Labels of the readings, with the cycle if there are several."""
     noise: KnownNoise
     """Noise with which residuals are compared."""
     independent: int
-    """Independent readings: distinct readings less gauge zeros."""
+    """Independent readings: distinct readings minus gauge zeros."""
     results: tuple[ModelResult, ...]
     undetermined: tuple[Undetermined, ...]
     repetition: Repetition | None
-    """Residuals of the recommended model against those of another session."""
+    """Correlation of the residuals of the recommended model with those of another session."""
     repeat_title: str
     """Title of the other session; empty if there is none."""
     recommendation: Recommendation
@@ -78,7 +78,7 @@ class Comparison:
         return _assess(self)
 
     def to_json(self) -> str:
-        """JSON document, SI units."""
+        """Comparison as a JSON document, SI units."""
         document = {
             "schema": "orthocal/comparison/4",
             "title": self.title,
@@ -112,36 +112,38 @@ def compare_models(
     options: SolverOptions | None = None,
     judgement: Judgement | None = None,
 ) -> Comparison:
-    """Identify a session by several models, linearised and exactly, and recommend one.
+    """Identify several models from a session, linearised and exactly, and recommend one.
 
     Args:
         sessions: The session, or several, or paths to them.
         models: Models of the robot's YAML; all by default.
-        tolerances: As in `Choice`, for all models and the judgement of the readings.
-        repeat: Another session of the same rows, or several, to compare the residuals with.
+        tolerances: Tolerances as in `Choice`, for all models and the judgement of the readings.
+        repeat: Another session of the same rows, or several, whose residuals are compared.
         options: Solver and its options.
         judgement: Judgement of the sessions with these tolerances, if it was computed already.
 
     Raises:
         ParameterError: If a model or name is unknown.
-        SessionError: If the other session is of another robot, or the same one.
+        SessionError: If a session of `repeat` is of another robot, or is one of `sessions`.
         SolverError: If the solver does not converge.
         ClosureError: If the machine cannot reach a posture.
     """
-    chosen = [s.with_tolerances(tolerances or {}) for s in gather_sessions(sessions)]
+    gathered = [s.with_tolerances(tolerances or {}) for s in gather_sessions(sessions)]
     require_names(models or (), argument="models")
-    session = join_sessions(chosen)
-    others = _gather_others(() if repeat is None else repeat, tolerances or {}, chosen)
+    session = join_sessions(gathered)
+    others = _gather_repeats(() if repeat is None else repeat, tolerances or {}, gathered)
     noise = find_known_noise(session)
-    cycles = len({r.cycle for r in session.readings}) > 1
+    several_cycles = len({r.cycle for r in session.readings}) > 1
     judgement = judgement or judge_session(session)
     build = partial(build_problem, session, tolerance_scale=judgement.tolerance_scale)
     names = models or session.robot.parameters.models
     results, undetermined = _score_models(build, names, noise.sigma, options)
     recommendation = recommend_model(session, models)
-    compared = Comparison(
+    comparison = Comparison(
         title=session.title,
-        labels=tuple(r.label + (f", cycle {r.cycle}" if cycles else "") for r in session.readings),
+        labels=tuple(
+            r.label + (f", cycle {r.cycle}" if several_cycles else "") for r in session.readings
+        ),
         noise=noise,
         independent=results[0].spare + results[0].rank if results else 0,
         results=results,
@@ -156,11 +158,11 @@ def compare_models(
             for r in results
         ),
     )
-    if compared.best is None or not others:
-        return compared
-    best = compared.best.calibration
-    again = repeat_calibration(best, others)
-    return replace(compared, repetition=measure_repetition(best, again))
+    if comparison.best is None or not others:
+        return comparison
+    best = comparison.best.calibration
+    repeated = repeat_calibration(best, others)
+    return replace(comparison, repetition=measure_repetition(best, repeated))
 
 
 def _score_models(
@@ -169,23 +171,23 @@ def _score_models(
     noise: float,
     options: SolverOptions | None,
 ) -> tuple[tuple[ModelResult, ...], tuple[Undetermined, ...]]:
-    """Results of the models, the smallest first, and those that are not identifiable."""
+    """Results of the models, the smallest first, and models that are not identifiable."""
     results, undetermined = [], []
     for model in dict.fromkeys(models):
-        score = _score_with_prior(partial(build, model=model), noise, options)
-        if isinstance(score, Undetermined):
-            undetermined.append(score)
+        result = _score_with_prior(partial(build, model=model), noise, options)
+        if isinstance(result, Undetermined):
+            undetermined.append(result)
         else:
-            results.append(score)
+            results.append(result)
     return tuple(sorted(results, key=lambda r: r.n_free)), tuple(undetermined)
 
 
 def _score_with_prior(
     build: Callable[..., CalibrationProblem], noise: float, options: SolverOptions | None
 ) -> ModelResult | Undetermined:
-    """Score a model; with its tolerances as a prior if the readings alone do not determine it.
+    """Score a model, with its tolerances as a prior if the readings alone do not determine it.
 
-    Larger models always have a prior. A small model without one would be at a disadvantage.
+    Larger models always have a prior, so a small model that lacks one would be at a disadvantage.
     """
     problem = build()
     try:
@@ -199,40 +201,41 @@ def _score_with_prior(
 
 
 def _assess(comparison: Comparison) -> Assessment:
-    judged, best = comparison.judgement, comparison.best
+    """Assessment of a comparison: judgement of the readings and findings about the models."""
+    judgement, best = comparison.judgement, comparison.best
     notes = words.describe_recommendation(comparison.recommendation)
     notes += [words.not_determined(u.model, u.reason) for u in comparison.undetermined]
     notes += words.describe_effects(comparison.effects, len(comparison.labels))
     tool = None
     if best is not None:
-        assessed = comparison.assessments[comparison.results.index(best)]
-        notes += _others(comparison, best)
-        notes += assessed.of_kind(*get_args(NoiseKind))
+        best_assessment = comparison.assessments[comparison.results.index(best)]
+        notes += _models_not_recommended(comparison, best)
+        notes += best_assessment.of_kind(*get_args(NoiseKind))
         if comparison.repetition is not None:
             title = comparison.repeat_title
             notes.append(describe_repetition(comparison.repetition, title=title))
-        tool = assessed.tool
-        notes += assessed.of_kind("tool error", "out of reach")
+        tool = best_assessment.tool
+        notes += best_assessment.of_kind("tool error", "out of reach")
         if best.linearisation_cost is not None:
             notes.append(words.linearisation_cost(best.linearisation_cost.rms))
-    findings = rank([*judged.findings, *notes])
+    findings = rank([*judgement.findings, *notes])
     lead = next((f for f in findings if f.severity != "note"), notes[0])
-    headline = SESSION_HEADLINES[judged.verdict]
+    headline = SESSION_HEADLINES[judgement.verdict]
     return Assessment(
-        Decision(judged.verdict, headline, lead.text, lead.action),
+        Decision(judgement.verdict, headline, lead.text, lead.action),
         findings,
         (),
         tool,
     )
 
 
-def _others(comparison: Comparison, best: ModelResult) -> list[Finding]:
-    """Models that are not recommended, with the reasons."""
+def _models_not_recommended(comparison: Comparison, best: ModelResult) -> list[Finding]:
+    """Findings about the models that are not recommended."""
     recommendation = comparison.recommendation
     return [
         words.not_recommended(
             r.model,
-            recommendation.of(r.model) - recommendation.of(best.model),
+            recommendation.log_evidence_of(r.model) - recommendation.log_evidence_of(best.model),
             r.exact.unseen_rms,
             best.exact.unseen_rms,
         )
@@ -241,13 +244,13 @@ def _others(comparison: Comparison, best: ModelResult) -> list[Finding]:
     ]
 
 
-def _gather_others(
+def _gather_repeats(
     repeat: Given | Sequence[Given], tolerances: Mapping[str, float], compared: Sequence[Session]
 ) -> list[Session]:
-    """Sessions to repeat with, which are none of those compared.
+    """Sessions whose residuals are compared, none of which is one of the compared sessions.
 
     Raises:
-        SessionError: As `_require_another`.
+        SessionError: If a session is of another robot, or is one of the compared sessions.
     """
     others = [s.with_tolerances(tolerances) for s in gather_sessions(repeat)]
     for other in others:
@@ -256,7 +259,7 @@ def _gather_others(
 
 
 def _require_another(other: Session, sessions: Sequence[Session]) -> None:
-    """Refuse a session for `repeat` that is of another robot, or one of the compared sessions."""
+    """Refuse a session of `repeat` that is of another robot, or is one of the compared sessions."""
     where = None if other.path is None else str(other.path)
     for session in sessions:
         if other.robot.sha256 != session.robot.sha256:
@@ -272,7 +275,7 @@ def _require_another(other: Session, sessions: Sequence[Session]) -> None:
 
 
 def find_known_noise(session: Session) -> KnownNoise:
-    """Noise of a reading without any model: from cycles, otherwise as stated for the gauge."""
+    """Noise of a reading without any model: scatter between cycles, otherwise as stated."""
     problem = build_problem(session, free=["*.offset"])
     sigma, dof = estimate_repeatability(problem.values, problem.observations)
     if dof > 0 and sigma > 0.0:
@@ -282,22 +285,25 @@ def find_known_noise(session: Session) -> KnownNoise:
     return KnownNoise(math.nan, "unknown")
 
 
-def _effects_document(found: EffectComparison) -> dict[str, Any]:
+def _effects_document(comparison: EffectComparison) -> dict[str, Any]:
+    """Entries of the JSON document about effects."""
     return {
-        "recommended": list(found.recommended),
+        "recommended": list(comparison.recommended),
         "weighed": [
             {
                 "effects": list(w.effects),
                 "log_evidence": finite_or_none(w.log_evidence),
                 "unseen_rms": finite_or_none(w.unseen_rms),
             }
-            for w in found.weighed
+            for w in comparison.weighed
         ],
-        "lacking": {name: count for name, (count, _) in found.lacking.items()},
+        "lacking": {name: count for name, (count, _) in comparison.lacking.items()},
     }
 
 
 def _result_document(result: ModelResult) -> dict[str, Any]:
+    """Entries of the JSON document about one model."""
+
     def score(s: Score) -> dict[str, Any]:
         return {
             "estimates": dict(s.estimates),
@@ -305,12 +311,12 @@ def _result_document(result: ModelResult) -> dict[str, Any]:
             **{name: finite_or_none(getattr(s, name)) for name in CRITERIA},
         }
 
-    def size(s: ErrorSize | None) -> dict[str, float] | None:
+    def size(s: ErrorStatistics | None) -> dict[str, float] | None:
         if s is None:
             return None
         return {"rms": s.rms, "percentile_95": s.percentile_95, "largest": s.largest}
 
-    after = None if result.tool is None else result.tool.after
+    uncertainty = None if result.tool is None else result.tool.after
     return {
         "model": result.model,
         "n_free": result.n_free,
@@ -320,8 +326,12 @@ def _result_document(result: ModelResult) -> dict[str, Any]:
         "linearised": score(result.linearised),
         "exact": score(result.exact),
         "standard_deviations": {p.name: finite_or_none(p.std) for p in result.calibration.free},
-        "tool_uncertainty": size(None if after is None else after.sizes.aligned),
-        "tool_uncertainty_relative": size(None if after is None else after.sizes.relative),
-        "tool_uncertainty_absolute": size(None if after is None else after.sizes.absolute),
+        "tool_uncertainty": size(None if uncertainty is None else uncertainty.sizes.aligned),
+        "tool_uncertainty_relative": size(
+            None if uncertainty is None else uncertainty.sizes.relative
+        ),
+        "tool_uncertainty_absolute": size(
+            None if uncertainty is None else uncertainty.sizes.absolute
+        ),
         "linearisation_at_tool": size(result.linearisation_cost),
     }

@@ -1,12 +1,10 @@
 """Offsets, backlash and errors of screws to enter into a controller that corrects nothing else.
 
-A machine whose legs and axes are off as well is not served best by its true offsets: others make up
-for a part of its other errors. Entered is what leaves the least error at the tool, over the region
-that it reaches.
+The true offsets are not the best ones if legs and axes have errors, too: other offsets compensate
+a part of them. The offsets to enter minimise the tool error over the workspace.
 
-A backlash or a periodic error of a screw is entered where the readings determine it: where it, or
-its change, is larger than its expanded uncertainty, or where entering it lowers the expected tool
-error.
+A backlash or a periodic error of a screw is entered if the readings determine it. Then it, or its
+change, is larger than its expanded uncertainty, or entering it lowers the expected tool error.
 """
 
 from __future__ import annotations
@@ -25,39 +23,39 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.effects.compensation import Compensation, JointTrim
 from orthocal.effects.loading import robot_effects
-from orthocal.effects.screw import KINDS, Screw
+from orthocal.effects.screw import SCREW_COMPONENTS, Screw
 from orthocal.io.fields import read_only
 
-DECIDED = 1e-2
-"""Ratio of the aligned to the absolute tool error of a direction of the offsets, below which the
-absolute error decides on it: such offsets little more than shift and turn the workspace."""
+ALIGNED_SHARE = 1e-2
+"""Ratio of aligned to absolute tool error below which the absolute error determines a combination
+of offsets. Such offsets mainly translate and rotate the workspace."""
 
 ENTERED_DECIMALS = 6
-"""Step of an entered offset, [m, rad]: 1 µm."""
+"""Decimals of an entered offset in m or rad: 1 µm, 1 µrad."""
 
 WORTH_ENTERING = 0.05
-"""Share by which the expected tool error must fall for the offsets to be entered. Also that by
-which it must fall for a correction of all errors to be recommended."""
+"""Smallest relative reduction of the expected tool error for which offsets are entered, or a
+correction of all errors is recommended."""
 
-IN_TWO = math.sqrt(-2.0 * math.log(0.05)) / 1.96
-"""Radius of the ellipse that contains 95 % of two estimates, over the expanded uncertainty of one
-(1.25)."""
+ELLIPSE_FACTOR = math.sqrt(-2.0 * math.log(0.05)) / 1.96
+"""Radius of the ellipse that contains 95 % of two estimates, relative to the expanded uncertainty
+of one (1.25)."""
 
 POSITIONS = 64
-"""Positions, over two turns, at which a table is compared with a periodic error."""
+"""Positions over two turns at which a periodic error is fitted to a table."""
 
-MOST_STEPS = 12
+MAX_STEPS = 12
+"""Largest number of Gauss-Newton steps."""
 
-SETTLED = 1e-10
-"""Steps of the offsets that are none, [m, rad]."""
+STEP_TOLERANCE = 1e-10
+"""Step of the offsets at which the iteration ends, [m, rad]."""
 
 
 def find_entries(calibration: Calibration) -> tuple[ControllerEntry, ...]:
     """Offsets to enter into a controller that corrects offsets only.
 
-    As the assessment records them: those that leave the least error at the tool
-    (`choose_offsets`), or the active ones where the offsets stay as they are. Empty where no offset
-    was identified.
+    These are the entries of the assessment: the offsets with the least tool error
+    (`choose_offsets`), or the active ones if they are kept. Empty if no offset was identified.
     """
     if calibration.assessment is not None:
         return calibration.assessment.entries
@@ -67,64 +65,67 @@ def find_entries(calibration: Calibration) -> tuple[ControllerEntry, ...]:
 
 
 def find_backlash(calibration: Calibration) -> tuple[BacklashEntry, ...]:
-    """Backlash to enter of each drive, as the assessment records it; empty without any."""
+    """Backlash to enter for each drive, as recorded in the assessment; empty if there is none."""
     if calibration.assessment is not None:
         return calibration.assessment.backlash
     return compute_backlash(calibration, find_tool(calibration))
 
 
 def backlash_changes(calibration: Calibration, entries: Sequence[BacklashEntry]) -> Array:
-    """Changes of the backlash that the controller takes up, shape (n_drives,), [m, rad]."""
+    """Changes of the backlash that the controller compensates, shape (n_drives,), [m, rad]."""
     changes = {e.drive: e.change for e in entries}
     return np.array([changes.get(d.name, 0.0) for d in calibration.robot.drives])
 
 
 def compensation_to_enter(calibration: Calibration) -> Compensation:
-    """Compensation of a controller that takes up the backlash to enter.
+    """Compensation of the controller with the backlash to enter.
 
-    Empty where nothing changes, and beside tables: an export writes others.
+    Empty if nothing changes, or if the controller has tables: an export replaces these.
     """
     changes = backlash_changes(calibration, find_backlash(calibration))
-    tables = any(trim.table is not None for trim in calibration.session.compensation)
-    if tables or not changes.any():
+    has_tables = any(trim.table is not None for trim in calibration.session.compensation)
+    if has_tables or not changes.any():
         return ()
     entered = np.round(calibration.compensated_backlash + changes, ENTERED_DECIMALS)
     return tuple(map(JointTrim, entered.tolist()))
 
 
 def lowers(now: float, then: float) -> bool:
-    """True if an expected tool error, [m], falls enough to enter or to correct something."""
+    """True if a change of the expected tool error, [m], is worth entering or correcting."""
     return not then > (1.0 - WORTH_ENTERING) * now
 
 
 def compute_backlash(
     calibration: Calibration, tool: CalibratedTool | None
 ) -> tuple[BacklashEntry, ...]:
-    """Backlash to enter of each drive, computed anew.
+    """Compute the backlash to enter for each drive.
 
     Args:
         calibration: The calibration.
         tool: Its tool over the workspace; None if there is none.
     """
-    by_name = {p.name: p for p in calibration.parameters}
+    by_name = {estimate.name: estimate for estimate in calibration.parameters}
     active = calibration.compensated_backlash.tolist()
     entries, changes, determined = [], [], []
-    for drive, now in zip(calibration.robot.drives, active, strict=True):
-        p = by_name.get(f"{drive.name}.backlash")
-        if p is None or not (p.free or p.value):
+    for drive, active_backlash in zip(calibration.robot.drives, active, strict=True):
+        estimate = by_name.get(f"{drive.name}.backlash")
+        if estimate is None or not (estimate.free or estimate.value):
             continue
-        value, std = max(p.value, 0.0), p.std if p.free else 0.0
-        scatter = p.std_scatter if p.free else 0.0
-        entry = BacklashEntry(drive.name, drive.unit, now, value, value, std, scatter)
-        half = float(calibration.expand(std, scatter))
+        value, std = max(estimate.value, 0.0), estimate.std if estimate.free else 0.0
+        std_scatter = estimate.std_scatter if estimate.free else 0.0
+        entry = BacklashEntry(
+            drive.name, drive.unit, active_backlash, value, value, std, std_scatter
+        )
+        uncertainty = float(calibration.expand(std, std_scatter))
         entries.append(entry)
-        changes.append(_change_of(entry))
-        determined.append(max(value, abs(value - now)) > half)
+        changes.append(_backlash_change(entry))
+        determined.append(max(value, abs(value - active_backlash)) > uncertainty)
     entering = _choose_changes(calibration, tool, changes, determined)
     return tuple(e if enter else e.kept for e, enter in zip(entries, entering, strict=True))
 
 
-def _change_of(entry: BacklashEntry) -> dict[str, float]:
+def _backlash_change(entry: BacklashEntry) -> dict[str, float]:
+    """Parameter of the backlash of a drive to its change, [SI]."""
     return {f"{entry.drive}.backlash": entry.change}
 
 
@@ -134,50 +135,51 @@ def _choose_changes(
     changes: Sequence[Mapping[str, float]],
     determined: Sequence[bool],
 ) -> Sequence[bool]:
-    """Decide on each change: entered if it is determined, or if the others lower the tool error.
+    """Decide which changes are entered: all if the undetermined ones lower the tool error enough.
 
     Args:
         calibration: The calibration.
         tool: Its tool over the workspace; None if there is none.
-        changes: Change of what the controller corrects, parameter to amount, [SI].
-        determined: Whether each is larger than its expanded uncertainty.
+        changes: Changes of the controller's correction, each parameter to amount, [SI].
+        determined: Whether each change is larger than its expanded uncertainty.
     """
-    unclear: dict[str, float] = {}
-    for change, known in zip(changes, determined, strict=True):
-        unclear |= {} if known else change
-    return [True] * len(changes) if _changes_tool(calibration, tool, unclear) else determined
+    undetermined: dict[str, float] = {}
+    for change, is_determined in zip(changes, determined, strict=True):
+        if not is_determined:
+            undetermined |= change
+    return [True] * len(changes) if _changes_tool(calibration, tool, undetermined) else determined
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScrewEntry:
-    """Periodic error of a drive's screw, A sin(2πρ/lead) + B cos(2πρ/lead), for a table."""
+    """Periodic error of a screw, A sin(2πρ/lead) + B cos(2πρ/lead), for a table."""
 
     drive: str
     active: Array
-    """A and B that the controller corrects now, shape (2,), [m]."""
+    """A and B that the controller corrects at present, shape (2,), [m]."""
     identified: Array
     """A and B of the identified machine, shape (2,), [m]."""
     enter: Array
-    """A and B to enter: `identified`, or those active now if the change is undetermined."""
+    """A and B to enter: `identified`, or `active` if the change is undetermined."""
     uncertainty: float
     """Expanded uncertainty of the amplitude, [m]."""
 
     @property
     def change(self) -> Array:
-        """Values to enter less the active ones, shape (2,), [m]."""
+        """Values to enter minus the active ones, shape (2,), [m]."""
         return self.enter - self.active
 
     @property
     def values(self) -> dict[str, float]:
         """Parameter to value to enter, [m]."""
-        return _by_parameter(self.drive, self.enter)
+        return _screw_parameters(self.drive, self.enter)
 
 
 def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
-    """Periodic errors of screws to enter, by the rule for backlash; empty without any.
+    """Periodic errors of screws to enter, by the rule for backlash; empty if there are none.
 
-    An amplitude is determined if A and B are outside the ellipse that contains 95 % of their
-    estimates around 0, or around the active ones.
+    An amplitude is determined if (A, B) is outside the ellipse that contains 95 % of the estimates
+    around 0, or outside that around the active values.
     """
     robot = calibration.robot
     screw = next((e for e in robot_effects(robot) if isinstance(e, Screw)), None)
@@ -185,16 +187,17 @@ def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
         return ()
     errors, entries, determined = calibration.errors, [], []
     for drive, active in zip(robot.drives, _compensated_screws(calibration, screw), strict=True):
-        names = [f"{drive.name}.{kind}" for kind in KINDS]
-        value = np.array([errors.get(name, 0.0) for name in names])
-        if not (value.any() or active.any()):
+        names = [f"{drive.name}.{kind}" for kind in SCREW_COMPONENTS]
+        identified = np.array([errors.get(name, 0.0) for name in names])
+        if not (identified.any() or active.any()):
             continue
-        half = _amplitude_uncertainty(calibration, names, value)
-        other = _amplitude_uncertainty(calibration, names, value - active)
-        entries.append(ScrewEntry(drive.name, active, value, value, half))
-        sizes = np.linalg.norm([value, value - active], axis=1)
-        determined.append(bool((sizes > IN_TWO * np.array([half, other])).any()))
-    changes = [_by_parameter(e.drive, e.change) for e in entries]
+        uncertainty = _amplitude_uncertainty(calibration, names, identified)
+        change_uncertainty = _amplitude_uncertainty(calibration, names, identified - active)
+        entries.append(ScrewEntry(drive.name, active, identified, identified, uncertainty))
+        amplitudes = np.linalg.norm([identified, identified - active], axis=1)
+        limits = ELLIPSE_FACTOR * np.array([uncertainty, change_uncertainty])
+        determined.append(bool((amplitudes > limits).any()))
+    changes = [_screw_parameters(e.drive, e.change) for e in entries]
     entering = _choose_changes(calibration, find_tool(calibration), changes, determined)
     return tuple(
         e if enter else replace(e, enter=e.active)
@@ -202,8 +205,9 @@ def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
     )
 
 
-def _by_parameter(drive: str, values: Array) -> dict[str, float]:
-    return dict(zip((f"{drive}.{kind}" for kind in KINDS), values.tolist(), strict=True))
+def _screw_parameters(drive: str, values: Array) -> dict[str, float]:
+    """Parameters A and B of the screw of a drive to their values, [m]."""
+    return dict(zip((f"{drive}.{kind}" for kind in SCREW_COMPONENTS), values.tolist(), strict=True))
 
 
 def _amplitude_uncertainty(
@@ -211,43 +215,44 @@ def _amplitude_uncertainty(
 ) -> float:
     """Expanded uncertainty of A and B in the direction of an amplitude, [m].
 
-    Of the ellipse wᵀ C⁻¹ w = k² it is the radius in this direction; 0 if both are known.
+    It is the radius of the ellipse wᵀ C⁻¹ w = k² in this direction; 0 if A and B are not free.
     """
     free = [p.name for p in calibration.free]
-    at = [free.index(name) for name in names if name in free]
-    size = float(np.linalg.norm(amplitude))
-    if len(at) < len(names) or not size:
+    columns = [free.index(name) for name in names if name in free]
+    length = float(np.linalg.norm(amplitude))
+    if len(columns) < len(names) or not length:
         return 0.0
     total, scatter = (
-        c[np.ix_(at, at)] for c in (calibration.total_covariance, calibration.noise_covariance)
+        c[np.ix_(columns, columns)]
+        for c in (calibration.total_covariance, calibration.noise_covariance)
     )
-    unit = amplitude / size
-    std = 1.0 / math.sqrt(float(unit @ np.linalg.solve(total, unit)))
-    of_noise = math.sqrt(max(float(unit @ scatter @ unit), 0.0))
-    return float(calibration.expand(std, min(of_noise, std)))
+    direction = amplitude / length
+    std = 1.0 / math.sqrt(float(direction @ np.linalg.solve(total, direction)))
+    std_scatter = math.sqrt(max(float(direction @ scatter @ direction), 0.0))
+    return float(calibration.expand(std, min(std_scatter, std)))
 
 
 def _compensated_screws(calibration: Calibration, screw: Screw) -> Array:
     """A and B that tables of the controller corrected while measuring, shape (n_drives, 2), [m]."""
-    robot, found = calibration.robot, []
+    robot, amplitudes = calibration.robot, []
     for i, drive in enumerate(robot.drives):
         displayed = np.tile(robot.drive_zero, (POSITIONS, 1))
         if drive.unit == "m":
             displayed[:, i] += np.linspace(-screw.lead, screw.lead, POSITIONS)
-        moved = calibration.displacement(displayed)[:, i]
+        displacement = calibration.displacement(displayed)[:, i]
         phase = 2.0 * np.pi * (displayed[:, i] - calibration.active_offsets[i]) / screw.lead
         waves = np.column_stack([np.sin(phase), np.cos(phase), np.ones(POSITIONS)])
-        found.append(-np.linalg.lstsq(waves, moved, rcond=None)[0][:2])
-    return np.array(found)
+        amplitudes.append(-np.linalg.lstsq(waves, displacement, rcond=None)[0][:2])
+    return np.array(amplitudes)
 
 
 def is_worth_changing(
     calibration: Calibration, tool: CalibratedTool | None, entries: Sequence[BacklashEntry]
 ) -> bool:
-    """True if backlash is to be entered even where the offsets stay as they are."""
+    """True if the backlash is worth entering although the offsets are kept."""
     changes: dict[str, float] = {}
     for e in entries:
-        changes |= _change_of(e)
+        changes |= _backlash_change(e)
     return any(
         abs(e.change) > float(calibration.expand(e.std, e.std_scatter)) for e in entries
     ) or _changes_tool(calibration, tool, changes)
@@ -256,32 +261,32 @@ def is_worth_changing(
 def _changes_tool(
     calibration: Calibration, tool: CalibratedTool | None, changes: Mapping[str, float]
 ) -> bool:
-    """True if changes of what the controller corrects lower the expected tool error enough.
+    """True if changes of the controller's correction lower the expected tool error enough.
 
-    That of a controller which corrects all other errors, to first order.
+    The tool error is computed to first order, as if all other errors were corrected.
 
     Args:
         calibration: The calibration.
         tool: Its tool over the workspace; None if there is none.
-        changes: Parameter to the change, [SI].
+        changes: Parameter to its change, [SI].
     """
     names = [] if tool is None else list(tool.free)
-    known = {n: change for n, change in changes.items() if change}
-    at = [names.index(n) for n in known if n in names]
-    if tool is None or not at or not np.isfinite(calibration.model_covariance).all():
+    nonzero = {n: change for n, change in changes.items() if change}
+    columns = [names.index(n) for n in nonzero if n in names]
+    if tool is None or not columns or not np.isfinite(calibration.model_covariance).all():
         return False
-    change = np.array([known[names[i]] for i in at])
+    change = np.array([nonzero[names[i]] for i in columns])
     covariance = error_covariance(calibration)
-    aligned, _ = weigh_field(tool, tool.jacobian[:, :, : len(covariance)])
-    uncertain = math.sqrt(max(float(np.sum((aligned @ covariance) * aligned)), 0.0))
-    left = float(np.linalg.norm(aligned[:, at] @ change))
-    return left > 0.0 and lowers(math.hypot(uncertain, left), uncertain)
+    aligned, _ = weighted_fields(tool, tool.jacobian[:, :, : len(covariance)])
+    uncertainty = math.sqrt(max(float(np.sum((aligned @ covariance) * aligned)), 0.0))
+    deviation = float(np.linalg.norm(aligned[:, columns] @ change))
+    return deviation > 0.0 and lowers(math.hypot(uncertainty, deviation), uncertainty)
 
 
 def entered_offsets(
     calibration: Calibration, entries: Sequence[ControllerEntry] | None = None
 ) -> Array:
-    """Offsets in the controller once they were entered, shape (n_drives,), [m, rad]."""
+    """Offsets in the controller after the entries, shape (n_drives,), [m, rad]."""
     offsets = calibration.active_offsets
     names = [d.name for d in calibration.robot.drives]
     for entry in find_entries(calibration) if entries is None else entries:
@@ -290,42 +295,43 @@ def entered_offsets(
 
 
 def offsets_to_enter(calibration: Calibration) -> Array:
-    """Offsets in the controller once they were entered as printed, shape (n_drives,), [m, rad]."""
+    """Offsets in the controller after the entries as printed, shape (n_drives,), [m, rad]."""
     return np.asarray(entered_offsets(calibration).round(ENTERED_DECIMALS) + 0.0)
 
 
 def compute_entries(
     calibration: Calibration, tool: CalibratedTool | None
 ) -> tuple[ControllerEntry, ...]:
-    """Offsets with the least tool error, computed anew, to be entered all.
+    """Compute the offsets with the least tool error; all of them are to be entered.
 
     Args:
         calibration: The calibration.
         tool: Its tool over the workspace; None if there is none.
     """
     drives, weights = calibration.robot.drives, calibration.offset_weights
-    offset_stds = {
+    parameters_of_drive = {
         i: [calibration.parameters[j] for j in np.flatnonzero(row).tolist()]
         for i, row in enumerate(weights)
         if row.any()
     }
-    if not any(p.free for parts in offset_stds.values() for p in parts):
+    if not any(p.free for parts in parameters_of_drive.values() for p in parts):
         return ()
     names = [p.name for p in calibration.free]
     identified, enter = calibration.offsets, calibration.active_offsets
-    enter[list(offset_stds)] = identified[list(offset_stds)]
-    of_free = weights[:, [j for j, p in enumerate(calibration.parameters) if p.free]]
-    total, scatter = (
-        np.array([_size(row, covariance) for row in of_free])
+    enter[list(parameters_of_drive)] = identified[list(parameters_of_drive)]
+    free_weights = weights[:, [j for j, p in enumerate(calibration.parameters) if p.free]]
+    std, std_scatter = (
+        np.array([_std_of_sum(row, covariance) for row in free_weights])
         for covariance in (calibration.total_covariance, calibration.noise_covariance)
     )
-    judged = None if calibration.only_offsets else tool
-    if judged is not None:
-        chosen = choose_offsets(judged, enter, drives=list(offset_stds))
-        everything = error_covariance(calibration)
+    if calibration.only_offsets:
+        tool = None
+    if tool is not None:
+        chosen = choose_offsets(tool, enter, drives=list(parameters_of_drive))
+        covariance = error_covariance(calibration)
         enter = chosen.offsets
-        total = _spread(chosen.gain[:, : len(everything)], everything)
-        scatter = _spread(chosen.gain[:, : len(names)], calibration.noise_covariance)
+        std = _row_stds(chosen.gain[:, : len(covariance)], covariance)
+        std_scatter = _row_stds(chosen.gain[:, : len(names)], calibration.noise_covariance)
     active = calibration.session.controller_offsets
     return tuple(
         ControllerEntry(
@@ -335,15 +341,16 @@ def compute_entries(
             identified=float(identified[i]),
             best=float(enter[i]),
             enter=float(enter[i]),
-            std=float(total[i]),
-            std_scatter=float(scatter[i]),
-            held=_hold(parts[0]) if judged is None and len(parts) == 1 else None,
+            std=float(std[i]),
+            std_scatter=float(std_scatter[i]),
+            held=_reason_held(parts[0]) if tool is None and len(parts) == 1 else None,
         )
-        for i, parts in offset_stds.items()
+        for i, parts in parameters_of_drive.items()
     )
 
 
-def _hold(p: ParameterEstimate) -> Literal["known", "lower bound", "upper bound"] | None:
+def _reason_held(p: ParameterEstimate) -> Literal["known", "lower bound", "upper bound"] | None:
+    """Reason why the readings do not determine a parameter; None if they do."""
     if not p.free:
         return "known"
     if p.at_bound is None:
@@ -351,99 +358,103 @@ def _hold(p: ParameterEstimate) -> Literal["known", "lower bound", "upper bound"
     return "lower bound" if p.at_bound == "lower" else "upper bound"
 
 
-def _size(weights: Array, covariance: Array) -> float:
-    """Standard deviation of a sum of parameters; those that are not in it may be unknown."""
-    at = np.flatnonzero(weights)
-    weights_there = weights[at]
-    return (
-        math.sqrt(float(weights_there @ covariance[np.ix_(at, at)] @ weights_there))
-        if at.size
-        else 0.0
-    )
+def _std_of_sum(weights: Array, covariance: Array) -> float:
+    """Standard deviation of a weighted sum; parameters with weight 0 may have NaN covariances."""
+    used = np.flatnonzero(weights)
+    if not used.size:
+        return 0.0
+    return math.sqrt(float(weights[used] @ covariance[np.ix_(used, used)] @ weights[used]))
 
 
-def _spread(gain: Array, covariance: Array) -> Array:
+def _row_stds(gain: Array, covariance: Array) -> Array:
+    """Standard deviations of gain θ, shape (n_rows,), for the covariance of θ."""
     return np.asarray(np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", gain, covariance, gain), 0.0)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Entering:
-    """Offsets that serve a controller best which knows of nothing else."""
+class BestOffsets:
+    """Offsets with the least tool error if the controller corrects nothing else."""
 
     offsets: Array
-    """Shape (n_drives,), [m, rad]."""
+    """Offsets, shape (n_drives,), [m, rad]."""
     gain: Array
-    """How they follow from the parameters, to first order, shape (n_drives, n_parameters), [SI]."""
+    """Derivative of the offsets with respect to the parameters, shape (n_drives, n_parameters),
+    [SI]."""
 
 
-def choose_offsets(tool: CalibratedTool, start: Array, *, drives: Sequence[int]) -> Entering:
+def choose_offsets(tool: CalibratedTool, start: Array, *, drives: Sequence[int]) -> BestOffsets:
     """Offsets with the least tool error after alignment of the workpiece.
 
-    Where that leaves them open, since they do little but shift and turn the whole region, the
-    absolute error decides. Of a machine whose only errors are offsets these are they.
+    Combinations of offsets that mainly translate and rotate the workspace are determined by the
+    absolute error. If a machine has no other errors, the result equals its true offsets.
 
     Args:
-        tool: The calibrated machine's tool; its parameters hold an offset for each of the drives.
-        start: Offsets to begin with, shape (n_drives,), [m, rad].
-        drives: Indices of the drives whose offsets are chosen; the others stay.
+        tool: Tool of the calibrated machine; its parameters contain the offsets of the drives.
+        start: Initial offsets, shape (n_drives,), [m, rad].
+        drives: Indices of the drives whose offsets are chosen; the others are fixed.
 
     Raises:
         ClosureError: If the machine cannot reach a point with such offsets.
     """
     names, robot = list(tool.free), tool.sensitivities[0].robot
-    chosen = list(drives)
-    index = [names.index(f"{robot.drives[i].name}.offset") for i in chosen]
-    aligned, absolute = weigh_field(tool, tool.jacobian)
+    rows = list(drives)
+    columns = [names.index(f"{robot.drives[i].name}.offset") for i in rows]
+    aligned, absolute = weighted_fields(tool, tool.jacobian)
     gain = np.zeros((len(start), len(names)))
-    gain[chosen] = solve_in_order(aligned[:, index], absolute[:, index], aligned, absolute)
+    gain[rows] = solve_in_order(aligned[:, columns], absolute[:, columns], aligned, absolute)
     offsets = np.array(start, dtype=np.float64)
-    for _ in range(MOST_STEPS):
-        error = weigh_field(tool, tool.deviation(offsets))
-        step = solve_in_order(aligned[:, index], absolute[:, index], *error)
-        offsets[chosen] += step
-        if np.abs(step).max() < SETTLED:
+    for _ in range(MAX_STEPS):
+        error = weighted_fields(tool, tool.deviation(offsets))
+        step = solve_in_order(aligned[:, columns], absolute[:, columns], *error)
+        offsets[rows] += step
+        if np.abs(step).max() < STEP_TOLERANCE:
             break
-    return Entering(read_only(offsets), read_only(gain))
+    return BestOffsets(read_only(offsets), read_only(gain))
 
 
-def weigh_field(tool: CalibratedTool, field: Array) -> tuple[Array, Array]:
-    """Field of position errors after alignment of the workpiece, and absolute.
+def weighted_fields(tool: CalibratedTool, field: Array) -> tuple[Array, Array]:
+    """Weighted position errors, after alignment of the workpiece and absolute.
 
-    The sum of squares of either is the mean square over the workspace.
+    The sum of squares of each array is the mean square over the workspace.
 
     Args:
-        tool: The tool over its workspace of K points.
-        field: Shape (K, 3, ...), [m].
+        tool: Tool over a workspace of K points.
+        field: Position errors or their derivatives, shape (K, 3, ...), [m].
 
     Returns:
         Two arrays of shape (3 K, ...), [m].
     """
-    root = np.sqrt(tool.workspace.weights)[:, None]
-    parts = (tool.workspace.remove_motion(field, tool.targets), field)
+    roots = np.sqrt(tool.workspace.weights)[:, None]
+    fields = (tool.workspace.remove_motion(field, tool.targets), field)
     aligned, absolute = (
-        (root * p.reshape(len(root), -1)).reshape(-1, *field.shape[2:]) for p in parts
+        (roots * f.reshape(len(roots), -1)).reshape(-1, *field.shape[2:]) for f in fields
     )
     return aligned, absolute
 
 
 def solve_in_order(first: Array, second: Array, first_rows: Array, second_rows: Array) -> Array:
-    """Least-squares solution X of first X = first_rows, where ill-determined of the second system.
+    """Least-squares solution X of first X = first_rows.
 
-    A direction of X is determined by `first` if its effect there is at least DECIDED times its
-    effect in `second`.
+    Directions that the first system determines poorly are solved from second X = second_rows: those
+    whose effect in `first` is less than ALIGNED_SHARE times their effect in `second`.
+
+    Args:
+        first: Shape (m, n).
+        second: Shape (m, n), of full rank.
+        first_rows: Shape (m, ...).
+        second_rows: Shape (m, ...).
     """
-    square = second.T @ second
-    factor = np.linalg.cholesky(square)
+    factor = np.linalg.cholesky(second.T @ second)
     half = np.linalg.solve(factor, first.T)
-    ratios, turned = np.linalg.eigh(half @ half.T)
-    directions = np.linalg.solve(factor.T, turned)
-    determined = ratios > DECIDED**2
+    ratios, rotation = np.linalg.eigh(half @ half.T)
+    directions = np.linalg.solve(factor.T, rotation)
+    determined = ratios > ALIGNED_SHARE**2
     strong = directions[:, determined]
-    result = strong @ np.linalg.lstsq(first @ strong, first_rows, rcond=None)[0]
+    solution = strong @ np.linalg.lstsq(first @ strong, first_rows, rcond=None)[0]
     if not determined.all():
         weak = directions[:, ~determined]
-        result = (
-            result
-            + weak @ np.linalg.lstsq(second @ weak, second_rows - second @ result, rcond=None)[0]
+        solution = (
+            solution
+            + weak @ np.linalg.lstsq(second @ weak, second_rows - second @ solution, rcond=None)[0]
         )
-    return np.asarray(result)
+    return np.asarray(solution)

@@ -1,9 +1,8 @@
-"""Effects beside geometry, weighed by the readings as models are.
+"""Comparison of effects beside geometry by the evidence of the readings.
 
-By the marginal likelihood of the complete model with each set of effects. Effects are added one
-after the other as long as the evidence for them is strong. The prediction of each setup from all
-others is stated, too, but does not decide: it depends on few readings. Under a model that the
-readings support, the estimate with it has the least expected tool error.
+The evidence is the marginal likelihood of the complete model with a set of effects. Effects are
+added one after the other as long as the evidence for them is strong. The cross-validation error of
+setups is reported, but does not decide, as it depends on few readings.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthocal.assessment.recommendation import STRONG, weigh_model
+from orthocal.assessment.recommendation import STRONG, compute_log_evidence
 from orthocal.effects.loading import errors_of_no_model, measurable_effects
 from orthocal.effects.registry import find_effect, order_effects
 from orthocal.errors import RobotError
@@ -25,30 +24,30 @@ from orthocal.session.session import Session
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WeighedEffects:
-    """A set of effects, and what speaks for it."""
+    """A set of effects and the evidence for it."""
 
     effects: tuple[str, ...]
     log_evidence: float
-    """ln p(y) less that without any of the candidates."""
+    """ln p(y) minus that without any of the candidates."""
     unseen_rms: float
-    """RMS error of the prediction of setups from all others, [m]."""
+    """RMS error of the prediction of each setup from all others, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EffectComparison:
-    """Effects that could be identified beside geometry, weighed by the readings."""
+    """Comparison of effects that could be identified beside geometry."""
 
     weighed: tuple[WeighedEffects, ...]
-    """Without effects first, then each by itself, then the supported ones together."""
+    """No effect first, then each effect by itself, then combinations of supported effects."""
     recommended: tuple[str, ...]
-    """Those for which the evidence is strong, whatever left-out setups say."""
+    """Effects with strong evidence, regardless of the cross-validation error."""
     identified: tuple[str, ...]
     """Effects that the session or its robot chooses."""
     named: tuple[str, ...]
-    """Errors of recommended effects that no model contains: `--free` names them."""
+    """Errors of recommended effects that no model contains; they are named by `--free`."""
     lacking: Mapping[str, tuple[int, str]]
-    """Effect that was not weighed to the number of readings without its conditions, and the place
-    of the first."""
+    """Effect that was not compared, mapped to the number of readings that lack its conditions and
+    the place of the first one."""
 
     @property
     def best(self) -> WeighedEffects:
@@ -57,15 +56,15 @@ class EffectComparison:
 
 
 def compare_effects(session: Session) -> EffectComparison | None:
-    """Weigh the effects that a session or its robot chooses; without a choice all possible ones.
+    """Compare the effects that a session or its robot chooses; without a choice all possible ones.
 
-    Without a choice drift needs the time of the readings, not only their order.
+    Without a choice, drift is compared only if the time of the readings is stated, not their order.
 
     Args:
         session: The session, or several that were joined.
 
     Returns:
-        None if there is nothing to weigh.
+        None if there is nothing to compare.
 
     Raises:
         ClosureError: If the nominal machine cannot reach a posture.
@@ -75,48 +74,51 @@ def compare_effects(session: Session) -> EffectComparison | None:
     if not candidates:
         return EffectComparison((), (), chosen, (), lacking) if lacking else None
     present = [e.name for e in measurable_effects(session.robot)]
-    computed = [n for n in chosen if n not in present]
+    not_measurable = [n for n in chosen if n not in present]
     model = complete_model(session.robot.parameters)
-    known: dict[tuple[str, ...], tuple[float, float]] = {}
+    evidence_and_rms: dict[tuple[str, ...], tuple[float, float]] = {}
 
-    def weigh(names: Sequence[str]) -> float:
+    def log_evidence(names: Sequence[str]) -> float:
         trial = order_effects(names)
-        if trial not in known:
-            with_them = session.with_effects((*computed, *trial))
+        if trial not in evidence_and_rms:
+            with_them = session.with_effects((*not_measurable, *trial))
             free = errors_of_no_model(with_them.robot)
             errors = linear_model(with_them, free=free).predict_left_out(session.values)
             rms = float(np.sqrt(np.mean(errors**2)))
-            known[trial] = weigh_model(with_them, model, free=free)[0], rms
-        return known[trial][0]
+            evidence_and_rms[trial] = compute_log_evidence(with_them, model, free=free)[0], rms
+        return evidence_and_rms[trial][0]
 
-    weigh(())
+    log_evidence(())
     supported: tuple[str, ...] = ()
-    while more := [n for n in candidates if n not in supported]:
-        likeliest = max(more, key=lambda n: weigh((*supported, n)))
-        if weigh((*supported, likeliest)) < weigh(supported) + STRONG:
+    while remaining := [n for n in candidates if n not in supported]:
+        most_likely = max(remaining, key=lambda n: log_evidence((*supported, n)))
+        if log_evidence((*supported, most_likely)) < log_evidence(supported) + STRONG:
             break
-        supported = order_effects((*supported, likeliest))
-    weighed = [WeighedEffects(n, e - known[()][0], rms) for n, (e, rms) in known.items()]
+        supported = order_effects((*supported, most_likely))
+    weighed = [
+        WeighedEffects(effects, evidence - evidence_and_rms[()][0], rms)
+        for effects, (evidence, rms) in evidence_and_rms.items()
+    ]
     named = errors_of_no_model(session.with_effects(supported).robot)
     return EffectComparison(tuple(weighed), supported, chosen, named, lacking)
 
 
 def _candidates(session: Session) -> tuple[list[str], dict[str, tuple[int, str]]]:
-    """Effects to weigh, and those that lack conditions in some of the readings."""
+    """Effects to compare, and effects whose conditions are missing in some of the readings."""
     robot = session.robot
     present = [e.name for e in measurable_effects(robot)]
-    stated = any(r.conditions for r in session.readings)
-    possible = missing_effects(session) if stated and robot.chosen_effects is None else ()
-    timed = any(r.conditions and r.conditions.time for r in session.readings)
+    any_conditions = any(r.conditions for r in session.readings)
+    possible = missing_effects(session) if any_conditions and robot.chosen_effects is None else ()
+    any_time = any(r.conditions and r.conditions.time for r in session.readings)
     candidates, lacking = [], {}
     for name in (*present, *possible):
-        rows = rows_without(session, name)
+        rows_lacking = rows_without(session, name)
         conditions = find_effect(name, where="effects", error=RobotError).conditions
-        if "time" in conditions and name not in present and not timed:
+        if "time" in conditions and name not in present and not any_time:
             continue
-        if not rows.size:
+        if not rows_lacking.size:
             candidates.append(name)
-        elif rows.size < len(session.readings) or name in present:
-            first = session.where(session.readings[int(rows[0])])
-            lacking[name] = (int(rows.size), first)
+        elif rows_lacking.size < len(session.readings) or name in present:
+            first_place = session.where(session.readings[int(rows_lacking[0])])
+            lacking[name] = (int(rows_lacking.size), first_place)
     return candidates, lacking

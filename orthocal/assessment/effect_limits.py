@@ -1,4 +1,4 @@
-"""Limits of effects, such as backlash, that readings or planned readings reach."""
+"""Limits of effects, such as backlash, after taken or planned readings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from orthocal.statistics.zeros import project_out_zeros
 from orthocal.units import LIMIT, Unit
 
 DETERMINED = 0.9
-"""Ratio of limits after and before the readings below which they determine a parameter."""
+"""Ratio of the limits after and before the readings below which a parameter is determined."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +28,9 @@ class EffectLimits:
     count: int
     """Number of parameters."""
     before: float
-    """Limit from their tolerances, [SI]."""
+    """Largest of their limits by the tolerances, [SI]."""
     after: float
-    """Limit after the readings, the largest of them, [SI]."""
+    """Largest of their limits after the readings, [SI]."""
 
     @property
     def determined(self) -> bool:
@@ -41,8 +41,8 @@ class EffectLimits:
 def find_limits(problem: CalibrationProblem, noise: float) -> tuple[EffectLimits, ...]:
     """Limits of the parameters of effects after the readings of a problem.
 
-    To first order about the nominal machine; a parameter that is never negative counts like one
-    with a normal prior.
+    The limits are computed to first order about the nominal machine. A parameter that is never
+    negative is treated as one with a normal prior.
 
     Args:
         problem: Calibration problem with priors.
@@ -52,9 +52,9 @@ def find_limits(problem: CalibrationProblem, noise: float) -> tuple[EffectLimits
     if not effects:
         return ()
     _, jacobian = problem.predict_and_jacobian(problem.active_theta)
-    slopes = project_out_zeros(jacobian, problem.observations)
+    projected = project_out_zeros(jacobian, problem.observations)
     precision = np.maximum(problem.prior_precision, VAGUE)
-    variance = np.diag(Information(slopes).covariance(sigma=noise, precision=precision))
+    variance = np.diag(Information(projected).covariance(sigma=noise, precision=precision))
     after = LIMIT * np.sqrt(variance) * problem.theta_scale
     before = LIMIT * problem.theta_scale
     limits = []
@@ -68,10 +68,10 @@ def find_limits(problem: CalibrationProblem, noise: float) -> tuple[EffectLimits
         for unit in dict.fromkeys(units.values()):
             columns = [i for i, n in enumerate(problem.free) if units.get(n) == unit]
             if columns:
-                sizes = before[columns].max(), after[columns].max()
+                largest = before[columns].max(), after[columns].max()
                 limits.append(
                     EffectLimits(
-                        effect.name, effect.describe(), unit, len(columns), *map(float, sizes)
+                        effect.name, effect.describe(), unit, len(columns), *map(float, largest)
                     )
                 )
     return tuple(limits)

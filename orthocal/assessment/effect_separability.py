@@ -1,11 +1,12 @@
-"""Effects of a machine's model that its readings do not show, or do not separate.
+"""Effects of the robot's model that its readings do not show or do not separate.
 
-Effects a and b change readings alike if the columns of a, weighted by the covariance of the
-readings under all other errors,
+With W the Jacobian of the readings with respect to the parameters of all effects, and V their
+covariance from noise and all other errors, the information about the parameters is
 
-    V = σ² I + J P Jᵀ,  A = Wᵀ V⁻¹ W,
+    A = Wᵀ V⁻¹ W,  V = σ² I + J P Jᵀ.
 
-are nearly combinations of those of b: R² = A_ab A_bb⁻¹ A_ba / A_aa, as in a regression.
+A parameter a cannot be separated from parameters b if the coefficient of determination of a
+regression, R² = A_ab A_bb⁻¹ A_ba / A_aa, is close to 1.
 """
 
 from __future__ import annotations
@@ -29,19 +30,19 @@ from orthocal.hypotheses.linear_model import linear_model
 from orthocal.observation.observations import drive_table
 from orthocal.session.session import Conditions, Session
 
-ALIKE = 0.95
-"""Part R² of a parameter's information that another effect shares, from which on the readings do
-not separate them: the standard deviation is more than four times as large as without the other."""
+MAX_R_SQUARED = 0.95
+"""R² above which parameters are inseparable. The standard deviation is then more than four times as
+large as without the other effect."""
 
 WARMER = 5.0
-"""Change of the temperature at which a setup is supposed to be read again: that of a day, [K]."""
+"""Typical change of the temperature during a day, after which a setup is read again, [K]."""
 
-LEAST_INFORMATION = 1e-2
-"""Information about a parameter, over that of its prior, below which readings do not show it."""
+MIN_INFORMATION = 1e-2
+"""Information about a parameter, relative to that of its prior, below which it is not shown."""
 
 
 def find_unshown_effects(session: Session) -> list[Finding]:
-    """Effects of the robot's model that its readings do not show, or do not separate.
+    """Findings about effects that the readings do not show or do not separate.
 
     Raises:
         ClosureError: If the nominal machine cannot reach a posture.
@@ -49,92 +50,99 @@ def find_unshown_effects(session: Session) -> list[Finding]:
     if not measurable_effects(session.robot):
         return []
     findings = [*_unshown_backlash(session), *_unshown_expansion(session)]
-    return [*findings, *_alike(session)] if len(session.readings) > 1 else findings
+    return [*findings, *_inseparable(session)] if len(session.readings) > 1 else findings
 
 
 def _unshown_backlash(session: Session) -> Iterator[Finding]:
-    """Drives that all readings approach from one side, or whose approach none states."""
+    """Finding about drives that all readings approach from one side, or without stated approach."""
     if "backlash" not in session.robot.effect_names:
         return
-    stated = [r.approach for r in session.readings if r.approach is not None]
-    if not stated:
+    approaches = [r.approach for r in session.readings if r.approach is not None]
+    if not approaches:
         yield words.approach_not_stated()
         return
     names = list(session.postures)
-    read = sorted({names.index(r.posture) for r in session.readings})
-    distance = np.abs(drive_table(session)[read] - session.robot.drive_zero)
+    rows_read = sorted({names.index(r.posture) for r in session.readings})
+    distance = np.abs(drive_table(session)[rows_read] - session.robot.drive_zero)
     one_sided = {
-        drive.name: names[read[int(distance[:, i].argmax())]]
+        drive.name: names[rows_read[int(distance[:, i].argmax())]]
         for i, drive in enumerate(session.robot.drives)
-        if len({letters[i] for letters in stated} - {"u"}) < 2
+        if len({letters[i] for letters in approaches} - {"u"}) < 2
     }
     if one_sided:
         yield words.approached_from_one_side(one_sided)
 
 
 def _unshown_expansion(session: Session) -> Iterator[Finding]:
-    """Readings that were all taken at one temperature."""
+    """Finding about readings that were all taken at one temperature."""
     if "thermal" not in session.robot.effect_names:
         return
-    stated = {r.conditions.temperature for r in session.readings if r.conditions} - {None}
-    if len(stated) < 2:
+    temperatures = {r.conditions.temperature for r in session.readings if r.conditions} - {None}
+    if len(temperatures) < 2:
         setup = session.readings[0].setup
-        helps = _shows_expansion(_read_warmer(session, setup))
-        yield words.one_temperature(next(iter(stated), None), setup if helps else "")
+        repeating_helps = _shows_expansion(_read_warmer(session, setup))
+        yield words.one_temperature(
+            next(iter(temperatures), None), setup if repeating_helps else ""
+        )
 
 
 def _read_warmer(session: Session, setup: str) -> Session:
-    """Session in which one setup is read once more, after the machine has become warmer."""
+    """Session in which one setup is read again after the temperature has risen."""
     reference = neutral_values(session.robot)["temperature"]
     readings = []
     for r in session.readings:
-        known = r.conditions or Conditions()
-        cool = reference if known.temperature is None else known.temperature
-        readings.append(replace(r, conditions=replace(known, temperature=cool)))
+        conditions = r.conditions or Conditions()
+        temperature = reference if conditions.temperature is None else conditions.temperature
+        readings.append(replace(r, conditions=replace(conditions, temperature=temperature)))
         if r.setup == setup:
-            warm = replace(known, temperature=cool + WARMER)
+            warm = replace(conditions, temperature=temperature + WARMER)
             readings.append(replace(r, conditions=warm))
     return replace(session, readings=tuple(readings), parts=(), sha256="")
 
 
 def _shows_expansion(session: Session) -> bool:
-    """True if readings determine coefficients of expansion, as a plan states it."""
+    """True if the readings determine coefficients of expansion by the criterion of a plan."""
     model = linear_model(session)
     limits = find_limits(model.problem, model.sigma)
     return any(limit.determined for limit in limits if limit.effect == "thermal")
 
 
-def _alike(session: Session) -> Iterator[Finding]:
-    """Parameters of effects that change the readings alike."""
+def _inseparable(session: Session) -> Iterator[Finding]:
+    """Findings about parameters of effects that are inseparable."""
     free = errors_of_no_model(session.robot)
     model = linear_model(session, free=free)
-    about = model.at_reference(slopes=True)
+    linearisation = model.at_reference(keep_jacobian=True)
     effects = {e.name: e for e in measurable_effects(session.robot)}
-    members = _members(session, model.problem.free)
-    every = [i for indices in members.values() for i in indices]
-    columns, others = about.slopes[:, every], np.delete(about.slopes, every, axis=1)
-    normal = others.T @ others + model.sigma**2 * np.eye(others.shape[1])
-    white = columns - others @ np.linalg.solve(normal, others.T @ columns)
-    information = columns.T @ white / model.sigma**2
-    place = {i: k for k, i in enumerate(every)}
-    seen = {
+    indices_of_effects = _members(session, model.problem.free)
+    effect_columns = [i for indices in indices_of_effects.values() for i in indices]
+    effect_slopes, other_slopes = (
+        linearisation.jacobian[:, effect_columns],
+        np.delete(linearisation.jacobian, effect_columns, axis=1),
+    )
+    normal = other_slopes.T @ other_slopes + model.sigma**2 * np.eye(other_slopes.shape[1])
+    whitened = effect_slopes - other_slopes @ np.linalg.solve(
+        normal, other_slopes.T @ effect_slopes
+    )
+    information = effect_slopes.T @ whitened / model.sigma**2
+    position = {i: k for k, i in enumerate(effect_columns)}
+    shown = {
         name: np.array(
-            [k for k in (place[i] for i in indices) if information[k, k] > LEAST_INFORMATION], int
+            [k for k in (position[i] for i in indices) if information[k, k] > MIN_INFORMATION], int
         )
-        for name, indices in members.items()
+        for name, indices in indices_of_effects.items()
     }
-    labels = [model.problem.free[i] for i in every]
-    for one, other in combinations_with_replacement(seen, 2):
-        alike = _explained(information, seen[one], seen[other], same=one == other)
-        if alike:
-            partners = sorted({labels[q] for _, q in alike} - {labels[p] for p, _ in alike})
+    labels = [model.problem.free[i] for i in effect_columns]
+    for one, other in combinations_with_replacement(shown, 2):
+        pairs = _explained(information, shown[one], shown[other], same=one == other)
+        if pairs:
+            partners = sorted({labels[q] for _, q in pairs} - {labels[p] for p, _ in pairs})
             yield words.effects_alike(
-                effects[one], effects[other], [labels[p] for p, _ in alike], partners
+                effects[one], effects[other], [labels[p] for p, _ in pairs], partners
             )
 
 
 def _members(session: Session, free: tuple[str, ...]) -> dict[str, list[int]]:
-    """Places of the parameters of each effect among the free ones."""
+    """Indices of the parameters of each effect among the free parameters."""
     members: dict[str, list[int]] = {}
     for effect in measurable_effects(session.robot):
         names = {e.name for e in effect.errors}
@@ -146,15 +154,22 @@ def _members(session: Session, free: tuple[str, ...]) -> dict[str, list[int]]:
 def _explained(
     information: Array, one: Indices, other: Indices, *, same: bool
 ) -> list[tuple[int, int]]:
-    """Parameters of one effect that another explains, with the most similar one of that."""
+    """Pairs of a parameter that another effect explains and the most similar one of that effect.
+
+    Args:
+        information: Matrix A of all parameters, shape (n, n).
+        one: Parameters to explain.
+        other: Parameters of the other effect.
+        same: Whether both effects are the same one.
+    """
     explained = []
     for p in one:
-        among = other[other != p] if not same else other[other > p]
-        if not among.size:
+        candidates = other[other != p] if not same else other[other > p]
+        if not candidates.size:
             continue
-        shared = information[p, among]
-        inverse = np.linalg.pinv(information[np.ix_(among, among)], hermitian=True)
-        if shared @ inverse @ shared > ALIKE * information[p, p]:
-            alone = shared**2 / np.diag(information)[among]
-            explained.append((int(p), int(among[int(alone.argmax())])))
+        shared = information[p, candidates]
+        inverse = np.linalg.pinv(information[np.ix_(candidates, candidates)], hermitian=True)
+        if shared @ inverse @ shared > MAX_R_SQUARED * information[p, p]:
+            single_shares = shared**2 / np.diag(information)[candidates]
+            explained.append((int(p), int(candidates[int(single_shares.argmax())])))
     return explained

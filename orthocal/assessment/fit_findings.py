@@ -1,6 +1,6 @@
-"""Findings about a fit: what its residuals, noise and parameters show.
+"""Findings about a fit: residuals, noise and parameters.
 
-They are notes, except that an offset at a stated bound is to be reviewed.
+All are notes, except that an offset at a stated bound must be reviewed.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from orthocal.errors import ClosureError, RobotError
 from orthocal.estimation.diagnostics.idealisation import find_idealised
 
 STANDSTILL = 1e-6
-"""Prior standard deviations by which a parameter must move to have moved."""
+"""Change of a parameter, in prior standard deviations, below which it did not change."""
 
 NOTABLE_IDEALISATION = 1 / 3
-"""Part of a reading's standard deviation from which an idealisation is mentioned."""
+"""Error by idealisation, in standard deviations of a reading, above which it is reported."""
 
 
 def find_fit_findings(calibration: Calibration) -> list[Finding]:
-    """All findings about a fit, in the order in which they explain it."""
+    """All findings about a fit."""
     return [
         *_redundancy(calibration),
         *_residuals(calibration),
@@ -30,26 +30,30 @@ def find_fit_findings(calibration: Calibration) -> list[Finding]:
         *find_held(calibration),
         *_linearisation(calibration),
         *find_unresolved(calibration),
-        *_line(calibration),
+        *_idealisation(calibration),
     ]
 
 
 def _redundancy(calibration: Calibration) -> list[Finding]:
-    """Finding about the readings that check the model."""
+    """Finding about a fit without redundant readings."""
     if calibration.redundancy > 0:
         return []
     return [words.no_redundancy(calibration.identifiability.n_readings, len(calibration.free))]
 
 
 def _residuals(calibration: Calibration) -> list[Finding]:
-    """Residuals against the noise of the readings."""
+    """Finding about the residuals in comparison with the noise."""
     noise, stated = calibration.noise, calibration.session.gauge_sigma
-    row = "a difference" if calibration.rows_are_differences else "a reading"
-    factor, larger = calibration.row_factor, calibration.only_offsets
+    row_noun = "a difference" if calibration.rows_are_differences else "a reading"
 
     def excess(reference: float, source: str) -> Finding:
         return words.model_error(
-            noise.residual_sigma, reference, source=source, row=row, factor=factor, larger=larger
+            noise.residual_sigma,
+            reference,
+            source=source,
+            row_noun=row_noun,
+            row_factor=calibration.row_factor,
+            may_enlarge_model=calibration.only_offsets,
         )
 
     if noise.source == "unknown":
@@ -66,15 +70,15 @@ def _residuals(calibration: Calibration) -> list[Finding]:
         return [excess(noise.cycles_sigma, "the scatter of repeated readings")]
     if stated is None:
         return [words.noise_from_residuals(calibration.sigma)]
-    if noise.leaves_more(stated):
-        return [excess(stated, "the stated noise of the gauge")]
-    if noise.leaves_less(stated):
+    if noise.exceeded_by_residuals(stated):
+        return [excess(stated, "its stated noise")]
+    if noise.exceeds_residuals(stated):
         return [words.gauge_overstated(noise.residual_sigma, stated)]
     return [words.fits_stated_noise(noise.residual_sigma)]
 
 
 def _standstill(calibration: Calibration) -> list[Finding]:
-    """Finding about a fit that moved no parameter."""
+    """Finding about a fit that changed no parameter."""
     if any(abs(p.value - p.start) > STANDSTILL * p.prior_std for p in calibration.free):
         return []
     if len(calibration.identifiability.unseen) == len(calibration.free):
@@ -83,18 +87,18 @@ def _standstill(calibration: Calibration) -> list[Finding]:
 
 
 def find_held(calibration: Calibration) -> list[Finding]:
-    """Parameters that a bound holds."""
-    known = calibration.robot.parameters
+    """Findings about parameters at a bound."""
+    parameters = calibration.robot.parameters
     return [
-        words.held_by_bound(p, offset=known.are_offsets(p.name))
+        words.held_by_bound(p, offset=parameters.are_offsets(p.name))
         for p in calibration.free
         if p.at_bound is not None
     ]
 
 
 def _linearisation(calibration: Calibration) -> list[Finding]:
-    """Cost of linearisation, in the parameter where it is most of the standard deviation."""
-    if not calibration.solver.tells_linearisation:
+    """Finding about the linearisation error, for the parameter with the largest part of its std."""
+    if not calibration.solver.shows_linearisation_error:
         return []
     p = max(calibration.free, key=lambda p: abs(p.value - p.linear) / max(p.std, 1e-300))
     if math.isnan(p.std) or p.std <= 0.0:
@@ -103,20 +107,20 @@ def _linearisation(calibration: Calibration) -> list[Finding]:
 
 
 def find_unresolved(calibration: Calibration) -> list[Finding]:
-    """Parameters that the readings determine only in combination, and those below the noise."""
-    seen = calibration.identifiability
-    findings = [words.inseparable(c) for c in seen.alike]
-    if seen.unseen:
-        findings.append(words.below_noise(seen.unseen))
+    """Findings about parameters determined only in combination, and about those below the noise."""
+    identifiability = calibration.identifiability
+    findings = [words.inseparable(c) for c in identifiability.alike]
+    if identifiability.unseen:
+        findings.append(words.below_noise(identifiability.unseen))
     return findings
 
 
-def _line(calibration: Calibration) -> list[Finding]:
-    """Finding about gauges that touch a rod but are modelled by the line between the rods."""
+def _idealisation(calibration: Calibration) -> list[Finding]:
+    """Finding about gauges that may touch a rod but are modelled by the centre line of the leg."""
     sigma = calibration.noise.sigma
     try:
         idealised = find_idealised(restore_session(calibration))
-    except (ClosureError, RobotError):  # the finding of the tool says so
+    except (ClosureError, RobotError):  # reported by the finding about the tool error
         return []
     if idealised is None or not idealised.size > NOTABLE_IDEALISATION * sigma:
         return []

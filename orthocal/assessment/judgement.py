@@ -1,7 +1,7 @@
-"""Judgement of sessions: the one place that decides whether readings can be trusted.
+"""Judgement of sessions: decides whether readings can be trusted.
 
-It depends on the readings and the robot alone. Every command that takes sessions, and every
-calibration made from them, has the same verdict for the same readings by construction.
+It depends on the readings and the robot alone. Therefore all commands and calibrations have the
+same verdict for the same readings.
 """
 
 from __future__ import annotations
@@ -34,20 +34,21 @@ from orthocal.session.session import Session
 from orthocal.statistics.chance import chance_of_excess
 from orthocal.statistics.noise import estimate_repeatability
 
-RARE = 1e-3
-"""Share of the machines within their tolerances that are called worse."""
+FALSE_ALARM_RATE = 1e-3
+"""Probability that a machine within its tolerances is judged to exceed them."""
 
 LARGEST_SCALE = 4.0
-"""Factor of the tolerances beyond which no machine in working order is."""
+"""Tolerance scale above which the readings are rejected: no machine in working order has it."""
 
 RESOLVED = 1e-3
-"""Part of the noise by which one prior standard deviation of an offset must move the readings."""
+"""Effect of one prior standard deviation of an offset on the readings, relative to the noise, below
+which the offset is not resolved."""
 
-SCALES = np.geomspace(1.0, 30.0, 86)
-"""Factors of the tolerances that are tried."""
+TRIAL_SCALES = np.geomspace(1.0, 30.0, 86)
+"""Tolerance scales whose likelihoods are compared."""
 
 LARGEST_DEVIATION = 3.0
-"""Standard deviations from its prediction beyond which a reading is doubtful."""
+"""Standard deviations between a reading and its prediction above which it is doubtful."""
 
 _GRAVITY: dict[Severity, int] = {"reject": 0, "review": 1, "note": 2}
 
@@ -57,7 +58,7 @@ class Judgement:
     """Judgement of readings, independent of what is calibrated from them."""
 
     findings: tuple[Finding, ...]
-    """The gravest first."""
+    """Findings, the gravest first."""
     tolerance_scale: ToleranceScale
     """Factor by which the machine's errors exceed their tolerances; 1 if they do not."""
 
@@ -68,25 +69,25 @@ class Judgement:
 
 
 def verdict_of(findings: Sequence[Finding]) -> Verdict:
-    """The verdict that findings amount to: that of the gravest."""
+    """Verdict of the gravest of some findings."""
     severities = {f.severity for f in findings}
     return "reject" if "reject" in severities else "review" if "review" in severities else "enter"
 
 
 def rank(findings: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Findings, the gravest first, otherwise in their order."""
+    """Sort findings, the gravest first; others keep their order."""
     return tuple(sorted(findings, key=lambda f: _GRAVITY[f.severity]))
 
 
 def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Judgement:
     """Judge the readings of a session, or of several that were joined.
 
-    Several models are calibrated from one session with one judgement, which `calibrate`, `assess`,
-    `compare_models` and `check_session` receive.
+    The judgement does not depend on the model. `calibrate`, `assess`, `compare_models` and
+    `check_session` accept it to save time.
 
     Args:
         session: The session.
-        anomalies: Of its readings, if they are known already.
+        anomalies: Anomalies of its readings, if they were found already.
 
     Raises:
         ClosureError: If the machine cannot reach a posture.
@@ -94,24 +95,28 @@ def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Ju
     """
     mistakes = _find_mistakes(session, anomalies)
     implausible = find_implausible(session, explained=bool(mistakes))
-    scale, beyond = AS_STATED, []
+    scale, scale_findings = AS_STATED, []
     if verdict_of([*mistakes, *implausible]) == "enter":
         scale = find_tolerance_scale(session)
         if scale.factor > LARGEST_SCALE:
-            printer = session.firmware is not None
-            beyond = [words.beyond_tolerances(scale.factor, LARGEST_SCALE, firmware=printer)]
+            firmware = session.firmware is not None
+            scale_findings = [
+                words.beyond_tolerances(scale.factor, LARGEST_SCALE, firmware=firmware)
+            ]
         elif scale.factor > 1.0:
-            beyond = [words.above_tolerances(scale.factor)]
-    unchanged = [] if mistakes or not session.joined else [_describe_detectable(session)]
-    unshown = find_unshown_effects(session)
-    return Judgement(rank([*implausible, *mistakes, *unchanged, *beyond, *unshown]), scale)
+            scale_findings = [words.above_tolerances(scale.factor)]
+    no_change = [] if mistakes or not session.joined else [_describe_detectable(session)]
+    unshown_effects = find_unshown_effects(session)
+    return Judgement(
+        rank([*implausible, *mistakes, *no_change, *scale_findings, *unshown_effects]), scale
+    )
 
 
 def find_warnings(session: Session) -> tuple[Finding, ...]:
-    """Findings that a reading may cause while a session is measured, the gravest first.
+    """Findings that a single reading can cause while a session is measured, the gravest first.
 
-    They are among those of `judge_session` for the same readings. The others, which concern the
-    robot, the postures and the stated noise, do not depend on a single reading.
+    They are a part of those of `judge_session`. The others concern the robot, the postures and the
+    stated noise.
 
     Raises:
         ClosureError: If the machine cannot reach a posture.
@@ -122,13 +127,13 @@ def find_warnings(session: Session) -> tuple[Finding, ...]:
 
 
 def is_doubtful(session: Session, row: int, mean: float, std: float) -> bool:
-    """True if a reading calls for `find_warnings` before its setup is complete.
+    """True if `find_warnings` is needed after a reading, before its setup is complete.
 
     Args:
         session: The readings so far.
-        row: Place of the reading.
-        mean: Prediction of the reading by all others, [m]; NaN without one.
-        std: Its standard deviation, [m].
+        row: Index of the reading.
+        mean: Prediction of the reading by all others, [m]; NaN if there is none.
+        std: Standard deviation of the prediction, [m].
     """
     gauge = session.gauges[session.setups[session.readings[row].setup].gauge]
     value = session.values[row]
@@ -136,20 +141,24 @@ def is_doubtful(session: Session, row: int, mean: float, std: float) -> bool:
 
 
 def is_far(value: float, mean: float, std: float) -> bool:
-    """True if a reading contradicts its prediction by the others.
+    """True if a reading contradicts its prediction by the other readings.
 
     Args:
         value: Reading, [m].
-        mean: Its prediction, [m]; NaN without one.
-        std: Its standard deviation, [m].
+        mean: Prediction of the reading, [m]; NaN if there is none.
+        std: Standard deviation of the prediction, [m].
     """
     return bool(abs(value - mean) > LARGEST_DEVIATION * std)
 
 
 def _find_mistakes(session: Session, anomalies: Anomalies | None = None) -> list[Finding]:
-    """Anomalies of a session; without any, gauges whose repeated readings scatter too much.
+    """Findings about anomalies; if there are none, about scattered repeats.
 
-    Nothing is sought if a gauge is impossible as stated, or if the anomalies are known.
+    If a gauge is impossible as stated, the findings are about gauges alone.
+
+    Args:
+        session: The session.
+        anomalies: Its anomalies, if they were found already.
     """
     if impossible := list(find_impossible_gauges(session)):
         return impossible
@@ -158,76 +167,83 @@ def _find_mistakes(session: Session, anomalies: Anomalies | None = None) -> list
 
 
 def find_tolerance_scale(session: Session) -> ToleranceScale:
-    """Factor by which the machine's errors exceed their tolerances, by maximum likelihood.
+    """Tolerance scale of a machine by maximum likelihood.
 
-    Readings are y ~ N(h, e² J P Jᵀ + G + σ²) with P of all errors of the geometry but offsets, G of
-    how gauges are mounted and of other effects. Offsets and gauge zeros are free: home switches are
-    as far off as they are. σ is the stated noise, or the scatter of repeated readings if that is
-    larger. 1 where one in a thousand machines within tolerances shows as much, or nothing is stated
-    of the noise. Each independent contrast of the readings counts by the share of its variance that
-    the machine's errors have.
+    Readings are y ~ N(h, s² J P Jᵀ + G + σ² I) with the tolerance scale s, the prior covariance P
+    of errors of the geometry except offsets, and the covariance G from mountings and other effects.
+    Offsets and gauge zeros have no prior: their errors may have any size. σ is the stated noise, or
+    the scatter of repeated readings if that is larger.
+
+    s is 1 if the noise is not stated, or if the deviation is not significant
+    (FALSE_ALARM_RATE). Degrees of freedom are the sum of squared shares of the machine's errors in
+    the variances of the independent contrasts. Of several sessions the largest s counts.
     """
     scales = [AS_STATED]
     for part in split_sessions(session):
         if any(g.sigma is None for g in part.gauges.values()) or len(part.readings) < 2:
             continue
         model = linear_model(part)
-        about = model.most_likely(part.values)
-        deviation = model.entries(part.values[None])[0] - about.expected
-        repeated, _ = estimate_repeatability(model.problem.values, model.problem.observations)
-        noise = max(about.likelihood.sigma, repeated)
-        within, excess, remainder, dof = _parts(model, about, deviation, noise)
-        square = float((within**2 / (1.0 + excess)).sum()) + remainder
-        if dof < 1 or chance_of_excess(square, dof) >= RARE:
+        linearisation = model.most_likely(part.values)
+        deviation = model.entries(part.values[None])[0] - linearisation.expected
+        scatter, _ = estimate_repeatability(model.problem.values, model.problem.observations)
+        noise = max(linearisation.likelihood.sigma, scatter)
+        contrasts, machine_variances, rest_square, dof = _independent_contrasts(
+            model, linearisation, deviation, noise
+        )
+        square = float((contrasts**2 / (1.0 + machine_variances)).sum()) + rest_square
+        if dof < 1 or chance_of_excess(square, dof) >= FALSE_ALARM_RATE:
             continue
-        spread = 1.0 + SCALES[:, None] ** 2 * excess
-        logs = (within**2 / spread + np.log(spread)).sum(axis=1)
-        factor = float(SCALES[int(np.argmin(logs))])
-        share = factor**2 * excess / (1.0 + factor**2 * excess)
+        variances = 1.0 + TRIAL_SCALES[:, None] ** 2 * machine_variances
+        costs = (contrasts**2 / variances + np.log(variances)).sum(axis=1)
+        factor = float(TRIAL_SCALES[int(np.argmin(costs))])
+        share = factor**2 * machine_variances / (1.0 + factor**2 * machine_variances)
         scales.append(ToleranceScale(factor, float((share**2).sum())))
     return max(scales, key=lambda s: s.factor)
 
 
-def _parts(
-    model: LinearModel, about: ModelLinearisation, deviation: Array, noise: float
+def _independent_contrasts(
+    model: LinearModel, linearisation: ModelLinearisation, deviation: Array, noise: float
 ) -> tuple[Array, Array, float, int]:
-    """Independent parts of a deviation, offsets projected out.
+    """Independent contrasts of a deviation from which offsets are projected out.
 
     Returns:
-        Parts over the standard deviation that noise and gauges leave, shape (n,); variances that
-        the machine's errors at their tolerances add to the 1 of each, shape (n,); the sum of
-        squares of what neither moves, over the noise; degrees of freedom of all.
+        The contrasts, scaled to variance 1 from noise and mountings, shape (n,); the variances that
+        errors of the machine at their tolerances add, shape (n,); the sum of squares of components
+        that no error affects, relative to the noise; the degrees of freedom of both together.
     """
-    directions, problem = about.likelihood.directions, model.problem
-    along = directions @ deviation
-    square = max(float(deviation @ deviation - along @ along), 0.0) / noise**2
-    slopes = about.sizes[:, None] * about.errors.T / noise  # along each direction, by each error
-    known, n = problem.robot.parameters, problem.n_machine
+    directions, problem = linearisation.likelihood.directions, model.problem
+    components = directions @ deviation
+    rest_square = max(float(deviation @ deviation - components @ components), 0.0) / noise**2
+    # derivatives of the components with respect to the errors, in prior standard deviations
+    slopes = linearisation.singular_values[:, None] * linearisation.error_directions.T / noise
+    parameters, n = problem.robot.parameters, problem.n_machine
     machine = slopes[:, :n]
     names = problem.free[:n]
-    offset = np.array([known.are_offsets(name) for name in names], dtype=bool)
-    scaled = np.array([known.are_scaled(name) for name in names], dtype=bool)
-    basis, sizes, _ = np.linalg.svd(machine[:, offset])
-    rank = int((sizes > RESOLVED).sum())
+    offset = np.array([parameters.are_offsets(name) for name in names], dtype=bool)
+    scaled = np.array([parameters.are_scaled(name) for name in names], dtype=bool)
+    basis, singular_values, _ = np.linalg.svd(machine[:, offset])
+    rank = int((singular_values > RESOLVED).sum())
     contrasts = basis[:, rank:].T
     unscaled = np.column_stack([slopes[:, n:], machine[:, ~(offset | scaled)]])
-    gauges, errors = contrasts @ unscaled, contrasts @ machine[:, scaled]
-    root = np.linalg.cholesky(np.eye(len(contrasts)) + gauges @ gauges.T)
-    white = np.linalg.solve(root, np.column_stack([contrasts @ along / noise, errors]))
-    variances, turned = np.linalg.eigh(white[:, 1:] @ white[:, 1:].T)
-    return turned.T @ white[:, 0], np.maximum(variances, 0.0), square, model.dof - rank
+    nuisance_slopes, scaled_slopes = contrasts @ unscaled, contrasts @ machine[:, scaled]
+    factor = np.linalg.cholesky(np.eye(len(contrasts)) + nuisance_slopes @ nuisance_slopes.T)
+    whitened = np.linalg.solve(
+        factor, np.column_stack([contrasts @ components / noise, scaled_slopes])
+    )
+    variances, rotation = np.linalg.eigh(whitened[:, 1:] @ whitened[:, 1:].T)
+    return rotation.T @ whitened[:, 0], np.maximum(variances, 0.0), rest_square, model.dof - rank
 
 
 def _describe_detectable(session: Session) -> Finding:
-    """The change of an offset between joined sessions that would have been detected."""
-    sizes: dict[str, float] = {}
-    unseen = []
+    """Finding with the smallest detectable change of an offset between joined sessions."""
+    largest_sizes: dict[str, float] = {}
+    undetectable = []
     detectable = detectable_changes(session)
     for drive in session.robot.drives:
         size = detectable.get(drive.name, math.inf)
         if math.isinf(size):
-            unseen.append(drive.name)
+            undetectable.append(drive.name)
             continue
         p = session.robot.parameters[f"{drive.name}.offset"]
-        sizes[p.edge_unit] = max(sizes.get(p.edge_unit, 0.0), size * p.edge_factor)
-    return describe_no_change(sizes, unseen)
+        largest_sizes[p.edge_unit] = max(largest_sizes.get(p.edge_unit, 0.0), size * p.edge_factor)
+    return describe_no_change(largest_sizes, undetectable)

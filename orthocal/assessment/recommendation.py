@@ -1,14 +1,14 @@
-"""Recommended model: one function of the readings, for `calibrate` and `compare` alike.
+"""Recommended model of the readings of a session, the same for `calibrate` and `compare`.
 
-The complete model with priors is recommended unless the readings speak strongly for a smaller one,
-or for tolerances of another size. They are weighed by the marginal likelihood of the linearised
-model,
+The complete model with priors is recommended unless the evidence strongly favours a smaller model
+or another tolerance scale. The evidence is the marginal likelihood of the linearised model,
 
-    p(y | M) = ∫ p(y | θ, σ) p(θ | M) dθ,
+    p(y | M) = ∫ p(y | θ, σ) p(θ | M) dθ.
 
-with the parameters of the model at their prior standard deviations (times a scale) and all others
-at 0, gauge zeros free. Parameters that are never negative have half-normal priors. σ is the stated
-noise of a reading, with its rounding; if none is stated it is integrated over with a broad prior.
+The parameters of the model have their prior standard deviations times the tolerance scale; all
+other errors are 0. Gauge zeros have flat priors. Parameters that are never negative have
+half-normal priors. σ is the stated noise of a reading with its rounding. If none is stated, the
+evidence is integrated over σ with a broad prior.
 """
 
 from __future__ import annotations
@@ -28,124 +28,127 @@ from orthocal.hypotheses.linear_model import linear_model
 from orthocal.measurement.joining import split_sessions
 from orthocal.session.session import Session
 
-KEPT = 4
-"""Recommendations that are kept."""
+CACHE_SIZE = 4
+"""Number of cached recommendations."""
 
 STRONG = 5.0
-"""ln of the Bayes factor from which evidence is strong: 150 to 1 (Kass and Raftery, 1995)."""
+"""ln of the Bayes factor above which evidence is strong: 150 to 1 (Kass and Raftery, 1995)."""
 
-NEARLY = 3.0
-"""Difference of ln evidence up to which models are nearly as well supported."""
+NEARLY_EQUAL = 3.0
+"""Difference of the log evidence below which models are nearly equally well supported."""
 
-SCALES = np.geomspace(0.1, 10.0, 41)
-"""Scales of the tolerances that are weighed."""
+TOLERANCE_SCALES = np.geomspace(0.1, 10.0, 41)
+"""Tolerance scales whose evidence is computed."""
 
-SCALE_SPREAD = 1.0
-"""Standard deviation of ln(scale) before the readings."""
+LOG_SCALE_STD = 1.0
+"""Prior standard deviation of ln(tolerance scale)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelEvidence:
-    """Evidence of the readings for one model."""
+    """Evidence for one model."""
 
     model: str
     log_evidence: float
-    """ln p(y | M) less that of the complete model; NaN if the model cannot be weighed."""
+    """ln p(y | M) minus that of the complete model; NaN if it cannot be computed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recommendation:
-    """The model that the readings recommend, and the evidence for it."""
+    """Recommended model and the evidence for it."""
 
     model: str
     tolerance_scale: float
-    """Factor of the tolerances that the readings ask for; 1 unless the evidence is strong."""
+    """Recommended tolerance scale; 1 unless the evidence for another one is strong."""
     evidence: tuple[ModelEvidence, ...]
-    """Of every model, relative to the complete one."""
+    """Evidence of every model relative to the complete model."""
     scale_evidence: float
-    """ln evidence of tolerances at that factor, relative to the stated ones."""
+    """Log evidence of this scale relative to the stated tolerances; 0 if the scale is 1."""
 
-    def of(self, model: str) -> float:
-        """Ln evidence of a model relative to the complete one; NaN if it was not weighed."""
+    def log_evidence_of(self, model: str) -> float:
+        """Log evidence of a model relative to the complete model; NaN if it was not computed."""
         return next((e.log_evidence for e in self.evidence if e.model == model), math.nan)
 
 
 def recommend_model(session: Session, models: Sequence[str] = ()) -> Recommendation:
-    """The model that the readings recommend.
+    """Recommended model, cached because several calibrations of one session need it.
 
-    The last recommendations are kept: several models are calibrated from one session, or compared.
+    A smaller model is recommended if its evidence is strong, and at most NEARLY_EQUAL below that of
+    the best tolerance scale. Otherwise the complete model is recommended, with the best tolerance
+    scale if the evidence for it is strong.
 
     Args:
-        session: The session, or several that were joined: their evidence adds up.
-        models: Models of the robot to weigh against the complete one; by default all.
+        session: The session, or several that were joined: their log evidence is added.
+        models: Models of the robot to compare with the complete model; by default all.
     """
     return _recommend(session, tuple(models))
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=CACHE_SIZE)
 def _recommend(session: Session, models: tuple[str, ...]) -> Recommendation:
+    """Recommended model; see `recommend_model`."""
     parameters = session.robot.parameters
     complete = complete_model(parameters)
     names = [m for m in dict.fromkeys(models or parameters.models) if m != complete]
-    reference, by_scale = weigh_model(session, complete)
+    reference, by_scale = compute_log_evidence(session, complete)
     evidence = [ModelEvidence(complete, 0.0)]
     for name in names:
         try:
-            evidence.append(ModelEvidence(name, weigh_model(session, name)[0] - reference))
+            evidence.append(ModelEvidence(name, compute_log_evidence(session, name)[0] - reference))
         except OrthocalError:
             evidence.append(ModelEvidence(name, math.nan))
-    prior = -0.5 * (np.log(SCALES) / SCALE_SPREAD) ** 2
-    best = int(np.argmax(by_scale + prior))
-    gain = float(by_scale[best] - reference)
-    smaller = max(
+    log_prior = -0.5 * (np.log(TOLERANCE_SCALES) / LOG_SCALE_STD) ** 2
+    best = int(np.argmax(by_scale + log_prior))
+    gain = float(by_scale[best] - reference)  # without the prior, which only selects the scale
+    best_smaller = max(
         (e for e in evidence[1:] if math.isfinite(e.log_evidence)),
         key=lambda e: e.log_evidence,
         default=None,
     )
-    strong_scale = gain >= STRONG
-    # a smaller model is simpler than other tolerances that are nearly as well supported
-    least = max(STRONG, gain - NEARLY)
-    if smaller is not None and smaller.log_evidence >= least:
-        return Recommendation(smaller.model, 1.0, tuple(evidence), 0.0)
-    scale = float(SCALES[best]) if strong_scale else 1.0
-    return Recommendation(complete, scale, tuple(evidence), gain if strong_scale else 0.0)
+    required = max(STRONG, gain - NEARLY_EQUAL)
+    if best_smaller is not None and best_smaller.log_evidence >= required:
+        return Recommendation(best_smaller.model, 1.0, tuple(evidence), 0.0)
+    if gain < STRONG:
+        return Recommendation(complete, 1.0, tuple(evidence), 0.0)
+    return Recommendation(complete, float(TOLERANCE_SCALES[best]), tuple(evidence), gain)
 
 
-def weigh_model(session: Session, model: str, *, free: tuple[str, ...] = ()) -> tuple[float, Array]:
-    """Ln p(y | M) at the stated tolerances, and at each of SCALES, shape (n_scales,).
+def compute_log_evidence(
+    session: Session, model: str, *, free: tuple[str, ...] = ()
+) -> tuple[float, Array]:
+    """Log evidence at the stated tolerances, and at all TOLERANCE_SCALES, shape (n_scales,).
 
     Args:
         session: The session, or several that were joined.
         model: Name of the model.
-        free: Names of further errors that are free.
+        free: Names of errors that are free in addition to those of the model.
     """
-    total, by_scale = 0.0, np.zeros(SCALES.size)
+    total, by_scale = 0.0, np.zeros(TOLERANCE_SCALES.size)
     for part in split_sessions(session):
-        if len(part.readings) < 2:
+        if len(part.readings) < 2:  # one reading usually determines only a gauge zero
             continue
-        readings = linear_model(part, model, free=free)
-        about = readings.most_likely(part.values)
-        deviation = readings.entries(part.values[None])[0] - about.expected
-        stated = readings.stated
-        noises, weights = (
-            (np.ones(1), np.zeros(1)) if stated else (NOISE_SCALES, noise_weights(stated=False))
-        )
-        scales = np.append(1.0, SCALES)
-        likelihood = about.likelihood
+        linear = linear_model(part, model, free=free)
+        linearisation = linear.most_likely(part.values)
+        deviation = linear.entries(part.values[None])[0] - linearisation.expected
+        noises, log_weights = np.ones(1), np.zeros(1)
+        if not linear.stated:
+            noises, log_weights = NOISE_SCALES, noise_weights(stated=False)
+        scales = np.append(1.0, TOLERANCE_SCALES)
+        likelihood = linearisation.likelihood
         logs = likelihood.log_densities(likelihood.products(deviation[None]), scales, noises)
         logs = logs.reshape(scales.size, noises.size)
-        positive = np.array([p.positive for p in readings.problem.parameters])
+        positive = np.array([p.positive for p in linear.problem.parameters])
         if positive.any():
             logs += [
                 [
-                    about.log_positive_share(
-                        deviation, positive, tolerance_scale=float(e), noise_scale=float(s)
+                    linearisation.log_positive_share(
+                        deviation, positive, tolerance_scale=float(scale), noise_scale=float(noise)
                     )
-                    for s in noises
+                    for noise in noises
                 ]
-                for e in scales
+                for scale in scales
             ]
-        evidence = log_of_sum(logs + weights, axis=1)
+        evidence = log_of_sum(logs + log_weights, axis=1)
         total += float(evidence[0])
         by_scale += evidence[1:]
     return total, by_scale

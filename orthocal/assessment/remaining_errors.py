@@ -1,4 +1,4 @@
-"""Combinations of unknown errors that contribute most to the tool error."""
+"""Combinations of errors with the largest contributions to the tool error after a calibration."""
 
 from __future__ import annotations
 
@@ -12,27 +12,31 @@ from orthocal.assessment.calibrated_tool import error_covariance
 from orthocal.assessment.tool_error import ToolAccuracy
 from orthocal.calibration.calibration import Calibration
 
-NOTABLE = 0.1
-"""Prior standard deviations by which a parameter must be off to be named in a combination."""
+MIN_LISTED = 0.1
+"""Smallest part of a parameter in a combination that is listed, in prior standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RemainingError:
-    """A combination of parameters that is not well known, and what it does at the tool."""
+    """An uncertain combination of parameters and its effect on the tool."""
 
     rms: float
-    """RMS over the workspace with shift and rotation removed, [m]."""
+    """RMS tool error over the workspace after alignment, [m]."""
     parts: tuple[tuple[str, float], ...]
-    """Parameters and by how many prior standard deviations each is off, the largest first."""
+    """Parameters and their errors in prior standard deviations, the largest first."""
 
 
 def find_remaining_errors(
     calibration: Calibration, accuracy: ToolAccuracy, *, count: int = 3
 ) -> tuple[RemainingError, ...]:
-    """The combinations of errors that matter most at the tool after a calibration.
+    """Combinations of errors with the largest contributions to the tool error after a calibration.
 
-    Principal directions of what is not known of the parameters, weighed by the mean square that it
-    makes at the tool with shift and rotation taken out; the largest first.
+    They are the principal directions of the uncertainty of the tool after alignment.
+
+    Args:
+        calibration: The calibration.
+        accuracy: Its tool errors.
+        count: Number of combinations.
     """
     prior_stds = np.r_[[p.prior_std for p in calibration.free], calibration.unmodelled.prior_stds]
     return rank_errors(
@@ -54,15 +58,15 @@ def rank_errors(
     names: Sequence[str],
     count: int,
 ) -> tuple[RemainingError, ...]:
-    """The combinations of parameters that matter most at the tool, the largest first.
+    """Combinations of parameters with the largest tool errors, the largest first.
 
     Args:
-        field: What the parameters do at the tool, shape (K, 3, n), [m per parameter unit].
-        covariance: Of them, shape (n, n), [SI].
-        weights: Of the points, shape (K,).
-        prior_stds: Shape (n,), [SI].
-        names: Of the parameters.
-        count: Of combinations.
+        field: Jacobian of the tool position, shape (K, 3, n), [m per parameter unit].
+        covariance: Covariance of the parameters, shape (n, n), [SI].
+        weights: Weights of the points, shape (K,).
+        prior_stds: Prior standard deviations, shape (n,), [SI].
+        names: Names of the parameters.
+        count: Number of combinations.
     """
     root = _square_root(covariance)
     effect = field @ root
@@ -70,17 +74,17 @@ def rank_errors(
     errors = []
     for direction in directions.T[::-1][:count]:
         change = root @ direction
-        moved = field @ change
+        displacement = field @ change
         in_prior_stds = change / prior_stds
         order = np.argsort(-np.abs(in_prior_stds))
-        lead = np.sign(in_prior_stds[order[0]]) or 1.0
+        sign = np.sign(in_prior_stds[order[0]]) or 1.0
         errors.append(
             RemainingError(
-                rms=float(np.sqrt(weights @ (moved**2).sum(axis=1))),
+                rms=float(np.sqrt(weights @ (displacement**2).sum(axis=1))),
                 parts=tuple(
-                    (names[i], float(lead * in_prior_stds[i]))
+                    (names[i], float(sign * in_prior_stds[i]))
                     for i in order
-                    if abs(in_prior_stds[i]) > NOTABLE
+                    if abs(in_prior_stds[i]) > MIN_LISTED
                 ),
             )
         )
@@ -88,6 +92,6 @@ def rank_errors(
 
 
 def _square_root(covariance: Array) -> Array:
-    """A matrix whose product with its transpose is the covariance, which may be singular."""
+    """Matrix R with R Rᵀ equal to a covariance, which may be singular."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

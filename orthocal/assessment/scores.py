@@ -1,4 +1,4 @@
-"""Scores of a model, identified to first order and exactly."""
+"""Scores of a model that is identified to first order and exactly."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.assessment.tool_error import ErrorSize, ToolAccuracy, assess_tool
+from orthocal.assessment.tool_error import ErrorStatistics, ToolAccuracy, assess_tool
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, NotIdentifiableError, RobotError, SolverError
@@ -19,7 +19,7 @@ from orthocal.estimation.linear import LinearProblem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.weighting import SMALLEST_SIGMA
-from orthocal.statistics.information import decompose, take_for_known
+from orthocal.statistics.information import assume_others_known, decompose
 from orthocal.statistics.zeros import project_out_zeros
 
 Method = Literal["linearised", "exact"]
@@ -27,62 +27,64 @@ Method = Literal["linearised", "exact"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Score:
-    """Score of one model, identified in one way."""
+    """Score of one model, identified by one method."""
 
     method: Method
     estimates: Mapping[str, float]
     """Parameter name to estimate, [SI]."""
     residuals: Array
-    """Of the rows, as the closed-loop model shows them with the estimate, shape (n_rows,), [m]."""
+    """Residuals of the rows with the loops closed for the estimate, shape (n_rows,), [m]."""
     rms: float
-    """Of the residuals, [m]."""
+    """RMS of the residuals, [m]."""
     chi_square: float
     """Σ r²/σ² with the noise of the session; NaN if it is unknown."""
     dof: float
-    """Independent readings, repeated ones too, less effective parameters."""
+    """Independent readings, including repeated ones, minus effective parameters."""
     aicc: float
-    """n ln(Σ r²/n) + 2 k + 2 k (k + 1)/(n − k − 1); infinite where k is too large for n."""
+    """n ln(Σ r²/n) + 2 k + 2 k (k + 1)/(n − k − 1); infinite if n − k − 1 is not positive."""
     bic: float
     """n ln(Σ r²/n) + k ln n; infinite without degrees of freedom."""
     unseen: Array
-    """Prediction error of the rows of each setup from all others, (n_rows,), [m]; NaN where the
-    others do not determine the model."""
+    """Cross-validation errors: the rows of each setup, predicted from all others, shape (n_rows,),
+    [m]; NaN if the others do not determine the model."""
 
     @property
     def unseen_rms(self) -> float:
-        """Root mean square of the prediction errors of unseen setups, [m]."""
-        known = self.unseen[np.isfinite(self.unseen)]
-        return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
+        """RMS of the cross-validation errors, [m]."""
+        finite = self.unseen[np.isfinite(self.unseen)]
+        return float(np.sqrt(np.mean(finite**2))) if finite.size else math.nan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelResult:
-    """One model, identified both ways."""
+    """One model, identified by both methods."""
 
     model: str
     n_free: int
     rank: int
-    """Number of combinations of its parameters that perfect readings would determine."""
+    """Number of combinations of its parameters that readings without noise would determine."""
     spare: int
-    """Independent readings (repeated ones once) less the rank, which check the model."""
+    """Independent readings minus the rank: number of checks of the model. Repeated readings count
+    once."""
     effective: float
-    """Parameters that the readings determine, beside the prior."""
+    """Effective number of parameters that the readings determine."""
     prior: bool
-    """Whether tolerances act as a prior."""
+    """True if the tolerances are used as a prior."""
     by_choice: bool
-    """Whether that is so by choice, not because the readings alone leave the model open."""
+    """True if the prior is used, or not used, by choice; False if it is used because readings do
+    not determine the model."""
     linearised: Score
     exact: Score
     calibration: Calibration
     tool: ToolAccuracy | None
-    """None for a robot without a tool centre point."""
-    linearisation_cost: ErrorSize | None
-    """Distance at the tool between the two estimates with shift and rotation removed."""
+    """Tool errors; None for a robot without a tool centre point."""
+    linearisation_cost: ErrorStatistics | None
+    """Difference of the tool position between both estimates after alignment."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Undetermined:
-    """A model that the readings leave open."""
+    """A model that the readings do not determine."""
 
     model: str
     n_free: int
@@ -96,23 +98,22 @@ def score_model(
     by_choice: bool = True,
     options: SolverOptions | None = None,
 ) -> ModelResult:
-    """Identify one model both ways and score it.
+    """Identify one model by both methods and score it.
 
     Args:
-        problem: The session with the model's parameters free.
-        noise: Standard deviation of a reading that residuals are held against, [m]; NaN if unknown.
-        by_choice: Whether its prior, or that it has none, is as it should be; else it has one
-            because the readings leave it open.
-        options: Which solver, and how it is run.
+        problem: Problem with the parameters of the model free.
+        noise: Standard deviation of a reading for χ², [m]; NaN if unknown.
+        by_choice: See `ModelResult.by_choice`.
+        options: Solver and its options.
 
     Raises:
-        NotIdentifiableError: If the readings leave the model open.
+        NotIdentifiableError: If the readings do not determine the model.
         SolverError: If the solver does not converge.
         ClosureError: If the machine cannot reach a posture.
     """
     fit = fit_problem(problem, options=options)
     linearisation = fit.linearisation
-    rank = take_for_known(linearisation.information, problem.n_machine).rank
+    rank = assume_others_known(linearisation.information, problem.n_machine).rank
     calibration = assemble_calibration(fit)
     tool = _assess(calibration)
     return ModelResult(
@@ -132,78 +133,83 @@ def score_model(
 
 
 def _assess(calibration: Calibration) -> ToolAccuracy | None:
+    """Tool errors; None if they cannot be computed."""
     try:
         return assess_tool(calibration)
-    except (ClosureError, RobotError):  # no tool, or one that hardly moves
+    except (ClosureError, RobotError):  # no tool, or no reachable workspace
         return None
 
 
 def _effective(fit: Fit) -> float:
+    """Effective number of parameters of a fit."""
     return fit.information.effective_parameters(
         sigma=fit.sigma, precision=fit.problem.prior_precision
     )
 
 
 def _score(fit: Fit, linearisation: LinearProblem, method: Method, noise: float) -> Score:
-    problem, o = fit.problem, fit.problem.observations
+    """Score of one method; `noise` is the standard deviation of a reading, [m]."""
+    problem, observations = fit.problem, fit.problem.observations
     theta = fit.linearised_theta if method == "linearised" else fit.solution.theta
     try:
-        residual = project_out_zeros(problem.values - problem.predict(theta), o)
+        residual = project_out_zeros(problem.values - problem.predict(theta), observations)
     except ClosureError:  # the linearised machine cannot be assembled
-        residual = np.full(o.size, np.nan)
-    count, effective = o.size - o.n_zeros, _effective(fit)
-    square = float(residual @ residual)
-    rows = o.rows(residual)
-    k = effective + 1.0  # and the noise
-    room = count - k - 1.0
-    # readings without any scatter fit all models alike
-    mean_square = max(square / count, SMALLEST_SIGMA**2)
-    misfit = math.nan if math.isnan(square) else count * math.log(mean_square)
+        residual = np.full(observations.size, np.nan)
+    count, effective = observations.size - observations.n_zeros, _effective(fit)
+    sum_of_squares = float(residual @ residual)
+    rows = observations.rows(residual)
+    k = effective + 1.0  # with the noise
+    denominator = count - k - 1.0
+    # without any scatter all models fit equally well
+    mean_square = max(sum_of_squares / count, SMALLEST_SIGMA**2)
+    misfit = math.nan if math.isnan(sum_of_squares) else count * math.log(mean_square)
     return Score(
         method=method,
         estimates=dict(zip(problem.machine_selection.names, theta.tolist(), strict=False)),
         residuals=rows,
         rms=float(np.sqrt(np.mean(rows**2))),
-        chi_square=square / noise**2,
+        chi_square=sum_of_squares / noise**2,
         dof=count - effective,
-        aicc=misfit + 2.0 * k + 2.0 * k * (k + 1.0) / room if room > 0.0 else math.inf,
+        aicc=misfit + 2.0 * k + 2.0 * k * (k + 1.0) / denominator
+        if denominator > 0.0
+        else math.inf,
         bic=misfit + k * math.log(count) if count - effective >= 0.5 else math.inf,
         unseen=_predict_unseen(fit, linearisation, method),
     )
 
 
 def _predict_unseen(fit: Fit, linearisation: LinearProblem, method: Method) -> Array:
-    """Prediction errors of every setup from all the others, (n_rows,), [m]."""
-    problem, o = fit.problem, fit.problem.observations
-    errors = np.full(o.plus.size, np.nan)
-    setups = np.unique(o.setup)
+    """Errors of the rows of each setup, predicted from all others, shape (n_rows,), [m]."""
+    problem, observations = fit.problem, fit.problem.observations
+    errors = np.full(observations.plus.size, np.nan)
+    setups = np.unique(observations.setup)
     if setups.size < 2:
         return errors
     for setup in setups:
-        out = o.setup == setup
+        entries_left_out = observations.setup == setup
         try:
             if not problem.prior_precision.all():
-                jacobian = np.where(out[:, None], 0.0, linearisation.jacobian)
-                require_determined(problem, decompose(jacobian, o))
+                jacobian = np.where(entries_left_out[:, None], 0.0, linearisation.jacobian)
+                require_determined(problem, decompose(jacobian, observations))
             if method == "exact":
                 theta = fit.program.solve(
                     sigma=fit.sigma,
                     start=fit.solution.theta,
                     start_passive=fit.solution.passive,
-                    excluded=np.flatnonzero(out),
+                    excluded=np.flatnonzero(entries_left_out),
                 ).theta
             else:
-                theta = linearisation.solve(sigma=fit.sigma, use=~out)
-            residual = project_out_zeros(problem.values - problem.predict(theta), o)
+                theta = linearisation.solve(sigma=fit.sigma, use=~entries_left_out)
+            residual = project_out_zeros(problem.values - problem.predict(theta), observations)
         except (NotIdentifiableError, ClosureError, SolverError):
-            continue  # stays unknown
-        rows = out[o.plus]
-        errors[rows] = o.rows(residual)[rows]
+            continue  # errors remain NaN
+        rows = entries_left_out[observations.plus]
+        errors[rows] = observations.rows(residual)[rows]
     return errors
 
 
-def _linearisation_cost(fit: Fit, tool: ToolAccuracy) -> ErrorSize:
-    """Tool distance between the linearised and the exact estimate, to first order."""
+def _linearisation_cost(fit: Fit, tool: ToolAccuracy) -> ErrorStatistics:
+    """Difference of the tool position between the linearised and the exact estimate."""
     change = np.zeros(len(tool.names))
     n = fit.problem.n_machine
     change[:n] = (fit.linearised_theta - fit.solution.theta)[:n]

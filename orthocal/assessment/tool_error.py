@@ -1,11 +1,14 @@
 """Tool error over the workspace, before and after a calibration.
 
-A machine with errors θ, commanded to a posture, has its tool at p(θ). What is not known of θ
-becomes a position error J dθ with J = ∂p/∂θ (`kinematics.sensitivity`).
+A machine with errors θ, commanded to a posture, has its tool at p(θ). An error dθ of the estimate
+causes the position error J dθ with J = ∂p/∂θ (`kinematics.sensitivity`).
 
-Every figure is given three times: with shift and rotation taken out, which is what a workpiece sees
-that is aligned on the machine; with the common shift taken out; and absolute
-(`kinematics.workspace`).
+Statistics have three forms (`kinematics.workspace`):
+
+- aligned: the best-fit translation and rotation are removed, as for a workpiece that is aligned on
+  the machine;
+- relative: the mean translation is removed;
+- absolute.
 """
 
 from __future__ import annotations
@@ -38,7 +41,6 @@ from orthocal.calibration.assessment_record import (
     UsePart,
 )
 from orthocal.calibration.calibration import Calibration
-from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.conditions import (
     UseConditions,
@@ -47,26 +49,28 @@ from orthocal.kinematics.conditions import (
     sample_use,
     stated_use,
 )
+from orthocal.kinematics.reachable_box import no_workspace_error
 from orthocal.kinematics.workspace import FEWEST_ALIGNED, Workspace
 from orthocal.robot.model import require_commanded_tool
 
 MOST_POINTS = 5_000
-"""Points that are assessed together; each takes 40 kB. `accuracy_rows` takes any number."""
+"""Largest number of points that are assessed together; each needs 40 kB. `accuracy_rows` has no
+limit."""
 
-DRAWS = 500
-"""Errors drawn to find how large 95 % of the position errors are at most."""
+SAMPLES = 500
+"""Monte Carlo samples per point for the 95 % quantile."""
 
 
 @dataclass(frozen=True, eq=False)
-class ErrorSize:
-    """Size of position errors over a workspace, [m]."""
+class ErrorStatistics:
+    """Statistics of position errors over a workspace, [m]."""
 
     rms: float
-    """Root mean square over the points and the uncertainty."""
+    """RMS over the points, and over the distribution of uncertain errors."""
     largest: float
-    """Largest error; for an uncertainty the root mean square at the worst point."""
+    """Largest error; for uncertain errors the RMS at the worst point."""
     find_percentile: Callable[[], float] = field(repr=False)
-    """How the next is found, which takes time."""
+    """Function that computes `percentile_95`, which needs time."""
 
     @cached_property
     def percentile_95(self) -> float:
@@ -75,134 +79,147 @@ class ErrorSize:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ErrorSizes:
-    """Size of a field of position errors: aligned, relative and absolute."""
+class ToolErrorStatistics:
+    """Statistics of a field of position errors: aligned, relative and absolute."""
 
-    aligned: ErrorSize | None
-    """With shift and rotation removed; None if there are too few points."""
-    relative: ErrorSize
-    """With the mean translation removed."""
-    absolute: ErrorSize
+    aligned: ErrorStatistics | None
+    """Statistics after removing the best-fit translation and rotation; None for too few points."""
+    relative: ErrorStatistics
+    """Statistics after removing the mean translation."""
+    absolute: ErrorStatistics
+    """Statistics without alignment."""
 
     @property
-    def reported(self) -> ErrorSize:
-        """The reported form: aligned, or relative where there are too few points."""
+    def reported(self) -> ErrorStatistics:
+        """Reported form: aligned, or relative if there are too few points."""
         return self.relative if self.aligned is None else self.aligned
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolUncertainty:
-    """Uncertainty of the tool's position over a set of points."""
+    """Uncertainty of the tool position at K points under C conditions of use."""
 
     covariance: Array
-    """Of the position at each point, shape (K, 3, 3), [m²]."""
+    """Covariance of the absolute position at each point, shape (C K, 3, 3), [m²]."""
     aligned_covariance: Array
-    """Covariance at each point with shift and rotation removed, shape (K, 3, 3), [m²]."""
-    sizes: ErrorSizes
+    """Covariance at each point in the reported form, shape (C K, 3, 3), [m²]."""
+    sizes: ToolErrorStatistics
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolAccuracy:
-    """Deviation and uncertainty of the tool position, before and after a calibration."""
+    """Deviation and uncertainty of the tool position, before and after a calibration.
+
+    Arrays with C K rows hold the K points under each of C conditions of use.
+    """
 
     workspace: Workspace
-    """The points, once for each of C conditions of use."""
+    """The C K points."""
     use: UseSamples
-    """The conditions."""
+    """The C conditions."""
     targets: Array
     """Commanded tool positions, shape (C K, 3), [m]."""
     names: tuple[str, ...]
-    """Free, then unmodelled parameters."""
+    """Names of the free parameters, then of the unmodelled ones."""
     jacobian: Array
     """∂p/∂θ at every point, shape (C K, 3, n), [m per parameter unit]."""
     deviation: Array
     """Actual minus commanded tool position with the active offsets, shape (C K, 3), [m]."""
-    error_after_offsets: Array
-    """The same with the offsets and the backlash to enter, in a controller that corrects nothing
-    else."""
+    deviation_with_entries: Array
+    """Actual minus commanded tool position with the offsets and the backlash to enter, shape
+    (C K, 3), [m]. The controller corrects nothing else."""
     before: ToolUncertainty
     """Uncertainty from the priors alone."""
     after: ToolUncertainty | None
     """Uncertainty after the calibration; None if the noise is unknown."""
-    without_backlash: Array | None = None
-    """The same with the offsets to enter, but not the backlash; None without backlash to enter."""
-    unstated: Array | None = None
-    """Error of a controller that corrects all errors without these conditions, shape (C K, 3), [m];
-    None where they do not vary."""
+    deviation_without_backlash: Array | None = None
+    """Actual minus commanded tool position with the offsets to enter and the present backlash,
+    shape (C K, 3), [m]; None without backlash to enter."""
+    deviation_ignoring_conditions: Array | None = None
+    """Tool error if all errors are corrected for the reference conditions only, shape (C K, 3),
+    [m]; None if the conditions do not vary."""
 
     @property
     def points(self) -> Array:
-        """The points once, shape (K, n_coordinates), [m]."""
-        return self.workspace.points[: len(self.targets) // self.use.size]
+        """The K points, shape (K, n_coordinates), [m]."""
+        return self.workspace.once(self.use.size).points
 
     def average(self, field: Array) -> Array:
-        """Mean of a field over the conditions of use, shape (K, ...)."""
+        """Mean over the conditions of use, shape (K, ...) of a field of shape (C K, ...)."""
         if self.use.size == 1:
             return field
         fields = field.reshape(self.use.size, -1, *field.shape[1:])
         return np.asarray(fields.mean(axis=0))
 
     def align(self, field: Array) -> Array:
-        """A field of position errors with shift and rotation removed, shape (C K, 3, ...)."""
+        """Field of position errors with the best-fit translation and rotation removed.
+
+        Args:
+            field: Position errors or their derivatives, shape (C K, 3, ...), [m].
+        """
         return self.workspace.align(field, self.targets)
 
-    def measure(self, deviations: Array) -> ErrorSizes:
-        """Size of known position errors, shape (K, 3), [m]."""
+    def measure(self, deviations: Array) -> ToolErrorStatistics:
+        """Statistics of position errors of shape (C K, 3), [m]."""
         return measure_deviations(deviations, self.workspace, self.targets)
 
 
 def measure_uncertainty(
     jacobian: Array, covariance: Array, workspace: Workspace, positions: Array
 ) -> ToolUncertainty:
-    """Position uncertainty from sensitivities and the covariance of the parameters.
+    """Uncertainty of positions from sensitivities and the covariance of the parameters.
 
     Args:
         jacobian: ∂p/∂θ at every point, shape (K, 3, n), [m per parameter unit].
-        covariance: Of θ, shape (n, n), [SI].
-        workspace: The points, and the weights of their mean.
-        positions: Of the points in space, shape (K, 3), [m].
+        covariance: Covariance of θ, shape (n, n), [SI].
+        workspace: The points and their weights.
+        positions: Tool positions, shape (K, 3), [m].
     """
     fields = {
         "absolute": jacobian,
-        "relative": workspace.remove_shift(jacobian),
+        "relative": workspace.remove_translation(jacobian),
         "aligned": workspace.remove_motion(jacobian, positions),
     }
     n = len(covariance)
-    spread = {
+    covariances = {
         name: (j.reshape(-1, n) @ covariance).reshape(j.shape) @ j.transpose(0, 2, 1)
         for name, j in fields.items()
     }
-    sizes = {name: _spread_size(c, workspace) for name, c in spread.items()}
+    sizes = {name: _normal_statistics(c, workspace) for name, c in covariances.items()}
     few = len(positions) < FEWEST_ALIGNED
     return ToolUncertainty(
-        covariance=spread["absolute"],
-        aligned_covariance=spread["relative" if few else "aligned"],
-        sizes=ErrorSizes(None if few else sizes["aligned"], sizes["relative"], sizes["absolute"]),
+        covariance=covariances["absolute"],
+        aligned_covariance=covariances["relative" if few else "aligned"],
+        sizes=ToolErrorStatistics(
+            None if few else sizes["aligned"], sizes["relative"], sizes["absolute"]
+        ),
     )
 
 
-def measure_deviations(deviations: Array, workspace: Workspace, positions: Array) -> ErrorSizes:
-    """Size of known position errors.
+def measure_deviations(
+    deviations: Array, workspace: Workspace, positions: Array
+) -> ToolErrorStatistics:
+    """Statistics of position errors.
 
     Args:
-        deviations: Shape (K, 3), [m].
-        workspace: The points, and the weights of their mean.
-        positions: Of the points in space, shape (K, 3), [m].
+        deviations: Position errors, shape (K, 3), [m].
+        workspace: The points and their weights.
+        positions: Tool positions, shape (K, 3), [m].
     """
 
-    def size(field: Array) -> ErrorSize:
+    def statistics(field: Array) -> ErrorStatistics:
         lengths = np.linalg.norm(field, axis=1)
-        return ErrorSize(
+        return ErrorStatistics(
             rms=float(np.sqrt(workspace.weights @ lengths**2)),
             largest=float(lengths.max()),
             find_percentile=partial(_length_percentile, field, workspace),
         )
 
     few = len(positions) < FEWEST_ALIGNED
-    return ErrorSizes(
-        aligned=None if few else size(workspace.remove_motion(deviations, positions)),
-        relative=size(workspace.remove_shift(deviations)),
-        absolute=size(deviations),
+    return ToolErrorStatistics(
+        aligned=None if few else statistics(workspace.remove_motion(deviations, positions)),
+        relative=statistics(workspace.remove_translation(deviations)),
+        absolute=statistics(deviations),
     )
 
 
@@ -216,19 +233,18 @@ def assess_tool(
     """Deviation and uncertainty of the tool position, before and after a calibration.
 
     Unmodelled errors contribute with their prior standard deviations, and with the bias that they
-    cause in the estimate. The uncertainty before is at the stated tolerances, that after it at the
-    scaled ones.
+    cause in the estimate. `before` uses the stated tolerances, `after` the scaled ones.
 
     Args:
         calibration: The calibration.
-        workspace: Tool positions that are commanded; by default the workspace.
-        names: What to call the points in messages.
+        workspace: Commanded tool positions; by default the reachable workspace.
+        names: Names of the points, for messages.
         conditions: Conditions of use in place of those that the robot's YAML states. Squared errors
-            are averaged over all that remain.
+            are averaged over conditions that are not stated here.
 
     Raises:
         RobotError: If the robot has no tool centre point, or its drives do not command it.
-        ClosureError: If the machine cannot reach a point, or its tool hardly moves at all.
+        ClosureError: If the machine cannot reach a point, or no box of ±1 mm.
         ParameterError: If a condition is out of range, or nothing depends on it.
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
@@ -236,7 +252,8 @@ def assess_tool(
     if conditions is not None:
         conditions.require_valid(calibration.robot)
         use = sample_use(calibration.robot, conditions)
-        use = use if use.varying else UseSamples((conditions,))
+        if not use.varying:  # one sample: the stated conditions, also those that no effect needs
+            use = UseSamples((conditions,))
     if workspace is None:
         return assess_placed(calibration, require_tool(calibration, find_tool(calibration, use)))
     placed = place_tool(calibration, workspace, use, names=names)
@@ -244,19 +261,15 @@ def assess_tool(
 
 
 def require_tool(calibration: Calibration, tool: CalibratedTool | None) -> CalibratedTool:
-    """The tool over its workspace, which exists.
+    """Tool over its workspace; raises an error if there is none.
 
     Raises:
         RobotError: If the robot has no tool centre point, or its drives do not command it.
-        ClosureError: If its tool hardly moves at all.
+        ClosureError: If no box of ±1 mm can be reached.
     """
     require_commanded_tool(calibration.robot)
     if tool is None:
-        raise ClosureError(
-            "cannot be reached: there is no region around it, not even of a millimetre, that the "
-            "machine reaches within its limits",
-            posture="mechanical zero",
-        )
+        raise no_workspace_error()
     return tool
 
 
@@ -268,61 +281,77 @@ def assess_placed(
     *,
     names: Sequence[str] | None = None,
 ) -> ToolAccuracy:
-    """`assess_tool` over points whose tool is known, with entries that may be known."""
+    """Deviation and uncertainty of a tool, as `assess_tool` returns them.
+
+    Args:
+        calibration: The calibration.
+        tool: Its tool at the points.
+        entries: Offsets to enter; by default those of the assessment.
+        backlash: Backlash to enter; by default that of the assessment.
+        names: Names of the points, for messages.
+    """
     unmodelled = calibration.unmodelled
     prior_stds = np.r_[[p.prior_std for p in calibration.free], unmodelled.prior_stds]
     free = tuple(tool.free[: len(prior_stds)])
+    # back to the stated tolerances
     prior_stds /= calibration.tolerance_scale.factors(calibration.robot.parameters, free)
     jacobian = tool.jacobian[:, :, : len(prior_stds)]
-    space, where = tool.workspace, tool.targets
+    workspace, targets = tool.workspace, tool.targets
     after = None
     if np.isfinite(calibration.model_covariance).all():
-        after = measure_uncertainty(jacobian, error_covariance(calibration), space, where)
+        after = measure_uncertainty(jacobian, error_covariance(calibration), workspace, targets)
     offsets = entered_offsets(calibration, entries)
-    entered = find_backlash(calibration) if backlash is None else backlash
-    changes = backlash_changes(calibration, entered)
+    backlash_entries = find_backlash(calibration) if backlash is None else backlash
+    changes = backlash_changes(calibration, backlash_entries)
     deviation = tool.compensating(changes).deviation(offsets, names=names)
-    without = read_only(tool.deviation(offsets, names=names)) if changes.any() else None
+    deviation_without_backlash = None
+    if changes.any():
+        deviation_without_backlash = read_only(tool.deviation(offsets, names=names))
+    deviation_ignoring_conditions = None
+    if tool.use.varying:
+        deviation_ignoring_conditions = read_only(tool.deviation_ignoring_conditions())
     return ToolAccuracy(
-        workspace=space,
+        workspace=workspace,
         use=tool.use,
-        targets=where,
+        targets=targets,
         names=free,
         jacobian=jacobian,
         deviation=read_only(tool.deviation(calibration.active_offsets, names=names)),
-        error_after_offsets=read_only(deviation),
-        before=measure_uncertainty(jacobian, np.diag(prior_stds**2), space, where),
+        deviation_with_entries=read_only(deviation),
+        before=measure_uncertainty(jacobian, np.diag(prior_stds**2), workspace, targets),
         after=after,
-        without_backlash=without,
-        unstated=read_only(tool.deviation_unless_stated()) if tool.use.varying else None,
+        deviation_without_backlash=deviation_without_backlash,
+        deviation_ignoring_conditions=deviation_ignoring_conditions,
     )
 
 
 def summarise_tool(calibration: Calibration, accuracy: ToolAccuracy) -> ToolErrorSummary | None:
-    """Expected tool error now, with the offsets entered, and with all errors compensated.
+    """Expected tool error now, with the entries, and with all identified errors corrected.
 
-    Each is the root of the sum of squares of the known deviation and of the uncertainty.
+    Each is sqrt(deviation² + uncertainty²) in RMS; with all errors corrected the deviation is 0.
 
     Returns:
-        None if nothing determines the noise.
+        None if the noise is unknown.
     """
     if accuracy.after is None:
         return None
-    known = accuracy.after.sizes
-    compensated = known.reported.rms
-    now, entered = (accuracy.measure(d) for d in (accuracy.deviation, accuracy.error_after_offsets))
-    field, without = accuracy.without_backlash, None
-    if field is not None:
-        without = math.hypot(accuracy.measure(field).reported.rms, compensated)
+    uncertainty = accuracy.after.sizes
+    compensated, absolute = uncertainty.reported.rms, uncertainty.absolute.rms
+    now, entered = (
+        accuracy.measure(d) for d in (accuracy.deviation, accuracy.deviation_with_entries)
+    )
+    deviation, without_backlash = accuracy.deviation_without_backlash, None
+    if deviation is not None:
+        without_backlash = math.hypot(accuracy.measure(deviation).reported.rms, compensated)
     return ToolErrorSummary(
         box=tuple((float(low), float(high)) for low, high in accuracy.workspace.limits),
         coordinates=accuracy.workspace.letters,
-        now=math.hypot(now.reported.rms, known.reported.rms),
+        now=math.hypot(now.reported.rms, compensated),
         entered=math.hypot(entered.reported.rms, compensated),
         compensated=compensated,
-        now_absolute=math.hypot(now.absolute.rms, known.absolute.rms),
-        without_backlash=without,
-        entered_absolute=math.hypot(entered.absolute.rms, known.absolute.rms),
+        now_absolute=math.hypot(now.absolute.rms, absolute),
+        without_backlash=without_backlash,
+        entered_absolute=math.hypot(entered.absolute.rms, absolute),
         use=_summarise_use(calibration, accuracy, compensated),
     )
 
@@ -330,69 +359,70 @@ def summarise_tool(calibration: Calibration, accuracy: ToolAccuracy) -> ToolErro
 def _summarise_use(
     calibration: Calibration, accuracy: ToolAccuracy, compensated: float
 ) -> ToolUse | None:
-    """Conditions of use of the tool error, and what each that varies contributes.
+    """Conditions of use of the tool error, and the contribution of each varying condition.
 
-    Errors are nearly linear in the conditions, and a workpiece is aligned once for all of them. So
-    the mean square is that of the mean conditions and of the change by each condition, which no
-    alignment removes.
+    Errors are nearly linear in the conditions, and the workpiece is aligned once for all of them.
+    The mean square is therefore the sum of that at the mean conditions and of those of the changes
+    by each condition, which alignment does not remove.
     """
     use, effects = accuracy.use.declared, effects_by_condition(calibration.robot)
     stated = stated_use(calibration.robot, use)
     if use is None or stated is None:
         return None
     covariance = error_covariance(calibration)
-    weights = accuracy.use.size * accuracy.workspace.weights[: len(accuracy.points)]
-    known, unknown = (
-        accuracy.use.changes(v) for v in (accuracy.error_after_offsets, accuracy.jacobian)
+    weights = accuracy.workspace.once(accuracy.use.size).weights
+    deviation_changes, jacobian_changes = (
+        accuracy.use.changes(v) for v in (accuracy.deviation_with_entries, accuracy.jacobian)
     )
     parts = []
-    for name, change in known.items():
-        by = unknown[name]
-        spread = np.einsum("k,fkin,nm,fkim->", weights, by, covariance, by, optimize=True)
+    for name, change in deviation_changes.items():
+        j = jacobian_changes[name]
+        # weighted mean over points k, summed over changes f, of the trace of J C Jᵀ
+        variance = np.einsum("k,fkin,nm,fkim->", weights, j, covariance, j, optimize=True)
         parts.append(
             UsePart(
                 name,
                 effects[name],
                 known=math.sqrt(float(np.einsum("k,fki->", weights, change**2))),
-                uncertain=math.sqrt(max(float(spread), 0.0)),
+                uncertain=math.sqrt(max(float(variance), 0.0)),
             )
         )
-    unstated = (
-        0.0 if accuracy.unstated is None else accuracy.measure(accuracy.unstated).reported.rms
-    )
+    unstated, ignoring = 0.0, accuracy.deviation_ignoring_conditions
+    if ignoring is not None:
+        unstated = accuracy.measure(ignoring).reported.rms
     return ToolUse(**stated, parts=tuple(parts), unstated=math.hypot(unstated, compensated))
 
 
-def _spread_size(covariances: Array, workspace: Workspace) -> ErrorSize:
-    """Sizes of normal errors with given covariances, shape (K, 3, 3), at the points."""
+def _normal_statistics(covariances: Array, workspace: Workspace) -> ErrorStatistics:
+    """Statistics of normal errors with mean 0 and covariances of shape (K, 3, 3), [m²]."""
     mean_square = np.trace(covariances, axis1=1, axis2=2)
-    return ErrorSize(
+    return ErrorStatistics(
         rms=float(np.sqrt(workspace.weights @ mean_square)),
         largest=float(np.sqrt(mean_square.max())),
-        find_percentile=partial(_drawn_percentile, covariances, workspace),
+        find_percentile=partial(_sampled_percentile, covariances, workspace),
     )
 
 
 def _length_percentile(field: Array, workspace: Workspace) -> float:
-    """95 % quantile of the lengths of a field, shape (K, 3)."""
-    parts, weights = workspace.spread(field)
-    return _weighted_percentile(np.linalg.norm(parts, axis=1), weights)
+    """95 % quantile of the lengths of position errors, shape (K, 3)."""
+    errors, weights = workspace.interpolate_to_cells(field)
+    return _weighted_percentile_95(np.linalg.norm(errors, axis=1), weights)
 
 
-def _drawn_percentile(covariances: Array, workspace: Workspace) -> float:
-    """95 % quantile of normal errors, by sampling; covariances have the shape (K, 3, 3)."""
-    parts, weights = workspace.spread(covariances)
-    values, vectors = np.linalg.eigh(parts)
+def _sampled_percentile(covariances: Array, workspace: Workspace) -> float:
+    """95 % quantile of the lengths of normal errors by sampling; covariances (K, 3, 3)."""
+    interpolated, weights = workspace.interpolate_to_cells(covariances)
+    values, vectors = np.linalg.eigh(interpolated)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    draws = np.random.default_rng(0).normal(size=(3, DRAWS))
-    lengths = np.linalg.norm(roots @ draws, axis=1)
-    shares = np.broadcast_to(weights[:, None] / DRAWS, lengths.shape)
-    return _weighted_percentile(lengths.reshape(-1), shares.reshape(-1))
+    samples = np.random.default_rng(0).normal(size=(3, SAMPLES))
+    lengths = np.linalg.norm(roots @ samples, axis=1)
+    shares = np.broadcast_to(weights[:, None] / SAMPLES, lengths.shape)
+    return _weighted_percentile_95(lengths.reshape(-1), shares.reshape(-1))
 
 
-def _weighted_percentile(lengths: Array, weights: Array) -> float:
-    """95 % quantile by weight."""
-    if weights.min() == weights.max():  # without sorting all
+def _weighted_percentile_95(lengths: Array, weights: Array) -> float:
+    """Weighted 95 % quantile."""
+    if weights.min() == weights.max():  # faster, without sorting
         return float(np.quantile(lengths, 0.95, method="inverted_cdf"))
     order = np.argsort(lengths)
     share = np.cumsum(weights[order])

@@ -1,6 +1,6 @@
-"""Tables of many rows on the calibrated machine: a chunk at a time, each row for itself.
+"""Evaluation of long tables on the calibrated machine, in chunks of rows.
 
-Memory does not grow with the table, and a row that cannot be reached stops no other.
+Memory does not grow with the table. A row that cannot be reached does not affect the others.
 """
 
 from __future__ import annotations
@@ -26,39 +26,39 @@ from orthocal.kinematics.loop_closure import (
 )
 from orthocal.kinematics.sensitivity import ToolSensitivity
 
-ROWS_AT_ONCE = 512
-"""Rows of a chunk: a full model takes 20 kB a row while it is evaluated."""
+CHUNK_SIZE = 512
+"""Rows of a chunk. A full model needs 20 kB per row."""
 
 Block = tuple[Sequence[str], Array]
-"""Names of some rows, and their values."""
+"""Names of some rows and their values, shape (n_rows, n_columns)."""
 
 _Evaluate = Callable[[Array, Sequence[str], Failures], Array]
-"""Values of some rows, by name; fills in which fail, whose values are of no account."""
+"""Function that returns the values of some rows and records those that fail."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chunk:
-    """Some rows of a table, evaluated."""
+    """Evaluated rows of a table."""
 
     first: int
-    """Index of the first of them in the table."""
+    """Index of the first row in the table."""
     values: Array
-    """Shape (n_rows, n_columns), [SI]; NaN in rows that are refused."""
+    """Values, shape (n_rows, n_columns), [SI]; NaN in refused rows."""
     refused: Mapping[int, ClosureError]
-    """Index in the table to why the machine cannot be there."""
+    """Index in the table to the reason why the machine cannot reach the row."""
 
 
 def forward_blocks(
     calibration: Calibration, blocks: Iterable[Block], conditions: UseConditions | None = None
 ) -> Iterator[Chunk]:
-    """Tool centre points of the calibrated machine, of rows as they come.
+    """Tool centre points of the calibrated machine for blocks of drive coordinates.
 
     Args:
         calibration: The calibration.
-        blocks: Names and drive coordinates of some rows as the encoders give them, without any
-            offset of the controller, shape (n, n_drives), [m, rad].
-        conditions: Conditions of use; by default the middle of both sides of each drive, the
-            reference temperature and no payload.
+        blocks: Names and drive coordinates of encoders, without offsets of the controller, shape
+            (n, n_drives), [m, rad].
+        conditions: Conditions of use; by default the mean of both sides of approach, the reference
+            temperature and no payload.
 
     Yields:
         Chunks of shape (n, 3), [m].
@@ -76,15 +76,15 @@ def forward_blocks(
 def inverse_blocks(
     calibration: Calibration, blocks: Iterable[Block], conditions: UseConditions | None = None
 ) -> Iterator[Chunk]:
-    """Drive coordinates that bring the calibrated machine's tool to points as they come.
+    """Drive coordinates of the calibrated machine for blocks of tool positions.
 
     Args:
         calibration: The calibration.
-        blocks: Names and coordinates of some points, shape (n, n_drives), [m].
+        blocks: Names and coordinates of points, shape (n, n_drives), [m].
         conditions: As for `forward_blocks`.
 
     Yields:
-        Chunks of shape (n, n_drives), as the encoders give them, [m, rad].
+        Chunks of drive coordinates of encoders, shape (n, n_drives), [m, rad].
     """
     closure = _closure(calibration, conditions)
 
@@ -95,6 +95,7 @@ def inverse_blocks(
 
 
 def _closure(calibration: Calibration, conditions: UseConditions | None) -> LoopClosure:
+    """Loop closures of the calibrated machine."""
     use = conditions or UseConditions()
     return LoopClosure(calibration.robot, fixed=calibration.errors, conditions=use)
 
@@ -106,19 +107,19 @@ def accuracy_rows(
     names: Sequence[str] | None = None,
     conditions: UseConditions | None = None,
 ) -> Iterator[Chunk]:
-    """Actual tool positions for commanded points, with absolute uncertainty.
+    """Deviation of the tool at commanded points with its absolute uncertainty.
 
-    As `assess_tool` has it, point by point.
+    The values are those of `assess_tool`, computed point by point.
 
     Args:
         calibration: The calibration.
-        points: In the coordinates that the drives control, shape (K, n_coordinates), [m].
-        names: What to call the rows in messages.
+        points: Commanded coordinates, shape (K, n_coordinates), [m].
+        names: Names of the points, for messages.
         conditions: As for `forward_blocks`.
 
     Yields:
-        Chunks of shape (n, 9): the commanded position, by how much the tool is off it, and one
-        standard deviation of that, NaN where nothing tells the noise, [m].
+        Chunks of shape (n, 9), [m]: commanded position, deviation of the tool and its standard
+        deviation. The last is NaN if the noise is unknown.
     """
     robot, values = calibration.robot, calibration.errors
     free = [p.name for p in calibration.free]
@@ -129,8 +130,8 @@ def accuracy_rows(
     rows, _ = as_rows(points, len(robot.drives), "coordinates")
     active = calibration.session.controller_offsets
     offsets = np.zeros(len(robot.drives)) if active is None else np.array(active)
-    known = bool(np.isfinite(calibration.model_covariance).all())
-    covariance = error_covariance(calibration) if known else None
+    noise_known = bool(np.isfinite(calibration.model_covariance).all())
+    covariance = error_covariance(calibration) if noise_known else None
 
     def evaluate(rows: Array, names: Sequence[str], failures: Failures) -> Array:
         drives = nominal.inverse(rows, names=names, failures=failures)
@@ -138,29 +139,32 @@ def accuracy_rows(
         commanded = drives - offsets
         passive = tool.closure.close(commanded, names=names, failures=failures)
         result = np.full((len(rows), 9), np.nan)
-        at = np.array([i for i in range(len(rows)) if i not in failures], dtype=np.int64)
-        if not at.size:
+        reached = np.array([i for i in range(len(rows)) if i not in failures], dtype=np.int64)
+        if not reached.size:
             return result
-        result[at, :3] = target[at]
-        result[at, 3:6] = tool.closure.tcp(commanded[at], passive[at]) - target[at]
+        result[reached, :3] = target[reached]
+        result[reached, 3:6] = (
+            tool.closure.tcp(commanded[reached], passive[reached]) - target[reached]
+        )
         if covariance is not None:
-            jacobian = tool(commanded[at], passive=passive[at])
+            jacobian = tool(commanded[reached], passive=passive[reached])
             variance = np.einsum("kin,nm,kim->ki", jacobian, covariance, jacobian, optimize=True)
-            result[at, 6:] = np.sqrt(variance)
+            result[reached, 6:] = np.sqrt(variance)
         return result
 
     yield from _by_chunks(evaluate, row_blocks(rows, names))
 
 
 def row_blocks(rows: Array, names: Sequence[str] | None = None) -> Iterator[Block]:
-    """Rows some at a time, with what to call them in messages."""
+    """Blocks of rows with their names for messages."""
     names = names or [f"row {i + 1}" for i in range(len(rows))]
-    for first in range(0, len(rows), ROWS_AT_ONCE):
-        part = slice(first, first + ROWS_AT_ONCE)
-        yield names[part], rows[part]
+    for first in range(0, len(rows), CHUNK_SIZE):
+        chunk = slice(first, first + CHUNK_SIZE)
+        yield names[chunk], rows[chunk]
 
 
 def _by_chunks(evaluate: _Evaluate, blocks: Iterable[Block]) -> Iterator[Chunk]:
+    """Evaluate blocks of rows and number their rows."""
     first = 0
     for names, rows in blocks:
         failures: Failures = {}

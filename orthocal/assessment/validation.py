@@ -1,9 +1,9 @@
-"""Validation of a calibration by a new session, as the paper's third experiment.
+"""Validation of a calibration by a new session.
 
 The new session is measured with the calibrated offsets active in the controller. The calibration
 is confirmed if the new readings deviate as predicted, within the uncertainty of the calibration,
-and no change between the sessions is found. A confirmed calibration can still be improved: then the
-values to enter are those of a calibration from the readings of both.
+and no change between the sessions is found. New readings can still improve a confirmed
+calibration. Then the values to enter come from a joint calibration of all sessions.
 """
 
 from __future__ import annotations
@@ -58,11 +58,16 @@ from orthocal.session.session import Session
 from orthocal.statistics.chance import BY_CHANCE
 from orthocal.units import MM
 
-REMOVED = 0.7
-"""Part of the deviations below which a fit of the new readings is said to remove them."""
+EXPLAINED_RATIO = 0.7
+"""Ratio of RMS residuals to RMS deviations below which a fit explains the deviations."""
+
+ALLOWED_STDS = 0.5
+"""Allowed difference of a stated offset from the calibrated one, in standard deviations of its
+scatter."""
 
 ROUNDING = 0.02e-3
-"""Difference of a stated offset from the calibrated one that is due to rounding, [m, rad]."""
+"""Difference of a stated offset from the calibrated one that is always allowed: 0.02 mm or
+0.02 mrad, [m, rad]."""
 
 ENTRY_KINDS: tuple[FindingKind, ...] = (
     "no offset",
@@ -72,7 +77,7 @@ ENTRY_KINDS: tuple[FindingKind, ...] = (
     "tool error",
     "out of reach",
 )
-"""Kinds of findings about the values to enter after the new readings."""
+"""Kinds of findings about the values to enter."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,28 +85,28 @@ class Validation:
     """Comparison of a new session with the predictions of a calibration."""
 
     confirmed: bool | None
-    """Whether the calibration is confirmed; None if it predicts nothing, or if the new readings
-    agree with it but contradict each other."""
+    """True if the calibration is confirmed; None if it predicts nothing, or if the new readings
+    agree with it but have anomalies."""
     offsets_stated: bool
-    """Whether the session states the active offsets; otherwise the calibrated ones are assumed."""
+    """True if the session states the active offsets; otherwise the calibrated ones are assumed."""
     expected_rms: float
-    """RMS of the deviations as predicted, [m]."""
+    """Predicted RMS of the deviations, [m]."""
     expected_largest: float
-    """Largest deviation as predicted, [m]."""
+    """Predicted largest deviation, [m]."""
     excess_probability: float
-    """Probability of deviations as large as those measured, or larger; NaN if the calibration
+    """Probability of deviations at least as large as the measured ones; NaN if the calibration
     predicts nothing."""
     refit: Calibration
-    """The same fit to the new readings, with its assessment. Its deviations are those from the
-    machine as it was calibrated."""
+    """Fit of the same parameters to the new readings, with its assessment. Its deviations refer to
+    the calibrated machine."""
     joint: Calibration | None
-    """Calibration from its readings and the new ones together, as `calibrate` assesses it; None if
-    the calibration is not confirmed."""
+    """Joint calibration from all sessions with its assessment; None if the calibration is not
+    confirmed."""
     mistake: Anomaly | None
-    """Change between the sessions: offsets that were entered wrongly, or a machine that changed."""
+    """Wrongly entered offsets, or another change between the sessions; None without any."""
     enter: tuple[ControllerEntry, ...]
-    """Values to enter: those of the calibration if they were entered wrongly or all readings
-    together change none, otherwise those of `answer`."""
+    """Values to enter. Those of the calibration if they were entered wrongly, or if the joint
+    calibration changes none of them; otherwise those of `final_calibration`."""
     repetition: Repetition
     """Correlation of the residuals of both fits."""
     assessment: Assessment
@@ -113,27 +118,27 @@ class Validation:
         return _is_expected(self.excess_probability)
 
     @property
-    def answer(self) -> Calibration:
-        """Calibration whose values count: `joint`, or `refit` if that is None."""
+    def final_calibration(self) -> Calibration:
+        """Calibration with the final values: `joint`, or `refit` if that is None."""
         return self.joint or self.refit
 
     @property
     def nothing_to_change(self) -> bool:
-        """True if a calibration from these readings keeps the active offsets."""
-        return assessment_of(self.answer).keeps_offsets
+        """True if the final calibration keeps the active offsets."""
+        return assessment_of(self.final_calibration).keeps_offsets
 
     def to_json(self) -> str:
-        """Document for JSON, SI units."""
-        refit, answer = self.refit, self.answer
+        """Validation as a JSON document, SI units."""
+        refit, final = self.refit, self.final_calibration
         changes = [
             {
                 "drive": e.drive,
                 "unit": e.unit,
                 "change": e.best_change,
-                "expanded_uncertainty": finite_or_none(expanded_uncertainty(answer, e)),
-                "significant": is_significant(answer, e),
+                "expanded_uncertainty": finite_or_none(expanded_uncertainty(final, e)),
+                "significant": is_significant(final, e),
             }
-            for e in assessment_of(answer).entries
+            for e in assessment_of(final).entries
         ]
         document = {
             "schema": "orthocal/validation/4",
@@ -159,6 +164,7 @@ class Validation:
 
 
 def _mistake_document(mistake: Anomaly) -> dict[str, Any]:
+    """Entries of the JSON document about a change between the sessions."""
     e = mistake.explanation
     return {
         "kind": e.kind,
@@ -172,8 +178,9 @@ def _mistake_document(mistake: Anomaly) -> dict[str, Any]:
     }
 
 
-def _is_expected(probability: float) -> bool | None:
-    return None if math.isnan(probability) else probability >= BY_CHANCE
+def _is_expected(p_value: float) -> bool | None:
+    """True if deviations with this p-value are as predicted; None if it is unknown."""
+    return None if math.isnan(p_value) else p_value >= BY_CHANCE
 
 
 def validate_calibration(
@@ -186,117 +193,122 @@ def validate_calibration(
 
     Args:
         calibration: The calibration whose offsets were entered.
-        sessions: Measured afterwards, with its offsets in the controller, as is assumed of those
-            that state none. Adjustments that they state change the predicted readings.
-        tolerances: As in `Choice`, for the judgement of the new sessions and of changes, not for
-            the predictions.
+        sessions: Sessions measured with these offsets active, which is assumed if a session states
+            none. Adjustments that they state change the predicted readings.
+        tolerances: Tolerances as in `Choice`, for the judgement of the new sessions and of changes,
+            not for the predictions.
 
     Raises:
-        SessionError: If a session is of another robot, states offsets of another calibration, or is
-            one that the calibration was made from.
+        SessionError: If a session is of another robot, states other offsets, or belongs to the
+            calibration itself.
         NotIdentifiableError: If the sessions do not determine the parameters.
         SolverError: If the fit of the new readings does not converge.
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
-    calibration, new_sessions = _restate(calibration, gather_sessions(sessions), tolerances or {})
+    gathered = gather_sessions(sessions)
+    calibration, new_sessions = _apply_stated(calibration, gathered, tolerances or {})
     measured = [_with_active_offsets(calibration, one) for one in new_sessions]
-    session = join_sessions(measured)
-    judgement, fit = judge_session(session), repeat_fit(calibration, session)
-    refit = _assess_refit(fit, calibration, judgement)
-    every = join_sessions([restore_session(calibration), *measured])
-    anomalies = find_anomalies(every)
-    mistake, changes, wrongly_entered = _find_changes(every, anomalies, judgement)
+    judgement, fit, refit = _refit(calibration, join_sessions(measured))
+    all_sessions = join_sessions([restore_session(calibration), *measured])
+    anomalies = find_anomalies(all_sessions)
+    mistake, changes, wrongly_entered = _find_changes(all_sessions, anomalies, judgement)
     expected_rms, test = expect_rms(calibration, fit), judge_deviations(calibration, fit)
-    lead = _agreement(refit, test, expected_rms, explained=bool(changes))
-    confirmed = None if math.isnan(test.chance) else _is_confirmed(lead, changes, judgement)
-    joint = _calibrate_jointly(calibration, every, anomalies) if confirmed else None
-    further, assessed = _find_further_change(joint), assessment_of(joint or refit)
-    keep = wrongly_entered or (confirmed is not False and not further)
-    entries = find_entries(calibration) if keep else assessed.entries
+    agreement = _describe_agreement(refit, test, expected_rms, explained=bool(changes))
+    confirmed = None if math.isnan(test.p_value) else _confirmation(agreement, changes, judgement)
+    joint = _calibrate_jointly(calibration, all_sessions, anomalies) if confirmed else None
+    entries, notes = _choose_entries(
+        calibration, refit, joint, confirmed=confirmed, wrongly_entered=wrongly_entered
+    )
     repetition = measure_repetition(calibration, refit)
     stated = all(one.controller_offsets is not None for one in new_sessions)
-    notes = [*further, *([] if wrongly_entered else assessed.of_kind(*ENTRY_KINDS))]
-    notes.append(words.describe_repetition(repetition, new=_is_expected(test.chance) is False))
+    exceeded = _is_expected(test.p_value) is False
+    notes += [words.describe_repetition(repetition, exceeded=exceeded)]
     notes += [] if stated else [words.controller_assumed()]
     return Validation(
         confirmed=confirmed,
         offsets_stated=stated,
         expected_rms=expected_rms,
         expected_largest=_expect_largest(calibration, expected_rms),
-        excess_probability=test.chance,
+        excess_probability=test.p_value,
         refit=refit,
         joint=joint,
         mistake=mistake,
         enter=entries,
         repetition=repetition,
         assessment=replace(
-            assessed,
-            decision=_decide(confirmed, judgement, lead, changes),
-            findings=rank([*judgement.findings, lead, *changes, *notes]),
+            assessment_of(joint or refit),
+            decision=_decide(confirmed, judgement, agreement, changes),
+            findings=rank([*judgement.findings, agreement, *changes, *notes]),
             entries=entries,
         ),
     )
 
 
-def _restate(
+def _apply_stated(
     calibration: Calibration, sessions: Sequence[Session], tolerances: Mapping[str, float]
 ) -> tuple[Calibration, list[Session]]:
-    """Calibration and new sessions of the machine with stated tolerances and adjustments.
+    """Calibration and new sessions with the stated tolerances and mechanical adjustments.
 
     Raises:
-        SessionError: If the calibration was made from a session, or an adjustment does not fit.
+        SessionError: If a session belongs to the calibration, or an adjustment does not fit.
     """
     restated = [session.with_tolerances(tolerances) for session in sessions]
     robot = calibration.robot.with_tolerances(tolerances)
-    calibration = _as_adjusted(replace(calibration, robot=robot), restated)
+    calibration = _adjust_to_sessions(replace(calibration, robot=robot), restated)
     _require_new(calibration, restated)
     return calibration, restated
 
 
-def _assess_refit(fit: Fit, calibration: Calibration, judgement: Judgement) -> Calibration:
-    """Calibration of the new readings; its nominal readings are those that were predicted."""
+def _refit(calibration: Calibration, session: Session) -> tuple[Judgement, Fit, Calibration]:
+    """Judgement, fit and assessed calibration of new readings.
+
+    The nominal readings of the calibration are the predicted ones.
+    """
+    judgement, fit = judge_session(session), repeat_fit(calibration, session)
     refit = assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
-    return replace(refit, assessment=assess(refit, fit.problem.session, judgement=judgement))
+    refit = replace(refit, assessment=assess(refit, session, judgement=judgement))
+    return judgement, fit, refit
 
 
-def _is_confirmed(lead: Finding, changes: Sequence[Finding], judgement: Judgement) -> bool | None:
-    """Confirmation of the predictions by new readings; None if these contradict each other."""
-    agrees = lead.severity == "note" and not changes
+def _confirmation(
+    agreement: Finding, changes: Sequence[Finding], judgement: Judgement
+) -> bool | None:
+    """True if new readings confirm the predictions; None if they agree but have anomalies."""
+    agrees = agreement.severity == "note" and not changes
     return None if agrees and judgement.verdict != "enter" else agrees
 
 
 def _calibrate_jointly(
-    calibration: Calibration, every: Session, anomalies: Anomalies
+    calibration: Calibration, all_sessions: Session, anomalies: Anomalies
 ) -> Calibration:
-    """Calibration from its readings and new ones, which are joined, assessed."""
-    judgement = judge_session(every, anomalies=anomalies)
-    fit = repeat_fit(calibration, every, tolerance_scale=judgement.tolerance_scale)
+    """Assessed calibration from all sessions."""
+    judgement = judge_session(all_sessions, anomalies=anomalies)
+    fit = repeat_fit(calibration, all_sessions, tolerance_scale=judgement.tolerance_scale)
     joint = assemble_calibration(fit)
-    return replace(joint, assessment=assess(joint, every, judgement=judgement))
+    return replace(joint, assessment=assess(joint, all_sessions, judgement=judgement))
 
 
 def _require_new(calibration: Calibration, sessions: Sequence[Session]) -> None:
-    """Refuse sessions that the calibration was made from: their readings confirm nothing.
+    """Refuse sessions of the calibration itself, because their readings confirm nothing.
 
     Raises:
-        SessionError: Naming the session.
+        SessionError: If a session belongs to the calibration; it names the session.
     """
     record = calibration.session
     used = {part.sha256 for part in (record, *record.parts)} - {""}
     for session in sessions:
         if session.sha256 in used:
             raise SessionError(
-                "is a session that the calibration was made from, which is no validation; expected "
-                "readings taken afterwards",
+                "belongs to the calibration itself; expected a session measured afterwards",
                 where=str(session.path or "session"),
             )
 
 
-def _as_adjusted(calibration: Calibration, sessions: Sequence[Session]) -> Calibration:
-    """The calibration of the machine with the mechanical adjustments that new sessions state.
+def _adjust_to_sessions(calibration: Calibration, sessions: Sequence[Session]) -> Calibration:
+    """Calibration of the machine with the mechanical adjustments that new sessions state.
 
     Raises:
-        SessionError: If a session is of another robot, or two sessions state other adjustments.
+        SessionError: If a session is of another robot, or sessions state different adjustments.
     """
     first = sessions[0]
     for session in sessions:
@@ -311,10 +323,10 @@ def _as_adjusted(calibration: Calibration, sessions: Sequence[Session]) -> Calib
 
 
 def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
-    """The session with the offsets that were active: as stated, otherwise as calibrated.
+    """Session with active offsets: as stated, otherwise as calibrated.
 
     Raises:
-        SessionError: If it states other offsets.
+        SessionError: If it states other offsets than the calibrated ones.
     """
     drives = [d.name for d in session.robot.drives]
     entries = {drives.index(e.drive): e for e in find_entries(calibration)}
@@ -322,113 +334,145 @@ def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
         offsets = np.zeros(len(drives))
         offsets[list(entries)] = [e.enter for e in entries.values()]
         return session.with_controller(offsets) if entries else session
-    others, where = [], ""
+    differences, where = [], ""
     for i, entry in entries.items():
         active = float(session.active_offsets[i])
-        allowed = max(0.5 * entry.std_scatter, ROUNDING)
-        if not math.isnan(allowed) and abs(active - entry.enter) > allowed:
+        if math.isnan(entry.std_scatter):  # the calibration does not determine the offset
+            continue
+        if abs(active - entry.enter) > max(ALLOWED_STDS * entry.std_scatter, ROUNDING):
             factor, unit = entry.edge_factor, entry.edge_unit
             where = f"{session.path or 'session'}: controller.offsets_{unit}"
-            others.append(
+            differences.append(
                 f"{entry.drive} has {active * factor:g} {unit} instead of "
                 f"{entry.enter * factor:.3f} {unit}"
             )
-    if others:
+    if differences:
         raise SessionError(
-            f"{'; '.join(others)}. The session was not measured with the offsets to enter: enter "
-            "them, measure again, and validate that session",
+            f"{'; '.join(differences)}. The session was not measured with the offsets to enter: "
+            "enter them, measure again, and validate that session",
             where=where,
         )
     return session
 
 
 def _find_changes(
-    every: Session, anomalies: Anomalies, judgement: Judgement
+    all_sessions: Session, anomalies: Anomalies, judgement: Judgement
 ) -> tuple[Anomaly | None, list[Finding], bool]:
-    """Changes between the sessions of a calibration and new ones.
+    """Changes between the sessions of a calibration and the new sessions.
 
     Args:
-        every: The session of the calibration and the new ones, joined.
-        anomalies: Of all their readings.
-        judgement: Judgement of the new sessions by themselves.
+        all_sessions: The session of the calibration and the new ones, joined.
+        anomalies: Anomalies of all their readings.
+        judgement: Judgement of the new sessions alone.
 
     Returns:
-        The most likely change, all findings, and whether the offsets of the calibration were
-        entered wrongly.
+        The first change of a session or None, findings about all changes, and whether the offsets
+        of the calibration were entered wrongly.
     """
     changes = tuple(a for a in anomalies.found if a.between_sessions)
-    if not changes and judgement.verdict != "enter":  # its findings explain the readings
+    if not changes and judgement.verdict != "enter":  # findings of the new sessions explain them
         return None, [], False
     mistake = next((a for a in changes if a.explanation.sessions), None)
-    findings = describe_anomalies(every, replace(anomalies, found=changes))
+    findings = describe_anomalies(all_sessions, replace(anomalies, found=changes))
     if mistake is None:
         return None, findings, False
-    new = {name.partition("/")[0] for name in list(every.setups)[len(every.parts[0].setups) :]}
+    new_setups = list(all_sessions.setups)[len(all_sessions.parts[0].setups) :]
+    new = {name.partition("/")[0] for name in new_setups}
     e = mistake.explanation
     return mistake, findings, e.kind in WRONGLY_ENTERED and e.sessions[0] in new
 
 
-def _agreement(
+def _describe_agreement(
     refit: Calibration, test: DeviationTest, expected: float, *, explained: bool
 ) -> Finding:
-    """Agreement of the deviations with their prediction, and of the values to enter.
+    """Finding about the agreement of the deviations with their prediction.
 
     Args:
         refit: Fit of the new readings, assessed.
         test: Test of the deviations.
-        expected: RMS of the deviations as predicted, [m].
+        expected: Predicted RMS of the deviations, [m].
         explained: Whether a change between the sessions explains the deviations.
     """
     achieved = refit.rms_before
+    limit = test.critical_factor * achieved
     numbers = {
         "expected_rms_mm": expected / MM,
         "achieved_rms_mm": achieved / MM,
         "refit_rms_mm": refit.rms_after / MM,
-        "limit_of_pattern_mm": test.limit * achieved / MM,
-        "chance": test.chance,
+        "limit_of_pattern_mm": limit / MM,
+        "chance": test.p_value,
     }
-    as_expected = _is_expected(test.chance)
+    as_expected = _is_expected(test.p_value)
     if as_expected is None:
         return words.nothing_predicted(numbers)
     if not as_expected:
         worst = max(refit.residuals, key=lambda r: abs(r.deviation))
         return words.larger_than_predicted(
             achieved,
-            test.limit * achieved,
+            limit,
             None if explained else refit.rms_after,
-            removed=refit.rms_after < REMOVED * achieved,
+            explains=refit.rms_after < EXPLAINED_RATIO * achieved,
             numbers=numbers,
             place=Place(line=worst.line, setup=worst.setup, posture=worst.postures),
         )
-    return words.as_predicted(achieved, test.limit * achieved, numbers)
+    return words.as_predicted(achieved, limit, numbers)
+
+
+def _choose_entries(
+    calibration: Calibration,
+    refit: Calibration,
+    joint: Calibration | None,
+    *,
+    confirmed: bool | None,
+    wrongly_entered: bool,
+) -> tuple[tuple[ControllerEntry, ...], list[Finding]]:
+    """Values to enter after the new readings, and findings about them.
+
+    Args:
+        calibration: The validated calibration.
+        refit: Fit of the new readings, assessed.
+        joint: Joint calibration; None if the calibration is not confirmed.
+        confirmed: Whether the calibration is confirmed; None if unknown.
+        wrongly_entered: Whether the offsets of the calibration were entered wrongly.
+    """
+    assessment, findings = assessment_of(joint or refit), _find_further_change(joint)
+    keep = wrongly_entered or (confirmed is not False and not findings)
+    entries = find_entries(calibration) if keep else assessment.entries
+    if not wrongly_entered:
+        findings += assessment.of_kind(*ENTRY_KINDS)
+    return entries, findings
 
 
 def _find_further_change(joint: Calibration | None) -> list[Finding]:
-    """Finding about offsets that a calibration from all readings changes; none without one."""
+    """Finding about offsets that the joint calibration changes; empty if there is none."""
     if joint is None:
         return []
-    judged = assessment_of(joint)
-    if judged.keeps_offsets:
+    assessment = assessment_of(joint)
+    if assessment.keeps_offsets:
         return []
-    return [words.further_change([e for e in judged.entries if is_significant(joint, e)])]
+    return [words.further_change([e for e in assessment.entries if is_significant(joint, e)])]
 
 
 def _expect_largest(calibration: Calibration, expected_rms: float) -> float:
-    """Largest deviation as predicted, [m]: that of the calibration, in proportion to the RMS."""
+    """Predicted largest deviation, [m]: largest residual of the calibration, scaled by the RMS."""
     if calibration.rms_after == 0.0:
         return expected_rms
     return expected_rms / calibration.rms_after * calibration.largest_after
 
 
 def _decide(
-    confirmed: bool | None, judgement: Judgement, lead: Finding, changes: Sequence[Finding]
+    confirmed: bool | None, judgement: Judgement, agreement: Finding, changes: Sequence[Finding]
 ) -> Decision:
-    """The decision: readings that cannot be trusted come first, then the agreement, its causes."""
+    """Decision about a validation.
+
+    Its reason states anomalies first, then the agreement, then the changes that explain it. Its
+    action is the first one of the anomalies, the changes and the agreement.
+    """
     anomalies = [f for f in judgement.findings if f.severity != "note"][:1]
-    headlines = {True: words.CONFIRMED, False: words.NOT_CONFIRMED, None: words.UNKNOWN}
+    headlines = {True: words.CONFIRMED, False: words.NOT_CONFIRMED, None: words.INCONCLUSIVE}
     return Decision(
-        verdict_of([*judgement.findings, lead, *changes]),
+        verdict_of([*judgement.findings, agreement, *changes]),
         headlines[confirmed],
-        " ".join(f.text for f in (*anomalies, lead, *changes)),
-        next((f.action for f in (*anomalies, *changes, lead) if f.action), ""),
+        " ".join(f.text for f in (*anomalies, agreement, *changes)),
+        next((f.action for f in (*anomalies, *changes, agreement) if f.action), ""),
     )

@@ -1,4 +1,4 @@
-"""Findings of each severity; numbers, lists and directions in sentences."""
+"""Constructors of findings; formats of numbers, lists and directions in sentences."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def note(
     /,
     **numbers: float,
 ) -> Finding:
-    """Finding that only informs, with numbers whose names end in their unit."""
+    """Finding for information. The names of its numbers end in their units."""
     return Finding(kind, "note", text, action, numbers, tuple(places))
 
 
@@ -35,64 +35,64 @@ def review(
     /,
     **numbers: float,
 ) -> Finding:
-    """Finding that asks the user to check the readings."""
+    """Finding after which the user should check the readings."""
     return Finding(kind, "review", text, action, numbers, tuple(places))
 
 
 def reject(kind: FindingKind, text: str, action: str = "", /, **numbers: float) -> Finding:
-    """Finding that forbids to use the readings."""
+    """Finding after which the readings must not be used."""
     return Finding(kind, "reject", text, action, numbers)
 
 
 def named(*names: str) -> tuple[Place, ...]:
-    """Parameters, or drives, as places."""
+    """Places of a finding that are parameters or drives."""
     return tuple(Place(parameter=name) for name in names)
 
 
 def mm(value: float) -> str:
-    """A length in mm, three decimals."""
+    """Length in mm with three decimals."""
     return plain(value / MM)
 
 
 def plain(value: float, decimals: int = 3) -> str:
-    """A number, or the word unknown."""
+    """Number with fixed decimals, or "unknown"."""
     return f"{value:.{decimals}f}" if math.isfinite(value) else "unknown"
 
 
 def signed(value: float, decimals: int = 3) -> str:
-    """A number with its sign, or the word unknown."""
+    """Number with its sign, or "unknown"."""
     return f"{value:+.{decimals}f}" if math.isfinite(value) else "unknown"
 
 
 def um(value: float) -> str:
-    """A length in µm, as many decimals as say something."""
+    """Length in µm; one decimal below 20 µm."""
     size = value / UM
     return f"{size:.0f}" if abs(size) >= 20.0 else f"{size:.1f}"
 
 
 def counted(count: int, noun: str) -> str:
-    """So many of something, in words: 1 reading, 2 readings."""
+    """Number with a noun, such as "1 reading" or "2 readings"."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def times(ratio: float) -> str:
-    """Ratio in words: 2.5 times."""
+    """Ratio in words, such as "2.5 times"."""
     return f"{ratio:.1f} times" if ratio < 3.0 else f"{ratio:.0f} times"
 
 
 def joined(names: Sequence[str], word: str = "and") -> str:
-    """Names as a list in a sentence: a, b and c."""
+    """Names as a list in a sentence, such as "a, b and c"."""
     return f" {word} ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 def count_of(value: int) -> str:
-    """A number of things, below ten as a word."""
+    """Number, below ten as a word."""
     words = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
     return words[value] if 0 <= value < len(words) else str(value)
 
 
 def tool_mm(value: float) -> str:
-    """A tool error in mm: two significant digits, at most three decimals.
+    """Tool error in mm with two significant digits and at most three decimals.
 
     Args:
         value: Length, [m].
@@ -103,7 +103,7 @@ def tool_mm(value: float) -> str:
 
 
 def axis_name(direction: Array, *, cosine: float = ALONG_AXIS) -> str:
-    """Name of the world axis along a direction, such as −y; "" for other directions."""
+    """Name of the world axis along a direction, such as "−y"; "" for other directions."""
     k = int(np.abs(direction).argmax())
     if abs(direction[k]) <= cosine * np.linalg.norm(direction):
         return ""
@@ -111,7 +111,7 @@ def axis_name(direction: Array, *, cosine: float = ALONG_AXIS) -> str:
 
 
 def name_direction(direction: Array, *, cosine: float = ALONG_AXIS) -> str:
-    """Name of the world axis along a direction, else the components of its unit vector."""
+    """Name of the world axis along a direction; otherwise the components of the unit vector."""
     unit = direction / np.linalg.norm(direction)
     components = ", ".join(f"{round(v, 2) + 0.0:.2f}".replace("-", "−") for v in unit)
     return axis_name(direction, cosine=cosine) or f"({components})"

@@ -1,4 +1,4 @@
-"""Dimensions of a biglide: the Orthoglide's planar sister."""
+"""Dimensions of a biglide, the planar counterpart of the Orthoglide."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from orthocal.builder.robot_yaml import (
     robot_yaml,
 )
 
-ACROSS = ("x", "z")
-"""Rows of a closure in the plane, in the frame of a leg, whose Y is across the plane."""
+PLANAR_ROWS = ("x", "z")
+"""Rows of a planar loop closure in the frame of a leg, whose Y is normal to the plane."""
 
 PLATE = np.array([0.02, 0.02, 0.012])
-"""Width and thickness of the drawn platform, [m]."""
+"""Widths and thickness of a drawn arm of the platform, without its length, [m]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Biglide(SlidingLegs):
-    """Dimensions of two crossed slides whose legs move the tool in their plane, [m]."""
+    """Dimensions of two crossed slides with legs that move the tool in their plane, [m]."""
 
     attachment: float = 0.06
 
@@ -61,20 +61,20 @@ class Biglide(SlidingLegs):
         return self.rods_apart == 0.0
 
     def find_problem(self) -> tuple[str, str] | None:
-        """Name of the first impossible dimension, and why; None if all are possible."""
+        """Name and problem of the first impossible dimension; None if all are possible."""
         if not self.single:
             return SlidingLegs.find_problem(self)
-        apart = 4.0 * abs(self.rod_radius)  # one rod has nothing to clear
+        apart = 4.0 * abs(self.rod_radius)  # a single rod needs no clearance from another one
         problem = SlidingLegs.find_problem(replace(self, rods_apart=apart))
         if problem is None and self.attachment:
             return "rods_apart", (
                 "legs of one rod meet in the tool centre point, but their hinges are "
-                f"{in_mm(self.attachment)} mm from it; expected one of both to differ"
+                f"{in_mm(self.attachment)} mm from it; change one of both"
             )
         return problem
 
     def frames(self) -> list[Array]:
-        """Frames of the slides along x and y, with Y downwards."""
+        """Frames of the slides along x and y, with Y downwards, shape (3, 3) each."""
         axes = np.eye(3)
         return [np.column_stack([-a, -axes[2], np.cross(-a, -axes[2])]) for a in axes[:2]]
 
@@ -97,7 +97,7 @@ class Biglide(SlidingLegs):
             sums = {"x_leg.length": ["x_end.x"], "y_leg.length": ["-frame.y_end.y"]}
         else:
             loops = [parallelogram_loop(k) for k in self.letters]
-            loops.append(Loop("platform", ("y_leg_tip", "y_pin"), "3d", ACROSS))
+            loops.append(Loop("platform", ("y_leg_tip", "y_pin"), "3d", PLANAR_ROWS))
             sums = length_sums(self.letters)
         return robot_yaml(
             self.title,

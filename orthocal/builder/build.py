@@ -1,6 +1,6 @@
-"""Robot files of a machine of given dimensions.
+"""Robot files of a machine from its kind and dimensions in machine.yaml.
 
-Dimensions and kind are in machine.yaml. Changes of the YAML that do not follow from it stay.
+Manual changes of the YAML that do not contradict machine.yaml are preserved.
 """
 
 from __future__ import annotations
@@ -31,13 +31,15 @@ from orthocal.robot.model import Robot
 
 __all__ = ["describe_machine", "make_robot", "remake_robot"]
 
-_FEET = re.compile(rf"(?m)^ *# {re.escape(FEET)}\n(?: *#.*\n)* *adjustments:.*\n(?: {{4,}}.*\n)*")
-_HEAD = re.compile(r"\A(?:# (?:A machine of the|Made from).*\n)+")
-_DRIVE = r"(?m)^(?P<name> *{drive}: )\{{[^#\n]*zero_mm: [^#\n]*\}}(?P<rest> *(?:#.*)?)$"
-_WORKSPACE = re.compile(r"(?m)^(?P<indent> +)workspace:.*\n(?:(?P=indent) +.*\n)*")
-_ORTHOCAL = re.compile(r"(?m)^orthocal:[^\n]*\n(?: *(?:#.*)?\n)*(?P<indent> +)")
-_RADIUS = re.compile(r"radius_mm: [-+.0-9e]+")
-_TOLERANCES = re.compile(r"(?m)^( *tolerances: \{[^{}\n]*)\}")
+_FEET_SECTION = re.compile(
+    rf"(?m)^ *# {re.escape(FEET)}\n(?: *#.*\n)* *adjustments:.*\n(?: {{4,}}.*\n)*"
+)
+_TITLE_LINES = re.compile(r"\A(?:# (?:A machine of the|Made from).*\n)+")
+_DRIVE_LINE = r"(?m)^(?P<name> *{drive}: )\{{[^#\n]*zero_mm: [^#\n]*\}}(?P<rest> *(?:#.*)?)$"
+_WORKSPACE_KEY = re.compile(r"(?m)^(?P<indent> +)workspace:.*\n(?:(?P=indent) +.*\n)*")
+_ORTHOCAL_KEY = re.compile(r"(?m)^orthocal:[^\n]*\n(?: *(?:#.*)?\n)*(?P<indent> +)")
+_RADIUS_KEY = re.compile(r"radius_mm: [-+.0-9e]+")
+_TOLERANCES_LINE = re.compile(r"(?m)^( *tolerances: \{[^{}\n]*)\}")
 
 
 def describe_machine(
@@ -49,19 +51,20 @@ def describe_machine(
     tolerances: Mapping[str, float] | None = None,
     effects: Sequence[str] = (),
 ) -> dict[str, str]:
-    """Files of a machine: name to text.
+    """Texts of the files of a machine by file name.
 
     Args:
         dimensions: Dimensions of the machine.
         name: Name of its directory and files.
         counting: Relation of the controller's joints to the drives; by default they are equal.
         description: YAML of the robot to change; by default that of the kind.
-        tolerances: Names or globs with their unit, such as *.offset_mm, mapped to tolerances that
-            replace those of the kind; not with a description, which has its own.
-        effects: Effects beside geometry, with their default keys; not with a description.
+        tolerances: Tolerances that replace those of the kind, by error name or glob with its unit,
+            such as *.offset_mm. They are not used with a description.
+        effects: Effects beside geometry, with their default keys. They are not used with a
+            description.
 
     Raises:
-        RobotError: If the dimensions are impossible, or the YAML has no place for one of them.
+        RobotError: If the dimensions are impossible, or the YAML lacks the line of one of them.
     """
     impossible = dimensions.find_problem()
     if impossible:
@@ -71,14 +74,14 @@ def describe_machine(
     problem = find_counting_problem(joints, len(drives))
     if problem:
         raise RobotError(problem, where="dimensions")
-    pattern = dimensions.yaml() if description is None else description
+    base = dimensions.yaml() if description is None else description
     if tolerances:
-        pattern = _override(pattern, tolerances, f"{name}.yaml")
+        base = _override_tolerances(base, tolerances, f"{name}.yaml")
     if effects:
-        pattern = f"{pattern.rstrip()}\n\n{_effects_text(effects)}"
+        base = f"{base.rstrip()}\n\n{_effects_text(effects)}"
     return {
-        f"{name}.yaml": _describe(
-            pattern, dimensions, joints, f"{name}.yaml", made=description is None
+        f"{name}.yaml": _complete_yaml(
+            base, dimensions, joints, f"{name}.yaml", is_new=description is None
         ),
         f"{name}.urdf": dimensions.urdf(name),
         MACHINE: machine_text(dimensions, joints),
@@ -111,55 +114,64 @@ def make_robot(
 
 
 def remake_robot(folder: Path, *, check: Callable[[Robot], object] | None = None) -> Robot:
-    """Make URDF and YAML of a machine again from its machine.yaml, and load it.
+    """Update URDF and YAML of a machine from its machine.yaml, and load the robot.
 
-    Other changes in the YAML stay. Files are written only if the robot loads and passes the check.
+    Other changes of the YAML are preserved. Files are written only if the robot loads and passes
+    the check.
 
     Args:
         folder: Directory of the machine.
-        check: Raises RobotError for a robot that is not to be written.
+        check: Function that raises RobotError for a robot that must not be written.
 
     Raises:
-        RobotError: If there is no machine.yaml, its dimensions are impossible, or the YAML has no
-            place for one of them.
+        RobotError: If there is no machine.yaml, its dimensions are impossible, or the YAML lacks
+            the line of one of them.
         OrthocalError: If the directory cannot be written.
     """
     dimensions, counting = read_machine(folder / MACHINE)
     yaml_file = find_robot_files(folder)[0]
     if yaml_file.name == MACHINE:
-        raise RobotError(f"contains no YAML of a robot beside {MACHINE}", where=str(folder))
+        raise RobotError(f"contains {MACHINE} but no YAML of a robot", where=str(folder))
     name, description = yaml_file.stem, read_file(yaml_file, error=RobotError)
     files = describe_machine(
         dimensions, name=name, counting=counting, description=description.decode("utf-8", "replace")
     )
     del files[MACHINE]
-    with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
-        place = Path(trial) / folder.resolve().name
-        write_files(place, files)
+    with tempfile.TemporaryDirectory(prefix="orthocal-") as temporary:
+        trial = Path(temporary) / folder.resolve().name
+        write_files(trial, files)
         try:
-            robot = load_robot(place)
+            robot = load_robot(trial)
             if check is not None:
                 check(robot)
         except RobotError as e:
-            where = None if e.where is None else e.where.replace(str(place), str(folder))
+            where = None if e.where is None else e.where.replace(str(trial), str(folder))
             raise RobotError(e.problem, where=where) from None
     write_files(folder, files)
     return load_robot(folder.resolve())
 
 
-def _describe(
-    pattern: str, dimensions: Dimensions, counting: Sequence[Counting], file: str, *, made: bool
+def _complete_yaml(
+    base: str, dimensions: Dimensions, counting: Sequence[Counting], file: str, *, is_new: bool
 ) -> str:
-    """YAML with zeros of the drives, radii of the rods, joints, workspace and adjustments.
+    """YAML with the zeros of drives, radii of rods, joints, workspace and adjustments of a machine.
+
+    Args:
+        base: YAML of the robot.
+        dimensions: Dimensions of the machine.
+        counting: Relation of the controller's joints to the drives.
+        file: Name of the YAML, for messages.
+        is_new: Whether adjustments are added; otherwise only existing ones are replaced.
 
     Raises:
-        RobotError: If the YAML has no place for one of them.
+        RobotError: If the YAML lacks one of the keys.
     """
-    text, count = _RADIUS.subn(f"radius_mm: {in_mm(dimensions.rod_radius)}", _HEAD.sub("", pattern))
+    text = _TITLE_LINES.sub("", base)
+    text, count = _RADIUS_KEY.subn(f"radius_mm: {in_mm(dimensions.rod_radius)}", text)
     if not count:
         raise RobotError("has no rods with a radius_mm", where=file)
     for drive, joint in zip(dimensions.drives_of(), counting, strict=True):
-        line = re.compile(_DRIVE.format(drive=drive))
+        line = re.compile(_DRIVE_LINE.format(drive=drive))
         keys = f"{{{drive_text(dimensions, joint)}}}"
         text, count = line.subn(rf"\g<name>{keys}\g<rest>", text)
         if count != 1:
@@ -167,15 +179,16 @@ def _describe(
                 f"has no line '{drive}: {{zero_mm: ...}}'; expected one for its zero", where=file
             )
     box = box_text(dimensions.workspace)
-    if box:  # a workspace in the YAML alone stays
-        text, place = _WORKSPACE.sub("", text), _ORTHOCAL.search(_WORKSPACE.sub("", text))
+    if box:  # without it, a workspace in the YAML is preserved
+        text = _WORKSPACE_KEY.sub("", text)
+        place = _ORTHOCAL_KEY.search(text)
         if place is None:
             raise RobotError("has no key orthocal with others below it", where=file)
-        at = place.start("indent")
-        text = f"{text[:at]}{place['indent']}workspace: {{box_mm: {box}}}\n{text[at:]}"
+        start = place.start("indent")
+        text = f"{text[:start]}{place['indent']}workspace: {{box_mm: {box}}}\n{text[start:]}"
     feet = dimensions.adjustments()
     if feet:
-        text = f"{text.rstrip()}\n\n{feet}" if made else _FEET.sub(feet, text)
+        text = f"{text.rstrip()}\n\n{feet}" if is_new else _FEET_SECTION.sub(feet, text)
     return f"# {dimensions.title}\n# Made from {MACHINE}: change dimensions there.\n{text}"
 
 
@@ -192,14 +205,14 @@ def _effects_text(names: Sequence[str]) -> str:
     )
 
 
-def _override(pattern: str, tolerances: Mapping[str, float], file: str) -> str:
+def _override_tolerances(text: str, tolerances: Mapping[str, float], file: str) -> str:
     """YAML with other tolerances of some errors.
 
     Raises:
-        RobotError: If the YAML has no place for them.
+        RobotError: If the YAML has no line of tolerances.
     """
     stated = ", ".join(f"{json.dumps(name)}: {_number(v)}" for name, v in tolerances.items())
-    text, count = _TOLERANCES.subn(lambda m: f"{m[1]}, overrides: {{{stated}}}}}", pattern)
+    text, count = _TOLERANCES_LINE.subn(lambda m: f"{m[1]}, overrides: {{{stated}}}}}", text)
     if count != 1:
         raise RobotError(
             "has no line 'tolerances: {...}'; expected one for other tolerances", where=file
@@ -208,4 +221,5 @@ def _override(pattern: str, tolerances: Mapping[str, float], file: str) -> str:
 
 
 def _number(value: float) -> str:
+    """Number with 12 significant digits."""
     return f"{round(value, 12) + 0.0:.12g}"

@@ -1,4 +1,4 @@
-"""Dimensions of machines: one class for each kind of machine, one key for each dimension."""
+"""Dimensions of machines: one class per kind of machine, one key per dimension."""
 
 from __future__ import annotations
 
@@ -10,26 +10,28 @@ from typing import Any, ClassVar
 from orthocal.units import DEG, MM
 
 SHORTEST_LEG, LONGEST_LEG = 0.02, 5.0
-"""[m]"""
+"""Limits of the length of a leg or rod, [m]."""
 
 UNITS = {"mm": MM, "deg": DEG}
+"""Units of dimensions, to their factors to SI."""
 
 
 @dataclass(frozen=True, slots=True)
 class Dimension:
-    """A dimension: its key in machine.yaml, and what it means."""
+    """Dimension of a machine, with its key in machine.yaml and its description."""
 
     name: str
-    """Name of the field of the dimensions."""
+    """Name of the field of `Dimensions`."""
     question: str
-    """Question to the owner; {zero} is the coordinate of the slides in the mechanical zero, mm."""
+    """Question to the user; {zero} is the coordinate of the slides in the mechanical zero, [mm]."""
     comment: str
-    """Comment in machine.yaml; it may have several lines."""
+    """Comment in machine.yaml, of one or more lines."""
     unit: str = "mm"
+    """Unit in machine.yaml."""
     form: str = ""
     """Form of several numbers, such as LEAST:LARGEST, with their separator; "" for one number."""
     usual: str | None = None
-    """Answer that is assumed where nothing is stated; None if the owner must state it."""
+    """Default answer; None if the user must state it."""
 
     @property
     def key(self) -> str:
@@ -47,12 +49,12 @@ class Dimension:
         return self.form.count(self.separator) + 1 if self.separator else 1
 
     def to_si(self, numbers: Sequence[float]) -> Any:  # noqa: ANN401 - a float or a tuple
-        """Value of the field, of numbers in its unit."""
+        """Value of the field in SI units, from numbers in the unit of the key."""
         values = tuple(v * UNITS[self.unit] for v in numbers)
         return values if self.separator else values[0]
 
     def show(self, value: float | Sequence[float]) -> str:
-        """Value of the field as YAML, in its unit."""
+        """Value of the field as YAML, in the unit of the key."""
         if isinstance(value, Sequence):
             return f"[{', '.join(in_unit(v, self.unit) for v in value)}]"
         return in_unit(value, self.unit)
@@ -87,27 +89,27 @@ class Dimensions(ABC):
     """Dimensions of a machine of one kind."""
 
     rods_apart: float = 0.08
-    """Distance of the axes of a leg's two rods, [m]."""
+    """Distance between the axes of a leg's two rods, [m]."""
     rod_radius: float = 0.0055
-    """[m]"""
+    """Radius of a rod, [m]."""
     workspace: tuple[tuple[float, float], ...] | None = None
     """Limits of the tool's coordinates relative to the mechanical zero, [m]; by default those of
     the kind."""
 
     kind: ClassVar[str]
-    """Name in machine.yaml and on the command line."""
+    """Name of the kind in machine.yaml and on the command line."""
     keys: ClassVar[tuple[Dimension, ...]]
-    """Its dimensions, in the order in which they are asked for."""
+    """Dimensions of the kind, in the order of the questions."""
     letters: ClassVar[str]
-    """Names of the legs; the drive of leg x is x_slide."""
+    """Names of the legs, one letter each; the drive of leg x is x_slide."""
     coordinates: ClassVar[str] = "xyz"
-    """Coordinates of the tool that the drives control."""
+    """Coordinates of the tool that the drives command."""
     at_zero: ClassVar[str] = "where the legs are parallel to their axes"
-    """The mechanical zero, in words."""
+    """Description of the mechanical zero."""
     usual_workspace: ClassVar[str] = "the largest cube of at most ±60 mm that the machine reaches"
-    """Workspace where none is stated, in words."""
+    """Description of the default workspace."""
     growing: ClassVar[str] = "outwards"
-    """Direction in which a slide moves as its coordinate grows."""
+    """Direction of a slide's motion if its coordinate grows."""
     read_legs: ClassVar[bool] = True
     """Whether readings of the legs determine offsets of the drives."""
 
@@ -118,7 +120,7 @@ class Dimensions(ABC):
 
     @classmethod
     def axes_words(cls) -> str:
-        """Coordinates of the tool in words."""
+        """Coordinates of the tool as text, such as x, y and z."""
         return f"{', '.join(cls.coordinates[:-1])} and {cls.coordinates[-1]}"
 
     @property
@@ -128,19 +130,19 @@ class Dimensions(ABC):
 
     @abstractmethod
     def find_problem(self) -> tuple[str, str] | None:
-        """Name of the first impossible dimension, and why; None if all are possible.
+        """Name and problem of the first impossible dimension; None if all are possible.
 
-        A dimension is compared with the ones before it, in the order of `keys`.
+        Each dimension is compared with earlier ones, in the order of `keys`.
         """
 
     @property
     @abstractmethod
     def words(self) -> str:
-        """Dimensions in words, in mm."""
+        """Description of the dimensions, in mm."""
 
     @property
     def title(self) -> str:
-        """Kind and dimensions in words."""
+        """Description of the kind and the dimensions."""
         return f"A machine of the kind {self.kind}: {self.words}."
 
     @abstractmethod
@@ -152,33 +154,45 @@ class Dimensions(ABC):
         """YAML of the machine: loops, drives, legs, parameters, tolerances and models."""
 
     def adjustments(self) -> str:
-        """Mechanical adjustments, as lines below `orthocal`; "" by default."""
+        """Mechanical adjustments as YAML lines below `orthocal`; "" by default."""
         return ""
 
     @classmethod
     def find_key(cls, key: str) -> Dimension | None:
-        """The dimension of a key."""
+        """Dimension of a key of machine.yaml."""
         return next((d for d in cls.keys if d.key == key), None)
 
     @classmethod
     def of_keys(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Fields of the dimensions, [m, rad], of keys of machine.yaml."""
+        """Fields of the dimensions, [m, rad], from keys of machine.yaml."""
         return {
             d.name: d.to_si(values[d.key] if d.separator else [values[d.key]]) for d in cls.keys
         }
 
 
-def find_length_problem(name: str, what: str, value: float) -> tuple[str, str] | None:
-    """Problem of a leg or rod that no machine has."""
+def find_length_problem(name: str, part: str, value: float) -> tuple[str, str] | None:
+    """Problem of an implausible length of a leg or rod; None if it is plausible.
+
+    Args:
+        name: Name of the dimension.
+        part: Name of the part in the plural, for messages.
+        value: Length, [m].
+    """
     if SHORTEST_LEG <= value <= LONGEST_LEG:
         return None
     return name, (
-        f"{what} of {in_mm(value)} mm; expected {in_mm(SHORTEST_LEG)} to {in_mm(LONGEST_LEG)} mm"
+        f"{part} of {in_mm(value)} mm; expected {in_mm(SHORTEST_LEG)} to {in_mm(LONGEST_LEG)} mm"
     )
 
 
 def find_rods_problem(apart: float, radius: float, leg: float) -> tuple[str, str] | None:
-    """Problem of the two rods of a leg."""
+    """Problem of the two rods of a leg; None without one.
+
+    Args:
+        apart: Distance between the axes of the rods, [m].
+        radius: Radius of a rod, [m].
+        leg: Length of the leg, [m].
+    """
     if radius > 0.0 and 2.0 * radius < apart <= leg:
         return None
     return "rod_radius" if 0.0 < apart <= leg else "rods_apart", (
@@ -188,17 +202,17 @@ def find_rods_problem(apart: float, radius: float, leg: float) -> tuple[str, str
 
 
 def in_mm(value: float) -> str:
-    """Length in mm, without the rounding error of the factor."""
+    """Length in mm as text, without the rounding error of the factor."""
     return in_unit(value, "mm")
 
 
 def in_unit(value: float, unit: str) -> str:
-    """Number in mm or degrees, without the rounding error of the factor."""
+    """Number in mm or degrees as text, without the rounding error of the factor."""
     return f"{round(value / UNITS[unit], 9) + 0.0:.12g}"
 
 
 def box_text(box: Sequence[Sequence[float]] | None) -> str:
-    """Box in mm as YAML; "" for none."""
+    """Box in mm as YAML; "" if it is None."""
     if box is None:
         return ""
     return f"[{', '.join(f'[{in_mm(a)}, {in_mm(b)}]' for a, b in box)}]"

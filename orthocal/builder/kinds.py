@@ -1,4 +1,4 @@
-"""Kinds of machines that `orthocal new` makes."""
+"""Kinds of machines of `orthocal new`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from orthocal.builder.orthoglide import InclinedOrthoglide, Orthoglide
 KINDS: dict[str, type[Dimensions]] = {
     k.kind: k for k in (Orthoglide, InclinedOrthoglide, LinearDelta, Biglide)
 }
-"""Name in machine.yaml and on the command line to dimensions."""
+"""Name in machine.yaml and on the command line, to the class of dimensions."""
 
 USUAL = Orthoglide.kind
-"""Kind where none is stated."""
+"""Default kind."""
 
 
 def describe_kinds() -> str:
-    """Kinds in words."""
+    """Names of the kinds, separated by commas."""
     return ", ".join(KINDS)

@@ -1,11 +1,11 @@
 """URDF of a machine with slides and legs of rods that carry a platform.
 
 Legs of the Orthoglide have a slide, a swivel, a parallelogram of two rods, a wrist and a fork.
-Planar legs have a slide and a parallelogram, or a slide and one rod. Slides may have any place and
-direction. The platform hangs on the first leg; loop closures join it to the others.
+Planar legs have a slide and a parallelogram, or a slide and one rod. Slides may have any position
+and direction. The first leg carries the platform; loop closures join it to the others.
 
-Frames of a leg: Z along the two hinge axes that are as far apart as the rods; X from the hinge on
-the slide to the hinge on the platform; Y = Z × X, the axis of the rods' hinges.
+Frame of a leg: X points from the hinge on the slide to the hinge on the platform. Z points from rod
+b to rod a. Y = Z × X is the axis of the rods' hinges.
 """
 
 from __future__ import annotations
@@ -31,25 +31,26 @@ COLOURS = {
 
 LEG_COLOURS = ("red", "green", "blue")
 
-QUARTER = 0.5 * np.pi
+QUARTER_TURN = 0.5 * np.pi
 
 ROUNDING = 1e-14
 """Largest rounding error of an angle, [rad]."""
 
 LIMITS = {"effort": 1000.0, "velocity": 2.0}
+"""Limits of all joints in addition to their travel, [N or N m, m/s or rad/s]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LegGeometry:
-    """A leg and its slide in the mechanical zero, in the world."""
+    """A leg and its slide in the mechanical zero, in world coordinates."""
 
     name: str
     frame: Array
-    """Axes of the slide's frame as columns, shape (3, 3); its Z is that of the leg."""
+    """Axes of the slide's frame as columns, shape (3, 3); its Z is also the Z of the leg."""
     direction: Array
-    """Unit vector in which the slide moves as its coordinate grows, shape (3,)."""
+    """Unit vector of the slide's motion if its coordinate grows, shape (3,)."""
     zero: float
-    """Coordinate of the slide, [m]."""
+    """Coordinate of the slide in the mechanical zero, [m]."""
     slide: Array
     """Origin of the slide's frame, shape (3,), [m]."""
     root: Array
@@ -57,7 +58,7 @@ class LegGeometry:
     tip: Array
     """Middle of the hinge on the platform, shape (3,), [m]."""
     travel: tuple[float, float]
-    """Least and largest coordinate of the slide, [m]."""
+    """Smallest and largest coordinate of the slide, [m]."""
     colour: str = "red"
 
     @property
@@ -69,7 +70,7 @@ class LegGeometry:
 
     @property
     def length(self) -> float:
-        """Length of its rods, [m]."""
+        """Length of the rods, [m]."""
         return float(np.linalg.norm(self.tip - self.root))
 
 
@@ -78,10 +79,14 @@ class Shape:
     """A drawn box, cylinder or sphere of a link."""
 
     sizes: tuple[float, ...]
-    """Edges of a box (3), radius and length of a cylinder along Z (2), radius of a sphere (1)."""
+    """Edges of a box (3), radius and length of a cylinder along Z (2), radius of a sphere (1); all
+    in [m]."""
     material: str
-    at: Array = field(default_factory=lambda: np.zeros(3))
-    turned: Array = field(default_factory=lambda: np.eye(3))
+    """Name of a colour in COLOURS."""
+    position: Array = field(default_factory=lambda: np.zeros(3))
+    """Position of the centre in the link's frame, shape (3,), [m]."""
+    rotation: Array = field(default_factory=lambda: np.eye(3))
+    """Orientation in the link's frame, shape (3, 3)."""
 
 
 FOOT = Shape((0.018, 0.018, 0.018), "dark")
@@ -89,22 +94,24 @@ FOOT = Shape((0.018, 0.018, 0.018), "dark")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body:
-    """Dimensions of the rods, and what is drawn of base, slides and platform."""
+    """Dimensions of the rods, and drawn shapes of base, slides and platform."""
 
     rods_apart: float
+    """Distance between the axes of a leg's two rods, [m]; 0 for legs of one rod."""
     rod_radius: float
+    """Radius of a rod, [m]."""
     base: Sequence[Shape]
-    """In the world."""
+    """Shapes of the base, in world coordinates."""
     slider: Sequence[Shape]
-    """In the slide's frame, from the middle of its hinge."""
+    """Shapes of a slide, in the slide's frame relative to the middle of its hinge."""
     platform: Sequence[Shape]
-    """In the tool's frame, which is parallel to the world."""
+    """Shapes of the platform, in the tool's frame, which is parallel to the world."""
     foot: Shape = FOOT
     """Hinge on the platform, in the leg's frame."""
 
 
 def coloured(letters: str) -> Iterable[tuple[str, str]]:
-    """Names of legs with their colours."""
+    """Pairs of a leg's name and colour."""
     return zip(letters, LEG_COLOURS, strict=False)
 
 
@@ -113,9 +120,9 @@ def machine_urdf(name: str, legs: Sequence[LegGeometry], body: Body, *, comment:
 
     Args:
         name: Name of the robot.
-        legs: Its legs; the first one carries the platform.
-        body: Rods and drawings.
-        comment: First line.
+        legs: The legs; the first one carries the platform.
+        body: Rods and drawn shapes.
+        comment: Comment in the first line.
     """
     root = _robot(name, body)
     first = legs[0]
@@ -130,17 +137,17 @@ def machine_urdf(name: str, legs: Sequence[LegGeometry], body: Body, *, comment:
 
 
 def planar_urdf(name: str, legs: Sequence[LegGeometry], body: Body, *, comment: str) -> str:
-    """URDF of a machine whose legs move in a plane, of two rods or, if these are 0 apart, of one.
+    """URDF of a machine whose legs move in a plane, with one or two rods each.
 
-    Legs of two rods keep the platform from turning: the first one carries it, the others end in
-    pins on it. Of legs of one rod, the last one carries the platform, and the first one ends in a
-    pin on it, the tool centre point.
+    Legs of two rods keep the orientation of the platform: the first leg carries it, the others end
+    in pins on it. Legs of one rod (`rods_apart` is 0) meet in the tool centre point. The foot of
+    the first leg, which turns on its rod, carries the platform; a closure joins it to the last rod.
 
     Args:
         name: Name of the robot.
-        legs: Its legs.
-        body: Rods and drawings.
-        comment: First line.
+        legs: The legs.
+        body: Rods and drawn shapes.
+        comment: Comment in the first line.
     """
     root = _robot(name, body)
     first, *others = legs
@@ -175,7 +182,7 @@ def planar_urdf(name: str, legs: Sequence[LegGeometry], body: Body, *, comment: 
 
 
 def _robot(name: str, body: Body) -> etree._Element:
-    """Robot with materials and base."""
+    """Robot element with materials and base."""
     root = etree.Element("robot", name=name)
     for colour, rgb in COLOURS.items():
         material = etree.SubElement(root, "material", name=colour)
@@ -185,13 +192,14 @@ def _robot(name: str, body: Body) -> etree._Element:
 
 
 def _text(root: etree._Element, comment: str) -> str:
+    """Document with a comment in the first line."""
     etree.indent(root)
     text = str(etree.tostring(root, encoding="unicode"))
     return f'<?xml version="1.0"?>\n<!-- {comment} -->\n{text}\n'
 
 
 def _add_platform(root: etree._Element, parent: str, leg: LegGeometry, body: Body) -> None:
-    """Platform and tool centre point, on the frame in which a leg ends."""
+    """Add platform and tool centre point to the link at the end of a leg."""
     _link(root, "platform", body.platform)
     _fixed(root, "platform_mount", parent, "platform", _to_tool(leg))
     _link(root, "tcp")
@@ -199,7 +207,7 @@ def _add_platform(root: etree._Element, parent: str, leg: LegGeometry, body: Bod
 
 
 def _add_leg(root: etree._Element, leg: LegGeometry, body: Body) -> None:
-    """Slide and leg in space."""
+    """Add slide and leg of a spatial machine."""
     k = leg.name
     y, z = np.eye(3)[1], np.eye(3)[2]
     _add_slide(root, leg, body)
@@ -214,8 +222,9 @@ def _add_leg(root: etree._Element, leg: LegGeometry, body: Body) -> None:
 
 
 def _add_slide(root: etree._Element, leg: LegGeometry, body: Body) -> None:
+    """Add the slide of a leg."""
     k, (to_root, _) = leg.name, _root(leg)
-    slider = [Shape(s.sizes, s.material, to_root + s.at, s.turned) for s in body.slider]
+    slider = [Shape(s.sizes, s.material, to_root + s.position, s.rotation) for s in body.slider]
     _link(root, f"{k}_slider", slider)
     _joint(
         root,
@@ -229,7 +238,7 @@ def _add_slide(root: etree._Element, leg: LegGeometry, body: Body) -> None:
 
 
 def _add_parallelogram(root: etree._Element, leg: LegGeometry, body: Body) -> None:
-    """Two rods between yoke and crossbar."""
+    """Add two rods between yoke and crossbar."""
     k, half = leg.name, 0.5 * body.rods_apart
     y, tip = np.eye(3)[1], np.array([leg.length, 0.0, 0.0])
     up, down = np.array([0.0, 0.0, half]), np.array([0.0, 0.0, -half])
@@ -246,18 +255,19 @@ def _add_parallelogram(root: etree._Element, leg: LegGeometry, body: Body) -> No
 
 
 def _yoke(body: Body) -> list[Shape]:
+    """Shapes of the yoke on a slide."""
     return [Shape((0.01, body.rods_apart + 0.03), "steel"), Shape((0.014, 0.022), "dark")]
 
 
 def _rod(leg: LegGeometry, body: Body) -> list[Shape]:
-    """Rod with the hinges at both ends."""
-    across = pin.rpy.rpyToMatrix(QUARTER, 0.0, 0.0)
-    lying = pin.rpy.rpyToMatrix(0.0, QUARTER, 0.0)
+    """Shapes of a rod and the hinges at both ends."""
+    across = pin.rpy.rpyToMatrix(QUARTER_TURN, 0.0, 0.0)
+    along = pin.rpy.rpyToMatrix(0.0, QUARTER_TURN, 0.0)
     r, length = body.rod_radius, leg.length
     hinge = (r + 0.0035, 4.0 * r)
     return [
-        Shape((r, length), leg.colour, np.array([0.5 * length, 0.0, 0.0]), lying),
-        Shape(hinge, "steel", turned=across),
+        Shape((r, length), leg.colour, np.array([0.5 * length, 0.0, 0.0]), along),
+        Shape(hinge, "steel", rotation=across),
         Shape(hinge, "steel", np.array([length, 0.0, 0.0]), across),
     ]
 
@@ -273,10 +283,11 @@ def _to_tool(leg: LegGeometry) -> tuple[Array, Array]:
 
 
 def _link(root: etree._Element, name: str, shapes: Sequence[Shape] = ()) -> None:
+    """Add a link with its shapes."""
     link = etree.SubElement(root, "link", name=name)
     for shape in shapes:
         visual = etree.SubElement(link, "visual")
-        _origin(visual, shape.at, shape.turned)
+        _origin(visual, shape.position, shape.rotation)
         geometry = etree.SubElement(visual, "geometry")
         if len(shape.sizes) == 3:
             etree.SubElement(geometry, "box", size=_numbers(shape.sizes))
@@ -288,19 +299,20 @@ def _link(root: etree._Element, name: str, shapes: Sequence[Shape] = ()) -> None
         etree.SubElement(visual, "material", name=shape.material)
 
 
-def _mounted(root: etree._Element, name: str, parent: str, at: Array) -> None:
-    """Link without extent that is fixed to another, with its axes."""
+def _mounted(root: etree._Element, name: str, parent: str, position: Array) -> None:
+    """Add a link without shapes that is fixed to another one and parallel to it."""
     _link(root, name)
-    _fixed(root, f"{name}_mount", parent, name, (at, np.eye(3)))
+    _fixed(root, f"{name}_mount", parent, name, (position, np.eye(3)))
 
 
 def _fixed(
-    root: etree._Element, name: str, parent: str, child: str, place: tuple[Array, Array]
+    root: etree._Element, name: str, parent: str, child: str, placement: tuple[Array, Array]
 ) -> None:
+    """Add a fixed joint."""
     joint = etree.SubElement(root, "joint", name=name, type="fixed")
     etree.SubElement(joint, "parent", link=parent)
     etree.SubElement(joint, "child", link=child)
-    _origin(joint, *place)
+    _origin(joint, *placement)
 
 
 def _hinge(
@@ -308,10 +320,11 @@ def _hinge(
     name: str,
     parent: str,
     child: str,
-    place: tuple[Array, Array],
+    placement: tuple[Array, Array],
     axis: Array,
 ) -> None:
-    _joint(root, name, "revolute", (parent, child), place, axis, (-1.3, 1.3))
+    """Add a revolute joint of ±1.3 rad."""
+    _joint(root, name, "revolute", (parent, child), placement, axis, (-1.3, 1.3))
 
 
 def _joint(
@@ -319,38 +332,42 @@ def _joint(
     name: str,
     kind: str,
     links: tuple[str, str],
-    place: tuple[Array, Array],
+    placement: tuple[Array, Array],
     axis: Array,
     limits: tuple[float, float],
 ) -> None:
+    """Add a joint with limits."""
     joint = etree.SubElement(root, "joint", name=name, type=kind)
     etree.SubElement(joint, "parent", link=links[0])
     etree.SubElement(joint, "child", link=links[1])
-    _origin(joint, *place)
+    _origin(joint, *placement)
     etree.SubElement(joint, "axis", xyz=_numbers(axis))
     low, high = map(_number, limits)
     others = {key: _number(v) for key, v in LIMITS.items()}
     etree.SubElement(joint, "limit", lower=low, upper=high, **others)
 
 
-def _origin(owner: etree._Element, at: Array, turned: Array) -> None:
-    roll, pitch, yaw = (_exact_angle(float(v)) for v in pin.rpy.matrixToRpy(turned))
-    if abs(pitch) == QUARTER:  # only yaw ∓ roll matters
+def _origin(owner: etree._Element, position: Array, rotation: Array) -> None:
+    """Add the origin of a joint or a visual."""
+    roll, pitch, yaw = (_exact_angle(float(v)) for v in pin.rpy.matrixToRpy(rotation))
+    if abs(pitch) == QUARTER_TURN:  # then only yaw ∓ roll is determined
         roll, yaw = 0.0, _exact_angle(yaw - roll if pitch > 0.0 else yaw + roll)
     rpy = " ".join(f"{v + 0.0:.17g}" for v in (roll, pitch, yaw))
-    etree.SubElement(owner, "origin", xyz=_numbers(at), rpy=rpy)
+    etree.SubElement(owner, "origin", xyz=_numbers(position), rpy=rpy)
 
 
 def _exact_angle(angle: float) -> float:
-    """Angle, [rad]; a quarter turn exactly where it is one but for rounding; π for −π."""
-    quarters = round(angle / QUARTER)
-    exact = (2 if quarters == -2 else quarters) * QUARTER
-    return exact if abs(angle - quarters * QUARTER) < ROUNDING else angle
+    """Angle without rounding errors of multiples of a quarter turn, [rad]; π instead of −π."""
+    quarters = round(angle / QUARTER_TURN)
+    exact = (2 if quarters == -2 else quarters) * QUARTER_TURN
+    return exact if abs(angle - quarters * QUARTER_TURN) < ROUNDING else angle
 
 
 def _numbers(values: Sequence[float] | Array) -> str:
+    """Numbers of an attribute, separated by spaces."""
     return " ".join(_number(float(v)) for v in values)
 
 
 def _number(value: float) -> str:
+    """Number with 15 significant digits."""
     return f"{round(value, 15) + 0.0:.15g}"

@@ -24,17 +24,17 @@ from orthocal.units import DEG
 
 UP = np.array([0.0, 0.0, 1.0])
 
-FARTHEST = 0.95
-"""Largest horizontal distance between the hinges of a rod, as a part of its length."""
+MAX_RELATIVE_DISTANCE = 0.95
+"""Largest horizontal distance between the hinges of a rod, relative to its length."""
 
-NEAREST_TOWERS = 60.0 * DEG
-"""Least angle between two towers, [rad]."""
+MIN_TOWER_ANGLE = 60.0 * DEG
+"""Smallest angle between two towers, [rad]."""
 
-DELTA = ("*.offset", "radius", "*_tower.tangential", "*_rod_a.length", "*_rod_b.length")
-"""Free errors of the model `delta`: those of delta firmware, with all six rods."""
+DELTA_MODEL = ("*.offset", "radius", "*_tower.tangential", "*_rod_a.length", "*_rod_b.length")
+"""Free errors of the model `delta`: the errors that delta firmware corrects, with all six rods."""
 
-CLOSE = 1e-9
-"""[m]"""
+ROUNDING = 1e-9
+"""Tolerance for rounding errors, relative to a step or in [rad]."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,13 +44,13 @@ class LinearDelta(Dimensions):
     rod: float = 0.28
     """Length of a rod, from hinge to hinge."""
     radius: float = 0.14
-    """Horizontal distance of the hinges on a slide from those on the platform, with the tool in the
-    middle: the delta radius of printers."""
+    """Delta radius: horizontal distance between the hinges on a slide and on the platform, with the
+    tool in the middle."""
     angles: tuple[float, ...] = (210 * DEG, 330 * DEG, 90 * DEG)
     """Directions of the towers from the middle of the bed."""
     travel: tuple[float, float] = (0.03, 0.56)
-    """Least and largest height of the hinges on a slide above those on the platform when the tool
-    is on the bed."""
+    """Smallest and largest height of the hinges on a slide above those on the platform, with the
+    tool on the bed."""
     platform: float = 0.03
     """Distance of the tool centre point from the hinges on the platform."""
     rods_apart: float = 0.05
@@ -103,27 +103,30 @@ class LinearDelta(Dimensions):
 
     @property
     def zero(self) -> float:
-        """Height of a slide in the mechanical zero: tool in the middle, on the bed, [m]."""
+        """Height of a slide with the tool in the middle of the bed (the mechanical zero), [m]."""
         return math.sqrt(max(self.rod**2 - self.radius**2, 0.0))
 
     @property
     def box(self) -> tuple[tuple[float, float], ...]:
-        """Workspace: the stated one, or one of half the radius to each side that is reached, [m].
+        """Limits of the workspace, [m]: the stated one, or a reachable box.
 
-        Whole centimetres, or whole millimetres on small machines.
+        The box extends at most half the radius to each side. Its limits are whole centimetres, or
+        whole millimetres on small machines.
         """
         if self.workspace is not None:
             return self.workspace
         step = 0.01 if self.radius >= 0.1 else 0.001
-        half = min(0.5 * self.radius, (FARTHEST * self.rod - self.radius) / math.sqrt(2.0))
+        half = min(
+            0.5 * self.radius, (MAX_RELATIVE_DISTANCE * self.rod - self.radius) / math.sqrt(2.0)
+        )
         half = step * math.floor(half / step + 0.5)
         near = max(self.radius - math.sqrt(2.0) * half, 0.0)
         top = min(self.radius, self.travel[1] - math.sqrt(self.rod**2 - near**2))
-        top = step * math.floor(top / step + CLOSE)
+        top = step * math.floor(top / step + ROUNDING)
         return (-half, half), (-half, half), (0.0, max(top, step))
 
     def find_problem(self) -> tuple[str, str] | None:
-        """Name of the first impossible dimension, and why; None if all are possible."""
+        """Name and problem of the first impossible dimension; None if all are possible."""
         problem = find_length_problem("rod", "rods", self.rod)
         if problem:
             return problem
@@ -137,11 +140,11 @@ class LinearDelta(Dimensions):
             for i, a in enumerate(self.angles)
             for b in self.angles[:i]
         ]
-        if not min(gaps) >= NEAREST_TOWERS - CLOSE:
+        if not min(gaps) >= MIN_TOWER_ANGLE - ROUNDING:
             shown = ", ".join(in_unit(a, "deg") for a in self.angles)
             return "angles", (
-                f"towers at {shown}°; expected three directions, {NEAREST_TOWERS / DEG:g}° apart "
-                "at least"
+                f"towers at {shown}°; expected three directions, at least "
+                f"{MIN_TOWER_ANGLE / DEG:g}° apart"
             )
         lower, upper = self.travel
         if not 0.0 < lower < self.zero < upper <= self.zero + 20.0 * self.rod:
@@ -159,7 +162,7 @@ class LinearDelta(Dimensions):
 
     @property
     def words(self) -> str:
-        """Dimensions in words, in mm."""
+        """Description of the dimensions, in mm."""
         lower, upper = self.travel
         return (
             f"rods of {in_mm(self.rod)} mm, radius {in_mm(self.radius)} mm, slides "
@@ -200,7 +203,7 @@ class LinearDelta(Dimensions):
         """YAML of the machine, with the parameters of delta firmware as named sums."""
         towers = self.letters
         parameters = {
-            # outwards; X of a slide's frame points to the middle
+            # positive outwards, because X of a slide's frame points to the middle
             "radius": [f"-{k}_slide.x" for k in towers],
             **{f"{k}_tower.radial": [f"-{k}_slide.x"] for k in towers},
             **{f"{k}_tower.tangential": [f"{k}_slide.z"] for k in towers},
@@ -208,7 +211,7 @@ class LinearDelta(Dimensions):
                 name for k in towers for name in (f"{k}_coupler.x", f"frame.{k}_rod_b_tip.x")
             ],
             **length_sums(towers),
-            # turns the effector about the rods of an arm
+            # rotation of the effector about the rods of an arm
             **{f"{k}_effector.tilt": [f"{k}_fork.rx"] for k in towers},
             **{f"{k}_rod_a.length": [f"{k}_coupler.x"] for k in towers},
             **{f"{k}_rod_b.length": [f"frame.{k}_rod_b_tip.x"] for k in towers},
@@ -220,7 +223,7 @@ class LinearDelta(Dimensions):
             rod_radius=self.rod_radius,
             loops=platform_loops(towers),
             parameters=parameters,
-            models={"delta": DELTA},
+            models={"delta": DELTA_MODEL},
             workspace=self.box,
             tolerances="offset_mm: 4, translation_mm: 1, rotation_mrad: 5, scale_ppm: 500",
         )

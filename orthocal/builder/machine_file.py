@@ -1,6 +1,6 @@
-"""machine.yaml: kind and dimensions of a machine, in one place.
+"""machine.yaml: kind and dimensions of a machine.
 
-The URDF and YAML of its directory are made from it, and again after a change.
+The URDF and YAML in the same directory are generated from it, and updated after a change.
 """
 
 from __future__ import annotations
@@ -22,56 +22,58 @@ from orthocal.units import MM
 
 MACHINE = "machine.yaml"
 
-LARGEST_SHOWN = 100.0
+MAX_COORDINATE = 100.0
 """Largest coordinate of a controller's joint in the mechanical zero, [m]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Counting:
-    """Relation of a controller's joint to the drive's coordinate."""
+    """Relation of a controller's joint to the drive coordinate."""
 
     up: bool = True
-    """Whether it grows with the drive's coordinate."""
+    """Whether the joint coordinate grows with the drive coordinate."""
     at_zero: float | None = None
-    """Coordinate in the mechanical zero, [m]; None for that of the drive."""
+    """Joint coordinate in the mechanical zero, [m]; None if it equals the drive coordinate."""
 
 
 AS_DRIVE = Counting()
-"""Joint coordinate equal to the drive's coordinate."""
+"""Joint coordinate that equals the drive coordinate."""
 
 
 def find_counting_problem(counting: Sequence[Counting], count: int) -> str | None:
-    """Reason why the joints of so many drives cannot count like this; None if they can."""
+    """Problem of the stated joints of `count` drives; None without one."""
     if len(counting) != count:
         return f"has {len(counting)} joints; expected {count}"
     for joint in counting:
-        at = joint.at_zero
-        if at is not None and not (math.isfinite(at) and abs(at) <= LARGEST_SHOWN):
-            return f"{in_mm(at)} mm in the mechanical zero; expected within ±{LARGEST_SHOWN:g} m"
+        zero = joint.at_zero
+        if zero is not None and not (math.isfinite(zero) and abs(zero) <= MAX_COORDINATE):
+            return f"{in_mm(zero)} mm in the mechanical zero; expected within ±{MAX_COORDINATE:g} m"
     return None
 
 
 class _Keys(BaseModel):
+    """Base of keys that refuses unknown ones."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class CountingKeys(_Keys):
-    """Joint of a controller."""
+    """Keys of a controller's joint."""
 
     counts: Literal["up", "down"] = "up"
     at_zero_mm: Number | None = None
 
     def to_counting(self) -> Counting:
-        """Relation to the drive's coordinate."""
-        at = self.at_zero_mm
-        return Counting(self.counts == "up", None if at is None else at * MM)
+        """Relation to the drive coordinate."""
+        zero = self.at_zero_mm
+        return Counting(self.counts == "up", None if zero is None else zero * MM)
 
 
 def read_machine(path: Path) -> tuple[Dimensions, tuple[Counting, ...]]:
-    """Dimensions of a machine, and how its joints count.
+    """Read the dimensions of a machine and its joints.
 
     Raises:
-        RobotError: Naming file and key, also where the dimensions are impossible.
+        RobotError: If a key is invalid or a dimension is impossible; names file and key.
     """
     data = read_yaml(path, error=RobotError)
     name = data.get("kind", USUAL) if isinstance(data, dict) else USUAL
@@ -89,14 +91,14 @@ def read_machine(path: Path) -> tuple[Dimensions, tuple[Counting, ...]]:
         key = next(d.key for d in kind.keys if d.name == problem[0])
         raise RobotError(problem[1], where=f"{path}: {key}")
     counting = tuple(getattr(keys.joints, drive).to_counting() for drive in kind.drives_of())
-    wrong = find_counting_problem(counting, len(counting))
-    if wrong:
-        raise RobotError(wrong, where=f"{path}: joints")
+    joints_problem = find_counting_problem(counting, len(counting))
+    if joints_problem:
+        raise RobotError(joints_problem, where=f"{path}: joints")
     return dimensions, counting
 
 
 def _keys_of(kind: type[Dimensions]) -> type[BaseModel]:
-    """Keys of the machine.yaml of a kind."""
+    """Model of the keys in the machine.yaml of a kind."""
     joints: dict[str, Any] = {d: (CountingKeys, CountingKeys()) for d in kind.drives_of()}
     count = len(kind.coordinates)
     box = Annotated[WorkspaceBox, Field(min_length=count, max_length=count)]

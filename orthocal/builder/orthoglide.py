@@ -1,4 +1,4 @@
-"""Dimensions of the Orthoglide, and of one whose slides have another inclination."""
+"""Dimensions of the Orthoglide, and of an Orthoglide with differently inclined slides."""
 
 from __future__ import annotations
 
@@ -28,29 +28,29 @@ from orthocal.builder.leg_urdf import Body, LegGeometry, Shape, coloured, machin
 from orthocal.builder.robot_yaml import length_sums, platform_loops, robot_yaml
 from orthocal.units import DEG
 
-STEEPEST = 0.9
-"""Sine of the largest angle by which legs turn at the ends of a drive's travel."""
+MAX_SINE = 0.9
+"""Sine of the largest angle between a leg and its axis at the ends of a drive's travel."""
 
-SLIDER = 0.03
+SLIDER_DISTANCE = 0.03
 """Distance from a leg's hinge on the slide to the centre of the drawn slide, [m]."""
 
-RAIL = 0.09
-"""Length of a rail beyond the travel, [m]."""
+RAIL_OVERHANG = 0.09
+"""Length of a rail minus the travel, [m]."""
 
 ORTHOGONAL = math.asin(1.0 / math.sqrt(3.0))
 """Elevation of the slides of an Orthoglide, [rad]."""
 
-FLATTEST, STEEPEST_SLIDE = 20.0 * DEG, 70.0 * DEG
-"""Elevations of the slides of an inclined Orthoglide, [rad]."""
+MIN_ELEVATION, MAX_ELEVATION = 20.0 * DEG, 70.0 * DEG
+"""Limits of the elevation of the slides of an inclined Orthoglide, [rad]."""
 
 FEET = "Feet of the rails, made from machine.yaml until this line is removed."
-"""Comment above the adjustments of a machine whose feet follow its dimensions."""
+"""Comment above the adjustments of a machine if its feet depend on the dimensions."""
 
 DRAWN_SLIDE = (
-    Shape((0.07, 0.03, 0.06), "dark", np.array([-SLIDER, 0.036, 0.0])),
+    Shape((0.07, 0.03, 0.06), "dark", np.array([-SLIDER_DISTANCE, 0.036, 0.0])),
     Shape((0.02, 0.03, 0.034), "dark", np.array([-0.005, 0.012, 0.0])),
 )
-"""In the slide's frame, from the middle of its hinge."""
+"""Shapes of a slide, in its frame relative to the middle of its hinge."""
 
 DRAWN_FOOT = Shape((0.028, 0.018, 0.018), "dark", np.array([0.014, 0.0, 0.0]))
 
@@ -64,9 +64,8 @@ class SlidingLegs(Dimensions):
     leg: float = 0.31025
     """Length of a leg, from hinge to hinge of a rod."""
     travel: tuple[float, float] = (0.12, 0.39)
-    """Least and largest coordinate of a drive. A drive's coordinate is the distance of a leg's root
-    from the intersection of the drive axes, less the attachment: the leg length in the mechanical
-    zero."""
+    """Smallest and largest drive coordinate. It is the distance of a leg's root from the
+    intersection of the drive axes minus the attachment: the leg length in the mechanical zero."""
     attachment: float = 0.04
     """Distance from the tool centre point to the hinges on the platform, along the axis."""
 
@@ -76,11 +75,11 @@ class SlidingLegs(Dimensions):
         return self.leg
 
     def find_problem(self) -> tuple[str, str] | None:
-        """Name of the first impossible dimension, and why; None if all are possible."""
+        """Name and problem of the first impossible dimension; None if all are possible."""
         return find_length_problem("leg", "legs", self.leg) or self._find_others()
 
     def _find_others(self) -> tuple[str, str] | None:
-        """Problem of the dimensions after the leg length."""
+        """Name and problem of the first impossible dimension after the leg length."""
         leg, (lower, upper) = self.leg, self.travel
         travel = f"travel from {in_mm(lower)} to {in_mm(upper)} mm"
         if not lower < leg < upper:
@@ -88,10 +87,10 @@ class SlidingLegs(Dimensions):
                 f"{travel} does not include {in_mm(leg)} mm, the leg length, where the mechanical "
                 "zero is; check both numbers"
             )
-        if max(leg - lower, upper - leg) > STEEPEST * leg:
+        if max(leg - lower, upper - leg) > MAX_SINE * leg:
             return "travel", (
-                f"{travel}; legs of {in_mm(leg)} mm reach {in_mm((1.0 - STEEPEST) * leg)} to "
-                f"{in_mm((1.0 + STEEPEST) * leg)} mm"
+                f"{travel}; legs of {in_mm(leg)} mm reach {in_mm((1.0 - MAX_SINE) * leg)} to "
+                f"{in_mm((1.0 + MAX_SINE) * leg)} mm"
             )
         if not 0.0 <= self.attachment <= leg:
             return "attachment", (
@@ -102,11 +101,11 @@ class SlidingLegs(Dimensions):
 
     @property
     def words(self) -> str:
-        """Dimensions in words, in mm."""
+        """Description of the dimensions, in mm."""
         return self.words_of_legs()
 
     def words_of_legs(self) -> str:
-        """Dimensions of slides and legs in words, in mm."""
+        """Description of the dimensions of slides and legs, in mm."""
         lower, upper = self.travel
         return (
             f"legs of {in_mm(self.leg)} mm, travel {in_mm(lower)} to {in_mm(upper)} mm, "
@@ -116,7 +115,7 @@ class SlidingLegs(Dimensions):
 
     @abstractmethod
     def frames(self) -> list[Array]:
-        """Frames of the slides, shape (3, 3): X from the slide to the tool, Z that of the leg."""
+        """Frames of the slides, shape (3, 3) each: X from slide to tool, Z as of the leg."""
 
     def legs(self) -> list[LegGeometry]:
         """Legs in the mechanical zero."""
@@ -131,7 +130,7 @@ class SlidingLegs(Dimensions):
         return legs
 
     def rails(self) -> list[Shape]:
-        """Drawn rails, beside the slides."""
+        """Drawn shapes of the rails."""
         middle, length = self.rail
         return [
             Shape(
@@ -145,12 +144,14 @@ class SlidingLegs(Dimensions):
 
     @property
     def rail(self) -> tuple[float, float]:
-        """Middle of a rail along its axis, and its length, as drawn, [m]."""
+        """Position of a drawn rail's middle along its axis, and its length, [m]."""
         lower, upper = self.travel
-        return 0.5 * (lower + upper) + self.attachment + SLIDER, upper - lower + RAIL
+        return 0.5 * (
+            lower + upper
+        ) + self.attachment + SLIDER_DISTANCE, upper - lower + RAIL_OVERHANG
 
     def drawn_platform(self) -> Sequence[Shape]:
-        """Platform in the tool's frame."""
+        """Shapes of the platform in the tool's frame."""
         return DRAWN_PLATFORM
 
     def urdf(self, name: str) -> str:
@@ -180,14 +181,14 @@ class SlidingLegs(Dimensions):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Orthoglide(SlidingLegs):
-    """Dimensions of an Orthoglide, [m]: slides along x, y and z."""
+    """Dimensions of an Orthoglide with slides along x, y and z, [m]."""
 
     kind: ClassVar[str] = "orthoglide"
     keys: ClassVar[tuple[Dimension, ...]] = (LEG, TRAVEL, ATTACHMENT, RODS_APART, ROD_RADIUS)
     letters: ClassVar[str] = "xyz"
 
     def frames(self) -> list[Array]:
-        """Frames of the slides; Z is the axis before that of the slide."""
+        """Frames of the slides; Z is the axis that precedes the slide's axis cyclically."""
         axes = np.eye(3)
         return [
             np.column_stack([-axes[i], np.cross(axes[i - 1], -axes[i]), axes[i - 1]])
@@ -195,12 +196,12 @@ class Orthoglide(SlidingLegs):
         ]
 
     def drawn_platform(self) -> Sequence[Shape]:
-        """Platform with a spindle."""
+        """Shapes of a platform with a spindle."""
         box, ball = DRAWN_PLATFORM
         return box, Shape((0.006, 0.04), "steel", np.full(3, -0.025)), ball
 
     def adjustments(self) -> str:
-        """Adjustments at both ends of each rail, across it, and under one of its sides, as YAML."""
+        """Adjustments at both ends of each rail, across it, and at one of its sides, as YAML."""
         middle, length = self.rail
         inner, outer = middle - 0.5 * length, middle + 0.5 * length
         half = 0.5 * self.rods_apart
@@ -217,10 +218,10 @@ class Orthoglide(SlidingLegs):
         lines = []
         for axis, letter in enumerate(self.letters):
             moves = f"{{moves: {letter}_slide, at_mm:"
-            for end, at, pivot in (("inner", inner, outer), ("outer", outer, inner)):
+            for end, position, pivot in (("inner", inner, outer), ("outer", outer, inner)):
                 for k in ((axis + 1) % 3, (axis + 2) % 3):
                     lines.append(
-                        f"{letter}_{end}_foot_{self.letters[k]}: {moves} {point(axis, at)}, "
+                        f"{letter}_{end}_foot_{self.letters[k]}: {moves} {point(axis, position)}, "
                         f"direction: {unit(k)}, pivot_mm: {point(axis, pivot)}}}"
                     )
             side, other = (point(axis, 0.5 * (inner + outer), 1, s * half) for s in (1.0, -1.0))
@@ -239,7 +240,7 @@ class Orthoglide(SlidingLegs):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InclinedOrthoglide(SlidingLegs):
-    """Dimensions of three slides that rise from a vertical axis by one angle, [m, rad]."""
+    """Dimensions of three slides around a vertical axis with equal elevation, [m, rad]."""
 
     elevation: float = 45 * DEG
     """Angle of the slides above the horizontal plane; at 35.26° they are orthogonal."""
@@ -261,17 +262,17 @@ class InclinedOrthoglide(SlidingLegs):
     letters: ClassVar[str] = "abc"
 
     def find_problem(self) -> tuple[str, str] | None:
-        """Name of the first impossible dimension, and why; None if all are possible."""
-        if not FLATTEST <= self.elevation <= STEEPEST_SLIDE:
+        """Name and problem of the first impossible dimension; None if all are possible."""
+        if not MIN_ELEVATION <= self.elevation <= MAX_ELEVATION:
             return "elevation", (
-                f"slides at {in_unit(self.elevation, 'deg')}°; expected {FLATTEST / DEG:g} to "
-                f"{STEEPEST_SLIDE / DEG:g}°"
+                f"slides at {in_unit(self.elevation, 'deg')}°; expected {MIN_ELEVATION / DEG:g} to "
+                f"{MAX_ELEVATION / DEG:g}°"
             )
         return SlidingLegs.find_problem(self)
 
     @property
     def words(self) -> str:
-        """Dimensions in words, in mm and degrees."""
+        """Description of the dimensions, in mm and degrees."""
         angle = in_unit(self.elevation, "deg")
         return f"slides at {angle}°, {self.words_of_legs()}"
 

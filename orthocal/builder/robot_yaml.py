@@ -7,18 +7,18 @@ from dataclasses import dataclass
 
 from orthocal.builder.dimensions import box_text, in_mm
 
-ROUGH = "offset_mm: 10, translation_mm: 0.2, rotation_mrad: 2, scale_ppm: 200"
-"""Tolerances of a machine that was built in a workshop."""
+WORKSHOP_TOLERANCES = "offset_mm: 10, translation_mm: 0.2, rotation_mrad: 2, scale_ppm: 200"
+"""Default tolerances, of a machine built in a workshop."""
 
 TWO_RODS = {"a": ("{k}_bar_a", "{k}_coupler"), "b": ("{k}_bar_b", "{k}_rod_b_tip")}
-"""Frames at both ends of the rods of a parallelogram."""
+"""Frames at both ends of each rod of a parallelogram, by rod; {k} is the leg."""
 
 ONE_ROD = {"a": ("{k}_bar", "{k}_end")}
-"""Frames at both ends of a single rod."""
+"""Frames at both ends of a single rod; {k} is the leg."""
 
 
 MODELS = {"offsets": ("*.offset",), "lengths": ("*.offset", "*_leg.length")}
-"""Free errors of the models of every machine, besides full."""
+"""Free errors of the models of every machine, except the model full."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,13 +27,15 @@ class Loop:
 
     name: str
     frames: tuple[str, str]
+    """Frames that the closure joins."""
     kind: str = "3d"
+    """Kind in the Gepetto extended URDF: 3d or 6d."""
     rows: tuple[str, ...] = ()
-    """All by default."""
+    """Rows of the closure that count; all by default."""
 
 
 def platform_loops(letters: str) -> list[Loop]:
-    """Loops of a machine whose legs are parallelograms that carry a platform in space.
+    """Loops of a spatial machine whose legs are parallelograms.
 
     Args:
         letters: Names of the legs; the first one carries the platform.
@@ -45,12 +47,12 @@ def platform_loops(letters: str) -> list[Loop]:
 
 
 def parallelogram_loop(k: str) -> Loop:
-    """Loop of a leg of two rods, which is planar."""
+    """Planar loop of a leg with two rods."""
     return Loop(f"{k}_parallelogram", (f"{k}_crossbar_end", f"{k}_rod_b_tip"), "3d", ("x", "z"))
 
 
 def length_sums(letters: str) -> dict[str, list[str]]:
-    """Lengths of legs of two rods as named sums: both rods get longer together."""
+    """Lengths of legs with two rods as named sums, in which both rods change equally."""
     return {f"{k}_leg.length": [f"{k}_coupler.x", f"frame.{k}_rod_b_tip.x"] for k in letters}
 
 
@@ -67,7 +69,7 @@ def robot_yaml(
     tip: str = "{k}_leg_tip",
     coordinates: str = "xyz",
     workspace: Sequence[Sequence[float]] | None = None,
-    tolerances: str = ROUGH,
+    tolerances: str = WORKSHOP_TOLERANCES,
 ) -> str:
     """YAML of a machine.
 
@@ -78,14 +80,14 @@ def robot_yaml(
         rod_radius: Radius of a rod, [m].
         loops: Loop closures.
         parameters: Named sums of errors.
-        models: Free errors of models besides offsets, lengths and full.
+        models: Free errors of models in addition to offsets, lengths and full.
         rods: Frames at both ends of each rod of a leg k.
         tip: Frame at the end of a leg k.
-        coordinates: Coordinates of the tool that the drives control.
-        workspace: Limits, [m].
+        coordinates: Coordinates of the tool that the drives command.
+        workspace: Limits of the workspace relative to the mechanical zero, [m].
         tolerances: Tolerances as YAML.
     """
-    usual = {**MODELS, **(models or {})}
+    models = {**MODELS, **(models or {})}
     box = [] if workspace is None else [f"  workspace: {{box_mm: {box_text(workspace)}}}"]
     lines = [
         f"# {title}",
@@ -110,13 +112,14 @@ def robot_yaml(
         f"  tolerances: {{{tolerances}}}",
         "  # Free errors of each model. complete: every error that moves a rod or the tool.",
         "  models:",
-        *(f"    {name}: [{', '.join(map(repr, globs))}]" for name, globs in usual.items()),
+        *(f"    {name}: [{', '.join(map(repr, globs))}]" for name, globs in models.items()),
         "    full: complete",
     ]
     return "\n".join(lines) + "\n"
 
 
 def _gepetto_lines(letters: str, loops: Sequence[Loop]) -> list[str]:
+    """YAML of loops and drives in the keys of the Gepetto extended URDF."""
     return [
         "# Loops and drives, in the keys of the Gepetto extended URDF.",
         "closed_loop:",
@@ -128,11 +131,19 @@ def _gepetto_lines(letters: str, loops: Sequence[Loop]) -> list[str]:
 
 
 def _rows(rows: Sequence[str]) -> str:
+    """YAML of the rows of a closure; "" for all rows."""
     return f"rows: [{', '.join(rows)}]" if rows else ""
 
 
 def _leg_lines(k: str, tip: str, rods: Mapping[str, tuple[str, str]], radius: str) -> list[str]:
-    """YAML of a leg k with rods of a radius, in mm."""
+    """YAML of a leg k.
+
+    Args:
+        k: Name of the leg.
+        tip: Frame at its end; {k} is the leg.
+        rods: Frames at both ends of each rod; {k} is the leg.
+        radius: Radius of a rod in mm, as text.
+    """
     ends = {name: [frame.format(k=k) for frame in frames] for name, frames in rods.items()}
     return [
         f"    {k}:",

@@ -1,1 +1,1 @@
-"""A calibration: from a session, as data, as a file, and as a machine that moves."""
+"""Calibration of a session, its record and file, and the calibrated machine."""

@@ -1,4 +1,4 @@
-"""A calibrated machine after mechanical adjustments."""
+"""Calibration of a machine after mechanical adjustments."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from orthocal.io.fields import read_only
 
 
 def adjust_calibration(calibration: Calibration, amounts: Mapping[str, float]) -> Calibration:
-    """The calibration of a machine as it is after mechanical adjustments; not assessed.
+    """Calibration of a machine after mechanical adjustments; not assessed.
 
-    The amounts are held as known parameters. The errors with which they were set increase the
-    covariance of the free errors of the geometry: C + T S Tᵀ, with T their terms in these errors.
+    The amounts become known parameters. The errors with which they were set increase the covariance
+    of the free errors of the geometry to C + T S Tᵀ. S is the covariance of the amounts, and T the
+    coefficients of the amounts in the errors.
 
     Args:
-        calibration: The calibration of the machine before.
+        calibration: Calibration of the machine before the adjustments.
         amounts: Adjustment to its amount, [m].
     """
     if not amounts:
@@ -31,10 +32,10 @@ def adjust_calibration(calibration: Calibration, amounts: Mapping[str, float]) -
     terms = robot.parameters.coefficients(
         [p.name for p in calibration.free], [a.parameter for a in chosen]
     )
-    spread = terms * [a.setting_std(amounts[a.name]) for a in chosen]
-    before = {p.name: p.value for p in calibration.parameters if not p.free}
-    held = {a.parameter: before.get(a.parameter, 0.0) + amounts[a.name] for a in chosen}
-    covariance = calibration.model_covariance + spread @ spread.T
+    root = terms * [a.setting_std(amounts[a.name]) for a in chosen]
+    known_values = {p.name: p.value for p in calibration.parameters if not p.free}
+    held = {a.parameter: known_values.get(a.parameter, 0.0) + amounts[a.name] for a in chosen}
+    covariance = calibration.model_covariance + root @ root.T
     variances = iter(np.diag(covariance + calibration.unmodelled.bias_covariance).tolist())
 
     def estimate(p: ParameterEstimate) -> ParameterEstimate:

@@ -1,7 +1,7 @@
-"""The judgement of a calibration as data: findings, one decision, what to enter, the tool error.
+"""Assessment of a calibration as data: findings, decision, values to enter and tool error.
 
-It is computed once (`orthocal.assessment.assess`), stored in calibration.json, and only rendered
-by text, JSON, report, scene and exports.
+It is computed once (`orthocal.assessment.assess`) and stored in calibration.json. Text, JSON,
+report, scene and exports only render it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ EXIT_CODES: dict[Verdict, int] = {"enter": 0, "review": 3, "reject": 3}
 """Exit codes of check, calibrate, compare and validate."""
 
 Severity = Literal["reject", "review", "note"]
-"""What a finding does to the verdict: `reject` and `review` decide it, a note does not."""
+"""Severity of a finding: `reject` and `review` determine the verdict, a note does not."""
 
 NoiseKind = Literal[
     "noise unknown",
@@ -48,7 +48,7 @@ FindingKind = Literal[
     "change unknown",
     "scattered repeats",
     "readings missing",
-    # what no machine or gauge shows
+    # implausible readings and settings
     "wrong dimensions",
     "beyond tolerances",
     "above tolerances",
@@ -58,7 +58,7 @@ FindingKind = Literal[
     "resolution too coarse",
     "postures too near",
     "legs differ",
-    # of a fit
+    # a fit
     "no convergence",
     NoiseKind,
     "nothing moved",
@@ -69,7 +69,7 @@ FindingKind = Literal[
     "effects inseparable",
     "below the noise",
     "line assumed",
-    # of what to enter
+    # values to enter
     "no offset",
     "no change needed",
     "must change",
@@ -78,7 +78,7 @@ FindingKind = Literal[
     "earlier readings",
     "tool error",
     "out of reach",
-    # of a comparison of models
+    # a comparison of models
     "recommended",
     "not recommended",
     "not determined",
@@ -88,7 +88,7 @@ FindingKind = Literal[
     "residuals repeat",
     "residuals differ",
     "repetition unknown",
-    # of a validation
+    # a validation
     "as predicted",
     "larger than predicted",
     "nothing predicted",
@@ -119,40 +119,40 @@ class Finding:
     kind: FindingKind
     severity: Severity
     text: str
-    """What was found, in a sentence or two."""
+    """Statement, one or two sentences."""
     action: str = ""
-    """What to do next; empty if nothing."""
+    """Recommended action; empty if there is none."""
     numbers: Mapping[str, NumberOrNaN] = field(default_factory=dict)
-    """By name, with the unit as a suffix (_mm, _um); pure numbers without."""
+    """Numbers by name; the unit is a suffix (_mm, _um), pure numbers have none."""
     places: Many[Place] = ()
-    """Where; the first is the worst."""
+    """Places, the worst first."""
 
     @property
     def words(self) -> str:
-        """Text and action; after a list the action has a line of its own."""
+        """Text and action; after a list the action begins a new line."""
         return ("\n" if "\n" in self.text else " ").join((self.text, self.action)).strip()
 
     def to_document(self) -> dict[str, Any]:
-        """Plain data for JSON; null for what is unknown."""
+        """Plain data for JSON; unknown numbers are null."""
         return write_plain(self, Finding)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """Decision: one verdict, its reason, and the next step."""
+    """Verdict with its reason and the next step."""
 
     __pydantic_config__ = CLOSED
 
     verdict: Verdict
     headline: str
     reason: str
-    """Why, in a sentence or two."""
+    """Reason, one or two sentences."""
     action: str
-    """What to do next; empty if nothing."""
+    """Recommended action; empty if there is none."""
 
     @property
     def words(self) -> str:
-        """Headline, reason and action in one paragraph, lists included."""
+        """Headline, reason and action in one paragraph, without line breaks."""
         return " ".join(" ".join((self.headline, self.reason, self.action)).split())
 
     @property
@@ -174,34 +174,34 @@ class ControllerEntry(InUnit):
     drive: str
     unit: Unit
     active: Number | None
-    """Offset now in the controller, [unit]; None if the session does not state it."""
+    """Active offset in the controller, [unit]; None if the session does not state it."""
     identified: Number
     """Offset of the identified machine, [unit]."""
     best: Number
-    """Offset with the least tool error, [unit]; its change if the active one is unknown."""
+    """Offset with the smallest tool error, [unit]; its change if the active offset is unknown."""
     enter: Number
-    """Offset to enter, [unit]: `best`, or the active one where the offsets stay as they are; the
-    change to add to the active one if that is unknown."""
+    """Offset to enter, [unit]: `best`, or `active` if the offsets are kept. If the active offset is
+    unknown, the change to add to it."""
     std: SizeOrNaN
     """Standard deviation of `best` from noise, priors and unmodelled errors, [unit]."""
     std_scatter: SizeOrNaN
-    """The part of it that is due to the noise of the readings, [unit]."""
+    """Part of `std` from the noise of the readings, [unit]."""
     held: Literal["known", "lower bound", "upper bound"] | None
-    """What holds it instead of the readings."""
+    """Reason why the readings do not determine the offset; None if they do."""
 
     @property
     def change(self) -> float:
-        """Value to enter less the active one, [unit]: 0 where the offsets stay as they are."""
+        """Value to enter minus the active one, [unit]; 0 if the offsets are kept."""
         return self.enter - (0.0 if self.active is None else self.active)
 
     @property
     def best_change(self) -> float:
-        """Best value less the active one, [unit]."""
+        """Best value minus the active one, [unit]."""
         return self.best - (0.0 if self.active is None else self.active)
 
     @property
     def kept(self) -> ControllerEntry:
-        """The entry that leaves the offset as it is."""
+        """Entry that keeps the active offset."""
         return replace(self, enter=0.0 if self.active is None else self.active)
 
 
@@ -214,7 +214,7 @@ class BacklashEntry(InUnit):
     drive: str
     unit: Unit
     active: Number
-    """Backlash that the controller compensates now, at the mechanical zero, [unit]."""
+    """Backlash that the controller compensates at present, at the mechanical zero, [unit]."""
     identified: Number
     """Backlash of the identified machine, [unit]."""
     enter: Number
@@ -222,60 +222,60 @@ class BacklashEntry(InUnit):
     std: SizeOrNaN
     """Standard deviation of `identified` from noise, priors and unmodelled errors, [unit]."""
     std_scatter: SizeOrNaN
-    """The part of it that is due to the noise of the readings, [unit]."""
+    """Part of `std` from the noise of the readings, [unit]."""
 
     @property
     def change(self) -> float:
-        """Backlash to enter less the active one, [unit]."""
+        """Backlash to enter minus the active one, [unit]."""
         return self.enter - self.active
 
     @property
     def kept(self) -> BacklashEntry:
-        """The entry that leaves the backlash as it is."""
+        """Entry that keeps the active backlash."""
         return replace(self, enter=self.active)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UsePart:
-    """Contribution of a condition of use that varies to the tool error, RMS, [m]."""
+    """Contribution of a varying condition of use to the tool error, RMS, [m]."""
 
     __pydantic_config__ = CLOSED
 
     condition: UseCondition
     effects: Many[str]
-    """Effects that depend on it."""
+    """Effects that depend on the condition."""
     known: SizeOrNaN
-    """Known change, with the offsets to be entered."""
+    """Estimated change of the tool error with the offsets to enter."""
     uncertain: SizeOrNaN
-    """Uncertainty of the change."""
+    """Uncertainty of that change."""
 
     @property
     def size(self) -> float:
-        """Root of the sum of both squares, [m]."""
+        """Root sum of squares of both parts, [m]."""
         return math.hypot(self.known, self.uncertain)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolUse:
-    """Conditions of use of a tool error; None where no effect of the machine depends on one."""
+    """Conditions of use of a tool error. A condition is None if no effect depends on it."""
 
     __pydantic_config__ = CLOSED
 
     approach: str | None
-    """A letter for each drive: p or n for one side, u for both."""
+    """Letter for each drive: p or n for one side of approach, u for both."""
     temperature: tuple[Number, Number] | None
-    """Lowest and highest, [°C]."""
+    """Lowest and highest temperature, [°C]."""
     payload: tuple[Number, Number] | None
-    """Lightest and heaviest, [kg]."""
+    """Smallest and largest payload, [kg]."""
     parts: Many[UsePart]
     """Conditions that vary."""
     unstated: SizeOrNaN
-    """Tool error, aligned, with all identified errors corrected but the conditions unknown: for the
-    middle of both sides, the reference temperature and no payload, [m]."""
+    """Aligned tool error, [m], if all identified errors are corrected for the reference conditions
+    only: the mean of both sides of approach, the reference temperature and no payload."""
 
     @property
     def stated(self) -> StatedUse:
-        """The conditions."""
+        """Conditions that are stated."""
         return StatedUse(approach=self.approach, temperature=self.temperature, payload=self.payload)
 
 
@@ -283,59 +283,61 @@ class ToolUse:
 class ToolErrorSummary:
     """Expected RMS error of the tool over the workspace, [m].
 
-    `aligned`: after aligning the workpiece on the machine (translation and rotation removed), which
-    is what counts; `absolute`: in the machine's own coordinates.
+    "Aligned" errors are those after aligning the workpiece on the machine: the best-fit translation
+    and rotation are removed. "Absolute" errors are in coordinates of the machine.
     """
 
     __pydantic_config__ = CLOSED
 
     box: Many[tuple[Number, Number]]
-    """Workspace, lowest and highest coordinate about the mechanical zero, [m]."""
+    """Workspace: lowest and highest value of each coordinate, [m]."""
     coordinates: str
-    """Names of the coordinates: xyz."""
+    """Names of the coordinates, such as "xyz"."""
     now: SizeOrNaN
-    """Aligned, with the offsets that are active now."""
+    """Aligned error with the active offsets."""
     entered: SizeOrNaN
-    """Aligned, with the offsets and the backlash to be entered."""
+    """Aligned error with the offsets and the backlash to enter."""
     compensated: SizeOrNaN
-    """Aligned, with a controller that corrects all identified errors."""
+    """Aligned error if the controller corrects all identified errors."""
     entered_absolute: SizeOrNaN
+    """Absolute error with the offsets and the backlash to enter."""
     now_absolute: SizeOrNaN
+    """Absolute error with the active offsets."""
     without_backlash: SizeOrNaN | None = None
-    """Aligned, with the offsets to be entered but not the backlash; None without backlash to
+    """Aligned error with the offsets to enter and the present backlash; None without backlash to
     enter."""
     use: ToolUse | None = None
-    """Conditions of use; None for a machine that depends on none."""
+    """Conditions of use; None if the tool error depends on none."""
 
     @property
     def region(self) -> str:
-        """The workspace in words: ±60 mm, or its ranges."""
+        """Workspace in words, such as "±60 mm"."""
         return describe_box(np.array(self.box), self.coordinates)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Assessment:
-    """Assessment: verdict, findings, offsets to enter, tool error."""
+    """Assessment of a calibration or of readings."""
 
     __pydantic_config__ = CLOSED
 
     decision: Decision
     findings: Many[Finding]
-    """The gravest first."""
+    """Findings, the gravest first."""
     entries: Many[ControllerEntry]
-    """What to enter, drive by drive; empty if no offset was identified."""
+    """Offsets to enter; empty if no offset was identified."""
     tool: ToolErrorSummary | None
-    """None if the robot has no tool, or nothing determines the noise."""
+    """Expected tool error; None if the robot has no tool, or if the noise is unknown."""
     backlash: Many[BacklashEntry] = ()
-    """What to enter of the backlash of each drive; empty if the model has none."""
+    """Backlash to enter; empty if the model has none."""
 
     @property
     def keeps_offsets(self) -> bool:
-        """True if the offsets in the controller need no change."""
+        """True if the active offsets need no change."""
         return bool(self.of_kind("no change needed", "no offset"))
 
     def of_kind(self, *kinds: FindingKind) -> tuple[Finding, ...]:
-        """Findings of some kinds, in their order."""
+        """Findings of the stated kinds, in their order."""
         return tuple(f for f in self.findings if f.kind in kinds)
 
     def to_document(self) -> dict[str, Any]:
@@ -347,5 +349,5 @@ class Assessment:
 
 
 def first_of(findings: Sequence[Finding], *kinds: FindingKind) -> Finding | None:
-    """The first finding of any of some kinds."""
+    """First finding of one of the stated kinds; None if there is none."""
     return next((f for f in findings if f.kind in kinds), None)

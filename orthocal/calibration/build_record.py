@@ -1,4 +1,4 @@
-"""Building of a calibration from the fit of a problem."""
+"""Construction of a calibration from a fit."""
 
 from __future__ import annotations
 
@@ -62,32 +62,32 @@ def assemble_calibration(
     intervals: Mapping[str, tuple[float, float]] | None = None,
     nominal: Array | None = None,
 ) -> Calibration:
-    """Calibration of a solved problem.
+    """Build the calibration of a solved problem.
 
     Args:
         fit: The solved problem.
-        full_problem: The problem with all parameters, if base parameters were solved for.
-        intervals: Profile-likelihood intervals by name, [SI].
-        nominal: Free parameters of the machine whose predictions are the nominal readings, shape
-            (n_free,), [SI]; by default the offsets that are active in the controller.
+        full_problem: The problem with all parameters, if base parameters were estimated.
+        intervals: Parameter to its profile-likelihood interval, [SI].
+        nominal: Free parameters of the machine that predicts the nominal readings, shape
+            (n_machine,), [SI]; by default the nominal machine with the active offsets.
 
     Raises:
-        SolverError: If the result makes no sense.
+        SolverError: If an estimate is not a plausible number.
     """
     problem = fit.problem
     session, n = problem.session, problem.n_machine
-    # a base parameter stands for all errors of its combination
+    # a base parameter represents all errors of its combination
     represented = () if full_problem is None else full_problem.machine_selection.names
-    others = find_unmodelled_errors(fit, represented=represented)
-    unmodelled, taken_on = propagate_unmodelled(fit, others)
-    noise = _separate_noise(fit) if others.names else None
+    unmodelled_errors = find_unmodelled_errors(fit, represented=represented)
+    unmodelled, bias_of_sensors = propagate_unmodelled(fit, unmodelled_errors)
+    noise = _separate_noise(fit) if unmodelled_errors.names else None
     covariance, noise_covariance = fit.covariance(noise=noise), fit.noise_covariance(noise=noise)
-    bias = np.append(np.sqrt(np.diag(unmodelled.bias_covariance)), taken_on)
+    bias_std = np.append(np.sqrt(np.diag(unmodelled.bias_covariance)), bias_of_sensors)
     estimates = _estimates(
         fit,
-        std=np.hypot(np.sqrt(np.diag(covariance)), bias),
+        std=np.hypot(np.sqrt(np.diag(covariance)), bias_std),
         std_scatter=np.sqrt(np.diag(noise_covariance)),
-        intervals=_widen(fit, unmodelled, intervals or {}),
+        intervals=_widen_intervals(fit, unmodelled, intervals or {}),
     )
     _require_possible(estimates, fit.iterations)
     diagnostics = diagnose_readings(fit)
@@ -124,21 +124,22 @@ def _held_parameters(problem: CalibrationProblem) -> list[ParameterEstimate]:
 
 
 def _separate_noise(fit: Fit) -> float | None:
-    """Noise of a reading where unmodelled errors explain the residuals, [m]; else None.
+    """Noise of a reading without unmodelled errors, [m]; None if the estimated noise is used.
 
-    With tolerances that are scaled so that they do, residuals as noise would count them twice.
+    Scaled tolerances explain the residuals by unmodelled errors. Noise from the residuals would
+    then count these errors twice.
     """
     gauge, scale = fit.problem.session.gauge, fit.problem.machine_selection.tolerance_scale
     if scale.factor == 1.0 or fit.noise.source != "residuals":
         return None
-    return fit.noise.apart_from_residuals(gauge.sigma, gauge.resolution)[0]
+    return fit.noise.without_residuals(gauge.sigma, gauge.resolution)[0]
 
 
 def _require_possible(estimates: Sequence[ParameterEstimate], iterations: int) -> None:
-    """Refuse estimates that no machine has.
+    """Refuse estimates that are not plausible numbers.
 
     Raises:
-        SolverError: Naming the first such parameter.
+        SolverError: If an estimate is not finite or too large; it names the parameter.
     """
     for p in estimates:
         if not max(abs(p.value), abs(p.linear)) <= LARGEST_NUMBER:
@@ -146,6 +147,7 @@ def _require_possible(estimates: Sequence[ParameterEstimate], iterations: int) -
 
 
 def _solver_record(fit: Fit) -> SolverRecord:
+    """Record of the solver, its settings and its result."""
     return SolverRecord(
         name=fit.program.options.solver,
         status=fit.solution.status,
@@ -159,6 +161,7 @@ def _solver_record(fit: Fit) -> SolverRecord:
 
 
 def _posture_records(fit: Fit) -> tuple[PostureRecord, ...]:
+    """Records of the postures with the passive coordinates of the calibrated machine."""
     states, postures = fit.problem.states, fit.problem.session.postures.values()
     return tuple(
         PostureRecord(p.name, p.form, p.values, p.drives, read_only(fit.solution.passive[i]))
@@ -167,7 +170,7 @@ def _posture_records(fit: Fit) -> tuple[PostureRecord, ...]:
 
 
 def _identifiability(fit: Fit, full_problem: CalibrationProblem | None) -> Identifiability:
-    """Identifiability of the free parameters; for base parameters with their combinations."""
+    """Identifiability of the free parameters, or of all if base parameters were estimated."""
 
     def analyse(linearisation: LinearProblem) -> Identifiability:
         machine = linearisation.problem.machine_selection.parameters
@@ -190,23 +193,29 @@ def _identifiability(fit: Fit, full_problem: CalibrationProblem | None) -> Ident
     )
 
 
-def _widen(
+def _widen_intervals(
     fit: Fit, unmodelled: UnmodelledEffect, intervals: Mapping[str, tuple[float, float]]
 ) -> dict[str, tuple[float, float]]:
-    """Profile-likelihood intervals, widened by the errors of the machine that were not free."""
+    """Profile-likelihood intervals, widened by the bias from unmodelled errors, within the bounds.
+
+    Args:
+        fit: The solved problem.
+        unmodelled: Effect of the unmodelled errors.
+        intervals: Parameter to its profile-likelihood interval, [SI].
+    """
     contrasts = fit.problem.machine_selection.tolerance_scale.contrasts
-    spread = confidence_factor(contrasts) * np.sqrt(np.diag(unmodelled.bias_covariance))
-    result = {}
+    bias_limits = confidence_factor(contrasts) * np.sqrt(np.diag(unmodelled.bias_covariance))
+    widened = {}
     for name, ends in intervals.items():
         i = fit.problem.free.index(name)
-        value, more = float(fit.solution.theta[i]), float(spread[i])
-        low, high = (math.hypot(value - end, more) for end in ends)
+        value, bias_limit = float(fit.solution.theta[i]), float(bias_limits[i])
+        low, high = (math.hypot(value - end, bias_limit) for end in ends)
         selection = fit.problem.selection
-        result[name] = (
+        widened[name] = (
             max(value - low, float(selection.lower[i])),
             min(value + high, float(selection.upper[i])),
         )
-    return result
+    return widened
 
 
 def _estimates(
@@ -216,12 +225,19 @@ def _estimates(
     std_scatter: Array,
     intervals: Mapping[str, tuple[float, float]],
 ) -> tuple[ParameterEstimate, ...]:
-    """Estimates of the machine, then of the sensors; standard deviations in [SI]."""
+    """Estimates of the free parameters: errors of the machine, then nuisance parameters.
+
+    Args:
+        fit: The solved problem.
+        std: Standard deviations, shape (n_free,), [SI].
+        std_scatter: Parts of them from the noise of the readings, shape (n_free,), [SI].
+        intervals: Parameter to its profile-likelihood interval, [SI].
+    """
     problem, solution = fit.problem, fit.solution
     selection = problem.selection
     determined = fit.machine_information.determined(sigma=fit.noise.sigma)
     determined = np.append(determined, np.zeros(problem.n_free - determined.size, dtype=bool))
-    words: dict[int, Literal["lower", "upper"] | None] = {-1: "lower", 0: None, 1: "upper"}
+    bounds: dict[int, Literal["lower", "upper"] | None] = {-1: "lower", 0: None, 1: "upper"}
     return tuple(
         ParameterEstimate(
             name=p.name,
@@ -238,7 +254,7 @@ def _estimates(
             mean=float(problem.prior_mean[i]),
             lower=finite_or_none(selection.lower[i]),
             upper=finite_or_none(selection.upper[i]),
-            at_bound=words[int(solution.at_bound[i] * fit.at_bound[i])],
+            at_bound=bounds[int(solution.at_bound[i] * fit.at_bound[i])],
             interval=intervals.get(p.name),
         )
         for i, p in enumerate(problem.parameters)
@@ -246,7 +262,7 @@ def _estimates(
 
 
 def hold_parameter(robot: Robot, name: str, value: float) -> ParameterEstimate:
-    """A parameter of a robot that is held at a known value, [SI]."""
+    """Record of a parameter with a known value, [SI]."""
     p = robot.parameters[name]
     return ParameterEstimate(
         name=name,
@@ -270,11 +286,13 @@ def hold_parameter(robot: Robot, name: str, value: float) -> ParameterEstimate:
 
 @cache
 def _versions() -> Versions:
+    """Versions of the software."""
     names = ("pin", "casadi", "numpy", "scipy")
     return Versions(__version__, platform.python_version(), *(version(name) for name in names))
 
 
 def _session_record(session: Session) -> SessionRecord:
+    """Record of a session and of those that were joined into it."""
     offsets = session.controller_offsets
     return SessionRecord(
         path=None if session.path is None else str(session.path),
@@ -297,26 +315,35 @@ def _session_record(session: Session) -> SessionRecord:
 def _residual_rows(
     fit: Fit, diagnostics: Diagnostics, nominal_theta: Array | None
 ) -> tuple[ResidualRow, ...]:
-    """Readings with the predictions of three machines, each with its best gauge zeros."""
-    problem, o = fit.problem, fit.problem.observations
-    measured, session, noise = problem.values, problem.session, problem.noise_ratio[o.plus]
+    """Readings with the predictions of the nominal, linearised and calibrated machine.
+
+    Each prediction contains its best-fit gauge zeros.
+    """
+    problem, observations = fit.problem, fit.problem.observations
+    measured, session, row_noise = (
+        problem.values,
+        problem.session,
+        problem.noise_ratio[observations.plus],
+    )
 
     def fitted(prediction: Array) -> Array:
-        residual = project_out_zeros(measured - prediction, o, weights=fit.robust_weights)
-        return session.values - noise * o.rows(residual)
+        residual = project_out_zeros(
+            measured - prediction, observations, weights=fit.robust_weights
+        )
+        return session.values - row_noise * observations.rows(residual)
 
-    mounting = fit.solution.theta[problem.n_machine :]  # that of the calibrated machine
+    mountings = fit.solution.theta[problem.n_machine :]  # of the calibrated machine
     if nominal_theta is None:
-        nominal = fitted(problem.predict_nominal(mounting))
+        nominal = fitted(problem.predict_nominal(mountings))
     else:
-        nominal = fitted(problem.predict(np.append(nominal_theta, mounting), None))
+        nominal = fitted(problem.predict(np.append(nominal_theta, mountings), None))
     try:
-        closed = problem.close(fit.linearised_theta, start=fit.solution.passive)
-        by_linear = fitted(problem.predict(fit.linearised_theta, closed))
+        passive = problem.close(fit.linearised_theta, start=fit.solution.passive)
+        by_linear = fitted(problem.predict(fit.linearised_theta, passive))
     except ClosureError:  # the linearised machine cannot be assembled
         by_linear = np.full(len(session.readings), np.nan)
-    predicted = session.values - noise * o.rows(fit.residual)
-    unseen = noise * cross_validate_setups(fit)
+    predicted = session.values - row_noise * observations.rows(fit.residual)
+    unseen = row_noise * cross_validate_setups(fit)
     return tuple(
         ResidualRow(
             setup=r.setup,
@@ -340,6 +367,7 @@ def _residual_rows(
 
 
 def _gauge_records(fit: Fit) -> tuple[GaugeRecord, ...]:
+    """Records of the gauges with their estimated noise."""
     problem = fit.problem
     return tuple(
         GaugeRecord(
@@ -355,12 +383,15 @@ def _gauge_records(fit: Fit) -> tuple[GaugeRecord, ...]:
 
 
 def _setup_records(fit: Fit) -> tuple[SetupRecord, ...]:
-    o = fit.problem.observations
-    noise = np.ones(o.n_zeros)
-    noise[o.zero] = fit.problem.noise_ratio
+    """Records of the setups with their estimated gauge zeros."""
+    observations = fit.problem.observations
+    noise = np.ones(observations.n_zeros)
+    noise[observations.zero] = fit.problem.noise_ratio
     zeros = {
         name: float(fit.solution.zeros[i] * noise[i])
-        for i, (name, real) in enumerate(zip(o.zero_setup, o.zero_real, strict=True))
+        for i, (name, real) in enumerate(
+            zip(observations.zero_setup, observations.zero_real, strict=True)
+        )
         if real
     }
     aligned_at = fit.problem.session.alignment_postures

@@ -1,6 +1,6 @@
-"""The result of a calibration: its record with derived quantities.
+"""Result of a calibration: its record and derived quantities.
 
-It contains everything that reports, scenes and exports need; none of them reads the session again.
+It contains everything that reports, scenes and exports need. None of them reads the session.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from orthocal.statistics.chance import bounded_interval, expanded_uncertainty
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Calibration(CalibrationRecord):
-    """A calibration: its record, its robot, and quantities derived from both."""
+    """Calibration: its record, its robot, and quantities derived from both."""
 
     robot: Robot
-    """The nominal robot, with the tolerances that the session states."""
+    """Nominal robot with the tolerances that the session states."""
     path: Path | None = None
-    """File that it was loaded from."""
+    """File from which it was loaded."""
 
     def __getitem__(self, name: str) -> ParameterEstimate:
         for p in self.parameters:
@@ -55,7 +55,7 @@ class Calibration(CalibrationRecord):
 
     @property
     def correlation(self) -> Array:
-        """Correlation by noise and priors, shape (n_machine, n_machine); NaN at a bound.
+        """Correlation from noise and priors, shape (n_machine, n_machine); NaN at a bound.
 
         Parameters that the readings cannot separate have a correlation near ±1.
         """
@@ -64,7 +64,7 @@ class Calibration(CalibrationRecord):
             return np.asarray(self.model_covariance / np.outer(std, std))
 
     def correlated(self, *, above: float = 0.5) -> tuple[tuple[str, str, float], ...]:
-        """Pairs of free parameters with a correlation above a size, strongest first."""
+        """Pairs of free parameters with an absolute correlation above a limit, largest first."""
         names = [p.name for p in self.free]
         matrix = np.nan_to_num(self.correlation)
         pairs = [
@@ -75,7 +75,7 @@ class Calibration(CalibrationRecord):
 
     @property
     def redundancy(self) -> int:
-        """Independent readings minus resolvable parameters: they check the model."""
+        """Independent readings minus resolvable parameters: number of checks of the model."""
         rank = len(self.free) if self.base else self.identifiability.structural_rank
         return self.identifiability.n_readings - rank
 
@@ -94,12 +94,12 @@ class Calibration(CalibrationRecord):
 
     @property
     def rms_before(self) -> float:
-        """Root mean square of the deviations, [m]."""
+        """RMS of the deviations, [m]."""
         return root_mean_square(r.deviation for r in self.residuals)
 
     @property
     def rms_after(self) -> float:
-        """Root mean square of the residuals, [m]."""
+        """RMS of the residuals, [m]."""
         return root_mean_square(r.residual for r in self.residuals)
 
     @property
@@ -114,7 +114,7 @@ class Calibration(CalibrationRecord):
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of one row of the readings, [m]: of a difference where all are."""
+        """Standard deviation of one row, [m]: of a difference if all rows are differences."""
         return self.noise.sigma * self.row_factor
 
     @property
@@ -124,15 +124,18 @@ class Calibration(CalibrationRecord):
 
     @property
     def row_factor(self) -> float:
-        """Standard deviation of a row over that of one reading: √2 if all rows are differences."""
+        """Factor from the noise of one reading to `sigma`: √2 if all rows are differences, else 1.
+
+        For the rows of a mixed session see `noise_factor`.
+        """
         return math.sqrt(2.0) if self.rows_are_differences else 1.0
 
     @property
     def total_covariance(self) -> Array:
         """Total covariance of `free`, shape (n_machine, n_machine), [SI].
 
-        From noise and priors (`model_covariance`) and from unmodelled errors with their stated
-        priors (`unmodelled.bias_covariance`).
+        From noise and priors (`model_covariance`) and from unmodelled errors with their priors,
+        which the tolerance scale multiplies (`unmodelled.bias_covariance`).
         """
         return np.asarray(self.model_covariance + self.unmodelled.bias_covariance)
 
@@ -140,23 +143,23 @@ class Calibration(CalibrationRecord):
     def expanded_uncertainties(self) -> Array:
         """Expanded uncertainties of `free`, shape (n_machine,), [SI].
 
-        k = 2, but Student's 95 % factor where few degrees of freedom determine the noise, or few
-        contrasts the tolerance scale; see `statistics.chance.expanded_uncertainty`.
+        The coverage factor is k = 2, or Student's 95 % factor if few degrees of freedom determine
+        the noise or the tolerance scale; see `statistics.chance.expanded_uncertainty`.
         """
         return self.expand(self.standard_deviations, [p.std_scatter for p in self.free])
 
     def expand(self, std: ArrayLike, std_scatter: ArrayLike) -> Array:
-        """Expanded uncertainties of quantities that follow from `free`, of any shape.
+        """Expanded uncertainties of linear functions of `free`, of any shape.
 
         Args:
-            std: Their standard deviations.
-            std_scatter: The parts that are due to the noise of the readings.
+            std: Standard deviations.
+            std_scatter: Parts of them from the noise of the readings.
         """
         scale, noise = self.tolerance_scale, self.noise
         dof = self.dof
         if scale.factor != 1.0 and self.unmodelled.names and noise.source == "residuals":
             session = self.session
-            _, dof = noise.apart_from_residuals(session.gauge_sigma, session.gauge_resolution)
+            _, dof = noise.without_residuals(session.gauge_sigma, session.gauge_resolution)
         return expanded_uncertainty(std, std_scatter, dof=dof, other_dof=scale.contrasts)
 
     @property
@@ -178,55 +181,58 @@ class Calibration(CalibrationRecord):
 
     @property
     def active_offsets(self) -> Array:
-        """Offsets in the controller while measuring, 0 where not stated, (n_drives,), [m, rad]."""
+        """Active offsets while measuring, shape (n_drives,), [m, rad]; 0 if not stated."""
         stated = self.session.controller_offsets
         return np.zeros(len(self.robot.drives)) if stated is None else np.array(stated)
 
     @property
     def measured_again(self) -> bool:
-        """True if sessions with other offsets in the controller were joined."""
+        """True if sessions with different active offsets were joined."""
         active = tuple(self.active_offsets.tolist())
         return any(s.active is not None and s.active != active for s in self.setups)
 
     def noise_factor(self, row: ResidualRow) -> float:
-        """Ratio of the standard deviations of a row and of one reading."""
+        """Standard deviation of this row over that of one reading: √2 for a difference, else 1."""
         if row.minus is None:
             return 1.0
         sensor = next(s.sensor for s in self.setups if s.name == row.setup)
         return math.sqrt(1.0 + is_difference(row.minus, sensor))
 
     def displacement(self, displayed: ArrayLike, approach: str | None = None) -> Array:
-        """Displacement of the drives by what the controller compensated while measuring.
+        """Displacement of the drives by the controller's compensation while measuring.
 
         Args:
             displayed: Commanded drive coordinates with the active offsets, shape (K, n_drives),
                 [m, rad].
-            approach: As for `UseConditions`.
+            approach: Sides of approach as for `UseConditions`.
 
         Returns:
-            Shape (K, n_drives), [m, rad]; see `orthocal.effects.compensation`.
+            Displacements, shape (K, n_drives), [m, rad]; see `orthocal.effects.compensation`.
         """
-        at = np.asarray(displayed, dtype=np.float64)
+        coordinates = np.asarray(displayed, dtype=np.float64)
         if not self.session.compensation:
-            return np.zeros(at.shape)
-        sides = [APPROACH[letter] for letter in approach or "u" * at.shape[1]]
+            return np.zeros(coordinates.shape)
+        sides = [APPROACH[letter] for letter in approach or "u" * coordinates.shape[1]]
         return displace_drives(
-            self.robot, self.session.compensation, at, np.tile(sides, (len(at), 1))
+            self.robot,
+            self.session.compensation,
+            coordinates,
+            np.tile(sides, (len(coordinates), 1)),
         )
 
     @property
     def compensated_backlash(self) -> Array:
-        """Backlash that the controller took up while measuring, at the mechanical zero.
+        """Backlash that the controller compensated while measuring, at the mechanical zero.
 
         Shape (n_drives,), [m, rad].
         """
         zero = self.robot.drive_zero[None]
-        ahead, behind = (self.displacement(zero, side * zero.size)[0] for side in "pn")
-        return np.asarray(ahead - behind)
+        outward, inward = (self.displacement(zero, side * zero.size)[0] for side in "pn")
+        return np.asarray(outward - inward)
 
     @property
     def only_offsets(self) -> bool:
-        """True if the identified machine has no errors but offsets."""
+        """True if the identified machine has no errors except offsets."""
         are_offsets = self.robot.parameters.are_offsets
         return all(are_offsets(p.name) for p in self.parameters if p.free or p.value != 0.0)
 
@@ -247,7 +253,7 @@ class Calibration(CalibrationRecord):
         return Machine(self.robot, self.errors)
 
     def _repr_html_(self) -> str:
-        """In a notebook: the short answer."""
-        import orthocal  # what is shown follows in later stages
+        """Short answer for a notebook."""
+        import orthocal  # here, as the output depends on this module
 
         return orthocal.summarize(self, html=True)

@@ -1,7 +1,7 @@
 """Reading, checking and writing of calibration.json.
 
-The record (`records.py`) is the schema. The file also contains numbers derived from the record, for
-readers without orthocal. Loading recomputes and compares them.
+The record (`records.py`) is the schema. The file also contains numbers that are derived from the
+record, for use without orthocal. Loading recomputes and compares them.
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ from orthocal.text import shorten
 
 SCHEMA = "orthocal/calibration/10"
 
-FOLLOWS = 1e-9
+DERIVED_TOLERANCE = 1e-9
 """Largest relative difference of a derived number from its recomputed value."""
 
-BESIDE = ("schema", "decision", "findings")
-"""Keys outside the record: the schema, and further keys of `calibrate --json`."""
+OTHER_KEYS = ("schema", "decision", "findings")
+"""Keys outside the record: the schema, and keys of `calibrate --json`."""
 
-MAKE_ONE = "`orthocal calibrate SESSION --out DIRECTORY` makes one"
+CREATE_HINT = "`orthocal calibrate SESSION --out DIRECTORY` makes one"
 
 OTHER_KINDS = (".csv", ".html", ".urdf", ".yaml", ".yml")
-"""Suffixes of files of other kinds."""
+"""Suffixes of files that are no calibration."""
 
 
 def load_calibration(path: str | Path) -> Calibration:
-    """Read a calibration.json, or the one in a directory. It needs no other file.
+    """Read a calibration.json, or the one in a directory. No other file is needed.
 
     Raises:
-        CalibrationFileError: Naming file and key, what was found and what was expected.
+        CalibrationFileError: If the file is missing or invalid; names file and key.
     """
     file = Path(path)
     if is_folder(file):
         file = file / "calibration.json"
     if not exists(file):
-        raise CalibrationFileError(f"there is no such file; {MAKE_ONE}", where=str(file))
+        raise CalibrationFileError(f"there is no such file; {CREATE_HINT}", where=str(file))
     if file.suffix.lower() in OTHER_KINDS:
-        raise CalibrationFileError(f"is no calibration.json; {MAKE_ONE}", where=str(file))
+        raise CalibrationFileError(f"is no calibration.json; {CREATE_HINT}", where=str(file))
     data = read_json(file, error=CalibrationFileError)
     if isinstance(data, Mapping) and "schema" not in data:
         raise CalibrationFileError(f"is missing; expected '{SCHEMA}'", where=f"{file}: schema")
@@ -63,20 +63,20 @@ def load_calibration(path: str | Path) -> Calibration:
 
 
 def calibration_document(calibration: Calibration) -> dict[str, Any]:
-    """A calibration as plain data: the content of calibration.json."""
+    """Calibration as plain data: the content of calibration.json."""
     derived = _derive(calibration)
     document = {"schema": SCHEMA, **write_plain(calibration, CalibrationRecord)}
     document["identifiability"] |= derived.pop("identifiability")
-    for row, more in zip(document["residuals"], derived.pop("residuals"), strict=True):
-        row |= more
+    for row, derived_of_row in zip(document["residuals"], derived.pop("residuals"), strict=True):
+        row |= derived_of_row
     return document | derived
 
 
 def calibration_json(calibration: Calibration) -> str:
-    """A calibration as the text of calibration.json.
+    """Calibration as the text of calibration.json.
 
     Raises:
-        SolverError: If it could not be loaded again, naming the impossible number.
+        SolverError: If it could not be loaded again; names the impossible number.
     """
     _require_loadable(calibration)
     return json.dumps(calibration_document(calibration), indent=1, allow_nan=False) + "\n"
@@ -105,8 +105,7 @@ def _require_loadable(calibration: Calibration) -> None:
 def absurd_result(problem: str, iterations: int) -> SolverError:
     """Error for a result with impossible numbers."""
     return SolverError(
-        f"the result makes no sense ({problem}); look for readings, a σ, tolerances or bounds that "
-        "cannot be",
+        f"the result is implausible ({problem}); check readings, sigma_mm, tolerances and bounds",
         status="absurd result",
         iterations=iterations,
     )
@@ -119,18 +118,18 @@ def _read_document(
     path: Path | None = None,
     robot: Robot | None = None,
 ) -> Calibration:
-    """Calibration of a document, whose parts are checked against each other.
+    """Calibration of a document after checks for contradictions.
 
     Args:
         data: The document.
-        file: Name of the file, for messages.
-        path: The file, if the document was read from one.
+        file: File name, for messages.
+        path: Path to the file, if the document was read from one.
         robot: The calibrated robot; by default the embedded one.
 
     Raises:
-        CalibrationFileError: Naming the key.
+        CalibrationFileError: If the document is invalid or contradictory; names the key.
     """
-    plain = _without(data, (*_DERIVED, *BESIDE))
+    plain = _without(data, (*_DERIVED, *OTHER_KEYS))
     for key, names in _DERIVED_IN.items():
         if isinstance(plain, dict) and key in plain:
             plain[key] = _without(plain[key], names)
@@ -151,12 +150,14 @@ def _read_document(
 
 
 _DERIVED = ("sigma", "dof", "rms_before", "rms_after", "largest_before", "largest_after")
+"""Names of derived numbers of the document."""
+
 _DERIVED_IN = {"identifiability": ("condition", "observability"), "residuals": ("residual",)}
-"""Names of derived numbers in the document and in its parts."""
+"""Names of derived numbers in parts of the document."""
 
 
 def _derive(c: Calibration) -> dict[str, Any]:
-    """Derived numbers of a record, at their places in the document."""
+    """Derived numbers of a calibration, by their keys in the document."""
     return {
         **{name: finite_or_none(getattr(c, name)) for name in _DERIVED},
         "identifiability": {
@@ -168,7 +169,7 @@ def _derive(c: Calibration) -> dict[str, Any]:
 
 
 def _without(part: Any, names: Collection[str]) -> Any:  # noqa: ANN401 - any document
-    """A part of a document, or each part in a list, without some keys."""
+    """Part of a document, or list of parts, without some keys."""
     if isinstance(part, list):
         return [_without(p, names) for p in part]
     return {k: v for k, v in part.items() if k not in names} if isinstance(part, dict) else part
@@ -180,12 +181,12 @@ def _check_derived(
     file: str,
     key: str = "",
 ) -> None:
-    """Refuse stated numbers that differ from the recomputed ones; any may be left out."""
+    """Refuse stated numbers that differ from the recomputed ones; missing numbers are accepted."""
     if isinstance(expected, dict):
-        parts = stated if isinstance(stated, dict) else dict.fromkeys(expected)
-        for name in [name for name in expected if name in parts]:
-            inner = f"{key}.{name}" if key else name
-            _check_derived(parts[name], expected[name], file, inner)
+        stated_parts = stated if isinstance(stated, dict) else dict.fromkeys(expected)
+        for name in [name for name in expected if name in stated_parts]:
+            inner_key = f"{key}.{name}" if key else name
+            _check_derived(stated_parts[name], expected[name], file, inner_key)
         return
     if isinstance(expected, list):
         for i, pair in enumerate(zip(stated, expected, strict=True)):
@@ -195,12 +196,14 @@ def _check_derived(
     if stated is None or expected is None:
         agrees = stated is expected
     else:
-        agrees = is_number and math.isclose(stated, expected, rel_tol=FOLLOWS, abs_tol=1e-15)
+        agrees = is_number and math.isclose(
+            stated, expected, rel_tol=DERIVED_TOLERANCE, abs_tol=1e-15
+        )
     if not agrees:
-        shown = "null" if stated is None else shorten(str(stated))
-        wanted = "null" if expected is None else f"{expected:.9g}"
+        stated_text = "null" if stated is None else shorten(str(stated))
+        expected_text = "null" if expected is None else f"{expected:.9g}"
         raise CalibrationFileError(
-            f"found {shown}; by what the file says otherwise it is {wanted}",
+            f"found {stated_text}; the other numbers of the file give {expected_text}",
             where=f"{file}: {key}",
         )
 
@@ -219,43 +222,43 @@ def _check_estimates(record: CalibrationRecord, file: str) -> None:
 
 
 def _find_contradictions(record: CalibrationRecord) -> Iterator[tuple[str, str]]:
-    """Keys that contradict other parts of a record, each with the problem."""
-    count = sum(p.free for p in record.parameters)
-    if not count:
-        yield "parameters", "holds none that is free"
+    """Keys that contradict other parts of a record, with the problem."""
+    n_free = sum(p.free for p in record.parameters)
+    if not n_free:
+        yield "parameters", "contains no free parameter"
     for key in ("model_covariance", "noise_covariance"):
         matrix = getattr(record, key)
-        if matrix.shape != (count, count):
-            yield key, f"expected {count} × {count} numbers, as free parameters"
+        if matrix.shape != (n_free, n_free):
+            yield key, f"expected {n_free} × {n_free} numbers, one row per free parameter"
         if not _is_covariance(matrix):
             yield (
                 key,
                 "is not a covariance: expected symmetric numbers without negative variances",
             )
-    unmodelled, others = record.unmodelled, len(record.unmodelled.names)
-    if unmodelled.prior_stds.shape != (others,):
+    unmodelled, n_unmodelled = record.unmodelled, len(record.unmodelled.names)
+    if unmodelled.prior_stds.shape != (n_unmodelled,):
         size = unmodelled.prior_stds.size
-        yield "unmodelled.prior_stds", f"has {size} numbers; expected {others}, as names"
-    if unmodelled.leakage.shape != (count, others):
-        expected = f"expected {count} × {others} numbers, free parameters by names"
+        yield "unmodelled.prior_stds", f"has {size} numbers; expected {n_unmodelled}, one per name"
+    if unmodelled.leakage.shape != (n_free, n_unmodelled):
+        expected = f"expected {n_free} × {n_unmodelled} numbers, free parameters × names"
         yield "unmodelled.leakage", expected
     names = [p.name for p in record.parameters]
     for i, name in enumerate(names):
         if name in names[:i]:
-            yield f"parameters[{i}].name", f"'{name}' stands twice"
+            yield f"parameters[{i}].name", f"'{name}' occurs twice"
     values, rank = record.identifiability.singular_values, record.identifiability.rank
     if not values.size or values.min() < 0.0 or (np.diff(values) > 0.0).any():
         yield "identifiability.singular_values", "expected positive numbers, the largest first"
     if rank > len(values) or (rank and values[rank - 1] <= 0.0):
-        above = (values > 0.0).sum()
-        yield "identifiability.rank", f"found {rank}; only {above} singular values are above 0"
+        positive = (values > 0.0).sum()
+        yield "identifiability.rank", f"found {rank}; only {positive} singular values are above 0"
 
 
 def _is_covariance(matrix: Array) -> bool:
-    """False for finite numbers that are not symmetric, or that are variances below 0."""
+    """True for symmetric numbers without negative variances, and for unknown (NaN) covariances."""
     if not np.isfinite(matrix).all():
         return True
     std = np.sqrt(np.abs(np.diag(matrix)))
-    unit = matrix / np.outer(*(np.where(std > 0.0, std, 1.0),) * 2)
-    symmetric = np.abs(matrix - matrix.T).max() <= FOLLOWS * np.abs(matrix).max()
-    return bool(symmetric and np.linalg.eigvalsh(unit).min() >= -1e-6)
+    correlation = matrix / np.outer(*(np.where(std > 0.0, std, 1.0),) * 2)
+    symmetric = np.abs(matrix - matrix.T).max() <= DERIVED_TOLERANCE * np.abs(matrix).max()
+    return bool(symmetric and np.linalg.eigvalsh(correlation).min() >= -1e-6)

@@ -1,4 +1,4 @@
-"""Identification: from a session to a calibration, before it is assessed."""
+"""Identification of the errors of a machine from a session, without assessment."""
 
 from __future__ import annotations
 
@@ -46,23 +46,23 @@ def identify(
 
     Args:
         sessions: The session, or the path to one; or several, which are fitted together.
-        choice: Free errors and prior knowledge of them, or the name of a model; by default as the
-            session states.
+        choice: Free errors, known errors and priors; or the name of a model. By default the choice
+            that the session states.
         loss: `squares` (the default), `huber` (pseudo-Huber), or a Loss with another width.
         solver: `ipopt` on the complete program, the reference; `variable-projection`, the same
             optimum in less time; `linearised`, one step about the active offsets; or
             SolverOptions.
-        profile: Names or globs of free parameters whose profile-likelihood intervals are wanted.
-        start: Initial values of the free errors of the machine, shape (n_machine,), [SI]; by
-            default the linearised solution.
-        find_scale: Function that finds the scale of the tolerances from the session; by default
-            the tolerances are as stated.
+        profile: Names or globs of free parameters whose profile-likelihood intervals are computed.
+        start: Initial values of the free errors of the machine, shape (n_machine,), [SI]; nuisance
+            parameters then start at 0. By default all parameters start at the linearised solution.
+        find_scale: Function that returns the tolerance scale of the session; by default the
+            stated tolerances are used.
 
     Returns:
-        The calibration, and the session (or the joined sessions) that it is of.
+        The calibration and its session, or the joined sessions.
 
     Raises:
-        NotIdentifiableError: If the readings leave a parameter open and there is no prior.
+        NotIdentifiableError: If neither readings nor a prior determine a parameter.
         SolverError: If the solver does not converge.
         ClosureError: If the machine cannot reach a posture.
         ParameterError: If the model or a name is unknown.
@@ -79,7 +79,7 @@ def identify(
     options = _solver_options(solver, loss)
     problem = CalibrationProblem(session, chosen.select(session.robot.parameters))
     require_conditions(session, problem.machine_selection.names)
-    theta = None if start is None else _read_start(start, problem)
+    start_values = None if start is None else _read_start(start, problem)
     scale = AS_STATED if find_scale is None else find_scale(session)
     if chosen.base:  # without priors
         scale = AS_STATED
@@ -88,20 +88,20 @@ def identify(
         problem = CalibrationProblem(session, selection)
     full_problem = problem if chosen.base else None
     solve = _fit_base if chosen.base else fit_problem
-    fit = solve(problem, options=options, start=theta)
+    fit = solve(problem, options=options, start=start_values)
     profiled = _match_profiled(fit.problem, profile)
     intervals = {name: profile_interval(fit, name) for name in profiled}
     return assemble_calibration(fit, full_problem=full_problem, intervals=intervals), session
 
 
 def _read_start(start: ArrayLike, problem: CalibrationProblem) -> Array:
-    """Free parameters to start from, with exact mounting, shape (n_free,), [SI].
+    """Initial free parameters with exact mountings, shape (n_free,), [SI].
 
     Raises:
         ValueError: If there is not one finite number for each free error of the machine.
     """
     n = problem.n_machine
-    rows, _ = as_rows(start, n, "free parameters to start from")
+    rows, _ = as_rows(start, n, "start values")
     if rows.shape != (1, n) or not np.isfinite(rows).all():
         raise ValueError(f"expected {n} finite numbers to start from")
     return np.append(rows[0], np.zeros(problem.n_free - n))
@@ -110,6 +110,7 @@ def _read_start(start: ArrayLike, problem: CalibrationProblem) -> Array:
 def _solver_options(
     solver: SolverOptions | SolverKind, loss: Loss | LossKind | None
 ) -> SolverOptions:
+    """Solver options with a loss, from names or objects."""
     require_kind(solver, (SolverOptions, str), expected="a solver's name, or SolverOptions(...)")
     require_kind(loss, (Loss, str, type(None)), expected="a loss's name, or Loss(...)")
     options = solver if isinstance(solver, SolverOptions) else SolverOptions(solver=solver)
@@ -121,14 +122,15 @@ def _solver_options(
 def _fit_base(
     problem: CalibrationProblem, *, options: SolverOptions | None, start: ArrayLike | None
 ) -> Fit:
-    """Solve a problem in base parameters, each the sum of inseparable parameters.
+    """Solve a problem in base parameters: linear combinations of inseparable parameters.
 
-    Their number depends on the noise, which depends on the residuals: iterated until both agree.
+    Their number depends on the noise, and the noise on the residuals. The fit is iterated until the
+    base parameters do not change.
     """
     information = linearise_problem(problem).information
     repeatability = estimate_repeatability(problem.values, problem.observations)
     sigma = initial_sigma(problem.session.gauge, repeatability)
-    leads: list[str] = []
+    base_names: list[str] = []
     for _ in range(MAX_BASE_ROUNDS):
         factor = information.factor[:, : problem.n_machine]
         machine = problem.machine_selection.parameters
@@ -138,17 +140,18 @@ def _fit_base(
                 "the readings determine none of the free parameters",
                 parameters=problem.machine_selection.names,
             )
-        chosen = [c.terms[0][0] for c in combinations]
-        if chosen == leads:
+        names = [c.terms[0][0] for c in combinations]
+        if names == base_names:
             break
-        leads = chosen
-        reduced = CalibrationProblem(problem.session, problem.machine_selection.keep(leads))
+        base_names = names
+        reduced = CalibrationProblem(problem.session, problem.machine_selection.keep(base_names))
         fit = fit_problem(reduced, options=options, start=start)
         sigma = max(fit.sigma, sigma)  # no more parameters than before
     return fit
 
 
 def _match_profiled(problem: CalibrationProblem, patterns: Sequence[str]) -> list[str]:
+    """Names of the free parameters that match patterns."""
     if not patterns:
         return []
     names = [n for n in problem.robot.parameters.select(patterns) if n in problem.free]

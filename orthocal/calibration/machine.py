@@ -1,4 +1,4 @@
-"""A machine with errors: where its tool is, and which drive coordinates bring it somewhere."""
+"""Forward and inverse kinematics of a machine with errors."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from orthocal.robot.model import Robot
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Machine:
-    """Kinematics of a robot with given error parameters."""
+    """Kinematics of a robot with error parameters."""
 
     robot: Robot
     errors: Mapping[str, float]
-    """Parameter to value, such as {"x_slide.offset": 1e-3}, [SI]; others are 0."""
+    """Parameter to value, such as {"x_slide.offset": 1e-3}, [SI]; absent ones are 0."""
 
     def forward(
         self,
@@ -28,20 +28,20 @@ class Machine:
         names: Sequence[str] | None = None,
         conditions: UseConditions | None = None,
     ) -> Array:
-        """Tool centre point.
+        """Tool centre point for drive coordinates.
 
         Args:
-            joints: Drive coordinates as the encoders give them, without any offset of the
-                controller, shape (K, n_drives) or (n_drives,), [m, rad].
-            names: Labels of the rows in error messages.
-            conditions: Conditions of use; by default the middle of both sides of each drive, the
+            joints: Drive coordinates of the encoders, without offsets of the controller, shape
+                (K, n_drives) or (n_drives,), [m, rad].
+            names: Names of the rows, for messages.
+            conditions: Conditions of use; by default the mean of both sides of approach, the
                 reference temperature and no payload.
 
         Returns:
-            Shape (K, 3) or (3,), [m].
+            Tool positions, shape (K, 3) or (3,), [m].
 
         Raises:
-            ClosureError: If the machine cannot be at such coordinates.
+            ClosureError: If the machine cannot reach such coordinates.
             ParameterError: If a condition is out of range, or nothing depends on it.
         """
         rows, single = as_rows(joints, len(self.robot.drives), "drive coordinates")
@@ -58,24 +58,25 @@ class Machine:
         names: Sequence[str] | None = None,
         conditions: UseConditions | None = None,
     ) -> Array:
-        """Drive coordinates that bring the tool to given points.
+        """Drive coordinates for tool positions.
 
         Args:
-            points: Coordinates that the drives control, shape (K, n_coordinates) or
+            points: Commanded coordinates of the tool, shape (K, n_coordinates) or
                 (n_coordinates,), [m].
-            names: Labels of the rows in error messages.
-            conditions: As for `forward`.
+            names: Names of the rows, for messages.
+            conditions: Conditions of use, as for `forward`.
 
         Returns:
-            Drive coordinates as the encoders give them, shape (K, n_drives) or (n_drives,).
+            Drive coordinates of the encoders, shape (K, n_drives) or (n_drives,), [m, rad].
 
         Raises:
             ClosureError: If a point cannot be reached.
-            ParameterError: As `forward`.
+            ParameterError: If a condition is out of range, or nothing depends on it.
         """
         return self._closure(conditions).inverse(points, names=names)
 
     def _closure(self, conditions: UseConditions | None) -> LoopClosure:
+        """Loop closures of the machine under conditions of use."""
         use = conditions or UseConditions()
         use.require_valid(self.robot)
         return LoopClosure(self.robot, fixed=self.errors, conditions=use)

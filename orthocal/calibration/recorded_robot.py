@@ -1,6 +1,6 @@
-"""The robot in calibration.json: its files, and checks of what the calibration says of it.
+"""The robot in calibration.json: its files, and checks of the record against it.
 
-The embedded robot is the calibrated one. The directory that it came from may be gone or changed.
+The embedded files are those of the calibrated robot. Its original directory may have changed.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from orthocal.text import printable, shorten, text_problem
 
 
 def record_robot(session: Session) -> RobotRecord:
-    """Record of a session's robot, with its files."""
+    """Record of the robot of a session, with its files."""
     robot = session.robot
     packaged = session.robot_reference in packaged_robots()
     return RobotRecord(
@@ -55,6 +55,7 @@ def record_robot(session: Session) -> RobotRecord:
 
 @lru_cache(maxsize=8)
 def _record_files(robot: Robot) -> tuple[RobotFile, ...]:
+    """Files of a robot as text, or as base64 if they are binary."""
     files = []
     for name, content in collect_files(robot).items():
         text: str | None = content.decode(errors="surrogateescape")
@@ -66,17 +67,17 @@ def _record_files(robot: Robot) -> tuple[RobotFile, ...]:
 
 
 def load_recorded_robot(record: RobotRecord, *, file: str) -> Robot:
-    """The nominal robot of a record, with the tolerances that are stated there.
+    """Nominal robot of a record, with the tolerances of the record.
 
-    The robot is built from the embedded files. If its directory is there and unchanged, the robot
-    of that directory is the same one and is returned. If it has changed, a warning is logged.
+    The robot is built from the embedded files. If its directory exists and is unchanged, the robot
+    is loaded from there, so that it is shared. If the directory has changed, a warning is logged.
 
     Args:
         record: Record of the robot in a calibration.json.
-        file: Name of that file, for messages.
+        file: File name, for messages.
 
     Raises:
-        CalibrationFileError: Naming the key, if a file or a tolerance is invalid.
+        CalibrationFileError: If a file or a tolerance is invalid; names the key.
     """
     content = {
         f.name: _read_content(f, f"{file}: robot.files[{i}]") for i, f in enumerate(record.files)
@@ -105,16 +106,16 @@ def load_recorded_robot(record: RobotRecord, *, file: str) -> Robot:
             "used as it was calibrated.",
             *(printable(text) for text in (file, record.name, str(source))),
         )
-    with _named(f"{file}: robot.effects"):
+    with _errors_at(f"{file}: robot.effects"):
         robot = with_effects(robot, record.effects)
     if record.adjusted:
         robot = with_adjustments(robot)
-    with _named(f"{file}: robot.tolerances"):
+    with _errors_at(f"{file}: robot.tolerances"):
         return robot.with_tolerances(dict(record.tolerances))
 
 
 def _read_content(file: RobotFile, where: str) -> bytes:
-    """Content of an embedded file, held against its checksum."""
+    """Content of an embedded file, compared with its checksum."""
     if (file.text is None) == (file.base64 is None):
         raise CalibrationFileError("expected either text or base64", where=where)
     try:
@@ -136,43 +137,43 @@ def _read_content(file: RobotFile, where: str) -> bytes:
 def _require_robot_files(
     content: Mapping[str, bytes], count: int, where: str
 ) -> tuple[bytes, bytes]:
-    """URDF and YAML of an embedded robot; all else must be meshes of limited size."""
+    """URDF and YAML of an embedded robot; all other files must be meshes of limited size."""
     if len(content) != count:
-        raise CalibrationFileError("has two files of one name", where=where)
-    texts = sorted(
+        raise CalibrationFileError("two files have the same name", where=where)
+    main_files = sorted(
         (name for name in content if "/" not in name and name.endswith((".urdf", ".yaml"))),
         key=lambda name: name[-5:],
     )
-    if [name[-5:] for name in texts] != [".urdf", ".yaml"]:
+    if [name[-5:] for name in main_files] != [".urdf", ".yaml"]:
         raise CalibrationFileError(
-            f"expected one .urdf and one .yaml; found {shorten(', '.join(texts)) or 'none'}",
+            f"expected one .urdf and one .yaml; found {shorten(', '.join(main_files)) or 'none'}",
             where=where,
         )
-    meshes = content.keys() - set(texts)
+    meshes = content.keys() - set(main_files)
     for name in sorted(meshes):
-        folders = {parent.as_posix() for parent in PurePosixPath(name).parents}
-        if not name.lower().endswith(MESH_FORMATS) or folders & content.keys():
+        parents = {parent.as_posix() for parent in PurePosixPath(name).parents}
+        if not name.lower().endswith(MESH_FORMATS) or parents & content.keys():
             raise CalibrationFileError(
                 f"'{shorten(name)}' is neither the URDF nor the YAML nor a mesh "
                 f"({', '.join(MESH_FORMATS)})",
                 where=where,
             )
-    size = sum(len(content[name]) for name in meshes)
-    if size > LARGEST_MESHES:
+    mesh_bytes = sum(len(content[name]) for name in meshes)
+    if mesh_bytes > LARGEST_MESHES:
         raise CalibrationFileError(
-            f"has meshes of {size / 2**20:.1f} MiB; expected at most "
+            f"has meshes of {mesh_bytes / 2**20:.1f} MiB; expected at most "
             f"{LARGEST_MESHES / 2**20:g} MiB",
             where=where,
         )
-    urdf, yaml = texts
+    urdf, yaml = main_files
     return content[urdf], content[yaml]
 
 
 def require_calibrated_robot(calibration: CalibrationRecord, session: Session) -> None:
-    """Refuse a session on another robot than the calibrated one.
+    """Refuse a session of another robot than the calibrated one.
 
     Raises:
-        SessionError: Naming both robots.
+        SessionError: If the robots differ; names both.
     """
     record = calibration.robot_record
     if session.robot.sha256 != record.sha256:
@@ -185,30 +186,30 @@ def require_calibrated_robot(calibration: CalibrationRecord, session: Session) -
 
 
 def require_consistent(record: CalibrationRecord, robot: Robot, *, file: str) -> None:
-    """Refuse a record with anything that its robot does not have, or rows of nothing.
+    """Refuse a record that does not fit its robot, or rows with unknown setups or postures.
 
     Args:
         record: The record.
         robot: Its robot.
-        file: Name of the file, for messages.
+        file: File name, for messages.
 
     Raises:
-        CalibrationFileError: Naming the key.
+        CalibrationFileError: If the record is inconsistent; names the key.
     """
     for i, p in enumerate(record.parameters):
-        with _named(f"{file}: parameters[{i}].name"):
+        with _errors_at(f"{file}: parameters[{i}].name"):
             unit = robot.parameters[p.name].unit
         if p.unit != unit:
             raise CalibrationFileError(
                 f"found '{p.unit}'; {p.name} is in {unit}", where=f"{file}: parameters[{i}].unit"
             )
     for i, name in enumerate(record.unmodelled.names):
-        with _named(f"{file}: unmodelled.names[{i}]"):
+        with _errors_at(f"{file}: unmodelled.names[{i}]"):
             robot.parameters[name]
     for key, problem in (*_wrong_counts(record, robot), *_unknown_names(record)):
         raise CalibrationFileError(problem, where=f"{file}: {key}")
     for i, setup in enumerate(record.setups):
-        with _named(f"{file}: setups[{i}].reads"):
+        with _errors_at(f"{file}: setups[{i}].reads"):
             setup.sensor.require_fit(robot, where=f"{file}: setups[{i}].reads")
     for key, adjusted in (
         ("session", record.session.adjusted),
@@ -220,13 +221,15 @@ def require_consistent(record: CalibrationRecord, robot: Robot, *, file: str) ->
     for i, row in enumerate(record.residuals):
         if row.conditions is not None:
             where = f"{file}: residuals[{i}].conditions"
-            with _named(where):
-                check_conditions(row.conditions, robot, row.minus is not None, where)
+            with _errors_at(where):
+                check_conditions(
+                    row.conditions, robot, difference=row.minus is not None, where=where
+                )
 
 
 @contextmanager
-def _named(where: str) -> Iterator[None]:
-    """Turn errors about the robot into errors of the file, by default at a key."""
+def _errors_at(where: str) -> Iterator[None]:
+    """Convert errors about the robot to errors of the file, at a key unless they state a place."""
     try:
         yield
     except (ParameterError, RobotError, SessionError) as e:
@@ -234,18 +237,18 @@ def _named(where: str) -> Iterator[None]:
 
 
 def _wrong_counts(record: CalibrationRecord, robot: Robot) -> Iterator[tuple[str, str]]:
-    """Keys of coordinates and offsets that are not as many as the robot has, with the problem."""
-    passive = robot.passive_index.size
+    """Keys with a wrong number of coordinates, offsets or compensations, with the problem."""
+    n_passive = robot.passive_index.size
     for i, p in enumerate(record.postures):
         for key, values in (("values", p.values), ("drives", p.drives)):
             if len(values) != len(robot.drives):
-                expected = f"expected {len(robot.drives)}, one a drive"
+                expected = f"expected {len(robot.drives)}, one per drive"
                 yield f"postures[{i}].{key}", f"has {len(values)} numbers; {expected}"
-        if len(p.passive) != passive:
-            expected = f"expected {passive}, one a passive joint"
+        if len(p.passive) != n_passive:
+            expected = f"expected {n_passive}, one per passive joint"
             yield f"postures[{i}].passive", f"has {len(p.passive)} numbers; {expected}"
     offsets, names = record.session.controller_offsets, [d.name for d in robot.drives]
-    expected = f"expected {len(names)}, one a drive: {', '.join(names)}"
+    expected = f"expected {len(names)}, one per drive: {', '.join(names)}"
     if offsets is not None and len(offsets) != len(names):
         yield "session.controller_offsets", f"has {len(offsets)} numbers; {expected}"
     compensations = [("session", record.session.compensation)]
@@ -260,23 +263,23 @@ def _wrong_counts(record: CalibrationRecord, robot: Robot) -> Iterator[tuple[str
             ):
                 yield (
                     f"{key}.compensation[{i}].table",
-                    "expected rising positions, each with two trims",
+                    "expected increasing positions, each with two trims",
                 )
 
 
 def _unknown_names(record: CalibrationRecord) -> Iterator[tuple[str, str]]:
-    """Keys with names of setups and postures that the file does not have, with the problem."""
+    """Keys with names of unknown setups and postures, with the problem."""
     postures, setups = {p.name for p in record.postures}, {s.name for s in record.setups}
-    names = [
+    references = [
         (f"setups[{i}].aligned_at", s.aligned_at, "postures", postures)
         for i, s in enumerate(record.setups)
     ]
     for i, row in enumerate(record.residuals):
-        names += [
+        references += [
             (f"residuals[{i}].setup", row.setup, "setups", setups),
             (f"residuals[{i}].posture", row.posture, "postures", postures),
             (f"residuals[{i}].minus", row.minus or row.posture, "postures", postures),
         ]
-    for key, name, kind, existing in names:
-        if name not in existing:
+    for key, name, kind, known_names in references:
+        if name not in known_names:
             yield key, f"'{name}' is not among the file's {kind}"

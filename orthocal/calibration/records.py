@@ -44,6 +44,7 @@ class Versions:
 
 
 def _require_inner_path(name: str) -> str:
+    """Refuse a path that leads out of the robot's directory."""
     if not is_inner_path(name):
         raise ValueError(f"found '{shorten(name)}'; expected a path inside the robot's directory")
     return name
@@ -54,7 +55,7 @@ InnerPath = Annotated[str, AfterValidator(_require_inner_path)]
 
 @dataclass(frozen=True, slots=True)
 class RobotFile:
-    """A file of the robot that was calibrated."""
+    """File of the calibrated robot."""
 
     __pydantic_config__ = CLOSED
 
@@ -64,12 +65,12 @@ class RobotFile:
     text: str | None = None
     """Content of a text file."""
     base64: str | None = None
-    """Content of another file."""
+    """Content of a binary file."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotRecord:
-    """The robot that was calibrated, with its files."""
+    """The calibrated robot with its files."""
 
     __pydantic_config__ = CLOSED
 
@@ -79,25 +80,25 @@ class RobotRecord:
     directory: str | None
     """Directory of the files at the time of the calibration; None for a packaged robot."""
     sha256: str
-    """Of the URDF and the YAML."""
+    """Checksum of the URDF and the YAML."""
     files: Annotated[Many[RobotFile], Field(max_length=MOST_FILES)]
-    """URDF, YAML, and the meshes of drawings."""
+    """URDF, YAML and meshes."""
     legs: Many[tuple[str, PositiveInSI]]
     """Legs and their nominal lengths, [m]."""
     travel: Many[tuple[str, Unit, Number | None, Number | None]]
-    """Drives, their units, and the ends of their travel, [unit]; None where there is none."""
+    """Drives, their units, and the limits of their travel, [unit]; None without a limit."""
     tolerances: Many[tuple[str, PositiveNumber]] = ()
-    """Names or globs with their units, and the tolerances in these units that the session states
-    instead of the robot's."""
+    """Tolerances that the session states in place of those of the robot: names or globs with a unit
+    suffix, and the values in these units."""
     effects: Many[str] | None = None
-    """Effects beside geometry that were chosen; None for those that the robot's YAML names."""
+    """Chosen effects beside geometry; None for those of the robot's YAML."""
     adjusted: bool = False
     """True if sessions with different mechanical adjustments were calibrated together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SessionRecord:
-    """The session that it was calibrated from."""
+    """The calibrated session."""
 
     __pydantic_config__ = CLOSED
 
@@ -107,23 +108,23 @@ class SessionRecord:
     source: str
     sha256: str
     gauge_sigma: PositiveInSI | None
-    """[m]."""
+    """Stated standard deviation of a reading, [m]."""
     gauge_resolution: PositiveInSI | None
-    """[m]."""
+    """Resolution of the gauge, [m]."""
     controller_offsets: Many[Number] | None
-    """Offsets active in the controller, [m, rad]; None where not stated."""
+    """Active offsets, [m, rad]; None if not stated."""
     purpose: Purpose | None
     """Model and free errors that the session states."""
     seed: Count | None
     """Seed of simulated readings; None for measured readings."""
     compensation: Many[JointTrim] = ()
-    """What the controller compensated in the joint of each drive; empty for nothing."""
+    """Compensation of the controller for each drive; empty without any."""
     firmware: DeltaSettings | None = None
     """Settings of the firmware of a delta printer."""
     adjusted: Many[tuple[str, Number]] = ()
-    """Mechanical adjustments since the machine was built and their amounts, [m]."""
+    """Mechanical adjustments since the machine was built, with their amounts, [m]."""
     parts: Many[SessionRecord] = ()
-    """The sessions that were joined into this one."""
+    """Sessions that were joined into this one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,29 +136,29 @@ class SolverRecord:
     name: SolverKind
     status: str
     iterations: Count
-    """In all solutions until sigma had settled."""
+    """Iterations of all solutions until σ converged."""
     seconds_build: Number
-    """Building all functions and the program, once, [s]."""
+    """Time for building the functions and the program, [s]."""
     seconds_solve: Number
-    """All solutions until sigma had settled, [s]."""
+    """Time for all solutions until σ converged, [s]."""
     hessian: str
     loss: LossKind
-    """Loss: squares, or the pseudo-Huber loss."""
+    """Loss function: squares or pseudo-Huber."""
     loss_width: PositiveInSI
-    """Residual at which the loss turns from square to linear, [standard deviations]."""
+    """Residual at which the loss changes from square to linear, [standard deviations]."""
 
     @property
-    def tells_linearisation(self) -> bool:
-        """True if its estimate less the linearised one is the error of linearisation.
+    def shows_linearisation_error(self) -> bool:
+        """True if the difference from the linearised estimate is the linearisation error.
 
-        Not with a robust loss: the linearised estimate is by squares.
+        With a robust loss it is not, because the linearised estimate uses squares.
         """
         return self.name != "linearised" and self.loss == "squares"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ParameterEstimate(InUnit):
-    """One error parameter."""
+    """Estimate of one error parameter."""
 
     __pydantic_config__ = CLOSED
 
@@ -168,30 +169,29 @@ class ParameterEstimate(InUnit):
     linear: Number
     """Linearised estimate, [unit]."""
     std: SizeOrNaN
-    """Standard deviation from noise, priors (also of the mounting), and unmodelled errors with
-    their stated priors, [unit]. NaN if unknown."""
+    """Standard deviation from noise, priors and unmodelled errors, [unit]; NaN if unknown."""
     std_scatter: SizeOrNaN
-    """Part of `std` that is due to the noise of the readings, [unit]."""
+    """Part of `std` from the noise of the readings, [unit]."""
     prior_std: PositiveInSI
-    """One standard deviation before the calibration, [unit]."""
+    """Prior standard deviation, [unit]."""
     free: bool
     identifiable: bool
     """True if the readings alone determine it better than its prior."""
     start: Number
-    """What the controller already corrects: the point of linearisation, [unit]."""
+    """Active value in the controller, the point of linearisation, [unit]."""
     prior: bool
-    """Whether its prior was used."""
+    """True if its prior was used."""
     mean: Number
-    """Mean of that prior, [unit]."""
+    """Prior mean, [unit]."""
     lower: Number | None
     """Lower bound, [unit]."""
     upper: Number | None
     """Upper bound, [unit]."""
     at_bound: Literal["lower", "upper"] | None
-    """Bound that holds it. It then counts as fixed, with the standard deviation 0."""
+    """Active bound, at which the parameter is fixed with the standard deviation 0; None without."""
     interval: tuple[Number, Number] | None
-    """Profile-likelihood interval of 95 %, [unit], where it was asked for; widened by errors of the
-    machine that were not free, at their tolerances."""
+    """95 % profile-likelihood interval, [unit], widened by unmodelled errors; None if not
+    requested."""
 
     @property
     def data_share(self) -> float:
@@ -220,17 +220,17 @@ class GaugeRecord:
     __pydantic_config__ = CLOSED
 
     name: str
-    """"" for an only one."""
+    """Name; "" if it is the only gauge."""
     sigma: PositiveInSI | None
-    """Standard deviation of a reading as stated, [m]."""
+    """Stated standard deviation of a reading, [m]."""
     resolution: PositiveInSI | None
-    """[m]."""
+    """Resolution, [m]."""
     range: tuple[Number, Number] | None
     """Lowest and highest reading, [m]."""
     noise: SizeOrNaN
     """Estimated standard deviation of a reading, [m]; NaN if it is unknown."""
     readings: Count
-    """Of it, differences taken apart."""
+    """Number of readings; a difference counts as two."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -241,31 +241,31 @@ class SetupRecord:
 
     name: str
     sensor: Annotated[Sensor, RECORDED, Field(alias="reads")]
-    """What stood there."""
+    """Sensor of the setup."""
     gauge: str
-    """Name of what showed its readings."""
+    """Name of its gauge."""
     active: Many[Number] | None
-    """Offsets active in the controller, [m, rad], where they were not those of the session."""
+    """Active offsets, [m, rad]; None for those of the session."""
     zero: Number | None
-    """Zero of the gauge, [m]; None where only differences were given."""
+    """Estimated gauge zero, [m]; None if only differences were read."""
     aligned_at: str
     """Posture in which the operator aligned the gauge."""
     zero_kind: GaugeZero = "free"
-    """Whether the zero was estimated or known to be 0."""
+    """Kind of the zero: estimated, or known to be 0."""
     payload: Annotated[Number, Field(ge=0.0, le=HEAVIEST_KG)] = 0.0
     """Mass on the tool, [kg]."""
     compensation: Many[JointTrim] | None = None
-    """What the controller compensated, where it was not that of the session."""
+    """Compensation of the controller; None for that of the session."""
     adjusted: Many[tuple[str, Number]] | None = None
-    """Mechanical adjustments and their amounts, [m], where they were not those of the session."""
+    """Mechanical adjustments with their amounts, [m]; None for those of the session."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationRecord:
-    """Identified error parameters of a robot, with their uncertainty and provenance: plain data.
+    """Identified error parameters of a robot, with their uncertainty and provenance, as plain data.
 
-    What a calibration was made from is among it, so that it can be made again: readings, postures,
-    sensors, gauges, and what was free, held, bounded and known beforehand.
+    The record contains everything that is needed to repeat the calibration: readings, postures,
+    sensors, gauges, free and known parameters, bounds and priors.
     """
 
     __pydantic_config__ = CLOSED
@@ -275,25 +275,25 @@ class CalibrationRecord:
     session: SessionRecord
     model: str
     prior: bool
-    """Whether priors were used."""
+    """True if priors were used."""
     solver: SolverRecord
     parameters: Annotated[Many[ParameterEstimate], Field(min_length=1)]
-    """Free parameters, then those held at a known value."""
+    """Free parameters, then known parameters."""
     sensors: Many[ParameterEstimate]
     """Nuisance parameters of the sensors."""
     model_covariance: Matrix
-    """Covariance of the free errors of the machine by noise and priors, without unmodelled errors,
-    shape (n_machine, n_machine), [SI]."""
+    """Covariance of the free errors of the machine from noise and priors, without unmodelled
+    errors, shape (n_machine, n_machine), [SI]."""
     noise_covariance: Matrix
-    """Part of it that is due to the noise of the readings, shape (n_machine, n_machine), [SI]."""
+    """Part of it from the noise of the readings, shape (n_machine, n_machine), [SI]."""
     unmodelled: UnmodelledEffect
     """Unmodelled errors and the bias that they cause."""
     identifiability: Identifiability
     """Resolvable directions and groups of inseparable parameters."""
     base: bool
-    """Whether free parameters are base parameters: each the value of a whole combination."""
+    """True if free parameters are base parameters: values of linear combinations."""
     noise: Noise
-    """Of one reading of the (first) gauge."""
+    """Noise of one reading of the first gauge."""
     rows_are_differences: bool
     critical: SizeOrInf
     """Limit of studentised residuals for outliers; infinite if the noise is unknown."""
@@ -302,7 +302,7 @@ class CalibrationRecord:
     setups: Many[SetupRecord]
     gauges: Many[GaugeRecord]
     tolerance_scale: ToleranceScale = AS_STATED
-    """Factor on the tolerances of all errors of the geometry except offsets, which prior standard
-    deviations, covariances and everything that follows from them contain."""
+    """Scale of the tolerances of all errors of the geometry except offsets. Prior standard
+    deviations and covariances contain it."""
     assessment: Assessment | None = None
-    """Verdict, findings, what to enter and the tool error; None if it was not assessed."""
+    """Assessment; None if there is none."""

@@ -1,4 +1,4 @@
-"""Refit of a calibration with another session, or with the readings of its file."""
+"""Refit of a calibration with another session, or with its recorded readings."""
 
 from __future__ import annotations
 
@@ -26,16 +26,18 @@ from orthocal.statistics.information import Information, decompose
 
 
 def repeat_calibration(calibration: Calibration, sessions: Given | Sequence[Given]) -> Calibration:
-    """Refit of the same parameters, priors and bounds with another session.
+    """Fit the same parameters with the same priors and bounds to another session.
 
-    Its rows' nominal values are those of the machine as it was calibrated before.
+    Nominal readings of the result are those of the calibrated machine.
 
     Args:
-        calibration: Whose parameters they are.
+        calibration: Calibration that states parameters, priors and bounds.
         sessions: The other session, or several, or paths to them.
 
     Raises:
-        NotIdentifiableError, SolverError, ClosureError: As `calibrate`.
+        NotIdentifiableError: If neither readings nor a prior determine a parameter.
+        SolverError: If the solver does not converge.
+        ClosureError: If the machine cannot reach a posture.
     """
     session = join_sessions(gather_sessions(sessions))
     nominal = np.array([p.value for p in calibration.free])
@@ -45,12 +47,12 @@ def repeat_calibration(calibration: Calibration, sessions: Given | Sequence[Give
 def repeat_fit(
     calibration: Calibration, session: Session, *, tolerance_scale: ToleranceScale | None = None
 ) -> Fit:
-    """The fit of `repeat_calibration`.
+    """Fit of `repeat_calibration`.
 
     Args:
-        calibration: Whose parameters they are.
+        calibration: Calibration that states parameters, priors and bounds.
         session: The other session.
-        tolerance_scale: Scale of the tolerances; that of the calibration by default.
+        tolerance_scale: Tolerance scale; by default that of the calibration.
     """
     solver = calibration.solver
     options = SolverOptions(solver=solver.name, loss=Loss(solver.loss, solver.loss_width))
@@ -59,9 +61,9 @@ def repeat_fit(
 
 
 def restore_mounting_covariance(calibration: Calibration) -> Array:
-    """`find_mounting_covariance` of a calibration, from its record.
+    """Covariance of the estimate from the mountings, computed from the record.
 
-    Shape (n_free, n_free), [SI]; zeros if the noise is unknown.
+    See `find_mounting_covariance`. Shape (n_machine, n_machine), [SI]; 0 if the noise is unknown.
     """
     problem = _recorded_problem(calibration)
     if not math.isfinite(calibration.noise.sigma):
@@ -70,7 +72,7 @@ def restore_mounting_covariance(calibration: Calibration) -> Array:
         problem,
         _recorded_information(calibration, problem),
         sigma=max(calibration.noise.sigma, SMALLEST_SIGMA),
-        at_bound=_held(calibration),
+        at_bound=_at_bound(calibration),
     )
 
 
@@ -78,24 +80,23 @@ def restore_covariances(calibration: Calibration) -> tuple[Array, Array]:
     """Covariance of the free errors of the machine and the nuisance parameters, from the record.
 
     Returns:
-        The covariance, and its part that is due to noise, shape (n, n), [SI]; NaN if the noise is
-        unknown.
+        The covariance and its part from noise, shape (n, n), [SI]; NaN if the noise is unknown.
     """
     problem = _recorded_problem(calibration)
     scale = np.outer(problem.theta_scale, problem.theta_scale)
     if not math.isfinite(calibration.noise.sigma):
         return np.full_like(scale, np.nan), np.full_like(scale, np.nan)
     information = _recorded_information(calibration, problem)
-    both = (
+    covariances = (
         compute(
             sigma=max(calibration.noise.sigma, SMALLEST_SIGMA),
             precision=problem.prior_precision,
-            at_bound=_held(calibration),
+            at_bound=_at_bound(calibration),
         )
         for compute in (information.covariance, information.noise_covariance)
     )
-    covariance, of_noise = (np.asarray(scale * c) for c in both)
-    return covariance, of_noise
+    covariance, noise_covariance = (np.asarray(scale * c) for c in covariances)
+    return covariance, noise_covariance
 
 
 def _recorded_problem(calibration: Calibration) -> CalibrationProblem:
@@ -104,32 +105,35 @@ def _recorded_problem(calibration: Calibration) -> CalibrationProblem:
     problem = _repeat_problem(calibration, session, calibration.tolerance_scale)
     if not math.isfinite(calibration.noise.sigma):
         return problem
-    noise = {g.name: g.noise / calibration.noise.sigma for g in calibration.gauges}
-    of_setup = np.array([noise[s.gauge] for s in problem.session.setups.values()])
-    return problem.with_noise_ratio(of_setup[problem.observations.setup])
+    ratio_of_gauge = {g.name: g.noise / calibration.noise.sigma for g in calibration.gauges}
+    ratios = np.array([ratio_of_gauge[s.gauge] for s in problem.session.setups.values()])
+    return problem.with_noise_ratio(ratios[problem.observations.setup])
 
 
 def _recorded_information(calibration: Calibration, problem: CalibrationProblem) -> Information:
-    """Information of the readings at the estimate."""
+    """Information of the readings about the parameters, at the estimate."""
     theta = np.array([p.value for p in (*calibration.free, *calibration.sensors)])
     _, jacobian = problem.predict_and_jacobian(theta)
     return decompose(jacobian, problem.observations)
 
 
-def _held(calibration: Calibration) -> Mask:
-    """Mask of the parameters that a bound holds, shape (n,)."""
-    held = [p.at_bound for p in (*calibration.free, *calibration.sensors)]
-    return np.array(held, dtype=bool)
+def _at_bound(calibration: Calibration) -> Mask:
+    """Mask of the parameters at a bound, shape (n,)."""
+    bounds = [p.at_bound for p in (*calibration.free, *calibration.sensors)]
+    return np.array(bounds, dtype=bool)
 
 
 def _repeat_problem(
     calibration: Calibration, session: Session, scale: ToleranceScale
 ) -> CalibrationProblem:
+    """Problem with the parameters, priors and bounds of a calibration for another session."""
     free = calibration.free
     parameters = session.robot.parameters
     names = tuple(p.name for p in free)
-    old, new = (s.factors(parameters, names) for s in (calibration.tolerance_scale, scale))
-    stds = np.array([p.prior_std for p in free]) / old * new
+    old_factors, new_factors = (
+        s.factors(parameters, names) for s in (calibration.tolerance_scale, scale)
+    )
+    stds = np.array([p.prior_std for p in free]) / old_factors * new_factors
     selection = Selection(
         label=calibration.model,
         parameters=tuple(
@@ -147,9 +151,9 @@ def _repeat_problem(
 
 
 def restore_session(calibration: Calibration) -> Session:
-    """The session that a calibration was made from, rebuilt from its record.
+    """Session of a calibration, rebuilt from its record.
 
-    `repeat_calibration(calibration, restore_session(calibration))` gives the same result again.
+    `repeat_calibration(calibration, restore_session(calibration))` reproduces the calibration.
     """
     record, robot = calibration.session, calibration.robot
     offsets = record.controller_offsets

@@ -1,6 +1,6 @@
-"""A calibration as tables: lists of plain records for pandas, polars or csv.DictWriter.
+"""Tables of a calibration: lists of plain records for pandas, polars or csv.DictWriter.
 
-Values are in SI; a parameter's record states its unit. Unknown values are None.
+Values are in SI units, which the records of parameters state. Unknown values are None.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ Record = dict[str, str | float | int | bool | None]
 
 
 def parameter_table(calibration: Calibration) -> list[Record]:
-    """A record for each parameter: free ones, held ones, then those of sensors.
+    """Records of all parameters: free ones, known ones, then those of sensors.
 
     `value`, `linearised`, `std` (from noise, priors and unmodelled errors), `std_scatter` (its part
-    from noise), `low` and `high` (value ± expanded uncertainty) and `prior_std` are in `unit`.
+    from noise), `low` and `high` (value ± expanded uncertainty), and `prior_std` are in `unit`.
     """
     intervals = dict(
         zip((p.name for p in calibration.free), calibration.intervals, strict=True),
     )
     records: list[Record] = []
-    for of, group in (("machine", calibration.parameters), ("sensor", calibration.sensors)):
+    for owner, group in (("machine", calibration.parameters), ("sensor", calibration.sensors)):
         for p in group:
             low, high = intervals.get(p.name, (math.nan, math.nan))
             records.append(
                 {
                     "name": p.name,
-                    "of": of,
+                    "of": owner,
                     "unit": p.unit,
                     "value": p.value,
                     "linearised": p.linear,
@@ -48,7 +48,7 @@ def parameter_table(calibration: Calibration) -> list[Record]:
 
 
 def reading_table(calibration: Calibration) -> list[Record]:
-    """A record for each row of the readings, in metres but for `studentised` and conditions."""
+    """Records of all rows of readings, in metres except `studentised` and the conditions."""
     return [
         {
             "setup": r.setup,

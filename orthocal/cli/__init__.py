@@ -1,4 +1,4 @@
-"""The command line: the only place that prints and that turns errors into exit codes.
+"""Command line: the only package that prints, and that turns errors into exit codes.
 
 Commands import slow modules when they are called, so that help appears at once.
 """

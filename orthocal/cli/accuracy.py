@@ -82,8 +82,8 @@ def accuracy(
         assessment = orthocal.assess_tool(result, workspace, names=names, conditions=stated)
 
     def show() -> None:
-        special = workspace is not None or stated is not None
-        further = expect_further_hour(result, assessment if special else None)
+        is_default = workspace is None and stated is None
+        further = expect_further_hour(result, None if is_default else assessment)
         print_accuracy(result, assessment, further)
 
     deliver(lambda: accuracy_json(result, assessment), show, json=json)
@@ -116,10 +116,10 @@ def _print_points(
 
 
 def _require_few(targets: Array, path: Path) -> None:
-    """Refuse points that are too many to be evaluated together.
+    """Refuse too many points for an evaluation in one block.
 
     Raises:
-        SessionError: Naming their file.
+        SessionError: If there are too many points; names their file.
     """
     from orthocal.assessment.tool_error import MOST_POINTS
 
@@ -133,10 +133,14 @@ def _require_few(targets: Array, path: Path) -> None:
 
 @contextmanager
 def _cube_reached(result: orthocal.Calibration, half_side_mm: float | None) -> Iterator[None]:
-    """Explain a posture that the machine does not reach, by the cube if one is stated.
+    """Replace the error about a posture out of reach by one about the stated cube.
+
+    Args:
+        result: The calibration.
+        half_side_mm: Half the side of the cube; None if the option is absent.
 
     Raises:
-        SessionError: In place of `ClosureError`.
+        SessionError: If the block raises ClosureError.
     """
     from orthocal.kinematics.workspace import describe_box
 
@@ -145,9 +149,9 @@ def _cube_reached(result: orthocal.Calibration, half_side_mm: float | None) -> I
     except ClosureError as e:
         if half_side_mm is None:
             raise SessionError(e.reason, where=e.posture) from None
-        reached = describe_box(orthocal.assess_tool(result).workspace.limits)
+        workspace = describe_box(orthocal.assess_tool(result).workspace.limits)
         raise SessionError(
-            f"the machine does not reach a cube of ±{half_side_mm:g} mm; without this it is "
-            f"{reached} ({e.reason})",
+            f"the machine does not reach a cube of ±{half_side_mm:g} mm; the default is "
+            f"{workspace} ({e.reason})",
             where="--half-side-mm",
         ) from None

@@ -56,7 +56,7 @@ def again(
     """
     from orthocal.assessment.controller_entries import compensation_to_enter
     from orthocal.export.formats import require_entering
-    from orthocal.measurement.files.linuxcnc_ini import read_ini
+    from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
     require_new_session(out, FILES, force=force)
     result = orthocal.load_calibration(calibration)
@@ -68,7 +68,7 @@ def again(
     if ini is None:
         new = replace(new, compensation=compensation_to_enter(result) or new.compensation)
     else:
-        new = replace(new, compensation=read_ini(ini, result.robot).compensation)
+        new = replace(new, compensation=read_controller_joints(ini, result.robot).compensation)
     comment = (
         "A plan: enter these offsets, then run `orthocal record .` in this directory, or fill in\n"
         "readings.csv. Compare the readings with the calibration by `orthocal validate`."
@@ -79,18 +79,18 @@ def again(
     orthocal.write_session(new, out, comment=comment, extra=sheet, blank=True)
     if amounts:
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
-        put_out(f"The machine is expected with these adjustments: {settings}.")
+        put_out(f"Set these adjustments before you measure: {settings}.")
     put_out(_describe_entries(new, changes=result.session.controller_offsets is None))
     put_out(f"  orthocal record {out}\n  orthocal validate {calibration} {out}")
     put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, and sheet.html")
 
 
 def _describe_entries(new: orthocal.Session, *, changes: bool) -> str:
-    """Corrections of the controller while a new session is read, in words.
+    """Instructions about the corrections of the controller for a new session.
 
     Args:
         new: The session.
-        changes: Whether its offsets count from those of the calibration, which are not known.
+        changes: Whether its offsets are changes of the active offsets, which are not known.
     """
     from orthocal.effects.compensation import describe_trims
 
@@ -109,22 +109,22 @@ def _describe_entries(new: orthocal.Session, *, changes: bool) -> str:
         text += f" The sign is reversed for joints that count down: {', '.join(down)}."
     if backlash := describe_trims(new.robot, new.compensation):
         text += (
-            f"\nThe controller is expected to take up this backlash: {backlash}. If it does not, "
+            f"\nCheck that the controller compensates this backlash: {backlash}. If it does not, "
             "remove it from `controller` in session.yaml."
         )
     return text
 
 
 def _require_offsets(calibration: orthocal.Calibration, path: Path) -> None:
-    """Refuse a printer, whose firmware takes settings.
+    """Refuse a printer, whose firmware has settings instead of offsets.
 
     Raises:
         ParameterError: If the session states a firmware.
     """
     if calibration.session.firmware is not None:
         raise ParameterError(
-            "is of a printer's log; expected a controller of offsets: probe the bed with the new "
-            "settings, and `orthocal import` the new log",
+            "was made from a printer's log, and a printer has no offsets to enter; probe the bed "
+            "with the new settings, and `orthocal import` the new log",
             where=str(path),
         )
 
@@ -132,12 +132,12 @@ def _require_offsets(calibration: orthocal.Calibration, path: Path) -> None:
 def _read_amounts(
     calibration: orthocal.Calibration, text: str | None, *, anyway: bool
 ) -> dict[str, float]:
-    """Adjustments of the option `--adjusted`, name to amount, [m].
+    """Amounts of the adjustments of the option `--adjusted`, [m], by name.
 
     Raises:
         ParameterError: If the text is not NAME=MM, or a name is unknown or stated twice.
-        RobotError: If adjustments are to be planned, and the robot declares none.
-        ExportError: If adjustments are to be planned, and are not worth doing.
+        RobotError: If the text is `plan`, and the robot declares no adjustments.
+        ExportError: If the text is `plan`, and the planned adjustments are not worth doing.
     """
     from orthocal.assessment.words.adjustment import HEADLINES
     from orthocal.effects.adjustment import LARGEST_AMOUNT_MM, require_adjustment
@@ -154,7 +154,7 @@ def _read_amounts(
             raise ParameterError(f"found '{part}'; expected NAME=MM, or plan", where=where)
         require_adjustment(calibration.robot, name, where=where, error=ParameterError)
         if name in amounts:
-            raise ParameterError(f"'{name}' is given twice", where=where)
+            raise ParameterError(f"'{name}' is stated twice", where=where)
         amount = read_number(value, where, name)
         require_between(amount, -LARGEST_AMOUNT_MM, LARGEST_AMOUNT_MM, where)
         amounts[name] = amount * MM
@@ -164,12 +164,12 @@ def _read_amounts(
 def _plan_again(
     calibration: orthocal.Calibration, path: Path | None, amounts: Mapping[str, float]
 ) -> orthocal.Session:
-    """The rows of a session, with the offsets to enter as active offsets.
+    """Plan of the rows of a session, with the offsets to enter as active offsets.
 
     Args:
         calibration: The calibration.
-        path: A session with these rows; None for that of the calibration.
-        amounts: Mechanical adjustments since the calibration, name to amount, [m].
+        path: A session with these rows; None for the last session of the calibration.
+        amounts: Amounts of the mechanical adjustments since the calibration, [m], by name.
     """
     from orthocal.assessment.controller_entries import offsets_to_enter
     from orthocal.calibration.recorded_robot import require_calibrated_robot
@@ -180,7 +180,7 @@ def _plan_again(
         last = None if parts[-1].path is None else Path(parts[-1].path)
         if last is None or not exists(last):
             raise ParameterError(
-                "is missing; the last session of the calibration is not there any more",
+                "is missing; the last session of the calibration does not exist any more",
                 where="--session",
             )
         path = last

@@ -26,7 +26,7 @@ from orthocal.cli.options import (
     split_effects,
     split_globs,
 )
-from orthocal.cli.overwriting import require_own_results
+from orthocal.cli.overwriting import require_replaceable_results
 from orthocal.cli.printing import deliver_judged, judgement_on_failure
 
 FILES = ("calibration.json", "report.html")
@@ -74,7 +74,7 @@ class ChoiceOptions:
             base=self.base,
         )
         choice = resolve_choice(choice, session)
-        choice.select(parameters)  # refuses what does not fit before the readings are judged
+        choice.select(parameters)  # refuses a wrong choice before the readings are judged
         return choice
 
 
@@ -107,13 +107,13 @@ def calibrate(
         profile (PATTERNS): For research: profile-likelihood intervals of these errors (slow).
     """
     if out is not None:
-        require_own_results(out, dict.fromkeys(FILES, ""), force=force)
+        require_replaceable_results(out, dict.fromkeys(FILES, ""), force=force)
     effects = split_effects(choice.effects)
     session = load_joined(sessions, effects=effects, tolerance=choice.tolerance)
     chosen = choice.read(session)
     options = orthocal.SolverOptions(
-        solver=solver,  # type: ignore[arg-type] # checked there
-        loss=orthocal.Loss(loss),  # type: ignore[arg-type] # likewise
+        solver=solver,  # type: ignore[arg-type] # checked by SolverOptions
+        loss=orthocal.Loss(loss),  # type: ignore[arg-type] # checked by Loss
     )
     judgement = orthocal.judge_session(session)
     with judgement_on_failure(session, judgement, json=json):

@@ -30,7 +30,7 @@ from orthocal.cli.options import (
     read_conditions,
     read_vector,
 )
-from orthocal.cli.overwriting import require_own_file
+from orthocal.cli.overwriting import require_replaceable_file
 from orthocal.cli.printing import put_note, put_part
 from orthocal.errors import CalibrationFileError, GcodeError, OutputError, ParameterError
 from orthocal.io.files import (
@@ -58,17 +58,17 @@ if TYPE_CHECKING:
 MARK = "Corrected by orthocal"
 """Beginning of the comment that marks a corrected program."""
 
-BLOCK = 2**16
-"""Characters or bytes that are read or written together."""
+BLOCK_SIZE = 2**16
+"""Number of characters or bytes that are read or written at once."""
 
 LONGEST_COMMENT = 240
 """Largest number of characters of a comment; LinuxCNC reads lines of 252 bytes."""
 
 CONDITIONS: tuple[UseCondition, ...] = ("temperature", "payload")
-"""Conditions of use that a program has; the side of approach is that of its motions."""
+"""Conditions of use of a program; the side of approach follows from its motions."""
 
 PROGRESS_VARIABLE = "AXIS_PROGRESS_BAR"
-"""Environment variable with which LinuxCNC's window requests progress from a filter."""
+"""Environment variable by which the user interface of LinuxCNC requests progress."""
 
 
 class Offsets(StrEnum):
@@ -79,7 +79,7 @@ class Offsets(StrEnum):
 
 
 class Backlash(StrEnum):
-    """Part that takes up the backlash of the drives."""
+    """Place at which the backlash of the drives is compensated."""
 
     PROGRAM = "program"
     CONTROLLER = "controller"
@@ -139,7 +139,7 @@ def correct(
 
     controller = _read_controller(options)
     if out is not None:
-        require_own_file(out, force=force)
+        require_replaceable_file(out, force=force)
     result = orthocal.load_calibration(calibration)
     if not anyway:
         require_entering(result)
@@ -183,7 +183,7 @@ def _read_controller(options: CorrectionOptions) -> _Controller:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Correction:
-    """Correction of one program, and what the notes say about it."""
+    """Correction of one program, and the facts for its notes."""
 
     result: orthocal.Calibration
     controller: _Controller
@@ -193,18 +193,18 @@ class _Correction:
     tolerance: float
     """Largest distance of the written path from the corrected path, [m]."""
     lags: Array
-    """Half of the backlash that the program or the controller takes up, (n_drives,), [m, rad]."""
+    """Half of the backlash to be compensated, shape (n_drives,), [m, rad]."""
     sides: ApproachSides | None
-    """None where the controller takes up the backlash, or there is none."""
+    """Sides of approach; None if the controller compensates the backlash, or there is none."""
     interpreter: Interpreter
     corrector: ProgramCorrector
     region: str
-    """Workspace in words."""
+    """Description of the workspace."""
     for_controller: str
-    """Offsets in the controller in words."""
+    """Description of the offsets in the controller."""
 
     def list_comments(self) -> list[str]:
-        """Controller and machine of the program, for its first lines; empty ones do not apply."""
+        """Comments about controller and machine; empty ones do not apply."""
         from orthocal.output.text.conditions import describe_conditions_of
 
         return [
@@ -215,7 +215,7 @@ class _Correction:
         ]
 
     def _describe_backlash(self) -> str:
-        return _describe_backlash(self.result, self.lags, taken_up=self.sides is not None)
+        return _describe_backlash(self.result, self.lags, by_program=self.sides is not None)
 
     def list_notes(self, warning: str) -> list[str]:
         """Notes about the corrected program; empty ones do not apply."""
@@ -242,7 +242,7 @@ class _Correction:
 def _prepare(
     result: orthocal.Calibration, options: CorrectionOptions, controller: _Controller, file: str
 ) -> _Correction:
-    """Correction of a program by a calibration.
+    """Prepare the correction of a program by a calibration.
 
     Raises:
         OrthocalError: If a condition of use is invalid, or the correction cannot be computed.
@@ -271,8 +271,8 @@ def _prepare(
     )
     region, words = _find_region(result)
     lags = _find_lags(result)
-    taken_up = options.backlash is Backlash.PROGRAM and bool(lags.any())
-    sides = ApproachSides(result.robot, lags) if taken_up else None
+    by_program = options.backlash is Backlash.PROGRAM and bool(lags.any())
+    sides = ApproachSides(result.robot, lags) if by_program else None
     return _Correction(
         result=result,
         controller=controller,
@@ -294,19 +294,20 @@ def _prepare(
 def _put_program(spool: IO[bytes], out: Path | None) -> None:
     """Write a corrected program to its file, or to standard output; closes the spool."""
     if out is not None:
-        write_file(out, iter(lambda: spool.read(BLOCK), b""))
+        write_file(out, iter(lambda: spool.read(BLOCK_SIZE), b""))
         return
     with io.TextIOWrapper(spool, encoding="utf-8", errors="replace", newline="") as text:
-        while part := text.read(BLOCK):
+        while part := text.read(BLOCK_SIZE):
             put_part(part)
     sys.stdout.flush()
 
 
 @contextmanager
 def _frozen() -> Iterator[None]:
-    """Exclude all loaded objects from garbage collection.
+    """Exclude all loaded objects from garbage collection inside the block.
 
-    A program creates and drops thousands of lines, without cycles.
+    The correction creates and frees many objects without cycles; scanning the loaded ones each time
+    would take longer.
     """
     gc.freeze()
     try:
@@ -316,6 +317,7 @@ def _frozen() -> Iterator[None]:
 
 
 def _lines(program: Path, file: str) -> Iterator[str]:
+    """Lines of a program or of the standard input; long lines are split into parts."""
     from orthocal.gcode.lines import LONGEST_LINE
 
     if str(program) != "-":
@@ -329,12 +331,12 @@ def _lines(program: Path, file: str) -> Iterator[str]:
         parts = _report_progress(parts, source)
     for part in parts:
         text = part.decode("utf-8", "surrogateescape")
-        # padded, a part of a line that is too long in bytes is also too long in characters
+        # padding, so that a part with too many bytes also has too many characters
         yield text.ljust(len(part)) if len(part) > LONGEST_LINE else text
 
 
 def _report_progress(parts: Iterable[bytes], source: Path) -> Iterator[bytes]:
-    """Parts of a file; reports progress on stderr in the form of LinuxCNC's filters."""
+    """Pass on the parts of a file; report progress on stderr in the form of LinuxCNC's filters."""
     done = percent = size = 0
     for part in parts:
         size = size or source.stat().st_size
@@ -346,17 +348,17 @@ def _report_progress(parts: Iterable[bytes], source: Path) -> Iterator[bytes]:
 
 
 def _identify(calibration: Path) -> str:
-    """Name of a calibration and the beginning of the SHA-256 of its file."""
+    """Name of a calibration, and the first digits of the SHA-256 of its file."""
     file = calibration / "calibration.json" if is_folder(calibration) else calibration
     digest = hashlib.sha256(read_file(file, error=CalibrationFileError)).hexdigest()
     return f"{comment_safe(file.resolve().parent.name)}, SHA-256 {digest[:12]}"
 
 
 def _refuse_corrected(texts: Iterable[str], file: str) -> Iterator[str]:
-    """Lines of a program that is not corrected yet.
+    """Pass on the lines of a program that is not corrected yet.
 
     Raises:
-        GcodeError: At the comment that marks a corrected program.
+        GcodeError: If a comment marks the program as corrected.
     """
     for number, text in enumerate(texts, start=1):
         if MARK in text:
@@ -369,22 +371,25 @@ def _refuse_corrected(texts: Iterable[str], file: str) -> Iterator[str]:
 
 
 def _with_comments(texts: Iterable[str], comments: Sequence[str]) -> Iterator[str]:
-    """A program with comments as its first lines, or after the % that begins it."""
+    """Program with comments as its first lines, or after a % at its beginning."""
     commented = False
     for text in texts:
         if commented or not text:
             yield text
             continue
         commented = True
-        mark = re.match(r"\s*%[^\n]*(\n|$)", text)
-        at = mark.end() if mark else 0
-        end = "\r\n" if "\r\n" in text else "\n"
-        head = text[:at] if text[:at].endswith("\n") or not at else text[:at] + end
-        lines = "".join(f"; {comment[:LONGEST_COMMENT]}{end}" for comment in comments)
-        yield f"{head}{lines}{text[at:]}"
+        percent = re.match(r"\s*%[^\n]*(\n|$)", text)
+        split = percent.end() if percent else 0
+        line_end = "\r\n" if "\r\n" in text else "\n"
+        head = text[:split]
+        if head and not head.endswith("\n"):
+            head += line_end
+        lines = "".join(f"; {comment[:LONGEST_COMMENT]}{line_end}" for comment in comments)
+        yield f"{head}{lines}{text[split:]}"
 
 
 def _spool(texts: Iterable[str], spool: IO[bytes]) -> None:
+    """Write texts to a temporary file and rewind it."""
     try:
         for text in texts:
             spool.write(text.encode("utf-8", "surrogateescape"))
@@ -394,6 +399,7 @@ def _spool(texts: Iterable[str], spool: IO[bytes]) -> None:
 
 
 def _read_offsets(texts: list[str]) -> dict[str, Vector]:
+    """Work offsets of the option `--work-offset-mm`, [m], by coordinate system."""
     from orthocal.gcode.interpreter import SYSTEMS
 
     option, systems = "--work-offset-mm", list(SYSTEMS.values())
@@ -413,6 +419,7 @@ def _read_offsets(texts: list[str]) -> dict[str, Vector]:
 
 
 def _describe(summary: Summary, field: CorrectionField, within: float) -> str:
+    """Note about the size and the accuracy of the correction."""
     from orthocal.assessment.wording import counted, mm
     from orthocal.gcode.program import ROUNDING
 
@@ -427,7 +434,7 @@ def _describe(summary: Summary, field: CorrectionField, within: float) -> str:
 
 
 def _find_region(result: orthocal.Calibration) -> tuple[Array | None, str]:
-    """Limits of x, y and z over which the correction was determined, shape (3, 2), [m]; words."""
+    """Limits of x, y and z of the workspace, shape (3, 2), [m], and its description."""
     import numpy as np
 
     from orthocal.assessment.assess import assessment_of
@@ -444,6 +451,7 @@ def _find_region(result: orthocal.Calibration) -> tuple[Array | None, str]:
 
 
 def _describe_outside(summary: Summary, file: str, region: str) -> str:
+    """Note about the first line that leaves the workspace; empty if none does."""
     if summary.outside is None:
         return ""
     return (
@@ -453,6 +461,7 @@ def _describe_outside(summary: Summary, file: str, region: str) -> str:
 
 
 def _describe_uncorrected(line: int | None, file: str) -> str:
+    """Note about the first uncorrected rapid motion; empty if there is none."""
     if line is None:
         return ""
     return (
@@ -462,12 +471,14 @@ def _describe_uncorrected(line: int | None, file: str) -> str:
 
 
 def _describe_tip(tip: Vector | None) -> str:
+    """Note about the stated tip; empty if there is none."""
     if tip is None:
         return ""
     return f"For a tip at {', '.join(f'{v / MM:g}' for v in tip)} mm from the tool centre point."
 
 
 def _describe_tools(tools: Sequence[str]) -> str:
+    """Note about a program with several tools; empty for one tool."""
     if len(tools) < 2:
         return ""
     return (
@@ -476,47 +487,56 @@ def _describe_tools(tools: Sequence[str]) -> str:
     )
 
 
-def _describe_backlash(result: orthocal.Calibration, lags: Array, *, taken_up: bool) -> str:
+def _describe_backlash(result: orthocal.Calibration, lags: Array, *, by_program: bool) -> str:
+    """Note about the backlash to be compensated; empty if there is none.
+
+    Args:
+        result: The calibration.
+        lags: Half of the backlash to be compensated, shape (n_drives,), [m, rad].
+        by_program: Whether the program compensates it, not the controller.
+    """
     if not lags.any():
         return ""
     listed = []
     for drive, lag in zip(result.robot.drives, lags.tolist(), strict=True):
-        unit, size = DRIVE_UNITS[drive.unit]
-        listed.append(f"{drive.name} {format_fixed(2.0 * lag / size, 3)} {unit}")
-    if taken_up and result.session.compensation:
+        unit, factor = DRIVE_UNITS[drive.unit]
+        listed.append(f"{drive.name} {format_fixed(2.0 * lag / factor, 3)} {unit}")
+    if by_program and result.session.compensation:
         text = (
             "Where drives reverse, the program takes up the backlash that the controller does not"
         )
         return f"{text} compensate, as the session states: {', '.join(listed)}."
-    if taken_up:
+    if by_program:
         text = f"Where drives reverse, the program takes up their backlash: {', '.join(listed)}."
         return f"{text} The controller must not compensate it."
     return f"The controller must compensate the backlash of the drives: {', '.join(listed)}."
 
 
 def _find_lags(result: orthocal.Calibration) -> Array:
-    """Lags of the drives that the controller does not take up itself, (n_drives,), [m, rad].
+    """Lags of the drives that the controller does not compensate, shape (n_drives,), [m, rad].
 
-    Half of the backlash, less what the session states as compensated; 0 where it is not determined.
+    A lag is half of the backlash, minus the compensation that the session states. It is 0 for a
+    drive whose backlash is not entered as identified.
     """
     from orthocal.assessment.controller_entries import find_backlash
     from orthocal.export.approach_sides import find_lags
 
     lags: Array = find_lags(result.robot, result.errors) - 0.5 * result.compensated_backlash
-    kept = {e.drive for e in find_backlash(result) if e.enter != e.identified}
-    lags[[d.name in kept for d in result.robot.drives]] = 0.0
+    unchanged = {e.drive for e in find_backlash(result) if e.enter != e.identified}
+    lags[[d.name in unchanged for d in result.robot.drives]] = 0.0
     return lags
 
 
 def _describe_controller(
     result: orthocal.Calibration, values: Iterable[float], *, active: bool
 ) -> str:
+    """Note about the offsets in the controller, [m, rad], when the program runs."""
     from orthocal.assessment.assess import assessment_of
 
     listed = []
     for drive, value in zip(result.robot.drives, values, strict=True):
-        unit, size = DRIVE_UNITS[drive.unit]
-        listed.append(f"{drive.name} {format_fixed(float(value) / size, 3, sign=True)} {unit}")
+        unit, factor = DRIVE_UNITS[drive.unit]
+        listed.append(f"{drive.name} {format_fixed(float(value) / factor, 3, sign=True)} {unit}")
     keep = assessment_of(result).keeps_offsets
     state = "active during the measurement" if active else "that stay" if keep else "to enter"
     if result.session.controller_offsets is None:

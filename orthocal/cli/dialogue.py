@@ -24,7 +24,7 @@ LARGEST_OFFSET = 100.0
 """Largest tolerance of the home switches, [mm]."""
 
 IN_METRES = 5e-3
-"""Lengths of legs below that are probably in metres, [m]."""
+"""Length of a leg below which it is probably stated in metres instead of mm, [m]."""
 
 COUNTS, AT_ZERO = "counts", "at_zero_mm"
 """Keys of the joints of the controller."""
@@ -34,38 +34,39 @@ COUNTING = {
     "down, for all or as {letters}",
     AT_ZERO: "What does the controller show {at_zero}, mm? One number for all, or {letters}",
 }
-"""Keys of the joints and the questions at the terminal."""
+"""Questions at the terminal by the key of a property of the joints."""
 
 
 class Stated(NamedTuple):
-    """Value of a dimension on the command line."""
+    """Value of a dimension or of a property of the joints, as text."""
 
     option: str
-    """Option that states it."""
+    """Option that states the value."""
     text: str
 
 
 class Answers(NamedTuple):
-    """Answers so far; the usual values in place of other ones."""
+    """Dimensions and properties of the joints; missing answers have the usual values."""
 
     dimensions: Dimensions
     counting: tuple[Counting, ...]
     asked: bool = False
-    """Whether some were asked for at the terminal."""
+    """Whether some values were asked for at the terminal."""
 
 
 class _Question(NamedTuple):
-    """A dimension or a property of the joints, as it is asked for."""
+    """Question about a dimension or a property of the joints."""
 
     key: str
     words: str
     usual: str | None = None
+    """Usual answer; None if there is none."""
     dimension: Dimension | None = None
     """None for a property of the joints."""
 
     @property
     def option(self) -> str:
-        """Option that states it."""
+        """Option that states the answer."""
         return OPTIONS.get(self.key, f"--dimension {self.key}")
 
 
@@ -74,7 +75,7 @@ OPTIONS = {
     for key in ("leg_mm", "travel_mm", "attachment_mm", "rods_apart_mm", "rod_radius_mm",
                 COUNTS, AT_ZERO)
 }  # fmt: skip
-"""Keys that have options of their own."""
+"""Options by key, for keys that have an option beside --dimension."""
 
 
 def _questions(kind: type[Dimensions]) -> list[_Question]:
@@ -90,11 +91,13 @@ def _questions(kind: type[Dimensions]) -> list[_Question]:
 
 
 def find_answers(kind: type[Dimensions], stated: Mapping[str, Stated]) -> Answers:
-    """Dimensions of a machine and how its joints count; missing ones are asked for at a terminal.
+    """Dimensions of a machine and properties of its joints.
+
+    Missing values are asked for at a terminal.
 
     Args:
         kind: Kind of the machine.
-        stated: Key of machine.yaml, counts or at_zero_mm to what the command line states.
+        stated: Values on the command line by key of machine.yaml, counts or at_zero_mm.
 
     Raises:
         ParameterError: If an option is invalid, contradicts the others, or is missing without a
@@ -133,7 +136,13 @@ def find_answers(kind: type[Dimensions], stated: Mapping[str, Stated]) -> Answer
 
 
 def _ask_question(question: _Question, zero: str, add: Callable[[Stated], Answers]) -> Answers:
-    """Answers with that to a question at the terminal."""
+    """Ask a question at the terminal; answers with the new one.
+
+    Args:
+        question: The question.
+        zero: Coordinate of a slide in the mechanical zero, as text in mm.
+        add: Function that adds an answer to the previous ones.
+    """
     words = question.words.format(zero=zero)
     if question.usual is not None:
         words = f"{words}. Enter alone: {question.usual.format(zero=zero)}"
@@ -141,7 +150,7 @@ def _ask_question(question: _Question, zero: str, add: Callable[[Stated], Answer
 
 
 def _add(answers: Answers, question: _Question, stated: Stated) -> Answers:
-    """Answers with one more; an empty one is the usual one.
+    """Add an answer to the previous ones; an empty one is replaced by the usual one.
 
     Raises:
         ParameterError: If the answer is missing or invalid, or contradicts earlier ones.
@@ -150,12 +159,12 @@ def _add(answers: Answers, question: _Question, stated: Stated) -> Answers:
     if not stated.text:
         if question.usual is None:
             raise ParameterError("found nothing; expected an answer", where=stated.option)
-        if dimension is None:  # joints are as the drives
+        if dimension is None:  # the joints keep the convention of the drives
             return answers
         stated = stated._replace(text=question.usual)
     answers = _read(answers, question, stated)
     problem = answers.dimensions.find_problem()
-    if dimension and problem and problem[0] == dimension.name:  # later ones have no answers yet
+    if dimension and problem and problem[0] == dimension.name:  # later dimensions are not known yet
         value = getattr(answers.dimensions, dimension.name)
         in_metres = dimension.name in ("leg", "rod") and 0.0 < value < IN_METRES
         raise ParameterError(problem[1] + (": mm, not m" if in_metres else ""), where=stated.option)
@@ -163,10 +172,10 @@ def _add(answers: Answers, question: _Question, stated: Stated) -> Answers:
 
 
 def _read(answers: Answers, question: _Question, stated: Stated) -> Answers:
-    """Answers with one more, which may contradict others.
+    """Add an answer to the previous ones; it may contradict them.
 
     Raises:
-        ParameterError: If it is malformed.
+        ParameterError: If the answer is malformed.
     """
     if question.dimension is None:
         return answers._replace(counting=_read_counting(answers, question.key, stated))
@@ -187,7 +196,7 @@ def _example(dimension: Dimension) -> str:
 
 
 def _read_counting(answers: Answers, key: str, stated: Stated) -> tuple[Counting, ...]:
-    """Joints with an answer for all, or one for each.
+    """Properties of the joints, from one answer for all joints or one for each.
 
     Raises:
         ParameterError: If the answer is invalid.
@@ -218,22 +227,22 @@ def _length(text: str, option: str) -> float:
 
 
 def ask_tolerance(usual: float) -> list[str]:
-    """Tolerance of the drives' offsets, as values of --tolerance.
+    """Ask for the tolerance of the drives' offsets; values of --tolerance.
 
     Args:
-        usual: The usual one, [mm].
+        usual: Usual tolerance, [mm].
 
     Raises:
         ParameterError: If the input ends.
     """
 
     def read(text: str) -> list[str]:
-        size = _length(text or f"{usual:g}", "--tolerance") / MM
-        if not 0.0 < size <= LARGEST_OFFSET:
+        tolerance = _length(text or f"{usual:g}", "--tolerance") / MM
+        if not 0.0 < tolerance <= LARGEST_OFFSET:
             raise ParameterError(
-                f"found {size:g} mm; expected more than 0, and at most {LARGEST_OFFSET:g} mm"
+                f"found {tolerance:g} mm; expected more than 0, and at most {LARGEST_OFFSET:g} mm"
             )
-        return [f"*.offset_mm={size:g}"]
+        return [f"*.offset_mm={tolerance:g}"]
 
     return _ask_until_valid(
         "By how much may the zeros of the joints be off, ± limit in mm? Enter alone: "
@@ -244,11 +253,11 @@ def ask_tolerance(usual: float) -> list[str]:
 
 
 def ask_workspace(usual: str, read: Callable[[str], Array]) -> Array | None:
-    """Workspace of a machine; None for the usual one.
+    """Ask for the workspace of a machine; None for the usual one.
 
     Args:
-        usual: The usual one in words.
-        read: Box of a text; raises ParameterError for an invalid one.
+        usual: Description of the usual workspace.
+        read: Function from a text to a box, shape (n, 2), [m]; raises ParameterError.
 
     Raises:
         ParameterError: If the input ends.

@@ -21,7 +21,7 @@ from orthocal.cli.options import (
     read_numbers,
     read_vector,
 )
-from orthocal.cli.overwriting import mark_written, require_own_results
+from orthocal.cli.overwriting import mark_written, require_replaceable_results
 from orthocal.cli.printing import put_note, put_out, write_results
 from orthocal.errors import ParameterError
 from orthocal.io.files import exists
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from orthocal.measurement.files.linuxcnc_ini import ControllerJoints
 
 ALTERNATIVES = ("joints.ini", "kinematics.ini")
-"""Lines with new HOME_OFFSET, and lines of a module that contains the offsets."""
+"""Files that exclude each other: new HOME_OFFSET, and a module that contains the offsets."""
 
 
 @command()
@@ -99,13 +99,13 @@ def _show_settings(calibration: orthocal.Calibration, firmware: str) -> None:
     from orthocal.export.printer import describe_settings, fit_firmware
     from orthocal.printers.firmwares import FIRMWARES
 
-    for known in FIRMWARES:
-        if firmware == known:
-            put_out(describe_settings(fit_firmware(calibration, known)))
+    for name in FIRMWARES:
+        if firmware == name:
+            put_out(describe_settings(fit_firmware(calibration, name)))
 
 
 def _note_latching(calibration: orthocal.Calibration, options: orthocal.ExportOptions) -> None:
-    """Print what was assumed about the directions in which homing latches the switches."""
+    """Note the assumed directions in which homing latches the switches."""
     from orthocal.export.linuxcnc.export import assumes_latching
 
     if assumes_latching(calibration, options):
@@ -116,7 +116,7 @@ def _note_latching(calibration: orthocal.Calibration, options: orthocal.ExportOp
 
 
 def _note_payload(calibration: orthocal.Calibration, payload: float | None) -> None:
-    """Say which payload a module assumes, if it is not stated and matters."""
+    """Note the assumed payload of a module, if it is not stated and has an effect."""
     from orthocal.output.text.conditions import describe_assumed
 
     conditions = orthocal.UseConditions(payload=payload)
@@ -126,41 +126,41 @@ def _note_payload(calibration: orthocal.Calibration, payload: float | None) -> N
 
 
 def _require_free(out: Path, files: Mapping[str, str], *, force: bool) -> None:
-    """Refuse a directory with files of somebody else, or with an alternative to these files.
+    """Refuse a directory with files that orthocal did not write, or with an alternative file.
 
     Raises:
-        OrthocalError: Naming the file.
+        OrthocalError: If there is such a file; names it.
     """
-    for mine, other in (ALTERNATIVES, ALTERNATIVES[::-1]):
-        if mine in files and exists(out / other):
+    for new, other in (ALTERNATIVES, ALTERNATIVES[::-1]):
+        if new in files and exists(out / other):
             raise ParameterError(
-                f"is of another export; with both {mine} and {other} entered the controller "
+                f"belongs to another export; with both {new} and {other} entered the controller "
                 "would correct offsets twice: choose another directory",
                 where=str(out / other),
             )
-    require_own_results(out, files, force=force)
+    require_replaceable_results(out, files, force=force)
 
 
 def _read_joints(
     path: Path, calibration: orthocal.Calibration, stated: Mapping[str, str | None]
 ) -> ControllerJoints:
-    """Joints of an INI file, which compensate what the session of a calibration states.
+    """Joints of an INI file, with the compensation that the calibrated session states.
 
     Args:
         path: The INI file.
         calibration: The calibration.
-        stated: Options that the file replaces, with their values.
+        stated: Values of the options that the file replaces, by option.
 
     Raises:
-        ParameterError: If they compensate something else, or such an option is given.
+        ParameterError: If the compensation differs, or such an option is stated.
     """
     from orthocal.effects.compensation import compensates_alike
-    from orthocal.measurement.files.linuxcnc_ini import read_ini
+    from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
-    joints = read_ini(path, calibration.robot)
+    joints = read_controller_joints(path, calibration.robot)
     for option, value in stated.items():
         if value is not None and (option != "--latched" or joints.latched is not None):
-            raise ParameterError("is stated by --ini, too; give one of them", where=option)
+            raise ParameterError("is stated by --ini, too; state one of them", where=option)
     if not compensates_alike(joints.compensation, calibration.session.compensation):
         raise ParameterError(
             "has other BACKLASH or COMP_FILE than the session states under `controller` "
@@ -171,7 +171,7 @@ def _read_joints(
 
 
 def _home_offsets(text: str | None, calibration: orthocal.Calibration) -> tuple[float, ...] | None:
-    """HOME_OFFSET of each joint, [m, rad]; None where not stated."""
+    """HOME_OFFSET of each joint, [m, rad]; None if the option is absent."""
     if text is None:
         return None
     drives = calibration.robot.drives
@@ -180,10 +180,10 @@ def _home_offsets(text: str | None, calibration: orthocal.Calibration) -> tuple[
 
 
 def _signs(text: str | None) -> tuple[int, ...] | None:
-    """Signs of an option, such as +,+,-; None where not stated.
+    """Signs of an option, such as +,+,-; None if the option is absent.
 
     Raises:
-        ParameterError: If a part is no sign.
+        ParameterError: If a part is not a sign.
     """
     if text is None:
         return None

@@ -1,4 +1,4 @@
-"""Sessions that commands read."""
+"""Loading of sessions for commands."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from orthocal.cli.options import state_tolerances
 from orthocal.errors import SessionError
 
 FEWEST_DIFFERENT = 4
-"""Number of different values from which equal readings show that a session is a copy."""
+"""Fewest different values with which equal readings show that a session is a copy."""
 
 
 def load_each_once(
@@ -24,13 +24,13 @@ def load_each_once(
 
     Args:
         paths: Their paths.
-        effects: Effects beside geometry instead of those that the sessions state.
-        tolerance: Values of `--tolerance`, instead of tolerances that the sessions state.
+        effects: Effects beside geometry that replace those of the sessions.
+        tolerance: Values of `--tolerance` that replace tolerances of the sessions.
         partial: Whether some of the readings may be missing.
 
     Raises:
         SessionError: If two sessions are the same, or have the same readings.
-        ParameterError: If an effect does not exist, or a tolerance does not fit.
+        ParameterError: If an effect does not exist, or a tolerance is invalid.
     """
     sessions: list[orthocal.Session] = []
     for path in paths:
@@ -40,10 +40,10 @@ def load_each_once(
                 "is the same session as one before it; its readings would count twice",
                 where=str(path),
             )
-        copied = next((other for other in sessions if _same_readings(session, other)), None)
-        if copied is not None:
+        original = next((other for other in sessions if _same_readings(session, other)), None)
+        if original is not None:
             raise SessionError(
-                f"has the same readings as {copied.path}: a copy that was not measured again?",
+                f"has the same readings as {original.path}: a copy that was not measured again?",
                 where=str(session.readings_path or path),
             )
         sessions.append(session)
@@ -62,14 +62,14 @@ def load_joined(
     tolerance: Sequence[str] | None = None,
     partial: bool = False,
 ) -> orthocal.Session:
-    """Load sessions as one; arguments and errors as for `load_each_once`."""
+    """Load sessions and join them into one; for arguments and errors see `load_each_once`."""
     return orthocal.join_sessions(
         load_each_once(paths, effects=effects, tolerance=tolerance, partial=partial)
     )
 
 
 def _same_readings(one: orthocal.Session, other: orthocal.Session) -> bool:
-    """True for the same rows with the same values, which two measurements do not give."""
+    """True for equal rows with equal values, which two measurements do not have."""
     rows = [
         [(r.setup, r.posture, r.minus, r.cycle, r.value) for r in s.readings] for s in (one, other)
     ]
@@ -79,17 +79,18 @@ def _same_readings(one: orthocal.Session, other: orthocal.Session) -> bool:
 def state_conditions(
     plan: orthocal.Session, temperatures: tuple[float, float] | None
 ) -> orthocal.Session:
-    """Plan whose readings state what the effects of its machine need.
+    """Plan whose readings state the conditions that the effects of its machine need.
 
     Args:
         plan: The plan.
-        temperatures: At the first and the last reading, [°C]; those of the plan by default.
+        temperatures: Temperatures at the first and the last reading, [°C]; by default those of the
+            plan.
     """
     from orthocal.measurement.motion.approach import state_common_approach
-    from orthocal.observation.conditions import in_course, needed_conditions
+    from orthocal.observation.conditions import needed_conditions, schedule_readings
 
     needed = {"temperature", "time"} & set(needed_conditions(plan.robot))
     stated = any(getattr(r.conditions, name, None) for r in plan.readings for name in needed)
     if temperatures is not None or (needed and not stated):
-        plan = in_course(plan, temperatures=temperatures)
+        plan = schedule_readings(plan, temperatures=temperatures)
     return state_common_approach(plan)

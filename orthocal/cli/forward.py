@@ -1,4 +1,4 @@
-"""The command `forward`, and how tables of any size are transformed."""
+"""The command `forward`, and the transformation of tables of any size."""
 
 from __future__ import annotations
 
@@ -67,13 +67,13 @@ def print_transformed(
     Args:
         calibration: The calibration.
         path: The table; - for standard input.
-        stream: Blocks of a file or a stream.
-        transform: Chunks of the transformed table.
-        columns: Its columns and their factors to SI units.
-        conditions: Conditions of use; a note says which are assumed.
+        stream: Function that reads a file or a stream in blocks.
+        transform: Function from these blocks to chunks of the transformed table.
+        columns: Columns of the transformed table and their factors to SI units.
+        conditions: Conditions of use; a note lists the assumed ones.
 
     Raises:
-        SessionError: Naming file and line.
+        SessionError: If a row is wrong; names file and line.
     """
     from orthocal.measurement.files.coordinate_tables import format_rows
 
@@ -90,7 +90,7 @@ def print_transformed(
 
 
 def put_assumed(calibration: orthocal.Calibration, conditions: orthocal.UseConditions) -> None:
-    """Note which conditions are assumed, and what that costs; nothing if none matters."""
+    """Note the assumed conditions and their effect on the tool error, if there is one."""
     from orthocal.output.text.conditions import describe_assumed
 
     if note := describe_assumed(calibration, conditions):

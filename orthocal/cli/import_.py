@@ -80,7 +80,7 @@ def import_(
 
 
 def _show(result: orthocal.TableImport, *, dry_run: bool, json: bool) -> None:
-    """Write an import unless it is tried, and print it."""
+    """Write an import unless it is a dry run, and print it."""
     from orthocal.output.text.import_report import format_import, format_import_json
 
     written = result.changes and not dry_run
@@ -100,11 +100,11 @@ def _show(result: orthocal.TableImport, *, dry_run: bool, json: bool) -> None:
 
 
 def _is_printer_log(table: Path, session: Path) -> bool:
-    """True if there is no session to import into, and the file is a printer's log for certain."""
+    """True if there is no session to import into, and the file is clearly a printer's log."""
     from orthocal.measurement.importing.printer_log import recognise_log
 
-    place = session / "session.yaml" if session.suffix not in (".yaml", ".yml") else session
-    return not exists(place) and recognise_log(table) is not None
+    file = session / "session.yaml" if session.suffix not in (".yaml", ".yml") else session
+    return not exists(file) and recognise_log(table) is not None
 
 
 def _import_printer(
@@ -117,7 +117,7 @@ def _import_printer(
     dry_run: bool,
     json: bool,
 ) -> None:
-    """Write the session of a printer's log."""
+    """Import a printer's log as a new session, and print it."""
     from orthocal.measurement.importing.printer_log import import_printer_log, write_printer_import
     from orthocal.output.text.import_report import (
         describe_printer_import,
@@ -144,7 +144,7 @@ def _import_printer(
 
 
 def _parse_columns(assignments: list[str]) -> dict[str, str]:
-    """Role and heading of every ROLE=HEADING."""
+    """Headings by role, from texts of the form ROLE=HEADING."""
     columns: dict[str, str] = {}
     for text in assignments:
         role, separator, heading = text.partition("=")

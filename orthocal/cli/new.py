@@ -42,10 +42,10 @@ USUAL_OFFSET = 4.0
 """Tolerance of the zeros of a new machine, whose home switches were never measured, [mm]."""
 
 EFFECTS = "backlash"
-"""Effects of a new machine, where none are chosen."""
+"""Default effects of a new machine."""
 
 FIRST = "first"
-"""Directory of the first session, in that of the machine."""
+"""Name of the directory of the first session, in the directory of the machine."""
 
 BED_WORDS = (
     "All slides together move the tool without turning a leg, so that readings of the legs say "
@@ -53,7 +53,7 @@ BED_WORDS = (
     "assumed to be flat to 0.02 mm (session.yaml). Name other sensors, such as a ball bar, by "
     "--with FILE. For the log of a printer's probe use orthocal import."
 )
-"""What is said about the plan of a machine whose legs do not determine its offsets."""
+"""Note about the plan of a machine whose legs do not determine its offsets."""
 
 COMMENT = (
     "A plan. Print sheet.html and measure: run `orthocal record .` in this directory, or fill\n"
@@ -99,7 +99,7 @@ class DimensionOptions:
     at_zero_mm: str | None = None
 
     def by_key(self) -> dict[str, Stated]:
-        """Key of machine.yaml, counts or at_zero_mm to what states it.
+        """Stated values by key of machine.yaml, counts or at_zero_mm.
 
         Raises:
             ParameterError: If an option is malformed, or states a dimension twice.
@@ -200,7 +200,7 @@ def new(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Design:
-    """A new machine and its first plan, before they are written."""
+    """New machine and its first plan, before they are written."""
 
     machine: Dimensions
     counting: tuple[Counting, ...]
@@ -208,17 +208,17 @@ class _Design:
     tolerance_stated: bool
     """Whether the tolerance of the zeros of the joints was stated."""
     plan: orthocal.MeasuringPlan | FixedPlan | None
-    """None for the paper's readings."""
+    """Plan; None for the paper's readings."""
     session: orthocal.Session
     files: dict[str, str]
-    """Files beside session.yaml and readings.csv."""
+    """Text of the files beside session.yaml and readings.csv, by name."""
 
 
 def _design(name: str, dimensions: DimensionOptions, options: FirstPlanOptions) -> _Design:
-    """Machine of the options and answers, with its first plan.
+    """Design a machine from options and answers, with its first plan.
 
     Raises:
-        OrthocalError: If an option or answer is invalid, or there is no such plan.
+        OrthocalError: If an option or answer is invalid, or there is no suitable plan.
     """
     from orthocal.cli.dialogue import ask_tolerance, find_answers
     from orthocal.planning.equipment import load_dial
@@ -232,8 +232,8 @@ def _design(name: str, dimensions: DimensionOptions, options: FirstPlanOptions) 
         equipment = load_dial(options.gauge, equipment)
     effects = split_effects(options.effects) or []
     kind, tolerance = dimensions.read_kind(), options.tolerance
-    legs = kind.read_legs or bool(equipment.owned)
-    if not legs:
+    reads_legs = kind.read_legs or bool(equipment.owned)
+    if not reads_legs:
         _require_bed(kind, options)
     machine, counting, asked = find_answers(kind, dimensions.by_key())
     with tempfile.TemporaryDirectory(prefix="orthocal-") as trial:
@@ -246,8 +246,8 @@ def _design(name: str, dimensions: DimensionOptions, options: FirstPlanOptions) 
             box = tuple((low, high) for low, high in robot.workspace.tolist())
             machine = replace(machine, workspace=box)
         tolerances = {"*.offset_mm": USUAL_OFFSET} | read_tolerances(tolerance, robot)
-        make = _plan if legs else _plan_bed
-        plan, session = make(robot, equipment, tolerances, options)
+        make_plan = _plan if reads_legs else _plan_bed
+        plan, session = make_plan(robot, equipment, tolerances, options)
         put_note("orthocal: drawing the measuring sheet")
         return _Design(
             machine=machine,
@@ -265,14 +265,14 @@ def _write(folder: Path, name: str, design: _Design) -> None:
     from orthocal.builder.build import describe_machine
 
     stated = design.session.robot.parameters.stated
-    described = describe_machine(
+    machine_files = describe_machine(
         design.machine,
         name=name,
         counting=design.counting,
         tolerances=stated,
         effects=design.effects,
     )
-    write_files(folder, described)
+    write_files(folder, machine_files)
     robot = orthocal.load_robot(folder).with_tolerances(stated)
     session = replace(design.session, robot=robot, robot_reference=str(folder.resolve()))
     orthocal.write_session(session, folder / FIRST, comment=COMMENT, extra=design.files, blank=True)
@@ -284,20 +284,18 @@ def _make_trial(
     """Robot of the machine in a temporary directory.
 
     Raises:
-        ParameterError: If there is no such effect, or one needs keys that have no default.
+        ParameterError: If an effect does not exist, or needs keys without a default.
     """
     try:
         return orthocal.make_robot(machine, folder, counting=counting, effects=effects)
     except RobotError as e:
-        place = (e.where or "").partition("orthocal.effects.")[2]
-        if not place and e.where != "effects":
+        key = (e.where or "").partition("orthocal.effects.")[2]
+        if not key and e.where != "effects":
             raise
-        what = (
-            f"{place}: {e.problem}; add the effect to the robot's YAML later"
-            if place
-            else e.problem
-        )
-        raise ParameterError(what, where="--effects") from None
+        problem = e.problem
+        if key:
+            problem = f"{key}: {problem}; add the effect to the robot's YAML later"
+        raise ParameterError(problem, where="--effects") from None
 
 
 def _require_none(options: Mapping[str, str | None]) -> None:
@@ -308,7 +306,7 @@ def _require_none(options: Mapping[str, str | None]) -> None:
 
 
 def _require_new(folder: Path, *, force: bool) -> str:
-    """Name of a directory; refuse one that is in use or cannot be written."""
+    """Name of a directory; refuse a directory that is in use or not writable."""
     from orthocal.builder.machine_file import MACHINE
     from orthocal.robot.loading import packaged_robots
 
@@ -340,7 +338,8 @@ def _with_workspace(robot: orthocal.Robot, option: str | None) -> orthocal.Robot
         ParameterError: If the machine does not reach the workspace.
     """
     from orthocal.cli.dialogue import ask_workspace
-    from orthocal.kinematics.workspace import describe_box, find_workspace
+    from orthocal.kinematics.reachable_box import find_workspace
+    from orthocal.kinematics.workspace import describe_box
 
     if option is not None:
         return replace(robot, workspace=read_workspace(option, robot))
@@ -355,7 +354,10 @@ def _plan(
     tolerances: Mapping[str, float],
     options: FirstPlanOptions,
 ) -> tuple[orthocal.MeasuringPlan | None, orthocal.Session]:
-    """Plan, and its session with no active offsets; no plan for the paper's readings."""
+    """Plan of readings of the legs, and its session with active offsets of 0.
+
+    The plan is None for the paper's readings.
+    """
     from orthocal.planning.first_plan import first_equipment, paper_plan
     from orthocal.planning.plan import MODEL
     from orthocal.session.session import Purpose
@@ -383,7 +385,7 @@ def _plan_bed(
     tolerances: Mapping[str, float],
     options: FirstPlanOptions,
 ) -> tuple[FixedPlan, orthocal.Session]:
-    """Plan of the bed, of a machine whose legs do not determine its offsets."""
+    """Plan of readings of the bed, for a machine whose legs do not determine its offsets."""
     from orthocal.planning.first_plan import bed_plan, expect_fixed
     from orthocal.planning.plan import MODEL
     from orthocal.session.session import Purpose
@@ -396,13 +398,13 @@ def _plan_bed(
 
 
 def _require_bed(kind: type[Dimensions], options: FirstPlanOptions) -> None:
-    """Refuse options of plans with readings of the legs.
+    """Refuse options that apply to readings of the legs only.
 
     Raises:
-        ParameterError: If there is one.
+        ParameterError: If such an option is stated.
     """
-    for option, found in (("--paper", options.paper), ("--hours", options.hours is not None)):
-        if found:
+    for option, stated in (("--paper", options.paper), ("--hours", options.hours is not None)):
+        if stated:
             raise ParameterError(
                 f"readings of the legs say little about a {kind.kind}, and the readings of its bed "
                 "are fixed; name other sensors by --with",
@@ -413,7 +415,7 @@ def _require_bed(kind: type[Dimensions], options: FirstPlanOptions) -> None:
 def _draw(
     plan: orthocal.MeasuringPlan | FixedPlan | None, session: orthocal.Session
 ) -> dict[str, str]:
-    """Files beside session.yaml and readings.csv."""
+    """Text of the files beside session.yaml and readings.csv, by name."""
     from orthocal.output.sheet.page import sheet_files
     from orthocal.output.text.plan import draw_plan, plan_json
 
@@ -454,38 +456,39 @@ def _report(folder: Path, design: _Design) -> None:
 
 
 def _make_again(folder: Path) -> None:
-    """Make robot and sheets of a machine again from its machine.yaml; name plans that are old.
+    """Make robot and sheets of a machine again from its machine.yaml; report outdated plans.
 
     Raises:
         RobotError: If the machine does not load or does not reach its workspace.
-        typer.Exit: With code 3 if a plan is old.
+        typer.Exit: With code 3 if a plan is outdated.
     """
     from orthocal.builder.build import remake_robot
-    from orthocal.kinematics.workspace import find_unreached
+    from orthocal.kinematics.reachable_box import describe_unreachable_box
     from orthocal.output.sheet.page import SHEET
 
     def check(robot: orthocal.Robot) -> None:
-        problem = "" if robot.workspace is None else find_unreached(robot, robot.workspace)
+        box = robot.workspace
+        problem = "" if box is None else describe_unreachable_box(robot, box)
         if problem:
             raise RobotError(problem, where=f"{folder / 'machine.yaml'}: workspace_mm")
 
     robot = remake_robot(folder, check=check)
     put_out(f"Made {robot.yaml.name} and {robot.urdf.name} again from {folder / 'machine.yaml'}.")
-    old = False
+    is_outdated = False
     for sheet in sorted(folder.glob(f"*/{SHEET}")):
         changes = _remake_sheet(sheet, robot) if exists(sheet.parent / "session.yaml") else []
         if changes:
-            old = True
+            is_outdated = True
             put_note(
                 f"orthocal: {sheet.parent}: the plan is old ({'; '.join(changes)}); plan again:\n"
                 f"  orthocal plan {folder} --out {sheet.parent} --force"
             )
-    if old:
+    if is_outdated:
         raise typer.Exit(3)
 
 
 def _remake_sheet(sheet: Path, robot: orthocal.Robot) -> list[str]:
-    """Make the sheet of a plan without readings again; changes for which the plan is old."""
+    """Make the sheet of a plan without readings again; changes that make the plan outdated."""
     from orthocal.output.sheet.page import sheet_files
 
     try:
@@ -505,15 +508,15 @@ def _remake_sheet(sheet: Path, robot: orthocal.Robot) -> list[str]:
 
 
 def _changes_since(folder: Path, robot: orthocal.Robot) -> list[str]:
-    """Differences of travel and workspace from those for which a plan was made.
+    """Changes of travel and workspace since a plan was made.
 
     Raises:
-        OrthocalError: If plan.json cannot be read.
+        OrthocalError: If plan.json is not readable.
     """
     from orthocal.output.text.plan import PLAN_BASIS, describe_basis
 
     file = folder / "plan.json"
-    if not exists(file):  # the paper's plan depends on neither
+    if not exists(file):  # the paper's plan does not depend on travel and workspace
         return []
     try:
         before = json.loads(read_file(file, error=RobotError))

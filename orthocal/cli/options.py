@@ -1,4 +1,4 @@
-"""The program, the options that several commands share, and readers of their values."""
+"""Program object, options that several commands share, and readers of their values."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LARGEST_MM = 1e4
 """Largest coordinate of a box, displacement and size of errors, [mm]."""
 
 LONGEST_LINE = 100
-"""Number of characters of a line of help; lines that are too long are wrapped, not cut off."""
+"""Number of characters of a line of help; longer lines are wrapped, not cut off."""
 
 
 class PanelGroup(TyperGroup):
@@ -52,7 +52,7 @@ class PanelGroup(TyperGroup):
 
 
 def make_group(description: str, **settings: Any) -> typer.Typer:  # noqa: ANN401 - Typer's settings
-    """A group of commands."""
+    """Make a group of commands."""
     return typer.Typer(
         cls=PanelGroup,
         no_args_is_help=True,
@@ -76,8 +76,9 @@ def command(group: typer.Typer = app, *, name: str | None = None) -> Callable[[C
     """Decorator of commands, whose arguments and options are described in their docstrings.
 
     An entry under Args is `name (METAVAR): help`. A parameter without a default is an argument,
-    every other an option. An `Option` in its annotation states limits and other names.
-    The fields of a parameter that is a dataclass are options, described in its docstring alike.
+    and every other parameter is an option. An `Option` in its annotation states limits and other
+    names. The fields of a parameter that is a dataclass are options, described in the docstring of
+    the dataclass in the same way.
 
     Args:
         group: Group of the command.
@@ -111,16 +112,16 @@ def _list_parameters(source: Callable[..., Any]) -> list[inspect.Parameter]:
     entries = (inspect.getdoc(source) or "").partition("\n\nArgs:\n")[2]
     described = {name: (metavar, words) for name, metavar, words in _ENTRY.findall(entries)}
     hints: dict[str, Any] = get_type_hints(source, include_extras=True)
-    result = []
+    parameters = []
     for parameter in inspect.signature(source).parameters.values():
         hint = hints[parameter.name]
         if is_dataclass(hint):
-            result += _list_parameters(cast("type", hint))
+            parameters += _list_parameters(cast("type", hint))
             continue
         if parameter.name in described:
             hint = _describe(parameter, hint, *described[parameter.name])
-        result.append(parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY))
-    return result
+        parameters.append(parameter.replace(annotation=hint, kind=inspect.Parameter.KEYWORD_ONLY))
+    return parameters
 
 
 def _describe(parameter: inspect.Parameter, hint: Any, metavar: str, words: str) -> Any:  # noqa: ANN401
@@ -282,12 +283,12 @@ Anyway = Annotated[
 
 
 def split_globs(texts: Sequence[str] | None) -> list[str]:
-    """Globs of repeated options, each with several separated by commas."""
+    """Globs of repeated options, each with one or several globs separated by commas."""
     return [glob.strip() for text in texts or [] for glob in text.split(",") if glob.strip()]
 
 
 def split_effects(text: str | None) -> list[str] | None:
-    """Names of the option `--effects`; None where it is absent."""
+    """Names of the option `--effects`; None if the option is absent."""
     if text is None:
         return None
     names = split_globs([text])
@@ -298,7 +299,7 @@ def read_temperatures(text: str | None) -> tuple[float, float] | None:
     """Temperatures of the first and the last reading from the option `--temperature`, [°C].
 
     Raises:
-        ParameterError: If the text is neither a temperature nor two.
+        ParameterError: If the text is neither one temperature nor two.
     """
     from orthocal.robot.description import HIGHEST_C, LOWEST_C
 
@@ -313,10 +314,10 @@ def read_temperatures(text: str | None) -> tuple[float, float] | None:
 
 
 def load_robot_or_session(subject: str) -> tuple[orthocal.Session | None, orthocal.Robot]:
-    """Session of a path, or None for a robot, and the robot.
+    """Session, or None for a robot, and the robot.
 
     Raises:
-        OrthocalError: If it is neither, or does not load.
+        OrthocalError: If the subject is neither a session nor a robot, or does not load.
     """
     from orthocal.output.text.subject import load_subject
 
@@ -340,10 +341,10 @@ def read_tolerances(texts: Sequence[str] | None, robot: orthocal.Robot) -> dict[
 
 
 def state_tolerances(session: orthocal.Session, texts: Sequence[str] | None) -> orthocal.Session:
-    """Session whose robot has the tolerances of `--tolerance`, in place of those that it states.
+    """Session in which tolerances of `--tolerance` replace those of the robot.
 
     Raises:
-        ParameterError: As `read_tolerances`, or if a tolerance is implausible.
+        ParameterError: If a text is malformed or selects no error, or a tolerance is implausible.
     """
     from orthocal.robot.parameters import errors_at
 
@@ -368,10 +369,10 @@ def read_numbers(text: str, option: str, names: Sequence[str] | None = None) -> 
     Args:
         text: Value of the option.
         option: Name of the option, for messages.
-        names: Names of the numbers; default: any number of them.
+        names: Names of the numbers; None to accept any count.
 
     Raises:
-        ParameterError: If the number of values differs, or a value is not finite.
+        ParameterError: If the count of values differs, or a value is not finite.
     """
     parts = text.split(",")
     names = names or ["part"] * len(parts)
@@ -383,10 +384,10 @@ def read_numbers(text: str, option: str, names: Sequence[str] | None = None) -> 
 
 
 def read_vector(text: str, option: str) -> tuple[float, float, float]:
-    """Coordinates X,Y,Z of an option in mm, [m].
+    """Coordinates of an option X,Y,Z in mm, converted to [m].
 
     Raises:
-        ParameterError: If they are not three finite numbers.
+        ParameterError: If the text is not three finite numbers.
     """
     x, y, z = read_numbers(text, option, "XYZ")
     return (x * MM, y * MM, z * MM)
@@ -432,10 +433,11 @@ def read_workspace(text: str, robot: orthocal.Robot, *, where: str = "--workspac
     Raises:
         ParameterError: If the text is not a box, or the machine does not reach it.
     """
-    from orthocal.kinematics.workspace import coordinate_letters, find_unreached
+    from orthocal.kinematics.reachable_box import describe_unreachable_box
+    from orthocal.kinematics.workspace import coordinate_letters
 
     box = read_box(text, coordinate_letters(robot), where=where)
-    problem = find_unreached(robot, box)
+    problem = describe_unreachable_box(robot, box)
     if problem:
         raise ParameterError(problem, where=where)
     return box
@@ -451,7 +453,7 @@ def read_conditions(
     """Conditions of `--approach`, `--temperature` and `--payload`.
 
     Raises:
-        ParameterError: If one is out of range, or no effect of the machine depends on it.
+        ParameterError: If a condition is out of range, or no effect of the machine depends on it.
     """
     conditions = orthocal.UseConditions(approach, temperature, payload)
     conditions.require_valid(robot, prefix="--")
@@ -462,7 +464,7 @@ def require_between(value: float, low: float, high: float, option: str) -> None:
     """Refuse a value of an option outside an open range.
 
     Raises:
-        ParameterError: Naming the option.
+        ParameterError: If the value is out of range.
     """
     if not low < value < high:
         raise ParameterError(

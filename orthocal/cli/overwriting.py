@@ -1,8 +1,7 @@
-"""The rule for existing files: what a command may overwrite.
+"""Rule for existing files that commands may overwrite.
 
-Results that orthocal wrote are replaced. Files of somebody else, and those of a machine or a
-session, which people edit and fill in, are overwritten with --force only, and measured readings
-never.
+Results that orthocal wrote are replaced. With --force only, other files are overwritten, and those
+of a machine or a session, which users edit and fill in. Measured readings are never overwritten.
 """
 
 from __future__ import annotations
@@ -27,19 +26,19 @@ COMMENTS = {
     **dict.fromkeys((".c", ".h"), "/* {} */"),
     **dict.fromkeys((".md", ".urdf"), "<!-- {} -->"),
 }
-"""Suffix of a file to a comment in it."""
+"""Forms of a comment by the suffix of a file."""
 
 TABLES = (".csv", ".comp")
-"""Suffixes of files without comments, which cannot hold a mark."""
+"""Suffixes of files without comments, which cannot contain a mark."""
 
-_OWN = re.compile(
+_MARKS = re.compile(
     rb"Written by orthocal|Corrected by orthocal|\(orthocal: |"
     rb'"schema": "orthocal/|<title>(Calibration of|Measuring sheet:) '
 )
 """Marks of the files that orthocal writes."""
 
-_END = 4096
-"""Number of bytes at the beginning and at the end of a file, where its mark is."""
+_SEARCHED_BYTES = 4096
+"""Number of bytes at the beginning and at the end of a file in which its mark is searched."""
 
 
 def require_new_session(
@@ -49,16 +48,16 @@ def require_new_session(
     force: bool,
     error: type[OrthocalError] = SessionError,
 ) -> None:
-    """Refuse to overwrite files that people edit or fill in; measured readings even with --force.
+    """Refuse to overwrite files that users edit or fill in; measured readings even with --force.
 
     Args:
         directory: The directory; it need not exist.
         names: Names of the files.
-        force: True to overwrite all but measured readings.
+        force: Whether to overwrite all files except measured readings.
         error: Kind of error to raise.
 
     Raises:
-        OrthocalError: If the directory cannot be written, or of kind `error`, if a file exists.
+        OrthocalError: If the directory is not writable, or of kind `error`, if a file exists.
         SessionError: If the session of the directory has readings that were not simulated.
     """
     require_writable(directory)
@@ -80,7 +79,7 @@ def _require_no_readings(directory: Path) -> None:
         return
     try:
         session = load_rows(directory)
-    except OrthocalError:  # it was not a session
+    except OrthocalError:  # not a valid session
         return
     count = sum(r.is_read for r in session.readings)
     if count and not session.source.startswith(SIMULATED):
@@ -90,38 +89,40 @@ def _require_no_readings(directory: Path) -> None:
         )
 
 
-def require_own_results(directory: Path, files: Mapping[str, str], *, force: bool) -> None:
-    """Refuse to overwrite files that orthocal did not write; its own are replaced.
+def require_replaceable_results(directory: Path, files: Mapping[str, str], *, force: bool) -> None:
+    """Refuse to overwrite files that orthocal did not write.
 
-    A table without a mark is its own beside a file with one, or with the header of the new table.
+    A table has no mark. It counts as written by orthocal if a file beside it has a mark, or if it
+    has the header of the new table.
 
     Args:
         directory: The directory; it need not exist.
-        files: Names and texts of the new files; the texts matter for tables only.
-        force: True to overwrite any file.
+        files: Texts of the new files by name; they are needed for tables only.
+        force: Whether to overwrite any file.
 
     Raises:
-        OrthocalError: If the directory cannot be written, or contains a file of somebody else.
+        OrthocalError: If the directory is not writable, or contains a file that orthocal did not
+            write.
     """
     require_writable(directory, files)
-    there = {directory / n: text for n, text in files.items() if exists(directory / n)}
-    marked = {path for path in there if _is_marked(path)}
-    for path, text in there.items():
+    existing = {directory / n: text for n, text in files.items() if exists(directory / n)}
+    marked = {path for path in existing if _is_marked(path)}
+    for path, text in existing.items():
         is_table = path.suffix in TABLES and (marked or _has_header(path, text))
         if not (force or path in marked or is_table):
             raise _refusal(path)
 
 
-def require_own_file(path: Path, *, force: bool, kinds: tuple[str, ...] = ()) -> None:
+def require_replaceable_file(path: Path, *, force: bool, kinds: tuple[str, ...] = ()) -> None:
     """Refuse to overwrite a file that orthocal did not write.
 
     Args:
         path: The file.
-        force: True to overwrite it all the same.
+        force: Whether to overwrite any file.
         kinds: Allowed suffixes; any suffix if empty.
 
     Raises:
-        OrthocalError: If the file cannot be written, or is of somebody else.
+        OrthocalError: If the file cannot be written, or orthocal did not write it.
     """
     require_writable_file(path, kinds=kinds)
     if exists(path) and not force and not _is_marked(path):
@@ -129,9 +130,9 @@ def require_own_file(path: Path, *, force: bool, kinds: tuple[str, ...] = ()) ->
 
 
 def mark_written(files: Mapping[str, str]) -> dict[str, str]:
-    """Texts of files with a last line that marks those that can hold a comment."""
+    """Texts of files with a mark in the last line, if the kind of file has comments."""
     return {
-        name: text if WRITTEN in text[-_END:] else text + _comment(name)
+        name: text if WRITTEN in text[-_SEARCHED_BYTES:] else text + _comment(name)
         for name, text in files.items()
     }
 
@@ -148,23 +149,23 @@ def _refusal(path: Path) -> OrthocalError:
 
 
 def _is_marked(path: Path) -> bool:
-    """True for a file with a mark of orthocal at its beginning or end; empty files count, too."""
+    """True for an empty file, and for a file with a mark of orthocal at its beginning or end."""
     try:
         with path.open("rb") as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(0)
-            head = file.read(_END)
-            file.seek(max(0, size - _END))
-            return not size or bool(_OWN.search(head) or _OWN.search(file.read()))
+            beginning = file.read(_SEARCHED_BYTES)
+            file.seek(max(0, size - _SEARCHED_BYTES))
+            return not size or bool(_MARKS.search(beginning) or _MARKS.search(file.read()))
     except OSError:
         return False
 
 
 def _has_header(path: Path, text: str) -> bool:
-    """True for a table with the first line of a text."""
+    """True for a table that has the same header as a text."""
     header = text.partition("\n")[0].encode()
     try:
         with path.open("rb") as file:
-            return bool(header) and file.readline(_END).rstrip() == header
+            return bool(header) and file.readline(_SEARCHED_BYTES).rstrip() == header
     except OSError:
         return False

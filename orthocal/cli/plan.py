@@ -139,7 +139,7 @@ def plan(
 
 
 def _choose(subject: str, options: PlanOptions, *, workers: int) -> orthocal.MeasuringPlan:
-    """Plan for a robot, or further readings for a session.
+    """Plan readings for a robot, or further readings for a session.
 
     Raises:
         OrthocalError: If an option is invalid, or the subject does not load.
@@ -171,7 +171,7 @@ def _choose(subject: str, options: PlanOptions, *, workers: int) -> orthocal.Mea
         equipment=equipment,
         measured=measured,
         workspace=workspace,
-        criterion=options.criterion,  # type: ignore[arg-type] # checked
+        criterion=options.criterion,  # type: ignore[arg-type] # checked by `plan`
         seed=options.seed,
         starts=options.starts,
         reference=subject if measured is None else measured.robot_reference,
@@ -186,14 +186,13 @@ def _write(plan: orthocal.MeasuringPlan, directory: Path) -> None:
     from orthocal.runtime.worker_pool import call_in_parallel
 
     stated = any(r.approach for r in plan.session.readings)
-    approach = "as the column approach states" if stated else "from the same side"
-    approach = f"Approach every posture {approach}"
+    side = "as the column approach states" if stated else "from the same side"
     comment = (
         "A plan: run `orthocal record .` in this directory, or fill in readings.csv; then\n"
         "orthocal calibrate .\n"
         "State the offsets that are active in the controller during the measurement, such as\n"
         "controller: {offsets_mm: [0, 0, 0]}, one number for each drive.\n"
-        f"{approach}. The last reading of a setup is its first\n"
+        f"Approach every posture {side}. The last reading of a setup is its first\n"
         "posture again."
     )
     (sheet, problem), figure = call_in_parallel(
@@ -204,8 +203,8 @@ def _write(plan: orthocal.MeasuringPlan, directory: Path) -> None:
         put_note(problem)
     files = {"plan.json": plan_json(plan), "plan.svg": figure, **sheet}
     path = orthocal.write_session(plan.session, directory, comment=comment, extra=files, blank=True)
-    paper = ", sheet.html and its programs" if sheet else ""
-    put_note(f"Wrote {path}, an empty readings.csv, plan.json, plan.svg{paper}")
+    sheet_names = ", sheet.html and its programs" if sheet else ""
+    put_note(f"Wrote {path}, an empty readings.csv, plan.json, plan.svg{sheet_names}")
 
 
 def _read_equipment(

@@ -48,11 +48,11 @@ def deliver(
     """Print a result and write its files.
 
     Args:
-        document: The result as JSON.
-        show: Prints the result as text.
-        json: True to print JSON instead of text.
-        out: Directory of the files; None to write none.
-        files: Names and contents of the files.
+        document: Function that returns the result as JSON.
+        show: Function that prints the result as text.
+        json: Whether to print JSON instead of text.
+        out: Directory of the files; None to write no files.
+        files: Function that returns the contents of the files by name.
     """
     if json:
         put_out(document().rstrip("\n"))
@@ -70,7 +70,9 @@ def deliver_judged(
     files: Callable[[], Mapping[str, Content]] = dict,
     **shown: Any,  # noqa: ANN401 - arguments of `print_summary`
 ) -> None:
-    """Print a result with a decision about readings, and exit with its code; see `deliver`.
+    """Print a result with a decision about readings, and exit with its code.
+
+    For the arguments see `deliver`.
 
     Raises:
         typer.Exit: With the code of the decision if it is not 0.
@@ -94,12 +96,12 @@ def deliver_judged(
 def judgement_on_failure(
     session: orthocal.Session, judgement: orthocal.Judgement | None = None, *, json: bool
 ) -> Iterator[None]:
-    """Print the judgement of the readings in place of a failure of the solver that it explains.
+    """Print the judgement of the readings instead of a failure of the solver, if it explains it.
 
     Args:
         session: The readings.
-        judgement: Their judgement, if it is known already.
-        json: True to print JSON instead of text.
+        judgement: Their judgement, if it was made before.
+        json: Whether to print JSON instead of text.
     """
     try:
         yield
@@ -123,7 +125,7 @@ def write_results(directory: Path, files: Mapping[str, Content]) -> None:
 
 
 MOST_HELD = 10_000
-"""Number of refused rows before the first served one, after which a table begins all the same."""
+"""Largest number of refused rows that are withheld until the first row within reach."""
 
 
 def print_rows(columns: Iterable[str], form: Callable[[Any], str], chunks: Iterable[Chunk]) -> None:
@@ -131,40 +133,40 @@ def print_rows(columns: Iterable[str], form: Callable[[Any], str], chunks: Itera
 
     Args:
         columns: Names of the columns.
-        form: Lines of CSV of the values of a block.
+        form: Function from the values of a block to lines of CSV.
         chunks: Blocks of the table.
 
     Raises:
-        SessionError: If the machine reaches none of the rows; or the error of a block, with the
-            number of rows before it.
+        SessionError: If the machine reaches none of the rows, or a block has an error; the message
+            then has the number of rows before it.
         typer.Exit: With code 3 if the machine does not reach some rows.
     """
     header = printable(",".join(columns)) + "\n"
-    held, notes = "", list[str]()
-    refused = served = 0
-    first: tuple[str, str] | None = None
+    withheld, notes = "", list[str]()
+    refused = evaluated = 0
+    first_refused: tuple[str, str] | None = None
     try:
         for chunk in chunks:
             refused += len(chunk.refused)
-            served += len(chunk.values)
+            evaluated += len(chunk.values)
             for error in chunk.refused.values():
-                first = first or (error.posture, error.reason)
+                first_refused = first_refused or (error.posture, error.reason)
                 notes.append(f"orthocal: {error.posture}: {error.reason}")
-            held += form(chunk.values)
+            withheld += form(chunk.values)
             if header and len(chunk.refused) == len(chunk.values) and refused < MOST_HELD:
                 continue  # perhaps the machine reaches none of the rows
-            put_out((header + held).removesuffix("\n"))
+            put_out((header + withheld).removesuffix("\n"))
             for note in notes:
                 put_note(note)
-            header, held = "", ""
+            header, withheld = "", ""
             notes.clear()
     except SessionError as e:
         if header:
             raise
-        before = f"; the {served} rows in blocks before it were served"
-        raise SessionError(e.problem + before, where=e.where) from None
-    if first is not None and header:
-        raise SessionError(first[1], where=first[0])
+        done = f"; the {evaluated} rows in blocks before it were evaluated"
+        raise SessionError(e.problem + done, where=e.where) from None
+    if first_refused is not None and header:
+        raise SessionError(first_refused[1], where=first_refused[0])
     if refused:
         rows, cells = ("1 row", "its") if refused == 1 else (f"{refused} rows", "their")
         put_note(f"orthocal: {rows} cannot be reached; {cells} cells are empty")

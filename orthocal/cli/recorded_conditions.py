@@ -1,4 +1,4 @@
-"""Conditions of the readings that are typed: temperature, side of approach, time."""
+"""Conditions of typed readings: temperature, side of approach, time."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ import sys
 from datetime import datetime
 
 from orthocal.io.tables.numerals import plain_minus
-from orthocal.measurement.files.readings_checks import parse_approach, parse_temperature
+from orthocal.measurement.files.readings_checks import parse_temperature, require_approach
 from orthocal.measurement.recording import Recording
 from orthocal.observation.conditions import needed_conditions
 from orthocal.session.session import Conditions, Reading
 
 
 class RecordedConditions:
-    """Conditions under which the next readings are taken.
+    """Conditions of the following readings.
 
-    The temperature is asked for in each setup, if an effect needs it; the side of approach once, if
-    an effect needs it and the plan does not state it. The time is that of the clock, unless
-    readings are typed from a file or from paper.
+    If an effect needs the temperature, it is asked for in each setup. The side of approach is asked
+    for once if an effect needs it and the plan does not state it. The time is that of the clock,
+    unless readings come from a file or from paper.
 
     Args:
         recording: The recording.
-        programmed: Approach of a program whose plan states none.
+        programmed: Approach of the programs, for a plan that states none.
     """
 
     def __init__(self, recording: Recording, programmed: str) -> None:
@@ -40,7 +40,7 @@ class RecordedConditions:
         return "time" in self._needed
 
     def question(self, row: Reading) -> str | None:
-        """Condition to ask for before a row is read; None if nothing is open."""
+        """Condition to ask for before a row is read; None if all are known."""
         if row.minus is not None:
             return None
         if "approach" in self._needed and row.approach is None and self.approach is None:
@@ -50,10 +50,10 @@ class RecordedConditions:
         return None
 
     def answer(self, question: str, text: str, row: Reading) -> None:
-        """Note the answer to a question; an empty one keeps what is proposed.
+        """Store the answer to a question; an empty one accepts the proposed value.
 
         Raises:
-            SessionError: If it is no answer.
+            SessionError: If the answer is invalid.
         """
         if question == "approach":
             self.set_approach(text or self.programmed)
@@ -66,7 +66,7 @@ class RecordedConditions:
         """Set the temperature of the following readings, [°C].
 
         Raises:
-            SessionError: If it is not one of a workshop.
+            SessionError: If the temperature is not that of a workshop.
         """
         number = plain_minus(text).replace(",", ".")
         self.temperature = parse_temperature(number, "the temperature")
@@ -75,11 +75,12 @@ class RecordedConditions:
         """Set the approach of the following readings: one letter for each drive, or for all.
 
         Raises:
-            SessionError: If it is none.
+            SessionError: If the letters are wrong.
         """
         robot = self._recording.session.robot
         letters = text * len(robot.drives) if len(text) == 1 else text
-        self.approach = parse_approach(letters, robot, "the side")
+        require_approach(letters, robot, "the side")
+        self.approach = letters
 
     def of(self, row: Reading) -> Conditions | None:
         """Conditions of a reading that is typed now; None if nothing is stated."""
@@ -91,9 +92,9 @@ class RecordedConditions:
         return None if stated == Conditions() else stated
 
     def _time(self, row: Reading) -> datetime | None:
-        """Time of the clock, with a time zone unless others have none.
+        """Time of the clock, with a time zone unless other readings have times without one.
 
-        None if an other reading of the setup has none, which then are in the order of time.
+        None if another reading of the setup has no time; then the order of the rows is assumed.
         """
         read = [r for r in self._recording.rows if r.is_read and r is not row and not r.minus]
         times = [r.conditions.time if r.conditions else None for r in read]

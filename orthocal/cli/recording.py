@@ -1,4 +1,4 @@
-"""Dialogue in which readings are recorded."""
+"""Dialogue of the command `record`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from orthocal.session.session import ReadingKey
 from orthocal.text import printable, shorten
 
 LONGEST_LINE = 10_000
-"""Characters of a line that are read at a time; a reading has ten."""
+"""Largest number of characters of a line that are read at once; a reading has ten."""
 
 
 class _EndOfDialogue(Exception):
@@ -40,20 +40,20 @@ class Dialogue:
         self._text = RecordingText(recording)
         self._conditions = RecordedConditions(recording, self._text.programmed_approach)
         self._warnings: tuple[Finding, ...] = ()
-        """Findings about the readings so far."""
-        self._open: tuple[Finding, ...] = ()
-        """Earlier findings that only later doubtful readings hide."""
+        """Findings about the present readings."""
+        self._hidden: tuple[Finding, ...] = ()
+        """Earlier findings that are absent only because of later doubtful readings."""
         self._far: set[ReadingKey] = set()
         """Rows that contradicted their prediction when they were read."""
         self._can_judge = True
-        """Whether readings are judged: the robot can be calibrated."""
+        """Whether readings are judged, which needs a robot that can be calibrated."""
         self._skipped: set[ReadingKey] = set()
         self._shown: str | None = None
         """Setup that was described last."""
         self._last: int | None = None
         """Index of the row that was read last."""
         self._asked: int | None = None
-        """Index of the row that is asked for; None where all are read or skipped."""
+        """Index of the row that is asked for; None if all are read or skipped."""
 
     def run(self) -> None:
         """Ask for readings until none is missing and Enter is typed, or the input ends."""
@@ -69,7 +69,7 @@ class Dialogue:
         self._say("", self._text.conclusion(self._warnings, self._path))
 
     def _ask_for(self, index: int | None) -> None:
-        """Ask for a row; None to ask for no more."""
+        """Ask for a row; None if all are read or skipped."""
         self._asked = index
         self._show()
 
@@ -106,7 +106,7 @@ class Dialogue:
         self._show()
 
     def _read_line(self) -> str:
-        """The next line that is typed.
+        """Next typed line.
 
         Raises:
             _EndOfDialogue: At the end of the input.
@@ -124,7 +124,7 @@ class Dialogue:
         if sys.stdin is None:
             raise _EndOfDialogue
         if isinstance(sys.stdin, io.TextIOWrapper) and sys.stdin.errors != "replace":
-            sys.stdin.reconfigure(errors="replace")  # invalid bytes are no number either
+            sys.stdin.reconfigure(errors="replace")  # invalid bytes are refused as text
         if sys.stdin.isatty() and sys.stdout.isatty():
             with suppress(ImportError):
                 import readline  # noqa: F401 - lines can be edited
@@ -159,7 +159,7 @@ class Dialogue:
             self._note(f"Not recorded: {e}.")
 
     def _is_answer(self, word: str, arguments: list[str]) -> bool:
-        """True if a line answers the question about a condition: no command and no more than it."""
+        """True if a line is a single word that answers the question about a condition."""
         if arguments:
             return False
         if self._question == "approach" and word and not word.strip("pnu"):
@@ -167,7 +167,7 @@ class Dialogue:
         return not (word and (word[0].isalpha() or word == "?"))
 
     def _answer_question(self, question: str, word: str) -> None:
-        """Note a condition, and ask for the next one or for the reading."""
+        """Store a condition, and ask for the next one or for the reading."""
         row = self._recording.rows[self._require_row()]
         self._conditions.answer(question, word, row)
         self._note(self._text.conditions(self._conditions.of(row)))
@@ -182,18 +182,18 @@ class Dialogue:
             self._conditions.set_approach(text)
         if self._asked is not None:
             row = self._recording.rows[self._asked]
-            if name == "temperature":  # it need not be asked for, too
+            if name == "temperature":  # answers the question of this setup
                 self._conditions.answer("temperature", "", row)
             self._note(self._text.conditions(self._conditions.of(row)))
 
     def _keep(self) -> None:
-        """Keep the reading of the row that is asked for; end where none is."""
+        """Keep the reading of the row that is asked for; end the dialogue if no row is."""
         if self._asked is None:
             raise _EndOfDialogue
         if not self._recording.rows[self._asked].is_read:
-            point = len(self._recording.point(self._asked)) > 1
-            what = "x, y and z of the point" if point else "the reading of the dial"
-            raise SessionError(f"type {what}, or `skip`, or `help`")
+            is_point = len(self._recording.point(self._asked)) > 1
+            expected = "x, y and z of the point" if is_point else "the reading of the dial"
+            raise SessionError(f"type {expected}, or `skip`, or `help`")
         self._ask_for_next()
 
     def _record(self, index: int, value: float | Array) -> None:
@@ -212,23 +212,23 @@ class Dialogue:
         self._ask_for(following)
 
     def _is_doubtful(self, index: int) -> bool:
-        """Print the prediction of a reading; whether the reading contradicts it.
+        """Print the prediction of a reading; True if the reading contradicts it.
 
-        Each coordinate of a point is predicted by the others as well. Readings with a warning do
-        not take part in the prediction.
+        Each coordinate of a point is also predicted by the other two. Readings with a warning are
+        excluded from the prediction.
         """
         return any([self._contradicts(i) for i in self._recording.point(index)])
 
     def _contradicts(self, index: int) -> bool:
-        """Print the prediction of a row; whether its value contradicts it."""
+        """Print the prediction of a row; True if its value contradicts it."""
         if not self._can_judge or not self._recording.is_located:
             return False
         rows = self._recording.rows
-        doubts = (*self._warnings, *self._open)
-        together = set(self._recording.point(index))
-        doubted = {i for f in doubts for i in find_rows(f, rows)} - together
-        session = self._recording.measured(without=doubted)
-        position = sum(r.is_read and i not in doubted for i, r in enumerate(rows[:index]))
+        findings = (*self._warnings, *self._hidden)
+        point = set(self._recording.point(index))
+        excluded = {i for f in findings for i in find_rows(f, rows)} - point
+        session = self._recording.measured(without=excluded)
+        position = sum(r.is_read and i not in excluded for i, r in enumerate(rows[:index]))
         try:
             mean, std = linear_model(session).predict_row(session.values, position)
         except (OrthocalError, np.linalg.LinAlgError) as e:
@@ -242,17 +242,17 @@ class Dialogue:
         return is_doubtful(session, position, mean, std)
 
     def _judge(self, *, last: int | None = None) -> None:
-        """Judge the readings so far; print new warnings and resolved ones.
+        """Judge the present readings; print new and resolved warnings.
 
-        A complete session is judged as by `check`, and its warnings are printed with its state.
+        A complete session is judged as by `check`; `_show` prints its warnings.
 
         Args:
             last: Index of the row that was just read.
         """
         recording = self._recording
-        nothing = len(recording.missing) == len(recording.rows)
-        if not self._can_judge or nothing or not recording.is_located:
-            self._warnings = self._open = ()
+        is_empty = len(recording.missing) == len(recording.rows)
+        if not self._can_judge or is_empty or not recording.is_located:
+            self._warnings = self._hidden = ()
             return
         try:
             if recording.missing:
@@ -260,13 +260,13 @@ class Dialogue:
             else:
                 findings = judge_session(recording.measured()).findings
                 warnings = tuple(f for f in findings if f.severity != "note")
-            new, gone = _compare((*self._warnings, *self._open), warnings)
-            hidden = [f for f in gone if self._is_hidden(f, warnings)]
+            new, absent = _compare((*self._warnings, *self._hidden), warnings)
+            hidden = [f for f in absent if self._is_hidden(f, warnings)]
         except (OrthocalError, np.linalg.LinAlgError) as e:
             self._stop_judging(e)
             return
-        resolved = [f for f in gone if f not in hidden]
-        self._warnings, self._open = warnings, tuple(hidden)
+        resolved = [f for f in absent if f not in hidden]
+        self._warnings, self._hidden = warnings, tuple(hidden)
         if recording.missing:
             for finding in new:
                 self._say(self._text.warning(finding, last=last))
@@ -274,24 +274,24 @@ class Dialogue:
             self._say(self._text.resolved(resolved))
 
     def _is_hidden(self, finding: Finding, warnings: Sequence[Finding]) -> bool:
-        """True if a finding is made again once all other doubtful readings are left out.
+        """True if a finding occurs again without all other doubtful readings.
 
         Args:
-            finding: An earlier finding that is none of the present ones.
+            finding: An earlier finding that is absent now.
             warnings: The present findings.
         """
         rows = self._recording.rows
         concerned = set(find_rows(finding, rows))
-        aside = {i for f in warnings for i in find_rows(f, rows)}
-        aside |= {i for i, row in enumerate(rows) if row.key in self._far}
-        aside -= concerned
-        if not aside or not concerned:
+        excluded = {i for f in warnings for i in find_rows(f, rows)}
+        excluded |= {i for i, row in enumerate(rows) if row.key in self._far}
+        excluded -= concerned
+        if not excluded or not concerned:
             return False
-        findings = find_warnings(self._recording.measured(without=aside))
+        findings = find_warnings(self._recording.measured(without=excluded))
         return any(concerned & set(find_rows(f, rows)) for f in findings)
 
     def _stop_judging(self, error: Exception) -> None:
-        """Print once why readings cannot be judged; they are recorded all the same."""
+        """Print once the reason why readings cannot be judged; recording continues."""
         self._can_judge = False
         reason = error if isinstance(error, OrthocalError) else "a posture is singular"
         self._note(f"Readings are recorded without a check: {reason}. Use `orthocal check` later.")
@@ -300,7 +300,7 @@ class Dialogue:
         """Execute a command.
 
         Raises:
-            SessionError: If it is unknown, or cannot be executed now.
+            SessionError: If the command is unknown, or cannot be executed now.
         """
         word = {"?": "help", "exit": "quit"}.get(word, word)
         names = [name for name in COMMANDS if name.startswith(word)]
@@ -308,14 +308,14 @@ class Dialogue:
             which = f" ({' or '.join(names)}?)" if names else ""
             raise SessionError(f"'{shorten(word)}' is not a command{which}; `help` lists them")
         name = names[0]
-        with_row = {"back": self._back, "again": self._again, "drop": self._drop}
+        row_commands = {"back": self._back, "again": self._again, "drop": self._drop}
         if name in ("temperature", "side") and len(arguments) == 1:
             self._set_condition(name, arguments[0])
             return
-        if arguments and (name not in with_row or len(arguments) > 1):
+        if arguments and (name not in row_commands or len(arguments) > 1):
             raise SessionError(f"`{name}` has no argument '{shorten(arguments[0])}'")
-        if name in with_row:
-            with_row[name](self._parse_row(arguments[0]) if arguments else None)
+        if name in row_commands:
+            row_commands[name](self._parse_row(arguments[0]) if arguments else None)
         elif name == "list":
             self._say(self._text.list_rows())
         elif name == "help":
@@ -346,20 +346,27 @@ class Dialogue:
     def _back(self, index: int | None) -> None:
         rows = self._recording.rows
         if index is None:
-            index = (len(rows) if self._asked is None else self._asked) - 1
+            index = self._before(len(rows) if self._asked is None else self._asked)
         if index < 0:
             raise SessionError("this is the first line")
         index = self._recording.point(index)[0]
         if rows[index].is_read:
-            self._note_moved(index, "correct only what was mistyped")
+            self._note_moved(index, "correct only typing errors")
         self._ask_for(index)
 
-    def _note_moved(self, index: int, what: str) -> None:
-        """Print what is still possible with the setup of a row, if another one was read since."""
+    def _before(self, asked: int) -> int:
+        """Index of the reading that was typed last; from a line that is read, of the line above."""
+        rows = self._recording.rows
+        if self._last is not None and (asked == len(rows) or not rows[asked].is_read):
+            return self._last
+        return asked - 1
+
+    def _note_moved(self, index: int, advice: str) -> None:
+        """Print advice about the setup of a row, if another setup was read since."""
         setup = self._recording.rows[index].setup
         if self._last is not None and self._recording.rows[self._last].setup != setup:
             self._note(
-                f"The stand has been moved since {setup} was read: {what}. To read there again, "
+                f"The stand has been moved since {setup} was read: {advice}. To read there again, "
                 "`restart` the setup."
             )
 
@@ -407,12 +414,12 @@ class Dialogue:
         recording = self._recording
         setup = self._text.name(recording.rows[index])
         recording.empty(index)
-        of_setup = [i for i, r in enumerate(recording.rows) if self._text.name(r) == setup]
-        self._skipped -= {recording.rows[i].key for i in of_setup}
+        indices = [i for i, r in enumerate(recording.rows) if self._text.name(r) == setup]
+        self._skipped -= {recording.rows[i].key for i in indices}
         self._shown, self._last = None, None
         self._note(f"Deleted: all readings of {setup}")
         self._judge()
-        self._ask_for(of_setup[0])
+        self._ask_for(indices[0])
 
     def _note(self, text: str) -> None:
         """Print an indented paragraph."""
@@ -425,21 +432,21 @@ class Dialogue:
 def _compare(
     before: Sequence[Finding], after: Sequence[Finding]
 ) -> tuple[list[Finding], list[Finding]]:
-    """New findings, and resolved ones, whose setups have no finding any more."""
+    """New findings, and absent ones whose setups have no finding any more."""
 
     def identify(finding: Finding) -> tuple[object, ...]:
         places = [(p.setup, p.posture) for p in finding.places[:1]]
         return finding.kind, *places, finding.numbers.get("cycle")
 
-    known, present = ({identify(f) for f in findings} for findings in (before, after))
+    earlier, present = ({identify(f) for f in findings} for findings in (before, after))
     setups = {p.setup for f in after for p in f.places}
-    new = [f for f in after if identify(f) not in known]
-    gone = [f for f in before if identify(f) not in present]
-    return new, [f for f in gone if not setups & {p.setup for p in f.places}]
+    new = [f for f in after if identify(f) not in earlier]
+    absent = [f for f in before if identify(f) not in present]
+    return new, [f for f in absent if not setups & {p.setup for p in f.places}]
 
 
 def _read_piped_line() -> str:
-    """A line of the standard input without a terminal; empty at its end."""
+    """Line of the standard input without a terminal, cut to LONGEST_LINE; empty at its end."""
     line = sys.stdin.readline(LONGEST_LINE)
     while line and not line.endswith("\n"):
         more = sys.stdin.readline(LONGEST_LINE)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import orthocal
 from orthocal.cli.options import CalibrationPath, Force, command
-from orthocal.cli.overwriting import require_own_file
+from orthocal.cli.overwriting import require_replaceable_file
 from orthocal.cli.printing import put_note
 from orthocal.io.files import is_folder
 
@@ -22,5 +22,5 @@ def report(calibration: CalibrationPath, out: Path | None = None, force: Force =
     target = out or (Path() if result.path is None else result.path.parent)
     if is_folder(target):
         target = target / "report.html"
-    require_own_file(target, force=force, kinds=(".html", ".htm"))
+    require_replaceable_file(target, force=force, kinds=(".html", ".htm"))
     put_note(f"Wrote {orthocal.write_report(result, target)}")

@@ -1,4 +1,4 @@
-"""Running of a command, and exit codes for errors."""
+"""Execution of a command, and exit codes for errors."""
 
 from __future__ import annotations
 
@@ -33,26 +33,26 @@ PANELS = {
 """Panels of `orthocal --help` and their commands, in the order of work."""
 
 MODULES = {"import": "import_"}
-"""Modules of commands with other names, because Python reserves those of the commands."""
+"""Modules of commands whose names are reserved words of Python."""
 
 
 SLOW = frozenset(
     "check trace simulate calibrate compare report validate again accuracy adjust correct export "
     "view".split()
 )
-"""Commands that may take longer than some seconds and print no progress."""
+"""Commands that may need more than some seconds and print no progress."""
 
 
 def main() -> None:
-    """Run the command line; no traceback ever reaches a user.
+    """Run the command line without tracebacks.
 
-    Exit codes: 0 done, 1 a solve did not converge or an output cannot be written, 2 bad input,
-    3 the verdict is to review or to reject the readings, a calibration is not confirmed, or some
-    rows of a table cannot be reached, 70 a bug of orthocal, 130 Ctrl-C.
+    Exit codes: 0 done; 1 the solver did not converge, or an output cannot be written; 2 bad input;
+    3 the verdict is `review` or `reject`, a calibration is not confirmed, or some rows of a table
+    cannot be reached; 70 a bug of orthocal; 130 Ctrl-C.
     """
-    # the matrices are small: more threads would only wait for each other
+    # with small matrices, more threads are slower
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # pydantic would search all installed packages for plugins
+    # otherwise pydantic searches all installed packages for plugins
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     with guarded_streams(), ending_at_interrupt():
         code = _run()
@@ -60,7 +60,7 @@ def main() -> None:
 
 
 def make_program(called: str = "") -> typer.Typer:
-    """The program with all commands in the order of work, or with the called command alone."""
+    """Program with all commands in the order of work, or with the called command only."""
     panels = {name: panel for panel, names in PANELS.items() for name in names}
     chosen = [called] if called in panels else list(panels)
     for name in chosen:
@@ -77,7 +77,7 @@ def make_program(called: str = "") -> typer.Typer:
 
 
 def _run() -> int | str | None:
-    """Run the command; its exit code."""
+    """Run the command, and return its exit code."""
     code: int | str | None = 0
     try:
         try:
@@ -109,7 +109,11 @@ def _run() -> int | str | None:
 
 
 def _announced(words: Sequence[str]) -> AbstractContextManager[None]:
-    """A line on the terminal if the command of these words takes long."""
+    """Line on the terminal if a command works for a long time without output.
+
+    Args:
+        words: The command and its arguments.
+    """
     serves = words[:1] == ["view"] and not {"--html", "--png"} & set(words)
     if serves or not words or words[0] not in SLOW:
         return nullcontext()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import orthocal
 from orthocal.cli.options import Force, OptionalOutDirectory, PlanPath, command, read_numbers
-from orthocal.cli.overwriting import require_own_results
+from orthocal.cli.overwriting import require_replaceable_results
 from orthocal.cli.printing import put_note
 from orthocal.errors import OrthocalError
 from orthocal.io.files import is_folder, require_writable, write_files
@@ -43,17 +43,17 @@ def sheet(
     directory = out or (session if is_folder(session) else session.parent)
     require_writable(directory)
     files = sheet_files(orthocal.load_plan(session), options=options)
-    require_own_results(directory, files, force=force)
+    require_replaceable_results(directory, files, force=force)
     write_files(directory, files)
-    programs = len(files) - 1
-    more = f" and {programs} programs" if programs else "; no programs: the drives control no tool"
-    put_note(f"Wrote {directory / 'sheet.html'} to print{more}")
+    count = len(files) - 1
+    programs = f" and {count} programs" if count else "; no programs: the drives control no tool"
+    put_note(f"Wrote {directory / 'sheet.html'} to print{programs}")
 
 
 def sheet_or_problem(
     session: orthocal.Session, *, calibration: str = "CALIBRATION"
 ) -> tuple[dict[str, str], str]:
-    """Files of the measuring sheet, or no files and the reason."""
+    """Text of the files of the measuring sheet by name, or no files and the reason."""
     from orthocal.output.sheet.page import sheet_files
 
     try:

@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -58,7 +59,7 @@ FILES = ("study.json", "results.parquet", "study.svg")
 """Files that a finished study writes beside its results.jsonl."""
 
 PROGRESS_STEP = 0.1
-"""Share of a study between two lines of progress."""
+"""Progress between two printed lines, as a share of the study."""
 
 Count = Annotated[int, Option(min=2, max=1_000_000)]
 Size = Annotated[int, Option(min=1, max=10_000)]
@@ -122,7 +123,7 @@ def accuracy(
     from orthocal.observation.simulate import collect_errors
 
     session = _load_plan(plan, effects, temperature)
-    robot, has = session.robot, session.robot.effect_names
+    robot, machine_effects = session.robot, session.robot.effect_names
     fixed = {}
     if error or errors is not None:
         fixed = collect_errors(robot, file=errors, single=error or [])
@@ -135,9 +136,9 @@ def accuracy(
             model,
             free=split_globs(free),
             tolerances=tolerances,
-            effects=_without(has, ignore) if ignore else None,
+            effects=_without(machine_effects, ignore) if ignore else None,
         ),
-        effects=has,
+        effects=machine_effects,
         drawn=_parameter_globs(draw, robot),
         fixed=fixed,
         machines=machines,
@@ -151,7 +152,7 @@ def _load_plan(plan: Path, effects: str | None, temperature: str | None) -> orth
     """Plan with the stated effects and conditions.
 
     Raises:
-        OrthocalError: If it does not load, or an option is invalid.
+        OrthocalError: If the plan does not load, or an option is invalid.
     """
     from orthocal.robot.loading import packaged_robots
     from orthocal.robot.parameters import errors_at
@@ -169,7 +170,7 @@ def _load_plan(plan: Path, effects: str | None, temperature: str | None) -> orth
 
 
 def _without(effects: Sequence[str], ignored: str) -> list[str]:
-    """Effects that are not ignored.
+    """Effects of the machines that the calibration does not ignore.
 
     Raises:
         ParameterError: If the machines lack an ignored effect.
@@ -177,9 +178,9 @@ def _without(effects: Sequence[str], ignored: str) -> list[str]:
     names = split_effects(ignored) or []
     for name in names:
         if name not in effects:
-            having = ", ".join(effects) or "none"
+            listed = ", ".join(effects) or "none"
             raise ParameterError(
-                f"found '{name}'; expected effects of the machines ({having}), which --effects "
+                f"found '{name}'; expected effects of the machines ({listed}), which --effects "
                 "chooses",
                 where="--ignore",
             )
@@ -370,7 +371,7 @@ def _run(study: orthocal.Study, options: RunOptions) -> None:
 
 
 def _progress_lines(study: orthocal.Study) -> Callable[[Progress], None] | None:
-    """Function that prints a line on stderr after each tenth of a study of several tasks."""
+    """Function that prints a line on stderr after each tenth of a study; None for one task."""
     if len(study.task_sizes) < 2:
         return None
     next_share = 0.0
@@ -401,7 +402,15 @@ def _duration(seconds: float) -> str:
 def _source(
     subject: str, leg_mm: float | None
 ) -> Iterator[tuple[orthocal.Session | None, orthocal.Robot]]:
-    """The session to study, if there is one, and the robot, with another leg length if stated."""
+    """Session to study, or None, and the robot, with the stated leg length.
+
+    Args:
+        subject: Name or path of a robot or a session.
+        leg_mm: Leg length of an Orthoglide, [mm]; None for that of the subject.
+
+    Raises:
+        ParameterError: If the leg length is invalid, or the subject is no Orthoglide.
+    """
     session, robot = load_robot_or_session(subject)
     if leg_mm is None:
         yield session, robot
@@ -419,12 +428,13 @@ def _source(
 
 
 def _scale_of(leg_mm: float) -> float:
+    """Ratio of a leg length to that of the paper's machine."""
     return leg_mm * MM / orthocal.Orthoglide().leg
 
 
 def _parameter_globs(texts: list[str] | None, robot: orthocal.Robot) -> tuple[str, ...] | None:
-    """Globs of error parameters; the name of a model selects those of the model."""
+    """Globs of error parameters; the name of a model is replaced by the globs of the model."""
     models = robot.parameters.models
     globs = split_globs(texts)
     patterns = [robot.parameters.patterns(g) if g in models else (g,) for g in globs]
-    return tuple(pattern for each in patterns for pattern in each) if texts else None
+    return tuple(chain.from_iterable(patterns)) if texts else None

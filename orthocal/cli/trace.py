@@ -48,11 +48,11 @@ def trace(session: PlanPath, traces: Traces, out: OutDirectory, force: Force = F
 
 
 def _split(traces: list[str]) -> dict[str, Path]:
-    """Setup and file of every SETUP=FILE."""
+    """Files by setup, from texts of the form SETUP=FILE."""
     files: dict[str, Path] = {}
     for text in traces:
-        setup, sign, file = text.partition("=")
-        if not (setup and sign and file):
+        setup, _, file = text.partition("=")
+        if not (setup and file):
             raise SessionError(f"found '{shorten(text)}'; expected SETUP=FILE", where="traces")
         if setup in files:
             raise SessionError(f"has two traces: '{setup}'", where="traces")

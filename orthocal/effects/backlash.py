@@ -1,9 +1,9 @@
-"""Backlash of each drive: the slide stays behind by half of it, on the side that it comes from.
+"""Backlash of each drive: the slide lags behind the command by half of the backlash.
 
-    really at  ρ − (b/2) s
+    actual coordinate = ρ − (b/2) s
 
-with the backlash b ≥ 0 of the drive and s = +1 where its coordinate grew in its last motion, −1
-where it fell. Where the direction is unknown s is 0: the middle of both positions.
+with the commanded coordinate ρ and the backlash b ≥ 0 of the drive. s = 1 if the coordinate grew in
+the last motion, −1 if it fell. If the direction is unknown, s = 0: the middle of both positions.
 """
 
 from __future__ import annotations
@@ -21,16 +21,17 @@ from orthocal.units import MM, MRAD, read_limit
 
 
 class BacklashKeys(EffectKeys):
-    """Keys under `orthocal.effects.backlash`: largest backlash of a drive in working order."""
+    """Keys under `orthocal.effects.backlash`: largest backlash of a drive in good condition."""
 
     tolerance_mm: PositiveNumber = 0.04
+    """Tolerance for prismatic drives."""
     tolerance_mrad: PositiveNumber = 0.2
-    """Of revolute drives."""
+    """Tolerance for revolute drives."""
 
 
 @dataclass(frozen=True, eq=False)
 class Backlash(Effect):
-    """Backlash of each drive, half-normal."""
+    """Backlash of each drive, with a half-normal prior."""
 
     name = "backlash"
     keys = BacklashKeys
@@ -38,11 +39,11 @@ class Backlash(Effect):
 
     robot: Robot
     errors: tuple[ElementaryError, ...]
-    """`<drive>.backlash`, [m, rad]."""
+    """Backlash of each drive, `<drive>.backlash`, [m, rad]."""
 
     @classmethod
     def from_keys(cls, keys: BacklashKeys, robot: Robot) -> Self:
-        """The effect of a robot; arguments as for `Effect.from_keys`."""
+        """Build the effect for a robot (see `Effect.from_keys`)."""
         stds = {
             "m": read_limit(keys.tolerance_mm) * MM,
             "rad": read_limit(keys.tolerance_mrad) * MRAD,
@@ -66,6 +67,6 @@ class Backlash(Effect):
         return "backlash of each drive"
 
     def drives(self, coordinates: ca.SX, errors: Symbols, conditions: Symbols) -> ca.SX:
-        """Actual drive coordinates; arguments as for `Effect.drives`."""
+        """Actual drive coordinates (see `Effect.drives`)."""
         backlash = ca.vertcat(*(errors[e.name] for e in self.errors))
         return coordinates - 0.5 * backlash * conditions["approach"]

@@ -1,8 +1,9 @@
-"""Displacement of the motors by a controller that compensates backlash and errors of screws.
+"""Displacement of the drives by a controller that compensates backlash and errors of screws.
 
-A controller adds a trim T to the commanded position j of a joint, on the side s = ±1 of its last
-motion. With a stated backlash b it is T = s b/2. A table lists the trims T₊ and T₋ over positions
-of the joint; they are linear between its rows, constant beyond them, and replace the backlash.
+A controller adds a trim T to the commanded position of a joint. For a stated backlash b it is
+T = s b/2, with s = ±1 the direction of the last motion. A table states the trims T₊ and T₋ for
+positions of the joint. They are interpolated linearly, constant beyond the table, and replace the
+backlash.
 """
 
 from __future__ import annotations
@@ -24,17 +25,25 @@ from orthocal.units import DRIVE_UNITS
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointTrim:
-    """Trim of one joint."""
+    """Trim that a controller adds to the position of one joint."""
 
     __pydantic_config__ = CLOSED
 
     backlash: Annotated[Number, Field(ge=0.0)] = 0.0
-    """Backlash that the controller takes up, [m, rad]; without effect beside a table."""
+    """Compensated backlash, [m, rad]; a table replaces it."""
     table: Matrix | None = None
-    """Position of the joint, trim after it grew and after it fell, shape (n, 3), [m, rad]."""
+    """Position of the joint, trim after the position grew, trim after it fell; shape (n, 3),
+    [m, rad]."""
 
     def __call__(self, joints: Array) -> Array:
-        """Trims on both sides, shape (n, 2) of positions (n,), [m, rad]."""
+        """Trims T₊ and T₋ in positions of the joint.
+
+        Args:
+            joints: Positions, shape (n,), [m, rad].
+
+        Returns:
+            Shape (n, 2), [m, rad].
+        """
         if self.table is None:
             return np.tile([0.5 * self.backlash, -0.5 * self.backlash], (len(joints), 1))
         columns = [np.interp(joints, self.table[:, 0], self.table[:, k]) for k in (1, 2)]
@@ -42,20 +51,20 @@ class JointTrim:
 
 
 Compensation = tuple[JointTrim, ...]
-"""Trim of the joint of each drive, in the robot's order."""
+"""Trim of the joint of each drive, in the robot's order; empty without compensation."""
 
-NEGLIGIBLE = 1e-9
-"""Difference of trims that does not count, [m, rad]: tables are written to 1e-6 mm."""
+SAME_TRIM = 1e-9
+"""Largest difference between equal trims, [m, rad]: tables are written to 1e-6 mm."""
 
 
 def compensates_alike(one: Sequence[JointTrim], other: Sequence[JointTrim]) -> bool:
-    """True if two controllers compensate the same; an empty compensation is none."""
+    """True if two controllers have the same compensation."""
     if not (one and other):
         return not any(t.backlash or t.table is not None for t in one or other)
     for a, b in zip(one, other, strict=True):
-        at = [t.table[:, 0] for t in (a, b) if t.table is not None]
-        joints = np.concatenate([*at, np.zeros(1)])
-        if np.abs(a(joints) - b(joints)).max() > NEGLIGIBLE:
+        positions = [t.table[:, 0] for t in (a, b) if t.table is not None]
+        joints = np.concatenate([*positions, np.zeros(1)])
+        if np.abs(a(joints) - b(joints)).max() > SAME_TRIM:
             return False
     return True
 
@@ -65,36 +74,36 @@ def displace_drives(
 ) -> Array:
     """Displacement of the drives by the controller.
 
-    A trim is applied as far as the robot's effects describe what it corrects: the difference of
-    both sides if one depends on the approach, the mean of both if one is periodic. What they do not
-    describe is taken as corrected.
+    Only trims of errors that the robot's effects describe are applied: the difference of both sides
+    if an effect depends on the approach, the mean of both sides if an effect is periodic. Other
+    trims are assumed to correct errors exactly.
 
     Args:
         robot: The robot with its effects.
         trims: Trim of the joint of each drive.
         displayed: Commanded drive coordinates with the active offsets, as the controller displays
             them, shape (n, n_drives), [m, rad].
-        sides: 1 where the coordinate grew in the last motion, -1 where it fell, 0 for the mean of
-            both sides, shape (n, n_drives).
+        sides: 1 if the coordinate grew in the last motion, -1 if it fell, 0 for the mean of both
+            sides, shape (n, n_drives).
 
     Returns:
-        Shape (n, n_drives), [m, rad].
+        Displacements, shape (n, n_drives), [m, rad].
     """
     effects = robot_effects(robot)
-    sided = any("approach" in e.conditions for e in effects)
-    periodic = any(e.period is not None for e in effects)
+    has_backlash = any("approach" in e.conditions for e in effects)
+    is_periodic = any(e.period is not None for e in effects)
     result = np.zeros(displayed.shape)
     for i, (drive, trim) in enumerate(zip(robot.drives, trims, strict=True)):
         both = trim(drive.to_joint(displayed[:, i]))
         half = 0.5 * (both[:, 0] - both[:, 1])
-        result[:, i] = sided * sides[:, i] * half
-        if periodic:
+        result[:, i] = has_backlash * sides[:, i] * half
+        if is_periodic:
             result[:, i] += drive.direction * both.mean(axis=1)
     return result
 
 
 def describe_trims(robot: Robot, trims: Sequence[JointTrim]) -> str:
-    """Compensation of a controller in each drive, in words; empty if there is none."""
+    """Description of the compensation of each drive; "" if there is none."""
     texts = []
     for drive, trim in zip(robot.drives, trims, strict=False):
         unit, size = DRIVE_UNITS[drive.unit]
@@ -111,7 +120,7 @@ def table_name(joint: int) -> str:
 
 
 def format_table(trim: JointTrim, drive: Drive) -> str:
-    """Text of a table: position, trim after the joint grew and after it fell, in mm or degrees."""
+    """Text of a table in mm or degrees: position, trim after it grew, trim after it fell."""
     if trim.table is None:
         return ""
     size = DRIVE_UNITS[drive.unit][1]

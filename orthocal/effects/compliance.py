@@ -3,8 +3,8 @@
     change of a rod's length = F / k
 
 with its axial stiffness k and its axial force F, tension positive (`RodForces`). Weights act at the
-tool centre point; those of the rods are not counted. Stiffness and masses are stated, not
-identified: what they change is mostly below the noise of an indicator.
+tool centre point; those of the rods are neglected. Stiffness and masses are stated and not
+identified, because their effect is mostly below the noise of an indicator.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class ComplianceKeys(EffectKeys):
     rod_N_per_um: Annotated[PositiveNumber, Field(ge=1e-3, le=1e5)]
     """Axial stiffness of one rod with its hinges."""
     platform_kg: Annotated[Number, Field(ge=0.0, le=HEAVIEST_KG)] = 0.0
-    """Mass of platform and spindle."""
+    """Mass of the platform with the spindle."""
     down: tuple[Number, Number, Number] = (0.0, 0.0, -1.0)
-    """Direction of gravity in the world frame, of any length."""
+    """Direction of gravity in the world frame, of any norm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,15 +51,15 @@ class Compliance(Effect):
 
     robot: Robot
     stiffness: float
-    """[N/m]."""
+    """Axial stiffness of one rod, [N/m]."""
     platform: float
-    """[kg]."""
+    """Mass of the platform with the spindle, [kg]."""
     down: Array
-    """Unit vector, shape (3,)."""
+    """Direction of gravity in the world frame, unit vector, shape (3,)."""
 
     @classmethod
     def from_keys(cls, keys: ComplianceKeys, robot: Robot) -> Self:
-        """The effect of a robot; arguments as for `Effect.from_keys`."""
+        """Build the effect for a robot (see `Effect.from_keys`)."""
         if robot.tcp is None or not robot.rods:
             raise RobotError("needs a robot with rods (orthocal.legs) and a tool (orthocal.tcp)")
         down = np.array(keys.down)
@@ -73,11 +73,11 @@ class Compliance(Effect):
         return "compliance of the rods under platform and payload"
 
     def tool_force(self, payload: float) -> Array:
-        """Force on the tool centre point; arguments as for `Effect.tool_force`."""
+        """Force on the tool centre point (see `Effect.tool_force`)."""
         return (self.platform + payload) * GRAVITY * self.down
 
     def rods(self, errors: Symbols, conditions: Symbols) -> Mapping[tuple[str, str], ca.SX]:
-        """Changes of the lengths of rods; arguments as for `Effect.rods`."""
+        """Changes of the lengths of rods (see `Effect.rods`)."""
         return {
             name: conditions["load"][i] / self.stiffness for i, name in enumerate(self.robot.rods)
         }

@@ -1,8 +1,8 @@
-"""Drift of a gauge: the zero of each setup moves linearly with time.
+"""Drift of a gauge: the gauge zero of each setup changes linearly with time.
 
     reading + rate · t
 
-with t counted from the first reading of the setup.
+with the time t since the first reading of the setup.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ class DriftKeys(EffectKeys):
     """Keys under `orthocal.effects.drift`."""
 
     tolerance_um_per_min: PositiveNumber = 0.5
+    """Tolerance of the rate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,11 +35,11 @@ class Drift(Effect):
     conditions = ("time",)
 
     setup_errors: tuple[ElementaryError, ...]
-    """`drift` of each setup, [m/s]."""
+    """Rate of each setup, `drift`, [m/s]."""
 
     @classmethod
     def from_keys(cls, keys: DriftKeys, robot: Robot) -> Self:
-        """The effect of a robot; arguments as for `Effect.from_keys`."""
+        """Build the effect for a robot (see `Effect.from_keys`)."""
         std = read_limit(keys.tolerance_um_per_min) * UM / 60.0
         return cls((ElementaryError("drift", cls.name, "", "m/s", std),))
 
@@ -47,5 +48,5 @@ class Drift(Effect):
         return "drift of the gauge in each setup"
 
     def reading(self, reading: ca.SX, errors: Symbols, conditions: Symbols) -> ca.SX:
-        """Reading of the gauge; arguments as for `Effect.reading`."""
+        """Reading of the gauge (see `Effect.reading`)."""
         return reading + errors["drift"] * conditions["time"]

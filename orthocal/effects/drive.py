@@ -1,8 +1,8 @@
 """Offset and scale of each drive.
 
-    really at  (gain + s) ρ + Δρ
+    actual coordinate = (gain + s) ρ + Δρ
 
-for the commanded coordinate ρ, with the offset Δρ (paper, equation 1) and the scale error s; the
+for the commanded coordinate ρ, with the offset Δρ (paper, equation 1) and the scale error s. The
 gain of the nominal machine is 1.
 """
 
@@ -37,15 +37,15 @@ class DriveErrors(Effect):
 
     robot: Robot
     errors: tuple[ElementaryError, ...]
-    """`<drive>.offset` of all drives, then `<drive>.scale`."""
+    """Offsets of all drives, `<drive>.offset`, then scale errors, `<drive>.scale`."""
 
     @classmethod
     def from_keys(cls, keys: DriveTolerances, robot: Robot) -> Self:
-        """The effect of a robot; arguments as for `Effect.from_keys`."""
-        size = {"m": read_limit(keys.offset_mm) * MM, "rad": read_limit(keys.offset_mrad) * MRAD}
+        """Build the effect for a robot (see `Effect.from_keys`)."""
+        stds = {"m": read_limit(keys.offset_mm) * MM, "rad": read_limit(keys.offset_mrad) * MRAD}
         offsets = (
             ElementaryError(
-                f"{d.name}.offset", "offset", d.name, d.unit, size[d.unit], complete=True
+                f"{d.name}.offset", "offset", d.name, d.unit, stds[d.unit], complete=True
             )
             for d in robot.drives
         )
@@ -61,7 +61,7 @@ class DriveErrors(Effect):
         return "offset and scale of each drive"
 
     def drives(self, coordinates: ca.SX, errors: Symbols, conditions: Symbols) -> ca.SX:
-        """Actual drive coordinates; arguments as for `Effect.drives`."""
+        """Actual drive coordinates (see `Effect.drives`)."""
         offset, scale = (
             ca.vertcat(*(errors[f"{d.name}.{kind}"] for d in self.robot.drives))
             for kind in ("offset", "scale")

@@ -4,8 +4,8 @@
 
 A parameter is one component of the twist δ, in the axes of the joint or frame:
 
-    x_coupler.rx      rotation of the placement of joint x_coupler about its own x axis
-    frame.tcp.z       translation of frame tcp along its own z axis
+    x_coupler.rx      rotation of the placement of joint x_coupler about the joint's x axis
+    frame.tcp.z       translation of frame tcp along the frame's z axis
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ class GeometryErrors(Effect):
     errors: tuple[ElementaryError, ...]
     """Errors of joint placements, then of the frames in use.
 
-    The component of a motor's placement along or about its own axis is left out: the offset is the
-    same error.
+    The component of a drive's placement along or about the axis of the drive is omitted, because
+    it is the same error as the offset.
     """
 
     @classmethod
     def from_keys(cls, keys: GeometryTolerances, robot: Robot) -> Self:
-        """The effect of a robot; arguments as for `Effect.from_keys`."""
+        """Build the effect for a robot (see `Effect.from_keys`)."""
         return cls(robot, (*_joint_errors(robot, keys), *_frame_errors(robot, keys)))
 
     def describe(self) -> str:
@@ -57,7 +57,7 @@ class GeometryErrors(Effect):
         return "position and orientation of each joint and frame"
 
     def placements(self, errors: Symbols, conditions: Symbols) -> Mapping[Placement, ca.SX]:
-        """Twists of placements; arguments as for `Effect.placements`."""
+        """Twists of placements (see `Effect.placements`)."""
         twists: dict[Placement, ca.SX] = {}
         for e in self.errors:
             twists.setdefault(self.robot.placement_of(e), ca.SX(6, 1))[e.axis] += errors[e.name]
@@ -65,25 +65,28 @@ class GeometryErrors(Effect):
 
 
 def _joint_errors(robot: Robot, keys: GeometryTolerances) -> Iterator[ElementaryError]:
-    model, motors = robot.model, {d.name for d in robot.drives}
+    """Errors of the placements of all joints."""
+    model, drives = robot.model, {d.name for d in robot.drives}
     for i in range(1, model.njoints):
         name = str(model.names[i])
-        motor_axis = int(np.abs(joint_axis(model, i)).argmax()) if name in motors else None
+        drive_axis = int(np.abs(joint_axis(model, i)).argmax()) if name in drives else None
         for axis in range(6):
-            if axis != motor_axis:
+            if axis != drive_axis:
                 yield _error(name, axis, keys, complete=True, of_frame=False)
 
 
 def _frame_errors(robot: Robot, keys: GeometryTolerances) -> Iterator[ElementaryError]:
-    parts = _ends_of_loops(robot)
+    """Errors of the placements of all frames in use."""
+    complete = _loop_frames(robot)
     for frame in robot.frames:
         for axis in range(6):
-            yield _error(frame, axis, keys, complete=frame in parts, of_frame=True)
+            yield _error(frame, axis, keys, complete=frame in complete, of_frame=True)
 
 
 def _error(
     owner: str, axis: int, keys: GeometryTolerances, *, complete: bool, of_frame: bool
 ) -> ElementaryError:
+    """One component of the twist of a joint or a frame, with its prior."""
     translation = axis < 3
     limit = keys.translation_mm * MM if translation else keys.rotation_mrad * MRAD
     return ElementaryError(
@@ -98,11 +101,11 @@ def _error(
     )
 
 
-def _ends_of_loops(robot: Robot) -> frozenset[str]:
-    """Frames in which loops end, the parts of a machine among its frames.
+def _loop_frames(robot: Robot) -> frozenset[str]:
+    """Frames of closures, except those that carry the tool.
 
-    An error of a frame that carries the tool moves the tool alone: it says where on the platform
-    that is. The ends of legs' lines are no parts.
+    Their errors belong to parts of the machine. An error of a frame that carries the tool only
+    moves the tool on the platform.
     """
     tool = set(carriers(robot.model, robot.frame_id(robot.tcp.frame))) if robot.tcp else set()
     ends = {frame for c in robot.closures for frame in (c.frame_a, c.frame_b)}

@@ -1,4 +1,4 @@
-"""Loading robots with their effects and error parameters."""
+"""Loading of robots with their effects and error parameters."""
 
 from __future__ import annotations
 
@@ -27,27 +27,28 @@ from orthocal.robot.parameters import (
 from orthocal.robot.redundant import find_redundant_errors
 
 MODELS: Mapping[str, Sequence[str]] = {"offsets": ("*.offset",), "full": COMPLETE}
-"""Models of each robot whose YAML does not define models of these names."""
+"""Models of a robot whose YAML does not define models with these names."""
 
 
 class ToleranceKeys(GeometryTolerances, DriveTolerances):
     """Keys under `orthocal.tolerances`: ±2 prior standard deviations of each kind of error."""
 
     overrides: dict[str, PositiveNumber] = Field(default_factory=dict)
-    """Parameter name or glob, with the unit as suffix, to value; later ones win."""
+    """Names or globs of parameters with the unit as suffix, mapped to tolerances; later entries
+    replace earlier ones."""
 
 
 def load_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
-    """Load a robot: URDF and YAML, checked against each other, with its loops closed.
+    """Load a robot from its URDF and YAML, check them against each other and close its loops.
 
-    A robot is never changed: the same files give the same one again.
+    Robots are immutable: unchanged files give the same object again.
 
     Args:
-        robot: Name of a robot that comes with orthocal, or path to a robot directory.
-        beside: Directory that a relative path counts from; the working directory by default.
+        robot: Name of a built-in robot, or path to a robot directory.
+        beside: Directory to which a relative path refers; the working directory by default.
 
     Raises:
-        RobotError: Naming file and line or key, what was found and what was expected.
+        RobotError: If the files do not describe a robot; names the file and the line or key.
     """
     return _add_parameters(load_bare_robot(robot, beside=beside))
 
@@ -55,30 +56,30 @@ def load_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
 def load_robot_content(
     name: str, content: Mapping[str, bytes], *, folder: Path | None = None
 ) -> Robot:
-    """Load a robot from the content of its files, as `load_robot` does from a directory.
+    """Load a robot from the content of its files, like `load_robot` from a directory.
 
     Args:
         name: Name of the robot.
-        content: Files by name: one URDF and one YAML, and meshes.
-        folder: Directory that they were read from, which need not exist any more.
+        content: File names, mapped to contents: one URDF, one YAML, and meshes.
+        folder: Directory from which the files were read; it need not exist any more.
 
     Raises:
-        RobotError: Naming file and line or key, as in NAME/FILE.
+        RobotError: If the files do not describe a robot; names NAME/FILE and the line or key.
     """
     return _add_parameters(load_bare_content(name, content, folder=folder))
 
 
 def with_effects(robot: Robot, names: Sequence[str] | None) -> Robot:
-    """Robot with chosen effects beside those of geometry and drives.
+    """Robot with chosen effects in addition to those of geometry and drives.
 
     Args:
-        robot: The robot, with tolerances that were stated for it or not.
-        names: Names of the effects, in any order; None for those that its YAML names. Effects that
-            it does not name have their default keys.
+        robot: The robot; tolerances that were stated for it remain.
+        names: Names of the effects, in any order; None for those in its YAML. Other effects have
+            their default keys.
 
     Raises:
-        ParameterError: If there is no such effect, or a stated tolerance is of an effect that was
-            not chosen.
+        ParameterError: If an effect does not exist, or a stated tolerance belongs to an effect that
+            was not chosen.
         RobotError: If an effect needs keys that the robot's YAML lacks.
     """
     chosen = None if names is None else order_effects(names)
@@ -93,12 +94,13 @@ def with_effects(robot: Robot, names: Sequence[str] | None) -> Robot:
 
 @lru_cache(maxsize=4 * MAX_LOADED)
 def _choose_effects(robot: Robot, chosen: tuple[str, ...] | None) -> Robot:
+    """Robot with ordered names of effects, cached."""
     plain = replace(robot, chosen_effects=chosen, parameters=ParameterSet())
     return _add_parameters(plain).with_tolerances(robot.parameters.stated)
 
 
 def with_adjustments(robot: Robot) -> Robot:
-    """Robot whose placements depend on the mechanical adjustments under which it was measured."""
+    """Robot whose placements depend on the mechanical adjustments of each session."""
     if robot.adjusted:
         return robot
     plain = replace(robot, adjusted=True, parameters=ParameterSet())
@@ -107,6 +109,7 @@ def with_adjustments(robot: Robot) -> Robot:
 
 @lru_cache(maxsize=MAX_LOADED)
 def _add_parameters(robot: Robot) -> Robot:
+    """Robot with the error parameters of its effects."""
     where, declared = f"{robot.yaml}: orthocal", robot.declared
     errors: dict[str, ElementaryError] = {}
     for effect in robot_effects(robot):
@@ -135,10 +138,10 @@ def _add_parameters(robot: Robot) -> Robot:
 
 @lru_cache(maxsize=2 * MAX_LOADED)
 def robot_effects(robot: Robot) -> tuple[Effect, ...]:
-    """Effects of a robot: drive, geometry, adjustments between sessions, and those beside them.
+    """Effects of a robot: drives, geometry, adjustments between sessions, then named effects.
 
     Raises:
-        RobotError: If there is no such effect, or one of its keys does not fit.
+        RobotError: If a named effect does not exist, or one of its keys does not fit.
     """
     tolerances = _read_tolerances(robot)
     effects: list[Effect] = [
@@ -147,19 +150,19 @@ def robot_effects(robot: Robot) -> tuple[Effect, ...]:
         *([AdjustmentChanges.of_robot(robot)] if robot.adjusted else []),
     ]
     for name in order_effects(robot.effect_names):
-        data, under = robot.declared.effects.get(name, {}), f"orthocal.effects.{name}"
-        kind = find_effect(name, where=f"{robot.yaml}: {under}", error=RobotError)
-        keys = validate(kind.keys, data, where=str(robot.yaml), error=RobotError, under=under)
+        data, prefix = robot.declared.effects.get(name, {}), f"orthocal.effects.{name}"
+        kind = find_effect(name, where=f"{robot.yaml}: {prefix}", error=RobotError)
+        keys = validate(kind.keys, data, where=str(robot.yaml), error=RobotError, under=prefix)
         try:
             effects.append(kind.from_keys(keys, robot))
         except OrthocalError as e:
-            key = ".".join(part for part in (under, e.where) if part)
+            key = ".".join(part for part in (prefix, e.where) if part)
             raise RobotError(e.problem, where=f"{robot.yaml}: {key}") from None
     return tuple(effects)
 
 
 def measurable_effects(robot: Robot) -> tuple[Effect, ...]:
-    """Effects of a robot beside those of geometry and drives, with parameters to identify."""
+    """Named effects of a robot that have parameters to identify."""
     return tuple(
         e
         for e in robot_effects(robot)
@@ -168,12 +171,12 @@ def measurable_effects(robot: Robot) -> tuple[Effect, ...]:
 
 
 def errors_of_no_model(robot: Robot) -> tuple[str, ...]:
-    """Names of the errors of effects that must be named to be identified: not `complete`."""
+    """Names of errors of effects that no model identifies: those that are not `complete`."""
     return tuple(e.name for f in measurable_effects(robot) for e in f.errors if not e.complete)
 
 
 def neutral_values(robot: Robot) -> dict[Condition, float]:
-    """Values of conditions that are not stated, at which the effects of a robot change nothing."""
+    """Values of conditions that are not stated, under which the effects change nothing."""
     values = dict(NEUTRAL)
     for effect in robot_effects(robot):
         values.update(effect.neutral)
@@ -181,11 +184,12 @@ def neutral_values(robot: Robot) -> dict[Condition, float]:
 
 
 def reading_effects(robot: Robot) -> tuple[Effect, ...]:
-    """Effects of a robot that change what a gauge shows."""
+    """Effects of a robot that change the readings of gauges."""
     return tuple(e for e in robot_effects(robot) if type(e).reading is not Effect.reading)
 
 
 def _read_tolerances(robot: Robot) -> ToleranceKeys:
+    """Tolerances in the robot's YAML."""
     return validate(
         ToleranceKeys,
         robot.declared.tolerances,

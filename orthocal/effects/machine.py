@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from orthocal.effects.loading import neutral_values, robot_effects
-from orthocal.effects.protocol import Condition, Placement, Symbols, condition_size
+from orthocal.effects.protocol import Condition, Placement, Symbols, add_twist, condition_size
 from orthocal.effects.rods import stretch_rod
 from orthocal.robot.model import Robot
 
@@ -20,11 +20,11 @@ class MachineExpressions:
     actuated: ca.SX
     """Actual drive coordinates, shape (n_drives,), [m, rad]."""
     twists: Mapping[Placement, ca.SX]
-    """Twist δ of each placement that effects act on, shape (6,), [m, rad]."""
+    """Placements on which effects act, mapped to their twist δ, shape (6,), [m, rad]."""
 
 
 def neutral_conditions(robot: Robot) -> dict[Condition, ca.SX]:
-    """Conditions that are not stated, as constants."""
+    """Neutral values of all conditions, as constants."""
     values = neutral_values(robot)
     return {name: ca.SX([v] * condition_size(robot, name)) for name, v in values.items()}
 
@@ -35,28 +35,29 @@ def express_machine(
     errors: Mapping[str, ca.SX | float],
     conditions: Mapping[Condition, ca.SX] | None = None,
 ) -> MachineExpressions:
-    """Drives and placements of a robot under all of its effects.
+    """Drives and placements of a robot with all its effects.
 
     Args:
         robot: The nominal robot.
         commanded: Commanded drive coordinates, shape (n_drives,), [m, rad].
-        errors: Parameter name to expression or number, [unit of the parameter]; 0 where absent.
+        errors: Names of parameters, mapped to expressions or numbers, [unit of the parameter]; 0
+            where absent.
         conditions: Conditions of the posture; neutral where absent.
     """
     elementary: dict[str, ca.SX] = dict.fromkeys(robot.parameters.elementary, ca.SX(1, 1))
     for name, value in errors.items():
         for term, coefficient in robot.parameters[name].terms:
             elementary[term] = elementary[term] + coefficient * value
-    known = {**neutral_conditions(robot), "coordinates": commanded, **(conditions or {})}
+    stated = {**neutral_conditions(robot), "coordinates": commanded, **(conditions or {})}
     actuated, twists = commanded, dict[Placement, ca.SX]()
-    for effect in reversed(robot_effects(robot)):  # the drive's gain and offset act last
-        of_effect = {e.name: elementary[e.name] for e in effect.errors}
-        needed: Symbols = {name: known[name] for name in effect.conditions}
-        actuated = effect.drives(actuated, of_effect, needed)
-        changes = [effect.placements(of_effect, needed)]
-        for rod, change in effect.rods(of_effect, needed).items():
-            changes.append(stretch_rod(robot, robot.rods[rod], change))
-        for placement, twist in (item for part in changes for item in part.items()):
-            before = twists.get(placement)
-            twists[placement] = twist if before is None else before + twist
+    for effect in reversed(robot_effects(robot)):  # gain and offset of the drives act last
+        parameters = {e.name: elementary[e.name] for e in effect.errors}
+        needed: Symbols = {name: stated[name] for name in effect.conditions}
+        actuated = effect.drives(actuated, parameters, needed)
+        displacements = [effect.placements(parameters, needed)]
+        for rod, change in effect.rods(parameters, needed).items():
+            displacements.append(stretch_rod(robot, robot.rods[rod], change))
+        for displacement in displacements:
+            for placement, twist in displacement.items():
+                add_twist(twists, placement, twist)
     return MachineExpressions(actuated, twists)

@@ -1,12 +1,15 @@
-"""Protocol of an effect: its parameters with priors, how it acts, the conditions it needs.
+"""Protocol of an effect: its parameters with priors, its expressions, the conditions it needs.
 
-Each effect is one file. It reads its own keys of the robot's YAML and returns CasADi expressions of
-its parameters and of the conditions of a reading. All derivatives come from these expressions, and
-the same expressions serve the predicted readings, the loop closures and the program for Ipopt.
+Each effect is one file. It reads its keys of the robot's YAML and returns CasADi expressions of its
+parameters and of the conditions of a reading. Predicted readings, loop closures, the program for
+Ipopt and all derivatives use these expressions.
 
-An effect may act on the coordinate of a drive (backlash, periodic errors of screws), on the length
-of a rod (thermal expansion, compliance), on a placement (geometry) and on a reading (drift of a
-gauge).
+An effect may act on
+
+- the coordinate of a drive: backlash, periodic errors of screws
+- the length of a rod: thermal expansion, compliance
+- a placement: geometry
+- a reading: drift of a gauge
 """
 
 from __future__ import annotations
@@ -24,19 +27,25 @@ from orthocal.robot.model import Robot
 from orthocal.robot.parameters import ElementaryError
 
 Symbols = Mapping[str, ca.SX]
-"""Names to expressions."""
+"""Names of parameters or conditions, mapped to expressions."""
 
 Condition = Literal[
     "approach", "temperature", "time", "load", "adjustment", "coordinates", "reference"
 ]
-"""Condition of a reading: the direction of each drive's last motion, shape (n_drives,), 1 where its
-coordinate grew, -1 where it fell, 0 if unknown; the temperature, [°C]; the time since the first
-reading of the setup, [s]; the axial force of each rod under the weight on the tool, tension
-positive, shape (n_rods,), [N], which is computed from the posture and the payload; the amounts by
-which the machine was adjusted otherwise than it is at last, shape (n_adjustments,), [m]; the
-commanded coordinates of the drives, shape (n_drives,), [m, rad], for placements that change along
-the travel; the same in the reference posture of the setup, which replace them where a gauge is
-mounted."""
+"""Condition of a reading.
+
+- approach: direction of each drive's last motion, shape (n_drives,): 1 if its coordinate grew, -1
+  if it fell, 0 if unknown
+- temperature: [°C]
+- time: time since the first reading of the setup, [s]
+- load: axial force of each rod under the weight on the tool, tension positive, shape (n_rods,),
+  [N]; computed from the posture and the payload
+- adjustment: differences of the adjustments from their last amounts, shape (n_adjustments,), [m]
+- coordinates: commanded coordinates of the drives, shape (n_drives,), [m, rad], for placements that
+  change along the travel
+- reference: commanded coordinates in the reference posture of the setup, which replace
+  `coordinates` for the mounting of a gauge
+"""
 
 NEUTRAL: dict[Condition, float] = {
     "approach": 0.0,
@@ -47,13 +56,13 @@ NEUTRAL: dict[Condition, float] = {
     "coordinates": 0.0,
     "reference": 0.0,
 }
-"""Value of a condition that is not stated. The temperature is that of ISO 1. Without a load a
-machine is weightless, as in the controller's nominal kinematics. Coordinates that are not stated
-are those of the command."""
+"""Value of a condition that is not stated. The temperature is that of ISO 1. Without a load the
+machine has no weight, as in the nominal kinematics of the controller. Coordinates that are not
+stated are those of the command."""
 
 
 def condition_size(robot: Robot, name: Condition) -> int:
-    """Numbers of a condition."""
+    """Count of the numbers that state a condition."""
     sizes = {
         "approach": len(robot.drives),
         "load": len(robot.rods),
@@ -71,43 +80,43 @@ class EffectKeys(BaseModel):
 
 
 class Effect:
-    """A systematic effect; those methods that do not apply are inherited.
+    """Systematic effect. A subclass overrides the methods that describe how it acts.
 
-    In expressions `errors` maps the names of the effect's parameters, and `conditions` those of the
-    conditions that it needs.
+    In these methods `errors` maps the names of the effect's parameters to expressions, and
+    `conditions` the names of the conditions that it needs.
     """
 
     name: ClassVar[str]
     """Key under `orthocal.effects`."""
     keys: ClassVar[type[EffectKeys]] = EffectKeys
     conditions: ClassVar[tuple[Condition, ...]] = ()
-    """Conditions of a reading that its expressions depend on."""
+    """Conditions of a reading on which its expressions depend."""
 
     errors: tuple[ElementaryError, ...] = ()
-    """Parameters of the machine, 0 for the nominal machine, with their tolerances. Those that are
-    `complete` are identified with every model."""
+    """Parameters of the machine with their priors, 0 for the nominal machine. Every model
+    identifies the `complete` ones."""
     setup_errors: tuple[ElementaryError, ...] = ()
-    """Parameters of each setup; the name of the setup comes before theirs."""
+    """Parameters of each setup, whose names are prefixed with that of the setup."""
     period: float | None = None
-    """Travel of a drive after which its errors repeat, [m]: readings at multiples of it show none
-    of their variation."""
+    """Travel of a drive after which its errors repeat, [m]. Readings at multiples of the period
+    cannot determine them."""
 
     @classmethod
     def from_keys(cls, keys: Any, robot: Robot) -> Self:  # noqa: ANN401 - an instance of `keys`
-        """The effect of a robot.
+        """Build the effect for a robot.
 
         Args:
             keys: Validated keys.
             robot: The robot, without error parameters.
 
         Raises:
-            OrthocalError: If a key does not fit the robot; its `where` is the key.
+            OrthocalError: If a key does not fit the robot; names the key as `where`.
         """
         raise NotImplementedError
 
     @property
     def neutral(self) -> Mapping[Condition, float]:
-        """Values of conditions that are not stated, where they are others than in NEUTRAL."""
+        """Values of conditions that are not stated, if they differ from NEUTRAL."""
         return {}
 
     def describe(self) -> str:
@@ -118,10 +127,10 @@ class Effect:
         """Actual drive coordinates.
 
         Args:
-            coordinates: Commanded coordinates, shape (n_drives,), [m, rad], after those effects
-                that the robot's YAML names later. Gain and offset of the drives act last.
-            errors: The effect's parameters.
-            conditions: The conditions that it needs.
+            coordinates: Commanded coordinates, shape (n_drives,), [m, rad], changed by the effects
+                that follow in the order of a machine. Gain and offset of the drives act last.
+            errors: Parameters of the effect.
+            conditions: Conditions that the effect needs.
 
         Returns:
             Shape (n_drives,), [m, rad].
@@ -131,23 +140,23 @@ class Effect:
     def placements(self, errors: Symbols, conditions: Symbols) -> Mapping[Placement, ca.SX]:
         """Twists δ of placements, shape (6,) each, [m, rad]; effects on one placement add up.
 
-        A placement that changes along the travel of a drive, such as that of a slide whose guide is
-        not straight, depends on the condition `coordinates`.
+        A placement that changes along the travel of a drive depends on the condition `coordinates`.
+        An example is a slide on a guide that is not straight.
         """
         return {}
 
     def rods(self, errors: Symbols, conditions: Symbols) -> Mapping[tuple[str, str], ca.SX]:
-        """Leg and rod to the change of the rod's length, [m]; effects on one rod add up."""
+        """Changes of the lengths of rods by leg and rod, [m]; effects on one rod add up."""
         return {}
 
     def tool_force(self, payload: float) -> Array:
         """Force on the tool centre point, from which the condition `load` is computed.
 
         Args:
-            payload: Mass on the tool beside the platform, [kg].
+            payload: Mass on the tool in addition to the platform, [kg].
 
         Returns:
-            In the world, shape (3,), [N]; forces of several effects add up.
+            Force in the world frame, shape (3,), [N]; forces of several effects add up.
         """
         return np.zeros(3)
 
@@ -155,11 +164,17 @@ class Effect:
         """Reading of the gauge.
 
         Args:
-            reading: Reading after the preceding effects, [m]; that of the sensor for the first.
-            errors: The effect's parameters of the setup (`setup_errors`).
-            conditions: The conditions that it needs.
+            reading: Reading of the sensor with the preceding effects, [m].
+            errors: Parameters of the effect for the setup (`setup_errors`).
+            conditions: Conditions that the effect needs.
 
         Returns:
-            [m].
+            Reading with this effect, [m].
         """
         return reading
+
+
+def add_twist(twists: dict[Placement, ca.SX], placement: Placement, twist: ca.SX) -> None:
+    """Add a twist of a placement, shape (6,), [m, rad], to those of all placements."""
+    present = twists.get(placement)
+    twists[placement] = twist if present is None else present + twist

@@ -1,7 +1,7 @@
 """Effects that a robot's YAML may name: built in, registered, or from installed packages.
 
-A package offers an effect by an entry point of the group `orthocal.effects`. Its name is that of
-the effect, and its object is the class:
+A package offers an effect by an entry point of the group `orthocal.effects`, with the name of the
+effect and its class:
 
     [project.entry-points."orthocal.effects"]
     backlash = "my_package.backlash:Backlash"
@@ -25,13 +25,14 @@ GROUP = "orthocal.effects"
 
 
 def _read_effect(name: str, offered: type[Effect]) -> type[Effect]:
+    """Require that an offered class is an effect of the name of its entry point."""
     if not issubclass(offered, Effect) or offered.name != name:
         raise TypeError(f"{offered.__qualname__} is not an Effect with name = '{name}'")
     return offered
 
 
 BUILT_IN: tuple[type[Effect], ...] = (Backlash, Thermal, Screw, Drift, Compliance)
-"""In the order in which a machine lists its effects; those on drives act in the reverse order."""
+"""Built-in effects in the order of a machine; effects on drives act in the reverse order."""
 
 _EFFECTS = Registry[type[Effect]](
     GROUP, "effect", _read_effect, {effect.name: effect for effect in BUILT_IN}
@@ -39,12 +40,12 @@ _EFFECTS = Registry[type[Effect]](
 
 
 def register_effect(effect: type[Effect]) -> None:
-    """Register an effect; it replaces one of the same name."""
+    """Register an effect; it replaces an effect of the same name."""
     _EFFECTS.register(effect.name, effect)
 
 
 def unregister_effect(name: str) -> None:
-    """Forget a registered effect."""
+    """Remove a registered effect."""
     _EFFECTS.unregister(name)
 
 
@@ -54,11 +55,11 @@ def effect_names() -> tuple[str, ...]:
 
 
 def order_effects(names: Iterable[str]) -> tuple[str, ...]:
-    """Names of effects once each: those of orthocal in their order, then others as stated."""
+    """Names of effects without repetition: built-in ones in their order, then the others."""
     order = {effect.name: i for i, effect in enumerate(BUILT_IN)}
     return tuple(sorted(dict.fromkeys(names), key=lambda name: order.get(name, len(order))))
 
 
 def find_effect(name: str, *, where: str, error: type[OrthocalError]) -> type[Effect]:
-    """The effect of a name; arguments and errors as for `Registry.find`."""
+    """Class of the effect of a name (see `Registry.find`)."""
     return _EFFECTS.find(name, where=where, error=error)

@@ -1,12 +1,12 @@
-"""Axial forces of the rods, from the statics of the closed loops with the drives held.
+"""Axial forces of the rods, from the statics of the closed loops with locked drives.
 
 A rod that becomes longer by dℓ moves the tool centre point by ∂p/∂ℓ dℓ. By virtual work on the
-nominal machine a force f on the tool centre point causes the tension
+nominal machine, a force f on the tool centre point causes the tension
 
-    F = f · ∂p/∂ℓ
+    F = f · ∂p/∂ℓ = f · p_ℓ − λ · g_ℓ,  g_qᵀ λ = p_qᵀ f
 
-With the tool's and the closures' Jacobians by Pinocchio, the forces λ that close the loops balance
-f at the passive joints, g_qᵀ λ = p_qᵀ f, so that F = f · p_ℓ − λ · g_ℓ.
+with the Jacobians of the tool p and of the closures g from Pinocchio. The closing forces λ balance
+f at the passive joints q.
 """
 
 from __future__ import annotations
@@ -20,20 +20,22 @@ import pinocchio as pin
 from orthocal.arrays import Array
 from orthocal.effects.protocol import Placement
 from orthocal.effects.rods import stretch_rod
+from orthocal.robot.closing import RANK_TOLERANCE
 from orthocal.robot.frames import carriers
 from orthocal.robot.model import Robot, require_tcp
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Displacement:
-    """Displacement of a placement by the unit change of a rod's length."""
+    """Displacement of a placement per unit change of a rod's length."""
 
     placement: Placement
     direction: Array
-    """In the axes of the placement, shape (3,)."""
+    """Displacement in the axes of the placement, shape (3,)."""
     moves_tool: bool
+    """True if the placement carries the tool."""
     moves_closures: tuple[int, ...]
-    """1 for each closure whose frame b moves, less 1 if frame a moves."""
+    """For each closure 1 if frame b moves, minus 1 if frame a moves."""
 
 
 class RodForces:
@@ -47,7 +49,7 @@ class RodForces:
         self.robot, model = robot, robot.model
         self._tool = robot.frame_id(require_tcp(robot).frame)
         pairs = [(robot.frame_id(c.frame_a), robot.frame_id(c.frame_b)) for c in robot.closures]
-        # a displacement counts in the axes of frame a for points, of frame b for poses
+        # residuals are in the axes of frame a for points, of frame b for poses
         self._axes = [
             a if c.kind == "3d" else b for c, (a, b) in zip(robot.closures, pairs, strict=True)
         ]
@@ -63,59 +65,60 @@ class RodForces:
                     tuple(int(b) - int(a) for a, b in moves),
                 )
                 self._displacements.append((i, displacement))
-        places = dict.fromkeys(d.placement for _, d in self._displacements)
-        self._place = {placement: i for i, placement in enumerate(places)}
+        placements = dict.fromkeys(d.placement for _, d in self._displacements)
+        self._index = {placement: i for i, placement in enumerate(placements)}
 
     def __call__(self, coordinates: Array) -> Array:
-        """Axial forces by unit forces on the tool centre point, ∂p/∂ℓ, tension positive.
+        """Axial forces ∂p/∂ℓ per unit force on the tool centre point, tension positive.
 
         Args:
             coordinates: Joint coordinates with closed loops, shape (K, nv), [m, rad].
 
         Returns:
-            By x, y and z in the world, shape (K, n_rods, 3), rods in the order of `Robot.rods`.
+            Shape (K, n_rods, 3), for forces along x, y and z of the world. Rods are in the order of
+            `Robot.rods`.
         """
         data = self.robot.model.createData()
         states = [self._evaluate(q, data) for q in coordinates]
         by_joints, by_tool, axes, placements = (np.array(v) for v in zip(*states, strict=True))
         passive = self.robot.passive_index
-        closed, tool = (np.swapaxes(v[:, :, passive], 1, 2) for v in (by_joints, by_tool))
-        if closed.shape[1] == closed.shape[2]:
-            closing = np.linalg.solve(closed, tool)
+        g_q, p_q = (np.swapaxes(v[:, :, passive], 1, 2) for v in (by_joints, by_tool))
+        if g_q.shape[1] == g_q.shape[2]:
+            multipliers = np.linalg.solve(g_q, p_q)
         else:
-            closing = np.linalg.pinv(closed, rcond=1e-10) @ tool
-        along = self._closing_forces(closing, axes)
+            multipliers = np.linalg.pinv(g_q, rcond=RANK_TOLERANCE) @ p_q
+        closing_forces = self._closing_forces(multipliers, axes)
         result = np.zeros((len(coordinates), len(self._rods), 3))
         for i, d in self._displacements:
-            moved = placements[:, self._place[d.placement]] @ d.direction
-            balance = np.tile(np.eye(3) * d.moves_tool, (len(coordinates), 1, 1))
-            balance -= np.tensordot(np.array(d.moves_closures), along, axes=(0, 1))
-            result[:, i] += np.einsum("kij,ki->kj", balance, moved)
+            direction = placements[:, self._index[d.placement]] @ d.direction
+            forces = np.tile(np.eye(3) * d.moves_tool, (len(coordinates), 1, 1))
+            forces -= np.tensordot(np.array(d.moves_closures), closing_forces, axes=(0, 1))
+            result[:, i] += np.einsum("kij,ki->kj", forces, direction)
         return result
 
     def _evaluate(self, coordinates: Array, data: pin.Data) -> tuple[Array, ...]:
-        """∂g and ∂p by the joints, rotations of the closures' axes and of the placements."""
+        """∂g/∂q, ∂p/∂q, and the world rotations of the axes of closures and of the placements."""
         robot, model = self.robot, self.robot.model
         _, by_joints = robot.evaluate_constraints_at(coordinates, data=data)
         pin.updateFramePlacements(model, data)
         world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         by_tool = pin.getFrameJacobian(model, data, self._tool, world)[:3]
         axes = np.array([data.oMf[frame].rotation for frame in self._axes]).reshape(-1, 3, 3)
-        placements = [self._rotation(placement, data) for placement in self._place]
+        placements = [self._rotation(placement, data) for placement in self._index]
         return by_joints, by_tool, axes, np.array(placements).reshape(-1, 3, 3)
 
-    def _closing_forces(self, closing: Array, axes: Array) -> Array:
-        """Forces that close the loops, in the world, by unit forces, (K, n_closures, 3, 3)."""
-        result, first = np.zeros((len(closing), len(self._axes), 3, 3)), 0
+    def _closing_forces(self, multipliers: Array, axes: Array) -> Array:
+        """Closing forces in the world per unit force on the tool, (K, n_closures, 3, 3)."""
+        result, first = np.zeros((len(multipliers), len(self._axes), 3, 3)), 0
         for i, closure in enumerate(self.robot.closures):
-            forces = np.zeros((len(closing), 6, 3))
-            forces[:, list(closure.rows)] = closing[:, first : first + len(closure.rows)]
+            forces = np.zeros((len(multipliers), 6, 3))
+            forces[:, list(closure.rows)] = multipliers[:, first : first + len(closure.rows)]
             result[:, i] = axes[:, i] @ forces[:, :3]
             first += len(closure.rows)
         return result
 
     def _rotation(self, placement: Placement, data: pin.Data) -> Array:
-        """Axes of a placement in the world, before the motion of its joint, shape (3, 3)."""
+        """World rotation of a placement before the motion of its joint, shape (3, 3)."""
         if placement.of_frame:
             return np.asarray(data.oMf[placement.index].rotation)
         model, joint = self.robot.model, placement.index

@@ -1,8 +1,8 @@
-"""Rods whose lengths change: twists of the placements that they carry."""
+"""Changes of the lengths of rods, as twists of the placements that the rods carry."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
@@ -11,17 +11,20 @@ import pinocchio as pin
 from orthocal.robot.frames import Placement, carriers, parent_frame
 from orthocal.robot.model import Robot, Rod
 
-SAME_PLACE = 1e-6
-"""Distance of two places along a rod that count as one, as a share of the rod's length."""
+SAME_POSITION = 1e-6
+"""Largest distance between equal positions along a rod, as a fraction of its length."""
 
 
 def stretch_rod(robot: Robot, rod: Rod, change: ca.SX) -> dict[Placement, ca.SX]:
-    """Twists of the placements on a rod whose length changes, uniformly along its axis.
+    """Twists of the placements on a rod whose length changes uniformly along its axis.
 
     Args:
         robot: The nominal robot.
         rod: One of its rods.
         change: Change of the length, [m].
+
+    Returns:
+        Placements, mapped to twists, shape (6,), [m, rad].
     """
     model = robot.model
     data = model.createData()
@@ -29,22 +32,23 @@ def stretch_rod(robot: Robot, rod: Rod, change: ca.SX) -> dict[Placement, ca.SX]
     root, tip = (data.oMf[robot.frame_id(f)].translation for f in (rod.root, rod.tip))
     axis = (tip - root) / rod.length
 
-    def share(position: np.ndarray) -> float:
+    def fraction(position: np.ndarray) -> float:
         return float(axis @ (position - root)) / rod.length
 
-    body = _body_of(robot, rod, {i: share(data.oMi[i].translation) for i in range(model.njoints)})
+    fractions = [fraction(data.oMi[i].translation) for i in range(model.njoints)]
+    body = _body_of(robot, rod, fractions)
     twists: dict[Placement, ca.SX] = {}
 
     def move(placement: Placement, pose: pin.SE3, carrier: pin.SE3) -> None:
-        part = share(pose.translation) - share(carrier.translation)
-        if abs(part) > SAME_PLACE:
-            local = pose.rotation.T @ axis * part
-            local[np.abs(local) < SAME_PLACE] = 0.0
+        stretched = fraction(pose.translation) - fraction(carrier.translation)
+        if abs(stretched) > SAME_POSITION:
+            local = pose.rotation.T @ axis * stretched
+            local[np.abs(local) < SAME_POSITION] = 0.0
             twists[placement] = ca.vertcat(ca.sparsify(ca.SX(local)) * change, ca.SX(3, 1))
 
     for joint in range(1, model.njoints):
         if int(model.parents[joint]) == body:
-            # before its motion, in which placements act
+            # pose before the motion of the joint, in which placements act
             pose = data.oMi[body] * model.jointPlacements[joint]
             move(Placement(joint, False), pose, data.oMi[body])
     for frame in sorted(_used_frames(robot)):
@@ -55,11 +59,17 @@ def stretch_rod(robot: Robot, rod: Rod, change: ca.SX) -> dict[Placement, ca.SX]
     return twists
 
 
-def _body_of(robot: Robot, rod: Rod, share: Mapping[int, float]) -> int:
-    """Joint that moves the link of a rod: the last one before its tip."""
+def _body_of(robot: Robot, rod: Rod, fractions: Sequence[float]) -> int:
+    """Joint that moves the link of a rod: the last joint before the tip.
+
+    Args:
+        robot: The nominal robot.
+        rod: One of its rods.
+        fractions: Position of each joint along the rod, from 0 at the root to 1 at the tip.
+    """
     model = robot.model
     first, joint = (int(model.frames[robot.frame_id(f)].parentJoint) for f in (rod.root, rod.tip))
-    while joint != first and joint > 0 and share[joint] > 1.0 - SAME_PLACE:
+    while joint != first and joint > 0 and fractions[joint] > 1.0 - SAME_POSITION:
         joint = int(model.parents[joint])
     return joint
 

@@ -1,9 +1,9 @@
-"""Periodic error of each drive's screw, once a turn.
+"""Periodic error of each drive's screw, with one period per turn.
 
     actual coordinate = ρ + A sin(2πρ/lead) + B cos(2πρ/lead)
 
-with the commanded coordinate ρ. It excludes the offset of the controller, so that the phase belongs
-to the screw and its home switch.
+with the commanded coordinate ρ. ρ excludes the offset in the controller: the phase depends only on
+the screw and its home switch.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from orthocal.robot.model import Robot
 from orthocal.robot.parameters import ElementaryError
 from orthocal.units import MM, read_limit
 
-KINDS = ("screw_sin", "screw_cos")
-"""Suffixes of the parameters of a drive: A and B."""
+SCREW_COMPONENTS = ("screw_sin", "screw_cos")
+"""Suffixes of the parameters A and B of a drive."""
 
 
 class ScrewKeys(EffectKeys):
@@ -43,13 +43,13 @@ class Screw(Effect):
 
     robot: Robot
     lead: float
-    """[m]."""
+    """Travel per turn, [m]."""
     errors: tuple[ElementaryError, ...]
-    """`<drive>.screw_sin` and `<drive>.screw_cos` of each linear drive, [m]."""
+    """A and B of each linear drive, `<drive>.screw_sin` and `<drive>.screw_cos`, [m]."""
 
     @classmethod
     def from_keys(cls, keys: ScrewKeys, robot: Robot) -> Self:
-        """The effect of a robot; arguments as for `Effect.from_keys`."""
+        """Build the effect for a robot (see `Effect.from_keys`)."""
         std = read_limit(keys.periodic_tolerance_mm) * MM
         linear = [d for d in robot.drives if d.unit == "m"]
         if not linear:
@@ -65,13 +65,13 @@ class Screw(Effect):
         errors = (
             ElementaryError(f"{d.name}.{kind}", cls.name, d.name, "m", std, complete=True)
             for d in linear
-            for kind in KINDS
+            for kind in SCREW_COMPONENTS
         )
         return cls(robot, keys.lead_mm * MM, tuple(errors))
 
     @property
     def period(self) -> float:  # type: ignore[override]
-        """The lead, [m]."""
+        """Lead of the screws, [m]."""
         return self.lead
 
     def describe(self) -> str:
@@ -79,10 +79,10 @@ class Screw(Effect):
         return "periodic error of the screws"
 
     def drives(self, coordinates: ca.SX, errors: Symbols, conditions: Symbols) -> ca.SX:
-        """Actual drive coordinates; arguments as for `Effect.drives`."""
+        """Actual drive coordinates (see `Effect.drives`)."""
         phase = 2.0 * np.pi * coordinates / self.lead
         sine, cosine = (
             ca.vertcat(*(errors.get(f"{d.name}.{kind}", ca.SX(1, 1)) for d in self.robot.drives))
-            for kind in KINDS
+            for kind in SCREW_COMPONENTS
         )
         return coordinates + sine * ca.sin(phase) + cosine * ca.cos(phase)

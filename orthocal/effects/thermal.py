@@ -1,12 +1,12 @@
 """Thermal expansion of legs and screws.
 
-    length of a rod   L (1 + α_legs (T − T0))
-    drive really at   ρ + α_screws (T − T0) (ρ − ρ_fixed)
+    length of a rod     L (1 + α_legs (T − T0))
+    actual coordinate   ρ + α_screws (T − T0) (ρ − ρ_fixed)
 
-Both coefficients are stated, with tolerances; the parameters are their deviations from the stated
-values. A screw expands from the coordinate ρ_fixed at which it is held: by default that of the
+Both coefficients are stated with a tolerance; the parameters are the deviations from the stated
+values. A screw expands from the coordinate ρ_fixed of its fixed bearing. By default this is the
 point nearest to all drive axes, where they meet on an Orthoglide. A base that expands about this
-point with the screws changes only the scale of the machine.
+point together with the screws changes only the scale of the machine.
 """
 
 from __future__ import annotations
@@ -28,20 +28,22 @@ from orthocal.robot.parameters import ElementaryError
 from orthocal.units import MM, PPM, read_limit
 
 PARALLEL = 1e-6
-"""Smallest eigenvalue over the largest below which drive axes have no common point."""
+"""Ratio of smallest to largest eigenvalue below which drive axes are parallel."""
 
 
 class ThermalKeys(EffectKeys):
     """Keys under `orthocal.effects.thermal`; the defaults are for steel."""
 
     reference_C: Annotated[Number, Field(ge=-50.0, le=100.0)] = 20.0
-    """Temperature at which the nominal dimensions hold."""
+    """Temperature of the nominal dimensions."""
     legs_ppm: Annotated[Number, Field(ge=-10.0, le=100.0)] = 11.5
+    """Coefficient of expansion of the rods, per kelvin."""
     screws_ppm: Annotated[Number, Field(ge=-10.0, le=100.0)] = 11.5
-    """Coefficients of expansion, per kelvin."""
+    """Coefficient of expansion of the screws, per kelvin."""
     tolerance_ppm: PositiveNumber = 3.0
+    """Tolerance of both coefficients, per kelvin."""
     fixed_mm: dict[Name, Number] = Field(default_factory=dict)
-    """Drive to the coordinate at which its screw is held."""
+    """Names of drives, mapped to the coordinate of the fixed bearing of their screw."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,17 +56,17 @@ class Thermal(Effect):
 
     robot: Robot
     reference: float
-    """[°C]."""
+    """Temperature T0 of the nominal dimensions, [°C]."""
     expansion: Mapping[str, float]
     """Stated coefficients of `legs` and `screws`, [1/K]."""
     fixed: tuple[float | None, ...]
-    """Coordinate at which the screw of each drive is held, [m]; None for a revolute drive."""
+    """Coordinate of the fixed bearing of each drive's screw, [m]; None for a revolute drive."""
     errors: tuple[ElementaryError, ...]
-    """`legs.expansion` and `screws.expansion`: deviations from the stated ones, [1/K]."""
+    """Deviations of `legs.expansion` and `screws.expansion` from the stated values, [1/K]."""
 
     @classmethod
     def from_keys(cls, keys: ThermalKeys, robot: Robot) -> Self:
-        """The effect of a robot; arguments as for `Effect.from_keys`."""
+        """Build the effect for a robot (see `Effect.from_keys`)."""
         stated = {"legs": keys.legs_ppm * PPM, "screws": keys.screws_ppm * PPM}
         std = read_limit(keys.tolerance_ppm) * PPM
         errors = (
@@ -75,7 +77,7 @@ class Thermal(Effect):
 
     @property
     def neutral(self) -> Mapping[Condition, float]:
-        """A reading without a temperature counts as one at the reference temperature."""
+        """Reference temperature for readings without a temperature."""
         return {"temperature": self.reference}
 
     def describe(self) -> str:
@@ -83,25 +85,25 @@ class Thermal(Effect):
         return "thermal expansion of legs and screws"
 
     def _growth(self, part: str, errors: Symbols, conditions: Symbols) -> ca.SX:
-        """Relative expansion of a part."""
+        """Relative expansion of `legs` or `screws`."""
         coefficient = self.expansion[part] + errors[f"{part}.expansion"]
         return coefficient * (conditions["temperature"] - self.reference)
 
     def drives(self, coordinates: ca.SX, errors: Symbols, conditions: Symbols) -> ca.SX:
-        """Actual drive coordinates; arguments as for `Effect.drives`."""
+        """Actual drive coordinates (see `Effect.drives`)."""
         lengths = ca.vertcat(
             *(0.0 if f is None else coordinates[i] - f for i, f in enumerate(self.fixed))
         )
         return coordinates + self._growth("screws", errors, conditions) * lengths
 
     def rods(self, errors: Symbols, conditions: Symbols) -> Mapping[tuple[str, str], ca.SX]:
-        """Changes of the lengths of rods; arguments as for `Effect.rods`."""
+        """Changes of the lengths of rods (see `Effect.rods`)."""
         growth = self._growth("legs", errors, conditions)
         return {name: growth * rod.length for name, rod in self.robot.rods.items()}
 
 
 def _fixed_points(keys: ThermalKeys, robot: Robot) -> tuple[float | None, ...]:
-    """Coordinate at which each screw is held, [m]; None for a revolute drive."""
+    """Coordinate of the fixed bearing of each screw, [m]; None for a revolute drive."""
     linear = [d.name for d in robot.drives if d.unit == "m"]
     for name in keys.fixed_mm:
         if name not in linear:
@@ -119,22 +121,22 @@ def _common_point(robot: Robot, drives: list[str]) -> dict[str, float]:
     """Commanded coordinate of each linear drive at the point nearest to all their axes, [m].
 
     Raises:
-        RobotError: If the axes are parallel: no point is nearest.
+        RobotError: If the axes are parallel, so that no point is nearest.
     """
     model, data = robot.model, robot.model.createData()
     pin.framesForwardKinematics(model, data, pin.neutral(model))
     joints = [model.getJointId(name) for name in drives]
-    places = np.array([data.oMi[j].translation for j in joints])
+    origins = np.array([data.oMi[j].translation for j in joints])
     axes = np.array([data.oMi[j].rotation @ joint_axis(model, j)[:3] for j in joints])
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    total = across.sum(axis=0)
-    spread = np.linalg.eigvalsh(total)
-    if spread[0] < PARALLEL * spread[-1]:
+    projections = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # normal to each axis
+    normal = projections.sum(axis=0)
+    eigenvalues = np.linalg.eigvalsh(normal)
+    if eigenvalues[0] < PARALLEL * eigenvalues[-1]:
         raise RobotError(
-            "the drive axes do not meet; state the coordinate at which each screw is held",
+            "the drive axes are parallel; state the coordinate of the fixed bearing of each screw",
             where="fixed_mm",
         )
-    point = np.linalg.solve(total, np.einsum("kij,kj->i", across, places))
+    point = np.linalg.solve(normal, np.einsum("kij,kj->i", projections, origins))
     gain = dict(zip((d.name for d in robot.drives), robot.drive_gain, strict=True))
-    along = ((point - places) * axes).sum(axis=1)
+    along = ((point - origins) * axes).sum(axis=1)
     return {name: float(x / gain[name]) for name, x in zip(drives, along, strict=True)}

@@ -1,4 +1,4 @@
-"""Choice of the free parameters by the user; numbers carry their unit in their key."""
+"""Choice of the free parameters by the user, with units in the keys of numbers."""
 
 from __future__ import annotations
 
@@ -26,23 +26,24 @@ from orthocal.units import read_limit
 class Choice:
     """Free errors of the machine, their priors, known values and bounds.
 
-    Keys of numbers end with the unit, as on the command line: {"x_leg.length_mm": 0.12}; the units
-    are _mm, _um, _m, _mrad, _deg, _rad and _ppm.
+    Keys of numbers end with the unit, as on the command line: {"x_leg.length_mm": 0.12}. The
+    suffixes are _mm, _um, _m, _mrad, _deg, _rad and _ppm.
 
     Args:
-        model: A model of the robot's YAML: `offsets`, `lengths`, `full` or another; by default
-            the one that the session states, otherwise the complete model.
-        free: Names or globs added to the model; without a model, the complete list. '!' excludes.
+        model: A model of the robot's YAML: `offsets`, `lengths`, `full` or another. By default
+            that of the session, otherwise the complete model.
+        free: Names or globs added to the model, or all free errors if no model is stated. '!'
+            excludes.
         prior: Use priors; by default True, unless only offsets are free.
-        known: Name with its unit to a known value, which is then fixed, or to a value and its
-            tolerance, a limit of ±2 prior standard deviations, which then act as prior.
-        tolerances: Name or glob with its unit to another tolerance than that of the session or the
-            robot, a limit of ±2 prior standard deviations, wherever tolerances are used.
-        bounds: Name or glob with its unit to lowest and highest value, ±inf for open.
-        base: Identify base parameters without priors: of each indistinguishable combination one
-            parameter remains free and represents the combination.
-        effects: Effects beside geometry, such as `backlash`, which are identified with any model;
-            by default those that the session states, otherwise those of the robot's YAML.
+        known: Names with unit, mapped to a known value, which is fixed, or to a value and its
+            tolerance (±2 prior standard deviations), which become the prior.
+        tolerances: Names or globs with unit, mapped to tolerances (±2 prior standard deviations)
+            that replace those of the session or robot for all purposes.
+        bounds: Names or globs with unit, mapped to lowest and highest value, ±inf for open.
+        base: Identify base parameters without priors. One parameter of each indistinguishable
+            combination remains free and represents the combination.
+        effects: Effects in addition to geometry, such as `backlash`, which any model identifies. By
+            default those of the session, otherwise those of the robot's YAML.
 
     Raises:
         TypeError: If an argument has a wrong type.
@@ -70,20 +71,21 @@ class Choice:
             raise TypeError(f"prior: found a {kind}; expected True, False or None")
         if not isinstance(self.base, bool):
             raise TypeError(f"base: found a {type(self.base).__name__}; expected True or False")
-        # JSON and YAML have lists
+        # JSON and YAML have lists instead of tuples
         known = {k: tuple(v) if isinstance(v, list) else v for k, v in self.known.items()}
         object.__setattr__(self, "known", known)
 
     @property
     def document(self) -> dict[str, Any]:
-        """Plain data of the choice."""
+        """Choice as plain data."""
         return asdict(self)
 
     def applied_to(self, session: Session) -> Session:
         """Session whose robot has the chosen effects and tolerances.
 
         Raises:
-            ParameterError, RobotError: As `Session.with_effects` and `Session.with_tolerances`.
+            ParameterError: If an effect or a tolerance is not valid.
+            RobotError: If an effect needs keys that the robot's YAML lacks.
         """
         if self.effects is not None:
             session = session.with_effects(self.effects)
@@ -92,7 +94,7 @@ class Choice:
     def select(
         self, parameters: ParameterSet, *, tolerance_scale: ToleranceScale = AS_STATED
     ) -> Selection:
-        """The free parameters among those of a robot, in SI.
+        """Select the free parameters of a robot, in SI.
 
         Args:
             parameters: Parameters of the robot.
@@ -103,11 +105,12 @@ class Choice:
                 value, tolerance or bound is invalid, or a tolerance has no effect.
         """
         parameters = parameters.with_tolerances(self.tolerances)
-        as_prior = [key for key, value in self.known.items() if isinstance(value, tuple)]
-        if self.base and (self.prior or as_prior):
+        with_tolerance = [key for key, value in self.known.items() if isinstance(value, tuple)]
+        if self.base and (self.prior or with_tolerance):
+            listed = ", ".join(with_tolerance)
             raise ParameterError(
                 "base parameters are identified without any prior"
-                + (f"; give {', '.join(as_prior)} as known without ±" if as_prior else "")
+                + (f"; state {listed} as known without ±" if listed else "")
             )
         selection = select_parameters(
             parameters,
@@ -130,7 +133,7 @@ def resolve_choice(
     Args:
         choice: A choice, or the name of a model.
         session: The measured session, or several joined ones.
-        default_model: The model if nothing is stated; by default the complete one.
+        default_model: Model if neither states one; the complete model by default.
 
     Raises:
         ParameterError: If nothing is chosen and the sessions state different models.
@@ -143,10 +146,11 @@ def resolve_choice(
     sessions = () if session is None else session.parts or (session,)
     purposes = {s.purpose: s for s in sessions if s.purpose is not None}
     if len(purposes) > 1:
-        said = "; ".join(
+        models = "; ".join(
             f"{label_choice(p.model, p.free)} in {s.path or s.title}" for p, s in purposes.items()
         )
-        raise ParameterError(f"sessions are for different models: {said}; say which", where="model")
+        problem = f"sessions are for different models: {models}; choose one"
+        raise ParameterError(problem, where="model")
     if default_model is None and session is not None:
         default_model = complete_model(session.robot.parameters)
     purpose = next(iter(purposes), Purpose(default_model))
@@ -156,7 +160,7 @@ def resolve_choice(
 def _require_used(
     tolerances: Mapping[str, float], parameters: ParameterSet, selection: Selection
 ) -> None:
-    """Refuse tolerances of sums that are not free: their terms have tolerances of their own."""
+    """Refuse tolerances of sums that are not free: only the tolerances of their terms are used."""
     used = {*selection.names, *parameters.elementary}
     for key in tolerances:
         glob, _ = parameters.read_glob(key)
@@ -167,13 +171,13 @@ def _require_used(
 def _known_in_si(
     known: Mapping[str, KnownWithTolerance], parameters: ParameterSet
 ) -> dict[str, KnownWithStd]:
-    """Name to known value, or to (value, prior standard deviation), [SI]."""
+    """Known values, or (value, prior standard deviation), by name, [SI]."""
     result: dict[str, KnownWithStd] = {}
     for key, value in known.items():
         with errors_at("known"):
             name, factor = parameters.read_quantity(key, 1.0)
         if name in result:
-            raise ParameterError(f"'{name}' is given twice", where="known")
+            raise ParameterError(f"'{name}' is stated twice", where="known")
         if isinstance(value, tuple):
             result[name] = (value[0] * factor, read_limit(value[1]) * factor)
         else:
@@ -184,12 +188,12 @@ def _known_in_si(
 def _bounds_in_si(
     bounds: Mapping[str, tuple[float, float]], parameters: ParameterSet
 ) -> dict[str, tuple[float, float]]:
-    """Name or glob to (lowest, highest value), [SI]."""
+    """Lowest and highest values by name or glob, [SI]."""
     result: dict[str, tuple[float, float]] = {}
     for key, (low, high) in bounds.items():
         with errors_at("bounds"):
             glob, factor = parameters.read_glob(key)
             if glob in result:
-                raise ParameterError(f"'{glob}' is given twice")
+                raise ParameterError(f"'{glob}' is stated twice")
         result[glob] = (low * factor, high * factor)
     return result

@@ -28,21 +28,21 @@ from orthocal.estimation.weighting import (
 )
 from orthocal.statistics.information import (
     Information,
+    assume_others_known,
     decompose,
     marginalise,
     require_identifiable,
-    take_for_known,
 )
 from orthocal.statistics.noise import Noise, estimate_noise, estimate_repeatability
 from orthocal.statistics.zeros import project_out_zeros
 
-SIGMA_SETTLED = 0.03
-"""Relative change of sigma below which no further solution is needed: with a prior it changes no
-parameter by more than a twentieth of its standard deviation."""
+SIGMA_TOLERANCE = 0.03
+"""Relative change of sigma at which it has converged: with a prior it changes no parameter by more
+than a twentieth of its standard deviation."""
 
 MAX_SIGMA_ROUNDS = 8
-"""Largest number of solutions until sigma and the noise ratios settle. The last solution is
-returned if they do not, such as where sigma alternates between cycles and residuals."""
+"""Largest number of solutions until sigma and the noise ratios converge. The last solution is
+returned if they do not, as when sigma alternates between cycles and residuals."""
 
 SMALL_DOF = 20.0
 """Residual degrees of freedom below which the initial sigma does not come from residuals."""
@@ -54,10 +54,11 @@ Nonlinearity alone remains below."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A solved problem."""
+    """Solved problem."""
 
     problem: CalibrationProblem
     program: Program
+    """Program that solved it."""
     seconds_build: float
     """Time to build the functions and the program, [s]."""
     seconds_solve: float
@@ -65,21 +66,23 @@ class Fit:
     iterations: int
     """Iterations of the solver in all solutions."""
     linearisation: LinearProblem
-    """The problem to first order about the active offsets of the controller."""
+    """Problem linearised about the active offsets of the controller."""
     linearised_theta: Array
     """Linearised solution, shape (n_free,), [SI]."""
     solution: Solution
+    """Exact solution."""
     noise: Noise
+    """Noise of a reading."""
     prediction: Array
     """h at the solution, gauge zeros at 0, shape (n_entries,), [m of the first gauge]."""
     jacobian: Array
     """dh/dθ̂ at the solution, shape (n_entries, n_free), [m of the first gauge per prior std]."""
     information: Information
-    """Information of that Jacobian."""
+    """Information of the Jacobian."""
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of a reading of the first gauge, [m]; assumed if it is unknown."""
+        """Standard deviation of a reading of the first gauge, [m]; the initial one if unknown."""
         if math.isfinite(self.noise.sigma):
             return floored_sigma(self.noise)
         return initial_sigma(self.problem.session.gauge, (math.nan, 0))
@@ -91,7 +94,7 @@ class Fit:
 
     @property
     def residual(self) -> Array:
-        """Readings less predictions and gauge zeros, shape (n_entries,), [m of the first gauge]."""
+        """Readings minus predictions and zeros, shape (n_entries,), [m of the first gauge]."""
         return _residual(self.program, self.solution, self.prediction)
 
     @property
@@ -101,7 +104,7 @@ class Fit:
 
     @property
     def machine_information(self) -> Information:
-        """Information about the machine, nuisance parameters marginalised over their priors."""
+        """Information about the machine, with nuisance parameters marginalised."""
         return marginalise(self.information, self.problem.n_machine, sigma=self.sigma)
 
     @property
@@ -117,9 +120,9 @@ class Fit:
         return self.problem.selection.held_at_bound(self.solution.at_bound)
 
     def covariance(self, *, noise: float | None = None) -> Array:
-        """Covariance of the free parameters by noise and priors, (n_free, n_free), [SI].
+        """Covariance of the free parameters by noise and priors, shape (n_free, n_free), [SI].
 
-        NaN where nothing determines the noise.
+        It is NaN if nothing determines the noise.
 
         Args:
             noise: Standard deviation of a reading, [m of the first gauge]; by default `sigma`, with
@@ -132,7 +135,7 @@ class Fit:
         return self._to_si(self.information.noise_covariance, noise)
 
     def _to_si(self, compute: Callable[..., Array], noise: float | None) -> Array:
-        """Covariance from `compute`, which returns that of θ̂, shape (n_free, n_free), [SI]."""
+        """Covariance of the free parameters, (n_free, n_free), [SI], from that of θ̂."""
         scale = np.outer(self.problem.theta_scale, self.problem.theta_scale)
         if not math.isfinite(self.noise.sigma):
             return np.full_like(scale, np.nan)
@@ -152,9 +155,9 @@ class Fit:
 
     @property
     def mounting_covariance(self) -> Array:
-        """Part of the covariance by mounting errors, shape (n_machine, n_machine), [SI].
+        """Part of the covariance due to mounting errors, shape (n_machine, n_machine), [SI].
 
-        Computed with squares, also for a robust loss; see `find_mounting_covariance`.
+        It is that of squares even for a robust loss (see `find_mounting_covariance`).
         """
         return find_mounting_covariance(
             self.problem, self.information, sigma=self.sigma, at_bound=self.at_bound
@@ -168,14 +171,14 @@ def fit_problem(
     start: ArrayLike | None = None,
     program: Program | None = None,
 ) -> Fit:
-    """Solve a problem exactly, with sigma from the readings if they determine it.
+    """Solve a problem, with sigma from the readings if they determine it.
 
     Args:
         problem: The problem.
         options: Choice and options of the solver.
-        start: Free parameters to start from, shape (n_free,), [SI]; with it no other start is
+        start: Start values of the free parameters, shape (n_free,), [SI]; the only start that is
             tried. By default the linearised solution, then the active offsets.
-        program: Program of the same problem with other readings; it replaces `options`.
+        program: Program of the same problem with other readings, instead of `options`.
 
     Raises:
         NotIdentifiableError: If neither readings nor a prior determine a parameter.
@@ -193,8 +196,8 @@ def fit_problem(
     require_determined(problem, linear.information)
     program = build_program(problem, options) if program is None else program.with_problem(problem)
     built = time.perf_counter()
-    solved = _solve_until_settled(program, linear, groups, start)
-    program, linear, noise = solved.program, solved.linear, solved.at.noise
+    solved = _solve_until_converged(program, linear, groups, start)
+    program, linear, noise = solved.program, solved.linear, solved.evaluation.noise
     require_assembly(program.problem, solved.solution, options=program.options)
     sigma = floored_sigma(noise)
     return Fit(
@@ -207,53 +210,54 @@ def fit_problem(
         linearised_theta=linear.solve(sigma=sigma if math.isfinite(sigma) else solved.sigma),
         solution=solved.solution,
         noise=noise,
-        prediction=solved.at.prediction,
-        jacobian=solved.at.jacobian,
-        information=solved.at.information,
+        prediction=solved.evaluation.prediction,
+        jacobian=solved.evaluation.jacobian,
+        information=solved.evaluation.information,
     )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Solved:
-    """Solution of a program whose sigma and ratios of noise agree with its residuals."""
+class _ConvergedSolution:
+    """Solution whose sigma and noise ratios agree with its residuals."""
 
     program: Program
     linear: LinearProblem
     solution: Solution
-    at: _Evaluation
+    evaluation: _Evaluation
     sigma: float
-    """Sigma of the last solve, [m]."""
+    """Sigma with which the last solution was computed, [m]."""
     iterations: int
-    """Iterations of all solves."""
+    """Iterations of all solutions."""
 
 
-def _solve_until_settled(
+def _solve_until_converged(
     program: Program,
     linear: LinearProblem,
     groups: Sequence[GaugeReadings],
     start: ArrayLike | None,
-) -> _Solved:
-    """Solve again until sigma and the ratios of the gauges' noise agree with the residuals."""
+) -> _ConvergedSolution:
+    """Solve until sigma and the noise ratios of the gauges agree with the residuals."""
     problem = program.problem
     repeatability = estimate_repeatability(problem.values, problem.observations)
     solution, sigma = _solve_first(program, linear, repeatability, start)
     iterations = solution.iterations
     for remaining in reversed(range(MAX_SIGMA_ROUNDS)):
-        at = _evaluate(program, solution, sigma, repeatability)
-        ratio = _estimate_noise_ratio(problem, groups, at, sigma)
-        balanced = bool(np.abs(ratio / problem.noise_ratio - 1.0).max() < SIGMA_SETTLED)
-        settled = not _depends_on_sigma(program) or _settled(floored_sigma(at.noise), sigma)
-        if (balanced and settled) or not remaining:
+        evaluation = _evaluate(program, solution, sigma, repeatability)
+        estimated = floored_sigma(evaluation.noise)
+        ratio = _estimate_noise_ratio(problem, groups, evaluation, sigma)
+        ratio_agrees = bool(np.abs(ratio / problem.noise_ratio - 1.0).max() < SIGMA_TOLERANCE)
+        sigma_agrees = not _depends_on_sigma(program) or _sigma_agrees(estimated, sigma)
+        if (ratio_agrees and sigma_agrees) or not remaining:
             break
-        if not settled:  # first: the ratios depend on it
-            sigma = floored_sigma(at.noise)
+        if not sigma_agrees:  # sigma first, because the ratios depend on it
+            sigma = estimated
         else:
             problem = problem.with_noise_ratio(ratio)
             program, linear = program.with_problem(problem), linearise_problem(problem)
         start_theta, start_passive = solution.theta, solution.passive
         solution = program.solve(sigma=sigma, start=start_theta, start_passive=start_passive)
         iterations += solution.iterations
-    return _Solved(program, linear, solution, at, sigma, iterations)
+    return _ConvergedSolution(program, linear, solution, evaluation, sigma, iterations)
 
 
 def _solve_first(
@@ -262,26 +266,29 @@ def _solve_first(
     repeatability: tuple[float, int],
     start: ArrayLike | None,
 ) -> tuple[Solution, float]:
-    """First solution and its sigma, [m]; without a start, others are tried if it fails."""
+    """First solution and its sigma, [m].
+
+    Without a start, the linearised solutions are tried, then the active offsets.
+    """
     sigma, residual_sigma = _linearised_sigma(program, linear, repeatability)
     if start is not None:
         return program.solve(sigma=sigma, start=np.asarray(start)), sigma
     sigmas = [sigma]
     if residual_sigma > sigma:  # unmodelled errors may be too large for the initial sigma
         sigmas.append(residual_sigma)
-    for each in sigmas:
+    for trial in sigmas:
         try:
-            return program.solve(sigma=each, start=linear.solve(sigma=each)), each
+            return program.solve(sigma=trial, start=linear.solve(sigma=trial)), trial
         except ClosureError:  # the linearised machine cannot reach a posture
             break
-        except SolverError:  # or shows no reading
+        except SolverError:
             continue
     return program.solve(sigma=sigma), sigma
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Evaluation:
-    """A solution with its predictions; quantities as in `Fit`."""
+    """Predictions, residuals and noise of a solution; quantities are those of `Fit`."""
 
     prediction: Array
     jacobian: Array
@@ -305,19 +312,22 @@ def _evaluate(
 
 
 def _estimate_noise_ratio(
-    problem: CalibrationProblem, groups: Sequence[GaugeReadings], at: _Evaluation, sigma: float
+    problem: CalibrationProblem,
+    groups: Sequence[GaugeReadings],
+    evaluation: _Evaluation,
+    sigma: float,
 ) -> Array:
     """Noise of each entry relative to the first gauge, from the residuals, (n_entries,)."""
     if len(groups) < 2:
         return problem.noise_ratio
-    covariance = at.information.covariance(
-        sigma=sigma, precision=problem.prior_precision, at_bound=at.at_bound
+    covariance = evaluation.information.covariance(
+        sigma=sigma, precision=problem.prior_precision, at_bound=evaluation.at_bound
     )
     std = estimate_gauge_sigmas(
         groups,
         problem.observations,
-        residual=at.residual * problem.noise_ratio,
-        leverage=leverages(at.jacobian, problem.observations, covariance, sigma),
+        residual=evaluation.residual * problem.noise_ratio,
+        leverage=leverages(evaluation.jacobian, problem.observations, covariance, sigma),
         values=problem.values * problem.noise_ratio,
         sigma=sigma * problem.noise_ratio,
     )
@@ -332,15 +342,15 @@ def floored_sigma(noise: Noise) -> float:
 def require_assembly(
     problem: CalibrationProblem, solution: Solution, *, options: SolverOptions
 ) -> None:
-    """Refuse a solution that cannot reach a posture: wrong readings can lead to impossible errors.
+    """Refuse a solution that cannot reach a posture, as wrong readings can cause.
 
     Args:
         problem: The problem.
-        solution: Its solution.
-        options: Options of its solver.
+        solution: Solution of the problem.
+        options: Options of the solver.
 
     Raises:
-        SolverError: Naming the posture that the machine cannot reach.
+        SolverError: If the machine cannot reach a posture; names it.
     """
     try:
         problem.close(solution.theta, start=solution.passive)
@@ -357,40 +367,40 @@ def _depends_on_sigma(program: Program) -> bool:
     return program.problem.has_prior or program.options.loss.robust
 
 
-def _settled(estimated: float, sigma: float) -> bool:
-    """True if an estimate of sigma agrees with the previous one, or is NaN: unknown."""
-    return not math.isfinite(estimated) or abs(estimated / sigma - 1.0) < SIGMA_SETTLED
+def _sigma_agrees(estimated: float, sigma: float) -> bool:
+    """True if an estimate of sigma agrees with the previous one, or is unknown (NaN)."""
+    return not math.isfinite(estimated) or abs(estimated / sigma - 1.0) < SIGMA_TOLERANCE
 
 
 def _linearised_sigma(
     program: Program, linearisation: LinearProblem, repeatability: tuple[float, int]
 ) -> tuple[float, float]:
-    """Sigma of the linearised problem, [m]: usually close enough for one exact solution.
+    """Sigma of the linearised problem, [m], which usually suffices for one exact solution.
 
-    With few residual degrees of freedom the initial sigma is kept, unless the residuals reject it:
-    an estimate from them would count nonlinearity as noise, which would allow larger residuals.
+    With few residual degrees of freedom a stated initial sigma is used, unless the residuals reject
+    it. An estimate from them would count nonlinearity as noise and allow larger residuals.
 
     Returns:
-        Sigma to start with, and sigma from the linearised residuals. They differ only if the
-        initial one was kept because of few degrees of freedom.
+        Sigma of the first solution, and sigma from the linearised residuals. They differ only if
+        the initial sigma is used because of few degrees of freedom.
     """
     problem = program.problem
     sigma = initial_sigma(problem.session.gauge, repeatability)
     initial = sigma
-    few_are_free = _residual_dof(problem, linearisation.information, sigma) < SMALL_DOF
-    keep_initial = problem.session.gauge.sigma is not None and few_are_free
+    small_dof = _residual_dof(problem, linearisation.information, sigma) < SMALL_DOF
+    use_initial = problem.session.gauge.sigma is not None and small_dof
     for i in range(MAX_SIGMA_ROUNDS if _depends_on_sigma(program) else 0):
         change = (linearisation.solve(sigma=sigma) - problem.active_theta) / problem.theta_scale
         residual = linearisation.residual - linearisation.jacobian @ change
         if i == 0:
             rejected = residual @ residual > residual.size * (MAX_LINEARISATION_RATIO * sigma) ** 2
-            keep_initial = keep_initial and not rejected
+            use_initial = use_initial and not rejected
         noise = _noise(program, residual, linearisation.information, sigma, repeatability)
         estimated = floored_sigma(noise)
-        if _settled(estimated, sigma):
+        if _sigma_agrees(estimated, sigma):
             break
         sigma = estimated
-    return (initial, sigma) if keep_initial else (sigma, sigma)
+    return (initial, sigma) if use_initial else (sigma, sigma)
 
 
 def _residual_dof(
@@ -399,7 +409,7 @@ def _residual_dof(
     sigma: float,
     at_bound: Mask | None = None,
 ) -> float:
-    """Readings less free zeros and effective parameters."""
+    """Number of readings minus free zeros and effective parameters."""
     o, precision = problem.observations, problem.prior_precision
     used = information.effective_parameters(sigma=sigma, precision=precision, at_bound=at_bound)
     return o.size - o.n_free_zeros - used
@@ -409,7 +419,7 @@ def require_determined(problem: CalibrationProblem, information: Information) ->
     """Refuse parameters that neither the readings nor a prior determine.
 
     Raises:
-        NotIdentifiableError: Naming them.
+        NotIdentifiableError: If there are such parameters; lists them.
     """
     session = problem.session
     where = session.readings_path or session.path
@@ -452,7 +462,7 @@ def _noise(
     problem, loss = program.problem, program.options.loss
     dof = _residual_dof(problem, information, sigma, at_bound)
     return estimate_noise(
-        # a wrong reading in repeated cycles would increase the noise of all
+        # a wrong reading in repeated cycles would increase the noise of all readings
         repeatability=(math.nan, 0) if loss.robust and dof > 1.0 else repeatability,
         residual_square=loss.robust_square(residual, dof=dof, start=sigma),
         residual_dof=dof,
@@ -462,19 +472,19 @@ def _noise(
 
 
 def build_program(problem: CalibrationProblem, options: SolverOptions | None = None) -> Program:
-    """A problem prepared for the chosen solver; Ipopt by default."""
-    chosen = options or SolverOptions()
-    if chosen.solver == "variable-projection":
+    """Program of a problem for the chosen solver; Ipopt by default."""
+    options = options or SolverOptions()
+    if options.solver == "variable-projection":
         from orthocal.estimation.solvers.variable_projection import VariableProjection
 
-        return VariableProjection(problem, options=chosen)
-    if chosen.solver == "linearised":
+        return VariableProjection(problem, options=options)
+    if options.solver == "linearised":
         from orthocal.estimation.solvers.linearised import LinearisedProgram
 
-        return LinearisedProgram(problem, options=chosen)
+        return LinearisedProgram(problem, options=options)
     from orthocal.estimation.solvers.ipopt import NonlinearProgram
 
-    return NonlinearProgram(problem, options=chosen)
+    return NonlinearProgram(problem, options=options)
 
 
 def find_mounting_covariance(
@@ -486,14 +496,14 @@ def find_mounting_covariance(
 ) -> Array:
     """Part of the covariance of the machine's parameters that is due to mounting errors.
 
-    The covariance less that with known nuisance parameters. Other setups have other mounting
-    errors, so this part is independent between sessions.
+    It is the covariance minus that for known nuisance parameters. Because setups have independent
+    mounting errors, this part is independent between sessions.
 
     Args:
         problem: The problem.
         information: Information about all its parameters.
         sigma: Standard deviation of a reading, [m].
-        at_bound: Mask of the parameters that a bound holds, shape (n_free,).
+        at_bound: Mask of the parameters at a bound, shape (n_free,).
 
     Returns:
         Shape (n_machine, n_machine), [SI].
@@ -501,7 +511,7 @@ def find_mounting_covariance(
     n, precision = problem.n_machine, problem.prior_precision
     at_bound = np.zeros(problem.n_free, dtype=np.bool_) if at_bound is None else at_bound
     total = information.covariance(sigma=sigma, precision=precision, at_bound=at_bound)
-    without_mounting = take_for_known(information, n).covariance(
+    without_mounting = assume_others_known(information, n).covariance(
         sigma=sigma, precision=precision[:n], at_bound=at_bound[:n]
     )
     scale = problem.theta_scale[:n]

@@ -1,7 +1,6 @@
-"""Linear identification: equation (8) of the paper, and the linearised solution of any problem.
+"""Linear identification: equation (8) of the paper, and linearised solutions of problems.
 
-The paper is Pashkevich, Chablat and Wenger, Kinematic calibration of Orthoglide-type mechanisms,
-2006.
+Paper: Pashkevich, Chablat and Wenger, Kinematic calibration of Orthoglide-type mechanisms, 2006.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ TWELVE_ROWS = tuple(
     for sign in "+-"
     for row in rows
 )
-"""Rows of equation (8): direction, leg, and sign.
+"""Rows of equation (8): direction, leg and sign.
 
-"+" is the posture of the maximum minus that at zero, "-" that of the minimum minus that at zero.
-The last block is (Δx_z, Δz_x).
+"+" is the reading in the maximum posture minus that in the zero posture, "-" the reading in the
+minimum posture minus that in the zero posture. The last block is (Δx_z, Δz_x).
 """
 
 SIX_ROWS = ("xy", "xz", "yx", "yz", "zx", "zy")
-"""Rows of the reduced system, maximum less minimum, in the order of the paper's Table 1."""
+"""Rows of the reduced system, maximum minus minimum, in the order of the paper's Table 1."""
 
 
 def leg_parallelism_matrix(
@@ -43,19 +42,19 @@ def leg_parallelism_matrix(
     rows: Literal[6, 12] = 12,
     fraction_from_tcp: float = 0.5,
 ) -> Array:
-    """Jacobian of differences of readings by the drive offsets, equation (8).
+    """Jacobian of differences of readings with respect to the drive offsets, equation (8).
 
         Δy_x = c Δρ_x + b Δρ_y,  b = sin α,  c = (1 − μ + sin α) tan α
 
-    With μ = 0.5 this is equation (7); a row of the reduced system is maximum less minimum.
+    With μ = 0.5 this is equation (7). A row of the reduced system is maximum minus minimum.
 
     Args:
         length: Leg length L, [m].
         displacement_max: Displacement of the tool in the maximum postures, [m].
         displacement_min: Displacement in the minimum postures, negative, [m].
-        rows: 12 for differences from the mechanical zero (order TWELVE_ROWS), 6 for maximum less
+        rows: 12 for differences from the mechanical zero (order TWELVE_ROWS), 6 for maximum minus
             minimum (order SIX_ROWS).
-        fraction_from_tcp: μ, where the gauge touches the leg in the mechanical zero: 0 at the
+        fraction_from_tcp: μ, position of the gauge along the leg in the mechanical zero: 0 at the
             tip, 1 at the root of the leg.
 
     Returns:
@@ -85,7 +84,7 @@ def leg_parallelism_matrix(
 def twelve_row_covariance() -> Array:
     """Covariance of the twelve differences for readings of variance 1, shape (12, 12).
 
-    Maximum and minimum differences of one setup share the zero reading: [[2, 1], [1, 2]].
+    Both differences of one setup share the reading in the zero posture: [[2, 1], [1, 2]].
     """
     same_setup = np.array([[a[:2] == b[:2] for b in TWELVE_ROWS] for a in TWELVE_ROWS])
     return same_setup.astype(np.float64) + np.eye(len(TWELVE_ROWS))
@@ -93,16 +92,16 @@ def twelve_row_covariance() -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearFit:
-    """A least-squares solution of equation (8)."""
+    """Least-squares solution of equation (8)."""
 
     offsets: Array
     """Δρ, shape (3,), [m]."""
     residuals: Array
     """y − A Δρ, shape (rows,), [m]."""
     cofactor: Array
-    """(Aᵀ V⁻¹ A)⁻¹, shape (3, 3), [1]: times `sigma`² it is the covariance of the offsets."""
+    """(Aᵀ V⁻¹ A)⁻¹, shape (3, 3), [1]; covariance of the offsets divided by `sigma`²."""
     sigma: float
-    """√(rᵀ V⁻¹ r/(rows − 3)), V = I for ordinary least squares, [m]; NaN for three rows."""
+    """√(rᵀ V⁻¹ r/dof), with V = I for ordinary least squares, [m]; NaN for dof = 0."""
     dof: int
     """Degrees of freedom: rows − 3."""
 
@@ -110,12 +109,13 @@ class LinearFit:
 def solve_equation_8(
     matrix: ArrayLike, differences: ArrayLike, *, covariance: ArrayLike | None = None
 ) -> LinearFit:
-    """Least squares of equation (8): generalised with the covariance of the rows, else ordinary.
+    """Solve equation (8) by generalised or ordinary least squares.
 
     Args:
-        matrix: From `leg_parallelism_matrix`, shape (rows, 3).
+        matrix: Result of `leg_parallelism_matrix`, shape (rows, 3).
         differences: Measured differences, shape (rows,), [m].
-        covariance: V, covariance of the rows up to a factor, shape (rows, rows).
+        covariance: V, covariance of the rows up to a factor, shape (rows, rows); ordinary least
+            squares by default.
 
     Raises:
         NotIdentifiableError: If the rows do not determine the three offsets.
@@ -146,7 +146,7 @@ def solve_equation_8(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearProblem:
-    """A problem to first order about the active offsets of the controller."""
+    """Problem linearised about the active offsets of the controller."""
 
     problem: CalibrationProblem
     residual: Array
@@ -155,14 +155,15 @@ class LinearProblem:
     """dh/dθ̂, gauge zeros eliminated, shape (n_entries, n_free), [m of the first gauge per prior
     std]."""
     information: Information
-    """Information of that Jacobian."""
+    """Information of the Jacobian."""
 
     def solve(self, *, sigma: float, use: Mask | None = None) -> Array:
-        """First-order solution: least squares with the problem's prior and bounds.
+        """First-order solution by least squares with the prior and bounds of the problem.
 
         Args:
             sigma: Standard deviation of one reading, [m]; used only with a prior.
-            use: Mask of the entries to use, shape (n_entries,): complete groups with a common zero.
+            use: Mask of the entries to use, shape (n_entries,); must contain all entries of a zero
+                or none. All by default.
 
         Returns:
             Free parameters, shape (n_free,), [SI].
@@ -170,15 +171,15 @@ class LinearProblem:
         problem = self.problem
         rows = slice(None) if use is None else use
         jacobian, residual = self.jacobian[rows], self.residual[rows]
-        if len(jacobian) > 2 * problem.n_free:  # the same normal equations from far fewer rows
-            stacked = np.asarray(np.linalg.qr(np.column_stack([jacobian, residual]), mode="r"))
-            jacobian, residual = stacked[:, :-1], stacked[:, -1]
+        if len(jacobian) > 2 * problem.n_free:  # R has the same normal equations in fewer rows
+            r = np.asarray(np.linalg.qr(np.column_stack([jacobian, residual]), mode="r"))
+            jacobian, residual = r[:, :-1], r[:, -1]
         reference = problem.active_theta / problem.theta_scale
         weight = np.sqrt(problem.prior_precision)
         if problem.has_prior:
-            expected = problem.prior_mean / problem.theta_scale
+            mean = problem.prior_mean / problem.theta_scale
             jacobian = np.vstack([jacobian / sigma, np.diag(weight)])
-            residual = np.concatenate([residual / sigma, weight * (expected - reference)])
+            residual = np.concatenate([residual / sigma, weight * (mean - reference)])
         selection = problem.selection
         lower, upper = selection.lower, selection.upper
         if np.isfinite(lower).any() or np.isfinite(upper).any():
@@ -211,10 +212,10 @@ def linearise_problem(problem: CalibrationProblem) -> LinearProblem:
 
 
 def require_finite(problem: CalibrationProblem, prediction: Array, jacobian: Array) -> None:
-    """Refuse predictions that are not finite, such as of a tip that does not touch its rod.
+    """Refuse predictions that are not finite, as for a tip that does not touch its rod.
 
     Raises:
-        SessionError: Naming setup and posture.
+        SessionError: If a prediction is not finite; names setup and posture.
     """
     bad = np.flatnonzero(~(np.isfinite(prediction) & np.isfinite(jacobian).all(axis=1)))
     if not bad.size:

@@ -6,7 +6,7 @@ Geometry, 2004, A6.8)
 
     ρ(r) = k² (√(1 + (r/k)²) − 1)
 
-which is r²/2 for small residuals and k |r| for large ones, so that the influence of a single wrong
+It is about r²/2 for small residuals and k |r| for large ones, so that the influence of a wrong
 reading is bounded.
 """
 
@@ -27,12 +27,12 @@ LossKind = Literal["squares", "huber"]
 Values = TypeVar("Values", Array, ca.SX)
 
 HUBER_WIDTH = 1.345
-"""k at which the estimate is about 95 % as efficient as by squares if all residuals are normal."""
+"""k for an efficiency of about 95 % relative to squares if all residuals are normal."""
 
-MOST_STEPS = 100
+MAX_CENTRE_STEPS = 100
 """Largest number of steps of a search for a centre."""
 
-SETTLED = 1e-11
+CENTRE_TOLERANCE = 1e-11
 """Last step of a search for a centre, [standard deviations]."""
 
 
@@ -60,46 +60,46 @@ class Loss:
         return self.kind == "huber"
 
     def value(self, r: Values, width: Values | None = None) -> Values:
-        """ρ(r) of residuals in standard deviations; arguments as for all functions of a residual.
+        """Cost ρ(r) of residuals. `influence`, `weight` and `curvature` have the same arguments.
 
         Args:
-            r: An array or an expression of any shape.
+            r: Residuals, array or expression of any shape, [standard deviations].
             width: k as an expression; `width` by default.
         """
         # not k² (√… − 1), which loses all digits of a small r
         return r**2 / (1.0 + self._root(r, width)) if self.robust else 0.5 * r**2
 
     def influence(self, r: Values, width: Values | None = None) -> Values:
-        """ρ'(r)."""
+        """Influence ρ'(r) of residuals."""
         return r / self._root(r, width) if self.robust else r
 
     def weight(self, r: Values, width: Values | None = None) -> Values:
-        """ρ'(r)/r, the weight of a squared residual, 1 at 0."""
+        """Weight ρ'(r)/r of squared residuals, 1 at 0."""
         return 1.0 / self._root(r, width) if self.robust else r**0
 
     def curvature(self, r: Values, width: Values | None = None) -> Values:
-        """ρ''(r), 1 at 0."""
+        """Curvature ρ''(r) of the cost, 1 at 0."""
         return self._root(r, width) ** -3 if self.robust else r**0
 
     def _root(self, r: Values, width: Values | None) -> Values:
-        """√(1 + (r/k)²)."""
+        """Root √(1 + (r/k)²) of the pseudo-Huber loss."""
         return (1.0 + (r / (self.width if width is None else width)) ** 2) ** 0.5
 
     def centres(self, values: Array, group: Indices, count: int, *, weights: Array) -> Array:
-        """Optimal centre of the values of each group: the mean for squares.
+        """Centre c of each group of values that minimises Σ w ρ(v − c); the mean for squares.
 
         Args:
-            values: In standard deviations, shape (n,).
+            values: Values v, shape (n,), [standard deviations].
             group: Index of the group of each value, shape (n,).
             count: Number of groups; none is empty.
-            weights: Weights of the values, shape (n,).
+            weights: Weights w of the values, shape (n,).
 
         Returns:
-            c with Σ w ρ(v − c) least, shape (count,).
+            Shape (count,), [standard deviations].
         """
 
-        def sums(each: Array) -> Array:
-            total = np.bincount(group, weights * each, minlength=count)
+        def sums(terms: Array) -> Array:
+            total = np.bincount(group, weights * terms, minlength=count)
             return np.asarray(total, dtype=np.float64)
 
         result = sums(values) / sums(np.ones_like(values))
@@ -109,14 +109,14 @@ class Loss:
         np.minimum.at(low, group, values)
         np.maximum.at(high, group, values)
         last_gradient = np.full(count, np.inf)
-        for _ in range(MOST_STEPS if self.robust else 0):
+        for _ in range(MAX_CENTRE_STEPS if self.robust else 0):
             residual = values - result[group]
             gradient = sums(self.influence(residual))
             low, high = (
                 np.where(gradient > 0.0, result, low),
                 np.where(gradient < 0.0, result, high),
             )
-            # Newton's step while the gradient decreases fast enough, otherwise bisection
+            # Newton step if the gradient decreases fast enough, otherwise bisection
             decreasing = np.abs(gradient) < 0.5 * last_gradient
             last_gradient = np.abs(gradient)
             newton = result + gradient / np.maximum(sums(self.curvature(residual)), 1e-300)
@@ -124,18 +124,18 @@ class Loss:
             trial = np.where(inside, newton, 0.5 * (low + high))
             trial = np.where(gradient == 0.0, result, trial)
             step, result = np.abs(trial - result).max(initial=0.0), trial
-            if step < SETTLED:
+            if step < CENTRE_TOLERANCE:
                 break
         return result
 
     def gain(self, r: Array, *, used: float) -> float:
-        """Mean of ρ''(r), the sensitivity of the estimate to the readings; 1 for squares.
+        """Sensitivity of the estimate to the readings: corrected mean of ρ''(r); 1 for squares.
 
-        Divided by Huber's correction for few residuals, 1 + (p/n) var ρ''/(mean ρ'')² (Robust
+        The correction for few residuals divides by 1 + (p/n) var ρ''/(mean ρ'')² (Huber, Robust
         Statistics, 1981, section 7.6).
 
         Args:
-            r: Residuals, [standard deviations], shape (n,).
+            r: Residuals, shape (n,), [standard deviations].
             used: p, number of fitted parameters and zeros.
         """
         if not self.robust or not r.size:
@@ -150,14 +150,14 @@ class Loss:
         return _normal_square(self.width) if self.robust else 1.0
 
     def robust_square(self, residual: Array, *, dof: float, start: float) -> float:
-        """Σ r² without the effect of outliers, [unit of r²].
+        """Σ r² without the effect of outliers: s² dof, [unit of r²].
 
-        The scale s with Σ ρ'(r/s)² = dof E ρ'(z)² (Huber's proposal 2), times dof.
+        s solves Σ ρ'(r/s)² = dof E ρ'(z)² (Huber's proposal 2). For squares it is Σ r².
 
         Args:
-            residual: Shape (n,).
+            residual: Residuals r, shape (n,).
             dof: Degrees of freedom of the residuals.
-            start: A first scale.
+            start: Start value of s, [unit of r].
         """
         if not self.robust or dof <= 0.0:
             return float(residual @ residual)
@@ -176,6 +176,7 @@ SQUARES = Loss()
 
 @lru_cache(maxsize=16)
 def _normal_square(width: float) -> float:
+    """Mean of ρ'(z)² for a standard normal z, by quadrature."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(120)
     values = nodes**2 / (1.0 + (nodes / width) ** 2)
     return float(weights @ values / weights.sum())

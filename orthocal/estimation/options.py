@@ -1,9 +1,9 @@
 """Choice and options of a solver.
 
-- `ipopt`: the complete nonlinear program, with passive coordinates and gauge zeros as variables;
-  the solver that the others are tested against.
+- `ipopt`: the complete nonlinear program, with passive coordinates and gauge zeros as variables. It
+  is the reference for the other solvers.
 - `variable-projection`: the same optimum by variable projection, for repetition and large sessions.
-- `linearised`: one step with readings to first order about the active offsets, as in the paper.
+- `linearised`: one step with readings linearised about the active offsets, as in the paper.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ Hessian = Literal["gauss-newton", "exact"]
 
 OptionValue = float | int | str | bool
 
-MOST_ITERATIONS = 10**6
-"""Largest `max_iterations`."""
+LARGEST_MAX_ITERATIONS = 10**6
+"""Largest value of `max_iterations`."""
 
-MOST_PRINTING = 12
-"""Largest `print_level` of Ipopt."""
+LARGEST_PRINT_LEVEL = 12
+"""Largest value of `print_level`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,19 +35,20 @@ class SolverOptions:
 
     Args:
         solver: `ipopt`, `variable-projection` or `linearised`.
-        hessian: Ipopt's Hessian of the Lagrangian: exact, or without the curvature of readings and
-            closures. If the latter does not converge, the exact one is tried, for sessions of up to
-            2000 readings.
-        tolerance: Ipopt's `tol`: largest optimality error, for parameters in prior standard
+        hessian: Hessian of the Lagrangian for Ipopt: `exact`, or `gauss-newton` without the
+            curvature of readings and closures. If the latter does not converge, the exact one is
+            tried, for sessions of up to 2000 readings.
+        tolerance: Largest optimality error (`tol` of Ipopt), for parameters in prior standard
             deviations. Multiplied by n/20 000 for n > 20 000 readings. Rounding errors of the
-            gradient are about 1e-7 for readings of 0.3 m known to 5 µm.
-        closure_tolerance: Ipopt's largest scaled closure residual: units of 1 mm.
-        max_iterations: Ipopt's `max_iter`; also of variable projection. Sets of readings that are
-            solved in a batch have at most 30 common iterations first.
-        print_level: Ipopt's own printing, 0 (none) to 12.
+            gradient are about 1e-7 for readings of 0.3 m with a noise of 5 µm.
+        closure_tolerance: Largest scaled closure residual in Ipopt, in units of 1 mm.
+        max_iterations: Largest number of iterations of Ipopt (`max_iter`) and of variable
+            projection. Sets of readings that are solved in a batch have up to 30 common iterations
+            before.
+        print_level: Output of Ipopt, 0 (none) to 12.
         loss: Loss function of standardised residuals.
-        ipopt: Further options of Ipopt, by its own names, such as {"mu_strategy": "adaptive"}; they
-            replace those that orthocal sets. Other solvers ignore them.
+        ipopt: Further options by their names in Ipopt, such as {"mu_strategy": "adaptive"}. They
+            replace those of orthocal. Other solvers ignore them.
 
     Raises:
         OrthocalError: If the solver is unknown.
@@ -70,10 +71,12 @@ class SolverOptions:
             value = getattr(self, name)
             if not (isinstance(value, int | float) and 0.0 < value < math.inf):
                 raise ValueError(f"{name} is {value!r}; expected a number above 0")
-        for name, most in (("max_iterations", MOST_ITERATIONS), ("print_level", MOST_PRINTING)):
+        limits = {"max_iterations": LARGEST_MAX_ITERATIONS, "print_level": LARGEST_PRINT_LEVEL}
+        for name, largest in limits.items():
             value = getattr(self, name)
-            if not (isinstance(value, int) and 0 <= value <= most):
-                raise ValueError(f"{name} is {value!r}; expected a whole number from 0 to {most}")
+            if not (isinstance(value, int) and 0 <= value <= largest):
+                problem = f"{name} is {value!r}; expected a whole number from 0 to {largest}"
+                raise ValueError(problem)
         if not isinstance(self.ipopt, Mapping):
             raise ValueError(f"ipopt is {self.ipopt!r}; expected names and values of options")
         for key, option in self.ipopt.items():
@@ -86,8 +89,8 @@ class SolverOptions:
 
 
 def _require_one_of(
-    value: object, names: tuple[str, ...], what: str, error: type[Exception]
+    value: object, names: tuple[str, ...], option: str, error: type[Exception]
 ) -> None:
-    """Check that an option has one of some names."""
+    """Require that the value of an option is one of some names."""
     if value not in names:
-        raise error(f"the {what} is {value!r}; expected one of {', '.join(names)}")
+        raise error(f"the {option} is {value!r}; expected one of {', '.join(names)}")

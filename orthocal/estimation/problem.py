@@ -1,10 +1,10 @@
-"""The calibration problem: free parameters with their priors, readings, and their prediction.
+"""Calibration problem: free parameters with their priors, readings, and their predictions.
 
     min over θ, z, q_1..q_K   Σ ρ((y − h(q_k, θ) − z)/σ) + ½ Σ ((θ − mean)/prior std)²
     s.t.                      g(q_k, θ) = 0 for every state k,  lower ≤ θ ≤ upper
 
-A state is a posture under one set of conditions. θ holds errors of the machine and nuisance
-parameters of the sensors; a known gauge zero z is 0.
+A state is a posture under one set of conditions. θ consists of errors of the machine and nuisance
+parameters of the sensors. Known gauge zeros z are 0.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ LENGTH_SCALE = 1e-3
 """Scale of closures, passive motions and gauge zeros, [m]."""
 
 ROW_RANK_TOLERANCE = 1e-8
-"""Singular value below which a row of the closures depends on others, [m per m or rad]."""
+"""Singular value below which closure rows are linearly dependent, [m per m or rad]."""
 
 
 class CalibrationProblem:
@@ -44,9 +44,9 @@ class CalibrationProblem:
 
     The free parameters are errors of the machine, then nuisance parameters of the sensors, as
     deviations from the manual alignment. An entry is a single reading; a difference has two.
-    Readings are divided by the ratio of their gauge's noise to that of the first gauge ("metres of
-    the first gauge"), so that all have equal standard deviations. With one gauge they are
-    in metres.
+    Readings are divided by the ratio of their gauge's noise to that of the first gauge, so that all
+    have equal standard deviations. Their unit is "metres of the first gauge": metres if there is
+    only one gauge.
 
     Args:
         session: The session, or several joined ones.
@@ -56,14 +56,15 @@ class CalibrationProblem:
 
     Attributes:
         session: The session.
-        robot: Its robot.
+        robot: Robot of the session.
         machine_selection: The argument `selection`.
         selection: `machine_selection` with the nuisance parameters appended.
         parameters: The free parameters of `selection`.
         states: Loop closures to solve.
-        passive_scale: One unit of each scaled passive coordinate, shape (n_passive,), [m, rad].
-        free: Names of the free parameters, which are the columns of the Jacobian.
-        fixed: Name to value of parameters that are known, [SI].
+        passive_scale: Value of one unit of each scaled passive coordinate, shape (n_passive,),
+            [m, rad].
+        free: Names of the free parameters, in the order of the Jacobian's columns.
+        fixed: Known values of parameters by name, [SI].
         observations: Setup, posture and zero of each entry.
         noise_ratio: The argument.
         theta_scale: Prior standard deviations of the free parameters, shape (n_free,), [SI].
@@ -72,7 +73,7 @@ class CalibrationProblem:
         prior_mean: Means of the priors, shape (n_free,), [SI].
 
     Raises:
-        RobotError: If closure rows of the robot depend on each other.
+        RobotError: If closure rows of the robot are linearly dependent.
     """
 
     def __init__(
@@ -96,12 +97,12 @@ class CalibrationProblem:
         self.passive_scale = LENGTH_SCALE / coordinate_units(self.robot)[self.robot.passive_index]
 
     def with_values(self, values: ArrayLike) -> CalibrationProblem:
-        """Problem for other readings of the same rows; it shares all functions.
+        """Problem with other readings of the same rows; it shares all functions.
 
         Args:
             values: Readings of the session's rows, shape (n_rows,), [m].
         """
-        _ = self.closure, self.model, self._free_parameters  # built here, not in every copy
+        _ = self.closure, self.model, self._free_parameters  # built once, not in every copy
         other = copy.copy(self)
         other.session = self.session.with_values(np.asarray(values, dtype=np.float64))
         other.__dict__.pop("values", None)
@@ -111,7 +112,8 @@ class CalibrationProblem:
         """Problem with other noise ratios; it shares all functions.
 
         Args:
-            noise_ratio: As for `CalibrationProblem`.
+            noise_ratio: Noise of each entry's gauge divided by that of the first gauge, shape
+                (n_entries,).
         """
         other = copy.copy(self)
         other.noise_ratio = noise_ratio
@@ -121,12 +123,12 @@ class CalibrationProblem:
 
     @property
     def n_machine(self) -> int:
-        """Number of free errors of the machine, which are the first free parameters."""
+        """Number of free errors of the machine, which come first among the free parameters."""
         return len(self.machine_selection.parameters)
 
     @property
     def n_free(self) -> int:
-        """Number of free parameters, nuisance parameters included."""
+        """Number of free parameters including nuisance parameters."""
         return len(self.free)
 
     @property
@@ -136,7 +138,7 @@ class CalibrationProblem:
 
     @property
     def n_states(self) -> int:
-        """Number of states: postures, or postures under different conditions."""
+        """Number of states: postures under different conditions."""
         return self.states.posture.size
 
     @cached_property
@@ -144,25 +146,26 @@ class CalibrationProblem:
         """Free parameters at the active offsets of the controller, shape (n_free,), [SI].
 
         All other parameters are 0. The values are clipped to the bounds. They are the point of
-        linearisation and the default start.
+        linearisation and the default start values.
         """
         return self._theta_at(self.session.active_offsets)
 
     def _theta_at(self, offsets: Array) -> Array:
         """Free parameters of the nominal machine with offsets, within their bounds, (n_free,)."""
         names = (f"{d.name}.offset" for d in self.robot.drives)
-        active = dict(zip(names, offsets, strict=True))
-        at = np.array([active.get(name, 0.0) for name in self.free])
-        return np.asarray(np.clip(at, self.selection.lower, self.selection.upper))
+        by_name = dict(zip(names, offsets, strict=True))
+        theta = np.array([by_name.get(name, 0.0) for name in self.free])
+        return np.asarray(np.clip(theta, self.selection.lower, self.selection.upper))
 
     def predict_nominal(self, deviations: Array) -> Array:
-        """Readings of the nominal machine, each with the offsets that were active when it was read.
+        """Readings of the nominal machine, each with the active offsets of its setup.
 
         A mounting that was estimated from wrong readings may miss the rod of the nominal machine.
-        The gauge of such a setup counts as exactly aligned.
+        The gauge of such a setup is then assumed to be exactly aligned.
 
         Args:
-            deviations: Deviations of the mounting of the gauges, shape (n_nuisance,), [SI].
+            deviations: Nuisance parameters as deviations from the manual alignment, shape
+                (n_nuisance,), [SI].
 
         Returns:
             Shape (n_entries,), [m of the first gauge]; NaN out of reach.
@@ -172,8 +175,8 @@ class CalibrationProblem:
         result = np.empty(self.observations.size)
         for offsets in np.unique(active, axis=0):
             theta = self._theta_at(offsets)
-            of_session = np.array_equal(theta, self.active_theta)
-            passive = self.active_passive if of_session else self.close(theta, failures={})
+            is_active = np.array_equal(theta, self.active_theta)
+            passive = self.active_passive if is_active else self.close(theta, failures={})
             rows = (active == offsets).all(axis=1)
             result[rows] = self.predict(np.append(theta[:n], deviations), passive)[rows]
             missed = rows & np.isin(setup, setup[rows & np.isnan(result)])
@@ -189,7 +192,7 @@ class CalibrationProblem:
 
     @cached_property
     def zero_incidence(self) -> Array:
-        """1 where an entry (row) has a zero (column), shape (n_entries, n_zeros)."""
+        """Incidence matrix of entries and gauge zeros, shape (n_entries, n_zeros)."""
         result = np.zeros((self.observations.size, self.observations.n_zeros))
         result[np.arange(self.observations.size), self.observations.zero] = 1.0
         return result
@@ -206,27 +209,29 @@ class CalibrationProblem:
         start: Array | None = None,
         failures: Failures | None = None,
     ) -> Array:
-        """Passive coordinates of every state, with its loops closed.
+        """Passive coordinates of every state with closed loops.
 
         Args:
-            theta: Shape (n_free,), or (S, n_free) for a batch, [SI]; n_machine values suffice.
-            start: Passive coordinates to start from; those at the active offsets by default.
+            theta: Free parameters, shape (n_free,) or (n_machine,), or with S in front for a batch,
+                [SI].
+            start: Start values of the passive coordinates; those at the active offsets by default.
             failures: Filled with the flat indices s · n_states + k of states that cannot be
-                reached, which are NaN then (see `LoopClosure.close`); by default the first of them
-                raises.
+                reached, whose results are NaN (see `LoopClosure.close`); by default the first of
+                them raises.
 
         Returns:
-            Shape (n_states, n_passive), with S in front for a batch, [m, rad].
+            Shape (n_states, n_passive), or (S, n_states, n_passive) for a batch, [m, rad].
 
         Raises:
             ClosureError: If a machine with these errors cannot reach a posture.
         """
-        begin = self._active_passive_or_none if start is None else start
-        return self._close(theta, begin, failures)
+        start = self._active_passive_or_none if start is None else start
+        return self._close(theta, start, failures)
 
     def _close(
         self, theta: ArrayLike, start: Array | None, failures: Failures | None = None
     ) -> Array:
+        """`close` from the reference posture by default."""
         return self.closure.close(
             self.states.commands,
             theta=self._of_machine(theta),
@@ -236,15 +241,15 @@ class CalibrationProblem:
         )
 
     def simulate(self, theta: Array) -> tuple[Array, Array, Mask]:
-        """Readings of a batch of machines.
+        """Simulate the exact readings of a batch of machines.
 
         Args:
-            theta: Shape (S, n_free), [SI].
+            theta: Free parameters, shape (S, n_free), [SI].
 
         Returns:
             Readings, shape (S, n_entries), [m of the first gauge]; passive coordinates, shape
             (S, n_states, n_passive); and a mask of the machines that reach every posture, shape
-            (S,). The others have NaN.
+            (S,). Results of the other machines contain NaN.
         """
         failures: Failures = {}
         passive = self.close(theta, start=self._first_order_passive(theta), failures=failures)
@@ -253,7 +258,7 @@ class CalibrationProblem:
         return self.predict(theta, passive), passive, reached
 
     def _first_order_passive(self, theta: Array) -> Array | None:
-        """Passive coordinates of a batch to first order, to start from; None if that fails."""
+        """Linearised passive coordinates of a batch, as start values; None if that fails."""
         if self._active_passive_or_none is None:
             return None
         try:
@@ -265,7 +270,7 @@ class CalibrationProblem:
 
     @cached_property
     def linearisation_at_active(self) -> ReadingLinearisation:
-        """Readings to first order about the active offsets."""
+        """Readings linearised about the active offsets."""
         return self.linearise(self.active_theta, self.active_passive)
 
     @cached_property
@@ -289,27 +294,28 @@ class CalibrationProblem:
         """Nuisance parameters: manual alignment plus deviations, shape (..., n_nuisance), [SI].
 
         Args:
-            theta: Shape (..., n_free), [SI]; or (..., n_machine), with deviations of 0.
+            theta: Free parameters, shape (..., n_free), [SI]; or (..., n_machine) for deviations of
+                0.
         """
         deviations = np.asarray(theta, dtype=np.float64)[..., self.n_machine :]
         aligned = self.model.alignment(self.elementary_errors(theta))
         return aligned + deviations if deviations.size else aligned
 
     def elementary_errors(self, theta: ArrayLike) -> Array:
-        """Elementary errors of the machine, shape (..., n_errors) of (..., n_free), [SI]."""
+        """Elementary errors, shape (..., n_errors), of free parameters, (..., n_free), [SI]."""
         return self.closure.errors(self._of_machine(theta))
 
     def predict(self, theta: ArrayLike, passive: Array | None = None) -> Array:
         """Predicted readings h(q(θ), θ) of all entries, gauge zeros at 0.
 
         Args:
-            theta: Shape (n_free,), or (S, n_free) for a batch, [SI]; with n_machine values the
-                nuisance parameters have their values of the manual alignment.
-            passive: Passive coordinates with closed loops at theta, with S in front for a batch;
-                solved here by default.
+            theta: Free parameters, shape (n_free,) or (S, n_free), [SI]. With n_machine values the
+                nuisance parameters are those of the manual alignment.
+            passive: Passive coordinates with closed loops at theta, shape (n_states, n_passive) or
+                (S, n_states, n_passive), [m, rad]; solved by default.
 
         Returns:
-            Shape (n_entries,), with S in front for a batch, [m of the first gauge].
+            Shape (n_entries,) or (S, n_entries), [m of the first gauge].
 
         Raises:
             ClosureError: If a machine with these errors cannot reach a posture.
@@ -327,19 +333,19 @@ class CalibrationProblem:
         *,
         units: Literal["prior_std", "SI"] = "prior_std",
     ) -> tuple[Array, Array]:
-        """Predicted readings and identification Jacobian, with closed loops.
+        """Predicted readings and identification Jacobian with closed loops.
 
         ∂q/∂θ = −g_q⁻¹ g_θ by the implicit function theorem, and J = h_θ − h_q g_q⁻¹ g_θ.
 
         Args:
-            theta: Shape (n_free,), or (S, n_free) for a batch, [SI].
-            passive: Passive coordinates with closed loops at theta; solved here by default.
+            theta: Free parameters, shape (n_free,) or (S, n_free), [SI].
+            passive: Passive coordinates with closed loops at theta; solved by default.
             units: Unit of the columns. "prior_std": dh/dθ̂ in metres per prior standard deviation
-                of the parameter, as the solvers use it. "SI": dh/dθ in metres per metre or radian.
+                of the parameter, for the solvers. "SI": dh/dθ in metres per SI unit.
 
         Returns:
             Readings, shape (n_entries,), [m of the first gauge], and Jacobian, shape (n_entries,
-            n_free), with S in front for a batch.
+            n_free); both with S in front for a batch.
 
         Raises:
             ClosureError: If a machine with these errors cannot reach a posture.
@@ -352,12 +358,13 @@ class CalibrationProblem:
     def linearise(
         self, theta: ArrayLike, passive: Array, *, free: FreeParameters | None = None
     ) -> ReadingLinearisation:
-        """Readings to first order about parameters and passive coordinates near closed loops.
+        """Linearise readings about parameters and passive coordinates near closed loops.
 
         Args:
-            theta: Shape (n_free,), or (S, n_free) for a batch, [SI].
-            passive: Shape (n_states, n_passive), with S in front for a batch, [m, rad].
-            free: Parameters by which to differentiate; the free ones by default.
+            theta: Free parameters, shape (n_free,) or (S, n_free), [SI].
+            passive: Passive coordinates, shape (n_states, n_passive) or (S, n_states, n_passive),
+                [m, rad].
+            free: Parameters of the derivatives; the free parameters by default.
 
         Raises:
             LinAlgError: If a posture is singular.
@@ -371,20 +378,22 @@ class CalibrationProblem:
         )
 
     def error_values(self, theta: ArrayLike) -> dict[str, float]:
-        """Name to value of the machine's error parameters, free and known, [SI]."""
+        """Values of the machine's free and known error parameters by name, [SI]."""
         names, values = self.machine_selection.names, self._of_machine(theta).tolist()
         return {**self.fixed, **dict(zip(names, values, strict=True))}
 
     def _of_machine(self, theta: ArrayLike) -> Array:
+        """Errors of the machine among the free parameters, shape (..., n_machine), [SI]."""
         return np.asarray(theta, dtype=np.float64)[..., : self.n_machine]
 
     def _nuisance_deviations(self, theta: ArrayLike) -> Array | None:
+        """Deviations of nuisance parameters among the free parameters; None without any."""
         deviations = np.asarray(theta, dtype=np.float64)[..., self.n_machine :]
         return deviations if deviations.size else None
 
     @cached_property
     def model(self) -> ObservationModel:
-        """The observation model of the session."""
+        """Observation model of the session."""
         return ObservationModel(self.session, self.observations)
 
     @property
@@ -394,6 +403,7 @@ class CalibrationProblem:
 
     @cached_property
     def _free_parameters(self) -> FreeParameters:
+        """Free parameters in the form of the observation model."""
         return self.model.parametrise(self.errors_per_theta, self.theta_scale[self.n_machine :])
 
     @cached_property
@@ -414,7 +424,7 @@ def build_problem(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     tolerance_scale: ToleranceScale = AS_STATED,
 ) -> CalibrationProblem:
-    """The problem of a model of the robot; arguments as for `select_parameters`."""
+    """Build the problem of a session; arguments are those of `select_parameters`."""
     selection = select_parameters(
         session.robot.parameters,
         model=model,
@@ -430,12 +440,12 @@ def build_problem(
 
 @cached_per_robot(maxsize=8)
 def _require_independent_rows(robot: Robot) -> None:
-    """Refuse closures with dependent rows.
+    """Refuse closures with linearly dependent rows.
 
-    They are redundant for the nominal machine and contradict each other for one with errors.
+    They are redundant for the nominal machine and contradict each other for a machine with errors.
 
     Raises:
-        RobotError: Naming the closures and the rows.
+        RobotError: If rows are dependent; names the closures and the rows.
     """
     passive = robot.reference_passive
     _, jacobian = robot.evaluate_constraints(robot.drive_zero, passive)
@@ -443,16 +453,15 @@ def _require_independent_rows(robot: Robot) -> None:
     rows = [(c.name, AXES[row]) for c in robot.closures for row in c.rows]
     independent = np.zeros((0, by_passive.shape[1]))
     dependent = []
-    for name, row in zip(rows, by_passive, strict=True):
+    for (closure, axis), row in zip(rows, by_passive, strict=True):
         trial = np.vstack([independent, row])
         if np.linalg.matrix_rank(trial, tol=ROW_RANK_TOLERANCE) == len(trial):
             independent = trial
         else:
-            dependent.append(name)
+            dependent.append(f"{axis} of {closure}")
     if dependent:
-        named = ", ".join(f"{row} of {closure}" for closure, row in dependent)
         raise RobotError(
-            f"closure rows depend on others: {named}; leave them out of "
+            f"closure rows depend on others: {', '.join(dependent)}; remove them from "
             "orthocal.closures.<name>.rows",
             where=str(robot.yaml),
         )

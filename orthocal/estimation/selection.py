@@ -36,8 +36,9 @@ def complete_model(parameters: ParameterSet) -> str:
     return max(parameters.models, key=lambda m: len(parameters.select_model(m)))
 
 
-LARGEST_KNOWN = 100.0
-"""Known value over tolerance above which it is a length or an angle instead of an error."""
+LARGEST_KNOWN_RATIO = 100.0
+"""Ratio of a known value to its prior standard deviation above which it is a length or an angle of
+the machine instead of an error."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +46,7 @@ class Selection:
     """Free parameters of a problem, with priors and bounds."""
 
     label: str
-    """Model and the patterns added to it."""
+    """Model and added patterns."""
     parameters: tuple[Parameter, ...]
     """Free parameters, with the priors of this selection."""
     prior: Mask
@@ -55,11 +56,11 @@ class Selection:
     lower: Array
     """Lower bounds, -inf for none, shape (n_free,), [SI]."""
     upper: Array
-    """Upper bounds, shape (n_free,), [SI]."""
+    """Upper bounds, inf for none, shape (n_free,), [SI]."""
     fixed: Mapping[str, float]
     """Known values of parameters that are not free, [SI]."""
     tolerance_scale: ToleranceScale = AS_STATED
-    """Factor on tolerances, which the priors contain."""
+    """Factor on tolerances, which the priors include."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -72,13 +73,14 @@ class Selection:
         return np.array([p.prior_std for p in self.parameters])
 
     def held_at_bound(self, at_bound: NDArray[np.int8]) -> Mask:
-        """Mask of the parameters whose value is that of a bound, shape (n_free,).
+        """Mask of the parameters that a bound determines, shape (n_free,).
 
-        A parameter that is never negative, such as backlash, may be 0 without being held: its
-        covariance remains that of the unbounded estimate.
+        A parameter that is never negative, such as backlash, does not count if it is 0: its
+        covariance is that of the unbounded estimate.
 
         Args:
-            at_bound: -1, 0 or 1 for each parameter at its lower, no or its upper bound.
+            at_bound: -1, 0 or 1 for each parameter at its lower, no or its upper bound, shape
+                (n_free,).
         """
         never_negative = np.array([p.positive for p in self.parameters]) & (self.lower == 0.0)
         return np.asarray((at_bound != 0) & ~((at_bound < 0) & never_negative))
@@ -96,7 +98,7 @@ class Selection:
         )
 
     def keep(self, names: Sequence[str]) -> Selection:
-        """Selection of some of the parameters, without priors; the others are 0."""
+        """Selection of some of the parameters without priors; the other parameters are 0."""
         index = [self.names.index(name) for name in names]
         return replace(
             self,
@@ -123,14 +125,15 @@ def select_parameters(
 
     Args:
         parameters: Parameters of the robot.
-        model: A model of the robot's YAML; the complete one if neither a model nor `free` is
-            given.
+        model: A model of the robot's YAML; by default the complete model, or none if `free` is
+            stated.
         free: Names or globs of further free parameters; '!' excludes.
         prior: Use priors; by default True, unless only offsets are free.
-        known: Name to a known value, which is then fixed, or to a value and its standard
-            deviation, which then act as prior of a free parameter, [SI].
-        prior_stds: Name or glob to another prior standard deviation than the robot's, [SI].
-        bounds: Name or glob to lowest and highest value, ±inf for open, [SI].
+        known: Names, mapped to a known value, which is fixed, or to a value and its standard
+            deviation, which become the prior of a free parameter, [SI].
+        prior_stds: Names or globs, mapped to prior standard deviations that replace those of the
+            robot, [SI].
+        bounds: Names or globs, mapped to lowest and highest value, ±inf for open, [SI].
         tolerance_scale: Factor on the tolerances of all errors of the geometry except offsets;
             standard deviations of `known` are not scaled.
 
@@ -154,13 +157,13 @@ def select_parameters(
     stds = _find_stds(parameters, names, prior_stds or {}, tolerance_scale)
     stds.update({n: s for n, (_, s) in priors.items()})
     lower, upper = _find_bounds(parameters, names, bounds or {})
-    priors_only = {*priors, *parameters.of_effects}
-    only_offsets = all(parameters.are_offsets(n) for n in names if n not in priors_only)
-    everywhere = not only_offsets if prior is None else prior
+    always_prior = {*priors, *parameters.of_effects}
+    only_offsets = all(parameters.are_offsets(n) for n in names if n not in always_prior)
+    use_priors = not only_offsets if prior is None else prior
     return Selection(
         label=label_choice(base, free),
         parameters=tuple(replace(parameters[n], prior_std=stds[n]) for n in names),
-        prior=np.array([everywhere or n in priors_only for n in names]),
+        prior=np.array([use_priors or n in always_prior for n in names]),
         mean=read_only([priors.get(n, (0.0, 0.0))[0] for n in names]),
         lower=read_only(lower),
         upper=read_only(upper),
@@ -196,10 +199,10 @@ def _split_known(
             parameter = parameters[name]
             _refuse_length(entry[0] if isinstance(entry, tuple) else entry, parameter)
             if isinstance(entry, tuple):
-                spread = require_prior_std(entry[1], parameters.defaults[name])
-                priors[name] = (_finite(entry[0], name), spread)
+                std = require_prior_std(entry[1], parameters.defaults[name])
+                priors[name] = (_require_finite(entry[0], name), std)
             else:
-                fixed[name] = _finite(entry, name)
+                fixed[name] = _require_finite(entry, name)
     return fixed, priors
 
 
@@ -222,36 +225,36 @@ def _find_bounds(
 def read_known(
     texts: Sequence[str], parameters: ParameterSet, *, where: str
 ) -> dict[str, KnownWithTolerance]:
-    """Known values from texts such as x_leg.length_mm=0.12 or x_leg.length_mm=0.12±0.02.
+    """Read known values from texts such as x_leg.length_mm=0.12 or x_leg.length_mm=0.12±0.02.
 
     Returns:
-        Key with its unit to a value, or to a value and its tolerance, as in `Choice`.
+        Keys with unit, mapped to a value, or to a value and its tolerance: `Choice.known`.
 
     Raises:
-        ParameterError: If a text does not fit.
+        ParameterError: If a text is not valid.
     """
     result: dict[str, KnownWithTolerance] = {}
     names: set[str] = set()
     for text in texts:
-        key, text_of_value = _split(text, "NAME=VALUE or NAME=VALUE±TOLERANCE", where)
-        value, sign, spread = text_of_value.replace("+/-", "±").replace("+-", "±").partition("±")
+        key, quantity = _split(text, "NAME=VALUE or NAME=VALUE±TOLERANCE", where)
+        value, sign, tolerance = quantity.replace("+/-", "±").replace("+-", "±").partition("±")
         number = _number(value, where, key)
         with errors_at(where):
             name, _ = parameters.read_quantity(key, number)
         if name in names:
-            raise ParameterError(f"'{name}' is given twice", where=where)
+            raise ParameterError(f"'{name}' is stated twice", where=where)
         names.add(name)
-        result[key] = (number, _number(spread, where, key)) if sign else number
+        result[key] = (number, _number(tolerance, where, key)) if sign else number
     return result
 
 
 def read_tolerances(
     texts: Sequence[str], parameters: ParameterSet, *, where: str
 ) -> dict[str, float]:
-    """Tolerances from texts such as *.offset_mm=2, as in `Choice`.
+    """Read tolerances from texts such as *.offset_mm=2, for `Choice.tolerances`.
 
     Raises:
-        ParameterError: If a text does not fit.
+        ParameterError: If a text is not valid.
     """
     result = {}
     for text in texts:
@@ -265,12 +268,12 @@ def read_tolerances(
 def read_bounds(
     texts: Sequence[str], parameters: ParameterSet, *, where: str
 ) -> dict[str, tuple[float, float]]:
-    """Bounds from texts such as x_slide.offset_mm=-2:2, as in `Choice`.
+    """Read bounds from texts such as x_slide.offset_mm=-2:2, for `Choice.bounds`.
 
-    Either side may be empty.
+    One side may be empty.
 
     Raises:
-        ParameterError: If a text does not fit.
+        ParameterError: If a text is not valid.
     """
     form = "NAME=LOWEST:HIGHEST"
     result = {}
@@ -299,6 +302,7 @@ def _split(text: str, form: str, where: str) -> tuple[str, str]:
 
 
 def _number(text: str, where: str, name: str) -> float:
+    """Number of a text such as KEY=VALUE."""
     return parse_number(text.strip(), where=where, name=name, error=ParameterError)
 
 
@@ -316,17 +320,17 @@ def _match_free(parameters: ParameterSet, glob: str, free: Sequence[str]) -> lis
 
 def _refuse_overlap(parameters: ParameterSet, names: Sequence[str]) -> None:
     """Refuse two parameters that contain the same elementary error."""
-    owner: dict[str, str] = {}
+    owners: dict[str, str] = {}
     for name in names:
         for term, _ in parameters[name].terms:
-            if term in owner:
-                larger = max(name, owner[term], key=lambda n: len(parameters[n].terms))
+            if term in owners:
+                larger = max(name, owners[term], key=lambda n: len(parameters[n].terms))
                 terms = ", ".join(t for t, _ in parameters[larger].terms)
                 raise ParameterError(
-                    f"'{owner[term]}' and '{name}' are partly the same error: {larger} is made of "
-                    f"{terms}; exclude one of them, such as '!{term}'"
+                    f"'{owners[term]}' and '{name}' are partly the same error: {larger} is the sum "
+                    f"of {terms}; exclude one of them, such as '!{term}'"
                 )
-            owner[term] = name
+            owners[term] = name
 
 
 def _lowest(parameter: Parameter) -> float:
@@ -335,13 +339,13 @@ def _lowest(parameter: Parameter) -> float:
 
 
 def label_choice(model: str | None, free: Sequence[str]) -> str:
-    """Model and the patterns added to it, as on the command line."""
+    """Label of a choice: model and added patterns, as on the command line."""
     return " ".join([*([] if model is None else [model]), *free])
 
 
 def _refuse_length(value: float, parameter: Parameter) -> None:
     """Refuse a known value that is a length or an angle of the machine instead of an error."""
-    if abs(value) > LARGEST_KNOWN * parameter.prior_std:
+    if abs(value) > LARGEST_KNOWN_RATIO * parameter.prior_std:
         factor, unit = parameter.edge_factor, parameter.edge_unit
         limit = show_limit(parameter.prior_std) * factor
         raise ParameterError(
@@ -350,7 +354,8 @@ def _refuse_length(value: float, parameter: Parameter) -> None:
         )
 
 
-def _finite(value: float, name: str) -> float:
+def _require_finite(value: float, name: str) -> float:
+    """Known value of a parameter, refused if it is not finite."""
     if not math.isfinite(value):
         raise ParameterError(f"the known value of '{name}' is {value}; expected a finite number")
     return float(value)

@@ -1,8 +1,7 @@
 """Scale of the tolerances: the factor by which the errors of a machine exceed them.
 
-One factor η, found from the readings (`assessment/judgement.py`), multiplies the prior standard
-deviations of all errors of the geometry except offsets: those that are estimated, and those that
-are not.
+One factor η multiplies the prior standard deviations of all errors of the geometry except offsets,
+whether they are estimated or not. It is estimated from the readings (`assessment/judgement.py`).
 """
 
 from __future__ import annotations
@@ -20,15 +19,15 @@ from orthocal.robot.parameters import ParameterSet
 
 @dataclass(frozen=True, slots=True)
 class ToleranceScale:
-    """Factor on the tolerances, and from how much it was estimated."""
+    """Factor on the tolerances, and the information from which it was estimated."""
 
     __pydantic_config__ = CLOSED
 
     factor: PositiveInSI = 1.0
-    """1 if the readings are possible within the tolerances."""
+    """Factor; 1 if errors within the tolerances explain the readings."""
     contrasts: SizeOrInf = math.inf
-    """Effective number of independent contrasts of the readings that determine it; infinite for a
-    factor of 1."""
+    """Effective number of independent contrasts of the readings that determine the factor; infinite
+    for a factor of 1."""
 
     def factors(self, parameters: ParameterSet, names: tuple[str, ...]) -> Array:
         """Factor on the prior standard deviation of each parameter, shape (n_names,)."""
@@ -36,4 +35,4 @@ class ToleranceScale:
 
 
 AS_STATED = ToleranceScale()
-"""Tolerances as stated."""
+"""Scale of unchanged tolerances."""

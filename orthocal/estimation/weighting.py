@@ -1,8 +1,8 @@
 """Noise ratios of the readings of several gauges.
 
-The noise of each gauge is estimated from its repeated cycles, otherwise from its residuals
-(variance components, Förstner, Ein Verfahren zur Schätzung von Varianz- und Kovarianzkomponenten,
-1979: squared residuals over the redundancy of the group). It is never below the stated noise.
+The noise of each gauge is estimated from its repeated cycles, otherwise from its residuals: squared
+residuals divided by the redundancy of the group (variance components; Förstner, Ein Verfahren zur
+Schätzung von Varianz- und Kovarianzkomponenten, 1979). It is never below the stated noise.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from orthocal.statistics.noise import estimate_noise, estimate_repeatability, no
 from orthocal.statistics.zeros import project_out_zeros
 
 DEFAULT_SIGMA = 10e-6
-"""Standard deviation of a reading assumed at first if none is stated, [m]."""
+"""Initial standard deviation of a reading if none is stated, [m]."""
 
 SMALLEST_SIGMA = 1e-9
-"""Standard deviation of a reading below which readings count as perfect, [m]."""
+"""Smallest standard deviation of a reading, [m]; below it readings count as perfect."""
 
-LEAST_DOF = 3.0
+MIN_DOF = 3.0
 """Degrees of freedom below which residuals do not determine the noise of a gauge."""
 
 
@@ -34,24 +34,31 @@ class GaugeReadings:
     """Entries of one gauge."""
 
     name: str
+    """Name of the gauge."""
     gauge: Gauge
+    """The gauge."""
     entries: Mask
-    """Mask of its entries, shape (n_entries,)."""
+    """Mask of the entries of the gauge, shape (n_entries,)."""
 
 
 def split_by_gauge(session: Session, observations: Observations) -> tuple[GaugeReadings, ...]:
-    """Entries by gauge, the session's first gauge first."""
+    """Entries of each gauge with readings, in the order of the session's gauges."""
     names = [s.gauge for s in session.setups.values()]
-    of_entry = np.array([list(session.gauges).index(n) for n in names])[observations.setup]
+    gauge_of = np.array([list(session.gauges).index(n) for n in names])[observations.setup]
     return tuple(
-        GaugeReadings(name, gauge, of_entry == i)
+        GaugeReadings(name, gauge, gauge_of == i)
         for i, (name, gauge) in enumerate(session.gauges.items())
-        if (of_entry == i).any()
+        if (gauge_of == i).any()
     )
 
 
 def initial_sigma(gauge: Gauge, repeatability: tuple[float, int]) -> float:
-    """Standard deviation of a reading before the first solution, [m]."""
+    """Standard deviation of a reading before the first solution, [m].
+
+    Args:
+        gauge: The gauge.
+        repeatability: Scatter of repeated cycles, [m], and its degrees of freedom.
+    """
     cycles_sigma, cycles_dof = repeatability
     floor = noise_floor(gauge.sigma, gauge.resolution)
     if cycles_dof > 0:
@@ -85,19 +92,19 @@ def estimate_gauge_sigmas(
 
     Args:
         groups: The gauges.
-        observations: Which setup, posture and zero each entry has.
+        observations: The entries.
         residual: Residuals, gauge zeros eliminated, shape (n_entries,), [m].
         leverage: Leverage of each entry, shape (n_entries,).
         values: Readings of the entries, shape (n_entries,), [m].
-        sigma: Standard deviations in the present solution, shape (n_entries,), [m]; kept for gauges
-            with too few readings.
+        sigma: Standard deviations in the present solution, shape (n_entries,), [m]; returned for
+            gauges with too few readings.
     """
     result = np.array(sigma)
     for g in groups:
         zeros = np.unique(observations.zero[g.entries]).size
         dof = float(g.entries.sum() - zeros - leverage[g.entries].sum())
         repeatability = _repeatability(values, observations, g)
-        if repeatability[1] < LEAST_DOF and dof < LEAST_DOF:
+        if repeatability[1] < MIN_DOF and dof < MIN_DOF:
             continue
         noise = estimate_noise(
             repeatability=repeatability,
@@ -112,8 +119,8 @@ def estimate_gauge_sigmas(
 
 
 def _repeatability(values: Array, o: Observations, group: GaugeReadings) -> tuple[float, int]:
-    chosen = group.entries
-    return estimate_repeatability(values[chosen], o.only(chosen))
+    """Scatter of the repeated cycles of a gauge, [m], and its degrees of freedom."""
+    return estimate_repeatability(values[group.entries], o.only(group.entries))
 
 
 def leverages(
@@ -123,7 +130,7 @@ def leverages(
 
     Args:
         jacobian: dh/dθ̂, shape (n_entries, n_free), [m of the first gauge per prior std].
-        observations: Which zero each entry has.
+        observations: The entries.
         covariance: Covariance of θ̂, shape (n_free, n_free).
         sigma: Standard deviation of a reading of the first gauge, [m].
     """

@@ -1,8 +1,9 @@
-"""Points to command on each side of drives with backlash, for a controller without compensation.
+"""Commanded points with backlash taken up, for a controller that does not compensate it.
 
-Corrected points are for the middle of both sides. To reach one from one side, the drives must move
-farther by their lags d. To first order the commanded point changes by J d, with the Jacobian J of
-the nominal forward kinematics. The second order is below 0.01 µm for a backlash of 0.1 mm.
+Corrected points hold for the middle of both sides of the backlash. To reach such a point from one
+side, the drives must move farther by their lags d. To first order the commanded point changes by
+J d, with the Jacobian J of the nominal forward kinematics. The second order is below 0.01 µm for a
+backlash of 0.1 mm.
 """
 
 from __future__ import annotations
@@ -25,22 +26,22 @@ from orthocal.robot.model import Robot, require_commanded_tool
 STEP = 1e-5
 """Step of the finite differences, [m]."""
 
-REGION = 0.02
-"""Half the side of the region around the mechanical zero that identifies the nominal form, relative
-to the characteristic length."""
+IDENTIFICATION_REGION = 0.02
+"""Half side of the region around the mechanical zero in which the nominal form is identified,
+relative to the characteristic length."""
 
 
 def find_lags(robot: Robot, errors: Mapping[str, float]) -> Array:
-    """Distances by which drives lag behind on one side, shape (n_drives,), [m, rad].
+    """Lags of the drives on one side of the backlash, shape (n_drives,), [m, rad].
 
-    This is half of the difference between both sides at the mechanical zero: half the backlash.
+    The lag is half of the difference between both sides at the mechanical zero.
 
     Args:
         robot: The robot.
-        errors: Parameter to value, [SI].
+        errors: Values by parameter name, [SI].
     """
     map_, zero = error_map(robot), robot.drive_zero[None]
-    smooth = without_periodic_errors(robot, errors)  # their slope depends on the coordinate
+    smooth = without_periodic_errors(robot, errors)  # the lag would depend on their phase
     if "approach" not in map_.conditions:
         return np.zeros(len(robot.drives))
 
@@ -49,8 +50,8 @@ def find_lags(robot: Robot, errors: Mapping[str, float]) -> Array:
         closure = LoopClosure(robot, fixed=smooth, conditions=conditions)
         return np.asarray(closure.geometry().drives(closure.commands(zero))[0])
 
-    gains, _ = map_.differentiate_drives(zero, map_.expand(smooth)[map_.drive_errors][None])
-    return np.asarray(0.5 * np.linalg.solve(gains[0], actual("n") - actual("p")))
+    jacobian, _ = map_.differentiate_drives(zero, map_.expand(smooth)[map_.drive_errors][None])
+    return np.asarray(0.5 * np.linalg.solve(jacobian[0], actual("n") - actual("p")))
 
 
 class ApproachSides:
@@ -58,7 +59,7 @@ class ApproachSides:
 
     Args:
         robot: The robot.
-        lags: Distance by which each drive lags behind on a side, shape (n_drives,), [m, rad].
+        lags: Lag of each drive on one side, shape (n_drives,), [m, rad].
     """
 
     def __init__(self, robot: Robot, lags: Array) -> None:
@@ -67,33 +68,33 @@ class ApproachSides:
         self._lags = lags
         self._closure = nominal_closure(robot)
         middle = tool_at_zero(robot)
-        half = np.full(middle.size, REGION * robot.characteristic_length)
+        half = np.full(middle.size, IDENTIFICATION_REGION * robot.characteristic_length)
         form = find_nominal_form(robot, middle, half)
         self._form = form if isinstance(form, SlidesWithRods) else None
 
     def drives(self, points: Array) -> Array:
-        """Nominal drive coordinates, as for `Sides.drives`."""
-        chosen = points[:, self._axes]
+        """Nominal drive coordinates of points; see `Sides.drives`."""
+        commanded = points[:, self._axes]
         if self._form is not None:
-            return self._form(chosen)
+            return self._form(commanded)
         failures: Failures = {}
-        return self._closure.inverse(chosen, failures=failures)
+        return self._closure.inverse(commanded, failures=failures)
 
     def command(self, points: Array, sides: Array) -> Array:
-        """Points to command on sides, as for `Sides.command`."""
-        result = np.array(points)
-        moved = np.flatnonzero(sides.any(axis=1) & np.isfinite(points).all(axis=1))
-        if not moved.size:
-            return result
-        at = result[moved]
+        """Points to command on the sides of the drives; see `Sides.command`."""
+        commanded = np.array(points)
+        shifted = np.flatnonzero(sides.any(axis=1) & np.isfinite(points).all(axis=1))
+        if not shifted.size:
+            return commanded
+        base = commanded[shifted]
         columns = []
         for axis in self._axes.tolist():
             step = np.zeros(3)
             step[axis] = STEP
-            columns.append((self.drives(at + step) - self.drives(at - step)) / (2.0 * STEP))
+            columns.append((self.drives(base + step) - self.drives(base - step)) / (2.0 * STEP))
         inverse_jacobian = np.stack(columns, axis=-1)
         if not np.isfinite(inverse_jacobian).all():
             raise ClosureError("is at the border of the workspace", posture="a point")
-        shifts = np.linalg.solve(inverse_jacobian, (sides[moved] * self._lags)[..., None])
-        result[np.ix_(moved, self._axes)] += shifts[..., 0]
-        return result
+        shifts = np.linalg.solve(inverse_jacobian, (sides[shifted] * self._lags)[..., None])
+        commanded[np.ix_(shifted, self._axes)] += shifts[..., 0]
+        return commanded

@@ -1,15 +1,15 @@
 """Correction of commanded points, fast enough for the lines of a program.
 
-A nominal controller with offsets o sends the drives to ρ(p) − o for a point p. They must be at
-c(p), where the tip of the calibrated machine is right (`tool_tip.py`). The point to command is
-therefore f(c(p) + o), with f the nominal forward kinematics. A controller that displaces the drives
-itself (tables of trims) receives as much less.
+A nominal controller with offsets o sends the drives to ρ(p) − o for a point p. The tip of the
+calibrated machine is at p if the drives are at c(p) (`tool_tip.py`). The point to command is
+therefore f(c(p) + o), with f the nominal forward kinematics. Displacements of the drives by the
+controller (tables of trims) are subtracted before.
 
 This exact correction takes up to a millisecond per point, and it is smooth. So it is interpolated
-by a polynomial in each box of a grid, made when the first point falls into the box and checked
-against the exact correction at other points. A box that is not accurate enough, or not reachable as
-a whole, is halved. In the smallest boxes at the border of the workspace each point is corrected
-exactly.
+by a polynomial in each box of a grid. The polynomial is computed for the first point in the box and
+checked against the exact correction at other points. A box that is not accurate enough, or not
+completely reachable, is halved. In the smallest boxes at the border of the workspace each point is
+corrected exactly.
 """
 
 from __future__ import annotations
@@ -30,39 +30,39 @@ from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import grid_points
 
-ERROR_PART = 0.1
-"""Part of the tolerance for the error of the polynomials."""
+POLYNOMIAL_TOLERANCE = 0.1
+"""Largest error of the polynomials, relative to the tolerance of the path."""
 
-SAFETY = 2.0
-"""Factor of the largest error over the largest one at the checked points."""
+SAFETY_FACTOR = 2.0
+"""Assumed ratio of the largest error to the largest error at the checked points."""
 
-EXACT = 1e-11
-"""Error of the exact correction, with loops closed to 1e-12 m twice, [m]."""
+EXACT_ERROR = 1e-11
+"""Error of the exact correction, which closes loops twice to 1e-12 m, [m]."""
 
-BOX = 0.2
+BOX_SIDE = 0.2
 """Side of a box, relative to the robot's characteristic length."""
 
-NODES = 5
+NODES_PER_AXIS = 5
 """Number of interpolation nodes along each axis, the degree plus one."""
 
 MARGIN = 0.05
-"""Extension of a box beyond each face, relative to its side. If all nodes are reachable, so is the
-box, although limits are curved."""
+"""Extension of a box beyond each face, relative to its side. It makes a box reachable if all nodes
+are, although the limits of the reach are curved."""
 
-MOST_DIVISIONS = 3
-"""Largest number of halvings of a box. After these, and in a halved box whose middle is out of
-reach, points are corrected exactly."""
+MAX_HALVINGS = 3
+"""Largest number of halvings of a box. In a smallest box, and in a halved box whose middle is out
+of reach, points are corrected exactly."""
 
 FIRST_BATCH = 8
 """Number of points that are corrected exactly at first; each further batch is twice as large."""
 
-MOST_BOXES = 2000
+MAX_BOXES = 2000
 """Largest number of boxes in memory."""
 
-CHECKS = 16
-"""Number of random points at which a box is checked, besides those between its nodes."""
+RANDOM_CHECKS = 16
+"""Number of random points at which a box is checked, in addition to points between its nodes."""
 
-POINTS_AT_ONCE = 2048
+BATCH_SIZE = 2048
 """Number of points that are corrected exactly in one call."""
 
 Key = tuple[int, ...]
@@ -86,12 +86,12 @@ class CorrectionField:
     Args:
         calibration: The calibration.
         offsets: Offsets in the controller, shape (n_drives,), [m, rad].
-        within: Tolerance of the corrected path, of which the field uses a part, [m].
+        within: Tolerance of the corrected path, [m]; the field uses a part of it.
         tool: Tip in the frame of the robot's tool centre point, [m].
-        conditions: Conditions of use, as for `ToolTip`.
+        conditions: Conditions of use; defaults as for `ToolTip`.
 
     Raises:
-        ExportError: If the robot's drives command no tool.
+        ExportError: If the robot's drives do not command the tool.
         ParameterError: If the tip is out of range.
     """
 
@@ -108,21 +108,27 @@ class CorrectionField:
         self._tip = ToolTip(calibration, tool, conditions=conditions)
         self.axes = tuple(self._tip.coordinates)
         """Indices of the axes that the drives command."""
-        self.bound = ERROR_PART * within
+        self.bound = POLYNOMIAL_TOLERANCE * within
         """Largest error of a point, [m]."""
         self._offsets = np.array(offsets, dtype=np.float64)
         self._displacement = calibration.displacement
         self._nominal = nominal_closure(robot)
-        self._side = BOX * robot.characteristic_length
+        self._side = BOX_SIDE * robot.characteristic_length
         self._boxes: dict[Key, _Box | Fallback] = {}
-        self._largest_error = EXACT
+        self._largest_error = EXACT_ERROR
         n = len(self.axes)
-        line = chebyshev_line(NODES)
+        line = chebyshev_line(NODES_PER_AXIS)
         self._nodes = grid_points(line, n)
-        self._fit = PolynomialFit(self._nodes, np.array(list(product(range(NODES), repeat=n))))
+        self._fit = PolynomialFit(
+            self._nodes, np.array(list(product(range(NODES_PER_AXIS), repeat=n)))
+        )
         # interpolation errors are largest between the nodes
-        between = np.cos(np.pi * np.array([0.5, 0.5 * (NODES - 1), NODES - 1.5]) / (NODES - 1))
-        random = np.random.default_rng(0).uniform(-1.0, 1.0, (CHECKS, n))
+        between = np.cos(
+            np.pi
+            * np.array([0.5, 0.5 * (NODES_PER_AXIS - 1), NODES_PER_AXIS - 1.5])
+            / (NODES_PER_AXIS - 1)
+        )
+        random = np.random.default_rng(0).uniform(-1.0, 1.0, (RANDOM_CHECKS, n))
         self._checks = np.vstack([grid_points(between, n), random])
 
     @property
@@ -137,8 +143,8 @@ class CorrectionField:
             points: Desired points of the tool, shape (k, 3), [m].
 
         Returns:
-            Points to command, shape (k, 3), [m]; and the index of the first point out of reach with
-            the reason. All later points are refused, too, some of them without a check.
+            Points to command, shape (k, 3), [m]; and indices of refused points with the reasons:
+            the first one out of reach and all later ones. Refused points are NaN.
         """
         axes = np.array(self.axes, dtype=np.int64)
         desired = np.array(points, dtype=np.float64)[:, axes]
@@ -146,7 +152,7 @@ class CorrectionField:
         end = len(points)
         boxes = _group(_cells(desired, self._side))
         for group, cell in sorted(boxes, key=lambda box: box[0][0]):
-            if exact and (0, *cell) not in self._boxes:  # making a box out of reach takes long
+            if exact and (0, *cell) not in self._boxes:  # a new box beyond the reach takes long
                 end = self._correct_exactly(desired, commanded, exact, refused)
             group = group[group < end]
             if group.size:
@@ -154,31 +160,35 @@ class CorrectionField:
                 commanded[group] = desired[group] + corrections
         end = self._correct_exactly(desired, commanded, exact, refused)
         for i in range(end, len(points)):
-            refused.setdefault(i, "comes after one that is not reached")
+            refused.setdefault(i, "follows a point that is not reached")
         commanded[end:] = np.nan
-        result = np.array(points, dtype=np.float64)
-        result[:, axes] = commanded
-        return result, refused
+        corrected = np.array(points, dtype=np.float64)
+        corrected[:, axes] = commanded
+        return corrected, refused
 
     def exactly(self, points: Array) -> tuple[Array, Mapping[int, str]]:
-        """Exact correction of coordinates that the drives command, shape (k, n_axes), [m]."""
-        result = np.full(points.shape, np.nan)
+        """Exact points to command, and refused points with the reasons.
+
+        Args:
+            points: Desired coordinates that the drives command, shape (k, n_axes), [m].
+        """
+        corrected = np.full(points.shape, np.nan)
         refused: dict[int, str] = {}
-        for first in range(0, len(points), POINTS_AT_ONCE):
-            part = points[first : first + POINTS_AT_ONCE]
+        for first in range(0, len(points), BATCH_SIZE):
+            batch = points[first : first + BATCH_SIZE]
             failures: Failures = {}
-            motors = self._tip.reach(part, failures=failures)[0] + self._offsets
+            motors = self._tip.reach(batch, failures=failures)[0] + self._offsets
             drives = motors - self._displacement(motors)
             drives = motors - self._displacement(drives)
-            reached = np.array([i for i in range(len(part)) if i not in failures], dtype=np.int64)
-            nominal: Failures = {}
-            commanded = self._nominal.forward(drives[reached], failures=nominal)
-            result[first + reached] = commanded[:, list(self.axes)]
-            failures.update({int(reached[i]): e for i, e in nominal.items()})
+            reached = np.array([i for i in range(len(batch)) if i not in failures], dtype=np.int64)
+            nominal_failures: Failures = {}
+            commanded = self._nominal.forward(drives[reached], failures=nominal_failures)
+            corrected[first + reached] = commanded[:, list(self.axes)]
+            failures.update({int(reached[i]): e for i, e in nominal_failures.items()})
             for i, e in failures.items():
                 refused[first + i] = e.reason
-                result[first + i] = np.nan
-        return result, refused
+                corrected[first + i] = np.nan
+        return corrected, refused
 
     def _correct_exactly(
         self, desired: Array, commanded: Array, indices: list[int], refused: dict[int, str]
@@ -188,11 +198,11 @@ class CorrectionField:
         Args:
             desired: Desired points, shape (k, n_axes), [m].
             commanded: Filled with the corrected points, shape (k, n_axes), [m].
-            indices: Indices of the points; emptied.
-            refused: Filled with the points out of reach.
+            indices: Indices of the points; this list is emptied.
+            refused: Filled with the points out of reach and the reasons.
 
         Returns:
-            Index of the first point out of reach; k if there is none.
+            Index of the first point out of reach; k if all are reached.
         """
         end = min(refused, default=len(desired))
         pending, count = np.sort(np.array(indices, dtype=np.int64)), FIRST_BATCH
@@ -207,24 +217,32 @@ class CorrectionField:
     def _corrections(
         self, points: Array, indices: Indices, halvings: int, exact: list[int]
     ) -> Array:
-        """Corrections of points; indices of those to correct exactly are added to `exact`."""
-        result = np.empty_like(points)
+        """Corrections of points by the polynomials of their boxes, shape (k, n_axes), [m].
+
+        Args:
+            points: Desired points, shape (k, n_axes), [m].
+            indices: Indices of the points, shape (k,).
+            halvings: Number of halvings of the boxes.
+            exact: List to which indices of points without a polynomial are added.
+        """
+        corrections = np.empty_like(points)
         for group, cell in _group(_cells(points, self._side / 2**halvings)):
             box = self._box((halvings, *cell))
             if isinstance(box, _Box):
-                result[group] = box.correction(points[group])
+                corrections[group] = box.correction(points[group])
             elif box == "divided":
-                result[group] = self._corrections(
+                corrections[group] = self._corrections(
                     points[group], indices[group], halvings + 1, exact
                 )
             else:
                 exact.extend(indices[group].tolist())
-                result[group] = np.nan
-        return result
+                corrections[group] = np.nan
+        return corrections
 
     def _box(self, key: Key) -> _Box | Fallback:
+        """Box with its polynomial, cached."""
         if key not in self._boxes:
-            if len(self._boxes) >= MOST_BOXES:
+            if len(self._boxes) >= MAX_BOXES:
                 self._boxes.pop(next(iter(self._boxes)))
             box = self._boxes[key] = self._make(key)
             if isinstance(box, _Box):
@@ -232,7 +250,8 @@ class CorrectionField:
         return self._boxes[key]
 
     def _make(self, key: Key) -> _Box | Fallback:
-        fallback: Fallback = "divided" if key[0] < MOST_DIVISIONS else "exact"
+        """Compute the polynomial of a box, or decide its fallback."""
+        fallback: Fallback = "divided" if key[0] < MAX_HALVINGS else "exact"
         side = self._side / 2 ** key[0]
         middle = (np.array(key[1:]) + 0.5) * side
         half = np.full(middle.size, (0.5 + MARGIN) * side)
@@ -251,18 +270,18 @@ class CorrectionField:
         if refused:
             return fallback
         largest = float(np.linalg.norm(correction(checks) + checks - expected, axis=1).max())
-        error = SAFETY * largest + EXACT
+        error = SAFETY_FACTOR * largest + EXACT_ERROR
         return fallback if error > self.bound else _Box(correction, error)
 
 
 def _cells(points: Array, side: float) -> Indices:
-    """Indices of the cells that hold points, shape (k, n)."""
+    """Indices of the cells of points, shape (k, n)."""
     with np.errstate(invalid="ignore"):
         return np.asarray(np.floor(points / side).astype(np.int64))
 
 
 def _group(cells: Indices) -> list[tuple[Indices, Key]]:
-    """Indices of equal rows, with the row."""
+    """Groups of equal rows: their indices and the row."""
     if not len(cells):
         return []
     order = np.arange(len(cells))

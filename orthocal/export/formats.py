@@ -1,4 +1,4 @@
-"""Formats of an export; of these, the parameters (yaml) and the table of corrections."""
+"""Export of a calibration by format, with the formats yaml (parameters) and table (corrections)."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from orthocal.export.linuxcnc.export import OPTIONS, ExportOptions, export_linux
 from orthocal.export.printer import export_printer
 from orthocal.export.urdf import export_urdf
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.kinematics.workspace import even_grid
+from orthocal.kinematics.workspace import uniform_grid
 from orthocal.printers.firmwares import FIRMWARES
 from orthocal.units import MM, format_fixed, tidy
 
-POINTS_A_SIDE = 7
-"""Points along each side of the table's grid."""
+POINTS_PER_SIDE = 7
+"""Number of points along each side of the table's grid."""
 
 _YAML_HEAD = """\
 # Identified errors of the machine, relative to the nominal robot.
@@ -52,23 +52,25 @@ def export_corrections(calibration: Calibration) -> dict[str, str]:
     """Text of corrections.csv: corrections of the tool over a grid, for a nominal controller.
 
     A controller with offsets o sends the drives to ρ(p) − o for a point p. They must be at c(p),
-    the inverse kinematics of the calibrated machine. So it must be sent to p + d,
+    the inverse kinematics of the calibrated machine. So the point to command is p + d,
 
         d = f(c(p) + o) − p,  f the nominal forward kinematics.
 
     Raises:
-        ExportError: If the machine has no tool, or does not reach the grid.
+        ExportError: If the drives do not command a tool, or the machine does not reach the grid.
     """
     tool, robot = find_tool(calibration), calibration.robot
     if tool is None or robot.tcp is None:
         raise ExportError("the machine has no tool that its drives command over a region")
-    points = even_grid(robot, tool.workspace.limits, points_a_side=POINTS_A_SIDE)
+    points = uniform_grid(robot, tool.workspace.limits, points_per_side=POINTS_PER_SIDE)
     coordinates = list(robot.tcp.coordinates)
     try:
         drives = calibration.machine.inverse(points) + entered_offsets(calibration)
         commanded = nominal_closure(robot).forward(drives)[:, coordinates]
     except ClosureError as e:
-        raise ExportError(f"the calibrated machine does not reach all of the grid: {e}") from None
+        raise ExportError(
+            f"the calibrated machine does not reach every point of the grid: {e}"
+        ) from None
     text = io.StringIO()
     rows = csv.writer(text, lineterminator="\n")
     names = ["xyz"[k] for k in coordinates]
@@ -85,7 +87,7 @@ EXPORTERS: dict[str, Callable[[Calibration], dict[str, str]]] = {
     "table": export_corrections,
     "urdf": export_urdf,
 }
-"""Formats without options: from a calibration to texts of files by their names."""
+"""Formats without options: functions from a calibration to texts of files by file name."""
 
 EXPORTERS |= {name: partial(export_printer, firmware=name) for name in FIRMWARES}
 
@@ -99,21 +101,22 @@ def export_calibration(
     anyway: bool = False,
     options: ExportOptions | None = None,
 ) -> dict[str, str]:
-    """A calibration as files for a controller or another program.
+    """Export a calibration as files for a controller or another program.
 
     Args:
         calibration: The calibration.
         to: Name of the format.
-        anyway: Whether to export it against its verdict, which the files then state.
+        anyway: Whether to export a calibration with the verdict review or reject, with a warning
+            in the files.
         options: Options of the format.
 
     Returns:
-        Texts of files by their names.
+        Texts of files by file name.
 
     Raises:
-        ParameterError: If there is no such format, or it has no such option.
-        ExportError: If its verdict is not to enter it, or the machine does not reach the region
-            of the format.
+        ParameterError: If the format is unknown or does not have an option.
+        ExportError: If the verdict is review or reject, or the machine does not reach the region of
+            the format.
     """
     if to not in FORMATS:
         raise ParameterError(f"found '{to}'; expected one of {', '.join(FORMATS)}", where="--to")
@@ -124,19 +127,19 @@ def export_calibration(
         files = export_linuxcnc(calibration, options)
     elif options.requested:
         raise ParameterError(
-            "is an option of --to linuxcnc alone", where=OPTIONS[options.requested[0]]
+            "is an option of --to linuxcnc only", where=OPTIONS[options.requested[0]]
         )
     else:
         files = EXPORTERS[to](calibration)
     warning = warn_against_verdict(calibration)
-    return _warned(files, warning) if warning else files
+    return _add_warning(files, warning) if warning else files
 
 
 def require_entering(calibration: Calibration) -> None:
-    """Refuse a calibration whose verdict is to review or to reject the readings.
+    """Refuse a calibration with the verdict review or reject.
 
     Raises:
-        ExportError: If its verdict is not to enter it.
+        ExportError: If the verdict is not `enter`.
     """
     decision = assessment_of(calibration).decision
     if decision.verdict != "enter":
@@ -151,8 +154,8 @@ def warn_against_verdict(calibration: Calibration) -> str:
     return f"Written against the verdict '{verdict}' of the calibration (--anyway)."
 
 
-def _warned(files: dict[str, str], warning: str) -> dict[str, str]:
-    """Files of which one begins with a warning: errors.yaml, or README.md."""
+def _add_warning(files: dict[str, str], warning: str) -> dict[str, str]:
+    """Files with a warning at the beginning of errors.yaml or README.md."""
     if "errors.yaml" in files:
         return {**files, "errors.yaml": f"# {warning}\n{files['errors.yaml']}"}
     page = files.get("README.md", "")

@@ -39,9 +39,9 @@ class Polynomial:
         return int(self.exponents.sum(axis=1).max())
 
     def __call__(self, points: Array) -> Array:
-        """Values at points, shape (k, n), without limits: shape (k, n_values).
+        """Values at points (k, n), inside or outside the box, shape (k, n_values).
 
-        The sum of the terms is contracted along one coordinate after the other.
+        The coefficient tensor is contracted with the powers of one coordinate after the other.
         """
         scaled, values = (points - self.middle) / self.half, self.tensor
         for k in range(scaled.shape[1]):
@@ -90,5 +90,5 @@ def total_degree(n: int, degree: int) -> Indices:
 
 
 def chebyshev_line(count: int) -> Array:
-    """Chebyshev nodes of ±1 with both ends, shape (count,)."""
+    """Chebyshev nodes of [−1, 1] including both ends, shape (count,)."""
     return np.asarray(-np.cos(np.pi * np.arange(count) / (count - 1)))

@@ -1,9 +1,10 @@
 """Export of a calibration to the firmware of a delta printer.
 
-A firmware knows a radius, three towers, three rods and three endstops. With the carriages at the
-coordinates that bring the real nozzle to p, it believes the nozzle at f(h + Δ; φ). Its settings φ
-and the changes Δ of its homed carriages are chosen so that what it believes is where the nozzle is
-above the bed, but for a shift and turn in the plane of the bed, which no print shows:
+A firmware has a radius, three towers, three rods and three endstops as settings φ. Let h be the
+coordinates of the carriages that bring the real nozzle to p. The firmware computes the position
+f(h + Δ; φ), with Δ the change of its homed carriages. φ and Δ minimise the difference between the
+computed and the real position above the bed. A translation s and a rotation γ in the plane of the
+bed are free, because no print shows them:
 
     min Σ wₖ |f(h(pₖ) + Δ; φ) − Rz(γ) pₖ − s|² + λ Σ z²(first layer)
 """
@@ -33,28 +34,31 @@ from orthocal.printers.settings import DeltaSettings, FirmwareName
 from orthocal.units import DEG, MM
 
 FIRST_LAYER = 10.0
-"""Weight λ of the mean squared height of the first layer against that of the tool error. A print
-holds by its first layer: a weight of 10 makes it twice as flat for 5 % more tool error."""
+"""Weight λ of the mean squared height of the first layer, relative to that of the tool error. The
+first layer holds the print. The weight of 10 makes it twice as flat for 5 % more tool error."""
 
-SLOPE_STEP = 1e-5
+DIFFERENCE_STEP = 1e-5
 """Step of central differences, [m]."""
 
 RINGS = 6
-"""Rings of points of the first layer."""
+"""Number of rings of points of the first layer."""
 
-SCALES = (MM, *(10 * MM,) * 3, *(MM,) * 6, 10 * MM, MM, MM, MM, MM)
-"""Sizes of the unknowns: radius, angles [rad], rods, carriages, turn, shift, tilts."""
+UNKNOWN_SCALES = (MM, *(10.0 * MM,) * 2, *(MM,) * 6, 10.0 * MM, *(MM,) * 4)
+"""Scales of the unknowns of the fit, as in `_residuals`: radius, angles a and b, rods, homed
+carriages, rotation and translation of the print, tilts, [m, rad]."""
 
 
 @dataclass(frozen=True, slots=True)
 class FirmwareError:
-    """Errors of a firmware's kinematics against the calibrated machine, [m]."""
+    """Errors of a firmware's kinematics relative to the calibrated machine, [m].
+
+    Tool errors are over the workspace, with translation and rotation in the plane of the bed
+    removed. Layer errors are heights of the first layer above the bed.
+    """
 
     tool_rms: float
-    """Over the workspace, with shift and turn in the plane of the bed removed."""
     tool_largest: float
     layer_rms: float
-    """Height of the first layer above the bed."""
     layer_largest: float
 
 
@@ -64,17 +68,18 @@ class FirmwareFit:
 
     settings: DeltaSettings
     now: FirmwareError
-    """With the present settings."""
+    """Errors with the present settings."""
     new: FirmwareError
+    """Errors with the new settings."""
     tool_unknown: float
-    """RMS tool error that the readings leave, [m]."""
+    """RMS uncertainty of the tool error after the calibration, [m]."""
     layer_unknown: float
-    """RMS height of the first layer that they leave, [m]."""
+    """RMS uncertainty of the heights of the first layer, [m]."""
     rows: tuple[SettingRow, ...]
-    """The settings one by one: radius, rods, towers, endstops."""
+    """Settings one by one: radius, rods, towers, endstops."""
     gain: Array
-    """Derivative of the settings by the free errors of the machine and the nuisance parameters,
-    shape (10, n), [SI]."""
+    """Derivative of the settings with respect to the free errors of the machine and the nuisance
+    parameters, shape (10, n), [SI]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,56 +97,61 @@ class SettingRow:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Targets:
-    """Carriages of the calibrated machine and where its nozzle is above the bed."""
+    """Carriages of the calibrated machine, and positions of its nozzle above the bed.
+
+    Derivatives are in the axes of the bed, with respect to the n free errors of the machine and
+    nuisance parameters, or with respect to the carriages.
+    """
 
     points: Array
-    """Shape (K, 3), [m]."""
+    """Positions of the nozzle in the workspace, shape (K, 3), [m]."""
     weights: Array
+    """Weights of these points, shape (K,)."""
     carriages: Array
+    """Coordinates of the carriages at these points, shape (K, 3), [m]."""
     layer_points: Array
-    """On the bed, shape (M, 3), [m]."""
+    """Positions of the nozzle on the bed, shape (M, 3), [m]."""
     layer_carriages: Array
+    """Coordinates of the carriages at the points on the bed, shape (M, 3), [m]."""
     jacobian: Array
-    """Change of the points that the carriages reach, in the axes of the bed, by the free errors of
-    the machine and the nuisance parameters, shape (K, 3, n), [m per SI unit]."""
+    """Derivative of the points with respect to errors, shape (K, 3, n), [m per SI unit]."""
     layer_jacobian: Array
-    """The same of `layer_points`, shape (M, 3, n)."""
+    """Derivative of the points on the bed with respect to errors, shape (M, 3, n)."""
     by_drives: Array
-    """Change of the points by the carriages, in the axes of the bed, shape (K, 3, 3), [1]."""
+    """Derivative of the points with respect to the carriages, shape (K, 3, 3), [1]."""
     layer_by_drives: Array
-    """The same of `layer_points`, shape (M, 3, 3)."""
+    """Derivative of the points on the bed with respect to the carriages, shape (M, 3, 3)."""
 
 
 def fit_firmware(calibration: Calibration, firmware: FirmwareName) -> FirmwareFit:
-    """Settings of a firmware with the least tool error.
+    """Settings of a firmware with the smallest tool error.
 
     Args:
-        calibration: A calibration whose session states the settings of the firmware.
-        firmware: The firmware of the new settings.
+        calibration: Calibration whose session states the present settings of the firmware.
+        firmware: Firmware of the new settings.
 
     Raises:
-        ExportError: If the session states none, or the machine does not reach the workspace.
+        ExportError: If the session states no settings, or the machine does not reach the workspace.
     """
     present = calibration.session.firmware
     if present is None:
         raise ExportError(
             "the session states no settings of a firmware (controller.firmware); "
-            "`orthocal import LOG DIRECTORY` makes a session that does"
+            "`orthocal import LOG DIRECTORY` makes a session with them"
         )
     targets, layer_unknown = _find_targets(calibration)
-    free = 15 if FIRMWARES[firmware].tilts else 13
-    start = np.zeros(free)
-    found = least_squares(
-        partial(_residuals, targets, present), start, x_scale=SCALES[:free], method="lm"
+    scales = UNKNOWN_SCALES if FIRMWARES[firmware].tilts else UNKNOWN_SCALES[:-2]
+    solution = least_squares(
+        partial(_residuals, targets, present), np.zeros(len(scales)), x_scale=scales, method="lm"
     )
-    settings = replace(_changed(present, found.x), firmware=firmware)
+    settings = replace(_changed(present, solution.x), firmware=firmware)
     tool = assessment_of(calibration).tool
-    moved = np.array(settings.homed) - present.homed
-    gain = _setting_gain(targets, settings, found, moved)
+    homed_change = np.array(settings.homed) - present.homed
+    gain = _setting_gain(targets, settings, solution, homed_change)
     return FirmwareFit(
         settings=settings,
         now=_measure(targets, present, np.zeros(3)),
-        new=_measure(targets, settings, moved),
+        new=_measure(targets, settings, homed_change),
         tool_unknown=math.nan if tool is None else tool.compensated,
         layer_unknown=layer_unknown,
         rows=_setting_rows(calibration, settings, gain),
@@ -149,41 +159,41 @@ def fit_firmware(calibration: Calibration, firmware: FirmwareName) -> FirmwareFi
     )
 
 
-def _slopes(settings: DeltaSettings, carriages: Array) -> Array:
-    """Derivative of what a firmware believes by its carriages, shape (K, 3, 3), [1]."""
-    steps = SLOPE_STEP * np.eye(3)
-    ends = [settings.forward(carriages + s) - settings.forward(carriages - s) for s in steps]
-    return np.stack(ends, axis=2) / (2.0 * SLOPE_STEP)
+def _differentiate(settings: DeltaSettings, carriages: Array) -> Array:
+    """Derivative of the computed position with respect to the carriages, shape (K, 3, 3), [1]."""
+    steps = DIFFERENCE_STEP * np.eye(3)
+    differences = [settings.forward(carriages + s) - settings.forward(carriages - s) for s in steps]
+    return np.stack(differences, axis=2) / (2.0 * DIFFERENCE_STEP)
 
 
 def _setting_gain(
-    targets: _Targets, settings: DeltaSettings, found: OptimizeResult, moved: Array
+    targets: _Targets, settings: DeltaSettings, solution: OptimizeResult, homed_change: Array
 ) -> Array:
-    """Derivative of the settings by the errors that were identified, shape (n_settings, n), [SI].
+    """Derivative of the settings with respect to the free errors, shape (n_settings, n), [SI].
 
-    At the least squares Jᵀr = 0, so dx = −(JᵀJ)⁻¹ Jᵀ dr. With errors dθ more, the carriages that
-    bring the nozzle to a point change by dh = −(∂p/∂h)⁻¹ T dθ, T the sensitivity of the nozzle, and
-    what the firmware believes by dr = ∂f/∂h dh. Endstops follow from the homed carriages:
-    e = h − √(rod² − radius²).
+    At the minimum Jᵀr = 0, so dx = −(JᵀJ)⁻¹ Jᵀ dr. For a change dθ of the errors, the carriages
+    that bring the nozzle to a point change by dh = −(∂p/∂h)⁻¹ T dθ, with T the sensitivity of the
+    nozzle. The computed position changes by dr = ∂f/∂h dh. Endstops follow from the homed
+    carriages: e = h − √(rod² − radius²).
 
     Args:
         targets: The points.
         settings: The new settings.
-        found: The solved least squares.
-        moved: Change of the homed carriages, shape (3,), [m].
+        solution: Solution of the least squares.
+        homed_change: Change of the homed carriages, shape (3,), [m].
     """
     n = targets.jacobian.shape[-1]
-    believed, layer = (
-        _slopes(settings, carriages + moved) @ np.linalg.solve(by_drives, jacobian)
+    computed, layer = (
+        _differentiate(settings, carriages + homed_change) @ np.linalg.solve(by_drives, jacobian)
         for carriages, by_drives, jacobian in (
             (targets.carriages, targets.by_drives, targets.jacobian),
             (targets.layer_carriages, targets.layer_by_drives, targets.layer_jacobian),
         )
     )
-    change = np.sqrt(targets.weights)[:, None, None] * believed
+    change = np.sqrt(targets.weights)[:, None, None] * computed
     layer = math.sqrt(FIRST_LAYER / len(targets.layer_points)) * layer[:, 2]
     change = np.concatenate([change.reshape(-1, n), layer])
-    gain = np.asarray(np.linalg.lstsq(found.jac, change, rcond=None)[0])
+    gain = np.asarray(np.linalg.lstsq(solution.jac, change, rcond=None)[0])
     rods = np.array(settings.rods)[:, None] * gain[3:6] - settings.radius * gain[:1]
     endstops = gain[6:9] - rods / settings.middle[:, None]
     fixed = np.zeros((1, n))
@@ -198,33 +208,36 @@ def _setting_rows(
     Args:
         calibration: The calibration.
         settings: The new settings.
-        gain: Derivative of radius, rods, angles and endstops, shape (10, n), [SI].
+        gain: Derivative of radius, rods, angles and endstops with respect to errors, (10, n), [SI].
     """
     present = calibration.session.firmware or settings
-    uncertain = np.full(len(gain), np.nan)
+    uncertainties = np.full(len(gain), np.nan)
     if not calibration.unmodelled.prior_stds.size:
         stds = [
             np.sqrt(np.einsum("ij,jk,ik->i", gain, c, gain))
             for c in restore_covariances(calibration)
         ]
-        uncertain = calibration.expand(*stds)
+        uncertainties = calibration.expand(*stds)
     values = [("radius", present.radius / MM, settings.radius / MM, MM, "mm")]
-    for name, size, unit in (("rods", MM, "mm"), ("angles", DEG, "°"), ("endstops", MM, "mm")):
-        words = {"rods": "rod", "angles": "direction of tower", "endstops": "endstop"}[name]
+    for field, label, size, unit in (
+        ("rods", "rod", MM, "mm"),
+        ("angles", "direction of tower", DEG, "°"),
+        ("endstops", "endstop", MM, "mm"),
+    ):
         for k, tower in enumerate("abc"):
-            now, new = (getattr(s, name)[k] / size for s in (present, settings))
-            values.append((f"{words} {tower}", float(now), float(new), size, unit))
+            now, new = (getattr(s, field)[k] / size for s in (present, settings))
+            values.append((f"{label} {tower}", float(now), float(new), size, unit))
     return tuple(
         SettingRow(name, now, new, float(u) / size, unit)
-        for (name, now, new, size, unit), u in zip(values, uncertain.tolist(), strict=True)
+        for (name, now, new, size, unit), u in zip(values, uncertainties.tolist(), strict=True)
     )
 
 
 def _find_targets(calibration: Calibration) -> tuple[_Targets, float]:
-    """Points over the workspace and on the bed, and what is unknown of the latter's heights, [m].
+    """Points over the workspace and on the bed, and the uncertainty of heights on the bed, [m].
 
     Raises:
-        ExportError: If the machine does not reach them.
+        ExportError: If the machine does not reach the points.
     """
     robot, tool, tilt = calibration.robot, find_tool(calibration), _bed_tilt(calibration)
     if tool is None:
@@ -240,8 +253,8 @@ def _find_targets(calibration: Calibration) -> tuple[_Targets, float]:
         accuracy = assess_tool(calibration, Workspace.even(layer))
     except ClosureError as e:
         raise ExportError(f"the calibrated machine does not reach the bed: {e}") from None
-    unknown, turn = math.nan, _bed_turn(calibration)
-    of_errors, of_drives = (
+    layer_unknown, turn = math.nan, _bed_turn(calibration)
+    to_errors, to_drives = (
         ToolSensitivity(robot, free=names, values=calibration.errors)
         for names in (
             [p.name for p in calibration.free],
@@ -249,14 +262,14 @@ def _find_targets(calibration: Calibration) -> tuple[_Targets, float]:
         )
     )
     jacobians = [
-        np.concatenate([tilt.T @ of_errors(c), -np.einsum("ijk,nj->nik", turn, p)], axis=2)
+        np.concatenate([tilt.T @ to_errors(c), -np.einsum("ijk,nj->nik", turn, p)], axis=2)
         for p, c in ((space.points, carriages), (layer, layer_carriages))
     ]
-    by_drives = [tilt.T @ of_drives(c) for c in (carriages, layer_carriages)]
+    by_drives = [tilt.T @ to_drives(c) for c in (carriages, layer_carriages)]
     if accuracy.after is not None:
-        unknown = math.sqrt(float(accuracy.after.aligned_covariance[:, 2, 2].mean()))
-    parts = space.points, space.weights, carriages, layer, layer_carriages
-    return _Targets(*parts, *jacobians, *by_drives), unknown
+        layer_unknown = math.sqrt(float(accuracy.after.aligned_covariance[:, 2, 2].mean()))
+    points = space.points, space.weights, carriages, layer, layer_carriages
+    return _Targets(*points, *jacobians, *by_drives), layer_unknown
 
 
 def _bed_tilt(calibration: Calibration) -> Array:
@@ -267,16 +280,16 @@ def _bed_tilt(calibration: Calibration) -> Array:
     """
     for setup in calibration.setups:
         if setup.sensor.kind == "probe":
-            value = {p.name: p.value for p in calibration.sensors}
-            yaw, roll = (value.get(f"setup.{setup.name}.{k}", 0.0) for k in ("yaw", "roll"))
+            values = {p.name: p.value for p in calibration.sensors}
+            yaw, roll = (values.get(f"setup.{setup.name}.{k}", 0.0) for k in ("yaw", "roll"))
             return np.asarray(Rotation.from_euler("xy", [roll, yaw]).as_matrix())
     raise ExportError("no setup measured the bed with a probe: the plane of the print is unknown")
 
 
 def _bed_turn(calibration: Calibration) -> Array:
-    """Derivative of the tilt of the bed by the nuisance parameters, (3, 3, n_nuisance), [1/rad].
+    """Derivative of the bed's rotation with respect to nuisance parameters, (3, 3, n), [1/rad].
 
-    Element i, j, k: change of coordinate i of a point by its coordinate j and parameter k.
+    Element i, j, k: change of coordinate i of a point per unit of coordinate j and parameter k.
     """
     turn = np.zeros((3, 3, len(calibration.sensors)))
     for k, parameter in enumerate(calibration.sensors):
@@ -289,7 +302,7 @@ def _bed_turn(calibration: Calibration) -> Array:
 
 
 def _disc(limits: Array) -> Array:
-    """Points of the circle around the workspace on the bed, of equal areas, shape (M, 3), [m]."""
+    """Points of equal areas within the circle around the workspace on the bed, (M, 3), [m]."""
     middle, half = limits[:2].mean(axis=1), 0.5 * (limits[:2, 1] - limits[:2, 0])
     points = [np.zeros(2)]
     for ring in range(1, RINGS + 1):
@@ -306,7 +319,7 @@ def _changed(settings: DeltaSettings, x: Array) -> DeltaSettings:
     """
     rods, homed = np.array(settings.rods) + x[3:6], np.array(settings.homed) + x[6:9]
     a, b, c = settings.angles
-    tilts = (settings.tilts[0] + x[12], settings.tilts[1] + x[13]) if len(x) > 13 else (0.0, 0.0)
+    tilts = (settings.tilts[0] + x[12], settings.tilts[1] + x[13]) if len(x) > 12 else (0.0, 0.0)
     return replace(
         settings,
         radius=settings.radius + x[0],
@@ -318,27 +331,33 @@ def _changed(settings: DeltaSettings, x: Array) -> DeltaSettings:
 
 
 def _residuals(targets: _Targets, present: DeltaSettings, x: Array) -> Array:
-    """Weighted errors of changed settings, with a turn and a shift in the plane of the bed."""
+    """Weighted errors of changed settings, with a free translation and rotation in the bed's plane.
+
+    Args:
+        targets: The points.
+        present: Present settings.
+        x: Changes of the settings, then rotation x[9] and translation x[10:12].
+    """
     settings = _changed(present, x)
     change = np.array(settings.homed) - present.homed
-    turned = targets.points @ Rotation.from_euler("z", x[9]).as_matrix().T
-    turned[:, :2] += x[10:12]
-    error = settings.forward(targets.carriages + change) - turned
+    aligned = targets.points @ Rotation.from_euler("z", x[9]).as_matrix().T
+    aligned[:, :2] += x[10:12]
+    error = settings.forward(targets.carriages + change) - aligned
     heights = settings.forward(targets.layer_carriages + change)[:, 2] - targets.layer_points[:, 2]
     weighted = np.sqrt(targets.weights)[:, None] * error
     return np.concatenate([weighted.ravel(), math.sqrt(FIRST_LAYER / len(heights)) * heights])
 
 
 def _measure(targets: _Targets, settings: DeltaSettings, change: Array) -> FirmwareError:
-    """Errors of settings whose homed carriages changed by `change`, [m]."""
+    """Errors of settings with homed carriages changed by `change`, shape (3,), [m]."""
     error = settings.forward(targets.carriages + change) - targets.points
     motions = np.zeros((len(error), 3, 3))
     motions[:, 0, 0] = motions[:, 1, 1] = 1.0
     motions[:, 0, 2], motions[:, 1, 2] = -targets.points[:, 1], targets.points[:, 0]
     root = np.sqrt(np.repeat(targets.weights, 3))[:, None]
-    flat = error.reshape(-1, 1)
-    taken = np.linalg.lstsq(root * motions.reshape(-1, 3), root * flat, rcond=None)[0]
-    lengths = np.linalg.norm((flat - motions.reshape(-1, 3) @ taken).reshape(-1, 3), axis=1)
+    columns, flat = motions.reshape(-1, 3), error.reshape(-1, 1)
+    motion = np.linalg.lstsq(root * columns, root * flat, rcond=None)[0]
+    lengths = np.linalg.norm((flat - columns @ motion).reshape(-1, 3), axis=1)
     heights = settings.forward(targets.layer_carriages + change)[:, 2] - targets.layer_points[:, 2]
     return FirmwareError(
         tool_rms=math.sqrt(float(targets.weights @ lengths**2)),
@@ -349,14 +368,14 @@ def _measure(targets: _Targets, settings: DeltaSettings, change: Array) -> Firmw
 
 
 def export_printer(calibration: Calibration, firmware: FirmwareName) -> dict[str, str]:
-    """Lines with the settings, and a README.md.
+    """File with the new settings of a firmware, and README.md.
 
     Raises:
         ExportError: If the session states no settings, or the machine does not reach its bed.
     """
     fit = fit_firmware(calibration, firmware)
-    known = FIRMWARES[firmware]
-    return {known.file: known.config_lines(fit.settings), "README.md": _page(calibration, fit)}
+    target = FIRMWARES[firmware]
+    return {target.file: target.config_lines(fit.settings), "README.md": _page(calibration, fit)}
 
 
 STEPS: dict[FirmwareName, Sequence[str]] = {
@@ -368,57 +387,58 @@ STEPS: dict[FirmwareName, Sequence[str]] = {
     "marlin": (
         "Send the lines of `marlin.gcode`. `M500` saves them. Without EEPROM, change the values "
         "of the same names in `Configuration.h`.",
-        "Home (`G28`). A mesh of `G29` from before is old: `M420 S0`.",
+        "Home (`G28`). An existing mesh of `G29` is no longer valid: `M420 S0`.",
     ),
     "reprapfirmware": (
         "Replace `M665` and `M666` in `config.g`. Delete these commands in `config-override.g`.",
-        "Restart, then home (`G28`). A height map from before is old: `G29 S2`.",
+        "Restart, then home (`G28`). An existing height map is no longer valid: `G29 S2`.",
     ),
 }
 """How to enter the settings."""
 
 
 UNCERTAIN = (
-    "± is the uncertainty of a setting by itself (95 %). Settings compensate each other: with a "
-    "longer radius, longer rods are as flat."
+    "± is the uncertainty of a single setting (95 %). Settings compensate each other: longer rods "
+    "with a larger radius print equally flat."
 )
 
 
-def _plain(number: float) -> str:
+def _format(number: float) -> str:
+    """Number with three decimals; empty if it is unknown."""
     return f"{number:.3f}" if math.isfinite(number) else ""
 
 
 def describe_settings(fit: FirmwareFit) -> str:
-    """Table of the settings, before and after, as text."""
+    """Table of the present and the new settings as text."""
     lines = [f"  {'':20}{'now':>10}{'new':>10}{'±':>9}"]
     lines += [
-        f"  {r.name:20}{r.now:10.3f}{r.new:10.3f}{_plain(r.uncertainty):>9}  {r.unit}"
+        f"  {r.name:20}{r.now:10.3f}{r.new:10.3f}{_format(r.uncertainty):>9}  {r.unit}"
         for r in fit.rows
     ]
     return "\n".join(lines)
 
 
 def _page(calibration: Calibration, fit: FirmwareFit) -> str:
-    """README.md: what to do, the values, what remains."""
+    """README.md: steps, settings and expected errors."""
     settings = fit.settings
-    known = FIRMWARES[settings.firmware]
+    firmware = FIRMWARES[settings.firmware]
     steps = (
         *STEPS[settings.firmware],
         "Probe the bed again, and import the new log into another directory. The height of the "
-        "probe (z offset) stays as it is: set it by paper as before.",
+        "probe (z offset) does not change: set it with paper as before.",
     )
     table = [
-        f"| {r.name} | {r.now:.3f} | {r.new:.3f} | {_plain(r.uncertainty)} | {r.unit} |"
+        f"| {r.name} | {r.now:.3f} | {r.new:.3f} | {_format(r.uncertainty)} | {r.unit} |"
         for r in fit.rows
     ]
     return "\n".join(
         [
-            f"# Settings for {known.title}",
+            f"# Settings for {firmware.title}",
             "",
-            f"`{known.file}`:",
+            f"`{firmware.file}`:",
             "",
             "```",
-            known.config_lines(settings).rstrip(),
+            firmware.config_lines(settings).rstrip(),
             "```",
             "",
             *(f"{i}. {step}" for i, step in enumerate(steps, start=1)),
@@ -430,14 +450,14 @@ def _page(calibration: Calibration, fit: FirmwareFit) -> str:
             *([] if calibration.unmodelled.prior_stds.size else [UNCERTAIN, ""]),
             "## What to expect",
             "",
-            *_expectations(known.title, fit),
+            *_expectations(firmware.title, fit),
             "",
         ]
     )
 
 
 def _expectations(title: str, fit: FirmwareFit) -> list[str]:
-    """Table of errors, and what limits them."""
+    """Table of the expected errors, and their limits."""
 
     def row(words: str, *values: float) -> str:
         return f"| {words} | {' | '.join(f'{v / MM:.3f}' for v in values)} |"
@@ -448,13 +468,13 @@ def _expectations(title: str, fit: FirmwareFit) -> list[str]:
         "| mm | now | new | largest, new |",
         "|---|---|---|---|",
         row(
-            "tool error that the settings leave, RMS over the workspace",
+            "tool error of the settings, RMS over the workspace",
             fit.now.tool_rms,
             fit.new.tool_rms,
             fit.new.tool_largest,
         ),
         row(
-            "height of the first layer that they leave, RMS",
+            "height error of the first layer, RMS",
             fit.now.layer_rms,
             fit.new.layer_rms,
             fit.new.layer_largest,
@@ -463,7 +483,8 @@ def _expectations(title: str, fit: FirmwareFit) -> list[str]:
         f"{title} has no other settings for the geometry. The calibration identified errors that "
         "they cannot express, such as towers that lean.",
         "",
-        f"With what the readings leave unknown, expect a tool error of {tool / MM:.2g} mm RMS, and "
-        f"a first layer of {layer / MM:.2g} mm RMS. A bed alone hardly shows the size of a print: "
-        "longer rods with a larger radius are as flat. Measure a large print, or the rods.",
+        f"With the uncertainty of the calibration, expect a tool error of {tool / MM:.2g} mm RMS, "
+        f"and a height error of the first layer of {layer / MM:.2g} mm RMS. A probed bed hardly "
+        "determines the size of a print: longer rods with a larger radius print equally flat. "
+        "Measure a large print, or the rods.",
     ]

@@ -1,8 +1,8 @@
 """Tip of a tool on the calibrated machine, a point fixed to the platform.
 
-A controller adds a tool offset t as a constant, in the orientation of the nominal platform at the
-mechanical zero. The platform of a calibrated machine is tilted by R. So its tip, p' + R t for the
-tool centre point p', is at the commanded p + t for another p' than p.
+A controller adds a constant tool offset t, in the orientation of the nominal platform at the
+mechanical zero. The platform of the calibrated machine is rotated by R, with the tip at p' + R t
+for the tool centre point p'. So the tip is at the commanded p + t if p' = p + t − R t.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from orthocal.units import MM
 TOLERANCE = 1e-12
 """Largest distance of a tip from its target, [m]."""
 
-MOST_STEPS = 60
+MAX_STEPS = 60
 """Largest number of corrections of a point."""
 
 LARGEST_COORDINATE = 10.0
-"""Largest coordinate of a tip; a larger one is in another unit, [m]."""
+"""Largest accepted coordinate of a tip, [m]; a larger one is probably in another unit."""
 
 
 def require_tip(tool: Sequence[float]) -> None:
@@ -51,8 +51,8 @@ class ToolTip:
     Args:
         calibration: Calibration of a robot whose drives command the tool.
         tool: Tip in the frame of the robot's tool centre point, shape (3,), [m].
-        errors: Errors of the machine instead of the identified ones, [SI].
-        conditions: Conditions of use; by default the middle of both sides of each drive, the
+        errors: Errors of the machine by name, [SI]; by default the identified ones.
+        conditions: Conditions of use; by default the middle between both sides of each drive, the
             reference temperature and no payload.
 
     Raises:
@@ -74,12 +74,12 @@ class ToolTip:
         self.tool = np.array(tool, dtype=np.float64)
         require_tip(self.tool.tolist())
         self.coordinates = list(robot.tcp.coordinates)
-        """Indices of the coordinates that the drives control."""
-        fixed = calibration.errors if errors is None else errors
-        self._closure = LoopClosure(robot, fixed=fixed, conditions=conditions or UseConditions())
+        """Indices of the coordinates that the drives command."""
+        errors = calibration.errors if errors is None else errors
+        self._closure = LoopClosure(robot, fixed=errors, conditions=conditions or UseConditions())
         self._pose = robot_functions(robot).pose(robot.tcp.frame)
-        (zero,) = reference_poses(robot, [robot.tcp.frame])
-        self.level = np.array(zero[:3, :3])
+        (reference,) = reference_poses(robot, [robot.tcp.frame])
+        self.level = np.array(reference[:3, :3])
         """Rotation of the nominal platform at the mechanical zero, shape (3, 3)."""
 
     def targets(self, points: Array) -> Array:
@@ -107,23 +107,25 @@ class ToolTip:
             points: Commanded points, shape (k, n), [m].
             start: Drive and passive coordinates to start from, shape (k, n_drives + n_passive); the
                 reference posture by default.
-            failures: Filled with the points out of reach, whose results are NaN. Without it the
-                first of them raises.
+            failures: Filled with the points out of reach, whose results are NaN. If it is None, the
+                first such point raises an error.
 
         Raises:
             ClosureError: If a point is out of reach.
-            ExportError: If the iteration diverges because the platform turns too much.
+            ExportError: If the iteration diverges because the platform tilts too much.
         """
         shifted, targets = np.array(points), self.targets(points)
-        for _ in range(MOST_STEPS):
+        for _ in range(MAX_STEPS):
             drives, passive = self._closure.reach(shifted, start=start, failures=failures)
             reached = np.isfinite(drives).all(axis=1)
             if not self.tool.any() or not reached.any():
                 return drives, passive
-            missing = targets[reached] - self.place(drives[reached], start=passive[reached])
-            if np.abs(missing).max() < TOLERANCE:
+            distance = targets[reached] - self.place(drives[reached], start=passive[reached])
+            if np.abs(distance).max() < TOLERANCE:
                 return drives, passive
-            shifted[reached] += missing
-            shifted[~reached] = np.nan  # refused already
+            shifted[reached] += distance
+            shifted[~reached] = np.nan  # these are in `failures`
             start = np.hstack([drives, passive])
-        raise ExportError("the platform turns too much for a tool this long; use a shorter one")
+        raise ExportError(
+            "the platform tilts too much for a tool of this length; use a shorter one"
+        )

@@ -1,7 +1,7 @@
-"""Calibrated machine as a robot directory: its own URDF with corrected placements.
+"""Calibrated machine as a robot directory: the robot's URDF with corrected placements.
 
 The origin T of a joint becomes T · exp6(δ) · exp6(a Δρ), with its error δ, axis a and offset Δρ.
-The errors of a frame of closures, legs or the tool correct the fixed joint that places its link.
+Errors of a frame (of a closure, a leg or the tool) correct the fixed joint that places its link.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ _ATTRIBUTE = r"""(?<![\w:.-]){name}\s*=\s*(?P<quote>["'])(?P<value>.*?)(?P=quote
 
 
 def export_urdf(calibration: Calibration) -> dict[str, str]:
-    """Texts of the robot's URDF with the identified errors, and of its YAML without changes.
+    """Texts of the robot's URDF with the identified errors, and of its unchanged YAML.
 
-    A URDF cannot express the scale of a drive: scales are in a separate file.
+    Scales of drives are in scales.csv, because a URDF cannot express them.
 
     Raises:
         ExportError: If the URDF cannot express an error.
@@ -41,21 +41,25 @@ def export_urdf(calibration: Calibration) -> dict[str, str]:
     robot = calibration.robot
     urdf, description = (robot.content[p.name].decode() for p in (robot.urdf, robot.yaml))
     errors = robot.parameters.expand(calibration.errors)
-    text = _correct(urdf, _find_twists(robot, errors), robot)
-    _require_same(robot.with_errors(calibration.errors), text)
+    text = _correct_origins(urdf, _find_twists(robot, errors), robot)
+    _require_calibrated(robot.with_errors(calibration.errors), text)
     files = {robot.urdf.name: text, robot.yaml.name: description}
     scales = [
         f"{e.owner},{tidy(value / PPM)}\n"
         for name, value in errors.items()
         if (e := robot.parameters.elementary[name]).kind == "scale" and value
     ]
-    if scales:  # a drive commanded to q moves to (1 + scale) q
+    if scales:  # a drive that is commanded to q moves to (1 + scale) q
         files["scales.csv"] = "drive,scale_ppm\n" + "".join(scales)
     return files
 
 
 def _find_twists(robot: Robot, errors: Mapping[str, float]) -> dict[str, list[Array]]:
-    """Joints of the URDF with the twists that displace their origins, in order."""
+    """Joints of the URDF with the twists that displace their origins, in the order of composition.
+
+    Raises:
+        ExportError: If an error belongs to no fixed placement.
+    """
     twists: dict[str, Array] = {}
     offsets: dict[str, Array] = {}
     mounts = _mounts(robot)
@@ -67,7 +71,7 @@ def _find_twists(robot: Robot, errors: Mapping[str, float]) -> dict[str, list[Ar
             offsets[e.owner] = joint_axis(robot.model, robot.model.getJointId(e.owner)) * value
             continue
         if e.axis < 0:
-            raise ExportError(f"{name} is no error of a placement: a URDF cannot express it")
+            raise ExportError(f"{name} is not an error of a placement: a URDF cannot express it")
         owner = mounts.get(e.owner) if e.of_frame else e.owner
         if owner is None:
             raise ExportError(
@@ -81,7 +85,7 @@ def _find_twists(robot: Robot, errors: Mapping[str, float]) -> dict[str, list[Ar
 
 
 def _mounts(robot: Robot) -> dict[str, str]:
-    """Links and fixed joints, mapped to the fixed joint that places them."""
+    """Link or fixed joint, to the fixed joint that places it."""
     mounts = {}
     content = robot.content[robot.urdf.name]
     for joint in parse_urdf(robot.urdf, content=content).findall("joint"):
@@ -92,8 +96,8 @@ def _mounts(robot: Robot) -> dict[str, str]:
     return mounts
 
 
-def _correct(text: str, twists: Mapping[str, list[Array]], robot: Robot) -> str:
-    """URDF with displaced origins of joints, and no other byte changed."""
+def _correct_origins(text: str, twists: Mapping[str, list[Array]], robot: Robot) -> str:
+    """URDF with displaced origins of joints; all other bytes are unchanged."""
     content = text.encode()
     line_end = "\r\n" if b"\r\n" in content else "\n"
     changes: list[tuple[int, int, str]] = []
@@ -124,7 +128,7 @@ def _correct(text: str, twists: Mapping[str, list[Array]], robot: Robot) -> str:
 def _find_joints(content: bytes) -> list[tuple[str, int, int | None]]:
     """Names of the robot's joints with the byte positions of their tags and origins.
 
-    A parser finds them, so that comments and joints of other elements are not included.
+    A parser excludes comments and joints of other elements.
     """
     joints: list[tuple[str, int, int | None]] = []
     path: list[str] = []
@@ -132,11 +136,11 @@ def _find_joints(content: bytes) -> list[tuple[str, int, int | None]]:
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         path.append(tag)
-        at = parser.CurrentByteIndex
+        position = parser.CurrentByteIndex
         if path[1:] == ["joint"]:
-            joints.append((composed(attributes.get("name", "")), at, None))
+            joints.append((composed(attributes.get("name", "")), position, None))
         elif path[1:] == ["joint", "origin"] and joints[-1][2] is None:
-            joints[-1] = (*joints[-1][:2], at)
+            joints[-1] = (*joints[-1][:2], position)
 
     def end(_: str) -> None:
         path.pop()
@@ -147,7 +151,7 @@ def _find_joints(content: bytes) -> list[tuple[str, int, int | None]]:
 
 
 def _rewrite(origin: str, twists: list[Array]) -> str:
-    """Origin element with displaced numbers; unchanged ones keep their text."""
+    """Origin element with displaced numbers; unchanged numbers keep their text."""
     numbers = {m[0]: m[1]["value"] for m in _attributes(origin)}
     for key, value in _displaced(numbers, twists).items():
         attribute = next((m for name, m in _attributes(origin) if name == key), None)
@@ -156,8 +160,8 @@ def _rewrite(origin: str, twists: list[Array]) -> str:
             origin = f"{origin[:start]}{value}{origin[end:]}"
         else:
             closing = re.search(r"\s*/?>$", origin)
-            at = len(origin) if closing is None else closing.start()
-            origin = f'{origin[:at]} {key}="{value}"{origin[at:]}'
+            end = len(origin) if closing is None else closing.start()
+            origin = f'{origin[:end]} {key}="{value}"{origin[end:]}'
     return origin
 
 
@@ -168,7 +172,7 @@ def _attributes(origin: str) -> list[tuple[str, re.Match[str]]]:
 
 
 def _displaced(origin: Mapping[str, str], twists: list[Array]) -> dict[str, str]:
-    """Numbers of an origin that change by its displacement."""
+    """Attributes of an origin that its displacement changes, with their new numbers."""
     xyz, rpy = (
         np.array([float(v) for v in origin.get(k, "0 0 0").split()]) for k in ("xyz", "rpy")
     )
@@ -183,28 +187,26 @@ def _displaced(origin: Mapping[str, str], twists: list[Array]) -> dict[str, str]
     return {k: " ".join(f"{v + 0.0:.15g}" for v in n) for k, n in numbers.items()}
 
 
-def _require_same(machine: Robot, text: str) -> None:
-    """Refuse a URDF that is not the calibrated machine.
+def _require_calibrated(machine: Robot, text: str) -> None:
+    """Refuse a URDF that differs from the calibrated machine.
 
     Raises:
-        ExportError: Naming the first joint or frame with another placement.
+        ExportError: If a placement differs; names the first such joint or frame.
     """
     keys = load_description(machine.yaml, content=machine.content[machine.yaml.name])
     model = load_urdf(machine.urdf, content=text.encode(), joint_types=keys.joint_types)
-    used = {f for c in machine.closures for f in (c.frame_a, c.frame_b)}
-    used |= {f for leg in machine.legs.values() for f in (leg.root, leg.tip)}
-    used |= {machine.tcp.frame} if machine.tcp else set()
+    frames = {f for c in machine.closures for f in (c.frame_a, c.frame_b)}
+    frames |= {f for leg in machine.legs.values() for f in (leg.root, leg.tip)}
+    frames |= {machine.tcp.frame} if machine.tcp else set()
     pairs = list(
         zip(model.names, model.jointPlacements, machine.model.jointPlacements, strict=True)
     )
-    for frame in sorted(used):
-        ids = [find_frame(m, frame, where=str(machine.urdf)) for m in (model, machine.model)]
-        pairs.append(
-            (
-                frame,
-                *(m.frames[i].placement for m, i in zip((model, machine.model), ids, strict=True)),
-            )
+    for frame in sorted(frames):
+        placements = (
+            m.frames[find_frame(m, frame, where=str(machine.urdf))].placement
+            for m in (model, machine.model)
         )
+        pairs.append((frame, *placements))
     for name, written, expected in pairs:
         if np.abs(pin.log6(expected.inverse() * written).vector).max() > TOLERANCE:
             raise ExportError(f"a URDF cannot express an error of '{name}'")

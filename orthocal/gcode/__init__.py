@@ -1,1 +1,1 @@
-"""Reading, interpreting and correcting G-code programs, for any machine."""
+"""Reading, interpretation and correction of G-code programs for any machine."""

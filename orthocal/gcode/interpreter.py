@@ -25,7 +25,7 @@ from orthocal.units import MM
 INCH = 25.4 * MM
 
 LARGEST_COORDINATE = 1e3
-"""Largest coordinate of a point, [m]."""
+"""Largest accepted coordinate of a point, [m]."""
 
 MOST_TURNS = 10_000
 """Largest number of turns of an arc."""
@@ -34,7 +34,7 @@ SYSTEMS = {
     **{540.0 + 10 * k: f"G{54 + k}" for k in range(6)},
     **{591.0 + k: f"G59.{1 + k}" for k in range(3)},
 }
-"""Ten times the number of a G-word to the name of its work coordinate system."""
+"""Names of the work coordinate systems by ten times the number of their G-word."""
 
 GROUPS: dict[float, str] = {
     **dict.fromkeys((0.0, 10.0, 20.0, 30.0, 800.0), "motion"),
@@ -53,7 +53,8 @@ GROUPS: dict[float, str] = {
     921.0: "shift",
     970.0: "spindle",
 }
-"""Ten times the number of each accepted G-word to its modal group; a line has one of a group."""
+"""Modal groups of the accepted G-words, by ten times their number. A line has at most one word of a
+group."""
 
 STOPS = frozenset({0.0, 1.0, 2.0, 30.0, 60.0})
 """M-words that take effect after the motion of their line."""
@@ -70,7 +71,7 @@ M_WORDS = STOPS | P_WORDS | frozenset(float(m) for m in (3, 4, 5, 6, 7, 8, 9, 48
 TOOL_CHANGE = 6.0
 
 _LINES_AND_ARCS = "write the motion as lines and arcs (G0 to G3)"
-_ADD = "set it before the program, and give the zero with --work-offset-mm"
+_STATE_ZERO = "set it before the program, and state the zero with --work-offset-mm"
 _CENTER_PATH = "export the path of the tool centre point from the CAM"
 
 REFUSED_CODES: dict[str, tuple[str, str]] = {
@@ -97,15 +98,15 @@ REFUSED_CODES: dict[str, tuple[str, str]] = {
         ("G43", "G43.1", "G43.2"),
         (
             "is a tool length offset, and the length is in the controller",
-            f"{_CENTER_PATH}, and give the tip with --tool",
+            f"{_CENTER_PATH}, and state the tip with --tool",
         ),
     ),
-    "G53": ("is a motion in machine coordinates", "write it in those of the program"),
+    "G53": ("is a motion in machine coordinates", "write it in coordinates of the program"),
     **dict.fromkeys(
         ("G73", "G76", *(f"G{k}" for k in range(81, 90))),
         ("is a canned cycle, whose motions the controller makes", _LINES_AND_ARCS),
     ),
-    **dict.fromkeys(("G92", "G92.2", "G92.3"), ("moves the zero of the program", _ADD)),
+    **dict.fromkeys(("G92", "G92.2", "G92.3"), ("moves the zero of the program", _STATE_ZERO)),
     "G93": ("is inverse time feed", "expected G94"),
     "G95": ("is feed per revolution", "expected G94"),
     "G96": ("is constant surface speed", "expected G97"),
@@ -114,19 +115,19 @@ REFUSED_CODES: dict[str, tuple[str, str]] = {
     "M98": ("calls a subroutine", "write its lines out"),
     "M99": ("ends a subroutine", "write its lines out"),
 }
-"""G and M words that cannot be corrected: the reason, and what is expected instead."""
+"""Reasons and remedies for G and M words that cannot be corrected."""
 
 REFUSED_LETTERS: dict[str, tuple[str, str]] = {
     **dict.fromkeys("ABC", ("a rotary axis", "expected {axes}")),
     **dict.fromkeys("UVW", ("a secondary axis", "expected {axes}")),
     **dict.fromkeys("XYZ", ("an axis that the drives do not command", "expected {axes}")),
     "D": ("a tool radius", "remove it"),
-    "H": ("a tool length offset", "remove it, and give the tip with --tool"),
+    "H": ("a tool length offset", "remove it, and state the tip with --tool"),
     "O": ("subroutines and loops", "write their lines out"),
     "L": ("repetitions", "write them out"),
     "E": ("a word of splines", _LINES_AND_ARCS),
 }
-"""Letters that cannot be corrected: what they are, and what is expected instead."""
+"""Meanings and remedies of letters that cannot be corrected."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,19 +135,23 @@ class Modes:
     """Modal state of the controller."""
 
     motion: int | None = None
-    """0 to 3."""
+    """Number of the G-word, 0 to 3; None if no motion is active."""
     plane: int = 17
+    """Number of the G-word, 17 to 19."""
     unit: float = MM
     """Length unit, [m]."""
     has_unit: bool = False
     """Whether the program has set the unit."""
     absolute: bool = True
+    """Whether coordinates are absolute (G90)."""
     centers_absolute: bool = False
+    """Whether centres of arcs are absolute (G90.1)."""
     feed: float | None = None
     """Feed in units of the program per minute; None if unknown."""
     system: str | None = None
     """Work coordinate system that the program has selected."""
     ended: bool = False
+    """Whether the program has ended."""
 
 
 class Step(NamedTuple):
@@ -161,25 +166,25 @@ class Step(NamedTuple):
     has_feed: bool = False
     """Whether the line sets the feed."""
     end_only: bool = False
-    """Whether only the end is known: the first motion, from an unknown position."""
+    """Whether only the end is known, as for the first motion from an unknown position."""
 
 
 class Tools:
-    """Tools that a program moves, by its T and M6 words.
+    """Tools that a program moves, according to its T and M6 words.
 
     T selects a tool and M6 loads it. Before the first M6 the selected tool counts as loaded, as on
-    controllers that change tools by T alone. A tool without a number is the one that is loaded
-    when the program starts. T0 unloads the tool.
+    controllers that change tools by T alone. The tool without a number is the tool that is loaded
+    at the start of the program. T0 unloads the tool.
 
     Args:
-        one: Whether a second tool is refused.
+        one: Whether to refuse a second tool.
     """
 
     def __init__(self, *, one: bool) -> None:
         self.used: list[str] = []
         """Tools that have moved, in order."""
         self.recorded = False
-        """Whether `used` holds the loaded tool, or needs not to."""
+        """Whether further motions of the loaded tool do not change `used`."""
         self._one = one
         self._selected: float | None = None
         self._loaded: float | None = None
@@ -189,33 +194,33 @@ class Tools:
         """Apply the T and M6 words of a line.
 
         Args:
-            number: Number of the T word, if there is one.
-            load: Whether the line holds M6.
-            where: File and line for messages.
+            number: Number of the T word; None if there is none.
+            load: Whether the line contains M6.
+            where: File and line, for messages.
 
         Raises:
-            GcodeError: If another tool than the one that has moved is loaded.
+            GcodeError: If a second tool is loaded and must be refused.
         """
         if number is not None:
             self._selected = number
         if load or not self._changed:
             self._changed |= load
             self._loaded, self.recorded = self._selected, False
-            again = self._loaded is not None and _tool_name(self._loaded) in self.used[-1:]
-            if self._one and self.used and not again and self._loaded != 0.0:
+            is_same = self._loaded is not None and _tool_name(self._loaded) in self.used[-1:]
+            if self._one and self.used and not is_same and self._loaded != 0.0:
                 second = "M6 without T" if self._loaded is None else _tool_name(self._loaded)
                 raise GcodeError(
-                    f"found {second} after motions of {self.used[-1]}, and --tool gives one tip; "
+                    f"found {second} after motions of {self.used[-1]}, and --tool states one tip; "
                     "expected one tool: split the program by tools, and correct each part with "
                     "its own --tool",
                     where=where,
                 )
 
     def move(self, *, feed: bool) -> None:
-        """Record a motion; rapid motions of a tool without a number do not count.
+        """Record a motion; rapid motions of a tool without a number are ignored.
 
         Args:
-            feed: Whether it is not a rapid motion.
+            feed: Whether the motion is at the feed, not rapid.
         """
         self.recorded = feed or self._loaded is not None
         name = _tool_name(self._loaded)
@@ -228,15 +233,15 @@ def _tool_name(number: float | None) -> str:
 
 
 class Interpreter:
-    """Reads a program line by line.
+    """Interpreter that reads a program line by line.
 
     Args:
         file: Name of the program, for messages.
         axes: Indices of the axes that the drives command.
-        offsets: Work coordinate systems to their zero in machine coordinates, [m]. Without G54
-            the program starts in machine coordinates.
-        start: Position before the program, in its coordinates, [m]; None if unknown.
-        one_tool: Whether a second tool is refused.
+        offsets: Zeros of the work coordinate systems in machine coordinates, [m], by name. Without
+            G54 the program starts in machine coordinates.
+        start: Position before the program, in coordinates of the program, [m]; None if unknown.
+        one_tool: Whether to refuse a second tool.
     """
 
     def __init__(
@@ -263,16 +268,16 @@ class Interpreter:
         self._accepted = _ACCEPTED.union(self._letters.values())
         self._moved = False
         self.uncorrected: int | None = None
-        """First line with a rapid motion that is unchanged: other axes have no position yet."""
+        """First line with an uncorrected rapid motion, because other axes have no position yet."""
 
     def read(self, line: Line) -> Step:
         """Apply a line to modes, tools and position.
 
         Raises:
-            GcodeError: If it holds a word that cannot be corrected.
+            GcodeError: If the line contains a word that cannot be corrected.
         """
         where = f"{self.file}:{line.number}"
-        words, codes = self._sort(line, where)
+        words, codes = self._collect_words(line, where)
         dwell = ends = change = False
         for word in codes:
             if word.letter == "M":
@@ -299,9 +304,9 @@ class Interpreter:
         return step
 
     def read_point(self, line: PointLine) -> Step | None:
-        """Apply a line of coordinates alone; None where `read` is needed.
+        """Apply a line of coordinates only; None if `read` is needed.
 
-        A shortcut of `read` that halves the time of a program of short lines.
+        This shortcut of `read` halves the time for a program of short lines.
         """
         modes, offset, position = self.modes, self.offset, self.position
         code, unit = line.motion, modes.unit
@@ -324,8 +329,8 @@ class Interpreter:
         self.position[:] = end
         return Step(line, modes, offset, Motion(start, (end[0], end[1], end[2])))
 
-    def _sort(self, line: Line, where: str) -> tuple[dict[str, float], list[Word]]:
-        """Values by letter, and the G and M words.
+    def _collect_words(self, line: Line, where: str) -> tuple[dict[str, float], list[Word]]:
+        """Values of a line by letter, and its G and M words.
 
         Raises:
             GcodeError: If a word is repeated or not accepted.
@@ -361,11 +366,17 @@ class Interpreter:
         return words, codes
 
     def _refuse_letter(self, word: Word, where: str) -> NoReturn:
+        """Refuse a word with another letter.
+
+        Raises:
+            GcodeError: Always.
+        """
         reason, remedy = REFUSED_LETTERS.get(word.letter, ("an unknown word", "remove it"))
         remedy = remedy.format(axes=", ".join(self._letters.values()))
         raise GcodeError(f"found {word.text.strip()}, {reason}; {remedy}", where=where)
 
     def _set_mode(self, word: Word, where: str) -> None:
+        """Apply a G-word to the modes."""
         code, modes = _tenfold(word.value), self.modes
         match GROUPS[code]:
             case "motion":
@@ -389,7 +400,7 @@ class Interpreter:
                 name = SYSTEMS[code]
                 if name not in self._offsets:
                     raise GcodeError(
-                        f"found {name}, whose zero in machine coordinates is not given; expected "
+                        f"found {name}, whose zero in machine coordinates is not stated; expected "
                         f"--work-offset-mm {name}=X,Y,Z (0,0,0 for machine coordinates)",
                         where=where,
                     )
@@ -398,20 +409,20 @@ class Interpreter:
     def _check_arguments(
         self, words: Mapping[str, float], codes: Sequence[Word], where: str
     ) -> None:
-        """Refuse P, Q and the words of arcs on lines without a word that takes them."""
-        arc = self.modes.motion in (2, 3)
+        """Refuse P, Q and the words of arcs on lines without a word that needs them."""
+        is_arc = self.modes.motion in (2, 3)
         if "P" in words or "Q" in words:
-            with_p = {("G", 4.0), ("G", 64.0), *(("M", m) for m in P_WORDS)}
-            of_code = any((w.letter, w.value) in with_p for w in codes)
-            of_arc = arc and not _COORDINATES.isdisjoint(words)
-            if not (of_code or (of_arc and "Q" not in words)):
-                raise GcodeError("found P or Q without a word that takes it", where=where)
-            if of_code and of_arc:
+            codes_with_p = {("G", 4.0), ("G", 64.0), *(("M", m) for m in P_WORDS)}
+            belongs_to_code = any((w.letter, w.value) in codes_with_p for w in codes)
+            belongs_to_arc = is_arc and not _COORDINATES.isdisjoint(words)
+            if not (belongs_to_code or (belongs_to_arc and "Q" not in words)):
+                raise GcodeError("found P or Q without a word that needs it", where=where)
+            if belongs_to_code and belongs_to_arc:
                 raise GcodeError(
                     "found an arc and P for another word; write two lines", where=where
                 )
         for letter in ("I", "J", "K", "R"):
-            if letter in words and not arc:
+            if letter in words and not is_arc:
                 raise GcodeError(
                     f"found {letter}, a word of arcs, and the motion is {self._motion}; expected "
                     "G2 or G3",
@@ -420,9 +431,15 @@ class Interpreter:
 
     @property
     def _motion(self) -> str:
+        """Name of the active motion, for messages."""
         return "none" if self.modes.motion is None else f"G{self.modes.motion}"
 
     def _move(self, line: Line, words: Mapping[str, float], where: str) -> Step:
+        """Effect of a line with coordinates.
+
+        Raises:
+            GcodeError: If the motion cannot be corrected.
+        """
         modes = self.modes
         if modes.motion is None:
             raise GcodeError("found coordinates without a motion; expected G0 to G3", where=where)
@@ -453,7 +470,7 @@ class Interpreter:
         return Step(line, modes, self.offset, Motion(begin, end, arc), has_feed)
 
     def _is_unknown_after(self, words: Mapping[str, float]) -> bool:
-        """True for a rapid motion at the start after which the position is not yet known."""
+        """True for a rapid motion at the start that leaves the position of an axis unknown."""
         return (
             (self.modes.motion, self.modes.absolute, self._moved) == (0, True, False)
             and not _COORDINATES.isdisjoint(words)
@@ -464,7 +481,7 @@ class Interpreter:
         )
 
     def _pass(self, line: Line, words: Mapping[str, float], where: str) -> Step:
-        """Unchanged rapid motion, such as the first one to a safe height."""
+        """Effect of an uncorrected rapid motion, such as the first one to a safe height."""
         for k, letter in self._letters.items():
             if letter in words:
                 self.position[k] = self._coordinate(
@@ -476,6 +493,11 @@ class Interpreter:
         return Step(line, self.modes, self.offset)
 
     def _end(self, words: Mapping[str, float], where: str) -> Vector:
+        """End of a motion, [m].
+
+        Raises:
+            GcodeError: If the position of an axis is unknown.
+        """
         absolute, unit, offset = self.modes.absolute, self.modes.unit, self.offset
         end: list[float] = [0.0, 0.0, 0.0]
         for k, letter in self._letters.items():
@@ -496,7 +518,7 @@ class Interpreter:
 
     @staticmethod
     def _coordinate(letter: str, value: float, where: str) -> float:
-        """Refuse a coordinate that no machine has."""
+        """Coordinate, [m]; refuses one beyond LARGEST_COORDINATE."""
         if not -LARGEST_COORDINATE <= value <= LARGEST_COORDINATE:
             raise GcodeError(
                 f"found {letter} at {value / MM:.6g} mm; expected at most "
@@ -506,6 +528,11 @@ class Interpreter:
         return value
 
     def _arc(self, start: Vector, end: Vector, words: Mapping[str, float], where: str) -> Arc:
+        """Geometry of an arc from its words.
+
+        Raises:
+            GcodeError: If the words do not determine an arc.
+        """
         modes = self.modes
         i, j, _ = PLANES[modes.plane]
         if i not in self.axes or j not in self.axes:
@@ -515,10 +542,10 @@ class Interpreter:
                 where=where,
             )
         clockwise = modes.motion == 2
-        wrong = [c for k, c in enumerate(CENTERS) if k not in (i, j) and c in words]
-        if wrong:
+        misplaced = [c for k, c in enumerate(CENTERS) if k not in (i, j) and c in words]
+        if misplaced:
             raise GcodeError(
-                f"found {wrong[0]} with G{modes.plane}; expected {CENTERS[i]} and {CENTERS[j]}",
+                f"found {misplaced[0]} with G{modes.plane}; expected {CENTERS[i]} and {CENTERS[j]}",
                 where=where,
             )
         turns = words.get("P", 1.0)

@@ -1,4 +1,4 @@
-"""Lines of a program (RS274/NGC) as words and comments, with their text."""
+"""Splitting of the lines of a program (RS274/NGC) into words and comments."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _POINT = re.compile(
 )
 
 CONTROL = re.compile("[\x00-\x08\x0a-\x1f\x7f-\x9f]")
-"""Control characters but the tabulator."""
+"""Control characters except the tabulator."""
 
 _SUBROUTINE = re.compile(r"[ \t]*(?:[Nn][0-9. \t]*)?[Oo]")
 
@@ -36,16 +36,16 @@ _HINTS = {
     "^": "polar coordinates",
     "=": "assignments",
 }
-"""Characters that begin no word, and the syntax that they belong to."""
+"""Unsupported syntax by its first character."""
 
 
 class Word(NamedTuple):
-    """A letter and its number."""
+    """Word of a program: a letter and its number."""
 
     letter: str
     value: float
     text: str
-    """Text in the program, with preceding blanks."""
+    """Text in the program with preceding blanks."""
 
     @property
     def code(self) -> str:
@@ -54,11 +54,11 @@ class Word(NamedTuple):
 
 
 Item = Word | str
-"""A word or a comment; each with preceding blanks."""
+"""Word or comment, with preceding blanks."""
 
 
 class Line(NamedTuple):
-    """A line of a program."""
+    """Line of a program."""
 
     number: int
     """Number of the line, from 1."""
@@ -71,14 +71,14 @@ class Line(NamedTuple):
 
 
 class PointLine(NamedTuple):
-    """A line of coordinates alone, as most lines are."""
+    """Line of coordinates only, the most frequent kind."""
 
     number: int
     """Number of the line, from 1."""
     label: str | None
-    """N and its digits."""
+    """N and its digits; None if absent."""
     motion: str | None
-    """0 or 1."""
+    """0 or 1 of G0 or G1; None if absent."""
     x: str | None
     y: str | None
     z: str | None
@@ -86,7 +86,7 @@ class PointLine(NamedTuple):
 
 
 def split_point_line(text: str, number: int) -> PointLine | None:
-    """Split a line of coordinates alone; None for other lines, and for some of these.
+    """Split a line of coordinates only; None for other lines and unusual forms.
 
     Args:
         text: Line with its line end.
@@ -105,7 +105,7 @@ def split_line(text: str, number: int, *, file: str) -> Line:
         file: Name of the program, for messages.
 
     Raises:
-        GcodeError: If a part of it is neither a word nor a comment.
+        GcodeError: If a part of the line is neither a word nor a comment.
     """
     body = text.rstrip(" \t\r\n")
     ending, where = text[len(body) :], f"{file}:{number}"
@@ -114,7 +114,7 @@ def split_line(text: str, number: int, *, file: str) -> Line:
             f"has {len(text)} characters; expected at most {LONGEST_LINE}", where=where
         )
     words = _WORD.findall(body)
-    if sum([len(word[0]) for word in words]) == len(body):  # words alone: the fast case
+    if sum([len(word[0]) for word in words]) == len(body):  # no comments: the fast case
         items = [Word(letter.upper(), float(digits), word) for word, letter, digits in words]
         return Line(number, tuple(items), ending, text)
     mixed: list[Item] = []
@@ -138,6 +138,7 @@ def split_line(text: str, number: int, *, file: str) -> Line:
 
 
 def _refuse(body: str, position: int, *, where: str) -> GcodeError:
+    """Error about the part of a line at a position."""
     text = body[position:].lstrip()
     hint = next((f" ({syntax})" for c, syntax in _HINTS.items() if c in text[:2]), "")
     if _SUBROUTINE.match(body):

@@ -1,4 +1,4 @@
-"""Lines, arcs and helices as curves, many at once, and arcs from a centre or a radius.
+"""Curves of lines, arcs and helices, vectorised, and arcs from a centre or a radius.
 
 Every motion is p(t) = base + slope t + r(t) (cos φ(t) e₁ + sin φ(t) e₂), with r and φ linear in t
 from 0 to 1. A line has r = 0.
@@ -20,18 +20,18 @@ from orthocal.errors import GcodeError
 Vector = tuple[float, float, float]
 
 PLANES: dict[int, tuple[int, int, int]] = {17: (0, 1, 2), 18: (2, 0, 1), 19: (1, 2, 0)}
-"""G17, G18, G19: indices of the first and second axis of the plane, counterclockwise in this order,
-and of the normal axis."""
+"""Indices of the first and second axis of a plane and of its normal, by G17, G18 and G19.
+Counterclockwise is from the first to the second axis."""
 
 AXES = "XYZ"
 CENTERS = "IJK"
 """Letters of an arc's centre, in the order of the axes."""
 
 RADIUS_TOLERANCE = 5e-6
-"""Largest difference of an arc's radii at its ends, [m]: centres have three or four decimals."""
+"""Allowed difference of an arc's radii at its ends, [m]: centres have three or four decimals."""
 
 RELATIVE_RADIUS_TOLERANCE = 1e-3
-"""Largest difference of an arc's radii, relative to the radius."""
+"""Allowed difference of an arc's radii, relative to the radius."""
 
 LARGEST_RADIUS_TOLERANCE = 127e-6
 """Upper limit of the relative tolerance, as in controllers, [m]."""
@@ -39,33 +39,33 @@ LARGEST_RADIUS_TOLERANCE = 127e-6
 SMALLEST_RADIUS = 1e-7
 """Smallest radius of an arc, [m]."""
 
-ARC_PARTS = 64
-"""Parts of an arc at whose ends a region is checked."""
+ARC_POINTS = 64
+"""Number of points of an arc at which a region is checked."""
 
 BORDER = 1e-6
 """Distance beyond a region that counts as inside, [m]: coordinates have three decimals."""
 
-SHORT_RADIUS = 5e-6
-"""Largest shortfall of R against half the distance of the ends, for a half circle, [m]."""
+RADIUS_SHORTFALL = 5e-6
+"""Allowed shortfall of R compared with half the distance of the ends, [m], for a half circle."""
 
 
 class Arc(NamedTuple):
     """Geometry of an arc or a helix."""
 
     plane: int
-    """17, 18 or 19."""
+    """Number of the G-word, 17, 18 or 19."""
     center: tuple[float, float]
-    """Coordinates in the plane, [m]."""
+    """Coordinates of the centre in the plane, [m]."""
     radii: tuple[float, float]
     """Radius at the start and at the end, [m]."""
     angle: float
-    """Angle of the start, [rad]."""
+    """Angle at the start, [rad]."""
     sweep: float
     """Angle of rotation, positive counterclockwise, [rad]."""
 
 
 class Motion(NamedTuple):
-    """A motion between two points, [m]."""
+    """Motion between two points, [m]; a line without an arc."""
 
     start: Vector
     end: Vector
@@ -74,12 +74,12 @@ class Motion(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Paths:
-    """Curves of n motions."""
+    """Curves of n motions; symbols as in the equation of the module."""
 
     base: Array
-    """Shape (n, 3), [m]."""
+    """Base points, shape (n, 3), [m]."""
     slope: Array
-    """Shape (n, 3), [m]."""
+    """Slopes, shape (n, 3), [m]."""
     radius: Array
     """Radius at the start and its change, shape (n, 2), [m]."""
     angle: Array
@@ -88,7 +88,7 @@ class Paths:
     """Indices of e₁ and e₂, shape (n, 2)."""
 
     @classmethod
-    def of(cls, motions: Sequence[Motion]) -> Paths:
+    def from_motions(cls, motions: Sequence[Motion]) -> Paths:
         """Curves of a list of motions."""
         base = np.array([m.start for m in motions], dtype=np.float64).reshape(-1, 3)
         slope = np.array([m.end for m in motions], dtype=np.float64).reshape(-1, 3) - base
@@ -107,65 +107,65 @@ class Paths:
     @property
     def lengths(self) -> Array:
         """Lengths of the curves, shape (n,), [m]."""
-        middle = self.radius[:, 0] + 0.5 * self.radius[:, 1]
-        turned = np.hypot(middle * self.angle[:, 1], self.radius[:, 1])
-        return np.asarray(np.hypot(np.linalg.norm(self.slope, axis=1), turned))
+        mean_radius = self.radius[:, 0] + 0.5 * self.radius[:, 1]
+        in_plane = np.hypot(mean_radius * self.angle[:, 1], self.radius[:, 1])
+        return np.asarray(np.hypot(np.linalg.norm(self.slope, axis=1), in_plane))
 
     @property
     def largest_radii(self) -> Array:
         """Largest radius of each curve, 0 for lines, shape (n,), [m]."""
         return np.asarray(np.maximum(self.radius[:, 0], self.radius.sum(axis=1)))
 
-    def leave(self, region: Array) -> NDArray[np.bool_]:
-        """True for curves that end outside a box, or pass outside it on an arc, shape (n,).
+    def leaves_region(self, region: Array) -> NDArray[np.bool_]:
+        """Mask of the curves that end outside a box, or leave it on an arc, shape (n,).
 
         Args:
             region: Limits of x, y and z, shape (3, 2), [m].
         """
-        parts = np.linspace(0.0, 1.0, ARC_PARTS + 1)[1:]
-        curves = np.arange(len(self.base))
+        parameters = np.linspace(0.0, 1.0, ARC_POINTS + 1)[1:]
+        n = len(self.base)
         arcs = np.flatnonzero(self.angle[:, 1])
-        of = np.concatenate([curves, np.repeat(arcs, len(parts))])
-        points = self.points(of, np.concatenate([np.ones(len(curves)), np.tile(parts, len(arcs))]))
-        beyond = (points < region[:, 0] - BORDER) | (points > region[:, 1] + BORDER)
-        return np.asarray(np.bincount(of, weights=beyond.any(axis=1), minlength=len(curves)) > 0.0)
+        curve = np.concatenate([np.arange(n), np.repeat(arcs, len(parameters))])
+        points = self.points(curve, np.concatenate([np.ones(n), np.tile(parameters, len(arcs))]))
+        outside = (points < region[:, 0] - BORDER) | (points > region[:, 1] + BORDER)
+        return np.asarray(np.bincount(curve, weights=outside.any(axis=1), minlength=n) > 0.0)
 
-    def parts(self, of: Indices, first: Array, last: Array) -> Paths:
+    def parts(self, curve: Indices, first: Array, last: Array) -> Paths:
         """Parts of the curves.
 
         Args:
-            of: Index of the motion of each part, shape (k,).
-            first: Parameter of its start, 0 to 1, shape (k,).
-            last: Parameter of its end, shape (k,).
+            curve: Index of the curve of each part, shape (k,).
+            first: Parameter of the start of each part, 0 to 1, shape (k,).
+            last: Parameter of the end of each part, shape (k,).
         """
-        size = last - first
+        c, share = curve, last - first
         return Paths(
-            self.base[of] + first[:, None] * self.slope[of],
-            size[:, None] * self.slope[of],
+            self.base[c] + first[:, None] * self.slope[c],
+            share[:, None] * self.slope[c],
             np.stack(
-                [self.radius[of, 0] + first * self.radius[of, 1], size * self.radius[of, 1]], axis=1
+                [self.radius[c, 0] + first * self.radius[c, 1], share * self.radius[c, 1]], axis=1
             ),
             np.stack(
-                [self.angle[of, 0] + first * self.angle[of, 1], size * self.angle[of, 1]], axis=1
+                [self.angle[c, 0] + first * self.angle[c, 1], share * self.angle[c, 1]], axis=1
             ),
-            self.axes[of],
+            self.axes[c],
         )
 
-    def points(self, of: Indices, t: Array) -> Array:
+    def points(self, curve: Indices, t: Array) -> Array:
         """Points on the curves, shape (k, 3), [m].
 
         Args:
-            of: Index of the motion of each point, shape (k,).
+            curve: Index of the curve of each point, shape (k,).
             t: Parameter of each point, 0 to 1, shape (k,).
         """
-        points = self.base[of] + t[:, None] * self.slope[of]
-        radius = self.radius[of, 0] + t * self.radius[of, 1]
-        at = np.flatnonzero(radius)
-        if at.size:
-            arcs, r = of[at], radius[at]
-            angle = self.angle[arcs, 0] + t[at] * self.angle[arcs, 1]
-            points[at, self.axes[arcs, 0]] += r * np.cos(angle)
-            points[at, self.axes[arcs, 1]] += r * np.sin(angle)
+        points = self.base[curve] + t[:, None] * self.slope[curve]
+        radius = self.radius[curve, 0] + t * self.radius[curve, 1]
+        on_arc = np.flatnonzero(radius)
+        if on_arc.size:
+            arcs, r = curve[on_arc], radius[on_arc]
+            angle = self.angle[arcs, 0] + t[on_arc] * self.angle[arcs, 1]
+            points[on_arc, self.axes[arcs, 0]] += r * np.cos(angle)
+            points[on_arc, self.axes[arcs, 1]] += r * np.sin(angle)
         return np.asarray(points)
 
 
@@ -185,13 +185,13 @@ def arc_about(
         start: First point, [m].
         end: Last point, [m].
         center: Coordinates of the centre in the plane, [m].
-        plane: 17, 18 or 19.
-        clockwise: Whether it is G2, seen from the positive end of the normal axis.
+        plane: Number of the G-word, 17, 18 or 19.
+        clockwise: Whether the arc is clockwise (G2), seen from the positive end of the normal.
         turns: Number of times that the arc reaches its end.
-        where: File and line for messages.
+        where: File and line, for messages.
 
     Raises:
-        GcodeError: If the radii at its ends differ.
+        GcodeError: If the radii at the ends differ, or the centre is at an end.
     """
     i, j, _ = PLANES[plane]
     first = (start[i] - center[0], start[j] - center[1])
@@ -222,14 +222,22 @@ def arc_about(
 def center_of_radius(
     start: Vector, end: Vector, radius: float, *, plane: int, clockwise: bool, where: str
 ) -> tuple[float, float]:
-    """Centre of an arc with a radius R; a negative R selects the arc of more than 180°.
+    """Centre of an arc with a radius R, in the plane, [m].
+
+    Args:
+        start: First point, [m].
+        end: Last point, [m].
+        radius: R, [m]; a negative R selects the arc of more than 180°.
+        plane: Number of the G-word, 17, 18 or 19.
+        clockwise: Whether the arc is clockwise (G2).
+        where: File and line, for messages.
 
     Raises:
-        GcodeError: If there is no such arc, or more than one.
+        GcodeError: If there is no such arc, or the ends are equal.
     """
     i, j, _ = PLANES[plane]
-    across = (end[i] - start[i], end[j] - start[j])
-    distance = math.hypot(*across)
+    chord = (end[i] - start[i], end[j] - start[j])
+    distance = math.hypot(*chord)
     if distance < SMALLEST_RADIUS:
         raise GcodeError(
             f"found R with both ends at the same {AXES[i]} and {AXES[j]}, which determines no "
@@ -237,7 +245,7 @@ def center_of_radius(
             where=where,
         )
     half = 0.5 * distance
-    if abs(radius) < half - SHORT_RADIUS:
+    if abs(radius) < half - RADIUS_SHORTFALL:
         raise GcodeError(
             f"R is {abs(radius) * 1e3:.6g} mm, less than half the distance of the arc's ends, "
             f"{half * 1e3:.6g} mm",
@@ -248,6 +256,6 @@ def center_of_radius(
         height = -height
     middle = (0.5 * (start[i] + end[i]), 0.5 * (start[j] + end[j]))
     return (
-        middle[0] - height * across[1] / distance,
-        middle[1] + height * across[0] / distance,
+        middle[0] - height * chord[1] / distance,
+        middle[1] + height * chord[0] / distance,
     )

@@ -1,4 +1,4 @@
-"""Correction of a program in one pass, with little of it in memory."""
+"""Correction of a program in one pass, block by block."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from orthocal.gcode.segmentation import LONGEST_SEGMENT, Correction, Refused, se
 from orthocal.gcode.writer import Writer
 from orthocal.units import MM, UM
 
-LINES_AT_ONCE = 2000
-"""Largest number of lines in memory."""
+LINES_PER_BLOCK = 2000
+"""Largest number of lines of a block."""
 
-SEGMENTS_AT_ONCE = 20_000
-"""Estimated number of segments from which the lines in memory are written."""
+SEGMENTS_PER_BLOCK = 20_000
+"""Estimated number of segments above which a block ends."""
 
 ROUNDING = 0.1
-"""Part of the tolerance for the rounding of coordinates."""
+"""Share of the tolerance for the rounding of coordinates."""
 
 LONGEST_READ = 252
-"""Bytes of a line that LinuxCNC reads, without the newline."""
+"""Number of bytes of a line that LinuxCNC reads, without the newline."""
 
 SHORT = LONGEST_READ // 4
-"""Characters that have at most LONGEST_READ bytes in UTF-8."""
+"""Number of characters with at most LONGEST_READ bytes in UTF-8."""
 
 
 @dataclass(slots=True)
@@ -61,9 +61,9 @@ class ProgramCorrector:
     Args:
         interpreter: New interpreter of the program.
         correct: Correction of points.
-        within: Largest distance of the written path from the corrected one, [m].
-        region: Limits of x, y and z beyond which the summary names a line, shape (3, 2), [m].
-        sides: Sides of drives whose backlash the program takes up.
+        within: Largest distance of the written path from the corrected path, [m].
+        region: Limits of x, y and z, shape (3, 2), [m]. The summary has the first line beyond them.
+        sides: Sides of approach of drives whose backlash the program takes up.
 
     Raises:
         GcodeError: If the error bound of the correction exceeds the tolerance.
@@ -94,13 +94,13 @@ class ProgramCorrector:
         self.summary = Summary()
 
     def run(self, lines: Iterable[str]) -> Iterator[str]:
-        """Lines of the corrected program, a block at a time.
+        """Lines of the corrected program, block by block.
 
         Args:
             lines: Lines of the program, each with its line end.
 
         Raises:
-            GcodeError: Naming the first line that cannot be corrected.
+            GcodeError: If a line cannot be corrected; names the first such line.
         """
         steps: list[Step | str] = []
         segments, marks = 0.0, 0
@@ -120,14 +120,19 @@ class ProgramCorrector:
                 if step.motion is not None:
                     summary.unit_assumed |= not step.modes.has_unit
                     segments += _estimate(step.motion)
-            if len(steps) >= LINES_AT_ONCE or segments > SEGMENTS_AT_ONCE:
+            if len(steps) >= LINES_PER_BLOCK or segments > SEGMENTS_PER_BLOCK:
                 yield self._write(steps)
                 steps, segments = [], 0.0
         yield self._write(steps)
         summary.ended = interpreter.modes.ended or marks > 1
 
     def _read(self, text: str, pending: Sequence[Step | str]) -> Step:
-        """Effect of a line."""
+        """Effect of a line.
+
+        Args:
+            text: Text of the line.
+            pending: Effects of the previous lines of the block.
+        """
         number, interpreter = self.summary.lines, self._interpreter
         point = split_point_line(text, number)
         step = None if point is None else interpreter.read_point(point)
@@ -140,12 +145,12 @@ class ProgramCorrector:
             raise
 
     def _write(self, steps: Sequence[Step | str]) -> str:
-        """Corrected text of some lines."""
+        """Corrected text of a block."""
         moving = [s for s in steps if isinstance(s, Step) and s.motion is not None]
         motions = [s.motion for s in moving if s.motion is not None]
-        paths = Paths.of(motions)
+        paths = Paths.from_motions(motions)
         if self.summary.outside is None and self._region is not None and moving:
-            leaving = np.flatnonzero(paths.leave(self._region))
+            leaving = np.flatnonzero(paths.leaves_region(self._region))
             if leaving.size:
                 self.summary.outside = moving[leaving[0]].line.number
         results = iter(
@@ -175,7 +180,7 @@ class ProgramCorrector:
                     low = min(low, *segments.stretch)
                     high = max(high, *segments.stretch)
                 written = self._writer.write(step, segments)
-            if len(written[0]) > SHORT or len(written[-1]) > SHORT:  # others: coordinates alone
+            if len(written[0]) > SHORT or len(written[-1]) > SHORT:  # others have coordinates only
                 self._require_readable(written, step.line.number)
             texts += written
         summary.stretch = [low, high]
@@ -194,7 +199,7 @@ class ProgramCorrector:
 
 
 def _subject(step: Step, refused: Refused) -> str:
-    """Point that is out of reach, in the program's coordinates; "it" for a whole motion."""
+    """Point out of reach, in the program's coordinates, or "it" for the motion."""
     if refused.point is None:
         return "it"
     values = zip(AXES, refused.point, step.offset, strict=True)

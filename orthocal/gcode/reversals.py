@@ -1,4 +1,4 @@
-"""Reversals of drives along motions: where the backlash of a drive has to be taken up."""
+"""Reversals of drives along motions, at which their backlash is taken up."""
 
 from __future__ import annotations
 
@@ -15,32 +15,33 @@ LARGEST_ANGLE = math.pi / 8.0
 """Largest angle of a part of an arc, in which a drive reverses at most once, [rad]."""
 
 STEP = 1e-4
-"""Step of the parameter of a part for the direction of a drive."""
+"""Step of the parameter of a motion for the direction of a drive."""
 
 BISECTIONS = 24
+"""Number of bisections for the parameter of a reversal."""
 
 SMALLEST_MOVE = 1e-7
 """Change of a drive's coordinate along a part below which the drive rests, [m, rad]."""
 
 
 class Sides(Protocol):
-    """Sides from which drives with backlash come, and the points to command on each side.
+    """Sides of approach of drives with backlash, and the points to command on each side.
 
-    A side is 1 where the drive's coordinate grew in its last motion, -1 where it fell, and 0 if
-    that is unknown.
+    A side is 1 if the drive's coordinate grew in its last motion, -1 if it fell, and 0 if this is
+    unknown.
     """
 
     last: Array
     """Sides after the last motion, shape (n_drives,)."""
 
     def drives(self, points: Array) -> Array:
-        """Drive coordinates at points of the tool, to see in which direction drives move.
+        """Drive coordinates at tool positions, which show the direction of the drives.
 
         Args:
-            points: Shape (k, 3), [m].
+            points: Tool positions, shape (k, 3), [m].
 
         Returns:
-            Shape (k, n_drives), [m, rad]; NaN out of reach.
+            Drive coordinates, shape (k, n_drives), [m, rad]; NaN out of reach.
         """
 
     def command(self, points: Array, sides: Array) -> Array:
@@ -48,10 +49,10 @@ class Sides(Protocol):
 
         Args:
             points: Points to command in the middle of both sides, shape (k, 3), [m].
-            sides: Shape (k, n_drives).
+            sides: Sides of the drives, shape (k, n_drives).
 
         Returns:
-            Shape (k, 3), [m].
+            Points to command, shape (k, 3), [m].
         """
 
 
@@ -59,62 +60,88 @@ class Sides(Protocol):
 class Parts:
     """Motions divided where a drive reverses."""
 
-    of: Indices
+    motion: Indices
     """Motion of each part, shape (k,)."""
     first: Array
+    """Parameter of the start of each part on its motion, shape (k,)."""
     last: Array
-    """Parameters of its ends on the motion, shape (k,)."""
+    """Parameter of the end of each part on its motion, shape (k,)."""
     sides: Array
-    """Sides on it, shape (k, n_drives)."""
-    turned: Mask
-    """True where a side differs from that of the part before, shape (k,)."""
+    """Sides of the drives on each part, shape (k, n_drives)."""
+    reversed: Mask
+    """True if a side differs from that of the previous part, shape (k,)."""
     starts: list[int]
+    """First part of each motion."""
     ends: list[int]
-    """First part of each motion, and the one after its last."""
+    """Part after the last part of each motion."""
 
 
 def split_at_reversals(paths: Paths, sides: Sides) -> Parts:
-    """Divide motions where a drive reverses; `sides.last` becomes that after the last motion."""
+    """Divide motions where a drive reverses; updates `sides.last` to the end of the last motion."""
     counts = np.maximum(np.ceil(np.abs(paths.angle[:, 1]) / LARGEST_ANGLE), 1.0).astype(np.int64)
-    of = np.repeat(np.arange(len(counts)), counts)
-    number = np.arange(of.size) - np.repeat(np.cumsum(counts) - counts, counts)
-    first, last = number / counts[of], (number + 1.0) / counts[of]
-    at = np.column_stack([of, first])
-    at = np.unique(np.vstack([at, _find_cuts(paths, sides, of, first, last)]), axis=0)
-    of, first = at[:, 0].astype(np.int64), at[:, 1]
-    last = np.where(np.append(of[1:] == of[:-1], False), np.append(first[1:], 1.0), 1.0)
-    moved = sides.drives(paths.points(of, last)) - sides.drives(paths.points(of, first))
-    moving = np.abs(np.nan_to_num(moved)) > SMALLEST_MOVE
-    taken = np.vstack([sides.last[None], np.where(moving, np.sign(moved), 0.0)])
-    # a drive that rests stays on its side
-    index = np.where(taken != 0.0, np.arange(len(taken))[:, None], 0)
-    filled = np.take_along_axis(taken, np.maximum.accumulate(index, axis=0), axis=0)
-    turned = (filled[1:] != filled[:-1]).any(axis=1)
+    motion = np.repeat(np.arange(len(counts)), counts)
+    number = np.arange(motion.size) - np.repeat(np.cumsum(counts) - counts, counts)
+    first, last = number / counts[motion], (number + 1.0) / counts[motion]
+    starts = np.column_stack([motion, first])
+    reversals = _find_reversals(paths, sides, motion, first, last)
+    starts = np.unique(np.vstack([starts, reversals]), axis=0)
+    motion, first = starts[:, 0].astype(np.int64), starts[:, 1]
+    last = _part_ends(motion, first)
+    travel = sides.drives(paths.points(motion, last)) - sides.drives(paths.points(motion, first))
+    moves = np.abs(np.nan_to_num(travel)) > SMALLEST_MOVE
+    part_sides = np.vstack([sides.last[None], np.where(moves, np.sign(travel), 0.0)])
+    # a resting drive keeps its side: fill zeros forwards
+    index = np.where(part_sides != 0.0, np.arange(len(part_sides))[:, None], 0)
+    filled = np.take_along_axis(part_sides, np.maximum.accumulate(index, axis=0), axis=0)
+    reverses = (filled[1:] != filled[:-1]).any(axis=1)
     sides.last = filled[-1]
-    unchanged = (first == 0.0) | turned
-    of, first = of[unchanged], first[unchanged]
-    last = np.where(np.append(of[1:] == of[:-1], False), np.append(first[1:], 1.0), 1.0)
-    ends = np.cumsum(np.bincount(of, minlength=len(counts))).tolist()
-    return Parts(of, first, last, filled[1:][unchanged], turned[unchanged], [0, *ends[:-1]], ends)
+    is_start = (first == 0.0) | reverses  # parts without a reversal belong to the previous part
+    motion, first = motion[is_start], first[is_start]
+    ends = np.cumsum(np.bincount(motion, minlength=len(counts))).tolist()
+    return Parts(
+        motion,
+        first,
+        _part_ends(motion, first),
+        filled[1:][is_start],
+        reverses[is_start],
+        [0, *ends[:-1]],
+        ends,
+    )
 
 
-def _find_cuts(paths: Paths, sides: Sides, of: Indices, first: Array, last: Array) -> Array:
-    """Motions and parameters at which a drive reverses within short parts, shape (k, 2)."""
+def _part_ends(motion: Indices, first: Array) -> Array:
+    """Parameters of the ends of parts: the start of the next part of the motion, or 1."""
+    is_followed = np.append(motion[1:] == motion[:-1], False)
+    return np.where(is_followed, np.append(first[1:], 1.0), 1.0)
 
-    def direction(part: Indices, t: Array) -> Array:
-        """Signs of the drives' velocities, shape (k, n_drives)."""
+
+def _find_reversals(
+    paths: Paths, sides: Sides, motion: Indices, first: Array, last: Array
+) -> Array:
+    """Motions and parameters at which a drive reverses within short parts, shape (k, 2).
+
+    Args:
+        paths: Curves of the motions.
+        sides: Sides of the drives.
+        motion: Motion of each part, shape (n,).
+        first: Parameter of the start of each part, shape (n,).
+        last: Parameter of the end of each part, shape (n,).
+    """
+
+    def direction(curve: Indices, t: Array) -> Array:
+        """Changes of the drive coordinates about parameters, shape (n, n_drives)."""
         low, high = np.clip(t - STEP, 0.0, 1.0), np.clip(t + STEP, 0.0, 1.0)
-        at = sides.drives(paths.points(part, high)) - sides.drives(paths.points(part, low))
-        return np.asarray(np.nan_to_num(at))
+        change = sides.drives(paths.points(curve, high)) - sides.drives(paths.points(curve, low))
+        return np.asarray(np.nan_to_num(change))
 
-    begins, ends = direction(of, first), direction(of, last)
+    begins, ends = direction(motion, first), direction(motion, last)
     parts, drives = np.nonzero(begins * ends < 0.0)
     low, high = first[parts], last[parts]
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
-        before = direction(of[parts], middle)[np.arange(parts.size), drives]
-        same = before * begins[parts, drives] > 0.0
-        low, high = np.where(same, middle, low), np.where(same, high, middle)
+        change = direction(motion[parts], middle)[np.arange(parts.size), drives]
+        is_before = change * begins[parts, drives] > 0.0
+        low, high = np.where(is_before, middle, low), np.where(is_before, high, middle)
     middle = 0.5 * (low + high)
     inside = (middle > STEP) & (middle < 1.0 - STEP)
-    return np.column_stack([of[parts[inside]], middle[inside]])
+    return np.column_stack([motion[parts[inside]], middle[inside]])

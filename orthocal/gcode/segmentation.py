@@ -1,7 +1,7 @@
 """Segmentation of motions into chords that stay near the corrected path.
 
-The deviation of a chord is evaluated at a quarter, a half and three quarters of it. Segments are
-short compared with the curvature of any correction.
+The deviation of a chord is evaluated at a quarter, a half and three quarters of its length.
+Segments are so short that the curvature of a correction hardly changes within one.
 """
 
 from __future__ import annotations
@@ -26,11 +26,12 @@ LARGEST_ANGLE = math.pi / 4.0
 MOST_SEGMENTS = 50_000
 """Largest number of segments of one motion."""
 
-POINTS_AT_ONCE = 40_000
+POINTS_PER_BLOCK = 40_000
 """Number of points that are corrected together."""
 
-EVALUATED = 0.97
-"""Limit of the evaluated deviations, relative to the tolerance: others may be slightly larger."""
+EVALUATED_SHARE = 0.97
+"""Limit of the evaluated deviations, relative to the tolerance; between the evaluated points
+deviations may be slightly larger."""
 
 FRACTIONS = np.array([0.25, 0.5, 0.75])
 """Positions on a chord at which its deviation is evaluated."""
@@ -44,14 +45,14 @@ class Correction(Protocol):
         """Largest error of a corrected point, [m]."""
 
     def __call__(self, points: Array) -> tuple[Array, Mapping[int, str]]:
-        """Corrected points.
+        """Correct points.
 
         Args:
-            points: Desired points of the tool, shape (k, 3), [m].
+            points: Desired tool positions, shape (k, 3), [m].
 
         Returns:
-            Points to command, shape (k, 3), [m]; and the index of the first point out of reach with
-            the reason. Later points may be refused without a check.
+            Points to command, shape (k, 3), [m], and reasons by the index of refused points. The
+            first of them is out of reach; later points may be refused without a check.
         """
 
 
@@ -59,11 +60,11 @@ class Segments(NamedTuple):
     """Polyline of a motion."""
 
     start: list[float]
-    """Corrected x, y, z of its start, [m]."""
+    """Corrected x, y, z of the start of the motion, [m]."""
     points: list[list[float]]
-    """Corrected x, y, z of the segments' ends, without the start of the motion, [m]."""
+    """Corrected x, y, z of the ends of the segments, [m]."""
     stretch: list[float]
-    """Length of each segment relative to that of its part of the motion."""
+    """Length of each segment, relative to the length of its part of the motion."""
     deviation: float
     """Largest evaluated distance of the corrected motion from its chords, [m]."""
     correction: float
@@ -72,11 +73,11 @@ class Segments(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """A motion without segments."""
+    """Motion that cannot be divided, with the reason."""
 
     reason: str
     point: tuple[float, ...] | None = None
-    """x, y, z of the first point out of reach, [m]; None if there is another reason."""
+    """x, y, z of the first point out of reach, [m]; None for another reason."""
 
 
 def segment_motions(
@@ -89,27 +90,27 @@ def segment_motions(
         correct: Correction of points.
         tolerance: Largest distance of the corrected motion from its chords, [m].
         sides: Sides of drives with backlash. Motions are then divided where a drive reverses, and
-            a further segment takes up its backlash there.
+            an additional segment takes up its backlash there.
     """
     if sides is None or not len(paths.base):
         return _segment(paths, correct, tolerance)
     reversals = split_at_reversals(paths, sides)
-    parts = paths.parts(reversals.of, reversals.first, reversals.last)
-    segments = _segment(parts, correct, tolerance, sides=sides, of_part=reversals.sides)
+    parts = paths.parts(reversals.motion, reversals.first, reversals.last)
+    segments = _segment(parts, correct, tolerance, sides=sides, part_sides=reversals.sides)
     return [
-        _join([segments[k] for k in range(*ends)], reversals.turned[slice(*ends)])
+        _join([segments[k] for k in range(*ends)], reversals.reversed[slice(*ends)])
         for ends in zip(reversals.starts, reversals.ends, strict=True)
     ]
 
 
-def _join(parts: list[Segments | Refused], turned: Mask) -> Segments | Refused:
-    """One polyline of the parts of a motion, which takes up backlash where drives turned."""
+def _join(parts: list[Segments | Refused], reversed_drives: Mask) -> Segments | Refused:
+    """Join the parts of a motion to one polyline, which takes up backlash at reversals."""
     points: list[list[float]] = []
     stretch: list[float] = []
-    for part, has_turned in zip(parts, turned.tolist(), strict=True):
+    for part, reverses in zip(parts, reversed_drives.tolist(), strict=True):
         if isinstance(part, Refused):
             return part
-        if has_turned:
+        if reverses:
             points.append(part.start)
             stretch.append(1.0)
         points += part.points
@@ -130,19 +131,27 @@ def _segment(
     tolerance: float,
     *,
     sides: Sides | None = None,
-    of_part: Array | None = None,
+    part_sides: Array | None = None,
 ) -> list[Segments | Refused]:
-    """Segments of each motion, on the sides of each motion, shape (n, n_drives)."""
+    """Segments of each motion.
 
-    def on_sides(points: Array, of: Indices) -> tuple[Array, Mapping[int, str]]:
+    Args:
+        paths: Curves of the motions.
+        correct: Correction of points.
+        tolerance: Largest distance of the corrected motion from its chords, [m].
+        sides: Sides of drives with backlash.
+        part_sides: Sides of the drives on each motion, shape (n, n_drives).
+    """
+
+    def correct_on_sides(points: Array, motion: Indices) -> tuple[Array, Mapping[int, str]]:
         corrected, refused = correct(points)
-        if sides is None or of_part is None:
+        if sides is None or part_sides is None:
             return corrected, refused
-        return sides.command(corrected, of_part[of]), refused
+        return sides.command(corrected, part_sides[motion]), refused
 
     lengths, radii = paths.lengths, paths.largest_radii
     # sagitta of an arc: s²/8r
-    longest = np.where(radii > 0.0, np.sqrt(8.0 * radii * EVALUATED * tolerance), np.inf)
+    longest = np.where(radii > 0.0, np.sqrt(8.0 * radii * EVALUATED_SHARE * tolerance), np.inf)
     counts = lengths / np.minimum(longest, LONGEST_SEGMENT)
     counts = np.maximum(counts, np.abs(paths.angle[:, 1]) / LARGEST_ANGLE)
     counts = np.maximum(np.ceil(counts), 1.0)
@@ -156,7 +165,8 @@ def _segment(
             )
         refined: list[int] = []
         for group in _groups(pending[counts[pending] <= MOST_SEGMENTS], counts):
-            for i, count in _segment_group(paths, group, counts, on_sides, tolerance, results):
+            repeated = _segment_group(paths, group, counts, correct_on_sides, tolerance, results)
+            for i, count in repeated:
                 counts[i] = count
                 refined.append(i)
         pending = np.array(refined, dtype=np.int64)
@@ -165,11 +175,11 @@ def _segment(
 
 def _groups(pending: Indices, counts: Array) -> Iterator[Indices]:
     """Groups of motions whose points are corrected together, at least one motion each."""
-    load = np.cumsum(4.0 * counts[pending] + 1.0)
+    n_points = np.cumsum(4.0 * counts[pending] + 1.0)
     first = 0
     while first < pending.size:
-        before = load[first - 1] if first else 0.0
-        last = max(int(np.searchsorted(load, before + POINTS_AT_ONCE, side="right")), first + 1)
+        limit = (n_points[first - 1] if first else 0.0) + POINTS_PER_BLOCK
+        last = max(int(np.searchsorted(n_points, limit, side="right")), first + 1)
         yield pending[first:last]
         first = last
 
@@ -182,7 +192,15 @@ def _segment_group(
     tolerance: float,
     results: list[Segments | Refused | None],
 ) -> Iterator[tuple[int, float]]:
-    """Divide motions into given numbers of segments.
+    """Divide motions into stated numbers of segments.
+
+    Args:
+        paths: Curves of the motions.
+        group: Indices of the motions to divide.
+        counts: Number of segments of each motion.
+        correct: Correction of points, with the motion of each point.
+        tolerance: Largest distance of the corrected motion from its chords, [m].
+        results: Result of each motion; filled by this function.
 
     Yields:
         Motions that need more segments, and the next number to try.
@@ -210,15 +228,17 @@ def _segment_group(
     with np.errstate(divide="ignore", invalid="ignore"):
         stretch = np.where(part > 0.0, np.linalg.norm(b - a, axis=1) / part, 1.0)
     begins, ends, stretches = corrected[first].tolist(), b.tolist(), stretch.tolist()
-    last = 0
+    position = 0
     columns = (group.tolist(), n.tolist(), deviations.tolist(), corrections.tolist())
     for k, (i, count, largest, correction) in enumerate(zip(*columns, strict=True)):
-        part_of = slice(last, last + count)
-        last += count
+        segments = slice(position, position + count)
+        position += count
         if k in reasons:
             results[i] = reasons[k]
-        elif largest > EVALUATED * tolerance:
+        elif largest > EVALUATED_SHARE * tolerance:
             # the deviation of a chord grows with the square of its length
             yield i, max(count + 1.0, math.ceil(count * math.sqrt(largest / tolerance) * 1.05))
         else:
-            results[i] = Segments(begins[k], ends[part_of], stretches[part_of], largest, correction)
+            results[i] = Segments(
+                begins[k], ends[segments], stretches[segments], largest, correction
+            )

@@ -11,27 +11,31 @@ from orthocal.gcode.segmentation import Segments
 from orthocal.units import MM
 
 FEWEST_DECIMALS = {MM: 4, INCH: 5}
+"""Fewest decimals of a coordinate by unit."""
+
 MOST_DECIMALS = 9
+"""Largest number of decimals of a coordinate."""
 
 FEED_STEP = 1e-4
-"""Relative change of the feed from which a new F is written."""
+"""Relative change of the feed above which a new F is written."""
 
 FEED_DIGITS = 6
+"""Number of significant digits of a feed."""
 
 _REPLACED = frozenset("XYZIJKR")
 _MOTIONS = frozenset({0.0, 1.0, 2.0, 3.0})
 _ARCS = frozenset({2, 3})
 _CANCEL = 80.0
 _RESETS = frozenset({_CANCEL, 20.0, 21.0})
-"""G-words after which the motion or the feed has to be written again."""
+"""G-words after which the motion or the feed must be written again."""
 
 
 def find_decimals(unit: float, rounding: float) -> int:
-    """Decimals that round points in space by less than a distance.
+    """Number of decimals with which rounding displaces a point by less than a distance.
 
     Args:
         unit: Unit of the coordinates, [m].
-        rounding: Largest distance, [m].
+        rounding: Largest displacement, [m].
     """
     needed = math.ceil(math.log10(0.5 * math.sqrt(3.0) * unit / rounding))
     return min(max(FEWEST_DECIMALS[unit], needed), MOST_DECIMALS)
@@ -42,7 +46,7 @@ class Writer:
 
     Args:
         axes: Indices of the axes that the drives command.
-        rounding: Largest rounding of a point, [m].
+        rounding: Largest displacement of a point by rounding, [m].
         start: Position of the controller before the program, [m]; None if unknown.
     """
 
@@ -51,18 +55,18 @@ class Writer:
     ) -> None:
         self._axes = tuple(axes)
         self._formats: dict[float, tuple[int, str, str]] = {}
-        """Unit to decimals, format of a point, and a negative zero."""
+        """Number of decimals, format of a point and text of a negative zero, by unit."""
         for unit in (MM, INCH):
             n = find_decimals(unit, rounding)
             words = " ".join(f"{'XYZ'[k]}%.{n}f" for k in axes)
             self._formats[unit] = (n, words, f"-{0.0:.{n}f}")
         self._position: list[float] = [0.0 if v is None else v for v in start]
-        """Position that was written last, with its rounding, [m]."""
+        """Rounded position that was written last, [m]."""
         self._motion: int | None = None
         self._feed: float | None = None
 
     def copy(self, line: Line) -> str:
-        """Text of a line without a motion."""
+        """Unchanged text of a line without a motion; tracks its modes."""
         for item in line.items:
             if isinstance(item, Word):
                 if item.letter == "F":
@@ -100,12 +104,20 @@ class Writer:
     def _begin(
         self, line: Line, modes: Modes, point: str, feed: str, *, defer: bool
     ) -> tuple[str, str]:
-        """Line up to its first point and feed, and the stops to append to the last one."""
+        """First line of a motion, and the stops to append to its last line.
+
+        Args:
+            line: The line of the program.
+            modes: Modes during the line.
+            point: Coordinate words of the first point.
+            feed: Feed word of the first segment; empty if the feed does not change.
+            defer: Whether stops are deferred to the last line.
+        """
         motion = 0 if modes.motion == 0 else 1
         parts: list[str] = []
         stops = ""
         has_motion = has_point = False
-        feed_at = 0
+        feed_index = 0
         for item in line.items:
             if isinstance(item, str):
                 parts.append(item)
@@ -114,7 +126,7 @@ class Writer:
             if letter in _REPLACED or (letter == "P" and modes.motion in _ARCS):
                 if not has_point:
                     parts.append(f" {point}" if parts else point)
-                    has_point, feed_at = True, len(parts)
+                    has_point, feed_index = True, len(parts)
             elif letter == "G" and value in _MOTIONS:
                 parts.append(f" G{motion}" if parts else f"G{motion}")
                 has_motion = True
@@ -125,13 +137,13 @@ class Writer:
             else:
                 parts.append(item.text)
         if feed:
-            parts.insert(feed_at, f" {feed}")
+            parts.insert(feed_index, f" {feed}")
         if self._motion != motion and not has_motion:
             parts.insert(_after_number(line), f" G{motion}" if line.items else f"G{motion}")
         return "".join(parts).lstrip(), stops
 
     def _points(self, step: Step, segments: Segments) -> list[str]:
-        """Coordinate words of each segment's end."""
+        """Coordinate words of the end of each segment."""
         unit, axes = step.modes.unit, self._axes
         decimals, form, negative_zero = self._formats[unit]
         base: Sequence[float] = step.offset
@@ -149,7 +161,7 @@ class Writer:
         return texts
 
     def _feeds(self, step: Step, segments: Segments) -> list[str]:
-        """Feed word of each segment; empty where the feed does not change."""
+        """Feed word of each segment; empty if the feed does not change."""
         programmed, changed = step.modes.feed, step.has_feed
         if step.modes.motion == 0 or programmed is None:
             return [""] * len(segments.points)
@@ -166,7 +178,7 @@ class Writer:
 
 
 def _after_number(line: Line) -> int:
-    """Index of the first item after the line's number."""
+    """Index of the first item after the number of the line."""
     first = line.items[0] if line.items else ""
     return 1 if isinstance(first, Word) and first.letter == "N" else 0
 

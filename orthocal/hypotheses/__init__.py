@@ -1,4 +1,4 @@
-"""Mistakes made while reading, as hypotheses: which of them do the readings speak for?
+"""Hypotheses about mistakes made while reading, and their evidence in the readings.
 
-It knows no calibration.
+The package does not depend on a calibration.
 """

@@ -1,4 +1,4 @@
-"""Anomalies of a session as data: what happened, where, how large, and how sure."""
+"""Anomalies of a session as data: kind, place, amount and evidence."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ AnomalyKind = Literal[
     "offset of one drive",
     "machine changed",
 ]
-"""Kinds of anomaly; `offset of one drive` is one that differs from the stated offset and matches
-no known way to enter it wrongly. `other effect` is one from another package."""
+"""Kinds of anomaly. `offset of one drive`: an offset that differs from the stated one and matches
+no usual mistake of entering it. `other effect`: an effect from another package."""
 
 EFFECT_KINDS: Mapping[str, AnomalyKind] = {
     "backlash": "backlash",
@@ -52,103 +52,105 @@ WRONGLY_ENTERED: tuple[AnomalyKind, ...] = (
     "offsets entered twice",
     "offsets interchanged",
 )
-"""Kinds that say which offsets are in the controller instead of those stated."""
+"""Kinds that state which offsets the controller has instead of the stated ones."""
 
 Scope = Literal[
     "reading", "posture", "postures", "cycle", "setup", "setups", "leg", "legs", "gauge", "session"
 ]
-"""What an anomaly concerns as a unit; `posture` is one posture in all cycles of a setup,
-`postures` is a posture (or two) in all setups that read it."""
+"""Unit to which an anomaly belongs. `posture`: one posture in all cycles of a setup. `postures`:
+one posture (or two) in all setups that read it."""
 
-ORDERED: tuple[AnomalyKind, ...] = ("displaced gauge", "row offset", "stuck dial")
-"""Kinds that begin in one row and go on to later ones."""
+PERSISTENT: tuple[AnomalyKind, ...] = ("displaced gauge", "row offset", "stuck dial")
+"""Kinds that affect all rows from one row on."""
 
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """One thing that may have happened: all that its wording needs."""
+    """One possible event, with everything that its wording needs."""
 
     kind: AnomalyKind
     scope: Scope
     rows: tuple[int, ...] = ()
-    """Rows of the session that are wrong, in the order of measuring. Of `swapped rows` the first
-    half, in the same order as their counterparts in the second half. Of a row offset from the first
-    row that is wrong on."""
+    """Wrong rows of the session, in the order of measuring. `swapped rows`: each row of the first
+    half is swapped with the row at the same place of the second half. `row offset`: all rows from
+    the first wrong one on."""
     setups: tuple[str, ...] = ()
-    """Setups that are concerned as a whole."""
+    """Setups of which all readings are concerned."""
     names: tuple[str, ...] = ()
     """Legs, gauges or postures that the scope refers to; a displaced artefact; the key of a wrong
-    dimension, its stated size in mm and, of a readjusted one, the session from which on."""
+    dimension and its stated value in mm. `readjusted dimension`: also the first session with the
+    other value."""
     cycle: int | None = None
-    """The cycle, where one alone is concerned."""
+    """The cycle, if only one is concerned."""
     factor: float | None = None
     """Factor that corrects the readings."""
     amount: float | None = None
-    """Amount by which the rows are too large, [m] (misread dial, outlier, displaced gauge; for a
-    drift of the last row against the first; of other effects the range of what they add to the
-    rows); of `machine changed` the change, [SI]; of a wrong or readjusted dimension its true
-    less its stated size, [m]."""
+    """Amount of the anomaly. Misread dial, outlier, displaced gauge: excess of the rows, [m].
+    Drift: excess of the last row over the first, [m]. Other effects: range of their contributions
+    to the rows, [m]. `machine changed`: the change, [SI]. Wrong or readjusted dimension: true minus
+    stated value, [m]."""
     std: float | None = None
     """Standard deviation of the amount, [SI]."""
     missing: bool | None = None
-    """Of a row offset: True where the first of the rows was not read, False where the row before
-    was written twice, so that the last reading was lost."""
+    """Row offset: True if the first of the rows was not read, False if the row before was written
+    twice, so that the last reading was lost."""
     drives: tuple[str, ...] = ()
     """Drives whose offsets are concerned."""
     offsets: tuple[float, ...] = ()
-    """Offsets that are in the controller instead of those stated, one per drive of the robot,
-    [m, rad]."""
+    """Offsets in the controller instead of the stated ones, one per drive, [m, rad]."""
     effect: str = ""
-    """Name of the effect that the machine or its gauges have, and its model lacks."""
+    """Name of an effect of the machine or its gauges that the model lacks."""
     parameters: tuple[str, ...] = ()
-    """Error parameters that changed, or those of an effect."""
+    """Error parameters that changed, or the parameters of an effect."""
     amounts: tuple[float, ...] = ()
-    """Of an effect the value of each parameter, [SI]."""
+    """Value of each parameter of an effect, [SI]."""
     stds: tuple[float, ...] = ()
     """Standard deviations of the amounts, [SI]."""
     units: tuple[Unit, ...] = ()
-    """Their units."""
+    """Units of the parameters."""
     sessions: tuple[str, ...] = ()
-    """Sessions that are concerned, or the first session after a change; empty for a single one."""
+    """Sessions concerned, or the first session after a change; empty for a single session."""
     apart: bool = False
-    """Whether the machine changed for these sessions only, and not from the first of them on."""
+    """Whether the machine changed for these sessions only, not from the first of them on."""
 
     def agrees_with(self, other: Explanation) -> bool:
-        """True if both concern the same rows up to one at an end, or drives of the same session."""
+        """True if both concern the same drives and sessions, or the same rows.
+
+        Rows of a kind in PERSISTENT may differ by one.
+        """
         if not self.rows or not other.rows:
             same = self.drives == other.drives and self.sessions == other.sessions
             return self == other or (bool(self.drives) and same)
         if set(self.rows) == set(other.rows):
             no_setups = not (self.setups or other.setups)
             return len(self.rows) == 1 or self.kind == other.kind or no_setups
-        apart = set(self.rows) ^ set(other.rows)
-        return self.kind == other.kind and self.kind in ORDERED and len(apart) <= 1
+        difference = set(self.rows) ^ set(other.rows)
+        return self.kind == other.kind and self.kind in PERSISTENT and len(difference) <= 1
 
 
 @dataclass(frozen=True, slots=True)
 class Anomaly:
-    """An explanation that the readings prefer to no anomaly."""
+    """An explanation whose evidence exceeds that of no anomaly."""
 
     explanation: Explanation
     log_evidence: float
-    """Logarithm of the Bayes factor of all anomalies found against those without this one, prior
-    probabilities of its kind and place included."""
+    """Logarithm of the Bayes factor of the set of anomalies with and without this one. It includes
+    the prior probabilities of kind and place."""
     expected: float | None
-    """Predicted value of the row, where a single row is concerned, [m]."""
+    """Predicted value of the row, if a single row is concerned, [m]."""
     causes: tuple[Explanation, ...] = ()
-    """Other explanations of the same rows that are nearly as likely; then only the rows are
-    certain."""
+    """Nearly as likely explanations of the same rows; then only the rows are certain."""
     alternatives: tuple[Explanation, ...] = ()
-    """Explanations elsewhere that are nearly as likely."""
+    """Nearly as likely explanations in other rows."""
 
     @property
     def ambiguous(self) -> bool:
-        """True if an explanation elsewhere is nearly as likely."""
+        """True if an explanation in other rows is nearly as likely."""
         return bool(self.alternatives)
 
     @property
     def between_sessions(self) -> bool:
-        """True if it is, or may be, a change between sessions."""
+        """True if the explanation or an alternative is a change between sessions."""
         return any(e.sessions for e in (self.explanation, *self.alternatives))
 
 
@@ -158,14 +160,15 @@ class Anomalies:
 
     found: tuple[Anomaly, ...]
     log_evidence: float
-    """Logarithm of the Bayes factor of the anomalies found against none."""
+    """Logarithm of the Bayes factor of the found anomalies against no anomaly."""
     explained: bool
-    """Whether the readings are those of a machine near its tolerances once the anomalies are
-    corrected; if not, something else is wrong as well."""
+    """Whether a machine near its tolerances explains the corrected readings. If not, there is a
+    further cause."""
     rms_before: float
     """RMS residual of a machine within its tolerances, [m]."""
     rms_after: float
-    """The same once the anomalies are corrected, [m]; infinite if no machine shows them."""
+    """RMS residual of such a machine after correction of the anomalies, [m]; infinite if no
+    machine explains the corrected readings."""
     tolerance_scale: float
     """Most likely factor between the machine's errors and their tolerances."""
     noise_scale: float

@@ -1,4 +1,4 @@
-"""Families of hypotheses: how rows would change, or which effects would be added, many at once."""
+"""Families of hypotheses about rows of a session: corrections, effects and machine shifts."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ Key = TypeVar("Key")
 Sparse: TypeAlias = Any
 """A scipy.sparse.csr_array, which has no type stubs; an ordinary array for few columns."""
 
-MOST_DENSE = 64
-"""Number of columns up to which matrices are ordinary arrays: SciPy is imported for more only."""
+MAX_DENSE_COLUMNS = 64
+"""Most columns of a matrix that is stored as an ordinary array, without importing SciPy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tails:
-    """Patterns that are equal to a base vector from some row of a segment on, and 0 before.
+    """Patterns that equal a base vector from some row of a segment on, and are 0 before.
 
-    Products with all of them follow from cumulative sums, in memory linear in the rows.
+    Products with all patterns follow from cumulative sums, in memory linear in the rows.
     """
 
     segments: Sequence[tuple[Indices, Array]]
@@ -36,17 +36,17 @@ class Tails:
     segment: Indices
     """Segment of each pattern, ascending, shape (h,)."""
     start: Indices
-    """Position in the segment from which each pattern is not 0, shape (h,)."""
+    """Place in the segment from which on each pattern differs from 0, shape (h,)."""
 
     def select(self, chosen: slice) -> Tails:
         """Some of the patterns."""
         return Tails(self.segments, self.segment[chosen], self.start[chosen])
 
     def product(self, matrix: Array, *, power: int = 1) -> Array:
-        """Matrix product of the patterns, to a power element by element, shape (h, m).
+        """Matrix product of the element-wise powers of the patterns, shape (h, m).
 
         Args:
-            matrix: Shape (n_rows, m).
+            matrix: Matrix over the rows, shape (n_rows, m).
             power: Exponent of the elements of the patterns.
         """
         result = np.empty((self.segment.size, matrix.shape[1]))
@@ -66,9 +66,9 @@ class Tails:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patterns:
-    """Vectors over the rows of a session, one per hypothesis: a sparse part plus tails.
+    """Vectors over the rows of a session, one per hypothesis: sum of a sparse part and tails.
 
-    No row is in both parts of a pattern with a value other than 0.
+    No row of a pattern is nonzero in both parts.
     """
 
     rows: Sparse
@@ -81,12 +81,12 @@ class Patterns:
         return Patterns(self.rows[chosen], tails)
 
     def product(self, matrix: Array) -> Array:
-        """Matrix product of the patterns with a matrix over the rows, (n_rows, m): (h, m)."""
+        """Matrix product of the patterns with a matrix (n_rows, m), shape (h, m)."""
         product = np.asarray(self.rows @ matrix)
         return product if self.tails is None else product + self.tails.product(matrix)
 
     def to_sparse(self) -> Sparse:
-        """All patterns written out, shape (h, n_rows)."""
+        """All patterns as one sparse matrix, shape (h, n_rows)."""
         if self.tails is None:
             return self.rows
         return self.rows + self.tails.to_sparse(self.rows.shape[1])
@@ -99,13 +99,13 @@ class Patterns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MachineShift:
-    """A machine that differs by some errors in some of the sessions."""
+    """Difference of the machine's errors in some of the sessions."""
 
     sessions: NDArray[np.bool_]
-    """Sessions in which it differs, shape (n_sessions,)."""
+    """Mask of sessions in which the machine differs, shape (n_sessions,)."""
     direction: Array
-    """Difference of the free parameters, [prior std]; per unit of the amount where that is
-    unknown. Shape (n_free,)."""
+    """Difference of the free parameters, shape (n_free,), [prior std]; per unit of an unknown
+    amount."""
     unit: float = 1.0
     """Unit of the amount, [SI]."""
 
@@ -116,9 +116,9 @@ class SystematicEffect:
 
     name: str
     parameters: tuple[Parameter, ...]
-    """Its parameters, shape (k,)."""
+    """Parameters of the effect, shape (k,)."""
     change: Array
-    """Change of the rows by the nominal effect, all parameters 0, shape (n_rows,), [m]."""
+    """Change of the rows by the nominal effect (all parameters 0), shape (n_rows,), [m]."""
     columns: Array
     """Change of the rows by one prior std of each parameter, shape (k, n_rows), [m]."""
 
@@ -133,7 +133,7 @@ class SystematicEffect:
         return np.array([p.positive for p in self.parameters], dtype=bool)
 
     def select(self, chosen: Mask) -> SystematicEffect:
-        """Effect of some of its parameters."""
+        """Effect with some of its parameters."""
         parameters = tuple(p for p, c in zip(self.parameters, chosen, strict=True) if c)
         return SystematicEffect(self.name, parameters, self.change, self.columns[chosen])
 
@@ -142,63 +142,66 @@ class SystematicEffect:
 class Family:
     """Hypotheses of one kind, which share a prior probability equally.
 
-    Each changes rows by known amounts (`edits`), adds an effect of unknown amount (`effects`), adds
-    several effects, each of its own amount (`groups`; `systematic` for those of a machine),
-    declares rows to say nothing (`silent`), or changes the machine between sessions (`shifts`, by a
-    known or an unknown amount).
+    Each hypothesis is one of these:
+
+    - a change of rows by known amounts (`edits`), an effect of unknown amount (`effects`), or both;
+    - several effects with independent amounts (`groups`), or those of a machine (`systematic`);
+    - rows without information (`silent`);
+    - a change of the machine between sessions (`shifts`), by a known or an unknown amount.
     """
 
     explain: Callable[[int], Explanation]
     """Explanation of hypothesis number h, without its amount."""
     count: int
     size: float
-    """Number of ways in which it could have happened, tested or not."""
+    """Number of possible mistakes of this kind, tested or not."""
     edits: Patterns | None = None
     """Corrections of the rows, [m]."""
     effects: Patterns | None = None
     """Effects on the rows per unit of an unknown amount."""
     log_volume: Array | None = None
-    """Logarithm of the factor by which the edit scales a volume of readings, shape (h,); of silent
-    rows, the logarithm of the density of what they show."""
+    """Logarithm of the factor by which an edit scales a volume of readings, or of the probability
+    density of the values in silent rows, shape (h,)."""
     groups: Sequence[Sequence[Indices] | Array] = ()
-    """Several effects per hypothesis: the rows that each shifts alike, or their changes of the rows
+    """Several effects per hypothesis: rows that each effect changes equally, or changes of the rows
     per unit, shape (k, n_rows)."""
     systematic: Sequence[SystematicEffect] = ()
     """Effects that the machine may have."""
     silent: Sequence[Indices] = ()
-    """Rows that say nothing."""
+    """Rows without information, per hypothesis."""
     shifts: Sequence[MachineShift] = ()
     known: bool = True
     """Whether the amounts of `shifts` are known."""
 
     @classmethod
-    def of(cls, found: Sequence[Explanation], **parts: Any) -> Family:  # noqa: ANN401 - its fields
-        """Family of explanations that are at hand, each of them one way to happen."""
-        return cls(found.__getitem__, len(found), **{"size": len(found)} | parts)
+    def of(cls, explanations: Sequence[Explanation], **fields: Any) -> Family:  # noqa: ANN401 - own
+        """Family of listed explanations; its size is their number by default."""
+        count = len(explanations)
+        return cls(explanations.__getitem__, count, **{"size": count} | fields)
 
     @classmethod
     def edited(
         cls,
         rows: Rows,
-        found: Sequence[Explanation],
+        explanations: Sequence[Explanation],
         changes: Sequence[Array],
         *,
         size: int | None = None,
         log_volume: Array | None = None,
     ) -> Family:
-        """Family of explanations that correct their rows by known amounts, [m]."""
-        edits = Patterns(sparse_rows([e.rows for e in found], changes, rows.count))
-        size = len(found) if size is None else size
-        return cls.of(found, size=size, edits=edits, log_volume=log_volume)
+        """Family of explanations that correct their rows by known changes, [m]."""
+        edits = Patterns(sparse_rows([e.rows for e in explanations], changes, rows.count))
+        size = len(explanations) if size is None else size
+        return cls.of(explanations, size=size, edits=edits, log_volume=log_volume)
 
     @classmethod
     def with_effects(
-        cls, rows: Rows, found: Sequence[Explanation], shapes: Sequence[Array] | None = None
+        cls, rows: Rows, explanations: Sequence[Explanation], shapes: Sequence[Array] | None = None
     ) -> Family:
-        """Family of explanations whose rows are off by an unknown amount, times a shape."""
-        shapes = [np.ones(len(e.rows)) for e in found] if shapes is None else shapes
-        effects = Patterns(sparse_rows([e.rows for e in found], shapes, rows.count))
-        return cls.of(found, effects=effects)
+        """Family of explanations whose rows are wrong by an unknown amount times a shape."""
+        shapes = [np.ones(len(e.rows)) for e in explanations] if shapes is None else shapes
+        effects = Patterns(sparse_rows([e.rows for e in explanations], shapes, rows.count))
+        return cls.of(explanations, effects=effects)
 
 
 class Rows:
@@ -214,10 +217,10 @@ class Rows:
         self.values = session.values if values is None else values
         self.count = len(session.readings)
         self.single = np.array([not session.is_difference(r) for r in session.readings], dtype=bool)
-        """Whether a row is a reading as shown, not a difference."""
+        """Mask of rows that are single readings, not differences, shape (n_rows,)."""
         sensors = {name: setup.sensor for name, setup in session.setups.items()}
         self.paired = np.array([reads_pairs(sensors[r.setup]) for r in session.readings], bool)
-        """Whether a row is a length between two postures: no dial is read posture by posture."""
+        """Mask of rows that are distances between two postures, not read on a dial, (n_rows,)."""
 
     @cached_property
     def setups(self) -> dict[str, Indices]:
@@ -236,7 +239,7 @@ class Rows:
 
     @cached_property
     def groups(self) -> dict[tuple[str, str], tuple[str, ...]]:
-        """Setups of each leg and of each gauge, where these are several setups but not all."""
+        """Setups of each leg and of each gauge with several but not all setups."""
         members: dict[tuple[str, str], list[str]] = {}
         for name in self.setups:
             setup = self.session.setups[name]
@@ -245,24 +248,23 @@ class Rows:
                 members.setdefault(("leg", leg), []).append(name)
             if len(self.session.gauges) > 1:
                 members.setdefault(("gauge", setup.gauge), []).append(name)
-        every = len(self.setups)
-        return {k: tuple(v) for k, v in members.items() if 1 < len(v) < every}
+        return {k: tuple(v) for k, v in members.items() if 1 < len(v) < len(self.setups)}
 
     def of_setups(self, setups: Sequence[str]) -> Indices:
         """Rows of some setups."""
         return np.concatenate([self.setups[name] for name in setups])
 
     def gauge(self, row: int) -> Gauge:
-        """Gauge that shows a row."""
+        """Gauge of a row."""
         return self.session.gauges[self.session.setups[self.session.readings[row].setup].gauge]
 
     def posture(self, row: int) -> str:
-        """Posture of a row, or the difference of two."""
+        """Name of the posture of a row, or of the difference of two postures."""
         return self.session.readings[row].postures
 
 
 def group_rows(keys: Iterable[Key]) -> dict[Key, Indices]:
-    """Rows of each key, in their order; the keys are those of all rows."""
+    """Indices of the rows of each key, ascending, from the keys of all rows."""
     by_key: dict[Key, list[int]] = {}
     for i, key in enumerate(keys):
         by_key.setdefault(key, []).append(i)
@@ -272,11 +274,11 @@ def group_rows(keys: Iterable[Key]) -> dict[Key, Indices]:
 def sparse_rows(
     rows: Sequence[Indices | Sequence[int]], values: Sequence[Array], count: int
 ) -> Sparse:
-    """Sparse matrix with given entries in each row, shape (len(rows), count)."""
+    """Sparse matrix from the columns and values of each row, shape (len(rows), count)."""
     sizes = np.array([len(r) for r in rows], dtype=np.int64)
     columns = np.concatenate([*rows, np.empty(0, dtype=np.int64)]).astype(np.int64)
     data = np.concatenate([*values, np.empty(0)]).astype(np.float64)
-    if count <= MOST_DENSE:
+    if count <= MAX_DENSE_COLUMNS:
         dense = np.zeros((len(rows), count))
         np.add.at(dense, (np.repeat(np.arange(len(rows)), sizes), columns), data)
         return dense
@@ -291,7 +293,7 @@ def to_dense(matrix: Sparse) -> Array:
 
 
 def row_products(one: Sparse, other: Sparse) -> Array:
-    """Inner products of two matrices of one kind, row by row."""
+    """Row-wise inner products of two matrices that are both dense or both sparse."""
     if isinstance(one, np.ndarray):
         return np.asarray(np.vecdot(one, other))
     return np.asarray(one.multiply(other).sum(axis=1)).ravel()

@@ -1,4 +1,4 @@
-"""Sets of hypotheses: their terms, how they were scored, and how two sets compare."""
+"""Sets of hypotheses: terms, scores and comparison of two sets."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from orthocal.hypotheses.likelihood import Score
 from orthocal.hypotheses.linear_model import ModelLinearisation
 from orthocal.session.session import Session
 
-MOST_ALTERNATIVES = 8
-"""Alternatives of an anomaly that are listed."""
+MAX_ALTERNATIVES = 8
+"""Most alternatives of an anomaly that are listed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,15 +25,15 @@ class Term:
 
     explanation: Explanation
     prior: float
-    """Logarithm of its prior probability, with its factor on volumes."""
+    """Logarithm of its prior probability, including the volume factor."""
     change: Array | None = None
     """Correction of the rows, shape (n_rows,), [m]."""
     effects: Array | None = None
     """Effects of unknown amounts on the rows, shape (k, n_rows)."""
     systematic: SystematicEffect | None = None
-    """Effect of the machine, of which `change` and `effects` are the change and the columns."""
+    """Effect of the machine; its change and columns are in `change` and `effects`."""
     silent: NDArray[np.int64] | None = None
-    """Rows that say nothing."""
+    """Rows without information."""
     shift: MachineShift | None = None
     known: bool = True
     """Whether the amount of the shift is known."""
@@ -41,7 +41,7 @@ class Term:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HypothesisSet:
-    """A set of hypotheses, linearised where it leads."""
+    """A set of hypotheses, linearised about the machine that it implies."""
 
     terms: tuple[Term, ...]
     score: Score
@@ -62,31 +62,34 @@ class HypothesisSet:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Number of hypotheses and of rows concerned: the simpler set is the smaller one."""
+        """Numbers of hypotheses and of rows concerned; a simpler set has a smaller size."""
         return len(self.terms), sum(len(t.explanation.rows) for t in self.terms)
 
 
 def negative_log_posterior(state: HypothesisSet) -> float:
-    """Negative logarithm of marginal likelihood times prior, to sort the most likely first."""
+    """Negative logarithm of marginal likelihood times prior, as a sort key."""
     return -state.log_posterior
 
 
 def split_amounts(terms: Sequence[Term], amounts: Array) -> tuple[Array, ...]:
-    """Amounts of each term, from those of all effects followed by all silent rows."""
+    """Split amounts by term.
+
+    Args:
+        terms: The hypotheses.
+        amounts: Amounts of all effects and unknown shifts, then of all silent rows, shape (k,).
+    """
     sizes = [
         len(t.effects) if t.effects is not None else int(t.shift is not None and not t.known)
         for t in terms
     ]
     silent = [0 if t.silent is None else len(t.silent) for t in terms]
-    at, after = np.cumsum([0, *sizes]), np.cumsum([sum(sizes), *silent])
-    return tuple(
-        amounts[after[i] : after[i + 1]] if silent[i] else amounts[at[i] : at[i + 1]]
-        for i in range(len(terms))
-    )
+    effect_ends, silent_ends = np.cumsum([0, *sizes]), np.cumsum([sum(sizes), *silent])
+    ends = [silent_ends if n else effect_ends for n in silent]
+    return tuple(amounts[e[i] : e[i + 1]] for i, e in enumerate(ends))
 
 
 def correct_rows(rows: Array, terms: Sequence[Term], amounts: Sequence[Array]) -> Array:
-    """Rows without the effects of unknown amounts."""
+    """Subtract the effects of unknown amounts and the errors of silent rows from the rows."""
     corrected = rows.copy()
     for t, a in zip(terms, amounts, strict=True):
         if t.effects is not None:
@@ -97,8 +100,8 @@ def correct_rows(rows: Array, terms: Sequence[Term], amounts: Sequence[Array]) -
 
 
 def explain_with_amounts(state: HypothesisSet) -> list[Explanation]:
-    """Explanations of all terms with the amounts that were estimated."""
-    result = []
+    """Explanations of all terms with their estimated amounts."""
+    explanations = []
     for term, amounts, stds in zip(state.terms, state.amounts, state.stds, strict=True):
         e = term.explanation
         unit = 1.0 if term.shift is None else term.shift.unit
@@ -107,14 +110,21 @@ def explain_with_amounts(state: HypothesisSet) -> list[Explanation]:
             e = _with_parameters(e, term.systematic, amounts, stds)
         elif single or (term.shift is not None and not term.known):
             e = replace(e, amount=float(amounts[0] * unit), std=float(stds[0] * unit))
-        result.append(e)
-    return result
+        explanations.append(e)
+    return explanations
 
 
 def _with_parameters(
     e: Explanation, effect: SystematicEffect, amounts: Array, stds: Array
 ) -> Explanation:
-    """Explanation with the parameters of an effect that were estimated, in prior std."""
+    """Explanation with the estimated parameters of an effect.
+
+    Args:
+        e: The explanation.
+        effect: The effect.
+        amounts: Estimates of its parameters, shape (k,), [prior std].
+        stds: Standard deviations of the estimates, shape (k,), [prior std].
+    """
     values = np.where(effect.positive, np.maximum(amounts, 0.0), amounts)
     return replace(
         e,
@@ -130,8 +140,7 @@ def is_same_place(one: HypothesisSet, other: HypothesisSet) -> bool:
     """True if two sets concern the same rows, hypothesis by hypothesis."""
     if len(one.terms) != len(other.terms):
         return False
-    unmatched = _unmatched(one.terms, other.terms)
-    return not unmatched[0] and not unmatched[1]
+    return not any(_unmatched(one.terms, other.terms))
 
 
 def share_rows(one: Term, other: Term) -> bool:
@@ -140,7 +149,7 @@ def share_rows(one: Term, other: Term) -> bool:
 
 
 def distinct_terms(terms: Sequence[Term]) -> list[Term]:
-    """Hypotheses that share no row with one before."""
+    """Hypotheses that share no row with a preceding one."""
     distinct: list[Term] = []
     used: set[int] = set()
     for t in terms:
@@ -151,7 +160,7 @@ def distinct_terms(terms: Sequence[Term]) -> list[Term]:
 
 
 def _unmatched(one: Sequence[Term], other: Sequence[Term]) -> tuple[list[Term], list[Term]]:
-    """Hypotheses of each of two sets that none of the other set agrees with."""
+    """Hypotheses of each set without a matching one in the other set."""
 
     def without(a: Sequence[Term], b: Sequence[Term]) -> list[Term]:
         return [t for t in a if not any(t.explanation.agrees_with(u.explanation) for u in b)]
@@ -160,7 +169,7 @@ def _unmatched(one: Sequence[Term], other: Sequence[Term]) -> tuple[list[Term], 
 
 
 def is_local(session: Session, state: HypothesisSet, near: Sequence[HypothesisSet]) -> bool:
-    """True if alternatives concern only setups of the chosen hypotheses."""
+    """True if the alternatives concern only setups of the chosen set."""
 
     def setups(s: HypothesisSet) -> set[str]:
         return {session.readings[i].setup for t in s.terms for i in t.explanation.rows}
@@ -171,11 +180,11 @@ def is_local(session: Session, state: HypothesisSet, near: Sequence[HypothesisSe
 def find_alternatives(
     term: Term, near: Sequence[tuple[HypothesisSet, HypothesisSet]]
 ) -> tuple[tuple[Explanation, ...], tuple[Explanation, ...]]:
-    """Other causes in the same rows, and alternatives elsewhere, the most likely first.
+    """Other causes in the same rows, and alternatives in other rows, the most likely first.
 
     Args:
         term: A hypothesis.
-        near: Sets of hypotheses as they were chosen, each with one that is nearly as likely.
+        near: Pairs of a chosen set of hypotheses and a nearly as likely set.
     """
     e = term.explanation
     causes: dict[tuple[object, ...], Explanation] = {}
@@ -183,18 +192,14 @@ def find_alternatives(
     for chosen, s in sorted(near, key=lambda pair: negative_log_posterior(pair[1])):
         if not any(t is term for t in chosen.terms):
             continue
-        mine, others = _unmatched(chosen.terms, s.terms)
-        if any(t is term for t in mine):
-            if others:
-                sets = [
-                    c
-                    for t, c in zip(s.terms, explain_with_amounts(s), strict=True)
-                    if any(t is o for o in others)
-                ]
-                alternatives.update(dict.fromkeys(sets))
+        only_chosen, only_other = _unmatched(chosen.terms, s.terms)
+        if any(t is term for t in only_chosen):
+            for t, explanation in zip(s.terms, explain_with_amounts(s), strict=True):
+                if any(t is o for o in only_other):
+                    alternatives[explanation] = None
             continue
         for cause in explain_with_amounts(s):
             if set(cause.rows) == set(e.rows) and e.agrees_with(cause) and cause.kind != e.kind:
                 amount = cause.amount if cause.kind == "misread dial" else None
                 causes.setdefault((cause.kind, cause.factor, amount), cause)
-    return tuple(causes.values()), tuple(alternatives)[:MOST_ALTERNATIVES]
+    return tuple(causes.values()), tuple(alternatives)[:MAX_ALTERNATIVES]

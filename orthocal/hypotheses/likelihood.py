@@ -1,14 +1,14 @@
-"""Marginal likelihood of readings of a machine of which only the tolerances are known.
+"""Marginal likelihood of the readings of a machine with normally distributed errors.
 
     y = h(θ) + z + n,  h(θ) ≈ h(θ₁) + J (θ − θ₁),  θ ~ N(θ₀, e² P),  n ~ N(0, s² σ²),  z flat
 
-with all errors of the machine and all nuisance parameters of its sensors in θ. The tolerance scale
-e and the noise scale s are known to a factor only and are summed over on a grid. The covariance
-e² J P Jᵀ + s² σ² has the same r principal directions for all e and s, so that any number of edited
-readings is scored by products with these directions.
+with all errors of the machine and all nuisance parameters of its sensors in θ. The likelihood is
+summed over grids of the tolerance scale e and the noise scale s. The covariance e² J P Jᵀ + s² σ²
+has the same r principal directions for all e and s. So any number of corrected readings is scored
+by products with these directions.
 
 An effect of unknown amount, b w with b ~ N(0, τ²), is integrated over b in closed form and averaged
-over a grid of τ. Rows that say nothing are effects with a flat prior.
+over a grid of τ. A row without information has an effect with a flat prior.
 """
 
 from __future__ import annotations
@@ -31,29 +31,30 @@ TOLERANCE_SCALE_SPREAD = 0.5
 NOISE_SCALES = np.geomspace(0.25, 32.0, 15)
 """Grid of the noise scale s."""
 
-NOISE_SCALE_SPREAD = 0.25
-"""Prior standard deviation of ln s where the gauge's noise is stated."""
+STATED_NOISE_SPREAD = 0.25
+"""Prior standard deviation of ln s if the gauge's noise is stated."""
 
-UNSTATED_SPREAD = 1.5
-"""Prior standard deviation of ln s where it is not stated, or wrongly stated."""
+UNSTATED_NOISE_SPREAD = 1.5
+"""Prior standard deviation of ln s if the gauge's noise is not stated, or wrongly stated."""
 
-WRONGLY_STATED = 0.05
+WRONG_NOISE_PROBABILITY = 0.05
 """Prior probability that the stated noise is wrong."""
 
-AMOUNTS = np.geomspace(6.0, 6000.0, 4)
-"""Grid of the standard deviation τ of an effect's amount, over the noise."""
+AMOUNT_STDS = np.geomspace(6.0, 6000.0, 4)
+"""Grid of the standard deviation τ of an effect's amount, relative to the noise."""
 
-LEAST = 1e-9
-"""Ratio to the largest singular value below which a singular value counts as 0."""
+MIN_RELATIVE_SINGULAR_VALUE = 1e-9
+"""Singular values up to this, relative to the largest, count as 0."""
 
 LARGEST_AMOUNT = 1e9
-"""Standard deviation of the amount of an effect that no entry shows, over the noise."""
+"""Standard deviation of the amount of an effect without influence on the entries, relative to the
+noise."""
 
-LEAST_CHANCE = 1e-300
-"""Probability below which no smaller one is distinguished."""
+MIN_PROBABILITY = 1e-300
+"""Lower bound of a probability before its logarithm is taken."""
 
-MOST_SEPARATE = 2
-"""Groups of effects up to which each has a τ of its own; beyond, all share one."""
+MAX_SEPARATE_GROUPS = 2
+"""Most groups of effects with separate τ; more groups share one τ."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,9 +62,9 @@ class Products:
     """Inner products of vectors over the entries, gauge zeros projected out."""
 
     along: Array
-    """With the principal directions, shape (h, r), [m]."""
+    """Components along the principal directions, shape (h, r), [m]."""
     square: Array
-    """With themselves, shape (h,), [m²]."""
+    """Squared norms, shape (h,), [m²]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,13 +79,13 @@ class AmountPrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Score:
-    """Marginal likelihood of one hypothesis, and its most likely numbers."""
+    """Marginal likelihood of one hypothesis, and its most likely scales and amounts."""
 
     log_likelihood: float
     tolerance_scale: float
     noise_scale: float
     amounts: Array
-    """Of all effects, silent rows last, shape (k,), [m]."""
+    """Amounts of all effects, silent rows last, shape (k,), [m]."""
     stds: Array
     """Standard deviations of the amounts, shape (k,), [m]."""
 
@@ -96,41 +97,43 @@ class Likelihood:
     directions: Array
     """Orthonormal principal directions of the entries, shape (r, n_entries)."""
     variances: Array
-    """Variance along each with errors at their tolerances, shape (r,), [m²]."""
+    """Prior variance along each direction at tolerance scale 1, shape (r,), [m²]."""
     sigma: float
     """Stated standard deviation of a reading, [m]."""
     dof: int
-    """Number of entries less that of gauge zeros."""
+    """Number of entries minus number of gauge zeros."""
     weights: Array
     """Logarithms of the prior weights of all pairs (e, s), shape (g,)."""
 
     def grid(
         self, tolerance_scales: Array = TOLERANCE_SCALES, noise_scales: Array = NOISE_SCALES
     ) -> tuple[Array, Array]:
-        """Variance of the noise, (g,), and along each direction, (r, g), of pairs (e, s), [m²]."""
+        """Variances of all pairs (e, s), [m²]: of the noise, (g,), and along directions, (r, g)."""
         noise = np.tile((noise_scales * self.sigma) ** 2, tolerance_scales.size)
         scale = np.repeat(tolerance_scales**2, noise_scales.size)
         return noise, self.variances[:, None] * scale + noise
 
     def products(self, vectors: Array) -> Products:
-        """Products of dense vectors, zeros projected out, shape (h, n_entries), [m]."""
+        """Products of dense vectors (h, n_entries), zeros projected out, [m]."""
         return Products(vectors @ self.directions.T, (vectors**2).sum(axis=1))
 
     def estimate_amounts(self, deviation: Array, effects: Array) -> tuple[Array, Array]:
-        """Amount of each effect by itself, without prior; tolerances and noise as stated.
+        """Generalised least-squares estimate of the amount of each effect alone, without prior.
+
+        Tolerances and noise are as stated.
 
         Args:
-            deviation: Readings less predictions, shape (n_entries,), zeros projected out, [m].
+            deviation: Readings minus predictions, shape (n_entries,), zeros projected out, [m].
             effects: Effects per unit, shape (h, n_entries), zeros projected out.
 
         Returns:
-            The amounts and their standard deviations, shape (h,); 0 and infinity if the entries do
-            not show an effect.
+            The amounts and their standard deviations, shape (h,); 0 and infinity for an effect
+            without influence on the entries.
         """
         (gram,), (slope,) = self._gram(deviation, effects, np.ones(1), np.ones(1))
         information = np.maximum(np.diag(gram), 0.0)
-        shown = np.where(information > 0.0, information, np.inf)
-        return slope / shown, np.where(information > 0.0, shown**-0.5, np.inf)
+        positive = np.where(information > 0.0, information, np.inf)
+        return slope / positive, np.where(information > 0.0, positive**-0.5, np.inf)
 
     def score(
         self, deviations: Products, effects: Products | None = None, cross: Array | None = None
@@ -138,8 +141,8 @@ class Likelihood:
         """Logarithm of the marginal likelihood of many hypotheses, up to a common constant.
 
         Args:
-            deviations: Readings less predictions of each hypothesis.
-            effects: Effect of unknown amount of each hypothesis, per unit.
+            deviations: Products of readings minus predictions of each hypothesis.
+            effects: Products of the effect of each hypothesis per unit of its unknown amount.
             cross: Inner products of effect and deviation, shape (h,), [m²].
 
         Returns:
@@ -150,18 +153,25 @@ class Likelihood:
             noise, variance = self.grid()
             inverse = 1.0 / variance
             perpendicular = np.maximum(effects.square - (effects.along**2).sum(axis=1), 0.0)
-            remaining = cross - (effects.along * deviations.along).sum(axis=1)
+            cross_perpendicular = cross - (effects.along * deviations.along).sum(axis=1)
             information = effects.along**2 @ inverse + perpendicular[:, None] / noise
-            slope = (effects.along * deviations.along) @ inverse + remaining[:, None] / noise
+            slope = (effects.along * deviations.along) @ inverse
+            slope += cross_perpendicular[:, None] / noise
             logs = logs + self._gain(information, slope)
         return np.asarray(log_of_sum(logs + self.weights, axis=1))
 
     def _gain(self, information: Array, slope: Array) -> Array:
+        """Gain of log likelihood by an amount with normal prior, averaged over τ, shape (h, g).
+
+        Args:
+            information: wᵀ V⁻¹ w, shape (h, g).
+            slope: wᵀ V⁻¹ d, shape (h, g).
+        """
         gains = []
-        for tau in (AMOUNTS * self.sigma) ** 2:
+        for tau in (AMOUNT_STDS * self.sigma) ** 2:
             widened = 1.0 + tau * information
             gains.append(0.5 * (tau * slope**2 / widened - np.log(widened)))
-        return np.asarray(log_of_sum(np.array(gains), axis=0) - np.log(AMOUNTS.size))
+        return np.asarray(log_of_sum(np.array(gains), axis=0) - np.log(AMOUNT_STDS.size))
 
     def log_densities(
         self,
@@ -169,7 +179,7 @@ class Likelihood:
         tolerance_scales: Array = TOLERANCE_SCALES,
         noise_scales: Array = NOISE_SCALES,
     ) -> Array:
-        """Logarithms of normal densities for all pairs (e, s), up to a constant, shape (h, g)."""
+        """Logarithms of the normal densities at all pairs (e, s), up to a constant, (h, g)."""
         noise, variance = self.grid(tolerance_scales, noise_scales)
         perpendicular = np.maximum(deviations.square - (deviations.along**2).sum(axis=1), 0.0)
         squares = deviations.along**2 @ (1.0 / variance) + perpendicular[:, None] / noise
@@ -187,11 +197,12 @@ class Likelihood:
         """Marginal likelihood of one deviation with any number of effects.
 
         Args:
-            deviation: Shape (n_entries,), zeros projected out, [m].
+            deviation: Readings minus predictions, shape (n_entries,), zeros projected out, [m].
             groups: Effects per unit, zeros projected out, (k, n_entries) each; the amounts of a
                 group share one prior standard deviation τ.
-            silent: Indicators of rows that say nothing, zeros projected out, (m, n_entries).
-            priors: Of the amounts of each group; None for normal ones with τ on the grid AMOUNTS.
+            silent: Indicators of rows without information, zeros projected out, (m, n_entries).
+            priors: Prior of the amounts of each group; None for a normal prior with τ on the grid
+                AMOUNT_STDS.
         """
         logs = self.log_densities(self.products(deviation[None]))[0] + self.weights
         sizes = [len(g) for g in groups]
@@ -200,27 +211,38 @@ class Likelihood:
             return self._best(logs, np.zeros((logs.size, 0)), np.zeros((logs.size, 0, 0)))
         vectors = np.concatenate([*groups, *([] if silent is None else [silent])])
         gram, slope = self._gram(deviation, vectors)
-        chosen = list(priors) or [None] * len(groups)
-        grid = _grid_of_stds([AMOUNTS * self.sigma if p is None else p.stds for p in chosen])
-        signs = [
+        group_priors = list(priors) or [None] * len(groups)
+        grid = _grid_of_stds(
+            [AMOUNT_STDS * self.sigma if p is None else p.stds for p in group_priors]
+        )
+        positive_by_group = [
             np.zeros(k, bool) if p is None else p.positive
-            for p, k in zip(chosen, sizes, strict=True)
+            for p, k in zip(group_priors, sizes, strict=True)
         ]
-        positive = np.concatenate([*signs, np.zeros(n_silent, bool)])
-        known = np.repeat(np.array(grid) ** -2.0, sizes, axis=1)
-        precision = np.hstack([known, np.zeros((len(grid), n_silent))])
+        positive = np.concatenate([*positive_by_group, np.zeros(n_silent, bool)])
+        group_precision = np.repeat(np.array(grid) ** -2.0, sizes, axis=1)
+        precision = np.hstack([group_precision, np.zeros((len(grid), n_silent))])
         gains = _integrate_amounts(gram, slope, precision, positive)
-        every = logs + log_of_sum(gains, axis=0) - np.log(len(grid))
-        every = every + 0.5 * n_silent * np.log(2.0 * np.pi)
-        # the amount of an effect that no entry shows is 0, with a standard deviation beyond all
+        evidence = logs + log_of_sum(gains, axis=0) - np.log(len(grid))
+        evidence = evidence + 0.5 * n_silent * np.log(2.0 * np.pi)
+        # an effect without influence on the entries has the amount 0 and a huge standard deviation
         floor = 1e-12 * np.trace(gram, axis1=1, axis2=2) + (LARGEST_AMOUNT * self.sigma) ** -2
         gram = gram + floor[:, None, None] * np.eye(len(vectors))
-        likeliest = grid[int(np.argmax(log_of_sum(logs + gains, axis=1)))]
-        chosen_precision = [t**-2.0 if p else 0.0 for p, t in zip(chosen, likeliest, strict=True)]
-        gram = gram + np.diag(np.append(np.repeat(chosen_precision, sizes), np.zeros(n_silent)))
-        return self._best(every, np.linalg.solve(gram, slope[..., None])[..., 0], gram)
+        likeliest_stds = grid[int(np.argmax(log_of_sum(logs + gains, axis=1)))]
+        given_precision = [
+            t**-2.0 if p else 0.0 for p, t in zip(group_priors, likeliest_stds, strict=True)
+        ]
+        gram = gram + np.diag(np.append(np.repeat(given_precision, sizes), np.zeros(n_silent)))
+        return self._best(evidence, np.linalg.solve(gram, slope[..., None])[..., 0], gram)
 
     def _best(self, logs: Array, amounts: Array, gram: Array) -> Score:
+        """Score with the amounts of the most likely pair (e, s).
+
+        Args:
+            logs: Log evidence at each pair, shape (g,).
+            amounts: Estimated amounts, shape (g, k).
+            gram: Information matrix of the amounts, shape (g, k, k).
+        """
         best = int(np.argmax(logs))
         e, s = divmod(best, NOISE_SCALES.size)
         return Score(
@@ -238,7 +260,14 @@ class Likelihood:
         tolerance_scales: Array = TOLERANCE_SCALES,
         noise_scales: Array = NOISE_SCALES,
     ) -> tuple[Array, Array]:
-        """W V⁻¹ Wᵀ, shape (g, k, k), and W V⁻¹ d, shape (g, k), for all pairs (e, s)."""
+        """Information W V⁻¹ Wᵀ, shape (g, k, k), and slope W V⁻¹ d, shape (g, k), at all (e, s).
+
+        Args:
+            deviation: Deviation d, shape (n_entries,).
+            vectors: Effects W, shape (k, n_entries).
+            tolerance_scales: Grid of e.
+            noise_scales: Grid of s.
+        """
         inverse_noise, inverse = (1.0 / v for v in self.grid(tolerance_scales, noise_scales))
         along, components = self.directions @ deviation, vectors @ self.directions.T
         perpendicular = vectors - components @ self.directions
@@ -251,27 +280,31 @@ class Likelihood:
 
 
 def _grid_of_stds(stds: Sequence[Array]) -> list[tuple[float, ...]]:
-    """Standard deviations of the groups: all combinations of few groups, else one for all."""
-    if len(stds) <= MOST_SEPARATE:
+    """Grid of the standard deviations of all groups.
+
+    It has all combinations for at most MAX_SEPARATE_GROUPS groups. Otherwise all groups move along
+    their grids together.
+    """
+    if len(stds) <= MAX_SEPARATE_GROUPS:
         return list(product(*(s.tolist() for s in stds)))
-    most = max(s.size for s in stds)
-    return [tuple(float(s[i % s.size]) for s in stds) for i in range(most)]
+    longest = max(s.size for s in stds)
+    return [tuple(float(s[i % s.size]) for s in stds) for i in range(longest)]
 
 
 def _integrate_amounts(gram: Array, slope: Array, precision: Array, positive: Mask) -> Array:
     """Gain of log likelihood by amounts with normal or half-normal priors, shape (t, g).
 
-    A half-normal amount a ≥ 0 has twice the density, and of its posterior N(m, s²) the part above
-    0 counts: ln 2 Φ(m/s). Several are treated as independent, which is much faster than their
-    joint probability (`statistics.distributions.log_positive_share`). Backlashes of three drives
-    correlate by 0.02 (66 readings) to 0.12 (the plan of `orthocal new`). ln evidence is then wrong
-    by up to 0.17 with backlash and 0.4 without, where EFFECT_CLEARLY needs 4.5. Of 240 simulated
-    machines none is judged otherwise.
+    A half-normal amount a ≥ 0 with posterior N(m, s²) adds ln 2 Φ(m/s). Several amounts are treated
+    as independent, which is much faster than their joint probability
+    (`statistics.distributions.log_positive_share`). The correlation of the backlashes of three
+    drives is 0.02 (66 readings) to 0.12 (the plan of `orthocal new`). This makes the log evidence
+    wrong by up to 0.17 with backlash and 0.4 without; the limit CLEAR_EFFECT_LOG_BAYES is 4.5. It
+    changes the judgement of none of 240 simulated machines.
 
     Args:
         gram: W V⁻¹ Wᵀ, shape (g, k, k).
         slope: W V⁻¹ d, shape (g, k).
-        precision: Of t sets of priors, 0 for a flat one, shape (t, k).
+        precision: Inverse prior variances of t sets of priors, 0 for a flat one, shape (t, k).
         positive: Mask of half-normal priors, shape (k,).
     """
     full = gram + precision[:, None, :, None] * np.eye(precision.shape[1])
@@ -283,12 +316,12 @@ def _integrate_amounts(gram: Array, slope: Array, precision: Array, positive: Ma
         stds = np.sqrt(np.diagonal(np.linalg.inv(full), axis1=-2, axis2=-1))
         ratio = (solution / stds)[..., positive]
         doubled = [math.erfc(-r / math.sqrt(2.0)) for r in ratio.ravel().tolist()]
-        gain += np.log(np.maximum(doubled, LEAST_CHANCE)).reshape(ratio.shape).sum(axis=-1)
+        gain += np.log(np.maximum(doubled, MIN_PROBABILITY)).reshape(ratio.shape).sum(axis=-1)
     return np.asarray(gain)
 
 
 def log_of_sum(logs: Array, axis: int | None = None) -> Array:
-    """Logarithm of the sum of numbers given by their logarithms."""
+    """Logarithm of the sum of numbers from their logarithms."""
     top = logs.max(axis=axis, keepdims=True)
     total = np.log(np.exp(logs - top).sum(axis=axis, keepdims=True)) + top
     return np.asarray(total.squeeze(axis))
@@ -297,23 +330,25 @@ def log_of_sum(logs: Array, axis: int | None = None) -> Array:
 def build_likelihood(
     jacobian: Array, *, sigma: float, dof: int, stated: bool
 ) -> tuple[Likelihood, Array, Array]:
-    """Likelihood about a linearisation.
+    """Likelihood of a linearised model.
 
     Args:
         jacobian: ∂h per prior std of each error, zeros projected out, (n_entries, n_free), [m].
         sigma: Standard deviation of a reading, [m].
-        dof: Number of entries less that of gauge zeros.
-        stated: Whether that standard deviation is stated.
+        dof: Number of entries minus number of gauge zeros.
+        stated: Whether `sigma` is stated in the session.
 
     Returns:
-        The likelihood; errors of the machine per principal direction, shape (n_free, r); and the
-        singular values, shape (r,), [m].
+        The likelihood; errors of the machine per principal direction, shape (n_free, r), [prior
+        std]; and the singular values, shape (r,), [m].
     """
     basis, factor = None, jacobian
-    if len(jacobian) > 2 * jacobian.shape[1]:  # of a tall matrix by its triangular factor
+    if len(jacobian) > 2 * jacobian.shape[1]:  # a tall matrix: decompose its triangular factor
         basis, factor = np.linalg.qr(jacobian)
-    vectors, sizes, errors = np.linalg.svd(factor, full_matrices=False)
-    significant = sizes > LEAST * max(float(sizes.max(initial=0.0)), sigma)
+    vectors, singular_values, errors = np.linalg.svd(factor, full_matrices=False)
+    significant = singular_values > MIN_RELATIVE_SINGULAR_VALUE * max(
+        float(singular_values.max(initial=0.0)), sigma
+    )
     vectors = vectors[:, significant]
     directions = (vectors if basis is None else basis @ vectors).T
     scale = -0.5 * (np.log(TOLERANCE_SCALES) / TOLERANCE_SCALE_SPREAD) ** 2
@@ -321,12 +356,12 @@ def build_likelihood(
     weights = np.repeat(scale - log_of_sum(scale), NOISE_SCALES.size)
     likelihood = Likelihood(
         np.ascontiguousarray(directions),
-        sizes[significant] ** 2,
+        singular_values[significant] ** 2,
         sigma,
         dof,
         weights + np.tile(noise, TOLERANCE_SCALES.size),
     )
-    return likelihood, errors[significant].T, sizes[significant]
+    return likelihood, errors[significant].T, singular_values[significant]
 
 
 def noise_weights(*, stated: bool) -> Array:
@@ -335,13 +370,16 @@ def noise_weights(*, stated: bool) -> Array:
     Args:
         stated: Whether the standard deviation of a reading is stated.
     """
-    noise = _log_normal(NOISE_SCALES, UNSTATED_SPREAD)
+    noise = _log_normal(NOISE_SCALES, UNSTATED_NOISE_SPREAD)
     if not stated:
         return noise
-    stated_noise = np.log1p(-WRONGLY_STATED) + _log_normal(NOISE_SCALES, NOISE_SCALE_SPREAD)
-    return np.asarray(np.logaddexp(stated_noise, np.log(WRONGLY_STATED) + noise))
+    stated_noise = np.log1p(-WRONG_NOISE_PROBABILITY) + _log_normal(
+        NOISE_SCALES, STATED_NOISE_SPREAD
+    )
+    return np.asarray(np.logaddexp(stated_noise, np.log(WRONG_NOISE_PROBABILITY) + noise))
 
 
 def _log_normal(values: Array, spread: float) -> Array:
+    """Log weights of a grid under a normal prior of ln(value), normalised to a sum of 1."""
     logs = -0.5 * (np.log(values) / spread) ** 2
     return np.asarray(logs - log_of_sum(logs))

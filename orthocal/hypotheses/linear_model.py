@@ -21,7 +21,7 @@ from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import select_parameters
 from orthocal.estimation.weighting import DEFAULT_SIGMA, initial_noise_ratio
 from orthocal.hypotheses.hypothesis import (
-    MOST_DENSE,
+    MAX_DENSE_COLUMNS,
     MachineShift,
     Patterns,
     Sparse,
@@ -38,94 +38,100 @@ from orthocal.statistics.zeros import project_out_zeros
 
 Result = TypeVar("Result")
 
-KEPT = 6
-"""Models that are kept."""
+CACHE_SIZE = 6
+"""Number of cached models."""
 
-MOST_ROUNDS = 2
-"""Relinearisations per hypothesis."""
+MAX_RELINEARISATIONS = 2
+"""Most relinearisations per hypothesis."""
 
-NEAR = 0.2
-"""Change of the errors, in prior std, below which a linearisation is kept."""
+SMALL_CHANGE = 0.2
+"""Largest change of the errors without a relinearisation, [prior std]."""
 
-FURTHEST = 6.0
-"""Errors, in prior std, beyond which a hypothesis is not relinearised."""
+LARGEST_ERROR = 6.0
+"""Largest error about which a hypothesis is relinearised, [prior std]."""
 
-MOST_ENTRIES = 1600
-"""Entries of all points that are linearised together, for their memory."""
+MAX_ENTRIES = 1600
+"""Most entries of all points that are linearised at once, to limit the memory."""
 
-MOST_STEPS = 8
-"""Gauss-Newton steps to the most likely machine."""
+MAX_STEPS = 8
+"""Most Gauss-Newton steps to the most likely machine."""
 
-SETTLED = 0.02
-"""Change of the errors, in prior std, below which the most likely machine is found."""
+CONVERGED_CHANGE = 0.02
+"""Largest change of the errors in the last Gauss-Newton step, [prior std]."""
 
 HIDDEN = 0.1
-"""Effect of a prior std on readings that counts as none, [σ]."""
+"""Largest change of readings by one prior std that counts as no change, [σ]."""
 
-LEAST_SIGMA = 1e-9
-"""Least standard deviation of a reading, [m]."""
+SMALLEST_SIGMA = 1e-9
+"""Smallest standard deviation of a reading, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelLinearisation:
     """Linearised model about one machine, gauge zeros projected out.
 
-    With K sessions each may have a machine that differs by known errors (`shifts`).
+    The machine of each session may differ by known errors (`shifts`).
     """
 
     expected: Array
     """Predictions for the reference machine, to first order, shape (n_entries,), [m]."""
-    slopes: Array
-    """∂h per prior std of each error, shape (n_entries, n_free), [m]; empty where no hypothesis
-    needs them."""
+    jacobian: Array
+    """Jacobian ∂h per prior std of each error, shape (n_entries, n_free), [m]; shape (n_entries, 0)
+    if not requested."""
     likelihood: Likelihood
-    errors: Array
+    error_directions: Array
     """Errors per principal direction, shape (n_free, r), [prior std]."""
-    sizes: Array
+    singular_values: Array
     """Singular values, shape (r,), [m]."""
     theta: Array
-    """Errors at the point of linearisation less the reference, shape (n_free,), [prior std]."""
+    """Errors at the point of linearisation minus those of the reference, (n_free,), [prior std]."""
     passive: Array
-    """Passive coordinates there, shape (n_states, n_passive), [m, rad]."""
+    """Passive coordinates at that point, shape (n_states, n_passive), [m, rad]."""
 
     def errors_for(
         self, deviation: Array, *, tolerance_scale: float = 1.0, noise_scale: float = 1.0
     ) -> Array:
-        """Most likely errors for a deviation, shape (n_free,), [prior std]."""
+        """Most likely errors for a deviation, shape (n_free,), [prior std].
+
+        Args:
+            deviation: Readings minus predictions, shape (n_entries,), zeros projected out, [m].
+            tolerance_scale: Tolerance scale e.
+            noise_scale: Noise scale s.
+        """
         e2 = tolerance_scale**2
-        variance = e2 * self.sizes**2 + (noise_scale * self.likelihood.sigma) ** 2
+        variance = e2 * self.singular_values**2 + (noise_scale * self.likelihood.sigma) ** 2
         along = self.likelihood.directions @ deviation
-        return np.asarray(self.errors @ (e2 * self.sizes / variance * along))
+        return np.asarray(self.error_directions @ (e2 * self.singular_values / variance * along))
 
     def log_positive_share(
         self, deviation: Array, positive: Mask, *, tolerance_scale: float, noise_scale: float
     ) -> float:
-        """Gain of the log likelihood by half-normal in place of normal priors.
+        """Gain of the log likelihood by half-normal instead of normal priors.
 
-        ln 2ᵏ P(θ₊ > 0 | y), for k errors that are never negative: their prior density is twice that
-        of a normal prior, and only the positive part of the posterior counts.
+        The gain is ln 2ᵏ P(θ₊ > 0 | y) for the k errors θ₊ that are never negative. Their prior
+        density is twice the normal density, and only the positive part of the posterior counts.
 
         Args:
-            deviation: As for `errors_for`.
-            positive: Mask of these errors, shape (n_free,).
-            tolerance_scale: As for `errors_for`.
-            noise_scale: As for `errors_for`.
+            deviation: Readings minus predictions, shape (n_entries,), zeros projected out, [m].
+            positive: Mask of the errors that are never negative, shape (n_free,).
+            tolerance_scale: Tolerance scale e.
+            noise_scale: Noise scale s.
         """
         scales = {"tolerance_scale": tolerance_scale, "noise_scale": noise_scale}
         mean = self.errors_for(deviation, **scales)[positive]
-        known = tolerance_scale**2 * self.sizes**2
-        known /= known + (noise_scale * self.likelihood.sigma) ** 2
-        rows = self.errors[positive]
-        covariance = tolerance_scale**2 * (np.eye(len(rows)) - rows * known @ rows.T)
+        resolved = tolerance_scale**2 * self.singular_values**2
+        resolved /= resolved + (noise_scale * self.likelihood.sigma) ** 2
+        rows = self.error_directions[positive]
+        covariance = tolerance_scale**2 * (np.eye(len(rows)) - rows * resolved @ rows.T)
         return len(rows) * math.log(2.0) + log_positive_share(mean, covariance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearisationPoint:
-    """A machine about which the model is linearised."""
+    """Machine about which the model is linearised."""
 
     theta: Array
-    """Errors less the reference, shape (n_free,), [prior std]."""
+    """Errors minus those of the reference, shape (n_free,), [prior std]."""
     shifts: Sequence[MachineShift]
     """Known differences of the machine in some of the sessions."""
     start: Array
@@ -135,11 +141,11 @@ class LinearisationPoint:
 class LinearModel:
     """Predictions and derivatives of a session for all errors of the machine and its sensors.
 
-    All calls of the calibration problem by the hypothesis engine are here.
+    The search for anomalies calls the calibration problem through this class only.
 
     Args:
         session: A session, or several joined ones.
-        names: Errors that the machine may have; all by default.
+        names: Names of the errors that the machine may have; all by default.
 
     Raises:
         RobotError: If closures of the robot depend on each other.
@@ -154,58 +160,61 @@ class LinearModel:
         o = self.problem.observations
         self.stated = session.gauge.sigma is not None
         floor = noise_floor(session.gauge.sigma or DEFAULT_SIGMA, session.gauge.resolution)
-        self.sigma = max(floor, LEAST_SIGMA)
-        """Standard deviation of a reading of the first gauge, in whose metres all entries are."""
+        self.sigma = max(floor, SMALLEST_SIGMA)
+        """Standard deviation of a reading of the first gauge, [m]; all entries refer to it."""
         self.dof = o.size - o.n_zeros
         self.labels, self.session_of_entry = label_sessions(session, o.setup)
         self._counts = np.bincount(o.zero, minlength=o.n_zeros).astype(np.float64)
         self._incidence = self.problem.zero_incidence
         self._shared: dict[Hashable, object] = {}
-        self._kept_most_likely: list[tuple[bytes, ModelLinearisation]] = []
+        self._cached_most_likely: list[tuple[bytes, ModelLinearisation]] = []
 
     def with_values(self, values: Array) -> LinearModel:
-        """The model for other readings of the same rows, shape (n_rows,), [m]."""
+        """Model for other readings of the same rows, shape (n_rows,), [m]."""
         other = copy.copy(self)
         other.problem = self.problem.with_values(values)
         return other
 
     def share(self, name: Hashable, compute: Callable[[], Result]) -> Result:
-        """A result that does not depend on the values of the readings, computed once."""
+        """Cached result that does not depend on the values of the readings."""
         if name not in self._shared:
             self._shared[name] = compute()
         return cast(Result, self._shared[name])
 
-    def at_reference(self, *, slopes: bool) -> ModelLinearisation:
-        """The model linearised about the machine without errors; errors as for `linearise`.
+    def at_reference(self, *, keep_jacobian: bool) -> ModelLinearisation:
+        """Linearisation about the machine without errors, cached; raises as `linearise` does.
 
-        A nuisance parameter that changes readings noticeably, but to second order, such as the
-        height of a fixed ball across the plane of motion, has one standard deviation there.
+        Some nuisance parameters change readings noticeably, but only to second order, such as the
+        height of a fixed ball across the plane of motion. They are one standard deviation there.
         """
 
         def linearise() -> ModelLinearisation:
             theta = np.zeros(self.problem.n_free)
-            about = self.linearise(theta, (), None, slopes=True)
+            about = self.linearise(theta, (), None, keep_jacobian=True)
             theta[self._find_hidden(about)] = 1.0
             if theta.any():
-                about = self.linearise(theta, (), about.passive, slopes=slopes)
-            return about if slopes else replace(about, slopes=np.empty((len(about.slopes), 0)))
+                return self.linearise(theta, (), about.passive, keep_jacobian=keep_jacobian)
+            if keep_jacobian:
+                return about
+            return replace(about, jacobian=np.empty((len(about.jacobian), 0)))
 
-        return self.share(("reference", slopes), linearise)
+        return self.share(("reference", keep_jacobian), linearise)
 
     def _find_hidden(self, about: ModelLinearisation) -> Indices:
-        """Nuisance parameters without effect on readings at 0, but with one at their prior std."""
+        """Indices of nuisance parameters that change readings at one prior std, but not at 0."""
         n = self.problem.n_machine
-        hidden = n + np.flatnonzero(np.abs(about.slopes[:, n:]).max(axis=0) < HIDDEN * self.sigma)
+        changes = np.abs(about.jacobian[:, n:]).max(axis=0)
+        hidden = n + np.flatnonzero(changes < HIDDEN * self.sigma)
         if not hidden.size:
             return hidden
         theta = np.zeros(self.problem.n_free)
         theta[hidden] = 1.0
-        beside = self.linearise(theta, (), about.passive, slopes=True)
-        return np.asarray(hidden[np.abs(beside.slopes[:, hidden]).max(axis=0) > self.sigma])
+        beside = self.linearise(theta, (), about.passive, keep_jacobian=True)
+        return np.asarray(hidden[np.abs(beside.jacobian[:, hidden]).max(axis=0) > self.sigma])
 
     @property
     def offsets(self) -> dict[str, int]:
-        """Drive to the place of its offset among the free parameters."""
+        """Drive to the index of its offset among the free parameters."""
         place = {name: i for i, name in enumerate(self.problem.free)}
         drives = self.problem.robot.drives
         return {d.name: place[f"{d.name}.offset"] for d in drives if f"{d.name}.offset" in place}
@@ -213,23 +222,17 @@ class LinearModel:
     @property
     def active(self) -> Array:
         """Offsets stated as active in the controller, shape (n_sessions, n_drives), [m, rad]."""
-        session = self.problem.session
-        indices = [
-            session.active_offsets if s.active is None else s.active
-            for s in session.setups.values()
-        ]
-        setups = self.problem.observations.setup
-        first = [
-            int(setups[np.argmax(self.session_of_entry == k)]) for k in range(len(self.labels))
-        ]
-        return np.array([indices[i] for i in first])
+        active = _active_by_setup(self.problem.session)
+        setup_of_entry = self.problem.observations.setup
+        first_entries = [np.argmax(self.session_of_entry == k) for k in range(len(self.labels))]
+        return np.array([active[setup_of_entry[i]] for i in first_entries])
 
     @property
     def order(self) -> Indices:
         """Sessions in the order of measuring, shape (n_sessions,).
 
-        By the times of their readings where all state them. Otherwise those without active offsets
-        come first, the others in the order in which they were joined.
+        The times of the readings determine the order if all readings state them. Otherwise sessions
+        without active offsets come first; all others have the order in which they were joined.
         """
         session = self.problem.session
         keys: list[datetime | bool] = [bool(a.any()) for a in self.active]
@@ -237,54 +240,59 @@ class LinearModel:
         for r in session.readings:
             time = None if r.conditions is None else r.conditions.time
             times.setdefault(r.setup.partition("/")[0], []).append(time)
-        if session.joined and None not in (t for several in times.values() for t in several):
-            firsts = {
+        if session.joined and not any(None in of_session for of_session in times.values()):
+            start = {
                 k: min(t.replace(tzinfo=t.tzinfo or UTC) for t in v if t) for k, v in times.items()
             }
-            keys = [firsts[label] for label in self.labels]
+            keys = [start[label] for label in self.labels]
         return np.array(sorted(range(len(self.labels)), key=keys.__getitem__))
 
     @cached_property
     def to_entries(self) -> Sparse:
-        """Entries per row of the session, in the first gauge's metres, (n_rows, n_entries)."""
+        """Entries per unit of each row, in units of the first gauge, (n_rows, n_entries)."""
         o = self.problem.observations
         n = o.plus.size
-        if n > MOST_DENSE and self._has_single_zeros:
+        if n > MAX_DENSE_COLUMNS and self._has_single_readings:
             from scipy.sparse import csr_array
 
             return csr_array(
                 (1.0 / self.problem.noise_ratio[o.plus], (np.arange(n), o.plus)), (n, o.size)
             )
-        blocks = np.array([o.values(row) / self.problem.noise_ratio for row in np.eye(n)])
-        if n <= MOST_DENSE:
-            return blocks
+        matrix = np.array([o.values(row) / self.problem.noise_ratio for row in np.eye(n)])
+        if n <= MAX_DENSE_COLUMNS:
+            return matrix
         from scipy.sparse import csr_array
 
-        return csr_array(blocks)
+        return csr_array(matrix)
 
     def entries(self, rows: Array) -> Array:
         """Entries of rows, zeros projected out, shape (h, n_entries), [m].
 
         Args:
-            rows: Shape (h, n_rows), [m].
+            rows: Values of the rows, shape (h, n_rows), [m].
         """
         return self.project(np.asarray(self.to_entries.T @ rows.T).T)
 
     def project(self, entries: Array) -> Array:
-        """Vectors over the entries with their gauge zeros projected out, shape (h, n_entries)."""
+        """Project gauge zeros out of vectors over the entries, shape (h, n_entries)."""
         o = self.problem.observations
         return np.asarray(project_out_zeros(np.ascontiguousarray(entries.T), o).T)
 
     def linearise(
-        self, theta: Array, shifts: Sequence[MachineShift], start: Array | None, *, slopes: bool
+        self,
+        theta: Array,
+        shifts: Sequence[MachineShift],
+        start: Array | None,
+        *,
+        keep_jacobian: bool,
     ) -> ModelLinearisation:
         """Linearise the model.
 
         Args:
-            theta: Errors less the reference, shape (n_free,), [prior std].
+            theta: Errors minus those of the reference, shape (n_free,), [prior std].
             shifts: Known differences of the machine in some of the sessions.
-            start: Passive coordinates to start from.
-            slopes: Whether to keep the derivatives.
+            start: Passive coordinates to start from, shape (n_states, n_passive), [m, rad].
+            keep_jacobian: Whether the result includes the Jacobian.
 
         Raises:
             ClosureError: If the machine cannot reach a posture.
@@ -292,77 +300,89 @@ class LinearModel:
         """
         machines, of_session = self._machines(theta, shifts)
         starts = None if start is None else np.broadcast_to(start, (len(machines), *start.shape))
-        return self._assemble(theta, of_session, *self._predict(machines, starts), slopes=slopes)
+        return self._assemble(
+            theta, of_session, *self._predict(machines, starts), keep_jacobian=keep_jacobian
+        )
 
     def linearise_all(
-        self, points: Sequence[LinearisationPoint], *, slopes: bool
+        self, points: Sequence[LinearisationPoint], *, keep_jacobian: bool
     ) -> list[ModelLinearisation | None]:
-        """Linearise the model about several points: half the time of one after the other.
+        """Linearise the model about several points, in half the time of separate calls.
 
         Args:
             points: The points.
-            slopes: Whether to keep the derivatives.
+            keep_jacobian: Whether the results include the Jacobian.
 
         Returns:
-            The linearisations; None where a machine cannot reach a posture, or a predicted reading
-            is not finite.
+            The linearisations; None if a machine cannot reach a posture or a predicted reading is
+            not finite.
         """
-        size = max(1, MOST_ENTRIES // self.problem.observations.size)
+        size = max(1, MAX_ENTRIES // self.problem.observations.size)
         return [
-            linear
+            linearisation
             for first in range(0, len(points), size)
-            for linear in self._linearise_some(points[first : first + size], slopes=slopes)
+            for linearisation in self._linearise_block(
+                points[first : first + size], keep_jacobian=keep_jacobian
+            )
         ]
 
-    def _linearise_some(
-        self, points: Sequence[LinearisationPoint], *, slopes: bool
+    def _linearise_block(
+        self, points: Sequence[LinearisationPoint], *, keep_jacobian: bool
     ) -> Iterator[ModelLinearisation | None]:
         """Linearise the model about a few points at once, or one by one if one of them fails."""
         machines = [self._machines(p.theta, p.shifts) for p in points]
         place: dict[tuple[bytes, int], int] = {}
-        rows = [
+        places = [
             [place.setdefault((theta.tobytes(), id(p.start)), len(place)) for theta in thetas]
             for p, (thetas, _) in zip(points, machines, strict=True)
         ]
-        every = np.empty((len(place), self.problem.n_free))
+        distinct = np.empty((len(place), self.problem.n_free))
         starts = np.empty((len(place), *points[0].start.shape))
-        for point, (thetas, _), at in zip(points, machines, rows, strict=True):
-            every[at], starts[at] = thetas, point.start
-        together = None
+        for point, (thetas, _), m in zip(points, machines, places, strict=True):
+            distinct[m], starts[m] = thetas, point.start
+        predictions = None
         if len(points) > 1:
             with suppress(ClosureError, np.linalg.LinAlgError):
-                together = self._predict(every, starts)
-        for point, (thetas, of_session), at in zip(points, machines, rows, strict=True):
+                predictions = self._predict(distinct, starts)
+        for point, (thetas, of_session), m in zip(points, machines, places, strict=True):
             try:
                 predicted = (
-                    self._predict(thetas, starts[at])
-                    if together is None
-                    else [values[at] for values in together]
+                    self._predict(thetas, starts[m])
+                    if predictions is None
+                    else [values[m] for values in predictions]
                 )
-                yield self._assemble(point.theta, of_session, *predicted, slopes=slopes)
+                yield self._assemble(
+                    point.theta, of_session, *predicted, keep_jacobian=keep_jacobian
+                )
             except (ClosureError, SessionError, np.linalg.LinAlgError):
                 yield None
 
     def _machines(self, theta: Array, shifts: Sequence[MachineShift]) -> tuple[Array, Indices]:
-        """Different machines, shape (M, n_free), [SI], and that of each session, shape (K,)."""
-        each = [
+        """Errors of distinct machines and the machine of each session.
+
+        Returns:
+            Free parameters of M machines, shape (M, n_free), [SI], and the machine of each session,
+            shape (n_sessions,).
+        """
+        session_shifts = [
             sum((s.direction for s in shifts if s.sessions[k]), np.zeros_like(theta))
             for k in range(len(self.labels))
         ]
-        different = {shift.tobytes(): shift for shift in each}
-        place = {key: m for m, key in enumerate(different)}
-        errors = (theta + np.array(list(different.values()))) * self.problem.theta_scale
-        return self.problem.active_theta + errors, np.array([place[s.tobytes()] for s in each])
+        distinct = {shift.tobytes(): shift for shift in session_shifts}
+        place = {key: m for m, key in enumerate(distinct)}
+        errors = (theta + np.array(list(distinct.values()))) * self.problem.theta_scale
+        of_session = np.array([place[s.tobytes()] for s in session_shifts])
+        return self.problem.active_theta + errors, of_session
 
     def _predict(self, machines: Array, starts: Array | None) -> tuple[Array, Array, Array]:
-        """Readings, their derivatives and the passive coordinates of machines.
+        """Predicted entries, their Jacobians and the passive coordinates of machines.
 
         Args:
-            machines: Shape (M, n_free), [SI].
+            machines: Free parameters, shape (M, n_free), [SI].
             starts: Passive coordinates to start from, shape (M, n_states, n_passive).
 
         Returns:
-            Shapes (M, n_entries), (M, n_entries, n_free) and (M, n_states, n_passive).
+            Arrays of the shapes (M, n_entries), (M, n_entries, n_free), (M, n_states, n_passive).
         """
         passive = self.problem.close(machines, start=starts)
         return *self.problem.predict_and_jacobian(machines, passive), passive
@@ -375,27 +395,27 @@ class LinearModel:
         jacobians: Array,
         passive: Array,
         *,
-        slopes: bool,
+        keep_jacobian: bool,
     ) -> ModelLinearisation:
-        """Linearisation from the readings of the machine of each session.
+        """Linearisation from the predictions of the machine of each session.
 
         Raises:
             SessionError: If a predicted reading is not finite.
         """
-        o, which = self.problem.observations, of_session[self.session_of_entry]
-        every = np.arange(o.size)
-        expected, jacobian = readings[which, every], jacobians[which, every]
+        o, machine = self.problem.observations, of_session[self.session_of_entry]
+        entry = np.arange(o.size)
+        expected, jacobian = readings[machine, entry], jacobians[machine, entry]
         require_finite(self.problem, expected, jacobian)
         jacobian = project_out_zeros(jacobian, o)
-        likelihood, vectors, sizes = build_likelihood(
+        likelihood, error_directions, singular_values = build_likelihood(
             jacobian, sigma=self.sigma, dof=self.dof, stated=self.stated
         )
         return ModelLinearisation(
             project_out_zeros(expected, o) - jacobian @ theta,
-            jacobian if slopes else np.empty((o.size, 0)),
+            jacobian if keep_jacobian else np.empty((o.size, 0)),
             likelihood,
-            vectors,
-            sizes,
+            error_directions,
+            singular_values,
             theta,
             passive[-1],
         )
@@ -403,7 +423,7 @@ class LinearModel:
     def most_likely(self, rows: Array) -> ModelLinearisation:
         """Linearise about the most likely machine, with the tolerances as prior.
 
-        The result for the last readings is kept: a judgement and a recommendation need it.
+        The result for the last readings is cached because a judgement and a recommendation need it.
 
         Args:
             rows: Readings, shape (n_rows,), [m].
@@ -411,26 +431,26 @@ class LinearModel:
         Raises:
             ClosureError: If the nominal machine cannot reach a posture.
         """
-        key, kept = rows.tobytes(), self._kept_most_likely
-        if not kept or kept[0][0] != key:
+        key, cache = rows.tobytes(), self._cached_most_likely
+        if not cache or cache[0][0] != key:
             entries = self.entries(rows[None])[0]
-            kept[:] = [(key, self._approach(entries, np.zeros_like(entries)))]
-        return kept[0][1]
+            cache[:] = [(key, self._approach(entries, np.zeros_like(entries)))]
+        return cache[0][1]
 
     def predict_row(self, rows: Array, row: int) -> tuple[float, float]:
         """Predictive distribution of a reading, conditional on all other readings.
 
-        y_i | y_j, j ≠ i, about the machine that is most likely by the others, with errors at their
-        tolerances, noise as stated and free gauge zeros. A reading that says nothing is the sum of
-        its prediction and an effect of unknown amount.
+        The distribution of y_i | y_j, j ≠ i, follows from a linearisation about the most likely
+        machine of the other readings. Tolerances and noise are as stated, gauge zeros have flat
+        priors. An effect of unknown amount removes the information of reading i.
 
         Args:
-            rows: Readings, shape (n_rows,), [m]; the value of the predicted one does not matter.
-            row: Place of the predicted reading.
+            rows: Readings, shape (n_rows,), [m]; the value of the predicted one has no influence.
+            row: Index of the predicted reading.
 
         Returns:
-            Mean and standard deviation, [m]; NaN and infinity for a reading that no other one
-            predicts, such as the first of a setup.
+            Mean and standard deviation, [m]; NaN and infinity if no other reading predicts it, such
+            as for the only reading of a setup.
 
         Raises:
             ClosureError: If the nominal machine cannot reach a posture.
@@ -443,9 +463,9 @@ class LinearModel:
         return (math.nan if math.isinf(std) else float(rows[row] - amount)), float(std)
 
     def predict_left_out(self, rows: Array) -> Array:
-        """Errors of the prediction of each setup from all others, shape (n_rows,), [m].
+        """Readings of each setup minus their predictions from all other setups, (n_rows,), [m].
 
-        About the most likely machine, with errors at their tolerances and noise as stated.
+        The model is linearised about the most likely machine. Tolerances and noise are as stated.
 
         Args:
             rows: Readings, shape (n_rows,), [m].
@@ -454,42 +474,45 @@ class LinearModel:
             ClosureError: If the nominal machine cannot reach a posture.
         """
         near = self.most_likely(rows)
-        about = self.linearise(near.theta, (), near.passive, slopes=True)
+        about = self.linearise(near.theta, (), near.passive, keep_jacobian=True)
         deviation = self.entries(rows[None])[0] - about.expected
         o, errors = self.problem.observations, np.zeros(deviation.size)
         for setup in np.unique(o.setup):
-            out = o.setup == setup
-            slopes = about.slopes[~out]
-            normal = slopes.T @ slopes + self.sigma**2 * np.eye(slopes.shape[1])
-            theta = np.linalg.solve(normal, slopes.T @ deviation[~out])
-            errors[out] = deviation[out] - about.slopes[out] @ theta
+            left_out = o.setup == setup
+            jacobian = about.jacobian[~left_out]
+            normal = jacobian.T @ jacobian + self.sigma**2 * np.eye(jacobian.shape[1])
+            theta = np.linalg.solve(normal, jacobian.T @ deviation[~left_out])
+            errors[left_out] = deviation[left_out] - about.jacobian[left_out] @ theta
         return o.rows(errors * self.problem.noise_ratio)
 
     def _approach(self, entries: Array, effect: Array) -> ModelLinearisation:
-        """Linearise about the most likely machine, beside an effect of unknown amount.
+        """Linearise about the most likely machine, with a further effect of unknown amount.
 
-        Gauss-Newton steps end when the errors change by less than SETTLED prior std, or before the
-        first machine that cannot reach a posture. Readings are not linear over offsets of some mm.
+        Gauss-Newton steps are needed because readings are not linear over offsets of some mm. They
+        end when no error changes by more than CONVERGED_CHANGE, or before the first machine that
+        cannot reach a posture.
 
         Args:
             entries: Readings, zeros projected out, shape (n_entries,), [m].
-            effect: Effect per unit, zeros projected out, shape (n_entries,); 0 for none.
+            effect: Effect per unit, zeros projected out, shape (n_entries,); 0 without an effect.
         """
-        about = self.at_reference(slopes=False)
-        for _ in range(MOST_STEPS):
+        about = self.at_reference(keep_jacobian=False)
+        for _ in range(MAX_STEPS):
             deviation = entries - about.expected
             (amount,), _ = about.likelihood.estimate_amounts(deviation, effect[None])
             errors = about.errors_for(deviation - amount * effect)
-            if not np.abs(errors - about.theta).max(initial=0.0) > SETTLED:
+            if not np.abs(errors - about.theta).max(initial=0.0) > CONVERGED_CHANGE:
                 break
             try:
-                about = self.linearise(errors, (), about.passive, slopes=False)
+                about = self.linearise(errors, (), about.passive, keep_jacobian=False)
             except (ClosureError, SessionError, np.linalg.LinAlgError):
                 break
         return about
 
     def linearise_effect(self, name: str) -> SystematicEffect:
-        """Change of the rows by an effect that the robot lacks, about the nominal machine.
+        """Linearised change of the rows by an effect that the robot's model lacks.
+
+        The point of linearisation is the nominal machine.
 
         Args:
             name: Name of the effect.
@@ -500,10 +523,10 @@ class LinearModel:
         session, o = self.problem.session, self.problem.observations
         robot = session.robot
         other = session.with_effects((*robot.effect_names, name))
-        known = other.robot.parameters
-        errors = [n for n in known.names if n not in robot.parameters]
+        parameters = other.robot.parameters
+        errors = [n for n in parameters.names if n not in robot.parameters]
         offsets = [self.problem.free[i] for i in self.offsets.values()]
-        selection = select_parameters(known, free=[*offsets, *errors], prior=True)
+        selection = select_parameters(parameters, free=[*offsets, *errors], prior=True)
         problem = CalibrationProblem(other, selection)
         reading, jacobian = problem.predict_and_jacobian(problem.active_theta)
         nominal = self.problem.predict(self.problem.active_theta) * self.problem.noise_ratio
@@ -519,12 +542,13 @@ class LinearModel:
     def nuisance_columns(self) -> Array:
         """Change of the rows by one prior std of each nuisance parameter, [m].
 
-        About the machine without errors, shape (n_nuisance, n_rows); zeros are not projected out.
+        The shape is (n_nuisance, n_rows). The machine has no errors. Gauge zeros are not projected
+        out.
         """
 
         def compute() -> Array:
             problem = self.problem
-            passive = self.at_reference(slopes=False).passive
+            passive = self.at_reference(keep_jacobian=False).passive
             _, jacobian = problem.predict_and_jacobian(problem.active_theta, passive)
             columns = jacobian[:, problem.n_machine :] * problem.noise_ratio[:, None]
             return problem.observations.rows(columns).T
@@ -532,45 +556,45 @@ class LinearModel:
         return self.share("nuisance", compute)
 
     def dimension_changes(self) -> dict[tuple[str, str], dict[str, Array]]:
-        """Change of the rows by each dimension that setups state, per unit, (n_rows,) each.
+        """Derivative of the rows with respect to each dimension that setups state.
 
-        About the machine without errors.
+        The machine has no errors.
 
         Returns:
-            Key of the dimension and its stated size, to setup, to the change.
+            Key of the dimension and its stated value, to setup, to the derivative, shape (n_rows,).
         """
 
         def compute() -> dict[tuple[str, str], dict[str, Array]]:
             session, o = self.problem.session, self.problem.observations
             setups = {r.setup: session.setups[r.setup] for r in session.readings}
-            larger: dict[str, Setup] = {}
-            sizes: dict[str, tuple[str, str]] = {}
+            enlarged: dict[str, Setup] = {}
+            dimensions: dict[str, tuple[str, str]] = {}
             for name, setup in setups.items():
                 for key, sensor in stated_dimensions(setup.sensor).items():
-                    larger[name] = replace(setup, sensor=sensor)
-                    sizes[name] = key, _stated(setup.sensor.to_keys(), key)
-            if not larger:
+                    enlarged[name] = replace(setup, sensor=sensor)
+                    dimensions[name] = key, _stated_value(setup.sensor.to_keys(), key)
+            if not enlarged:
                 return {}
-            other = replace(session, setups={**session.setups, **larger})
-            passive = self.at_reference(slopes=False).passive
+            other = replace(session, setups={**session.setups, **enlarged})
+            passive = self.at_reference(keep_jacobian=False).passive
             stated, changed = (
                 o.rows(predict_readings(s, observations=o, passive=passive))
                 for s in (session, other)
             )
             change = (changed - stated) / DIMENSION_STEP
             changes: dict[tuple[str, str], dict[str, Array]] = {}
-            for name, size in sizes.items():
+            for name, dimension in dimensions.items():
                 of_setup = [r.setup == name for r in session.readings]
-                changes.setdefault(size, {})[name] = np.where(of_setup, change, 0.0)
+                changes.setdefault(dimension, {})[name] = np.where(of_setup, change, 0.0)
             return changes
 
         return self.share("dimensions", compute)
 
     def shift_entries(self, about: ModelLinearisation, shift: MachineShift) -> Array:
         """Effect of a machine shift on the entries, zeros projected out, (n_entries,), [m]."""
-        moved = np.asarray(about.slopes @ shift.direction)
-        changed = np.where(shift.sessions[self.session_of_entry], moved, 0.0)
-        return np.asarray(self.project(changed[None])[0])
+        change = np.asarray(about.jacobian @ shift.direction)
+        change = np.where(shift.sessions[self.session_of_entry], change, 0.0)
+        return np.asarray(self.project(change[None])[0])
 
     def products(
         self, patterns: Patterns, about: ModelLinearisation, deviation: Array
@@ -578,18 +602,18 @@ class LinearModel:
         """Products of patterns over the rows with the principal directions and a deviation.
 
         Args:
-            patterns: Over the rows, shape (h, n_rows), [m].
+            patterns: Patterns over the rows, shape (h, n_rows), [m].
             about: The linearisation.
-            deviation: Shape (n_entries,), zeros projected out, [m].
+            deviation: Readings minus predictions, shape (n_entries,), zeros projected out, [m].
 
         Returns:
             The products; and the inner products with the deviation, shape (h,), [m²].
         """
         directions = about.likelihood.directions
-        patterns = self._write_out(patterns)
+        patterns = self._without_tails(patterns)
         entries = patterns.rows @ self.to_entries
         square = row_products(entries, entries)
-        if patterns.tails is not None:  # an entry is a row over its noise
+        if patterns.tails is not None:  # then each entry is one row divided by its noise ratio
             scale = np.asarray(self.to_entries.sum(axis=1))
             square += patterns.tails.product(scale[:, None] ** 2, power=2)[:, 0]
         square -= self._sums_by_zero(patterns) ** 2 @ (1.0 / self._counts)
@@ -601,10 +625,11 @@ class LinearModel:
         """Inner products of patterns, pair by pair, zeros projected out, shape (h,), [m²].
 
         Args:
-            patterns: Over the rows, shape (h, n_rows).
-            others: The same number, without tails. Tails are 0 in their rows.
+            patterns: Patterns over the rows, shape (h, n_rows). Their tails are 0 in all nonzero
+                rows of `others`.
+            others: Patterns without tails, shape (h, n_rows).
         """
-        patterns = self._write_out(patterns)
+        patterns = self._without_tails(patterns)
         one, other = (p.rows @ self.to_entries for p in (patterns, others))
         means = self._sums_by_zero(patterns) * self._sums_by_zero(others) @ (1.0 / self._counts)
         return row_products(one, other) - means
@@ -613,27 +638,27 @@ class LinearModel:
         """Sums of the entries of patterns over each gauge zero, shape (h, n_zeros), [m]."""
         return patterns.product(np.asarray(self.to_entries @ self._incidence))
 
-    def _write_out(self, patterns: Patterns) -> Patterns:
-        """Patterns without tails, where cumulative sums do not apply or gain little."""
-        few = isinstance(patterns.rows, np.ndarray)
-        if patterns.tails is None or (self._has_single_zeros and not few):
+    def _without_tails(self, patterns: Patterns) -> Patterns:
+        """Patterns with their tails as a matrix, if cumulative sums do not apply or gain little."""
+        is_small = isinstance(patterns.rows, np.ndarray)
+        if patterns.tails is None or (self._has_single_readings and not is_small):
             return patterns
         return Patterns(patterns.to_sparse())
 
     @property
-    def _has_single_zeros(self) -> bool:
-        """True if all rows are single readings, so that the rows of a setup share one zero."""
+    def _has_single_readings(self) -> bool:
+        """True if all rows are single readings; then all rows of a setup share one gauge zero."""
         return bool((self.problem.observations.minus < 0).all())
 
     def rms(self, deviation: Array, about: ModelLinearisation) -> float:
-        """RMS residual of a machine within its tolerances, to first order, [m].
+        """RMS residual of the most likely machine, to first order, [m].
 
         Args:
-            deviation: Readings less predictions, shape (n_entries,), zeros projected out, [m].
+            deviation: Readings minus predictions, shape (n_entries,), zeros projected out, [m].
             about: The linearisation.
         """
         errors = about.errors_for(deviation)
-        along = about.sizes * (about.errors.T @ errors)
+        along = about.singular_values * (about.error_directions.T @ errors)
         residuals = (deviation - along @ about.likelihood.directions) * self.problem.noise_ratio
         return float(np.sqrt(np.mean(self.problem.observations.rows(residuals) ** 2)))
 
@@ -641,38 +666,38 @@ class LinearModel:
 def linear_model(
     session: Session, model: str | None = None, *, free: tuple[str, ...] = ()
 ) -> LinearModel:
-    """Linearised model; of the last sessions with the same rows it is built once.
+    """Linearised model of a session, cached for sessions with the same rows.
 
     Args:
-        session: As for `LinearModel`.
-        model: Name of the model of the errors that the machine may have; all by default.
-        free: Names of further errors.
+        session: A session, or several joined ones.
+        model: Name of the model of the errors that the machine may have; all errors by default.
+        free: Names of errors in addition to those of the model.
 
     Raises:
-        RobotError: As for `LinearModel`.
+        RobotError: If closures of the robot depend on each other.
         ParameterError: If the model or a name is unknown.
     """
     robot = session.robot
     names = machine_errors(robot) if model is None else robot.parameters.select_model(model)
-    return _build(_Rows(session, (*names, *free))).with_values(session.values)
+    return _cached_model(_Rows(session, (*names, *free))).with_values(session.values)
 
 
 class _Rows:
-    """All of a session but the values of its readings; equal for the same objects.
+    """Cache key of a session: everything except the values of its readings.
 
-    The values of several gauges count: the ratio of their noise may come from them.
+    With several gauges the values count, because their noise ratio may be estimated from them.
     """
 
     def __init__(self, session: Session, names: tuple[str, ...]) -> None:
         self.session, self.names = session, names
         offsets = session.controller_offsets
         gauges = {session.setups[r.setup].gauge for r in session.readings}
-        same = (
+        same_objects = (
             *(session.robot, session.postures, session.setups, *session.gauges.values()),
             *(session.compensation, session.firmware, session.adjusted, session.path),
         )
         self._key = (
-            *map(id, same),
+            *map(id, same_objects),
             *(None if offsets is None else offsets.tobytes(), session.joined, names),
             session.values.tobytes() if len(gauges) > 1 else None,
             tuple(
@@ -688,23 +713,29 @@ class _Rows:
         return isinstance(other, _Rows) and self._key == other._key
 
 
-@lru_cache(maxsize=KEPT)
-def _build(rows: _Rows) -> LinearModel:
+@lru_cache(maxsize=CACHE_SIZE)
+def _cached_model(rows: _Rows) -> LinearModel:
     return LinearModel(rows.session, rows.names)
 
 
 def _refer_to_most_corrected(session: Session) -> Session:
-    """Joined sessions with the largest active offsets of them as the reference of the errors.
+    """Use the largest active offsets of joined sessions as the reference of the errors.
 
-    The reference, at which the prior is centred, does not depend on the order of the sessions.
+    The prior is centred at the reference, which does not depend on the order of the sessions.
     """
     if not session.joined:
         return session
-    active = [
-        session.active_offsets if s.active is None else s.active for s in session.setups.values()
-    ]
-    largest = max(active, key=lambda offsets: (float(np.abs(offsets).max()), *offsets.tolist()))
+    largest = max(
+        _active_by_setup(session),
+        key=lambda offsets: (float(np.abs(offsets).max()), *offsets.tolist()),
+    )
     return replace(session, controller_offsets=largest)
+
+
+def _active_by_setup(session: Session) -> list[Array]:
+    """Active offsets of each setup, shape (n_drives,) each, [m, rad]."""
+    setups = session.setups.values()
+    return [session.active_offsets if s.active is None else s.active for s in setups]
 
 
 def label_sessions(session: Session, setup: Indices) -> tuple[tuple[str, ...], Indices]:
@@ -715,19 +746,19 @@ def label_sessions(session: Session, setup: Indices) -> tuple[tuple[str, ...], I
         setup: Setup of each entry, shape (n_entries,).
 
     Returns:
-        Names of the sessions with readings, a single "" where none were joined; and the place
-        among them, shape (n_entries,).
+        Names of the sessions with readings, or a single "" without joined sessions; and for each
+        entry the index of its session among them, shape (n_entries,).
     """
     if not session.joined:
         return ("",), np.zeros(setup.size, dtype=np.int64)
-    of_setup = [name.partition("/")[0] for name in session.setups]
-    read = {of_setup[i] for i in np.unique(setup)}
-    labels = tuple(n for n in dict.fromkeys(of_setup) if n in read)
-    place = np.array([labels.index(n) if n in labels else -1 for n in of_setup])
+    label_of_setup = [name.partition("/")[0] for name in session.setups]
+    with_readings = {label_of_setup[i] for i in np.unique(setup)}
+    labels = tuple(n for n in dict.fromkeys(label_of_setup) if n in with_readings)
+    place = np.array([labels.index(n) if n in labels else -1 for n in label_of_setup])
     return labels, place[setup]
 
 
-def _stated(keys: Mapping[str, Any], key: str) -> str:
+def _stated_value(keys: Mapping[str, Any], key: str) -> str:
     """Value of a key of a setup such as artefact.height_mm, as text."""
     first, _, others = key.partition(".")
-    return _stated(keys[first], others) if others else f"{keys[first]:g}"
+    return _stated_value(keys[first], others) if others else f"{keys[first]:g}"

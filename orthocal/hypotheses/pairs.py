@@ -1,10 +1,11 @@
-"""Search over all pairs of hypotheses: two anomalies may hide each other from every single one.
+"""Search over all pairs of hypotheses: two anomalies may hide each other from single hypotheses.
 
-Of two edits Δ_a, Δ_b of a deviation d the misfit is |d + Δ_a + Δ_b|². An effect w of unknown amount
-gains by its slope w·x on what remains, x, and its information w·w. All inner products are weighted
-by the inverse covariance of the entries, x·y = xᵀ V(e, s)⁻¹ y, one for each pair (e, s) of scales.
+Two edits Δ_a, Δ_b of a deviation d have the misfit |d + Δ_a + Δ_b|². The gain by an effect w of
+unknown amount depends on its slope w·x, with x the edited deviation, and its information w·w. All
+inner products are weighted by the inverse covariance of the entries, x·y = xᵀ V(e, s)⁻¹ y, for each
+pair (e, s) of scales.
 
-All pairs are scored at the best pair of scales on a coarse grid, the most likely ones on the full
+All pairs are scored at the best scales of a coarse grid, then the most likely pairs on the full
 grid.
 """
 
@@ -18,33 +19,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.arrays import Array, Indices
-from orthocal.hypotheses.likelihood import AMOUNTS, NOISE_SCALES, Likelihood, log_of_sum
+from orthocal.hypotheses.likelihood import AMOUNT_STDS, NOISE_SCALES, Likelihood, log_of_sum
 
-COARSE_TOLERANCES = (2, 3, 4, 5, 6)
-"""Places in the grid of tolerance scales that all pairs are scored at."""
+COARSE_TOLERANCE_PLACES = (2, 3, 4, 5, 6)
+"""Indices of the coarse grid in the grid of tolerance scales."""
 
-COARSE_NOISES = (3, 4, 5, 7, 10)
-"""Places in the grid of noise scales that all pairs are scored at."""
+COARSE_NOISE_PLACES = (3, 4, 5, 7, 10)
+"""Indices of the coarse grid in the grid of noise scales."""
 
-MOST_REFINED = 300
-"""Pairs that are scored on the full grid."""
+MAX_REFINED = 300
+"""Most pairs that are scored on the full grid."""
 
-BLOCK = 128
-"""Hypotheses whose pairs are scored at a time."""
+BLOCK_SIZE = 128
+"""Hypotheses whose pairs are scored at once, to limit the memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Singles:
-    """Single hypotheses of a small session, dense: edits first, then effects."""
+    """Single hypotheses of a small session as dense arrays: edits first, then effects."""
 
     edits: Array
     """Changes of the entries, zeros projected out, shape (n_edits, n_entries), [m]."""
     effects: Array
     """Effects per unit of an unknown amount, shape (n_effects, n_entries)."""
     prior: Array
-    """Logarithms of their prior probabilities, volumes included, shape (n_edits + n_effects,)."""
-    touched: NDArray[np.bool_]
-    """Rows that each acts on, shape (n_edits + n_effects, n_rows)."""
+    """Logarithms of their prior probabilities with volume factors, (n_edits + n_effects,)."""
+    changed_rows: NDArray[np.bool_]
+    """Mask of rows that each hypothesis changes, shape (n_edits + n_effects, n_rows)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,13 +53,21 @@ class Pairs:
     """The most likely pairs of hypotheses, the most likely one first."""
 
     members: Indices
-    """Shape (m, 2)."""
+    """Indices of both single hypotheses, shape (m, 2)."""
     log_posterior: Array
     """Logarithms of marginal likelihood times prior probability, shape (m,)."""
 
 
 class _Scaled:
-    """Vectors at one pair (e, s) of scales, in coordinates in which V is the identity."""
+    """Deviation, edits and effects at one pair (e, s), in coordinates in which V is the identity.
+
+    Args:
+        likelihood: The likelihood.
+        vectors: Deviation (n_entries,), edits (n_edits, n_entries), effects (n_effects, n_entries),
+            in a basis that begins with the principal directions.
+        grid: Variances of `Likelihood.grid`.
+        g: Index of the pair (e, s).
+    """
 
     def __init__(
         self, likelihood: Likelihood, vectors: Sequence[Array], grid: tuple[Array, Array], g: int
@@ -69,11 +78,11 @@ class _Scaled:
         self.vectors = tuple(v * scale for v in vectors)
         logs = np.log(variance).sum() + max(likelihood.dof - len(variance), 0) * np.log(noise)
         self.largest = float(likelihood.weights[g] - 0.5 * logs)
-        """Logarithm of the marginal likelihood of a deviation of 0, which no pair exceeds."""
+        """Log marginal likelihood of a deviation of 0, the upper bound of all pairs."""
 
     @cached_property
     def _second_edits(self) -> Array:
-        """Edits e, 1 and -|e|²/2: with x, c and 1 their products are c + x·e - |e|²/2."""
+        """Edits e, 1 and -|e|²/2: their products with (x, c, 1) are c + x·e - |e|²/2."""
         edits = self.vectors[1]
         return np.column_stack([edits, np.ones(len(edits)), -0.5 * (edits**2).sum(axis=1)])
 
@@ -83,7 +92,12 @@ class _Scaled:
         return np.asarray((self.vectors[2] ** 2).sum(axis=1))
 
     def score_edits(self, block: slice, taus: Array) -> Array:
-        """Logarithms of pairs of a block of edits with these and later edits, and all effects."""
+        """Log likelihoods of a block of edits, paired with these and later edits and all effects.
+
+        Args:
+            block: The edits.
+            taus: Grid of τ², shape (t,).
+        """
         deviation, edits, effects = self.vectors
         changed, later = deviation + edits[block], self._second_edits[block.start :]
         level = self.largest - 0.5 * (changed**2).sum(axis=1)
@@ -99,7 +113,12 @@ class _Scaled:
         return score
 
     def score_effects(self, block: slice, taus: Array) -> Array:
-        """Logarithms of pairs of a block of effects with these and later effects."""
+        """Log likelihoods of a block of effects, paired with these and later effects.
+
+        Args:
+            block: The effects.
+            taus: Grid of τ², shape (t,).
+        """
         deviation, _, effects = self.vectors
         later = slice(block.start, None)
         information, slope = self._information, effects @ deviation
@@ -112,34 +131,37 @@ class _Scaled:
 
 
 def find_pairs(
-    likelihood: Likelihood, deviation: Array, singles: Singles, *, least: float = -np.inf
+    likelihood: Likelihood, deviation: Array, singles: Singles, *, min_log: float = -np.inf
 ) -> Pairs:
     """Find the most likely pairs of hypotheses that act on different rows.
 
     Args:
-        likelihood: About one linearisation.
-        deviation: Readings less predictions, zeros projected out, shape (n_entries,), [m].
+        likelihood: Likelihood of one linearisation.
+        deviation: Readings minus predictions, zeros projected out, shape (n_entries,), [m].
         singles: The single hypotheses.
-        least: Log posterior on the coarse grid below which pairs are left out.
+        min_log: Pairs with a smaller log posterior on the coarse grid are omitted.
     """
-    # the directions, up to their signs, and a basis of what is perpendicular to them
+    # principal directions up to their signs, then a basis of their orthogonal complement
     basis = np.linalg.qr(likelihood.directions.T, mode="complete").Q
     vectors = (deviation @ basis, singles.edits @ basis, singles.effects @ basis)
-    taus = (AMOUNTS * likelihood.sigma) ** 2
-    places = [e * NOISE_SCALES.size + s for e in COARSE_TOLERANCES for s in COARSE_NOISES]
+    taus = (AMOUNT_STDS * likelihood.sigma) ** 2
+    places = [
+        e * NOISE_SCALES.size + s for e in COARSE_TOLERANCE_PLACES for s in COARSE_NOISE_PLACES
+    ]
     full = likelihood.grid()
     grid = [_Scaled(likelihood, vectors, full, g) for g in places]
     best_prior = 2.0 * singles.prior.max(initial=-np.inf)
-    grid = [scaled for scaled in grid if scaled.largest + best_prior > least]
+    grid = [scaled for scaled in grid if scaled.largest + best_prior > min_log]
     members, scores = [np.empty((0, 2), dtype=np.int64)], [np.empty(0)]
     for block, score in _score_blocks(grid, taus):
         log = score + singles.prior[block, None] + singles.prior[block.start :]
-        one, other = np.nonzero(np.triu(log > least, k=1))
+        one, other = np.nonzero(np.triu(log > min_log, k=1))
         pairs = np.column_stack([one, other]) + block.start
-        apart = ~(singles.touched[pairs[:, 0]] & singles.touched[pairs[:, 1]]).any(axis=1)
-        members.append(pairs[apart])
-        scores.append(log[one, other][apart])
-    likeliest = np.concatenate(members)[np.argsort(-np.concatenate(scores))[:MOST_REFINED]]
+        changed = singles.changed_rows[pairs]
+        disjoint = ~(changed[:, 0] & changed[:, 1]).any(axis=1)
+        members.append(pairs[disjoint])
+        scores.append(log[one, other][disjoint])
+    likeliest = np.concatenate(members)[np.argsort(-np.concatenate(scores))[:MAX_REFINED]]
     refined = _score_pairs(likelihood, vectors, likeliest, taus)
     refined += singles.prior[likeliest].sum(axis=1)
     ranked = np.argsort(-refined)
@@ -147,26 +169,39 @@ def find_pairs(
 
 
 def _score_blocks(grid: list[_Scaled], taus: Array) -> Iterator[tuple[slice, Array]]:
-    """Largest logarithms on the coarse grid, of a block of hypotheses with all from its first."""
+    """Score blocks of hypotheses, each paired with all hypotheses from its first one on.
+
+    Yields:
+        The block and the largest log likelihoods over the coarse grid.
+    """
     if not grid:
         return
     n, m = len(grid[0].vectors[1]), len(grid[0].vectors[2])
-    for begin in range(0, n, BLOCK):
-        block = slice(begin, min(begin + BLOCK, n))
+    for begin in range(0, n, BLOCK_SIZE):
+        block = slice(begin, min(begin + BLOCK_SIZE, n))
         yield block, _largest(scaled.score_edits(block, taus) for scaled in grid)
-    for begin in range(0, m, BLOCK):
-        block = slice(begin, min(begin + BLOCK, m))
+    for begin in range(0, m, BLOCK_SIZE):
+        block = slice(begin, min(begin + BLOCK_SIZE, m))
         score = _largest(scaled.score_effects(block, taus) for scaled in grid)
         yield slice(n + block.start, n + block.stop), score
 
 
 def _largest(scores: Iterator[Array]) -> Array:
-    """Largest of the elements of arrays, in the memory of the first one."""
+    """Element-wise maximum of arrays, in the memory of the first one."""
     return reduce(lambda best, score: np.maximum(best, score, out=best), scores)
 
 
 def _gain(tau: float, one: Array, other: Array, shared: Array, s: Array, t: Array) -> Array:
-    """Gain in the logarithm by two amounts of variance τ² with a 2 × 2 information matrix."""
+    """Gain of log likelihood by two amounts of prior variance τ².
+
+    Args:
+        tau: Prior variance τ².
+        one: Information of the first effect.
+        other: Information of the second effect.
+        shared: Inner product of both effects.
+        s: Slope of the first effect.
+        t: Slope of the second effect.
+    """
     a, b, c = 1.0 + tau * one, 1.0 + tau * other, tau * shared
     det = np.maximum(a * b - c**2, 1.0)
     return np.asarray(0.5 * (tau * (s**2 * b - 2.0 * s * t * c + t**2 * a) / det - np.log(det)))
@@ -175,18 +210,25 @@ def _gain(tau: float, one: Array, other: Array, shared: Array, s: Array, t: Arra
 def _score_pairs(
     likelihood: Likelihood, vectors: Sequence[Array], members: Indices, taus: Array
 ) -> Array:
-    """Logarithms of the marginal likelihood of some pairs on the full grid, shape (m,)."""
+    """Log marginal likelihoods of some pairs on the full grid, shape (m,).
+
+    Args:
+        likelihood: The likelihood.
+        vectors: Deviation, edits and effects, as for `_Scaled`.
+        members: Indices of both hypotheses, shape (m, 2).
+        taus: Grid of τ², shape (t,).
+    """
     deviation, edits, effects = vectors
     changed = deviation + np.vstack([edits, np.zeros_like(effects)])[members].sum(axis=1)
-    both = np.vstack([np.zeros_like(edits), effects])[members]
+    pair_effects = np.vstack([np.zeros_like(edits), effects])[members]
     logs, grid = np.empty((likelihood.weights.size, len(members))), likelihood.grid()
     for g in range(len(logs)):
-        scaled = _Scaled(likelihood, (changed, both[:, 0], both[:, 1]), grid, g)
+        scaled = _Scaled(likelihood, (changed, pair_effects[:, 0], pair_effects[:, 1]), grid, g)
         x, one, other = scaled.vectors
         products = [(one, one), (other, other), (one, other), (one, x), (other, x), (x, x)]
         *forms, misfit = (np.einsum("ij,ij->i", a, b) for a, b in products)
         gains = np.array([_gain(tau, *forms) for tau in taus])
-        # without an effect all gains are 0
+        # a pair of edits has no effects, and its gains are 0
         gain = log_of_sum(gains, axis=0) - np.log(taus.size)
         logs[g] = scaled.largest - 0.5 * misfit + gain
     return np.asarray(log_of_sum(logs, axis=0))

@@ -1,6 +1,6 @@
-"""YAML, JSON and CSV from strangers: bounded reading, validation, messages that name the place.
+"""YAML, JSON and CSV from untrusted sources: bounded reading, validation, messages with places.
 
-Every reader takes the kind of error to raise.
+The caller of a reader chooses the kind of error to raise.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from orthocal.text import composed, shorten, text_problem
 Record = TypeVar("Record")
 
 
-def _refuse_truth_values(value: object) -> object:
+def _refuse_booleans(value: object) -> object:
+    """Refuse yes and no of YAML, which pydantic would convert to 1 and 0."""
     if isinstance(value, bool):
         raise PydanticCustomError("float_type", "Input should be a valid number")
     return value
@@ -42,16 +43,19 @@ SMALLEST_POSITIVE = 1e-9
 
 
 def _refuse_huge(value: float) -> float:
+    """Refuse a number beyond LARGEST_NUMBER."""
     if abs(value) > LARGEST_NUMBER:
         raise PydanticCustomError("huge", f"Input should be within ±{LARGEST_NUMBER:g}")
     return value
 
 
 SMALLEST_IN_SI = 1e-16
-"""Smallest standard deviation in SI units: quotients by it can still be squared."""
+"""Smallest standard deviation in SI units; the square of a quotient by it does not overflow."""
 
 
 def _at_least(smallest: float) -> AfterValidator:
+    """Validator that refuses a number below the smallest one."""
+
     def refuse_smaller(value: float) -> float:
         if value < smallest:
             raise PydanticCustomError("tiny", f"Input should be at least {smallest:g}")
@@ -62,27 +66,27 @@ def _at_least(smallest: float) -> AfterValidator:
 
 Number = Annotated[
     float,
-    BeforeValidator(_refuse_truth_values),
+    BeforeValidator(_refuse_booleans),
     Field(allow_inf_nan=False),
     AfterValidator(_refuse_huge),
 ]
-"""A number within ±LARGEST_NUMBER; YAML's yes and no are not numbers."""
+"""Number within ±LARGEST_NUMBER; yes and no of YAML are not numbers."""
 
 Count = Annotated[int, Field(ge=0, le=10**9)]
-"""A whole number from 0 to 10⁹."""
+"""Whole number from 0 to 10⁹."""
 
 PositiveNumber = Annotated[Number, Field(gt=0.0), _at_least(SMALLEST_POSITIVE)]
-"""A number from SMALLEST_POSITIVE to LARGEST_NUMBER."""
+"""Number from SMALLEST_POSITIVE to LARGEST_NUMBER."""
 
 Name = Annotated[
     str,
     Field(min_length=1, max_length=200, pattern=r"^[^,;\s\"]+$"),
     AfterValidator(composed),
 ]
-"""A name that needs no quotes in a CSV file."""
+"""Name that needs no quotes in a CSV file."""
 
 PositiveInSI = Annotated[Number, Field(gt=0.0), _at_least(SMALLEST_IN_SI)]
-"""A positive number in SI units that users state in mm, mrad or ppm."""
+"""Positive number in SI units that users state in mm, mrad or ppm."""
 
 MOST_JSON_VALUES = 2_000_000
 """Largest number of keys and values of a JSON file; a calibration has forty per reading."""
@@ -112,7 +116,7 @@ def read_text(
         largest: Largest size, [bytes]; default: LARGEST_FILE.
 
     Raises:
-        OrthocalError: Of kind `error`, if the file is missing, too large or not text.
+        OrthocalError: Of kind `error`, if the file is missing, too large or not UTF-8.
     """
     if content is None:
         content = read_file(path, error=error)
@@ -136,7 +140,7 @@ def read_yaml(path: Path, *, error: type[OrthocalError], content: bytes | None =
         content: Content of the file, if it was read before.
 
     Raises:
-        OrthocalError: Of kind `error`, naming file and line.
+        OrthocalError: Of kind `error`, if the file is invalid; names file and line.
     """
     text = read_text(path, error=error, content=content, largest=LARGEST_YAML)
     try:
@@ -145,7 +149,7 @@ def read_yaml(path: Path, *, error: type[OrthocalError], content: bytes | None =
         mark = e.problem_mark or e.context_mark
         line = "" if mark is None else f":{mark.line + 1}"
         problem = str(e.problem)
-        if problem.startswith("but "):  # PyYAML's sentence begins in the context
+        if problem.startswith("but "):  # the context is the first half of PyYAML's sentence
             problem = f"{e.context}, {problem}"
         if mark is not None and text[mark.index : mark.index + 1] == "\t":
             problem += " (a tab; indent with spaces)"
@@ -159,10 +163,9 @@ def read_json(path: Path, *, error: type[OrthocalError]) -> Any:  # noqa: ANN401
     """Content of a JSON file.
 
     Raises:
-        OrthocalError: Of kind `error`, naming file and line.
+        OrthocalError: Of kind `error`, if the file is invalid; names file and line.
     """
     text = read_text(path, error=error)
-
     commas_and_brackets = sum(text.count(c) for c in ",[{")
     if commas_and_brackets > MOST_JSON_VALUES:
         raise error(
@@ -170,7 +173,7 @@ def read_json(path: Path, *, error: type[OrthocalError]) -> Any:  # noqa: ANN401
             where=str(path),
         )
 
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    def to_dict(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         result: dict[str, Any] = {}
         for key, value in pairs:
             if key in result:
@@ -178,16 +181,19 @@ def read_json(path: Path, *, error: type[OrthocalError]) -> Any:  # noqa: ANN401
             result[key] = value
         return result
 
-    def short(digits: str) -> str:
+    def require_short(digits: str) -> str:
         if len(digits) > LONGEST_NUMBER:
             raise ValueError(f"the number {shorten(digits)} has {len(digits)} characters")
         return digits
 
-    readers: dict[str, Any] = {}
-    if _LONG_NUMBER.search(text):  # these readers are slow
-        readers = {"parse_int": lambda d: int(short(d)), "parse_float": lambda d: float(short(d))}
+    parsers: dict[str, Any] = {}
+    if _LONG_NUMBER.search(text):  # otherwise the faster parsers of the json module suffice
+        parsers = {
+            "parse_int": lambda digits: int(require_short(digits)),
+            "parse_float": lambda digits: float(require_short(digits)),
+        }
     try:
-        document = json.loads(text, object_pairs_hook=unique, **readers)
+        document = json.loads(text, object_pairs_hook=to_dict, **parsers)
         _check_texts(document)
         return document
     except json.JSONDecodeError as e:
@@ -200,18 +206,18 @@ def _check_texts(document: object) -> None:
     """Refuse control characters and half surrogate pairs in any text of a document.
 
     Raises:
-        ValueError: With the problem.
+        ValueError: If the document contains such a text, or is nested too deeply.
     """
     pending: list[tuple[Any, int]] = [([document], 0)]
     while pending:
         value, depth = pending.pop()
         if depth > DEEPEST:
             raise ValueError(f"lists and objects are nested more than {DEEPEST} deep")
-        for inner in value if isinstance(value, list) else (*value, *value.values()):
-            if isinstance(inner, list | dict):
-                pending.append((inner, depth + 1))
-            elif isinstance(inner, str):
-                problem = text_problem(inner)
+        for item in value if isinstance(value, list) else (*value, *value.values()):
+            if isinstance(item, list | dict):
+                pending.append((item, depth + 1))
+            elif isinstance(item, str):
+                problem = text_problem(item)
                 if problem:
                     raise ValueError(problem)
 
@@ -225,9 +231,9 @@ def csv_rows(
     error: type[OrthocalError],
     most: int | None = None,
 ) -> Iterator[tuple[int, dict[str, str]]]:
-    """Rows of a CSV file with a header: line number, and cells by column. Blank lines are skipped.
+    """Line numbers and cells by column of the rows of a CSV file with a header.
 
-    The separator is a semicolon if the header has no comma.
+    Blank lines are skipped. The separator is a semicolon if the header has one and no comma.
 
     Args:
         lines: Lines with their line ends.
@@ -235,50 +241,47 @@ def csv_rows(
         required: Required columns.
         optional: Optional columns.
         error: Kind of error to raise.
-        most: Largest number of rows.
+        most: Largest number of lines.
 
     Raises:
-        OrthocalError: Of kind `error`, naming file and line.
+        OrthocalError: Of kind `error`, if a row is invalid; names file and line.
     """
-    path, lines = name, iter(lines)
-    first = next(lines, "")
-    if not first.strip():
+    lines = iter(lines)
+    first_line = next(lines, "")
+    if not first_line.strip():
         problem = "is blank" if any(line.strip() for line in lines) else "is empty"
-        raise error(f"{problem}; expected a header: {','.join(required)}", where=f"{path}:1")
-    delimiter = ";" if "," not in first and ";" in first else ","
+        raise error(f"{problem}; expected a header: {','.join(required)}", where=f"{name}:1")
+    delimiter = ";" if "," not in first_line and ";" in first_line else ","
     reader = csv.reader(
-        chain([first], lines), delimiter=delimiter, skipinitialspace=True, strict=True
+        chain([first_line], lines), delimiter=delimiter, skipinitialspace=True, strict=True
     )
     try:
-        header = [composed(name.strip()) for name in next(reader)]
+        header = [composed(cell.strip()) for cell in next(reader)]
         if invalid := _header_problem(header, required, optional):
-            raise error(invalid, where=f"{path}:1")
+            raise error(invalid, where=f"{name}:1")
         for row in reader:
             line = reader.line_num
             if most is not None and line > most:
-                raise error(f"has more than {most} rows", where=path)
+                raise error(f"has more than {most} rows", where=name)
             if not any(cell.strip() for cell in row):
                 continue
             if len(row) != len(header):
-                comma = delimiter == "," and len(row) > len(header)
-                hint = "; a decimal comma? write a point" if comma else ""
+                maybe_comma = delimiter == "," and len(row) > len(header)
+                hint = "; a decimal comma? write a point" if maybe_comma else ""
                 raise error(
                     f"has {len(row)} fields; expected {len(header)} "
                     f"({delimiter.join(header)}){hint}",
-                    where=f"{path}:{line}",
+                    where=f"{name}:{line}",
                 )
-            yield (
-                line,
-                {name: composed(cell.strip()) for name, cell in zip(header, row, strict=True)},
-            )
+            yield line, {c: composed(cell.strip()) for c, cell in zip(header, row, strict=True)}
     except csv.Error as e:
-        raise error(f"is not valid CSV: {e}", where=f"{path}:{reader.line_num}") from None
+        raise error(f"is not valid CSV: {e}", where=f"{name}:{reader.line_num}") from None
 
 
 def _header_problem(
     header: Sequence[str], required: Sequence[str], optional: Sequence[str]
 ) -> str | None:
-    """First problem with the columns of a CSV file."""
+    """First problem with the columns of a CSV file; None if there is none."""
     for name in header:
         if name not in required and name not in optional:
             more = f" and optionally {', '.join(optional)}" if optional else ""
@@ -295,10 +298,11 @@ _DECIMAL = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?(
 
 
 def parse_number(text: str, *, where: str, name: str, error: type[OrthocalError]) -> float:
-    """A finite number from a CSV field.
+    """Finite number in a CSV field.
 
     Raises:
-        OrthocalError: Of kind `error`, for text, NaN, infinity or a decimal comma.
+        OrthocalError: Of kind `error`, for other text, NaN, infinity, a decimal comma or a number
+            beyond LARGEST_NUMBER.
     """
     try:
         if len(text) > LONGEST_NUMBER or not _DECIMAL.fullmatch(text):
@@ -324,7 +328,7 @@ def validate(
     error: type[OrthocalError],
     under: str = "",
 ) -> Record:
-    """Data as an instance of a pydantic model or of a dataclass.
+    """Convert plain data to an instance of a pydantic model or of a dataclass.
 
     Args:
         schema: The model or dataclass.
@@ -334,7 +338,7 @@ def validate(
         under: Key of the data in the file.
 
     Raises:
-        OrthocalError: Of kind `error`, with the first invalid key.
+        OrthocalError: Of kind `error`, if the data are invalid; names the first invalid key.
     """
     if not isinstance(data, Mapping):
         kinds = {str: "text", int: "a number", float: "a number", list: "a list", bool: "a word"}
@@ -345,12 +349,12 @@ def validate(
         return cast("Record", _adapter(schema).validate_python(data))  # type: ignore[arg-type] # types are hashable
     except ValidationError as e:
         key, problem = explain_validation_error(e, schema)
-        key = ".".join(part for part in (under, key) if part)
+        key = ".".join(name for name in (under, key) if name)
         raise error(problem, where=f"{where}: {key}" if key else where) from None
 
 
 def write_plain(record: object, schema: type[Any]) -> dict[str, Any]:
-    """A dataclass as plain data that `validate` reads."""
+    """Plain data of a dataclass, which `validate` reads."""
     adapter = _adapter(schema)  # type: ignore[arg-type] # types are hashable
     return cast("dict[str, Any]", adapter.dump_python(record, mode="json", by_alias=True))
 
@@ -361,16 +365,16 @@ def _adapter(schema: Any) -> TypeAdapter[Any]:  # noqa: ANN401 - a hashable type
 
 
 UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
-"""Pydantic's error types for an unknown key, of a model and of a dataclass."""
+"""Pydantic's error types for an unknown key of a model and of a dataclass."""
 
 
 PARSED = {"float_parsing": "a number", "int_parsing": "a whole number"}
-"""Pydantic's error types for texts that are no numbers, and what is expected instead."""
+"""Expected input by pydantic's error types for texts that are not numbers."""
 
 
 def explain_validation_error(exception: ValidationError, schema: type[Any]) -> tuple[str, str]:
     """Key and problem of the first error in a pydantic ValidationError."""
-    # an unknown key may be a misspelled one that is missing: name it first
+    # an unknown key may be a misspelled required key: name it before the missing one
     errors = exception.errors(include_url=False)
     first = min(errors, key=lambda e: e["type"] not in UNKNOWN_KEY)
     path = [part for part in first["loc"] if not _is_pydantic_tag(part)]
@@ -386,25 +390,27 @@ def explain_validation_error(exception: ValidationError, schema: type[Any]) -> t
         return key, "is missing"
     message = str(first["msg"]).removeprefix("Value error, ")
     if kind in ("value_error", "assertion_error"):
-        # a validator of several keys begins its message with "KEY|"
-        inner, separator, problem = message.partition("|")
-        return (_join([*path, inner] if inner else path), problem) if separator else (key, message)
+        # the message of a validator of several keys has the form "KEY|PROBLEM"
+        inner_key, separator, problem = message.partition("|")
+        if not separator:
+            return key, message
+        return _join([*path, inner_key] if inner_key else path), problem
     shown = "nothing" if value is None else f"'{_show(value)}'"
     comma = kind in PARSED and isinstance(value, str) and re.fullmatch(r"\s*[-+]?\d+,\d+\s*", value)
     hint = " (a decimal comma? write a point)" if comma else ""
-    expected = _expectation(kind, message, first.get("ctx") or {})
+    expected = _describe_expected(kind, message, first.get("ctx") or {})
     return key, f"found {shown}; expected {expected}{hint}"
 
 
 def _show(value: object) -> str:
-    """A value from a document, shortened for a message."""
+    """Text of a value from a document, shortened for a message."""
     if isinstance(value, list | dict) and len(value) > MOST_SHOWN:
         return f"{'a list' if isinstance(value, list) else 'a mapping'} of {len(value)} items"
     return shorten(str(value))
 
 
-def _expectation(kind: str, message: str, context: Mapping[str, Any]) -> str:
-    """The expected input, from pydantic's error type and message."""
+def _describe_expected(kind: str, message: str, context: Mapping[str, Any]) -> str:
+    """Description of the expected input, from pydantic's error type and message."""
     if kind in PARSED:
         return PARSED[kind]
     if kind in ("dict_type", "model_type", "dataclass_type", "mapping_type"):
@@ -420,13 +426,13 @@ def _expectation(kind: str, message: str, context: Mapping[str, Any]) -> str:
 
 
 def _join(path: list[Any]) -> str:
-    """A location as text: setups.yx.section or closed_loop[2]."""
+    """Text of a location, such as setups.yx.section or closed_loop[2]."""
     parts = (f"[{p}]" if isinstance(p, int) else f".{shorten(str(p))}" for p in path)
     return "".join(parts).lstrip(".")
 
 
 def _is_pydantic_tag(part: object) -> bool:
-    """True for a part of a location that is pydantic's name of a union branch, not a key."""
+    """True for a part of a location that is not a key but pydantic's name of a union branch."""
     return isinstance(part, str) and ("[" in part or part in {"float", "int", "str", "bool"})
 
 

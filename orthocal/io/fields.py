@@ -1,7 +1,7 @@
 """Field types of records that are stored as JSON: closed records, unknown numbers, arrays.
 
-A record is a dataclass, which pydantic reads and writes by these annotations. A file holds null for
-NaN and infinity, and for nothing else.
+A record is a dataclass, which pydantic reads and writes with the help of these annotations. In a
+file, null represents NaN or infinity only.
 """
 
 from __future__ import annotations
@@ -38,6 +38,8 @@ Size = Annotated[Number, Field(ge=0.0)]
 
 
 def _null_for(unknown: float) -> WrapValidator:
+    """Validator that reads null as NaN or infinity."""
+
     def read(value: object, handler: ValidatorFunctionWrapHandler) -> object:
         return unknown if value is None else handler(value)
 
@@ -56,7 +58,7 @@ SizeOrInf = Annotated[Size, _null_for(math.inf), PlainSerializer(finite_or_none)
 
 
 class _AsLists:
-    """An array in memory; nested lists in a file, with null for numbers that are not finite."""
+    """Array in memory, nested lists in a file, where null replaces numbers that are not finite."""
 
     def __init__(self, lists: Any) -> None:  # noqa: ANN401 - a type
         self.lists = lists
@@ -79,11 +81,11 @@ Matrix = Annotated[Array, _AsLists(Many[Many[NumberOrNaN]])]
 
 
 class As:
-    """A field with its own functions to read and write plain data.
+    """Annotation of a field that functions read from and write to plain data.
 
     Args:
-        read: Value from plain data; raises ValueError("KEY|PROBLEM").
-        write: Plain data from the value.
+        read: Function from plain data to the value; raises ValueError("KEY|PROBLEM").
+        write: Function from the value to plain data.
     """
 
     def __init__(self, read: Callable[[Any], object], write: Callable[[Any], object]) -> None:
@@ -115,7 +117,7 @@ def _to_lists(values: Array) -> object:
 
 
 def read_only(values: ArrayLike) -> Array:
-    """A read-only copy of an array."""
-    result = np.array(values, dtype=np.float64)
-    result.setflags(write=False)
-    return result
+    """Read-only copy of an array."""
+    copy = np.array(values, dtype=np.float64)
+    copy.setflags(write=False)
+    return copy

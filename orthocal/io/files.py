@@ -22,7 +22,7 @@ from orthocal.text import control_character, printable
 LARGEST_FILE = 64 * 2**20
 """Largest size of a file, [bytes]."""
 
-PART = 2**16
+BLOCK_SIZE = 2**16
 """Size of a block that is read at once, [bytes]."""
 
 _READ_FLAGS = (
@@ -35,8 +35,10 @@ _READ_FLAGS = (
 
 _WRITE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
 
-_NO_NAME = frozenset({errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP, errno.EILSEQ, errno.EINVAL})
-"""Errors of the name itself, not of space or permission."""
+_NAME_ERRORS = frozenset(
+    {errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP, errno.EILSEQ, errno.EINVAL}
+)
+"""Errors caused by the name, not by space or permission."""
 
 _LEFTOVER = re.compile(r"\.orthocal-(\d+)-[0-9a-f]{16}\.tmp")
 
@@ -61,7 +63,7 @@ def read_file(
         raise error(f"cannot be read: {e.strerror}", where=str(path)) from None
     if content is None:
         raise error("cannot be read: it is not ready", where=str(path))
-    if len(content) > largest:  # some files state no size
+    if len(content) > largest:  # some special files have no size
         raise error(f"has more; expected at most {largest / 2**20:g} MiB", where=str(path))
     return content
 
@@ -69,7 +71,7 @@ def read_file(
 def read_parts(
     path: Path | BinaryIO, *, longest: int, name: str, error: type[OrthocalError] = OrthocalError
 ) -> Iterator[bytes]:
-    """Lines of a file of any size with their line ends; long lines come in parts.
+    """Lines of a file of any size with their line ends; long lines are split into parts.
 
     Args:
         path: A regular file, or an open stream.
@@ -108,7 +110,7 @@ def read_lines(
     decoder = getincrementaldecoder("utf-8-sig")()
     newlines = IncrementalNewlineDecoder(decoder, translate=True)
     count, number, pending = 0, 0, ""
-    parts = chain(read_parts(path, longest=PART, name=name, error=error), [b""])
+    parts = chain(read_parts(path, longest=BLOCK_SIZE, name=name, error=error), [b""])
     for part in parts:
         undecoded = len(decoder.getstate()[0])
         try:
@@ -130,16 +132,16 @@ def read_lines(
 
 
 def require_file(path: Path, *, error: type[OrthocalError] = OrthocalError) -> None:
-    """Check a file that other code will read, as `read_file` does.
+    """Check a file that other code will read.
 
     Raises:
-        OrthocalError: Of kind `error`, as `read_file`.
+        OrthocalError: Of kind `error`, if the file is missing, not regular, or too large.
     """
     os.close(_open_regular(path, error, LARGEST_FILE))
 
 
 def _open_regular(path: Path, error: type[OrthocalError], largest: int | None = None) -> int:
-    """Descriptor of a regular file; the checks are on the opened file, not on its name."""
+    """Descriptor of a regular file; the opened file is checked, not its name."""
     try:
         descriptor = os.open(path, _READ_FLAGS)
         status = os.fstat(descriptor)
@@ -164,17 +166,17 @@ def _open_regular(path: Path, error: type[OrthocalError], largest: int | None = 
 
 @contextmanager
 def content_withheld_outside(directory: Path, *files: Path) -> Iterator[None]:
-    """Withhold the text of errors about files that a document names outside its own directory.
+    """Withhold the text of errors about files outside the directory of the naming document.
 
-    A document from a stranger may name any file of this machine, directly or by a symbolic link.
-    Messages about such a file name it and the line, and quote nothing of what it holds.
+    A document from an untrusted source may name any file of this machine, directly or by a symbolic
+    link. A message about such a file contains its name and the line, but none of its content.
 
     Args:
         directory: Directory of the document.
         files: Files that the code inside the block reads because the document names them.
 
     Raises:
-        OrthocalError: Of the same kind as inside the block, without its text.
+        OrthocalError: If the code inside the block raises one about such a file; of the same kind.
     """
     root = os.path.realpath(directory)
     outside = [f for f in files if not Path(os.path.realpath(f)).is_relative_to(root)]
@@ -208,7 +210,7 @@ def require_plain_name(path: Path, *, error: type[OrthocalError] = OrthocalError
 
 
 is_folder, exists = os.path.isdir, os.path.exists
-"""Tests of a path that are False for invalid names, for which those of pathlib may raise."""
+"""Tests of a path that are False for invalid names; the methods of Path may raise errors."""
 
 
 def require_writable(folder: Path, names: Iterable[str] = ()) -> None:
@@ -221,9 +223,9 @@ def require_writable(folder: Path, names: Iterable[str] = ()) -> None:
         names: Names of the files that will be written.
 
     Raises:
-        OrthocalError: If it is a file or has an invalid name, or if one of the files exists and
-            is not a regular file.
-        OutputError: If it cannot be written to.
+        OrthocalError: If the directory is a file or has an invalid name, or if one of the files
+            exists and is not a regular file.
+        OutputError: If the directory is not writable.
     """
     try:
         for name in names:
@@ -277,11 +279,11 @@ def _require_replaceable(path: Path) -> None:
 
 
 Content = str | bytes | Iterable[bytes]
-"""Content of a file: text, which is written as UTF-8, bytes, or a sequence of parts."""
+"""Content of a file: text, which is written as UTF-8, bytes, or a sequence of bytes."""
 
 
 def write_file(path: Path, content: Content) -> None:
-    """Write a file atomically: a temporary file beside it is renamed.
+    """Write a file atomically, by renaming a temporary file beside it.
 
     Raises:
         OrthocalError: If the path is invalid.
@@ -294,14 +296,14 @@ def write_file(path: Path, content: Content) -> None:
 def write_files(folder: Path, files: Mapping[str, Content]) -> None:
     """Write several files of one directory that belong together, all or none.
 
-    All are written to temporary files first. Then, with Ctrl-C postponed, the old files except the
-    first are moved away, the first is replaced, and the others follow. Whenever the process is
-    killed, the remaining files are of one generation. Symbolic links are followed. Existing files
-    keep their mode; new files have the mode of the user's mask.
+    All are written to temporary files first. Then Ctrl-C is postponed, the old files except the
+    first are moved away, the first is replaced, and the others follow. If the process is killed at
+    any time, the remaining files are of one generation. Symbolic links are followed. Existing files
+    keep their mode; new files have the default mode of the user.
 
     Args:
         folder: The directory; created if necessary.
-        files: Name to content. The first is the one without which the others are useless.
+        files: Content by name. The others are useless without the first file.
 
     Raises:
         OrthocalError: If a path is invalid.
@@ -328,9 +330,9 @@ def sync_folder(folder: Path) -> None:
 
 
 def _write(folder: Path, files: Mapping[str, Content]) -> None:
-    """Stage all files and put them in place; temporary files are removed in any case."""
+    """Write all files to temporary files, then rename them; temporary files are always removed."""
     staged: dict[Path, Path] = {}
-    aside: dict[Path, Path] = {}
+    moved_away: dict[Path, Path] = {}
     created = [f for f in (folder, *folder.parents) if not f.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -341,22 +343,21 @@ def _write(folder: Path, files: Mapping[str, Content]) -> None:
             data = content.encode() if isinstance(content, str) else content
             _stage(staged[target], [data] if isinstance(data, bytes) else data, like=target)
         with postponed_interrupt():
-            _put_in_place(staged, aside)
+            _put_in_place(staged, moved_away)
     finally:
-        for temporary in (*staged.values(), *aside.values()):
+        for temporary in (*staged.values(), *moved_away.values()):
             temporary.unlink(missing_ok=True)
         for empty in created:  # succeeds only if nothing was written
             with suppress(OSError):
                 empty.rmdir()
 
 
-def _put_in_place(staged: Mapping[Path, Path], aside: dict[Path, Path]) -> None:
+def _put_in_place(staged: Mapping[Path, Path], moved_away: dict[Path, Path]) -> None:
     """Rename staged files without ever mixing two generations.
 
     Args:
-        staged: Target of each file to its temporary file; the first is the one without which the
-            others are useless.
-        aside: Filled with the targets and temporary names of old files to be removed.
+        staged: Temporary files by target; the others are useless without the first file.
+        moved_away: Temporary names of old files by target; filled by this function.
     """
     first, *others = staged
     try:
@@ -364,19 +365,19 @@ def _put_in_place(staged: Mapping[Path, Path], aside: dict[Path, Path]) -> None:
             old = target.with_name(_temporary_name())
             with suppress(FileNotFoundError):
                 os.replace(target, old)
-                aside[target] = old
+                moved_away[target] = old
         os.replace(staged[first], first)
     except OSError:
-        for target, old in aside.items():
+        for target, old in moved_away.items():
             os.replace(old, target)
-        aside.clear()
+        moved_away.clear()
         raise
     for target in others:
         os.replace(staged[target], target)
 
 
 def _behind_links(path: Path) -> Path:
-    """Target of a symbolic link, existing or not; other paths unchanged."""
+    """Target of a symbolic link, existing or not; other paths are returned unchanged."""
     return Path(os.path.realpath(path)) if path.is_symlink() else path
 
 
@@ -413,8 +414,8 @@ def _is_alive(process: int) -> bool:
 
 
 def _refusal(e: OSError | ValueError, where: Path) -> OrthocalError:
-    """The error for a path that cannot be written: of its name, or of the file system."""
+    """Error for a path that is not writable, because of its name or of the file system."""
     if not isinstance(e, OSError):
         return OrthocalError("contains a character that file names cannot have", where=str(where))
-    kind = OrthocalError if e.errno in _NO_NAME else OutputError
+    kind = OrthocalError if e.errno in _NAME_ERRORS else OutputError
     return kind(f"cannot be written: {e.strerror}", where=str(where))

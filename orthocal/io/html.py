@@ -8,14 +8,14 @@ from collections.abc import Iterable, Sequence
 
 from orthocal.text import printable
 
-TYPED = re.compile("`([^`\n]+)`")
-
+CODE = re.compile("`([^`\n]+)`")
+"""Code between backquotes."""
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data: blob:"
 
 
 def page(title: str, style: str, body: str, *, scripts: bool = False) -> str:
-    """A self-contained page that loads nothing from elsewhere.
+    """Self-contained page that loads nothing from other files or servers.
 
     Args:
         title: Title of the page.
@@ -34,44 +34,44 @@ def page(title: str, style: str, body: str, *, scripts: bool = False) -> str:
 
 
 def escape(text: str) -> str:
-    """A text as HTML, without markup and without characters that change the text direction."""
+    """HTML of a text, without markup and without characters that change the text direction."""
     return html.escape(printable(text, keep="\n"))
 
 
 def prose(text: str) -> str:
-    """A text as HTML; words between backquotes are code."""
-    return TYPED.sub(r"<code>\1</code>", escape(text))
+    """HTML of a text in which words between backquotes are code."""
+    return CODE.sub(r"<code>\1</code>", escape(text))
 
 
 def paragraph(text: str, *, kind: str = "") -> str:
-    """A paragraph of prose, with an optional class `kind`."""
+    """Paragraph of prose, with an optional class `kind`."""
     return f"<p{_class(kind)}>{prose(text)}</p>"
 
 
 def heading(text: str, *, level: int = 2) -> str:
-    """A heading of a level from 1 to 6."""
+    """Heading of a level from 1 to 6."""
     return f"<h{level}>{escape(text)}</h{level}>"
 
 
 def items(texts: Iterable[str]) -> str:
-    """A bulleted list of prose."""
+    """Bulleted list of prose."""
     return "<ul>" + "".join(f"<li>{prose(t)}</li>" for t in texts) + "</ul>"
 
 
 def table(headers: Sequence[str], rows: Iterable[Sequence[str]], *, left: int = 1) -> str:
-    """A table.
+    """Table with columns of words and of numbers.
 
     Args:
-        headers: Headers of the columns; all empty for no header.
+        headers: Headers of the columns; all empty for a table without a header.
         rows: Cells of each row.
-        left: Number of columns of words at the left; the others hold numbers.
+        left: Number of columns of words at the left; other columns contain numbers or units.
     """
-    words = [i < left or h == "unit" for i, h in enumerate(headers)]
+    has_words = [i < left or h == "unit" for i, h in enumerate(headers)]
 
     def cells(tag: str, texts: Sequence[str]) -> str:
         return "".join(
             f"<{tag}{_class('' if word else 'number')}>{escape(text)}</{tag}>"
-            for text, word in zip(texts, words, strict=True)
+            for text, word in zip(texts, has_words, strict=True)
         )
 
     head = f"<thead><tr>{cells('th', headers)}</tr></thead>" if any(headers) else ""

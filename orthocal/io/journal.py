@@ -1,6 +1,7 @@
-"""Append-only journals of JSON lines, each on disk before it counts; one process at a time.
+"""Append-only journals of JSON lines for one process at a time.
 
-A killed process leaves at most one incomplete line, which the next process removes.
+A line is synced to disk before `append` returns. If a process is killed, at most one line is
+incomplete, and the next process removes it.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ LONGEST_LINE = 2**26
 
 
 class Journal:
-    """JSON lines in an open and locked file.
+    """Journal in an open and locked file.
 
     Args:
         path: The file.
@@ -59,10 +60,10 @@ class Journal:
             raise OutputError(f"cannot be written: {e.strerror}", where=str(self.path)) from None
 
     def append(self, entry: Mapping[str, Any]) -> None:
-        """Append a line, and return when it is on disk.
+        """Append a line and sync it to disk.
 
         Raises:
-            OutputError: If it cannot be written.
+            OutputError: If the line cannot be written.
         """
         data = (json.dumps(entry, allow_nan=False) + "\n").encode()
         try:
@@ -77,17 +78,17 @@ class Journal:
 def open_journal_file(
     path: Path, *, busy: str, discard: bool = False, longest: int = LONGEST_LINE
 ) -> Iterator[Journal]:
-    """A locked journal; the file is created if necessary.
+    """Open and lock a journal; the file is created if necessary.
 
     Args:
         path: The file.
         busy: Message if another process has locked the file.
-        discard: Discard the content of the file.
+        discard: Whether to discard the content of the file.
         longest: Largest length of a line, [bytes].
 
     Raises:
-        OrthocalError: If another process has locked it, or the path is invalid.
-        OutputError: If it cannot be written.
+        OrthocalError: If another process has locked the file, or the path is invalid.
+        OutputError: If the file cannot be written.
     """
     require_writable_file(path)
     try:

@@ -1,4 +1,4 @@
-"""YAML from strangers: text, numbers, lists and mappings, within limits.
+"""YAML from untrusted sources: text, numbers, lists and mappings, within limits.
 
 The events of a document are checked before any value is built, so that no document can exhaust
 the memory or the stack.
@@ -33,13 +33,13 @@ _TAGS: dict[type[yaml.Event], frozenset[str]] = {
     yaml.SequenceStartEvent: frozenset({"!", f"{_YAML}seq"}),
     yaml.MappingStartEvent: frozenset({"!", f"{_YAML}map"}),
 }
-"""Explicit tags that each kind of value may have."""
+"""Allowed explicit tags by kind of value."""
 
 _Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _Loader(_Base):  # type: ignore[misc] # either of PyYAML's safe loaders
-    """PyYAML's safe loader, which also refuses duplicate keys and texts that cannot be shown."""
+    """Safe loader of PyYAML that also refuses duplicate keys and texts with control characters."""
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:  # noqa: ANN401 - any value
         """Value of a node."""
@@ -55,7 +55,7 @@ class _Loader(_Base):  # type: ignore[misc] # either of PyYAML's safe loaders
         return value
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Value of a mapping; each key occurs once."""
+        """Value of a mapping without duplicate keys."""
         if not isinstance(node, yaml.MappingNode):
             raise _error("expected keys and values", node)
         keys: set[str] = set()
@@ -83,7 +83,7 @@ def _check_events(text: str) -> None:
     """Check number, depth, aliases and tags of the values of a document.
 
     Raises:
-        yaml.MarkedYAMLError: At the first value that is refused.
+        yaml.MarkedYAMLError: If a value is refused; at its place.
     """
     count = depth = 0
     for event in yaml.parse(text, Loader=_Loader):

@@ -18,7 +18,7 @@ from orthocal.robot.model import Robot, Use
 from orthocal.text import shorten
 
 APPROACH = {"p": 1.0, "n": -1.0, "u": 0.0}
-"""Letter of an approach to the direction of the drive's last motion."""
+"""Letters of an approach, mapped to the direction of the drive's last motion."""
 
 UseCondition = Literal["approach", "temperature", "payload"]
 """Field of `UseConditions`."""
@@ -28,7 +28,7 @@ CONDITION_OF: Mapping[UseCondition, Condition] = {
     "temperature": "temperature",
     "payload": "load",
 }
-"""Field of `UseConditions` to the condition on which effects depend."""
+"""Fields of `UseConditions`, mapped to the conditions on which effects depend."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,10 +37,10 @@ class UseConditions:
 
     Args:
         approach: A letter for each drive in the robot's order: p if its coordinate grew in its last
-            motion, n if it fell, u if unknown, which is the middle of both sides; all are unknown
-            by default.
-        temperature: Temperature of the machine, [°C]; the effects' reference by default.
-        payload: Mass on the tool beside the platform, [kg].
+            motion, n if it fell, u if unknown. Unknown means the middle of both sides and is the
+            default of all drives.
+        temperature: Temperature of the machine, [°C]; the reference of the effects by default.
+        payload: Mass on the tool in addition to the platform, [kg].
     """
 
     approach: str | None = None
@@ -53,14 +53,14 @@ class UseConditions:
         return tuple(name for name in CONDITION_OF if getattr(self, name) is not None)
 
     def require_valid(self, robot: Robot, *, prefix: str = "conditions.") -> None:
-        """Refuse conditions that are out of range, or on which nothing depends.
+        """Refuse conditions that are out of range or that affect nothing.
 
         Args:
             robot: The robot with its effects.
             prefix: Text before the name of a field in messages.
 
         Raises:
-            ParameterError: Naming the field.
+            ParameterError: If a condition is refused; names the field.
         """
         used = effects_by_condition(robot)
         for name in self.stated:
@@ -80,10 +80,9 @@ class UseConditions:
                 )
 
     def values(self, robot: Robot) -> dict[Condition, Array]:
-        """Values of the conditions except the load, neutral where not stated."""
-        neutral = neutral_values(robot).items()
+        """Values of the conditions; neutral where not stated, and for the load."""
         result: dict[Condition, Array] = {
-            c: np.full(condition_size(robot, c), v) for c, v in neutral
+            c: np.full(condition_size(robot, c), v) for c, v in neutral_values(robot).items()
         }
         if self.approach is not None:
             result["approach"] = np.array([APPROACH[letter] for letter in self.approach])
@@ -96,18 +95,18 @@ class UseConditions:
 class UseSamples:
     """Equally likely conditions that represent how a machine is used.
 
-    Each condition that varies has two values: both sides of a drive, or the middle of a range less
-    and plus its standard deviation. The combinations are orthogonal columns of a Hadamard matrix,
-    so that mean squares are exact for errors that are linear in the conditions.
+    Each condition that varies has two values: both sides of a drive, or the middle of a range minus
+    and plus its standard deviation. Their combinations follow orthogonal columns of a Hadamard
+    matrix. Mean squares are therefore exact for errors that are linear in the conditions.
     """
 
     conditions: tuple[UseConditions, ...]
     varying: tuple[UseCondition, ...] = ()
-    """Field of `UseConditions` of each condition that varies; approach once for each such drive."""
+    """Fields of the conditions that vary; `approach` once for each drive with two sides."""
     signs: Array = field(default_factory=lambda: np.zeros((1, 0)))
-    """-1 and 1 for their values, shape (n_samples, n_varying)."""
+    """Lower (-1) or upper (1) value of each varying condition, shape (n_samples, n_varying)."""
     declared: Use | None = None
-    """What the robot's YAML states, if they represent that."""
+    """Use that the samples represent; None for a single condition."""
 
     @property
     def size(self) -> int:
@@ -115,14 +114,14 @@ class UseSamples:
         return len(self.conditions)
 
     def changes(self, values: Array) -> dict[UseCondition, Array]:
-        """Changes of a field by the conditions that vary.
+        """Changes of a quantity by the conditions that vary.
 
         Args:
-            values: Fields of all samples in turn, shape (n_samples K, ...).
+            values: The quantity at K points under each sample in turn, shape (n_samples K, ...).
 
         Returns:
-            Field of `UseConditions` to half the difference of its two values, one for each drive
-            with two sides of approach, shape (n, K, ...).
+            Fields of `UseConditions`, mapped to half the difference between both values, shape
+            (n, K, ...). n is the number of drives with two sides for `approach`, else 1.
         """
         fields = values.reshape(self.size, -1, *values.shape[1:])
         halves = np.tensordot(self.signs.T, fields, axes=1) / self.size
@@ -131,12 +130,11 @@ class UseSamples:
 
 
 def sample_use(robot: Robot, conditions: UseConditions | None = None) -> UseSamples:
-    """Conditions of use that the robot's YAML states, as far as its effects depend on them.
+    """Samples of the conditions of use on which the effects of a robot depend.
 
     Args:
-        robot: The robot.
-        conditions: Conditions that replace those of the YAML; an approach that is unknown is from
-            both sides.
+        robot: The robot, whose YAML declares its use.
+        conditions: Conditions that replace the declared ones. An unknown approach means both sides.
     """
     use, used = _narrow(robot.use, conditions), effects_by_condition(robot)
     varying, widths = list[UseCondition](), dict[UseCondition, float]()
@@ -168,7 +166,7 @@ def sample_use(robot: Robot, conditions: UseConditions | None = None) -> UseSamp
 
 
 def _narrow(use: Use, conditions: UseConditions | None) -> Use:
-    """Use in which stated conditions do not vary."""
+    """Use with stated conditions held constant."""
     if conditions is None:
         return use
     values: dict[str, Any] = {name: getattr(conditions, name) for name in conditions.stated}
@@ -178,7 +176,7 @@ def _narrow(use: Use, conditions: UseConditions | None) -> Use:
 
 
 def effects_by_condition(robot: Robot) -> dict[UseCondition, tuple[str, ...]]:
-    """Fields of `UseConditions` on which a machine depends, with the effects that need each."""
+    """Fields of `UseConditions` on which a machine depends, mapped to the effects concerned."""
     conditions, effects = error_map(robot).conditions, robot_effects(robot)
     return {
         name: tuple(effect.name for effect in effects if c in effect.conditions)
@@ -188,7 +186,7 @@ def effects_by_condition(robot: Robot) -> dict[UseCondition, tuple[str, ...]]:
 
 
 class StatedUse(TypedDict):
-    """Conditions of use on which a machine depends; None for others."""
+    """Conditions of use on which a machine depends; None for the others."""
 
     approach: str | None
     """A letter for each drive: p or n for one side, u for both."""
@@ -199,7 +197,7 @@ class StatedUse(TypedDict):
 
 
 def stated_use(robot: Robot, use: Use | None = None) -> StatedUse | None:
-    """Conditions of use, by default of a robot's YAML; None if no effect depends on any."""
+    """Conditions of use, declared in the YAML by default; None if no effect depends on any."""
     use, effects = use or robot.use, effects_by_condition(robot)
     if not effects:
         return None
@@ -213,7 +211,7 @@ def stated_use(robot: Robot, use: Use | None = None) -> StatedUse | None:
 
 
 def find_approach_problem(text: str, robot: Robot) -> str:
-    """The text and what was expected, if it is not a letter for each drive; else ""."""
+    """Text and expectation if an approach is not one letter per drive; else ""."""
     if len(text) == len(robot.drives) and not text.strip("".join(APPROACH)):
         return ""
     drives = ", ".join(d.name for d in robot.drives)
@@ -227,7 +225,7 @@ def require_range(value: float, low: float, high: float, unit: str, *, where: st
     """Refuse a number outside a closed range.
 
     Raises:
-        ParameterError: At `where`.
+        ParameterError: If the number is outside; names `where`.
     """
     if not low <= value <= high:
         raise ParameterError(
@@ -236,6 +234,6 @@ def require_range(value: float, low: float, high: float, unit: str, *, where: st
 
 
 def tool_force(robot: Robot, payload: float) -> Array:
-    """Force of all effects on the tool centre point, shape (3,), [N]."""
+    """Sum of the forces of all effects on the tool centre point, shape (3,), [N]."""
     forces = [effect.tool_force(payload) for effect in robot_effects(robot)]
     return np.asarray(np.sum(forces, axis=0))

@@ -1,8 +1,8 @@
 """Newton's method for closure equations, continued from the reference posture.
 
-It works on all postures of all machines at once. A posture that it does not reach from the start is
-approached along a straight path from the reference posture, in steps short enough to stay in the
-assembly mode in which the machine was built.
+All postures of all machines are solved at once. A posture that Newton's method does not reach from
+the start is approached along a straight path from the reference posture. Its steps are short
+enough to stay in the assembly mode in which the machine was built.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from orthocal.arrays import Array, Indices, Mask
 from orthocal.errors import ClosureError
 from orthocal.kinematics.error_map import MachineGeometry
-from orthocal.robot.closing import describe_opening
+from orthocal.robot.closing import CLOSURE_TOLERANCE, RANK_TOLERANCE, describe_opening
 from orthocal.robot.model import (
     Robot,
     closure_row_units,
@@ -29,36 +29,34 @@ from orthocal.units import DRIVE_UNITS
 Evaluate = Callable[[Array, Array, MachineGeometry], tuple[Array, Array]]
 Prepare = Callable[[Array, MachineGeometry], Array]
 Failures = dict[int, ClosureError]
-"""Index of a posture to the reason why it cannot be reached. In a batch of machines, posture k of
-machine s of K postures has the index s K + k."""
-
-CLOSED = 1e-12
-"""Largest scaled residual of closed loops, relative to max(1 m, characteristic length), [m]."""
+"""Indices of postures, mapped to the reason why they cannot be reached. Posture k of machine s has
+the index s K + k if each machine has K postures."""
 
 SINGULAR_BELOW = 1e-5
 """Ratio of smallest to largest singular value below which a posture counts as singular. Near a
-singular posture Newton stops where the residual, quadratic in the distance, is below CLOSED: a
-smaller ratio would not be noticed. The Orthoglide has 1/20 to 1/60."""
+singular posture the residual is quadratic in the distance, and Newton's method stops below
+CLOSURE_TOLERANCE: smaller ratios would not be noticed. The Orthoglide has 1/20 to 1/60."""
 
-SAFETY = 0.1
-"""Part of that bound at which rounding errors of an inverse do not matter."""
+SINGULAR_MARGIN = 0.1
+"""Factor of SINGULAR_BELOW that allows for rounding errors of an inverse."""
 
 MAX_NEWTON_STEP = 1e3
-"""A longer Newton step comes from rows that depend on each other, [m or rad]."""
+"""Longer Newton steps are caused by linearly dependent rows, [m or rad]."""
 
 MAX_LAST_STEP = 1e-6
-"""A longer step from closed loops is that of a nearly singular posture, [m or rad]."""
+"""Longer steps from closed loops are caused by nearly singular postures, [m or rad]."""
 
 MAX_NEWTON_STEPS = 30
-MAX_STEP_HALVINGS = 6
+MAX_STEP_REDUCTIONS = 6
 SMALLEST_CONTINUATION_STEP = 1.0 / 512.0
 LARGEST_CONTINUATION_MOVE = 0.3
 """Change of a passive coordinate in one continuation step, [rad] or characteristic lengths."""
 
 LIMIT_TOLERANCE = 1e-9
+"""Accepted excess over the limit of a joint, [m or rad]."""
 
 MAX_POINTS = 4096
-"""Postures of a batch of machines that are solved together, for the memory of their Jacobians."""
+"""Postures per block of a batch of machines, which limits the memory of their Jacobians."""
 
 
 class System:
@@ -66,16 +64,17 @@ class System:
 
     Args:
         robot: The robot.
-        evaluate: (x, v, geometry) to residuals, (n, n_rows), and Jacobians by x, (n, n_rows, n_x).
-        prepare: (p, geometry) to v, shape (n, n_v), what is the same for all x.
-        index: Joint coordinates that are x, shape (n_x,).
+        evaluate: Maps (x, v, geometry) to residuals, (n, n_rows), and Jacobians with respect to x,
+            (n, n_rows, n_x).
+        prepare: Maps (p, geometry) to v, shape (n, n_v): values that do not depend on x.
+        index: Indices of x among the joint coordinates, shape (n_x,).
         start: x of the nominal machine's reference posture, shape (n_x,).
         origin: p of the nominal machine's reference posture, shape (n_p,).
         n_tool: Number of tool coordinates.
 
     Attributes:
-        shortest: Take the shortest steps that close the loops, for robots with free motions: the
-            solution of a system that is singular up to rounding is no useful step.
+        shortest: Use the shortest steps that close the loops, for robots with free motions. Their
+            Jacobians are singular up to rounding, so that solving them does not give a useful step.
         units: Metres per unit of x, shape (n_x,).
         lower: Lower bounds of x, shape (n_x,).
         upper: Upper bounds of x, shape (n_x,).
@@ -105,7 +104,7 @@ class System:
         self._turns = np.append(closure_turns(robot), np.zeros(n_tool, dtype=np.bool_))
 
     def step(self, residuals: Array, jacobians: Array) -> Array:
-        """Newton steps, shape (n, n_x); least squares where rows depend on each other."""
+        """Newton steps, shape (n, n_x); least-squares steps if rows are linearly dependent."""
         if self.shortest:
             return self._shortest_step(residuals, jacobians)
         try:
@@ -118,9 +117,10 @@ class System:
         return steps
 
     def _shortest_step(self, residuals: Array, jacobians: Array) -> Array:
+        """Least-squares steps of minimum norm; NaN for Jacobians that are not finite."""
         steps = np.full((len(residuals), self.n_x), np.nan)  # no step: the caller drops the posture
         usable = np.isfinite(jacobians).all(axis=(1, 2))
-        inverse = np.linalg.pinv(jacobians[usable], rcond=1e-10)
+        inverse = np.linalg.pinv(jacobians[usable], rcond=RANK_TOLERANCE)
         with np.errstate(over="ignore"):
             steps[usable] = -(inverse @ residuals[usable][..., None])[..., 0]
         return steps
@@ -128,8 +128,8 @@ class System:
     def regular_step(self, residuals: Array, jacobians: Array) -> tuple[Array, Mask]:
         """Newton steps, and a mask of the Jacobians that are certainly not singular.
 
-        The ratio of singular values is at least 1/(|A| |A⁻¹|) by Frobenius' norm, with the inverse
-        that the step needs anyway.
+        The ratio of singular values is at least 1/(|A| |A⁻¹|) in the Frobenius norm. The step needs
+        the inverse anyway.
         """
         try:
             if self.shortest:
@@ -137,13 +137,13 @@ class System:
             inverses = np.linalg.inv(jacobians)
         except np.linalg.LinAlgError:
             return self.step(residuals, jacobians), np.zeros(len(residuals), dtype=np.bool_)
-        size = np.linalg.norm(jacobians / self.units, axis=(1, 2))
-        inverse_size = np.linalg.norm(inverses * self.units[:, None], axis=(1, 2))
+        norms = np.linalg.norm(jacobians / self.units, axis=(1, 2))
+        inverse_norms = np.linalg.norm(inverses * self.units[:, None], axis=(1, 2))
         steps = -(inverses @ residuals[..., None])[..., 0]
-        return steps, np.asarray(size * inverse_size < SAFETY / SINGULAR_BELOW)
+        return steps, np.asarray(norms * inverse_norms < SINGULAR_MARGIN / SINGULAR_BELOW)
 
     def describe_beyond(self, j: int, value: float) -> str:
-        """Position and limits of a joint in words; a drive's as the controller counts."""
+        """Position and limits of a joint in words; those of a drive in controller coordinates."""
         drives = {d.name: d for d in self.robot.drives}
         if self.names[j] in drives:
             return drives[self.names[j]].describe_beyond(value)
@@ -152,7 +152,7 @@ class System:
         return f"at {value / size:.4g} {unit}, outside its limits {low:g} ... {high:g} {unit}"
 
     def describe(self, x: Array, p: Array, geometry: MachineGeometry) -> str:
-        """Openings of the loops of one posture, in words."""
+        """Description of the openings of the loops in one posture."""
         residuals, _ = self.evaluate(x[None], self.prepare(p[None], geometry), geometry)
         return describe_opening(residuals[0] / self._row_units, self._turns)
 
@@ -168,7 +168,7 @@ def solve_closures(
     failures: Failures | None = None,
     allow_singular: bool = True,
 ) -> Array:
-    """Newton's method along the straight path from the reference posture, or a start, to targets.
+    """Solve closure equations along the straight path from the reference posture to targets.
 
     The first trial covers the complete path. Postures that do not converge, or may have changed
     their assembly mode, are approached in halved steps.
@@ -178,17 +178,18 @@ def solve_closures(
         targets: p of each posture, shape (K, n_p).
         geometry: S machines, or S machines in K postures.
         machines: S.
-        start: x to start from, shape (n_x,), (K, n_x) or (S, K, n_x); by default the system's.
+        start: Start values of x, shape (n_x,), (K, n_x) or (S, K, n_x); by default the reference
+            posture.
         names: Names of the postures, for messages.
         failures: Filled with the points that cannot be reached; by default the first one raises.
-        allow_singular: Accept targets that leave motions free.
+        allow_singular: Accept targets with free motions.
 
     Returns:
         x, shape (S, K, n_x).
 
     Raises:
-        ClosureError: If a posture cannot be reached, is outside the limits of a joint or, unless
-            allowed, singular; names the posture and the residual.
+        ClosureError: If a posture cannot be reached or is outside the limits of a joint, or if it
+            is singular and this is not allowed; states the posture and the residual.
     """
     count = len(targets)
     labels = [f"posture {i + 1}" for i in range(count)] if names is None else names
@@ -196,9 +197,11 @@ def solve_closures(
         raise ValueError(f"found {len(labels)} names for {count} rows")
     first = system.start if start is None else np.asarray(start, dtype=np.float64)
     if first.shape[-1:] != (system.n_x,):
-        raise ValueError(f"found the shape {first.shape}; expected {system.n_x} start values a row")
-    begin = np.broadcast_to(first, (machines, count, system.n_x))
-    x = np.array(begin).reshape(machines * count, system.n_x)
+        raise ValueError(
+            f"found the shape {first.shape}; expected {system.n_x} start values per row"
+        )
+    shape = machines, count, system.n_x
+    x = np.array(np.broadcast_to(first, shape)).reshape(machines * count, system.n_x)
     for i in range(0, len(x), MAX_POINTS):
         points = np.arange(i, min(i + MAX_POINTS, len(x)))
         path = _Path(
@@ -211,20 +214,20 @@ def solve_closures(
             allow_singular=allow_singular,
         )
         x[points] = path.follow(x[points], restart=start is not None)
-    return x.reshape(begin.shape)
+    return x.reshape(shape)
 
 
 class _Path:
-    """Continuation of some points of a batch of machines from the reference posture to targets.
+    """Continuation from the reference posture to targets, for some points of a batch.
 
     Args:
         system: The equations.
         targets: p of each point, shape (n, n_p).
-        geometry: One row for all points, or a row for each.
+        geometry: One row for all points, or one row per point.
         points: Index of each point in the batch, shape (n,).
         labels: Names of the postures of a machine, for messages.
         failures: Filled with the points that cannot be reached; by default the first one raises.
-        allow_singular: Accept targets that leave motions free.
+        allow_singular: Accept targets with free motions.
     """
 
     def __init__(
@@ -242,8 +245,8 @@ class _Path:
         self._points, self._labels, self._failures = points, labels, failures
         self._allow_singular = allow_singular
         length = system.robot.characteristic_length
-        self._tolerance = CLOSED * max(1.0, length)
-        self._moves = LARGEST_CONTINUATION_MOVE * np.where(system.units == 1.0, length, 1.0)
+        self._tolerance = CLOSURE_TOLERANCE * max(1.0, length)
+        self._max_moves = LARGEST_CONTINUATION_MOVE * np.where(system.units == 1.0, length, 1.0)
         self._refused = np.zeros(len(points), dtype=np.bool_)
 
     def _refuse(self, i: int, reason: str, residual: float | None = None) -> None:
@@ -264,28 +267,28 @@ class _Path:
         """Solutions, NaN at refused points, shape (n, n_x).
 
         Args:
-            start: x to start from, shape (n, n_x).
-            restart: Begin again at the reference posture where the start does not help.
+            start: Start values of x, shape (n, n_x).
+            restart: Restart from the reference posture if the start fails.
         """
         system, targets, count = self._system, self._targets, len(self._targets)
         for i in np.flatnonzero(~np.isfinite(targets).all(axis=1)).tolist():
             self._refuse(i, "has coordinates that are not numbers")
         x, regular = np.array(start), np.full(count, self._allow_singular)
-        done, step = np.zeros(count), np.ones(count)
-        pending, fresh = np.flatnonzero(~self._refused), np.full(count, restart)
+        done, step = np.zeros(count), np.ones(count)  # fractions of the path
+        pending, may_restart = np.flatnonzero(~self._refused), np.full(count, restart)
         while pending.size:
             reach = np.minimum(1.0, done[pending] + step[pending])
-            path = system.origin + reach[:, None] * (targets[pending] - system.origin)
-            trial, worst, checked = self._newton(pending, x[pending], path)
-            moved = (np.abs(trial - x[pending]) < self._moves).all(axis=1)
-            good = (worst < self._tolerance) & moved
+            waypoints = system.origin + reach[:, None] * (targets[pending] - system.origin)
+            trial, worst, certain = self._newton(pending, x[pending], waypoints)
+            short = (np.abs(trial - x[pending]) < self._max_moves).all(axis=1)
+            good = (worst < self._tolerance) & short
             reached, failed = pending[good], pending[~good]
             x[reached], done[reached] = trial[good], reach[good]
             if not self._allow_singular:
-                regular[reached] = checked[good]
-            retry = failed[fresh[failed]]  # the start was no help: use the reference posture
-            x[retry], step[retry] = system.start, 2.0
-            fresh[pending] = False
+                regular[reached] = certain[good]
+            retry = failed[may_restart[failed]]
+            x[retry], step[retry] = system.start, 2.0  # complete path again, as it is halved below
+            may_restart[pending] = False
             step[failed] *= 0.5
             for i in failed[step[failed] < SMALLEST_CONTINUATION_STEP].tolist():
                 self._refuse_unreached(i, x[[i]], done[i])
@@ -298,7 +301,7 @@ class _Path:
         return x
 
     def _refuse_unreached(self, i: int, x: Array, done: float) -> None:
-        """Refuse a point that continuation does not reach beyond a part of the way."""
+        """Refuse a point whose continuation stopped at a fraction of the path."""
         target = self._targets[[i]]
         last, worst, _ = self._newton(np.array([i]), x, target)
         if worst[0] < self._tolerance:
@@ -307,10 +310,10 @@ class _Path:
                 f"which the loops are assembled, {done:.0%} of the way"
             )
         else:
-            at = self._geometry.at(np.array([i]), len(self._points))
+            geometry = self._geometry.at(np.array([i]), len(self._points))
             reason = (
                 "cannot be reached: the loops stay open by "
-                f"{self._system.describe(last[0], target[0], at)}, {done:.0%} of the way "
+                f"{self._system.describe(last[0], target[0], geometry)}, {done:.0%} of the way "
                 "from the mechanical zero"
             )
         self._refuse(i, reason, float(worst[0]))
@@ -327,9 +330,10 @@ class _Path:
             self._refuse(i, reason, 0.0)
 
     def _refuse_singular(self, x: Array, rows: NDArray[np.intp]) -> None:
-        """Refuse solutions at some points that leave motions free, the most singular one first."""
-        system, at = self._system, self._geometry.at(rows, len(self._points))
-        _, jacobians = system.evaluate(x[rows], system.prepare(self._targets[rows], at), at)
+        """Refuse solutions with free motions, the most singular one first."""
+        system, geometry = self._system, self._geometry.at(rows, len(self._points))
+        prepared = system.prepare(self._targets[rows], geometry)
+        _, jacobians = system.evaluate(x[rows], prepared, geometry)
         values = np.linalg.svd(jacobians / system.units, compute_uv=False)
         smallest = values[:, system.n_x - 1] if values.shape[1] >= system.n_x else 0.0
         largest = values.max(axis=1, initial=0.0)  # without closures there are no values
@@ -345,18 +349,23 @@ class _Path:
     def _newton(
         self, points: NDArray[np.intp], start: Array, p: Array
     ) -> tuple[Array, Array, Mask]:
-        """Damped Newton's method of some points at once.
+        """Solve some points by damped Newton's method.
+
+        Args:
+            points: Rows of the points, shape (n,).
+            start: Start values of x, shape (n, n_x).
+            p: Parameters of the equations, shape (n, n_p).
 
         Returns:
             Solutions, shape (n, n_x), the largest residual of each, shape (n,), [m], and a mask of
-            the solutions that are certainly not singular (if that matters).
+            the solutions that are certainly not singular (False if singular ones are allowed).
         """
         system, tolerance, x = self._system, self._tolerance, np.array(start)
         prepared = system.prepare(p, self._geometry.at(points, len(self._points)))
 
         def evaluate(rows: NDArray[np.intp], x: Array) -> tuple[Array, Array, Array]:
-            at = self._geometry.at(points[rows], len(self._points))
-            residuals, jacobians = system.evaluate(x, prepared[rows], at)
+            geometry = self._geometry.at(points[rows], len(self._points))
+            residuals, jacobians = system.evaluate(x, prepared[rows], geometry)
             return residuals, jacobians, np.abs(residuals).max(axis=1, initial=0.0)
 
         residuals, jacobians, worst = evaluate(np.arange(len(x)), x)
@@ -367,23 +376,23 @@ class _Path:
             step = system.step(residuals[active], jacobians[active])
             usable = np.isfinite(step).all(axis=1)
             rows, step = active[usable], step[usable]
-            moved = []
-            for _ in range(MAX_STEP_HALVINGS):
+            improved = []
+            for _ in range(MAX_STEP_REDUCTIONS):
                 trial = x[rows] + step
-                r, j, size = evaluate(rows, trial)
-                better = size < worst[rows]
+                r, j, largest = evaluate(rows, trial)
+                better = largest < worst[rows]
                 good = rows[better]
                 x[good], residuals[good], jacobians[good] = trial[better], r[better], j[better]
-                worst[good] = size[better]
-                moved.append(good)
+                worst[good] = largest[better]
+                improved.append(good)
                 rows, step = rows[~better], 0.25 * step[~better]
                 if not rows.size:
                     break
-            active = np.sort(np.concatenate(moved))
+            active = np.sort(np.concatenate(improved))
             active = active[worst[active] >= tolerance]
         regular = np.zeros(len(x), dtype=np.bool_)
         closed = np.flatnonzero((worst < tolerance) & np.isfinite(jacobians).all(axis=(1, 2)))
-        if closed.size and system.n_x:  # a last step without evaluation: its Jacobian is at hand
+        if closed.size and system.n_x:  # a last step without evaluation: its Jacobian is known
             evaluated = residuals[closed], jacobians[closed]
             if self._allow_singular:
                 step = system.step(*evaluated)

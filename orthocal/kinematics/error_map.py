@@ -1,17 +1,17 @@
 """Placements and actual drive coordinates of a machine as functions of its error parameters.
 
-A placement with errors is placement · exp6(δ). Its derivative by δ is a twist in its own frame,
-exp6(δ) [T(δ) dδ], with T the right Jacobian of SE(3). All effects on the kinematics pass through
-these twists and through the actual drive coordinates. `ErrorMap` computes them from the expressions
-of the effects for NumPy arrays, `SymbolicErrorMap` for CasADi expressions.
+A placement with errors is placement · exp6(δ). A change dδ moves it by the twist dξ = T(δ) dδ in
+its frame, with T the right Jacobian of SE(3). Effects change the kinematics only by the twists δ
+and by the actual drive coordinates. `ErrorMap` computes both from the expressions of the effects
+for NumPy arrays, `SymbolicErrorMap` for CasADi expressions.
 
-A command holds the commanded drive coordinates of a posture, followed by those conditions of its
-readings on which drives or placements depend (`ErrorMap.conditions`). Coordinates alone are a
-command under neutral conditions.
+A command consists of the commanded drive coordinates of a posture and the conditions on which
+drives or placements depend (`ErrorMap.conditions`). Coordinates alone are a command under neutral
+conditions.
 
-Placements may depend on the coordinates of the drives (`Effect.placements`), which are conditions,
-too. A gauge is mounted in the reference posture: such a placement moves twice, with the coordinates
-of the posture and with those of the reference posture.
+Effects may make placements depend on the coordinates of the drives (`Effect.placements`), which
+are then conditions too. Because a gauge is mounted in the reference posture, such a placement
+exists twice: with the coordinates of the posture, and with those of the reference posture.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from orthocal.robot.model import Robot
 class MachineGeometry:
     """Geometry of one machine or of a batch of machines with errors.
 
-    Each row of a batch holds for as many successive points.
+    With S rows for n points, each row applies to n/S successive points.
     """
 
     map: ErrorMap
@@ -63,7 +63,7 @@ class MachineGeometry:
         return drives.reshape(*self._shape(commands), drives.shape[-1])
 
     def drive_derivatives(self, commands: Array) -> tuple[Array, Array]:
-        """Derivatives of `drives` by the commanded coordinates and by `drive_errors`.
+        """Derivatives of `drives` with respect to the commanded coordinates and `drive_errors`.
 
         Returns:
             Shapes (..., K, n_drives, n_drives) and (..., K, n_drives, n_drive_errors).
@@ -75,7 +75,7 @@ class MachineGeometry:
         return by_commands, by_errors
 
     def at(self, points: NDArray[np.intp], count: int) -> MachineGeometry:
-        """Geometry of some points out of `count`: a row for each, or one row for all."""
+        """Geometry of some of `count` points: one row per point, or one row for all."""
         placements, drive_errors = (
             rows if len(rows) == 1 else rows[points // (count // len(rows))]
             for rows in (self.placements, self.drive_errors)
@@ -83,34 +83,37 @@ class MachineGeometry:
         return MachineGeometry(self.map, placements, drive_errors)
 
     def _combine(self, commands: Array) -> tuple[Array, Array]:
-        """Commands of all machines, one a row, and drive errors, shape (n_machines, n)."""
+        """Commands of all machines, (S K, n_command), and drive errors, (S, n_drive_errors)."""
         errors = self.drive_errors.reshape(-1, self.drive_errors.shape[-1])
         return np.tile(np.atleast_2d(commands), (len(errors), 1)), errors
 
     def _shape(self, commands: Array) -> tuple[int, ...]:
+        """Leading dimensions of a result: those of the machines, then of the commands."""
         return *self.drive_errors.shape[:-1], *commands.shape[:-1]
 
 
 class ErrorMap:
-    """The elementary errors of a robot in a fixed order, shape (..., n_errors), [m, rad, 1].
+    """Placements and drives of a robot as functions of its elementary errors.
+
+    The elementary errors have a fixed order, shape (..., n_errors), [m, rad, 1].
 
     Args:
         robot: The nominal robot.
 
     Attributes:
         names: Names of the errors.
-        moved: Placements that effects act on; those in the reference posture that differ from them
+        moved: Placements on which effects act. Placements that differ in the reference posture
             follow at the end.
-        in_reference: Index of a placement among the moved ones to that of the same in the reference
-            posture; empty unless placements depend on the coordinates of drives.
+        in_reference: Index of each moved placement that differs in the reference posture, mapped
+            to its index there; empty unless placements depend on the coordinates of drives.
         conditions: Conditions that follow the drive coordinates in a command.
-        placement_conditions: Those on which placements depend.
-        of_placements: Mask of these in a command, shape (n_command,).
+        placement_conditions: Conditions on which placements depend.
+        of_placements: Mask of `placement_conditions` in a command, shape (n_command,).
         varying: Indices of the moved placements that may depend on conditions, shape (n_varying,).
         drive_errors: Indices of the errors on which the drives depend, shape (n_drive_errors,).
-        drives: Function of a command and these errors: actual drive coordinates.
+        drives: Function of a command and `drive_errors`: actual drive coordinates.
         twists: Function of the conditions and of all errors: twists of the moved placements, and
-            their derivative by the errors.
+            their derivatives with respect to the errors.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -123,12 +126,12 @@ class ErrorMap:
         machine = express_machine(
             robot, commanded, {n: errors[i] for i, n in enumerate(self.names)}, symbols
         )
-        moving = {p: ca.sparsify(t) for p, t in machine.twists.items()}
-        moved = [p for p, t in moving.items() if t.nnz()]
-        there = _in_reference(robot, {p: moving[p] for p in moved}, symbols)
-        self.moved = (*moved, *there)
-        self.in_reference = {moved.index(p): len(moved) + i for i, p in enumerate(there)}
-        twists = ca.vertcat(ca.SX(0, 1), *(moving[p] for p in moved), *there.values())
+        sparse = {p: ca.sparsify(t) for p, t in machine.twists.items()}
+        twist_of = {p: t for p, t in sparse.items() if t.nnz()}
+        moved, reference = list(twist_of), _reference_twists(robot, twist_of, symbols)
+        self.moved = (*moved, *reference)
+        self.in_reference = {moved.index(p): len(moved) + i for i, p in enumerate(reference)}
+        twists = ca.vertcat(ca.SX(0, 1), *twist_of.values(), *reference.values())
         self.conditions = _conditions_in(ca.vertcat(twists, machine.actuated), symbols)
         self.placement_conditions = _conditions_in(twists, symbols)
         neutral = neutral_values(robot)
@@ -138,7 +141,7 @@ class ErrorMap:
         self.of_placements = np.concatenate([drives, of_placements.astype(np.bool_)])
         self._neutral = np.repeat([neutral[c] for c in self.conditions], sizes).astype(np.float64)
         of_condition = np.repeat(np.array(self.conditions, dtype=object), sizes)
-        self._own = len(robot.drives) + np.flatnonzero(of_condition == "coordinates")
+        self._coordinates = len(robot.drives) + np.flatnonzero(of_condition == "coordinates")
         for name in ("coordinates", "reference"):
             if name in self.conditions:
                 self._neutral[of_condition == name] = robot.drive_zero
@@ -160,18 +163,18 @@ class ErrorMap:
         outputs = [twists, ca.jacobian(twists, errors)]
         self.twists = ca.Function("twists", [conditions, errors], outputs)
         self._twists = _Twists(self.twists)
-        self.varying = np.unique(self._twists.curved // 6)
+        self.varying = np.unique(self._twists.general // 6)
         nominal = [nominal_placement(robot.model, p) for p in self.moved]
         self._rotations = np.array([p.rotation for p in nominal]).reshape(-1, 3, 3)
         self._positions = np.array([p.translation for p in nominal]).reshape(-1, 3)
 
     @property
     def n_conditions(self) -> int:
-        """Numbers of a command beside the drive coordinates."""
+        """Count of the numbers in a command that are no drive coordinates."""
         return self._neutral.size
 
     def expand(self, values: Mapping[str, float]) -> Array:
-        """Elementary errors of named parameters, which may be sums, shape (n_errors,), [SI].
+        """Elementary errors of parameters, which may be sums of several, shape (n_errors,), [SI].
 
         Raises:
             ParameterError: If a name is unknown.
@@ -182,27 +185,27 @@ class ErrorMap:
         return result
 
     def columns(self, names: Sequence[str]) -> Array:
-        """Elementary errors of one unit of each named parameter, shape (n_errors, n)."""
+        """Elementary errors for one unit of each named parameter, shape (n_errors, n)."""
         return self.robot.parameters.coefficients(self.names, names)
 
     def command(self, coordinates: Array) -> Array:
-        """Commands of drive coordinates, shape (..., n_command); commands stay what they are."""
+        """Commands of drive coordinates, shape (..., n_command); commands are unchanged."""
         missing = len(self.robot.drives) + self._neutral.size - coordinates.shape[-1]
         if not missing:
             return coordinates
         neutral = np.broadcast_to(self._neutral, (*coordinates.shape[:-1], missing))
-        return self.at_own_coordinates(np.concatenate([coordinates, neutral], axis=-1))
+        return self.with_coordinates(np.concatenate([coordinates, neutral], axis=-1))
 
-    def at_own_coordinates(self, commands: Array) -> Array:
-        """Commands in which the condition `coordinates` is that of their drives, same shape."""
-        if not self._own.size:
+    def with_coordinates(self, commands: Array) -> Array:
+        """Commands with the drive coordinates copied to the condition `coordinates`."""
+        if not self._coordinates.size:
             return commands
         result = np.array(commands)
-        result[..., self._own] = commands[..., : self._own.size]
+        result[..., self._coordinates] = commands[..., : self._coordinates.size]
         return result
 
     def split(self, conditions: ca.SX) -> dict[Condition, ca.SX]:
-        """Conditions of a command, shape (n_conditions,), by name."""
+        """Split the conditions of a command, shape (n_conditions,), by name."""
         sizes = [condition_size(self.robot, c) for c in self.conditions]
         parts = ca.vertsplit(conditions, np.cumsum([0, *sizes]).tolist()) if sizes else []
         return dict(zip(self.conditions, parts, strict=True))
@@ -212,24 +215,25 @@ class ErrorMap:
 
         Args:
             errors: Shape (..., n_errors), [SI].
-            commands: If placements depend on conditions: a command, shape (n_command,), for all
-                machines, or K of them for each of S machines, shape (K, n_command), of which the
-                geometry has S K rows of placements; neutral conditions by default.
+            commands: Commands on which placements may depend; neutral conditions by default. One
+                command, shape (n_command,), applies to all machines. K commands, shape
+                (K, n_command), apply to each of S machines, which gives S K rows of placements.
         """
         values = np.asarray(errors, dtype=np.float64)
         drive_errors = values[..., self.drive_errors]
         if commands is not None and commands.ndim > 1 and self.placement_conditions:
-            under = self.placements_under(values, commands)
-            return MachineGeometry(self, under.reshape(-1, under.shape[-1]), drive_errors)
+            placements = self.placements_under(values, commands)
+            rows = placements.reshape(-1, placements.shape[-1])
+            return MachineGeometry(self, rows, drive_errors)
         command = commands if commands is not None and commands.ndim == 1 else None
         return MachineGeometry(self, self.placements(values, command), drive_errors)
 
     def placements(self, errors: ArrayLike, commands: Array | None = None) -> Array:
-        """Moved placements: rotation by columns, then position.
+        """Moved placements: rotation column by column, then position.
 
         Args:
             errors: Shape (..., n_errors), [SI].
-            commands: Shape (n_command,), or that of `errors`; neutral conditions by default.
+            commands: Shape (n_command,) or (..., n_command); neutral conditions by default.
 
         Returns:
             Shape (..., 12 n_moved), [1, m].
@@ -240,7 +244,7 @@ class ErrorMap:
     def placements_under(self, errors: Array, commands: Array) -> Array:
         """Moved placements of S machines under the conditions of V commands.
 
-        Only those that vary are computed for each command.
+        Only placements that vary are computed for each command.
 
         Args:
             errors: Shape (S, n_errors), [SI].
@@ -258,7 +262,7 @@ class ErrorMap:
         return result
 
     def _move(self, twists: Array, chosen: slice | Indices) -> Array:
-        """Chosen placements with the twists δ, shape (..., n, 12) of (..., n, 6)."""
+        """Chosen placements moved by twists δ, (..., n, 6): rotations, positions, (..., n, 12)."""
         rotation, position = exp6(twists)
         nominal = self._rotations[chosen]
         positions = (nominal @ position[..., None])[..., 0] + self._positions[chosen]
@@ -267,8 +271,8 @@ class ErrorMap:
 
     def _varying_twists(self, errors: Array, commands: Array) -> Array:
         """Twists of the varying placements, shape (S, V, n_varying, 6)."""
-        at = np.broadcast_to(errors[:, None], (len(errors), len(commands), errors.shape[-1]))
-        return self._shaped(self.twists_of(at, commands[None]))[:, :, self.varying]
+        twists = self.twists_of(_repeat_for(errors, commands), commands[None])
+        return self._shaped(twists)[:, :, self.varying]
 
     def varying_derivatives(
         self, errors: Array, columns: Array, commands: Array
@@ -277,18 +281,19 @@ class ErrorMap:
 
         Args:
             errors: Shape (S, n_errors), [SI].
-            columns: Elementary errors of one unit of each parameter, shape (n_errors, n).
+            columns: Elementary errors for one unit of each parameter, shape (n_errors, n).
             commands: Shape (V, n_command).
         """
-        at = np.broadcast_to(errors[:, None], (len(errors), len(commands), errors.shape[-1]))
         of_varying = (6 * self.varying[:, None] + np.arange(6)).reshape(-1)
-        constant, curved, by = self._twists.split(at, columns, self._conditions(commands[None]))
+        constant, jacobian, some_columns = self._twists.split(
+            _repeat_for(errors, commands), columns, self._conditions(commands[None])
+        )
         return VaryingDerivatives(
             right_jacobian(self._varying_twists(errors, commands)),
             constant[of_varying],
-            np.searchsorted(of_varying, self._twists.curved),
-            curved,
-            by,
+            np.searchsorted(of_varying, self._twists.general),
+            jacobian,
+            some_columns,
         )
 
     def actuate(self, commands: Array, drive_errors: Array) -> Array:
@@ -296,7 +301,8 @@ class ErrorMap:
 
         Args:
             commands: Shape (n, n_command).
-            drive_errors: Shape (n, n_drive_errors), or fewer rows that hold for successive ones.
+            drive_errors: Shape (n, n_drive_errors), or (S, n_drive_errors) if each row applies to
+                n/S successive commands.
 
         Returns:
             Shape (n, n_drives), [m, rad].
@@ -305,7 +311,7 @@ class ErrorMap:
         return actuated
 
     def differentiate_drives(self, commands: Array, drive_errors: Array) -> tuple[Array, Array]:
-        """Derivatives of `actuate` by the commanded coordinates and by the errors.
+        """Derivatives of `actuate` with respect to the commanded coordinates and the errors.
 
         Returns:
             Shapes (n, n_drives, n_drives) and (n, n_drives, n_drive_errors).
@@ -321,15 +327,16 @@ class ErrorMap:
         command: Array | None = None,
         right: Array | None = None,
     ) -> Array:
-        """Derivatives of placements by parameters.
-
-        ∂ξ of every moved placement in its own frame, shape (..., 6 n_moved, n), [m, rad].
+        """Derivatives of the moved placements with respect to parameters, ∂ξ = T ∂δ.
 
         Args:
             errors: Point of differentiation, shape (..., n_errors), [SI].
-            columns: Elementary errors of one unit of each parameter, shape (n_errors, n).
-            command: As for `placements`.
-            right: `right_jacobians` there, if known.
+            columns: Elementary errors for one unit of each parameter, shape (n_errors, n).
+            command: Shape (n_command,) or (..., n_command); neutral conditions by default.
+            right: `right_jacobians` of these errors; computed by default.
+
+        Returns:
+            Twists in the frames of the placements, shape (..., 6 n_moved, n), [m, rad].
         """
         right = self.right_jacobians(errors, command) if right is None else right
         n = columns.shape[1]
@@ -343,7 +350,7 @@ class ErrorMap:
 
     @property
     def nominal(self) -> Array:
-        """Moved placements without errors: rotation by columns, position; (n_moved, 12)."""
+        """Moved placements without errors, shape (n_moved, 12): rotation columns, position."""
         columns = np.swapaxes(self._rotations, 1, 2).reshape(-1, 9)
         return np.concatenate([columns, self._positions], axis=1)
 
@@ -352,37 +359,40 @@ class ErrorMap:
 
         Args:
             errors: Shape (..., n_errors), [SI].
-            commands: As for `placements`.
+            commands: Shape (n_command,) or (..., n_command); neutral conditions by default.
         """
         return self._twists(np.asarray(errors, dtype=np.float64), self._conditions(commands))
 
     def twist_columns(
         self, errors: ArrayLike, columns: Array, command: Array | None = None
     ) -> Array:
-        """∂δ of the moved placements by parameters, shape (6 n_moved, n), [m, rad].
-
-        The shape begins with that of the machines if the derivatives differ among them.
+        """Derivatives of the twists δ of the moved placements with respect to parameters.
 
         Args:
             errors: Point of differentiation, shape (..., n_errors), [SI].
-            columns: Elementary errors of one unit of each parameter, shape (n_errors, n).
-            command: As for `placements`.
+            columns: Elementary errors for one unit of each parameter, shape (n_errors, n).
+            command: Shape (n_command,) or (..., n_command); neutral conditions by default.
+
+        Returns:
+            Shape (6 n_moved, n), [m, rad]; (..., 6 n_moved, n) if they depend on the errors.
         """
-        at = np.asarray(errors, dtype=np.float64)
-        return self._twists.columns(at, columns, self._conditions(command))
+        values = np.asarray(errors, dtype=np.float64)
+        return self._twists.columns(values, columns, self._conditions(command))
 
     def twists_moved_by(self, columns: Array) -> Mask:
         """Mask of the twists that parameters change, shape (6 n_moved,).
 
         Args:
-            columns: Elementary errors of one unit of each parameter, shape (n_errors, n).
+            columns: Elementary errors for one unit of each parameter, shape (n_errors, n).
         """
         return self._twists.moved_by(np.asarray(columns.any(axis=1)))
 
     def _conditions(self, commands: Array | None) -> Array:
+        """Conditions of commands, shape (..., n_conditions); neutral by default."""
         return self._neutral if commands is None else commands[..., len(self.robot.drives) :]
 
     def _shaped(self, twists: Array) -> Array:
+        """Twists with one row per placement, shape (..., n_moved, 6)."""
         return twists.reshape(*twists.shape[:-1], len(self.moved), 6)
 
 
@@ -393,23 +403,23 @@ class VaryingDerivatives:
     right: Array
     """T, shape (S, V, n_varying, 6, 6)."""
     constant: Array
-    """Part of ∂δ by parameters that is the same everywhere, shape (6 n_varying, n)."""
+    """Constant part of ∂δ with respect to the parameters, shape (6 n_varying, n)."""
     rows: Indices
-    """Rows of ∂δ that have another part, shape (n_rows,)."""
-    curved: Array
-    """The other part by some of the errors, shape (S, V, n_rows, n_some)."""
+    """Rows of ∂δ that have a varying part, shape (n_rows,)."""
+    jacobian: Array
+    """Varying part with respect to some of the errors, shape (S, V, n_rows, n_some)."""
     columns: Array
-    """These errors of one unit of each parameter, shape (n_some, n)."""
+    """Values of these errors for one unit of each parameter, shape (n_some, n)."""
 
 
 class _Twists:
-    """Twists as a function of conditions and errors, and their derivative by the errors.
+    """Twists as a function of conditions and errors, and their derivative.
 
-    Errors of the geometry are single linear terms of a twist and are assigned by index. The other
-    terms are evaluated by CasADi.
+    Geometric errors are single linear terms of a twist and are assigned by index. General terms are
+    evaluated by CasADi.
 
     Attributes:
-        curved: Indices of the twists with such other terms, shape (n_curved,).
+        general: Indices of the twists with general terms, shape (n_general,).
     """
 
     def __init__(self, function: ca.Function) -> None:
@@ -421,21 +431,21 @@ class _Twists:
         nonzeros = [jacobian.nz[k] for k in range(rows.size)]
         constant = np.array([v.is_constant() for v in nonzeros], dtype=np.bool_)
         first = np.isin(np.arange(rows.size), np.unique(rows, return_index=True)[1])
-        varying = np.unique(columns[~(constant & first)])
-        linear = ~np.isin(columns, varying)
+        self._general_errors = np.unique(columns[~(constant & first)])
+        linear = ~np.isin(columns, self._general_errors)
         self._linear = rows[linear], columns[linear]
         self._slopes = np.array([float(v) for v, ok in zip(nonzeros, linear, strict=True) if ok])
-        others = np.unique(self._linear[1]).tolist()
-        remainder = ca.SX(twists)
-        if others:
-            remainder = ca.substitute(remainder, errors[others], ca.SX.zeros(len(others)))
-        self._varying = varying
-        chosen = errors[varying.tolist()]
-        sparsity = ca.sparsify(remainder).sparsity()
-        self.curved = np.array(sparsity.get_triplet()[0], dtype=np.int64)
-        terms = remainder[self.curved.tolist()]
-        self._nonlinear = BatchFunction(
-            ca.Function("nonlinear", [conditions, chosen], [terms, ca.jacobian(terms, chosen)]),
+        linear_errors = np.unique(self._linear[1]).tolist()
+        general = ca.SX(twists)
+        if linear_errors:
+            zeros = ca.SX.zeros(len(linear_errors))
+            general = ca.substitute(general, errors[linear_errors], zeros)
+        chosen = errors[self._general_errors.tolist()]
+        sparsity = ca.sparsify(general).sparsity()
+        self.general = np.array(sparsity.get_triplet()[0], dtype=np.int64)
+        terms = general[self.general.tolist()]
+        self._general = BatchFunction(
+            ca.Function("general", [conditions, chosen], [terms, ca.jacobian(terms, chosen)]),
             matrices=["o1"],
         )
 
@@ -443,61 +453,69 @@ class _Twists:
         result = np.zeros((*errors.shape[:-1], self._n))
         rows, columns = self._linear
         result[..., rows] = self._slopes * errors[..., columns]
-        if self.curved.size:
-            result[..., self.curved] += self._evaluate(errors, conditions)[0]
+        if self.general.size:
+            result[..., self.general] += self._evaluate(errors, conditions)[0]
         return result
 
     def columns(self, errors: Array, columns: Array, conditions: Array) -> Array:
-        """∂δ by parameters; arguments as for `ErrorMap.twist_columns`."""
-        result, curved, by = self.split(errors, columns, conditions)
-        if not self.curved.size:
-            return result
-        result = np.array(np.broadcast_to(result, (*errors.shape[:-1], *result.shape)))
-        result[..., self.curved, :] += curved @ by
+        """Derivatives ∂δ with respect to parameters: `ErrorMap.twist_columns`."""
+        constant, jacobian, some_columns = self.split(errors, columns, conditions)
+        if not self.general.size:
+            return constant
+        result = np.array(np.broadcast_to(constant, (*errors.shape[:-1], *constant.shape)))
+        result[..., self.general, :] += jacobian @ some_columns
         return result
 
     def split(self, errors: Array, columns: Array, conditions: Array) -> tuple[Array, Array, Array]:
-        """∂δ by parameters, the part of the curved twists in two factors.
+        """Constant part and general part of ∂δ with respect to parameters.
 
         Returns:
-            The constant part, shape (n_twists, n); the other part of the curved twists by some
-            errors, shape (..., n_curved, n_some); and these errors of one unit of each parameter,
-            shape (n_some, n).
+            The constant part, shape (n_twists, n); the Jacobian of the general terms with respect
+            to some errors, shape (..., n_general, n_some); and the values of these errors for one
+            unit of each parameter, shape (n_some, n).
         """
-        rows, of = self._linear
+        rows, linear_errors = self._linear
         constant = np.zeros((self._n, columns.shape[1]))
-        constant[rows] = self._slopes[:, None] * columns[of]
-        by = columns[self._varying]
-        if not self.curved.size:
-            return constant, np.zeros((*errors.shape[:-1], 0, len(by))), by
-        return constant, self._evaluate(errors, conditions)[1], by
+        constant[rows] = self._slopes[:, None] * columns[linear_errors]
+        some_columns = columns[self._general_errors]
+        if not self.general.size:
+            empty = np.zeros((*errors.shape[:-1], 0, len(some_columns)))
+            return constant, empty, some_columns
+        return constant, self._evaluate(errors, conditions)[1], some_columns
 
     def moved_by(self, errors: Mask) -> Mask:
-        """Mask of the twists that some errors change."""
+        """Mask of the twists that masked errors change, shape (n_twists,)."""
         result = np.zeros(self._n, dtype=np.bool_)
         result[self._rows[errors[self._columns]]] = True
         return result
 
     def _evaluate(self, errors: Array, conditions: Array) -> tuple[Array, Array]:
-        at = errors.reshape(-1, errors.shape[-1])[:, self._varying]
-        shape = errors.shape[:-1]
-        rows = np.broadcast_to(conditions, (*shape, conditions.shape[-1])).reshape(len(at), -1)
-        twists, jacobian = self._nonlinear(rows, at)
+        """General terms, shape (..., n_general), and their Jacobian with respect to the errors."""
+        shape, values = errors.shape[:-1], errors.reshape(-1, errors.shape[-1])
+        rows = np.broadcast_to(conditions, (*shape, conditions.shape[-1]))
+        twists, jacobian = self._general(
+            rows.reshape(len(values), -1), values[:, self._general_errors]
+        )
         return twists.reshape(*shape, -1), jacobian.reshape(*shape, *jacobian.shape[1:])
 
 
 @cached_per_robot(maxsize=8)
 def error_map(robot: Robot) -> ErrorMap:
-    """The error map of a robot, built once."""
+    """Error map of a robot, built once."""
     return ErrorMap(robot)
 
 
-def _in_reference(
+def _repeat_for(errors: Array, commands: Array) -> Array:
+    """Errors of S machines for each of V commands, shape (S, V, n_errors)."""
+    return np.broadcast_to(errors[:, None], (len(errors), len(commands), errors.shape[-1]))
+
+
+def _reference_twists(
     robot: Robot, twists: Mapping[Placement, ca.SX], symbols: Mapping[Condition, ca.SX]
 ) -> dict[Placement, ca.SX]:
-    """Twists in the reference posture of those placements that depend on drive coordinates.
+    """Twists in the reference posture of placements that depend on drive coordinates.
 
-    Other conditions are neutral there, except adjustments.
+    Other conditions are neutral, except adjustments.
     """
     neutral = {**neutral_conditions(robot), "coordinates": symbols["reference"]}
     names = [c for c in symbols if c not in ("adjustment", "reference")]
@@ -514,39 +532,39 @@ def _conditions_in(expression: ca.SX, symbols: Mapping[Condition, ca.SX]) -> tup
 class SymbolicErrorMap:
     """Placements and drives of a machine as expressions of scaled parameters θ̂.
 
-    The choice of free parameters is a matrix of constants; the CasADi function of one placement is
-    mapped over all of them. Placements that may depend on conditions are apart from the others,
-    which are then evaluated once for all conditions.
+    The choice of free parameters is a matrix of constants. The CasADi function of one placement is
+    mapped over all placements. Constant placements are evaluated once for all conditions, varying
+    ones for each.
 
     Args:
         errors: The robot's error map.
         fixed: Elementary errors at θ̂ = 0, shape (n_errors,), [SI].
-        columns: Elementary errors of one unit of each θ̂, shape (n_errors, n_free).
+        columns: Elementary errors for one unit of each θ̂, shape (n_errors, n_free).
 
     Attributes:
         placements: The moved placements, shape (12 n_moved,).
-        symbols: θ̂; placements and the nonzeros of ∂ξ/∂θ̂ of those that do not vary; the same of
-            those that do: the inputs of posture and reading functions.
-        digest: Digest of the numbers that are constants here.
+        symbols: Inputs of posture and reading functions: θ̂, the constant placements, the nonzeros
+            of their ∂ξ/∂θ̂, the varying placements, the nonzeros of their ∂ξ/∂θ̂.
+        digest: Digest of `fixed` and `columns`.
     """
 
     def __init__(self, errors: ErrorMap, *, fixed: Array, columns: Array) -> None:
         self.digest = hashlib.sha256(fixed.tobytes() + columns.tobytes()).hexdigest()
         varying = errors.varying
-        others = np.setdiff1d(np.arange(len(errors.moved)), varying)
+        constant = np.setdiff1d(np.arange(len(errors.moved)), varying)
         theta = ca.SX.sym("theta", columns.shape[1])
         symbols, jacobians = [theta], []
         self._functions = []
-        for chosen in (others, varying):
+        for chosen in (constant, varying):
             function, sparsity = _moved_placements(errors, chosen, fixed=fixed, columns=columns)
             jacobians.append(ca.SX.sym("twist_jacobian", sparsity))
             symbols += [ca.SX.sym("placements", 12 * chosen.size), jacobians[-1].nz[:]]
             self._functions.append(function)
         self.symbols = tuple(symbols)
-        place = np.argsort(np.concatenate([others, varying]))
+        order = np.argsort(np.concatenate([constant, varying]))
 
         def ordered(parts: list[ca.SX], size: int) -> ca.SX:
-            rows = (size * place[:, None] + np.arange(size)).reshape(-1)
+            rows = (size * order[:, None] + np.arange(size)).reshape(-1)
             return ca.vertcat(*parts)[rows.tolist(), :]
 
         self.placements = ordered([symbols[1], symbols[3]], 12)
@@ -562,17 +580,27 @@ class SymbolicErrorMap:
             theta: θ̂, shape (n_free,).
             conditions: Conditions of a command, shape (V, n_conditions).
         """
-        others, varying = self._functions
-        count = len(conditions)
-        under = varying if count == 1 else varying.map(count, [True, False], [False, False])
-        return [theta, *others(theta, ca.DM(conditions[0])), *under(theta, ca.DM(conditions.T))]
+        constant, varying = self._functions
+        if len(conditions) > 1:
+            varying = varying.map(len(conditions), [True, False], [False, False])
+        return [
+            theta,
+            *constant(theta, ca.DM(conditions[0])),
+            *varying(theta, ca.DM(conditions.T)),
+        ]
 
     def actuated(self, command: ca.SX) -> ca.SX:
         """Actual drive coordinates of a command, shape (n_drives,), [m, rad]."""
         return self._drives(command, self._drive_errors)
 
     def chain(self, by_twists: ca.SX, by_actuated: ca.SX, command: ca.SX) -> ca.SX:
-        """Derivative by θ̂ of rows with known derivatives by twists and actuated coordinates."""
+        """Derivative of rows with respect to θ̂, by the chain rule.
+
+        Args:
+            by_twists: Derivative of the rows with respect to twists, shape (n, 6 n_moved).
+            by_actuated: Derivative with respect to actual drive coordinates, shape (n, n_drives).
+            command: The command, shape (n_command,).
+        """
         by_theta = ca.jacobian(self.actuated(command), self.symbols[0])
         return by_twists @ self._twist_jacobian + by_actuated @ by_theta
 
@@ -585,19 +613,19 @@ def _moved_placements(
     Args:
         errors: The robot's error map.
         chosen: Indices of the moved placements, shape (n,).
-        fixed: As for `SymbolicErrorMap`.
-        columns: As for `SymbolicErrorMap`.
+        fixed: Elementary errors at θ̂ = 0, shape (n_errors,), [SI].
+        columns: Elementary errors for one unit of each θ̂, shape (n_errors, n_free).
 
     Returns:
         The function, and the sparsity of ∂ξ/∂θ̂, shape (6 n, n_free).
     """
-    at, conditions = ca.MX.sym("theta", columns.shape[1]), ca.MX.sym("u", errors.n_conditions)
+    theta, conditions = ca.MX.sym("theta", columns.shape[1]), ca.MX.sym("u", errors.n_conditions)
     rows = (6 * chosen[:, None] + np.arange(6)).reshape(-1).tolist()
     symbols = errors.twists.sx_in()
     outputs = [v[rows, :] for v in errors.twists(*symbols)]
     twists = ca.Function("twists", symbols, outputs)
     by_theta = ca.MX(ca.sparsify(ca.DM(columns)))
-    delta, by_errors = twists(conditions, ca.DM(fixed) + by_theta @ at)
+    delta, by_errors = twists(conditions, ca.DM(fixed) + by_theta @ theta)
     values, right = ca.MX(12, 0), ca.MX(27, 0)
     if chosen.size:
         mapped = _moved_placement().map(chosen.size)
@@ -605,20 +633,20 @@ def _moved_placements(
     blocks = ca.diagcat(ca.Sparsity(0, 0), *[_right_jacobian_sparsity()] * chosen.size)
     by_twists = ca.MX(blocks, ca.vec(right)) @ (by_errors @ by_theta)
     function = ca.Function(
-        "error_map", [at, conditions], [ca.densify(ca.vec(values)), by_twists.nz[:]]
+        "error_map", [theta, conditions], [ca.densify(ca.vec(values)), by_twists.nz[:]]
     )
     return function, by_twists.sparsity()
 
 
 @lru_cache(maxsize=1)
 def _right_jacobian_sparsity() -> ca.Sparsity:
-    """Nonzeros of T: rotations of a placement do not depend on translations."""
+    """Sparsity of T: rotations of a placement do not depend on translations."""
     return right_jacobian(ca.SX.sym("twist", 6)).sparsity()
 
 
 @lru_cache(maxsize=1)
 def _moved_placement() -> ca.Function:
-    """(twist, nominal placement) to placement · exp6(twist), and the nonzeros of T."""
+    """Function of a twist and a nominal placement: placement · exp6(twist), nonzeros of T."""
     twist, nominal = ca.SX.sym("twist", 6), ca.SX.sym("nominal", 12)
     pose = Pose(ca.reshape(nominal[:9], 3, 3), nominal[9:]) * Pose(*exp6(twist))
     values = ca.vertcat(ca.vec(pose.rotation), pose.position)

@@ -1,7 +1,7 @@
 """Cache of a robot's CasADi functions, in memory and on disk.
 
-The key of a function holds everything it depends on: the robot as loaded, the code that builds
-functions, and the versions of CasADi and Pinocchio.
+The key of a function covers the loaded robot, the code that builds functions, and the versions of
+CasADi and Pinocchio.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from orthocal.runtime import disk_cache
 Result = TypeVar("Result")
 
 MAX_FUNCTIONS = 256
-"""Functions held in memory; one takes up to 2 MB."""
+"""Functions held in memory; one needs up to 2 MB."""
 
 _CODE_DIRECTORIES = (
     "kinematics",
@@ -36,12 +36,12 @@ _CODE_DIRECTORIES = (
     "estimation",
     "estimation/solvers",
 )
-"""Directories with code that builds functions."""
+"""Directories of orthocal with code that builds functions."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Recipe:
-    """A function that is not built yet; recipes with the same key are equal."""
+    """Key and constructor of a function; recipes with the same key are equal."""
 
     key: str
     build: Callable[[], ca.Function] = field(compare=False)
@@ -52,17 +52,17 @@ def function_key(robot: Robot, name: str) -> str:
 
     Args:
         robot: The robot.
-        name: Name of the function, with everything that distinguishes it from the robot's others.
+        name: Name of the function, unique among the functions of the robot.
     """
     return f"function {name}\n{fingerprint(robot)}\n{_code()}"
 
 
 def cached_function(robot: Robot, name: str, build: Callable[[], ca.Function]) -> ca.Function:
-    """A function of a robot, from memory, from disk, or built now.
+    """Load a function of a robot from memory or disk, or build it.
 
     Args:
         robot: The robot.
-        name: As for `function_key`.
+        name: Name of the function, unique among the functions of the robot.
         build: Builds the function.
     """
     return _load_or_build(_Recipe(function_key(robot, name), build))
@@ -70,6 +70,7 @@ def cached_function(robot: Robot, name: str, build: Callable[[], ca.Function]) -
 
 @lru_cache(maxsize=MAX_FUNCTIONS)
 def _load_or_build(recipe: _Recipe) -> ca.Function:
+    """Load a function from disk, or build and store it."""
     function = _load(recipe.key)
     if function is None:
         function = recipe.build()
@@ -78,6 +79,7 @@ def _load_or_build(recipe: _Recipe) -> ca.Function:
 
 
 def _load(key: str) -> ca.Function | None:
+    """Load a function from disk; None if it is absent or unreadable."""
     content = disk_cache.load(key)
     if content is None:
         return None
@@ -88,6 +90,7 @@ def _load(key: str) -> ca.Function | None:
 
 
 def _save(key: str, function: ca.Function) -> None:
+    """Store a function on disk if it can be serialised."""
     try:
         text = function.serialize()
     except RuntimeError:  # some functions cannot be serialised
@@ -97,7 +100,7 @@ def _save(key: str, function: ca.Function) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _RobotKey:
-    """A robot; robots with the same kinematics and the same files are equal."""
+    """Robot as key of a cache; robots with the same identity are equal."""
 
     identity: tuple[str, str]
     robot: Robot = field(compare=False)
@@ -106,10 +109,10 @@ class _RobotKey:
 def cached_per_robot(
     maxsize: int,
 ) -> Callable[[Callable[[Robot], Result]], Callable[[Robot], Result]]:
-    """Decorator that caches a function of a robot; equal robots share the result.
+    """Decorator that caches a function of a robot; robots of equal identity share the result.
 
     Args:
-        maxsize: Number of robots whose results are held.
+        maxsize: Number of robots whose results are cached.
     """
 
     def decorate(function: Callable[[Robot], Result]) -> Callable[[Robot], Result]:
@@ -125,13 +128,13 @@ def cached_per_robot(
 
 
 def identify(robot: Robot) -> tuple[str, str]:
-    """Identity of a robot: equal for the same kinematics and the same name in messages."""
+    """Identity of a robot: its fingerprint and its YAML file, which messages name."""
     return fingerprint(robot), str(robot.yaml)
 
 
 @lru_cache(maxsize=16)
 def fingerprint(robot: Robot) -> str:
-    """Digest of everything that a robot's functions depend on."""
+    """Digest of all properties of a robot on which its functions depend."""
     parts = [
         robot.model.saveToString(),
         repr(robot.closures),
@@ -159,9 +162,9 @@ def fingerprint(robot: Robot) -> str:
 
 @lru_cache(maxsize=64)
 def source_digest(kind: type) -> str:
-    """Digest of the code of a class from outside orthocal: functions built from it change with it.
+    """Digest of the source file of a class outside orthocal; "" for classes of orthocal.
 
-    A class without a file, as in a notebook, has functions of this process alone.
+    A class without a file, such as one in a notebook, has a new digest in each process.
     """
     if kind.__module__.startswith("orthocal."):
         return ""

@@ -1,7 +1,7 @@
 """Solver of the loop closures g(q, θ) = 0, for batches of machines and postures.
 
-Forward: commanded drives to passive coordinates and tool centre point. Inverse: tool centre point
-to drives. `continuation` solves the equations.
+Forward: passive coordinates and tool centre point of commanded drives. Inverse: drives that bring
+the tool centre point to a position. `continuation` solves the equations.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.robot_functions import robot_functions
 from orthocal.robot.model import Robot, require_commanded_tool, require_tcp
 
-MOST_TRANSMISSIONS = 32
-"""Tables of postures whose rod forces are remembered for one robot."""
+FORCE_CACHE_SIZE = 32
+"""Sets of postures whose rod forces are cached for one robot."""
 
-MOST_SOLUTIONS, MOST_KEPT = 16, 200
-"""Sets of postures whose solutions from the reference posture are kept, and postures of a set."""
+SOLUTION_CACHE_SIZE, MAX_CACHED_POSTURES = 16, 200
+"""Sets of postures whose solutions from the reference posture are cached, and postures per set."""
 
-MOST_REPETITIONS = 10
-SETTLED = 1e-9
-"""Relative change of the conditions of an inverse that depend on its drive coordinates, loads and
-coordinates of placements, below which the drive coordinates do not change. Each repetition reduces
-it at least a hundred times."""
+MAX_ITERATIONS = 10
+CONDITION_TOLERANCE = 1e-9
+"""Relative change at which the conditions of an inverse have converged: loads, and coordinates on
+which placements depend. They follow from its drive coordinates. Each iteration reduces their change
+by more than a factor of 100."""
 
 
 class LoopClosure:
-    """Solver of the loop closures of machines with some errors fixed and some passed to each call.
+    """Solver of the loop closures of machines, with fixed errors and errors passed to each call.
 
     `theta` has shape (n_free,) for one machine or (S, n_free) for a batch of machines; `errors`
     passes all elementary errors instead, shape (n_errors,) or (S, n_errors). Results of a batch
@@ -48,8 +48,8 @@ class LoopClosure:
         robot: The nominal robot.
         free: Names of the parameters whose values are passed to each call as `theta`, in order.
         fixed: Values of other parameters, [unit of the parameter]; 0 where absent.
-        conditions: Conditions of the postures whose commands do not state them; neutral by default:
-            middle of both sides of each drive, reference temperature, weightless.
+        conditions: Conditions of use for drive coordinates without conditions. The default is
+            neutral: middle of both sides of each drive, reference temperature, no weight.
     """
 
     def __init__(
@@ -86,29 +86,29 @@ class LoopClosure:
 
         Args:
             drives: Commanded drive coordinates, shape (K, n_drives) or (n_drives,), [m, rad]; or
-                commands, which hold conditions too (`error_map`).
+                commands, which include conditions (`error_map`).
             theta: Values of the free parameters; 0 by default.
             errors: All elementary errors, instead of theta.
-            start: Passive coordinates to start from, shape (n_passive,), (K, n_passive) or
+            start: Start values of the passive coordinates, shape (n_passive,), (K, n_passive) or
                 (S, K, n_passive); the reference posture by default.
             names: Names of the postures, for messages.
-            allow_free: Accept loops that leave passive motions free, as those of a robot that is
-                only displayed; the passive coordinates then move as little as possible.
-            failures: Filled with the postures that cannot be reached, which are NaN then; by
+            allow_free: Accept free passive motions, such as those of a robot that is only
+                displayed; the passive coordinates then move as little as possible.
+            failures: Filled with the postures that cannot be reached, whose results are NaN; by
                 default the first of them raises.
 
         Returns:
             Shape (K, n_passive), or (n_passive,) for one posture; a batch has S in front.
 
         Raises:
-            ClosureError: If a posture cannot be reached, is outside the limits of a passive joint
-                or, unless free motions are allowed, singular; names the posture and the residual.
+            ClosureError: If a posture cannot be reached, is outside the limits of a passive joint,
+                or is singular without `allow_free`; states the posture and the residual.
         """
         d, single = self._as_commands(drives)
-        at: Array = self.errors(theta) if errors is None else np.asarray(errors, dtype=np.float64)
+        values = self._all_errors(theta, errors)
 
         def solve() -> Array:
-            geometry, batch = self._batch(None, at, d)
+            geometry, batch = self._batch(None, values, d)
             system = self._closing
             if allow_free:
                 system = copy.copy(system)
@@ -126,8 +126,8 @@ class LoopClosure:
             return passive if batch else passive[0]
 
         from_reference = start is None and failures is None and not allow_free
-        if from_reference and at.ndim == 1 and len(d) <= MOST_KEPT:
-            passive = self._solutions.find((at.tobytes(), d.tobytes()), solve)
+        if from_reference and values.ndim == 1 and len(d) <= MAX_CACHED_POSTURES:
+            passive = self._solutions.find((values.tobytes(), d.tobytes()), solve)
         else:
             passive = solve()
         return passive[..., 0, :] if single else passive
@@ -146,15 +146,15 @@ class LoopClosure:
         Args:
             drives: Shape (K, n_drives) or (n_drives,), [m, rad].
             theta: Values of the free parameters; 0 by default.
-            start: As for `close`.
+            start: Start values of the passive coordinates; the reference posture by default.
             names: Names of the postures, for messages.
-            failures: As for `close`.
+            failures: Filled with the postures that cannot be reached; by default the first raises.
 
         Returns:
             Shape (K, 3) or (3,), [m]; a batch has S in front.
 
         Raises:
-            ClosureError: As `close`.
+            ClosureError: If a posture cannot be reached or is singular.
             RobotError: If the robot has no tool centre point.
         """
         d, single = self._as_commands(drives)
@@ -172,10 +172,9 @@ class LoopClosure:
         """Drive coordinates that bring the tool centre point to points.
 
         Args:
-            points: The coordinates of the tool that the drives control, shape (K, n_drives) or
-                (n_drives,), [m].
+            points: Commanded coordinates of the tool, shape (K, n_drives) or (n_drives,), [m].
             names: Names of the postures, for messages.
-            failures: As for `close`.
+            failures: Filled with the points that cannot be reached; by default the first raises.
 
         Returns:
             Shape (K, n_drives) or (n_drives,), [m, rad].
@@ -199,17 +198,18 @@ class LoopClosure:
         """All joint coordinates that bring the tool centre point of one machine to points.
 
         Args:
-            points: As for `inverse`, shape (K, n_drives).
-            start: Drive and passive coordinates to start from, shape (K, n_drives + n_passive); the
-                reference posture by default.
-            names: As for `inverse`.
-            failures: As for `inverse`.
+            points: Commanded coordinates of the tool, shape (K, n_drives), [m].
+            start: Start values of drive and passive coordinates, shape
+                (K, n_drives + n_passive); the reference posture by default.
+            names: Names of the postures, for messages.
+            failures: Filled with the points that cannot be reached; by default the first raises.
 
         Returns:
             Drive coordinates, shape (K, n_drives), and passive ones, shape (K, n_passive).
 
         Raises:
-            ClosureError, RobotError: As `inverse`.
+            ClosureError: If a point cannot be reached.
+            RobotError: If the robot has no tool centre point with as many coordinates as drives.
         """
         n = len(self.robot.drives)
         if not self._depends_on_drives:
@@ -219,11 +219,11 @@ class LoopClosure:
         if self._has_load:
             drives = nominal_closure(self.robot).inverse(points, failures={})
         commands = self.commands(drives)
-        for _ in range(MOST_REPETITIONS):
+        for _ in range(MAX_ITERATIONS):
             x = self._reach(points, commands[:, :n], start, names, failures)
             before, commands = commands[:, n:], self.commands(x[:, :n])
             change = np.abs(commands[:, n:] - before)
-            if (change <= SETTLED * np.abs(before).max(axis=0, initial=0.0)).all():
+            if (change <= CONDITION_TOLERANCE * np.abs(before).max(axis=0, initial=0.0)).all():
                 break
             start = np.where(np.isfinite(x), x, self._inverting.start)
         return x[:, :n], x[:, n:]
@@ -231,13 +231,13 @@ class LoopClosure:
     def _reach(
         self,
         points: Array,
-        conditions_at: Array,
+        drives: Array,
         start: Array | None,
         names: Sequence[str] | None,
         failures: Failures | None,
     ) -> Array:
-        """Joint coordinates of `reach` under the conditions at some drive coordinates."""
-        commands = self.commands(conditions_at)
+        """Joint coordinates of `reach` under the conditions of some drive coordinates."""
+        commands = self.commands(drives)
         targets = np.hstack([points, commands[:, len(self.robot.drives) :]])
 
         def solve() -> Array:
@@ -253,7 +253,7 @@ class LoopClosure:
             )[0]
             return x
 
-        if start is None and failures is None and len(points) <= MOST_KEPT:
+        if start is None and failures is None and len(points) <= MAX_CACHED_POSTURES:
             return self._solutions.find((b"tool" + self._fixed.tobytes(), targets.tobytes()), solve)
         return solve()
 
@@ -268,10 +268,10 @@ class LoopClosure:
         """Tool centre point of joint coordinates with closed loops.
 
         Args:
-            drives: Commanded, shape (K, n_drives) or (n_drives,), [m, rad].
-            passive: As `close` returns them for these drives.
-            theta: As for `close`.
-            errors: As for `close`.
+            drives: Commanded drive coordinates, shape (K, n_drives) or (n_drives,), [m, rad].
+            passive: Passive coordinates that `close` returns for these drives.
+            theta: Values of the free parameters; 0 by default.
+            errors: All elementary errors, instead of theta.
 
         Returns:
             Shape (K, 3) or (3,), [m]; a batch has S in front.
@@ -282,7 +282,7 @@ class LoopClosure:
         machines, n = len(geometry.drive_errors), self.robot.passive_index.size
         q = np.asarray(passive, dtype=np.float64)
         if q.ndim == 0 or q.shape[-1] != n:
-            raise ValueError(f"found the shape {q.shape}; expected {n} passive coordinates a row")
+            raise ValueError(f"found the shape {q.shape}; expected {n} passive coordinates per row")
         rows = machines * len(d)
         if n and q.size != rows * n:
             raise ValueError(f"found {rows} rows of drive and {q.size // n} of passive coordinates")
@@ -294,7 +294,7 @@ class LoopClosure:
         return np.asarray(shaped[..., 0, :] if single else shaped)
 
     def errors(self, theta: ArrayLike | None = None) -> Array:
-        """All elementary errors for values of the free ones, shape (..., n_errors), [SI]."""
+        """All elementary errors for values of the free parameters, shape (..., n_errors), [SI]."""
         return np.asarray(self._fixed + self._theta(theta) @ self._columns.T)
 
     def geometry(self, theta: ArrayLike | None = None) -> MachineGeometry:
@@ -302,10 +302,11 @@ class LoopClosure:
         return self._functions.errors.geometry(self.errors(theta))
 
     def commands(self, drives: Array) -> Array:
-        """Commands of drive coordinates under the closure's conditions; commands stay as they are.
+        """Commands of drive coordinates under the conditions of this closure.
 
         Args:
-            drives: Shape (K, n_drives), or commands, shape (K, n_command).
+            drives: Shape (K, n_drives), or commands, shape (K, n_command), which are returned
+                unchanged.
 
         Returns:
             Shape (K, n_command).
@@ -317,9 +318,9 @@ class LoopClosure:
         if self._has_load:
             values["load"] = find_loads(self.robot, drives, conditions.payload or 0.0)
         values["coordinates"], values["reference"] = drives, self.robot.drive_zero
-        parts = [values[c] for c in map_.conditions]
-        stated = [np.broadcast_to(v, (len(drives), v.shape[-1])) for v in parts]
-        return np.hstack([drives, *stated])
+        columns = [values[c] for c in map_.conditions]
+        rows = [np.broadcast_to(v, (len(drives), v.shape[-1])) for v in columns]
+        return np.hstack([drives, *rows])
 
     @property
     def _depends_on_drives(self) -> bool:
@@ -328,20 +329,27 @@ class LoopClosure:
 
     @property
     def _has_load(self) -> bool:
+        """True if effects depend on the load, and conditions state it."""
         return self._conditions is not None and "load" in self._functions.errors.conditions
 
     def inputs(self, drives: Array, passive: Array) -> tuple[Array, Array, Array]:
         """Inputs of the robot's functions (`RobotFunctions`) in postures of one machine.
 
         Args:
-            drives: Commanded, shape (K, n_drives), [m, rad], or commands, shape (K, n_command).
+            drives: Commanded drive coordinates, shape (K, n_drives), [m, rad], or commands, shape
+                (K, n_command).
             passive: Shape (K, n_passive), [m, rad].
         """
         commands = self.commands(drives)
         geometry, _ = self._batch(None, None, commands)
         return geometry.drives(commands)[0], passive, geometry.placements
 
+    def _all_errors(self, theta: ArrayLike | None, errors: ArrayLike | None) -> Array:
+        """All elementary errors of a call that states either theta or errors."""
+        return self.errors(theta) if errors is None else np.asarray(errors, dtype=np.float64)
+
     def _theta(self, theta: ArrayLike | None) -> Array:
+        """Values of the free parameters, shape (n_free,) or (S, n_free); 0 by default."""
         if theta is None:
             return np.zeros(len(self.free))
         values, single = as_rows(theta, len(self.free), "values of the free parameters")
@@ -350,12 +358,12 @@ class LoopClosure:
     def _batch(
         self, theta: ArrayLike | None, errors: ArrayLike | None, commands: Array | None = None
     ) -> tuple[MachineGeometry, bool]:
-        """Geometry with a leading dimension, and whether the arguments were a batch."""
-        at: Array = self.errors(theta) if errors is None else np.asarray(errors, dtype=np.float64)
-        return self._functions.errors.geometry(np.atleast_2d(at), commands), at.ndim > 1
+        """Geometry with a leading dimension, and True if the arguments were a batch."""
+        values = self._all_errors(theta, errors)
+        return self._functions.errors.geometry(np.atleast_2d(values), commands), values.ndim > 1
 
     def _as_commands(self, drives: ArrayLike) -> tuple[Array, bool]:
-        """Commands, shape (K, n_command), and whether they were a single row."""
+        """Commands, shape (K, n_command), and True if they were a single row."""
         values, map_ = np.asarray(drives), self._functions.errors
         n = len(self.robot.drives)
         if values.shape[-1:] == (n + map_.n_conditions,):
@@ -365,6 +373,7 @@ class LoopClosure:
 
     @cached_property
     def _closing(self) -> System:
+        """Equations of the passive coordinates for commands."""
         robot, function = self.robot, self._functions.closure_by_passive
         map_ = self._functions.errors
 
@@ -386,28 +395,28 @@ class LoopClosure:
 
     @cached_property
     def _inverting(self) -> System:
+        """Equations of drive and passive coordinates for tool positions and conditions."""
         robot = self.robot
-        chosen = list(require_commanded_tool(robot))
+        axes = list(require_commanded_tool(robot))
         function, n_d = self._functions.closure_and_tool, len(robot.drives)
         map_ = self._functions.errors
 
         def evaluate(x: Array, p: Array, geometry: MachineGeometry) -> tuple[Array, Array]:
             d, q = x[:, :n_d], x[:, n_d:]
-            target, conditions = p[:, : len(chosen)], p[:, len(chosen) :]
+            target, conditions = p[:, : len(axes)], p[:, len(axes) :]
             commands = np.hstack([d, conditions])
             actuated = map_.actuate(commands, geometry.drive_errors)
             by_commands, _ = map_.differentiate_drives(commands, geometry.drive_errors)
             g, g_a, g_q, tool, t_a, t_q = function(actuated, q, geometry.placements)
-            residuals = np.concatenate([g, tool[:, chosen] - target], axis=1)
-            by_drives = np.concatenate([g_a, t_a[:, chosen]], axis=1)
-            by_drives = by_drives @ by_commands
-            by_passive = np.concatenate([g_q, t_q[:, chosen]], axis=1)
+            residuals = np.concatenate([g, tool[:, axes] - target], axis=1)
+            by_drives = np.concatenate([g_a, t_a[:, axes]], axis=1) @ by_commands
+            by_passive = np.concatenate([g_q, t_q[:, axes]], axis=1)
             return residuals, np.concatenate([by_drives, by_passive], axis=2)
 
         index = np.concatenate([robot.drive_index, robot.passive_index])
         tool_at_zero = nominal_closure(robot).tcp(robot.drive_zero, robot.reference_passive)
         neutral = map_.command(robot.drive_zero)[n_d:]
-        origin = np.concatenate([tool_at_zero[chosen], neutral])
+        origin = np.concatenate([tool_at_zero[axes], neutral])
         start = np.concatenate([robot.drive_zero, robot.reference_passive])
         return System(
             robot,
@@ -416,41 +425,41 @@ class LoopClosure:
             index=index,
             start=start,
             origin=origin,
-            n_tool=len(chosen),
+            n_tool=len(axes),
         )
 
 
 class _Solutions:
-    """The last solutions from the reference posture: every model of a session begins with them."""
+    """Cache of solutions from the reference posture, which all models of a session need."""
 
     def __init__(self) -> None:
-        self._kept: dict[tuple[bytes, bytes], Array] = {}
+        self._cached: dict[tuple[bytes, bytes], Array] = {}
 
     def find(self, key: tuple[bytes, bytes], solve: Callable[[], Array]) -> Array:
-        """The solution of a key, solved now if it is not among the last ones."""
-        solution = self._kept.pop(key, None)
+        """Copy of the solution of a key, solved if it is not cached."""
+        solution = self._cached.pop(key, None)
         if solution is None:
             solution = solve()
-        self._kept[key] = solution
-        while len(self._kept) > MOST_SOLUTIONS:
-            self._kept.pop(next(iter(self._kept)), None)
+        self._cached[key] = solution
+        while len(self._cached) > SOLUTION_CACHE_SIZE:
+            self._cached.pop(next(iter(self._cached)), None)
         return np.array(solution)
 
 
 @cached_per_robot(maxsize=8)
 def _solutions(robot: Robot) -> _Solutions:
-    """Solutions of a robot, with errors or without."""
+    """Cache of the solutions of a robot, shared by all its closures."""
     return _Solutions()
 
 
 @cached_per_robot(maxsize=8)
 def nominal_closure(robot: Robot) -> LoopClosure:
-    """The loop closure solver of a robot without errors, built once."""
+    """Loop closure solver of a robot without errors, built once."""
     return LoopClosure(robot)
 
 
-class _Transmissions:
-    """Axial forces of the rods by forces on the tool, remembered for a few tables of postures.
+class _UnitRodForces:
+    """Axial forces of the rods per unit force on the tool, cached for sets of postures.
 
     The same postures recur under several payloads and with several machines.
 
@@ -460,13 +469,14 @@ class _Transmissions:
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self._forces = robot, RodForces(robot)
-        self._find = lru_cache(maxsize=MOST_TRANSMISSIONS)(self._compute)
+        self._cached = lru_cache(maxsize=FORCE_CACHE_SIZE)(self._compute)
 
     def __call__(self, drives: Array) -> Array:
-        """∂p/∂ℓ of all rods, 0 where the machine cannot be, shape (K, n_rods, 3)."""
-        return self._find(np.ascontiguousarray(drives).tobytes())
+        """∂p/∂ℓ of all rods, shape (K, n_rods, 3); 0 in postures out of reach."""
+        return self._cached(np.ascontiguousarray(drives).tobytes())
 
     def _compute(self, content: bytes) -> Array:
+        """Forces for the bytes of drive coordinates."""
         robot, n = self._robot, len(self._robot.drives)
         drives = np.frombuffer(content).reshape(-1, n)
         result = np.zeros((len(drives), len(robot.rods), 3))
@@ -479,9 +489,9 @@ class _Transmissions:
 
 
 @cached_per_robot(maxsize=8)
-def _transmissions(robot: Robot) -> _Transmissions:
-    """The transmissions of a robot, prepared once."""
-    return _Transmissions(robot)
+def _unit_rod_forces(robot: Robot) -> _UnitRodForces:
+    """Unit rod forces of a robot, prepared once."""
+    return _UnitRodForces(robot)
 
 
 def find_loads(robot: Robot, drives: Array, payload: ArrayLike) -> Array:
@@ -490,18 +500,19 @@ def find_loads(robot: Robot, drives: Array, payload: ArrayLike) -> Array:
     Args:
         robot: The nominal robot.
         drives: Commanded drive coordinates, shape (K, n_drives), [m, rad].
-        payload: Mass on the tool beside the platform, of all postures or of each, [kg].
+        payload: Mass on the tool in addition to the platform, one value or shape (K,), [kg].
 
     Returns:
-        Tension positive, shape (K, n_rods), [N]; 0 where the nominal machine cannot be.
+        Shape (K, n_rods), [N], tension positive; 0 in postures that the nominal machine cannot
+        reach.
     """
-    masses, which = np.unique(np.broadcast_to(payload, len(drives)), return_inverse=True)
-    forces = np.array([tool_force(robot, float(m)) for m in masses]).reshape(-1, 3)[which]
-    return np.asarray(np.einsum("kri,ki->kr", _transmissions(robot)(drives), forces))
+    masses, mass_of = np.unique(np.broadcast_to(payload, len(drives)), return_inverse=True)
+    forces = np.array([tool_force(robot, float(m)) for m in masses]).reshape(-1, 3)[mass_of]
+    return np.asarray(np.einsum("kri,ki->kr", _unit_rod_forces(robot)(drives), forces))
 
 
 def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str]) -> Failures:
-    """Rows of drive coordinates beyond a drive's travel, with the reason.
+    """Rows of drive coordinates beyond the travel of a drive, with the reason.
 
     Args:
         robot: The robot.
@@ -521,15 +532,15 @@ def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str]) -> Fai
 
 
 def as_rows(values: ArrayLike, n: int, noun: str) -> tuple[Array, bool]:
-    """Numbers as an array of shape (K, n), and whether they were a single row.
+    """Numbers as an array of shape (K, n), and True if they were a single row.
 
     Raises:
-        ValueError: If they are not numbers, or not n in a row.
+        ValueError: If they are not numbers, or if a row does not have n of them.
     """
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"found {type(values).__name__}; expected {n} {noun} a row") from None
+        raise ValueError(f"found {type(values).__name__}; expected {n} {noun} per row") from None
     if array.ndim not in (1, 2) or array.shape[-1] != n:
-        raise ValueError(f"found the shape {array.shape}; expected {n} {noun} a row, (K, {n})")
+        raise ValueError(f"found the shape {array.shape}; expected {n} {noun} per row, (K, {n})")
     return np.atleast_2d(array), array.ndim == 1

@@ -1,8 +1,8 @@
-"""The paper's closed forms, equations (1) to (6), vectorised over postures.
+"""Closed-form kinematics of the Orthoglide, vectorised over postures.
 
-A check on the closed-loop model and a fast special case; nothing in the identification uses them.
-R = ρ + Δρ is where the sliders really are. Equation numbers are the paper's (Pashkevich, Chablat,
-Wenger 2006); three of its formulas are corrected here, as noted in the docstrings.
+Equations (1) to (6) of Pashkevich, Chablat and Wenger (2006) check the closed-loop model; the
+identification does not use them. R = ρ + Δρ are the actual positions of the slides. Docstrings
+mark the formulas that are corrected here.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from orthocal.units import MM
 def constraint_residual(
     points: ArrayLike, joints: ArrayLike, *, length: float, offsets: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Array:
-    """Residual of equation (1): squared leg lengths less L².
+    """Residual of equation (1): squared leg lengths minus L².
 
         (p_i − R_i)² + Σ_{j≠i} p_j² − L²
 
@@ -53,27 +53,27 @@ def inverse(
         points: Tool centre points, shape (..., 3), [m].
         length: Leg length L, [m].
         offsets: Joint offsets Δρ, shape (3,), [m].
-        configuration: Signs s_i, each 1 or −1: one of eight; the machine is built as (1, 1, 1).
+        configuration: Signs s_i, each 1 or −1; the machine is built with (1, 1, 1).
 
     Returns:
         Joint coordinates ρ, shape (..., 3), [m].
 
     Raises:
-        UnreachableError: If a point is out of a leg's reach; names the first.
+        UnreachableError: If a point is out of reach of a leg; names the first one.
     """
     p = np.asarray(points, dtype=np.float64)
     signs = np.asarray(configuration)
     if signs.shape != (3,) or not np.all(np.isin(signs, (-1, 1))):
         raise UnreachableError(f"configuration is {configuration}; expected three signs, 1 or -1")
-    under = length**2 - _others(p)
-    if not np.all(under >= 0.0):
-        bad = np.argwhere(~np.atleast_2d(under >= 0.0))[0]
+    radicand = length**2 - _others(p)
+    if not np.all(radicand >= 0.0):
+        bad = np.argwhere(~np.atleast_2d(radicand >= 0.0))[0]
         point = np.atleast_2d(p.reshape(-1, 3))[int(bad[0]) if p.ndim == 2 else 0]
         raise UnreachableError(
             f"point {np.round(point / MM, 3).tolist()} mm is out of reach of leg "
             f"{'xyz'[bad[-1]]} (length {length / MM:g} mm)"
         )
-    return np.asarray(p + signs * np.sqrt(under) - np.asarray(offsets, dtype=np.float64))
+    return np.asarray(p + signs * np.sqrt(radicand) - np.asarray(offsets, dtype=np.float64))
 
 
 def direct(
@@ -101,7 +101,7 @@ def direct(
         Tool centre points, shape (..., 3), [m].
 
     Raises:
-        UnreachableError: If the legs do not meet, or a slider is at the origin.
+        UnreachableError: If the legs do not meet, or a slide is at the origin.
     """
     if root not in (-1, 1):
         raise UnreachableError(f"root is {root}; expected 1 or -1")
@@ -119,7 +119,7 @@ def direct(
     if not np.all(reachable):
         worst = np.atleast_2d(slides)[int(np.flatnonzero(~np.atleast_1d(reachable).ravel())[0])]
         raise UnreachableError(
-            f"the legs do not meet with the sliders at {np.round(worst / MM, 3).tolist()} mm "
+            f"the legs do not meet with the slides at {np.round(worst / MM, 3).tolist()} mm "
             f"(length {length / MM:g} mm)"
         )
     t = (-product + root * np.sqrt(discriminant)) / (2.0 * a)
@@ -129,7 +129,7 @@ def direct(
 def inverse_jacobian(
     points: ArrayLike, joints: ArrayLike, *, offsets: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Array:
-    """J⁻¹ = ∂ρ/∂p, equation (4), with R in place of ρ (corrected).
+    """Inverse Jacobian J⁻¹ = ∂ρ/∂p, equation (4), with R instead of ρ (corrected).
 
         J⁻¹_ij = p_j / (p_i − R_i) for j ≠ i, 1 on the diagonal
 
@@ -152,7 +152,12 @@ def inverse_jacobian(
 def jacobian(
     points: ArrayLike, joints: ArrayLike, *, offsets: ArrayLike = (0.0, 0.0, 0.0)
 ) -> Array:
-    """J = ∂p/∂ρ = ∂p/∂Δρ, the inverse of equation (4).
+    """Jacobian J = ∂p/∂ρ = ∂p/∂Δρ, the inverse of equation (4).
+
+    Args:
+        points: Tool centre points, shape (..., 3), [m].
+        joints: Commanded joint coordinates ρ, shape (..., 3), [m].
+        offsets: Joint offsets Δρ, shape (3,), [m].
 
     Returns:
         Shape (..., 3, 3).
@@ -173,7 +178,7 @@ def displacement_angle(displacement: float, *, length: float) -> float:
     asin(ρ_min/L)).
 
     Args:
-        displacement: Displacement of the tool from the mechanical zero, signed, [m].
+        displacement: Signed displacement of the tool from the mechanical zero, [m].
         length: Leg length L, [m].
 
     Raises:
@@ -188,14 +193,14 @@ def displacement_angle(displacement: float, *, length: float) -> float:
 
 
 def displacement_jacobian(axis: int, displacement: float, *, length: float) -> Array:
-    """J at a displacement along one axis, equation (5), for offset sensitivities, equation (6).
+    """Jacobian at a displacement along one axis, equation (5), for sensitivities, equation (6).
 
-    Equation (5) is J, not J⁻¹ as the paper says (corrected): the column of the moving axis holds
-    1 for itself and T_α = tan α for the other two.
+    Equation (5) is J, not J⁻¹ as the paper states (corrected). The column of the moving axis is 1
+    on the diagonal and T_α = tan α elsewhere.
 
     Args:
         axis: 0, 1, 2 for a motion along x, y, z.
-        displacement: Displacement of the tool, signed, [m].
+        displacement: Signed displacement of the tool from the mechanical zero, [m].
         length: Leg length L, [m].
 
     Returns:
@@ -208,6 +213,6 @@ def displacement_jacobian(axis: int, displacement: float, *, length: float) -> A
 
 
 def _others(p: Array) -> Array:
-    """Σ_{j≠i} p_j², shape (..., 3)."""
+    """Sums Σ_{j≠i} p_j², shape (..., 3)."""
     square = p**2
     return np.asarray(square.sum(axis=-1, keepdims=True) - square)

@@ -1,10 +1,10 @@
 """Compiled functions of a robot: loop closures, tool and frames, with their derivatives.
 
 Their inputs are the actual drive coordinates, the passive coordinates and the placements with
-errors (see `ErrorMap`). Another machine, session, model or choice of free errors is therefore
-another evaluation, not another function. Derivatives follow the geometry: a joint or an error that
-acts in a frame X moves another frame b by the twist Ad(b⁻¹ X) ξ. That takes several times less work
-than differentiating the expressions, and is as exact.
+errors (see `ErrorMap`). One function therefore serves all machines, sessions, models and choices of
+free errors. Derivatives follow the geometry: a joint or an error that acts in a frame X moves
+another frame b by the twist Ad(b⁻¹ X) ξ. This needs several times fewer operations than
+differentiating the expressions and is as exact.
 """
 
 from __future__ import annotations
@@ -28,12 +28,14 @@ from orthocal.robot.model import Closure, Robot, closure_row_units, joint_axis
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _MotionSource:
-    """A frame in which a joint or an error acts."""
+    """Frame in which a joint or an error acts."""
 
     pose: Pose
+    """Pose of the frame in the world."""
     joint: int | None
+    """Index of the joint; None if only an error acts."""
     first: int | None
-    """First of its components among the twists of the moved placements."""
+    """Index of the first of its six twist components; None if no error acts."""
 
 
 class RobotFunctions:
@@ -42,9 +44,8 @@ class RobotFunctions:
     Args:
         robot: The nominal robot.
         passive: Values of the passive coordinates; symbols by default.
-        placements: Symbols of the placements to share with other functions; new ones by default.
-        reference: Whether placements that depend on drive coordinates are those of the reference
-            posture.
+        placements: Symbols of the placements, shared with other functions; new ones by default.
+        reference: Use the placements in the reference posture if they depend on drive coordinates.
 
     Attributes:
         actuated: Symbol of the actual drive coordinates, shape (n_drives,), [m, rad].
@@ -75,30 +76,34 @@ class RobotFunctions:
         coordinates[robot.passive_index.tolist()] = self.passive
         joints: dict[int, Pose] = {}
         frames: dict[int, Pose] = {}
-        there = self.errors.in_reference
-        places = {k: there.get(k, k) if reference else k for k in range(len(moved) - len(there))}
-        for k, place in places.items():
-            m, v = moved[k], self.placements[12 * place : 12 * place + 12]
+        in_reference = self.errors.in_reference
+        count = len(moved) - len(in_reference)
+        rows = {k: in_reference.get(k, k) if reference else k for k in range(count)}
+        for k, row in rows.items():
+            m, v = moved[k], self.placements[12 * row : 12 * row + 12]
             (frames if m.of_frame else joints)[m.index] = Pose(ca.reshape(v[:9], 3, 3), v[9:])
         self.tree = SymbolicTree(
             robot.model, coordinates, joint_placements=joints, frame_placements=frames
         )
-        self._first = {(moved[k].index, moved[k].of_frame): 6 * p for k, p in places.items()}
-        self._of_frames: dict[str, BatchFunction] = {}
+        self._first = {(moved[k].index, moved[k].of_frame): 6 * r for k, r in rows.items()}
+        self._frame_functions: dict[str, BatchFunction] = {}
 
     @property
     def symbols(self) -> list[ca.SX]:
-        """Actuated and passive coordinates, placements."""
+        """Symbols of the actuated coordinates, the passive coordinates and the placements."""
         return [self.actuated, self.passive, self.placements]
 
     @cached_property
     def reference(self) -> RobotFunctions:
         """Functions in the reference posture, with separate drive symbols.
 
-        Passive joints have their nominal values: they do not move frames that hang on drives alone.
+        Passive joints have their nominal values, because they do not move frames whose chain to the
+        base contains only drives.
         """
-        zero = ca.SX(self.robot.reference_passive)
-        return RobotFunctions(self.robot, passive=zero, placements=self.placements, reference=True)
+        passive = ca.SX(self.robot.reference_passive)
+        return RobotFunctions(
+            self.robot, passive=passive, placements=self.placements, reference=True
+        )
 
     @cached_property
     def second(self) -> RobotFunctions:
@@ -114,12 +119,12 @@ class RobotFunctions:
 
     @cached_property
     def closure(self) -> ca.SX:
-        """Residual g of all closures, shape (closure_rows,), [m]; rotations times the length."""
+        """Residual g of all closures, shape (closure_rows,), [m]: rotations scaled to lengths."""
         return closure_residual(self.robot, self.tree) * closure_row_units(self.robot)
 
     @cached_property
     def _closure_derivatives(self) -> tuple[ca.SX, ca.SX]:
-        """∂g by joint coordinates, (closure_rows, nv), and by twists, (closure_rows, n_twists)."""
+        """∂g/∂q, shape (closure_rows, nv), and ∂g/∂ξ, shape (closure_rows, n_twists)."""
         blocks = [self._closure_blocks(closure) for closure in self.robot.closures]
         scale = ca.diag(ca.SX(closure_row_units(self.robot)))
         nv = self.robot.model.nv
@@ -129,7 +134,7 @@ class RobotFunctions:
 
     @cached_property
     def closure_by_passive(self) -> BatchFunction:
-        """(actuated, passive, placements) to g and ∂g by the passive coordinates."""
+        """Function of `symbols`: g, and its derivative with respect to the passive coordinates."""
 
         def outputs() -> list[ca.SX]:
             by_joints, _ = self._closure_derivatives
@@ -139,7 +144,7 @@ class RobotFunctions:
 
     @cached_property
     def closure_and_tool(self) -> BatchFunction:
-        """(actuated, passive, placements) to g, ∂g by actuated and passive; the tool likewise."""
+        """Function of `symbols`: g, ∂g/∂actuated, ∂g/∂passive, p, ∂p/∂actuated, ∂p/∂passive."""
 
         def outputs() -> list[ca.SX]:
             tool, joints, _ = self._tool()
@@ -150,50 +155,54 @@ class RobotFunctions:
 
     @cached_property
     def closure_jacobian(self) -> BatchFunction:
-        """(actuated, passive, placements) to g and ∂g by actuated, by passive and by twists.
+        """Function of `symbols`: g, ∂g/∂actuated, ∂g/∂passive and the nonzeros of ∂g/∂ξ.
 
-        The last output has the nonzeros of `twist_pattern`.
+        The nonzeros are in the order of `twist_pattern`.
         """
         return self._batch("closure_jacobian", self._jacobian_outputs, matrices=(1, 2), sparse=(3,))
 
     @cached_property
     def twist_pattern(self) -> tuple[Indices, Indices]:
-        """Rows and columns of the nonzeros of ∂g by twists, column by column."""
+        """Rows and columns of the nonzeros of ∂g/∂ξ, column by column."""
         return self.closure_jacobian.pattern("y3")
 
     @cached_property
     def closure_expressions(self) -> ca.Function:
-        """The closure Jacobian with all outputs sparse, for use in other expressions."""
+        """Closure Jacobian with all outputs sparse, for use in other expressions."""
         return self._function("closure_expressions", self._jacobian_outputs, sparse=(0, 1, 2, 3))
 
     def _jacobian_outputs(self) -> list[ca.SX]:
+        """Residual g, ∂g/∂actuated, ∂g/∂passive and ∂g/∂ξ."""
         joints, twists = self._closure_derivatives
         return [self.closure, *self.split(joints), twists]
 
     # ---- frames
 
     def position(self, frame: str) -> BatchFunction:
-        """(actuated, passive, placements) to the position of a frame, [m]."""
-        return self._of_frame("frame", frame, lambda pose: pose.position)
+        """Function of `symbols`: position of a frame in the world, shape (3,), [m]."""
+        return self._frame_function("frame", frame, lambda pose: pose.position)
 
     def pose(self, frame: str) -> BatchFunction:
-        """(actuated, passive, placements) to the pose of a frame, shape (4, 4), [1, m]."""
+        """Function of `symbols`: pose of a frame in the world, shape (4, 4), [1, m]."""
         last = ca.SX([[0, 0, 0, 1]])
-        return self._of_frame(
+        return self._frame_function(
             "pose", frame, lambda pose: ca.blockcat([[pose.rotation, pose.position], [last]])
         )
 
-    def _of_frame(self, kind: str, frame: str, express: Callable[[Pose], ca.SX]) -> BatchFunction:
+    def _frame_function(
+        self, kind: str, frame: str, express: Callable[[Pose], ca.SX]
+    ) -> BatchFunction:
+        """Function of `symbols`: an expression of the pose of a frame."""
         index = self.robot.frame_id(frame)
         name = f"{kind}_{index}"
-        if name not in self._of_frames:
+        if name not in self._frame_functions:
             pose = self.tree.frame_pose
-            self._of_frames[name] = self._batch(name, lambda: [express(pose(index))])
-        return self._of_frames[name]
+            self._frame_functions[name] = self._batch(name, lambda: [express(pose(index))])
+        return self._frame_functions[name]
 
     @cached_property
     def tool_jacobian(self) -> BatchFunction:
-        """(actuated, passive, placements) to the tool and ∂ by actuated, passive and twists."""
+        """Function of `symbols`: tool p, ∂p/∂actuated, ∂p/∂passive and ∂p/∂ξ."""
 
         def outputs() -> list[ca.SX]:
             tool, joints, twists = self._tool()
@@ -202,14 +211,14 @@ class RobotFunctions:
         return self._batch("tool_jacobian", outputs, matrices=(1, 2, 3))
 
     def _tool(self) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Position of the tool, and its derivatives by joint coordinates and twists."""
+        """Position p of the tool, ∂p/∂q and ∂p/∂ξ."""
         frame = self.robot.frame_id("" if self.robot.tcp is None else self.robot.tcp.frame)
         return self.tree.frame_pose(frame).position, *self.wrench_rows(frame, ca.SX.eye(3))
 
     def wrench_rows(
         self, frame: int, forces: ca.SX, moments: ca.SX | None = None
     ) -> tuple[ca.SX, ca.SX]:
-        """Derivatives of f · p + m · φ of a frame, p its position, φ its rotation in the world.
+        """Derivatives of f · p + m · φ, with p the position and φ the rotation of a frame.
 
         Args:
             frame: Index of the frame.
@@ -217,14 +226,14 @@ class RobotFunctions:
             moments: m of each row, shape (n, 3); none by default.
 
         Returns:
-            By the joint coordinates, shape (n, nv), and by the twists of the moved placements,
-            shape (n, n_twists).
+            Derivatives with respect to the joint coordinates, shape (n, nv), and to the twists of
+            the moved placements, shape (n, n_twists).
         """
         sources = [(1.0, source) for source in self._sources(frame).values()]
         return self._rows(sources, self.tree.frame_pose(frame).position, forces, moments)
 
     def _closure_blocks(self, closure: Closure) -> tuple[ca.SX, ca.SX]:
-        """∂g of one closure: its rows are forces and moments on frame b, in the world."""
+        """∂g/∂q and ∂g/∂ξ of one closure: its rows act as forces and moments on frame b."""
         a, b = self.robot.frame_id(closure.frame_a), self.robot.frame_id(closure.frame_b)
         pose_a, pose_b = self.tree.frame_pose(a), self.tree.frame_pose(b)
         rows, moments = list(closure.rows), None
@@ -234,7 +243,7 @@ class RobotFunctions:
             relative = pose_a.relative(pose_b)
             outer = log6_jacobian(relative.rotation, relative.position)[rows, :]
             forces, moments = outer[:, :3] @ pose_b.rotation.T, outer[:, 3:] @ pose_b.rotation.T
-        of_a, of_b = self._sources(a), self._sources(b)  # a common one moves both alike
+        of_a, of_b = self._sources(a), self._sources(b)  # common sources move both alike
         sources = [(1.0, source) for key, source in of_b.items() if key not in of_a]
         sources += [(-1.0, source) for key, source in of_a.items() if key not in of_b]
         return self._rows(sources, pose_b.position, forces, moments)
@@ -246,7 +255,7 @@ class RobotFunctions:
         forces: ca.SX,
         moments: ca.SX | None,
     ) -> tuple[ca.SX, ca.SX]:
-        """Effect of unit twists in the frames of sources on rows of forces at a position."""
+        """Derivatives of rows of forces and moments at a position, from unit twists of sources."""
         n = forces.size1()
         joints, twists = ca.SX(n, self.robot.model.nv), ca.SX(n, self.n_twists)
         for sign, source in sources:
@@ -255,11 +264,11 @@ class RobotFunctions:
                 torques += moments
             to_source = sign * source.pose.rotation
             block = ca.horzcat(forces @ to_source, torques @ to_source)
-            self._place(joints, twists, source, block)
+            self._add_block(joints, twists, source, block)
         return joints, twists
 
     def _sources(self, frame: int) -> dict[tuple[int, bool], _MotionSource]:
-        """Joints that move a frame, and errors of joints and of the frames it hangs on."""
+        """Joints that move a frame, and errors of these joints and of the frames that carry it."""
         sources = {
             (i, False): _MotionSource(self.tree.joint_base(i), i, self._first.get((i, False)))
             for i in self.tree.joints_to(frame)
@@ -270,8 +279,15 @@ class RobotFunctions:
                 sources[key] = _MotionSource(self.tree.frame_pose(carrier), None, self._first[key])
         return sources
 
-    def _place(self, joints: ca.SX, twists: ca.SX, source: _MotionSource, block: ca.SX) -> None:
-        """Add the effect of a unit twist in a source's frame to the source's columns."""
+    def _add_block(self, joints: ca.SX, twists: ca.SX, source: _MotionSource, block: ca.SX) -> None:
+        """Add the derivative with respect to the twist of a source to the columns of the source.
+
+        Args:
+            joints: Derivative with respect to the joint coordinates, shape (n, nv); changed.
+            twists: Derivative with respect to the twists, shape (n, n_twists); changed.
+            source: The source.
+            block: Derivative with respect to a twist in the frame of the source, shape (n, 6).
+        """
         if source.first is not None:
             twists[:, source.first : source.first + 6] += block
         if source.joint is not None:
@@ -284,7 +300,7 @@ class RobotFunctions:
             joints[:, joint.idx_v : joint.idx_v + joint.nv] += block @ axis
 
     def split(self, by_joints: ca.SX) -> list[ca.SX]:
-        """Columns of the actuated and of the passive coordinates, of shape (n, nv)."""
+        """Split a derivative, shape (n, nv), into its actuated and its passive columns."""
         index = self.robot.drive_index.tolist(), self.robot.passive_index.tolist()
         return [by_joints[:, columns] for columns in index]
 
@@ -296,6 +312,7 @@ class RobotFunctions:
         matrices: tuple[int, ...] = (),
         sparse: tuple[int, ...] = (),
     ) -> BatchFunction:
+        """Batch function of the symbols; `matrices` and `sparse` are indices of outputs."""
         return BatchFunction(
             self._function(name, outputs, sparse=sparse),
             matrices=[f"y{i}" for i in matrices],
@@ -306,7 +323,7 @@ class RobotFunctions:
     def _function(
         self, name: str, outputs: Callable[[], list[ca.SX]], *, sparse: tuple[int, ...]
     ) -> ca.Function:
-        """A cached function of the symbols; outputs are expressed only if it is not cached."""
+        """Cached function of the symbols; `outputs` is called only if it is not cached."""
 
         def build() -> ca.Function:
             values = [y if i in sparse else ca.densify(y) for i, y in enumerate(outputs())]
@@ -319,7 +336,7 @@ class RobotFunctions:
 
 @cached_per_robot(maxsize=8)
 def robot_functions(robot: Robot) -> RobotFunctions:
-    """The functions of a robot, built once."""
+    """Functions of a robot, built once."""
     return RobotFunctions(robot)
 
 
@@ -328,5 +345,5 @@ def reference_poses(robot: Robot, frames: Sequence[str]) -> list[Array]:
     functions = robot_functions(robot)
     errors = functions.errors
     placements = errors.placements(np.zeros(len(errors.names)))
-    zero = robot.drive_zero[None], robot.reference_passive[None]
-    return [functions.pose(frame)(*zero, placements)[0][0] for frame in frames]
+    posture = robot.drive_zero[None], robot.reference_passive[None]
+    return [functions.pose(frame)(*posture, placements)[0][0] for frame in frames]

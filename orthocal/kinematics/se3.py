@@ -4,7 +4,7 @@ A twist is (translation v, rotation ω), as in Pinocchio. All coefficients belon
 
     α_n(θ²) = Σ_k (−θ²)^k/(n + 2k)!,  α_1 = sin θ/θ,  α_2 = (1 − cos θ)/θ²,  θ = |ω|,
 
-whose series near 0 keeps every function safe to differentiate there. Arrays may have any leading
+whose series near 0 makes every function differentiable there. Arrays may have any leading
 batch dimensions. Sources: Chirikjian, Stochastic Models, Information Theory, and Lie Groups,
 volume 2, 2012, section 10.8; Barfoot, State Estimation for Robotics, 2017, section 7.1.5.
 """
@@ -30,14 +30,14 @@ SERIES_TERMS = 9
 """Terms of a series: the first omitted one is below 1e-21 at SERIES_BELOW."""
 
 LOGARITHM_SERIES_ABOVE = 0.999
-"""Cosine above which the logarithm's coefficients come from their series."""
+"""Cosine above which the coefficients of the logarithm come from their series."""
 
 _ARCSINE = (1.0, 1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240, 10395 / 599040)
 _BERNOULLI = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
 
 
 class _Operations(NamedTuple):
-    """Operations that NumPy and CasADi spell differently; vectors are columns."""
+    """Operations with different names in NumPy and CasADi; vectors are columns."""
 
     where: Callable[[Any, Any, Any], Any]
     sqrt: Callable[[Any], Any]
@@ -81,7 +81,7 @@ def log6(rotation: Array, position: Array) -> Array: ...
 @overload
 def log6(rotation: ca.SX, position: ca.SX) -> ca.SX: ...
 def log6(rotation: Operand, position: Operand) -> Operand:
-    """Logarithm of a pose, for rotations by less than π.
+    """Logarithm of a pose, for rotation angles below π.
 
         ω = (θ/sin θ) ½ vee(R − Rᵀ)
         v = p − ½ ω × p + (1/θ² − (1 + cos θ)/(2 θ sin θ)) ω × (ω × p)
@@ -151,7 +151,7 @@ def right_jacobian(twist: Operand) -> Operand:
 
 
 def log6_jacobian(rotation: ca.SX, position: ca.SX) -> ca.SX:
-    """Derivative of log6(M exp6(ξ)) by ξ at 0, as Pinocchio's Jlog6, shape (6, 6)."""
+    """Derivative of log6(M exp6(ξ)) with respect to ξ at 0, shape (6, 6): Jlog6 of Pinocchio."""
     r, p = ca.SX.sym("r", 3, 3), ca.SX.sym("p", 3)
     twist = log6(r, p)
     by_rotation, by_position = ca.jacobian(twist, ca.vec(r)), ca.jacobian(twist, p) @ r
@@ -161,7 +161,7 @@ def log6_jacobian(rotation: ca.SX, position: ca.SX) -> ca.SX:
 
 
 def skew(vectors: Array) -> Array:
-    """Cross-product matrices [v] of vectors, shape (..., 3, 3) of (..., 3)."""
+    """Cross-product matrices [v], shape (..., 3, 3), of vectors v, shape (..., 3)."""
     result = np.zeros((*vectors.shape, 3))
     x, y, z = (vectors[..., i] for i in range(3))
     result[..., 0, 1], result[..., 0, 2] = -z, y
@@ -171,7 +171,7 @@ def skew(vectors: Array) -> Array:
 
 
 def _coefficients(m: _Operations, square: Operand, count: int) -> list[Operand]:
-    """α_1 to α_count of the squared angle."""
+    """Coefficients α_1 to α_count of a squared angle, [rad²]."""
     near = square < SERIES_BELOW
     safe = m.where(near, 1.0, square)
     angle = m.sqrt(safe)
@@ -187,13 +187,13 @@ def _coefficients(m: _Operations, square: Operand, count: int) -> list[Operand]:
 
 
 def _series(square: Operand, first: int) -> Operand:
-    """Σ (−θ²)^k/(first + 2k)!."""
+    """Series Σ (−θ²)^k/(first + 2k)! of a squared angle θ²."""
     coefficients = (1.0 / math.factorial(first + 2 * k) for k in range(SERIES_TERMS))
     return _polynomial(-square, tuple(coefficients))
 
 
 def _polynomial(x: Operand, coefficients: tuple[float, ...]) -> Operand:
-    """Σ c_k x^k by Horner's rule."""
+    """Polynomial Σ c_k x^k by Horner's rule."""
     total = 0.0 * x
     for coefficient in reversed(coefficients):
         total = total * x + coefficient
@@ -201,7 +201,7 @@ def _polynomial(x: Operand, coefficients: tuple[float, ...]) -> Operand:
 
 
 def _split(twist: Operand) -> tuple[_Operations, Operand, Operand]:
-    """Operations, and translation and rotation as columns."""
+    """Operations for the type of a twist, and its translation and rotation as columns."""
     if isinstance(twist, ca.SX):
         return _CASADI, twist[:3], twist[3:]
     columns = np.asarray(twist, dtype=np.float64)[..., None]
@@ -209,7 +209,7 @@ def _split(twist: Operand) -> tuple[_Operations, Operand, Operand]:
 
 
 def _inverse_skew(matrices: Array) -> Array:
-    """Columns v of cross-product matrices [v], shape (..., 3, 1)."""
+    """Vectors v of cross-product matrices [v], as columns, shape (..., 3, 1)."""
     parts = [matrices[..., 2, 1], matrices[..., 0, 2], matrices[..., 1, 0]]
     return np.stack(parts, axis=-1)[..., None]
 

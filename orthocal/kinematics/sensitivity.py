@@ -1,8 +1,10 @@
 """Sensitivity of the tool's position to errors of the machine, with the loops closed.
 
-    J = p_θ − p_q g_q⁻¹ g_θ
+    J = (p_ξ − M g_ξ) ∂ξ/∂θ + (p_a − M g_a) ∂a/∂θ,  M = p_q g_q⁻¹
 
-with p the tool's position and g the closures, by the errors θ and the passive joints q.
+p is the tool position and g = 0 are the loop closures. Both depend on the actual drive coordinates
+a, the passive coordinates q and the twists ξ of the placements. A subscript denotes a partial
+derivative, and θ are the errors.
 """
 
 from __future__ import annotations
@@ -17,20 +19,25 @@ from orthocal.arrays import Array
 from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import robot_functions
+from orthocal.robot.closing import RANK_TOLERANCE
 from orthocal.robot.model import Robot, require_tcp
 
-CONDITIONS_AT_ONCE = 64
-"""Postures with placements of their own that are differentiated together; each takes 300 kB."""
+POSTURE_BLOCK_SIZE = 64
+"""Postures per block if placements depend on the posture; one needs 300 kB."""
 
 
 class ToolSensitivity:
-    """∂p/∂θ of the tool at commanded postures.
+    """Sensitivity ∂p/∂θ of the tool at commanded postures.
 
     Args:
         robot: The nominal robot.
         free: Names of the parameters.
-        values: Values of all parameters about which to differentiate, [SI]; 0 where absent.
-        conditions: As for `LoopClosure`.
+        values: Parameter values at the point of differentiation, [SI]; 0 where absent.
+        conditions: Conditions of use of drive coordinates; neutral by default.
+
+    Attributes:
+        theta: Values of the free parameters at the point of differentiation, shape (n_free,), [SI].
+        closure: Loop closures with all values fixed.
 
     Raises:
         RobotError: If the robot has no tool centre point.
@@ -45,11 +52,11 @@ class ToolSensitivity:
         conditions: UseConditions | None = None,
     ) -> None:
         require_tcp(robot)
-        at = dict(values or {})
+        values = dict(values or {})
         self.robot = robot
         self.free = tuple(free)
-        self.theta = np.array([at.get(name, 0.0) for name in self.free])
-        self.closure = LoopClosure(robot, fixed=at, conditions=conditions)
+        self.theta = np.array([values.get(name, 0.0) for name in self.free])
+        self.closure = LoopClosure(robot, fixed=values, conditions=conditions)
         self._functions = robot_functions(robot)
         errors = self._functions.errors
         self._columns = errors.columns(self.free)
@@ -62,13 +69,16 @@ class ToolSensitivity:
         names: Sequence[str] | None = None,
         passive: ArrayLike | None = None,
     ) -> Array:
-        """∂p/∂θ at commanded drive coordinates.
+        """Evaluate ∂p/∂θ at commanded drive coordinates.
+
+        Placements depend on the command only if effects make them. Derivatives are then taken in
+        blocks of postures, for their memory.
 
         Args:
             drives: Shape (K, n_drives), [m, rad], or commands, shape (K, n_command).
-            names: What to call the postures in messages.
-            passive: Passive coordinates that close the loops there, shape (K, n_passive), [m, rad],
-                if they are known.
+            names: Names of the postures, for messages.
+            passive: Passive coordinates that close the loops in these postures, shape
+                (K, n_passive), [m, rad]; solved by default.
 
         Returns:
             Shape (K, 3, n_free), [m per parameter unit].
@@ -76,49 +86,69 @@ class ToolSensitivity:
         Raises:
             ClosureError: If a posture cannot be reached.
         """
-        d = np.atleast_2d(np.asarray(drives, dtype=np.float64))
+        coordinates = np.atleast_2d(np.asarray(drives, dtype=np.float64))
         if passive is None:
-            passive = self.closure.close(d, names=names)
-        commands, q = self.closure.commands(d), np.atleast_2d(passive)
-        under = commands[:, self._functions.errors.of_placements]
-        if not under.size:
-            return self._differentiate(commands, q, self._twists)
-        if (under == under[0]).all():
-            return self._differentiate(commands, q, self._twists_under(commands[:1])[0])
-        rows = [slice(k, k + CONDITIONS_AT_ONCE) for k in range(0, len(d), CONDITIONS_AT_ONCE)]
-        parts = [
-            self._differentiate(commands[r], q[r], self._twists_under(commands[r])) for r in rows
-        ]
-        return np.concatenate(parts)
+            passive = self.closure.close(coordinates, names=names)
+        commands, q = self.closure.commands(coordinates), np.atleast_2d(passive)
+        conditions = commands[:, self._functions.errors.of_placements]
+        if not conditions.size:
+            return self._differentiate(commands, q, self._placement_jacobian)
+        if (conditions == conditions[0]).all():
+            return self._differentiate(commands, q, self._placement_jacobians(commands[:1])[0])
+        starts = range(0, len(commands), POSTURE_BLOCK_SIZE)
+        blocks = [slice(k, k + POSTURE_BLOCK_SIZE) for k in starts]
+        return np.concatenate(
+            [
+                self._differentiate(commands[b], q[b], self._placement_jacobians(commands[b]))
+                for b in blocks
+            ]
+        )
 
     @cached_property
-    def _twists(self) -> Array:
-        """Derivative of the moved placements by the parameters, shape (n_twists, n_free)."""
+    def _placement_jacobian(self) -> Array:
+        """∂ξ/∂θ of the placements under neutral conditions, shape (n_twists, n_free)."""
         return self._functions.errors.jacobian(self.closure.errors(), self._columns)
 
-    def _twists_under(self, commands: Array) -> Array:
-        """Derivative of the moved placements under commands, shape (K, n_twists, n_free)."""
+    def _placement_jacobians(self, commands: Array) -> Array:
+        """∂ξ/∂θ of the placements under the conditions of commands, (K, n_twists, n_free)."""
         errors = np.tile(self.closure.errors(), (len(commands), 1))
         return self._functions.errors.jacobian(errors, self._columns, command=commands)
 
-    def _differentiate(self, commands: Array, passive: Array, moved: Array) -> Array:
-        """∂p/∂θ at commands, with the derivative of the moved placements by the parameters."""
+    def _differentiate(self, commands: Array, passive: Array, placement_jacobian: Array) -> Array:
+        """Equation of the module.
+
+        Args:
+            commands: Shape (K, n_command).
+            passive: q, shape (K, n_passive), [m, rad].
+            placement_jacobian: ∂ξ/∂θ, shape (n_twists, n_free) or (K, n_twists, n_free).
+
+        Returns:
+            Shape (K, 3, n_free).
+        """
         arguments = self.closure.inputs(commands, passive)
-        _, p_a, p_q, p_t = self._functions.tool_jacobian(*arguments)
-        _, g_a, g_q, nonzeros = self._functions.closure_jacobian(*arguments)
+        _, p_a, p_q, p_xi = self._functions.tool_jacobian(*arguments)
+        _, g_a, g_q, g_xi = self._functions.closure_jacobian(*arguments)
         if g_q.shape[1] == g_q.shape[2]:
             multiplier = np.swapaxes(
                 np.linalg.solve(np.swapaxes(g_q, 1, 2), np.swapaxes(p_q, 1, 2)), 1, 2
             )
         else:
-            multiplier = p_q @ np.linalg.pinv(g_q, rcond=1e-10)
-        twists = p_t - self._times_twists(multiplier, nonzeros)
-        _, by_drive_errors = self.closure.geometry().drive_derivatives(commands)
-        drives = (p_a - multiplier @ g_a) @ by_drive_errors
-        return np.asarray(twists @ moved + drives @ self._drive_errors)
+            multiplier = p_q @ np.linalg.pinv(g_q, rcond=RANK_TOLERANCE)
+        by_twists = p_xi - self._multiply_closures(multiplier, g_xi)
+        _, drive_jacobian = self.closure.geometry().drive_derivatives(commands)
+        by_drive_errors = (p_a - multiplier @ g_a) @ drive_jacobian
+        return np.asarray(by_twists @ placement_jacobian + by_drive_errors @ self._drive_errors)
 
-    def _times_twists(self, multiplier: Array, nonzeros: Array) -> Array:
-        """Rows times ∂g by twists, shape (K, 3, n_twists) of (K, 3, n_rows) and (K, nnz)."""
+    def _multiply_closures(self, multiplier: Array, nonzeros: Array) -> Array:
+        """Product M g_ξ with the sparse g_ξ, whose nonzeros are in the order of columns.
+
+        Args:
+            multiplier: M, shape (K, 3, n_rows).
+            nonzeros: Nonzeros of g_ξ, shape (K, nnz).
+
+        Returns:
+            Shape (K, 3, n_twists).
+        """
         rows, columns = self._functions.twist_pattern
         result = np.zeros((*multiplier.shape[:2], self._functions.n_twists))
         if columns.size:

@@ -1,9 +1,9 @@
-"""Symbolic kinematics (CasADi) of a Pinocchio model, with errors on every placement.
+"""Symbolic kinematics (CasADi) of a Pinocchio model with errors of all placements.
 
     oM_i = oM_parent · placement_i · exp6(δ_i) · M_i(q)
 
-A pose is a pair (R, p): rotation 3×3 and position 3, as CasADi expressions. All functions are safe
-to differentiate at zero errors and at closed loops (see `se3`).
+A pose is a rotation R and a position p, as CasADi expressions. All functions can be differentiated
+at zero errors and at closed loops (see `se3`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from orthocal.robot.model import Robot, joint_axis
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """A rigid-body pose: maps coordinates of its frame into the parent's."""
+    """Rigid-body pose, which maps coordinates of its frame to those of its parent."""
 
     rotation: ca.SX
     """Shape (3, 3)."""
@@ -43,7 +43,7 @@ class Pose:
 
 
 def constant_pose(placement: pin.SE3) -> Pose:
-    """A Pinocchio placement as a symbolic pose; rounding zeros become structural zeros."""
+    """Symbolic pose of a Pinocchio placement, with rounding errors replaced by structural zeros."""
     rotation = np.array(placement.rotation)
     position = np.array(placement.translation)
     rotation[np.abs(rotation) < 1e-15] = 0.0
@@ -52,15 +52,16 @@ def constant_pose(placement: pin.SE3) -> Pose:
 
 
 def joint_motion(model: pin.Model, joint: int, coordinates: ca.SX) -> Pose:
-    """M_i(q) = exp6(S q) of a joint.
+    """Motion M_i(q) = exp6(S q) of a joint.
 
     Args:
         model: The model.
         joint: Index of the joint.
-        coordinates: Shape (nv,): an angle also for an unbounded revolute joint.
+        coordinates: Coordinates of the joint, shape (nv,); one angle for an unbounded revolute
+            joint.
 
     Raises:
-        RobotError: For joints other than revolute, prismatic, helical and translation.
+        RobotError: If the joint is not a revolute, prismatic, helical or translation joint.
     """
     joint_model = model.joints[joint]
     if "Translation" in joint_model.shortname():
@@ -74,7 +75,7 @@ def joint_motion(model: pin.Model, joint: int, coordinates: ca.SX) -> Pose:
 
 
 def screw_motion(axis: Array, angle: ca.SX) -> Pose:
-    """exp6(S q) for a constant S = (v, ω) with |ω| = 1 or ω = 0, shape (6,)."""
+    """Motion exp6(S q) for a constant axis S = (v, ω), shape (6,), with |ω| = 1 or ω = 0."""
     v, w = np.array(axis[:3]), np.array(axis[3:])
     if not np.any(w):
         return Pose(ca.SX.eye(3), ca.sparsify(ca.SX(v)) * angle)
@@ -94,11 +95,11 @@ class SymbolicTree:
 
     Args:
         model: The nominal model.
-        coordinates: Joint coordinates, shape (nv,): one an unbounded revolute joint.
-        joint_placements: Joint to its placement in its parent's moving frame; the model's by
-            default.
-        frame_placements: Index of a frame to its placement in the frame that it hangs on (see
-            `parent_frame`); the model's by default.
+        coordinates: Joint coordinates, shape (nv,); one angle per unbounded revolute joint.
+        joint_placements: Indices of joints, mapped to their placements in the moving frames of
+            their parents; those of the model by default.
+        frame_placements: Indices of frames, mapped to their placements in the frames that carry
+            them (see `parent_frame`); those of the model by default.
     """
 
     def __init__(
@@ -118,7 +119,7 @@ class SymbolicTree:
         self._frames: dict[int, Pose] = {}
 
     def joint_base(self, joint: int) -> Pose:
-        """Pose of a joint's frame in the world before its motion, in which its errors act."""
+        """World pose of a joint's frame before the joint's motion; its errors act in this frame."""
         if joint not in self._bases:
             m = self.model
             placement = self._joint_placements.get(joint)
@@ -128,7 +129,7 @@ class SymbolicTree:
         return self._bases[joint]
 
     def joint_pose(self, joint: int) -> Pose:
-        """Pose of a joint's moving frame in the world."""
+        """World pose of a joint's moving frame."""
         if joint not in self._joints:
             first, count = self.model.joints[joint].idx_v, self.model.joints[joint].nv
             motion = joint_motion(self.model, joint, self.coordinates[first : first + count])
@@ -136,7 +137,7 @@ class SymbolicTree:
         return self._joints[joint]
 
     def frame_pose(self, frame: int) -> Pose:
-        """Pose of a frame in the world; the errors of frames that it hangs on act on it."""
+        """World pose of a frame, with the errors of the frames that carry it."""
         if frame not in self._frames:
             parent = parent_frame(self.model, frame)
             placement = self._frame_placements.get(frame)
@@ -150,7 +151,7 @@ class SymbolicTree:
         return self._frames[frame]
 
     def joints_to(self, frame: int) -> list[int]:
-        """Joints that move a frame, from it to the base."""
+        """Indices of the joints that move a frame, from the frame to the base."""
         joint, joints = int(self.model.frames[frame].parentJoint), []
         while joint > 0:
             joints.append(joint)
@@ -159,7 +160,7 @@ class SymbolicTree:
 
 
 def nominal_placement(model: pin.Model, placement: Placement) -> pin.SE3:
-    """Placement of a joint, or of a frame in the frame that it hangs on, or else in its joint."""
+    """Nominal placement of a joint, or of a frame in the frame or joint that carries it."""
     if not placement.of_frame:
         return model.jointPlacements[placement.index]
     parent, nominal = parent_frame(model, placement.index), model.frames[placement.index].placement
@@ -167,13 +168,13 @@ def nominal_placement(model: pin.Model, placement: Placement) -> pin.SE3:
 
 
 class SymbolicRobot:
-    """The closed-loop model of a robot as expressions of drives, passive joints and errors.
+    """Closed-loop model of a robot as expressions of drives, passive joints and errors.
 
     Args:
         robot: The nominal robot.
         drives: Commanded drive coordinates, shape (n_drives,), [m, rad].
         passive: Passive coordinates, shape (n_passive,), [m, rad].
-        errors: Parameter name to expression or number, [unit of the parameter].
+        errors: Names of parameters, mapped to expressions or numbers, [unit of the parameter].
         conditions: Conditions of the posture; neutral where absent.
     """
 
@@ -199,16 +200,16 @@ class SymbolicRobot:
         )
 
     def frame_pose(self, name: str) -> Pose:
-        """Pose of a named frame in the world."""
+        """World pose of a named frame."""
         return self.tree.frame_pose(self.robot.frame_id(name))
 
     def closure_residual(self) -> ca.SX:
-        """g(q, θ) of all closures, shape (closure_rows,), [m, rad]."""
+        """Residual g(q, θ) of all closures, shape (closure_rows,), [m, rad]."""
         return closure_residual(self.robot, self.tree)
 
 
 def closure_residual(robot: Robot, tree: SymbolicTree) -> ca.SX:
-    """Constrained rows of all closures: position of frame b in a, or log6 of its pose in a.
+    """Constrained components of all closures: position of frame b in a, or log6 of its pose in a.
 
     Args:
         robot: Robot with the closures.
@@ -230,7 +231,7 @@ def closure_residual(robot: Robot, tree: SymbolicTree) -> ca.SX:
 def erroneous_placements(
     model: pin.Model, twists: Mapping[Placement, ca.SX]
 ) -> tuple[dict[int, Pose], dict[int, Pose]]:
-    """Placement · exp6(δ) of every joint and every frame that has a twist."""
+    """Placements · exp6(δ) of the joints and of the frames with errors, by index."""
     joints: dict[int, Pose] = {}
     frames: dict[int, Pose] = {}
     for placement, twist in twists.items():

@@ -1,4 +1,4 @@
-"""Several sessions as one: each keeps its zeros, its gauges and the offsets that were active."""
+"""Joining of sessions: each keeps its gauge zeros, its gauges and its active offsets."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from orthocal.measurement.files.session_file import load_session
 from orthocal.session.session import Posture, Session, Setup
 from orthocal.text import composed
 
-KEPT = 4
-"""Joined sessions whose parts are kept."""
+CACHE_SIZE = 4
+"""Number of joined sessions whose parts are cached."""
 
 Value = TypeVar("Value")
 
@@ -25,32 +25,32 @@ Given = Session | str | Path
 """A session, or the path to one."""
 
 
-def gather_sessions(given: Given | Sequence[Given]) -> list[Session]:
+def gather_sessions(sources: Given | Sequence[Given]) -> list[Session]:
     """List of one or several sessions; paths are loaded.
 
     Raises:
-        SessionError: If a path is none of a session.
-        TypeError: If an argument is of another kind.
+        SessionError: If a path does not lead to a valid session.
+        TypeError: If an argument has another type.
     """
-    several = [given] if isinstance(given, Session | str | Path) else given
-    require_kind(several, (list, tuple), expected="a Session, the path to one, or a list of them")
-    for one in several:
-        require_kind(one, (Session, str, Path), expected="a Session, or the path to one")
-    return [one if isinstance(one, Session) else load_session(one) for one in several]
+    listed = [sources] if isinstance(sources, Session | str | Path) else sources
+    require_kind(listed, (list, tuple), expected="a Session, the path to one, or a list of them")
+    for source in listed:
+        require_kind(source, (Session, str, Path), expected="a Session, or the path to one")
+    return [source if isinstance(source, Session) else load_session(source) for source in listed]
 
 
 def join_sessions(sessions: Sequence[Session]) -> Session:
-    """One session of all readings of several on the same robot.
+    """Join sessions on the same robot into one session with all their readings.
 
-    Setups, postures and gauges are named after their session. The active offsets and the mechanical
-    adjustments are those of the last session: the errors of the machine are those that it has then.
+    Setups, postures and gauges are named after their session. Active offsets and mechanical
+    adjustments are those of the last session. So the errors are those of the machine at that time.
 
     Args:
-        sessions: In the order in which they were measured, joined ones among them or not; a single
-            one is returned unchanged.
+        sessions: Sessions in the order of measurement, each joined before or not. A single one is
+            returned unchanged.
 
     Raises:
-        SessionError: If there are none, or of different robots or effects.
+        SessionError: If there is no session, or if robots, effects, firmware or tolerances differ.
     """
     if not sessions:
         raise SessionError("there is no session to join")
@@ -101,49 +101,56 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
 
 
 def _join_tolerances(sessions: Sequence[Session]) -> dict[str, float]:
-    """Tolerances that sessions on one machine state.
+    """Stated tolerances of all sessions on one machine.
 
     Raises:
-        SessionError: If they do not agree.
+        SessionError: If two sessions state different tolerances for one key.
     """
     tolerances: dict[str, float] = {}
-    of: dict[str, Session] = {}
+    first_session: dict[str, Session] = {}
     for session in sessions:
         for key, value in session.robot.parameters.stated.items():
             if tolerances.setdefault(key, value) != value:
                 other = tolerances[key]
                 raise SessionError(
-                    f"is {value:g}; it is {other:g} in {of[key].path or 'another session'}, and "
+                    f"is {value:g}; it is {other:g} in "
+                    f"{first_session[key].path or 'another session'}, and "
                     "the machine is the same; expected one value. "
                     f"--tolerance '{key}={other:g}' states it for all sessions",
                     where=f"{session.path or 'session'}: calibration.tolerances.{key}",
                 )
-            of.setdefault(key, session)
+            first_session.setdefault(key, session)
     return tolerances
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=CACHE_SIZE)
 def split_sessions(session: Session) -> tuple[Session, ...]:
-    """Parts of a joined session, with their names in it; another session is its only part.
+    """Sessions of which a joined session consists; any other session is its only part.
 
-    The parts of the last sessions are kept, and with them what is known of the same parts.
+    Names in a part are those of the joined session. The parts are cached, so that results that are
+    cached for a part are found again.
     """
     if not session.joined:
         return (session,)
-    label = [r.setup.partition("/")[0] for r in session.readings]
+    labels = dict.fromkeys(_label_of(r.setup) for r in session.readings)
     return tuple(
         replace(
             session,
-            setups={k: v for k, v in session.setups.items() if k.partition("/")[0] == part},
-            readings=tuple(r for r, of in zip(session.readings, label, strict=True) if of == part),
+            setups={name: s for name, s in session.setups.items() if _label_of(name) == label},
+            readings=tuple(r for r in session.readings if _label_of(r.setup) == label),
         )
-        for part in dict.fromkeys(label)
+        for label in labels
     )
 
 
 def name_within(name: str, *, joined: bool) -> str:
-    """A setup's or posture's name in its own session, where sessions were joined or not."""
+    """Name of a setup or posture in its session before sessions were joined."""
     return name.partition("/")[2] or name if joined else name
+
+
+def _label_of(name: str) -> str:
+    """Label of a session, the first part of a name in a joined session."""
+    return name.partition("/")[0]
 
 
 def _merged(mappings: Iterable[Mapping[str, Value]]) -> dict[str, Value]:
@@ -151,32 +158,33 @@ def _merged(mappings: Iterable[Mapping[str, Value]]) -> dict[str, Value]:
 
 
 def _labels(sessions: Sequence[Session]) -> list[dict[str, str]]:
-    """Names of the sessions in the joined one, all different.
+    """Unique labels of the sessions to be joined.
 
     Returns:
-        For each session its present label ("" unless it was joined before) and the new one: the
-        name of its directory, or its number.
+        Mapping of present to new labels for each session. The present label is "" unless the
+        session was joined before. The new one is the name of its directory, or its number.
     """
     names: list[tuple[int, str, str]] = []
     for i, session in enumerate(sessions):
         if session.joined:
-            old = dict.fromkeys(name.partition("/")[0] for name in session.setups)
-            names += [(i, label, label) for label in old]
+            names += [(i, label, label) for label in dict.fromkeys(map(_label_of, session.setups))]
             continue
         folder = "" if session.path is None else session.path.resolve().parent.name
-        plain = "".join("_" if c.isspace() or c in ',;"/' else c for c in composed(folder))
-        names.append((i, "", plain or f"session-{len(names) + 1}"))
+        label = "".join("_" if c.isspace() or c in ',;"/' else c for c in composed(folder))
+        names.append((i, "", label or f"session-{len(names) + 1}"))
     if len({new for _, _, new in names}) < len(names):
         names = [(i, old, f"{new}-{k}") for k, (i, old, new) in enumerate(names, start=1)]
     return [{old: new for k, old, new in names if k == i} for i in range(len(sessions))]
 
 
 def _rename(session: Session, labels: Mapping[str, str]) -> Session:
-    """The session with setups, postures and gauges that carry its labels, and with its offsets.
+    """Session whose setups, postures and gauges have names with labels.
+
+    Active offsets, adjustments and compensation become those of the setups.
 
     Args:
         session: A session, joined before or not.
-        labels: Present labels to new ones, as of `_labels`.
+        labels: Present labels, mapped to new ones; see `_labels`.
     """
 
     def named(name: str) -> str:

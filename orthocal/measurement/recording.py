@@ -1,12 +1,12 @@
 """Recording of readings: rows in the order of the sheet, each change on disk before it counts.
 
-No change renumbers a row: added rows come last, and a blank line stays where a row was deleted.
+No change renumbers a row: added rows come last, and a blank line remains where a row was deleted.
 
 A change is appended to a journal beside the readings.csv and synced; then the CSV is replaced. Each
 line of the journal holds the digests of the CSV before and after its change. If the process is
-killed or the power fails, the CSV is that of some change, and the later changes of the journal are
-applied again. A recording that ends in order closes its journal: from then on the CSV counts,
-edited or not.
+killed or the power fails, the CSV contains the changes up to some line of the journal. The later
+changes are applied again. A recording that ends regularly closes its journal: from then on the CSV
+counts, edited or not.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ from orthocal.measurement.files.point_rows import (
     locate_stations,
 )
 from orthocal.measurement.files.readings_checks import check_conditions, check_range
-from orthocal.measurement.files.schema import LARGEST_READING_MM, MOST_READINGS
+from orthocal.measurement.files.readings_file import FIRST_LINE
 from orthocal.measurement.files.session_file import load_rows
+from orthocal.measurement.files.session_keys import LARGEST_READING_MM, MOST_READINGS
 from orthocal.measurement.files.write_session import readings_table
 from orthocal.runtime.interrupts import postponed_interrupt
 from orthocal.sensors.points import Coordinate
@@ -49,37 +50,36 @@ SUFFIX = ".journal"
 """Suffix of the journal, after the name of the CSV."""
 
 LONGEST_LINE = 2**16
-"""Largest length of a line of the journal, [bytes]: it names two rows at most."""
+"""Largest length of a line of the journal, [bytes]: a line names six rows at most."""
 
 CLOSED: dict[str, Any] = {"closed": True}
-"""Last line of a recording that ended in order."""
+"""Last line of a recording that ended regularly."""
 
 DECIMALS = 9
 """Decimals of a recorded reading in mm."""
 
-FIRST_LINE = 2
-"""Line of the first row of a readings.csv, after the header."""
 
 BUSY = "these readings are being recorded by another process; one at a time"
 
 
 class Change(BaseModel):
-    """A change of the rows."""
+    """Change of the rows of a recording."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     done: Literal["read", "emptied", "added", "dropped"]
-    """A value was read for a row; all rows of its setup were emptied; a row that repeats it was
-    added at the end; it was deleted. The three rows of a point change together."""
+    """Kind of change: `read` gives a row its value; `emptied` removes the values of all rows of its
+    setup; `added` appends a row that repeats it; `dropped` deletes it. The three rows of a point
+    change together."""
     rows: Annotated[list[ReadingKey], Field(min_length=1, max_length=6)]
-    """The row or the three of a point, then as many added ones."""
+    """Keys of the row, or of the three rows of a point, then of as many added rows."""
     reading_mm: Annotated[Number, Field(ge=-LARGEST_READING_MM, le=LARGEST_READING_MM)] | None = (
         None
     )
     point_mm: Annotated[list[Coordinate], Field(min_length=3, max_length=3)] | None = None
     """Readings of the three rows of a point."""
     conditions: Conditions | None = None
-    """Stated with the value; those that are None stay what they were."""
+    """Conditions stated with the value; those that are None do not change."""
 
 
 class _JournalLine(Change):
@@ -92,21 +92,21 @@ def change_rows(rows: Sequence[Reading], change: Change) -> tuple[Reading, ...]:
     """Rows after a change.
 
     Raises:
-        SessionError: If the row does not exist, or the added one does.
+        SessionError: If a row to change does not exist, or an added row exists already.
     """
     indices = {row.key: i for i, row in enumerate(rows)}
     changed = list(rows)
-    half = len(change.rows) // 2 if change.done == "added" else len(change.rows)
-    keys, added = change.rows[:half], change.rows[half:]
+    count = len(change.rows) // 2 if change.done == "added" else len(change.rows)
+    keys, added = change.rows[:count], change.rows[count:]
     for key in keys:
         if key not in indices:
             raise SessionError(f"there is no row {' '.join(str(k) for k in key if k)}")
-    places = [indices[key] for key in keys]
+    selected = [indices[key] for key in keys]
     if change.done == "read":
         values = change.point_mm or [v for v in (change.reading_mm,) if v is not None]
-        if len(values) != len(places):
+        if len(values) != len(selected):
             raise SessionError("the reading is missing")
-        for index, value in zip(places, values, strict=True):
+        for index, value in zip(selected, values, strict=True):
             row = rows[index]
             conditions = _merge_conditions(row.conditions, change.conditions)
             changed[index] = replace(row, value=value * MM, conditions=conditions)
@@ -116,7 +116,7 @@ def change_rows(rows: Sequence[Reading], change: Change) -> tuple[Reading, ...]:
         setup = base_name(keys[0][0])
         changed = [_emptied(r) if base_name(r.setup) == setup else r for r in changed]
     elif change.done == "dropped":
-        changed = [row for i, row in enumerate(changed) if i not in places]
+        changed = [row for i, row in enumerate(changed) if i not in selected]
     else:
         if len(added) != len(keys) or any(key in indices for key in added):
             raise SessionError("the added row exists already, or is not named")
@@ -129,7 +129,7 @@ def change_rows(rows: Sequence[Reading], change: Change) -> tuple[Reading, ...]:
 
 
 def _merge_conditions(planned: Conditions | None, stated: Conditions | None) -> Conditions | None:
-    """Conditions as planned, with those that are stated in their place."""
+    """Planned conditions, replaced by those that are stated."""
     if planned is None or stated is None:
         return planned or stated
     return Conditions(
@@ -140,21 +140,21 @@ def _merge_conditions(planned: Conditions | None, stated: Conditions | None) -> 
 
 
 def _emptied(row: Reading) -> Reading:
-    """The row before it was read: only its approach is planned."""
+    """Row without its reading and its measured conditions; only the approach is planned."""
     approach = None if row.conditions is None else row.conditions.approach
     return replace(row, value=math.nan, conditions=Conditions(approach) if approach else None)
 
 
 class Recording:
-    """A session that is being measured, locked against other recordings.
+    """Session that is being measured, locked against other recordings.
 
     Args:
-        session: The session as it was when the recording began.
-        rows: Its rows in the order of measuring; NaN before they are read.
+        session: The session at the start of the recording.
+        rows: Its rows in the order of measurement; NaN before they are read.
         journal: Journal of the changes.
         digest: Digest of the CSV on disk.
         restored: Number of changes that a killed recording had not written to the CSV.
-        edited: Whether the CSV is none of those that the killed recording wrote.
+        edited: Whether the CSV differs from all versions that the killed recording wrote.
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class Recording:
 
     @property
     def path(self) -> Path:
-        """The readings.csv."""
+        """Path of the readings.csv."""
         return _csv_of(self.session)
 
     @property
@@ -195,19 +195,20 @@ class Recording:
         return len({self.rows[i].line for i in self.missing})
 
     def measured(self, *, without: Collection[int] = ()) -> Session:
-        """The session with the rows that were read; gauges stay aligned as planned.
+        """Session with the rows that were read; alignment postures remain the planned ones.
 
         Args:
-            without: Indices of rows to be left out.
+            without: Indices of rows to exclude.
         """
         session = replace(self.session, readings=self.rows, sha256="")
         read = [row for i, row in enumerate(self.rows) if row.is_read and i not in without]
-        measured = session if len(read) == len(self.rows) else session.select(read)
-        return locate_stations(measured, partial=True)
+        if len(read) < len(self.rows):
+            session = session.select(read)
+        return locate_stations(session, partial=True)
 
     @property
     def is_located(self) -> bool:
-        """True if the points so far determine their stations."""
+        """True if the points read up to now determine their stations."""
         read = [row for row in self.rows if row.is_read]
         try:
             locate_stations(replace(self.session, readings=tuple(read)))
@@ -222,7 +223,7 @@ class Recording:
     def next_empty(self, skipped: frozenset[ReadingKey] = frozenset()) -> int | None:
         """Index of the next row without a reading, except those that are skipped.
 
-        The rows of a setup follow each other, also those that were added.
+        All rows of a setup precede those of the next setup, added rows included.
         """
         setups = list(dict.fromkeys(row.setup for row in self.rows))
         empty = [i for i in self.missing if self.rows[i].key not in skipped]
@@ -233,13 +234,13 @@ class Recording:
 
         Args:
             index: Index of the row.
-            value: Reading, [m]; of a point its coordinates in the station, shape (3,), [m].
-            conditions: Conditions of the reading; those that are None stay as planned.
+            value: Reading, [m], or coordinates of a point in its station, shape (3,), [m].
+            conditions: Conditions of the reading; those that are None remain the planned ones.
 
         Raises:
-            SessionError: If it is beyond the range of the gauge, or the row cannot have the
-                conditions.
-            OutputError: If it cannot be written.
+            SessionError: If the reading is beyond the range of the gauge, or the row cannot have
+                the conditions.
+            OutputError: If the files cannot be written.
         """
         rows = [self.rows[i] for i in self.point(index)]
         setups = [self.session.setups[row.setup] for row in rows]
@@ -247,46 +248,54 @@ class Recording:
         for row, setup in zip(rows, setups, strict=True):
             along = getattr(setup.sensor, "along", None)
             reading = to_mm(float(value if along is None else np.dot(along, value)))
-            gauge, difference = self.session.gauges[setup.gauge], self.session.is_difference(row)
-            largest = largest_reading(setup.sensor)
-            check_range(reading, gauge, difference, row.label_with_cycle, largest)
+            check_range(
+                reading,
+                self.session.gauges[setup.gauge],
+                difference=self.session.is_difference(row),
+                where=row.label_with_cycle,
+                largest=largest_reading(setup.sensor),
+            )
             if conditions is not None:
                 check_conditions(
-                    conditions, self.session.robot, row.minus is not None, row.label_with_cycle
+                    conditions,
+                    self.session.robot,
+                    difference=row.minus is not None,
+                    where=row.label_with_cycle,
                 )
             readings_mm.append(round(reading, DECIMALS))
         keys: list[ReadingKey] = [row.key for row in rows]
-        of_point = {"point_mm": readings_mm} if len(rows) > 1 else {"reading_mm": readings_mm[0]}
-        self._apply(Change(done="read", rows=keys, conditions=conditions, **of_point))
+        values = {"point_mm": readings_mm} if len(rows) > 1 else {"reading_mm": readings_mm[0]}
+        self._apply(Change(done="read", rows=keys, conditions=conditions, **values))
 
     def repeat(self, index: int) -> int:
-        """Add another cycle of a row after the last one, and return its index.
+        """Append a row that repeats a row in another cycle, and return its index.
 
-        A repeated difference must not follow from others of its cycle, nor share the cycle with
-        readings of another form. It gets a new cycle.
+        A repeated difference must not follow from other differences of its cycle. A cycle must not
+        contain both readings and differences. In both cases the row gets a new cycle.
 
         Raises:
             SessionError: If there are too many rows.
-            OutputError: If it cannot be written.
+            OutputError: If the files cannot be written.
         """
         row = self.rows[index]
         if len(self.rows) >= MOST_READINGS:
             raise SessionError(f"there are {MOST_READINGS} rows already, the largest number")
-        of_setup = [r for r in self.rows if r.setup == row.setup]
-        cycle = 1 + max(r.cycle for r in of_setup if row.minus is not None or r.place == row.place)
-        if any(r.cycle == cycle and (r.minus is None) != (row.minus is None) for r in of_setup):
-            cycle = 1 + max(r.cycle for r in of_setup)
+        same_setup = [r for r in self.rows if r.setup == row.setup]
+        is_difference = row.minus is not None
+        cycle = 1 + max(r.cycle for r in same_setup if is_difference or r.place == row.place)
+        if any(r.cycle == cycle and (r.minus is not None) != is_difference for r in same_setup):
+            cycle = 1 + max(r.cycle for r in same_setup)
         rows = [self.rows[i] for i in self.point(index)]
         added = [replace(_emptied(r), cycle=cycle).key for r in rows]
         self._apply(Change(done="added", rows=[*(r.key for r in rows), *added]))
         return len(self.rows) - len(added)
 
     def drop(self, index: int) -> None:
-        """Delete a row.
+        """Delete a row, or the three rows of a point.
 
         Raises:
-            SessionError: If it is the only one.
-            OutputError: If it cannot be written.
+            SessionError: If no other row remains.
+            OutputError: If the files cannot be written.
         """
         rows = self.point(index)
         if len(self.rows) == len(rows):
@@ -294,10 +303,10 @@ class Recording:
         self._apply(Change(done="dropped", rows=[self.rows[i].key for i in rows]))
 
     def empty(self, index: int) -> None:
-        """Delete all readings of a row's setup, to be read again; the journal keeps them.
+        """Delete all readings of a row's setup, to be read again; the journal preserves them.
 
         Raises:
-            OutputError: If it cannot be written.
+            OutputError: If the files cannot be written.
         """
         self._apply(Change(done="emptied", rows=[self.rows[index].key]))
 
@@ -307,31 +316,33 @@ class Recording:
             self._journal.append(CLOSED)
 
     def _apply(self, change: Change) -> None:
+        """Change the rows: first in the journal, then in the CSV, then in memory."""
         rows = change_rows(self.rows, change)
         content = _table(rows, self.session)
+        digest = _digest(content)
         with postponed_interrupt():
             line = change.model_dump(mode="json", exclude_none=True, by_alias=True) | {
                 "rows": [list(key) for key in change.rows],
                 "at": datetime.now(UTC).isoformat(timespec="seconds"),
                 "before": self._digest,
-                "after": _digest(content),
+                "after": digest,
             }
             self._journal.append(line)
             _write(self.path, content)
-            self.rows, self._digest = rows, _digest(content)
+            self.rows, self._digest = rows, digest
 
 
 @contextmanager
 def open_recording(path: str | Path) -> Iterator[Recording]:
-    """Open a session for recording; a plan without readings gets its rows.
+    """Open a session for recording; a plan without a readings.csv gets one.
 
     Args:
         path: The session.yaml, or its directory.
 
     Raises:
-        SessionError: If it does not load.
-        OrthocalError: If another process records it, or its journal is damaged.
-        OutputError: If its directory cannot be written to.
+        SessionError: If the session does not load.
+        OrthocalError: If another process records the session, or its journal is damaged.
+        OutputError: If its directory is not writable.
     """
     session = load_rows(path)
     csv = _csv_of(session)
@@ -368,7 +379,7 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
 
 
 def _files_to_add(session: Session) -> dict[Path, bytes]:
-    """Files that make a plan a session: its rows, then the YAML that names them."""
+    """Files that turn a plan into a session: readings.csv, then session.yaml, which names it."""
     if session.readings_path is not None or session.path is None:
         return {}
     csv, table = _csv_of(session), _table(session.readings, session)
@@ -410,8 +421,8 @@ def _is_outdated(session: Session) -> bool:
     """True if the files of a session changed since they were loaded."""
     if session.path is None or session.readings_path is None:
         return True
-    parts = (read_file(f, error=SessionError) for f in (session.path, session.readings_path))
-    return _digest(b"\0".join(parts)) != session.sha256
+    contents = (read_file(f, error=SessionError) for f in (session.path, session.readings_path))
+    return _digest(b"\0".join(contents)) != session.sha256
 
 
 def _write(csv: Path, content: bytes) -> None:
@@ -426,13 +437,15 @@ def _csv_of(session: Session) -> Path:
 
 
 def _table(rows: Sequence[Reading], session: Session) -> bytes:
-    """Content of the readings.csv, each row in its line; rows of a new plan follow each other."""
-    header, *texts = readings_table(rows, session.setups, decimals=DECIMALS).splitlines(
-        keepends=True
-    )
+    """Content of the readings.csv; blank lines keep every row in its line.
+
+    Rows of a new plan have no line yet and follow each other.
+    """
+    table = readings_table(rows, session.setups, decimals=DECIMALS)
+    header, *texts = table.splitlines(keepends=True)
     lines = [header]
-    firsts = [part[0] for part in gather_points(rows, session.setups)]
-    for row, text in zip(firsts, texts, strict=True):
+    first_rows = [group[0] for group in gather_points(rows, session.setups)]
+    for row, text in zip(first_rows, texts, strict=True):
         lines += ["\n"] * ((row.line or 0) - FIRST_LINE + 1 - len(lines))
         lines.append(text)
     return "".join(lines).encode()
@@ -443,7 +456,7 @@ def _digest(content: bytes) -> str:
 
 
 def _read_lines(journal: Journal) -> list[tuple[str, _JournalLine]]:
-    """Changes since a recording ended in order; a new journal gets its header."""
+    """Changes since a recording ended regularly; a new journal gets its header."""
     lines: list[tuple[str, _JournalLine]] = []
     has_header = False
     for where, data in journal.entries():
@@ -474,10 +487,10 @@ def _read_lines(journal: Journal) -> list[tuple[str, _JournalLine]]:
 def _find_pending(
     lines: Sequence[tuple[str, _JournalLine]], digest: str
 ) -> tuple[Sequence[tuple[str, _JournalLine]], bool]:
-    """Changes that the CSV does not have yet, and whether it was edited since.
+    """Changes that the CSV does not contain yet, and whether the CSV was edited since.
 
     Args:
-        lines: Lines of the journal.
+        lines: Places and lines of the journal.
         digest: Digest of the CSV.
     """
     if not lines or lines[-1][1].after == digest:

@@ -1,4 +1,4 @@
-"""Conditions of the readings of a session in the course of a day."""
+"""Conditions of the readings of a session: schedule and temperatures of a day."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from orthocal.robot.model import Robot
 from orthocal.session.points import gather_points, names_in_files
 from orthocal.session.session import Conditions, Session
 
-MINUTES_A_SETUP = 10.0
-"""Usual time to mount a gauge."""
+MINUTES_PER_SETUP = 10.0
+"""Usual time to mount a gauge, [min]."""
 
-MINUTES_A_READING = 0.5
+MINUTES_PER_READING = 0.5
+"""Usual time of a reading, [min]."""
 
 MORNING = datetime(2025, 1, 6, 9, 0)
-"""Time of the first reading of a day that is not dated."""
-
+"""Time of the first reading of a day without a date."""
 
 STATED: tuple[Condition, ...] = ("approach", "temperature", "time")
-"""Conditions that a reading states; others belong to the machine or to the session."""
+"""Conditions that a reading may state; others belong to the machine or to the session."""
 
 
 def needed_conditions(robot: Robot) -> tuple[Condition, ...]:
@@ -34,22 +34,23 @@ def needed_conditions(robot: Robot) -> tuple[Condition, ...]:
     return tuple(c for c in STATED if c in needed)
 
 
-def in_course(
+def schedule_readings(
     session: Session,
     *,
     temperatures: tuple[float, float] | None = None,
     durations: Mapping[str, tuple[float, float]] | None = None,
     start: datetime = MORNING,
 ) -> Session:
-    """Session whose readings were taken one after the other on a day that warms or cools evenly.
+    """Session with times of successive readings, and temperatures that change linearly with time.
 
-    Differences have no conditions. The coordinates of a point are read at once.
+    Approaches remain. Differences have no conditions. The coordinates of a point have one time.
 
     Args:
-        session: The session; approaches stay what they are.
-        temperatures: Temperature of the first and the last reading, [°C]; by default the neutral
-            one.
-        durations: Minutes to mount a gauge and to read it, by its name; by default usual ones.
+        session: The session.
+        temperatures: Temperature of the first and of the last reading, [°C]; the neutral
+            temperature by default.
+        durations: Names of gauges, mapped to the time to mount the gauge and the time of a reading,
+            [min]; usual times by default.
         start: Time of the first reading.
     """
     lines = gather_points(session.readings, session.setups)
@@ -57,21 +58,22 @@ def in_course(
     setups = [names[line[0].setup][0] for line in lines]
     if not setups:
         return session
-    usual, known = (MINUTES_A_SETUP, MINUTES_A_READING), durations or {}
-    of_setup = {name: known.get(gauge, usual) for name, gauge in names.values()}
+    usual, durations = (MINUTES_PER_SETUP, MINUTES_PER_READING), durations or {}
+    of_setup = {name: durations.get(gauge, usual) for name, gauge in names.values()}
     steps = [of_setup[a][1] + of_setup[b][0] * (a != b) for a, b in pairwise(setups)]
     minutes = np.repeat(np.cumsum([0.0, *steps]), [len(line) for line in lines])
     neutral = neutral_values(session.robot)["temperature"]
-    first, last = temperatures or (neutral, neutral)
-    warmth = np.interp(minutes, [0.0, max(float(minutes[-1]), 1e-9)], [first, last])
+    at_readings = np.interp(
+        minutes, [0.0, max(float(minutes[-1]), 1e-9)], temperatures or (neutral, neutral)
+    )
     readings = []
-    for reading, minute, temperature in zip(session.readings, minutes, warmth, strict=True):
+    for reading, minute, temperature in zip(session.readings, minutes, at_readings, strict=True):
         if reading.minus is None:
-            stated = Conditions(
+            conditions = Conditions(
                 None if reading.conditions is None else reading.conditions.approach,
                 round(float(temperature), 1),
                 start + timedelta(minutes=float(minute)),
             )
-            reading = replace(reading, conditions=stated)
+            reading = replace(reading, conditions=conditions)
         readings.append(reading)
     return replace(session, readings=tuple(readings), sha256="")

@@ -1,4 +1,4 @@
-"""Contact of the sensors with the nominal machine."""
+"""Contacts of the sensors with the nominal machine."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from orthocal.session.session import Session
 
 
 def locate_contacts(session: Session) -> dict[str, tuple[list[str], Contact]]:
-    """Contacts of all sensors with the nominal machine.
+    """Contacts of all sensors with the nominal machine in the postures of their readings.
 
     Returns:
-        Setup to the postures of its readings, and its contact in them.
+        Names of setups, mapped to the names of the postures and the contacts in them.
     """
     robot = session.robot
-    nominal = drive_table(session) + session.active_offsets
+    drives = drive_table(session) + session.active_offsets
     closure = nominal_closure(robot)
-    passive = closure.close(nominal, names=list(session.postures))
+    passive = closure.close(drives, names=list(session.postures))
     geometry, functions = closure.geometry(), robot_functions(robot)
 
-    def poses(frame: str, drives: Array, passive: Array) -> Array:
-        return functions.pose(frame)(drives, passive, geometry.placements)[0]
+    def poses(frame: str, rows: list[int]) -> Array:
+        return functions.pose(frame)(drives[rows], passive[rows], geometry.placements)[0]
 
     postures = {name: i for i, name in enumerate(session.postures)}
-    read: dict[str, set[str]] = {name: set() for name in session.setups}
+    read: dict[str, set[str]] = {name: set() for name in session.setups}  # postures by setup
     for reading in session.readings:
         read[reading.setup].update(p for p in (reading.posture, reading.minus) if p is not None)
     result = {}
@@ -34,7 +34,7 @@ def locate_contacts(session: Session) -> dict[str, tuple[list[str], Contact]]:
         names = sorted(read[setup.name], key=postures.__getitem__)
         rows, frames = [postures[n] for n in names], setup.sensor.frames(robot)
         contact = setup.sensor.contact(
-            [poses(f, nominal[rows], passive[rows]) for f in frames.in_posture],
+            [poses(f, rows) for f in frames.in_posture],
             reference_poses(robot, frames.at_zero),
             robot,
         )

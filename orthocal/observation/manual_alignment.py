@@ -1,15 +1,14 @@
 """Manual alignment: the operator centres a ball on the actual rod, not on its nominal position.
 
-Some nuisance parameters are deviations from what the operator sees in the posture in which the
-gauge is aligned (`Session.alignment_postures`), which depends on the errors of the machine. To
-first order,
+Some nuisance parameters are deviations from the aligned position, which depends on the errors of
+the machine in the alignment posture (`Session.alignment_postures`). To first order,
 
     ν = ν_deviation + S (θ − θ_active)
 
 with S the sensitivity of a virtual sensor in that posture, and θ_active the offsets that the
-controller already applies. In a session before mechanical adjustments θ is that of the machine
-then. Second-order terms, some hundredths of a millimetre for offsets of
-millimetres, are far below the uncertainty of alignment by eye.
+controller already applies. In a session before mechanical adjustments, θ are the errors of the
+machine at that time. Second-order terms are some hundredths of a millimetre for offsets of
+millimetres, far below the uncertainty of alignment by eye.
 """
 
 from __future__ import annotations
@@ -29,13 +28,19 @@ class ManualAlignment:
     """Nuisance parameters of aligned gauges as functions of the machine's errors."""
 
     sensitivity: Array
-    """S, derivative by all elementary errors, shape (n_nuisance, n_errors), [SI]."""
+    """S, derivative with respect to all elementary errors, shape (n_nuisance, n_errors), [SI]."""
     start: Array
-    """Value without errors, −S θ_active and what later adjustments changed, shape (n_nuisance,),
-    [SI]."""
+    """Value without errors, −S θ_active plus that of adjustments, shape (n_nuisance,), [SI]."""
 
     def __call__(self, errors: Array) -> Array:
-        """Nuisance parameters, shape (..., n_nuisance) of errors (..., n_errors), [SI]."""
+        """Nuisance parameters of aligned gauges.
+
+        Args:
+            errors: Elementary errors, shape (..., n_errors), [SI].
+
+        Returns:
+            Shape (..., n_nuisance), [SI].
+        """
         return np.asarray(errors @ self.sensitivity.T + self.start)
 
     @property
@@ -46,16 +51,16 @@ class ManualAlignment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """One nuisance parameter and the virtual sensor that it is aligned with."""
+    """Nuisance parameter and the virtual sensor with which it is aligned."""
 
     parameter: int
     """Index of the nuisance parameter."""
     setup: Setup
-    """The setup with the virtual sensor."""
+    """Setup with the virtual sensor."""
     posture: Posture
-    """The posture of alignment, with the active offsets added: as on the nominal machine."""
+    """Alignment posture with the active offsets added, for the nominal machine."""
     active: Array
-    """Those offsets, shape (n_drives,), [m, rad]."""
+    """Active offsets, shape (n_drives,), [m, rad]."""
 
 
 def list_alignments(session: Session, nuisance: NuisanceParameters) -> list[Alignment]:
@@ -64,10 +69,10 @@ def list_alignments(session: Session, nuisance: NuisanceParameters) -> list[Alig
     active = session.robot.drive_zero - session.zero_drives
     result = []
     for i, setup in enumerate(session.setups.values()):
-        if not nuisance.of_setup[i]:  # it has no readings
+        if not nuisance.of_setup[i]:  # without readings
             continue
         virtual = setup.sensor.aligned_to(session.robot)
-        # parameters of effects follow, and are not aligned
+        # the parameters of effects, which follow, are not aligned
         for index, parameter in zip(
             nuisance.of_setup[i], setup.sensor.nuisance_parameters, strict=False
         ):
@@ -85,7 +90,7 @@ def list_alignments(session: Session, nuisance: NuisanceParameters) -> list[Alig
 
 
 def virtual_session(session: Session, alignments: Sequence[Alignment]) -> Session:
-    """Session of one reading of the virtual sensor of each alignment."""
+    """Session with one reading of the virtual sensor of each alignment."""
     names = [str(i) for i in range(len(alignments))]
     return replace(
         session,

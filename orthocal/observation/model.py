@@ -1,14 +1,14 @@
-"""The observation model: predicted readings h(q, θ, ν) and their derivatives.
+"""Observation model: predicted readings h(q, θ, ν) and their derivatives.
 
-A reading depends on the geometry of the machine (errors θ), on the passive coordinates q that close
-the loops, and on nuisance parameters ν of its sensor. Gauge zeros are not part of the model. Near
+A reading depends on the errors θ of the machine, on the passive coordinates q that close the loops,
+and on nuisance parameters ν of its sensor. Gauge zeros are not part of the model. Near
 closed loops, g(q, θ) ≈ 0, the implicit function theorem gives
 
     dq = −g_q⁻¹ (g + g_θ dθ),  J = h_θ − h_q g_q⁻¹ g_θ
 
-Everything takes batches: S machines that differ in their errors, in K postures with any number of
-readings each. One machine is a batch of one. Simulation, solvers, predictive distributions, plans
-and studies all use this module.
+All functions accept batches of S machines that differ in their errors, in K postures with any
+number of readings each. One machine is a batch of one. Simulation, solvers, predictive
+distributions, plans and studies use this module.
 """
 
 from __future__ import annotations
@@ -40,13 +40,14 @@ from orthocal.observation.sensor_groups import (
     group_sensors,
     nuisance_parameters,
 )
+from orthocal.robot.closing import RANK_TOLERANCE
 from orthocal.session.session import Session
 
 MAX_POSTURES, MAX_READINGS = 64, 640
-"""Postures and readings of one block: its Jacobians stay in the processor's cache."""
+"""Most postures and readings of a block, so that its Jacobians fit the processor's cache."""
 
 MAX_PREDICTED = 4096
-"""Readings of all machines that are predicted together, for the memory of their inputs."""
+"""Readings of all machines per call of a prediction, which limits the memory of their inputs."""
 
 MIN_SPARSE_ROWS = 400
 """Rows from which a product with a sparse matrix is faster than with a dense one."""
@@ -57,11 +58,11 @@ class FreeParameters:
     """Scaled free parameters θ̂: machine errors first, then nuisance parameters."""
 
     columns: Array
-    """Elementary errors of one unit of each machine parameter, (n_errors, n_machine), [SI]."""
+    """Elementary errors for one unit of each machine parameter, (n_errors, n_machine), [SI]."""
     nuisance_scale: Array
-    """One unit of each nuisance parameter, shape (n_nuisance,), [SI]."""
+    """Values of one unit of each nuisance parameter, shape (n_nuisance,), [SI]."""
     pattern: _ClosurePattern
-    """Nonzeros of ∂g by the twists that the machine parameters move."""
+    """Nonzeros of ∂g/∂ξ for the twists ξ that the machine parameters change."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,12 +70,12 @@ class _Block:
     """Loop closures with the same number of readings."""
 
     states: Indices
-    """Shape (k,)."""
+    """Indices of the loop closures, shape (k,)."""
     entries: Indices
-    """Entries of each state, shape (k, m). The second postures of pairs follow all entries."""
+    """Entries of each closure, shape (k, m). The second postures of pairs follow all entries."""
     members: tuple[tuple[int, bool, Indices, Indices], ...]
-    """Sensor groups: index; True for second postures of pairs; positions in `entries`, flat; and
-    positions in the group, (n,) each."""
+    """For each sensor group in the block: its index, True for second postures of pairs, positions
+    in the flattened `entries`, shape (n,), and positions in the group, shape (n,)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,73 +87,84 @@ class _Closures:
     inverse: Array
     """g_q⁻¹, shape (S, k, n_passive, n_rows)."""
     by_drive_errors: Array
-    """Shape (S, k, n_rows, n_drive_errors)."""
+    """Derivative of g with respect to the drive errors, shape (S, k, n_rows, n_drive_errors)."""
     by_twists: Array
-    """Nonzeros in the order of the model's pattern, shape (S, k, nnz)."""
+    """Nonzeros of ∂g/∂ξ in the order of the closure pattern, shape (S, k, nnz)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Readings:
-    """Readings of a block and their derivatives, for S machines; shape (S, k m, ...)."""
+    """Readings of a block and their derivatives, for S machines."""
 
     value: Array
+    """h, shape (S, k m), [m]."""
     by_drive_errors: Array
-    """By the errors of the drives, in the posture and in the reference posture."""
+    """Derivative through posture and reference posture, shape (S, k m, n_drive_errors)."""
     by_passive: Array
+    """h_q, shape (S, k m, n_passive)."""
     by_nuisance: Array
+    """h_ν, shape (S, k m, n_nuisance)."""
     by_twists: Sequence[tuple[Indices, Indices, Array]]
-    """Of each sensor group: positions, (n,), columns, (nnz,), and nonzeros, (S, n, nnz)."""
+    """For each sensor group: positions of its readings, (n,), columns of the nonzeros of ∂h/∂ξ,
+    (nnz,), and the nonzeros, (S, n, nnz)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ClosurePattern:
-    """Nonzeros of ∂g by the twists that free parameters move, sorted by rows of g."""
+    """Nonzeros of ∂g/∂ξ for the twists that free parameters change, sorted by rows of g."""
 
     used: Indices
-    """Columns of the twists that free parameters move."""
-    place: Indices
-    """Position of each twist column among the used ones, -1 for others, shape (n_twists,)."""
+    """Indices of the twists that free parameters change, shape (n_used,)."""
+    position: Indices
+    """Position of each twist in `used`, -1 for other twists, shape (n_twists,)."""
     chosen: Indices
-    """Their positions among all nonzeros."""
+    """Positions of the chosen nonzeros among all nonzeros, shape (nnz,)."""
     rows: Indices
+    """Row of each chosen nonzero, shape (nnz,)."""
     columns: Indices
-    """Row and column of each, shape (nnz,)."""
+    """Twist of each chosen nonzero, shape (nnz,)."""
 
     @staticmethod
     def of(functions: RobotFunctions, columns: Array) -> _ClosurePattern:
+        """Pattern for parameters whose units are columns of elementary errors."""
         moved = functions.errors.twists_moved_by(columns).reshape(-1, 6).any(axis=1)
         used = np.flatnonzero(np.repeat(moved, 6))
-        place = np.full(functions.n_twists, -1)
-        place[used] = np.arange(used.size)
+        position = np.full(functions.n_twists, -1)
+        position[used] = np.arange(used.size)
         rows, twists = functions.twist_pattern
-        chosen = np.flatnonzero(place[twists] >= 0)
+        chosen = np.flatnonzero(position[twists] >= 0)
         chosen = chosen[np.argsort(rows[chosen], kind="stable")]
-        return _ClosurePattern(used, place, chosen, rows[chosen], twists[chosen])
+        return _ClosurePattern(used, position, chosen, rows[chosen], twists[chosen])
 
     def dense(self, nonzeros: Array, n_rows: int) -> Array:
-        """Matrices of nonzeros, shape (S, k, n_rows, n_used) of (S, k, nnz)."""
+        """Dense ∂g/∂ξ, shape (S, k, n_rows, n_used), of nonzeros, shape (S, k, nnz)."""
         result: Array = np.zeros((*nonzeros.shape[:2], n_rows * self.used.size))
-        result[:, :, self.rows * self.used.size + self.place[self.columns]] = nonzeros
+        result[:, :, self.rows * self.used.size + self.position[self.columns]] = nonzeros
         return result.reshape(*nonzeros.shape[:2], n_rows, self.used.size)
 
     def times(self, nonzeros: Array, twists: Array, n_rows: int) -> Array:
-        """∂g · ξ of nonzeros, (S, k, nnz), and twists, (S, k, n_twists), or (S, 1, n_twists).
+        """Product ∂g/∂ξ · ξ.
+
+        Args:
+            nonzeros: Nonzeros of ∂g/∂ξ, shape (S, k, nnz).
+            twists: ξ, shape (S, k, n_twists) or (S, 1, n_twists).
+            n_rows: Number of rows of g.
 
         Returns:
             Shape (S, k, n_rows).
         """
         n_sets = max(len(twists), len(nonzeros))
         result = np.zeros((n_sets, nonzeros.shape[1], n_rows))
-        for row, part in self._row_parts(n_rows):
-            moved = twists[:, :, self.columns[part]]
+        for row, part in self._row_slices(n_rows):
+            factors = twists[:, :, self.columns[part]]
             if twists.shape[1] == 1:
-                result[..., row] = (nonzeros[..., part] @ np.swapaxes(moved, 1, 2))[..., 0]
+                result[..., row] = (nonzeros[..., part] @ np.swapaxes(factors, 1, 2))[..., 0]
             else:
-                result[..., row] = (nonzeros[..., part] * moved).sum(axis=-1)
+                result[..., row] = (nonzeros[..., part] * factors).sum(axis=-1)
         return result
 
-    def _row_parts(self, n_rows: int) -> Iterator[tuple[int, slice]]:
-        """Rows that have nonzeros, and the slice of each."""
+    def _row_slices(self, n_rows: int) -> Iterator[tuple[int, slice]]:
+        """Rows with nonzeros, and the slice of the nonzeros of each."""
         starts = np.searchsorted(self.rows, np.arange(n_rows + 1)).tolist()
         for row, (first, end) in enumerate(itertools.pairwise(starts)):
             if end > first:
@@ -163,13 +175,13 @@ class ObservationModel:
     """Readings of a session's entries as functions of errors and nuisance parameters.
 
     Args:
-        session: Setups, postures and robot; the values of its readings do not matter.
+        session: Setups, postures and robot; the values of its readings are not used.
         observations: The entries to predict; those of the session's readings by default.
 
     Attributes:
-        states: Loop closures; one for each posture, unless effects on the kinematics need
+        states: Loop closures: one per posture, or several if effects on the kinematics depend on
             conditions of its readings (`States`).
-        nuisance: Nuisance parameters of the session's sensors.
+        nuisance: Nuisance parameters of the session.
     """
 
     def __init__(self, session: Session, observations: Observations | None = None) -> None:
@@ -181,15 +193,15 @@ class ObservationModel:
 
     @cached_property
     def groups(self) -> tuple[SensorGroup, ...]:
-        """Entries by the expression of their sensors."""
+        """Groups of entries whose sensors have the same expression."""
         return group_sensors(self.session, self.observations)
 
     @cached_property
     def alignment(self) -> ManualAlignment:
-        """Nuisance parameters at which the operator aligned the gauges, as functions of errors.
+        """Nuisance parameters of aligned gauges as functions of errors.
 
         Raises:
-            ClosureError: If the nominal machine cannot reach a posture of alignment.
+            ClosureError: If the nominal machine cannot reach an alignment posture.
         """
         errors = self.functions.errors
         sensitivity = np.zeros((len(self.nuisance.parameters), len(errors.names)))
@@ -209,7 +221,7 @@ class ObservationModel:
         return ManualAlignment(sensitivity, start)
 
     def parametrise(self, columns: Array, nuisance_scale: Array) -> FreeParameters:
-        """Free parameters for `linearise`; arguments as the fields of `FreeParameters`."""
+        """Free parameters for `linearise`; arguments are the fields of `FreeParameters`."""
         pattern = _ClosurePattern.of(self.functions, columns)
         return FreeParameters(columns, nuisance_scale, pattern)
 
@@ -219,20 +231,20 @@ class ObservationModel:
         passive: Array,
         nuisance: Array | None = None,
     ) -> Array:
-        """Readings with gauge zeros at 0.
+        """Predict readings with gauge zeros at 0.
 
         Args:
             errors: Elementary errors, shape (n_errors,), or (S, n_errors) for a batch, [SI].
-            passive: Passive coordinates with closed loops, shape (n_states, n_passive), with S in
-                front for a batch, [m, rad].
+            passive: Passive coordinates with closed loops, shape (n_states, n_passive), or
+                (S, n_states, n_passive), [m, rad].
             nuisance: Nuisance parameters as deviations from the manual alignment, shape
-                (n_nuisance,), with S in front for a batch, [SI]; 0 by default.
+                (n_nuisance,) or (S, n_nuisance), [SI]; 0 by default.
 
         Returns:
-            Shape (n_entries,), with S in front for a batch, [m].
+            Shape (n_entries,), or (S, n_entries) for a batch, [m].
         """
-        at, q, nu = self._batch(errors, passive, nuisance)
-        machines, n_sets = _Machines(self, at), len(at)
+        theta, q, nu = self._batch(errors, passive, nuisance)
+        machines, n_sets = _Machines(self, theta), len(theta)
         result = np.empty((n_sets, self.observations.size))
         for group in self.groups:
             size = max(1, MAX_PREDICTED // n_sets)
@@ -252,12 +264,14 @@ class ObservationModel:
         noise_ratio: Array | None = None,
         aligned: bool = True,
     ) -> ReadingLinearisation:
-        """Readings to first order about machines and passive coordinates near closed loops.
+        """Linearise readings about machines and passive coordinates near closed loops.
 
         Args:
-            errors: As for `predict`.
-            passive: As for `predict`; the loops need not be closed exactly.
-            nuisance: As for `predict`.
+            errors: Elementary errors, shape (n_errors,), or (S, n_errors) for a batch, [SI].
+            passive: Passive coordinates with nearly closed loops, shape (n_states, n_passive), or
+                (S, n_states, n_passive), [m, rad].
+            nuisance: Nuisance parameters as deviations from the manual alignment, shape
+                (n_nuisance,) or (S, n_nuisance), [SI]; 0 by default.
             free: The free parameters.
             noise_ratio: Divisor of each entry's reading, shape (n_entries,); 1 by default.
             aligned: Add the manual alignment to the nuisance parameters.
@@ -265,12 +279,13 @@ class ObservationModel:
         Raises:
             LinAlgError: If a posture is singular.
         """
-        at, q, nu = self._batch(errors, passive, nuisance, aligned=aligned)
-        alignment = self.alignment.sensitivity if aligned else np.zeros((nu.shape[1], at.shape[1]))
+        theta, q, nu = self._batch(errors, passive, nuisance, aligned=aligned)
+        shape = nu.shape[1], theta.shape[1]
+        alignment = self.alignment.sensitivity if aligned else np.zeros(shape)
         divisor = np.ones(self.observations.size) if noise_ratio is None else noise_ratio
         return ReadingLinearisation(
             self,
-            at,
+            theta,
             q,
             nu,
             free=free,
@@ -283,10 +298,10 @@ class ObservationModel:
         self, errors: Array, passive: Array, nuisance: Array | None, *, aligned: bool = True
     ) -> tuple[Array, Array, Array]:
         """Errors, passive coordinates and nuisance parameters with a leading dimension."""
-        at, n = np.atleast_2d(errors), len(self.nuisance.parameters)
-        q = passive if passive.ndim == 3 else np.broadcast_to(passive, (len(at), *passive.shape))
-        nu = self.alignment(at) if aligned else np.zeros((len(at), n))
-        return at, q, nu if nuisance is None else nu + np.atleast_2d(nuisance)
+        theta, n = np.atleast_2d(errors), len(self.nuisance.parameters)
+        q = passive if passive.ndim == 3 else np.broadcast_to(passive, (len(theta), *passive.shape))
+        nu = self.alignment(theta) if aligned else np.zeros((len(theta), n))
+        return theta, q, nu if nuisance is None else nu + np.atleast_2d(nuisance)
 
     def _inputs(
         self,
@@ -296,14 +311,14 @@ class ObservationModel:
         passive: Array,
         nuisance: Array,
     ) -> tuple[Array, ...]:
-        """Inputs of a sensor's functions for part of its group on all machines.
+        """Inputs of the functions of a sensor group, for some of its entries on all machines.
 
         Args:
             group: The group.
-            part: Positions in the group, shape (n,).
+            part: Positions of the entries in the group, shape (n,).
             machines: The machines.
             passive: Passive coordinates, shape (S, n_states, n_passive), [m, rad].
-            nuisance: Shape (S, n_nuisance), [SI].
+            nuisance: Nuisance parameters, shape (S, n_nuisance), [SI].
         """
         n_sets, n = len(passive), part.size
         entries = group.entries[part]
@@ -325,22 +340,23 @@ class ObservationModel:
 
     @cached_property
     def reference_commands(self) -> Array:
-        """Commands of the reference posture, shape (n_setups, n_command).
+        """Commands of the reference posture of each setup, shape (n_setups, n_command).
 
-        The drives are at the mechanical zero as each setup knew it, under neutral conditions: a
-        gauge on the base stays where it is when the machine gets warmer.
+        The drives are at the mechanical zero with the active offsets of the setup. Conditions are
+        neutral, because the position of a gauge on the base does not change when the machine warms
+        up.
         """
         return self.functions.errors.command(self.session.zero_drives)
 
     def blocks(self, n_sets: int) -> tuple[_Block, ...]:
-        """All states with readings, by their number, for a batch of machines."""
+        """Blocks of loop closures with the same number of readings, for S = n_sets machines."""
         o, paired = self.observations, self.paired
-        group, place = np.zeros((2, o.size), dtype=np.int64)
+        group, position = np.zeros((2, o.size), dtype=np.int64)
         for i, g in enumerate(self.groups):
-            group[g.entries], place[g.entries] = i, np.arange(g.entries.size)
-        # of each sensor group the first postures, then the second ones
+            group[g.entries], position[g.entries] = i, np.arange(g.entries.size)
+        # member 2 i: first postures of sensor group i; member 2 i + 1: its second postures
         member = np.concatenate([2 * group, 2 * group[paired] + 1])
-        place = np.concatenate([place, place[paired]])
+        position = np.concatenate([position, position[paired]])
         state = np.concatenate([o.state, o.second[paired]])
         order = np.argsort(state, kind="stable")
         states, starts, counts = np.unique(state[order], return_index=True, return_counts=True)
@@ -349,25 +365,29 @@ class ObservationModel:
             chosen = np.flatnonzero(counts == m)
             size = max(1, min(MAX_POSTURES, MAX_READINGS // m) // n_sets)
             for first in range(0, chosen.size, size):
-                at = chosen[first : first + size]
-                entries = order[starts[at][:, None] + np.arange(m)]
+                rows = chosen[first : first + size]
+                entries = order[starts[rows][:, None] + np.arange(m)]
                 flat = entries.reshape(-1)
-                parts = [
-                    (int(i), np.flatnonzero(member[flat] == i)) for i in np.unique(member[flat])
-                ]
-                members = tuple((i // 2, i % 2 == 1, w, place[flat[w]]) for i, w in parts)
-                blocks.append(_Block(states[at], entries, members))
+                members = []
+                for i in np.unique(member[flat]).tolist():
+                    where = np.flatnonzero(member[flat] == i)
+                    members.append((i // 2, i % 2 == 1, where, position[flat[where]]))
+                blocks.append(_Block(states[rows], entries, tuple(members)))
         return tuple(blocks)
 
     @cached_property
     def paired(self) -> Indices:
-        """Entries of pairs of postures, shape (n_pairs,)."""
+        """Indices of the entries that are pairs of postures, shape (n_pairs,)."""
         return np.flatnonzero(self.observations.second >= 0)
 
     def gather(self, values: Array) -> Array:
-        """Values of entries, shape (S, n, ...), of those with the second postures of pairs after.
+        """Add the values of the second postures of pairs to those of their entries.
 
-        The parts of a pair add up.
+        Args:
+            values: Values of all entries, then of the second postures, shape (S, n + n_pairs, ...).
+
+        Returns:
+            Shape (S, n, ...).
         """
         if not self.paired.size:
             return values
@@ -377,7 +397,8 @@ class ObservationModel:
         return result
 
     @cached_property
-    def _single_blocks(self) -> tuple[_Block, ...]:
+    def single_blocks(self) -> tuple[_Block, ...]:
+        """Blocks for one machine."""
         return self.blocks(1)
 
 
@@ -390,7 +411,8 @@ class _Machines:
 
     Attributes:
         actuated: Actual drive coordinates, shape (S, n_states, n_drives), [m, rad].
-        reference: The same in the reference posture of each setup, shape (S, n_setups, n_drives).
+        reference: Actual drive coordinates in the reference posture of each setup, shape
+            (S, n_setups, n_drives), [m, rad].
     """
 
     def __init__(self, model: ObservationModel, errors: Array) -> None:
@@ -402,16 +424,16 @@ class _Machines:
 
     def placements(self, states: Indices) -> Array:
         """Moved placements, shape (S, 12 n_moved), or (S n, 12 n_moved) if n states differ."""
-        under = self._placements
-        if under.shape[1] > 1:
-            under = under[:, self._states.variant[states]]
-        return under.reshape(-1, under.shape[-1])
+        placements = self._placements
+        if placements.shape[1] > 1:
+            placements = placements[:, self._states.variant[states]]
+        return placements.reshape(-1, placements.shape[-1])
 
 
 class ReadingLinearisation:
-    """Readings of a batch of machines to first order.
+    """Linearised readings of a batch of machines.
 
-    Shapes are those of a batch of S machines; S is absent where one machine was linearised.
+    Shapes are those of a batch of S machines; S is absent if one machine was linearised.
 
     Args:
         model: The observation model.
@@ -419,13 +441,14 @@ class ReadingLinearisation:
         passive: Passive coordinates, shape (S, n_states, n_passive), [m, rad].
         nuisance: Nuisance parameters, shape (S, n_nuisance), [SI].
         free: The free parameters.
-        alignment: Derivative of the nuisance parameters by errors, shape (n_nuisance, n_errors).
+        alignment: Derivative of the nuisance parameters with respect to errors, shape
+            (n_nuisance, n_errors).
         noise_ratio: Divisor of each entry's reading, shape (n_entries,).
         batch: Keep the leading dimension of results.
 
     Attributes:
-        reading: h at the given passive coordinates, shape (S, n_entries), [m].
-        opening: Change of h when the loops are closed, to first order, shape (S, n_entries), [m].
+        reading: h at the passive coordinates, shape (S, n_entries), [m].
+        opening: First-order change of h when the loops are closed, shape (S, n_entries), [m].
         correction: Change of the passive coordinates that closes the loops, shape (S, n_states,
             n_passive), [m, rad].
         jacobian: dh/dθ̂ with the loops closed, shape (S, n_entries, n_free), [m per unit of θ̂].
@@ -444,7 +467,7 @@ class ReadingLinearisation:
         batch: bool,
     ) -> None:
         self._model, self._free, self._batch = model, free, batch
-        by_errors = alignment @ free.columns
+        alignment_by_theta = alignment @ free.columns
         self._machines = _Machines(model, errors)
         geometry = self._machines.geometry
         _, self._by_drive_errors = geometry.drive_derivatives(model.states.commands)
@@ -460,7 +483,7 @@ class ReadingLinearisation:
         correction = np.zeros_like(passive, dtype=np.float64)
         jacobian = np.empty((n_sets, n, n_machine + n_nuisance))
         self._blocks: list[tuple[_Block, _Closures]] = []
-        for block in model._single_blocks if n_sets == 1 else model.blocks(n_sets):
+        for block in model.single_blocks if n_sets == 1 else model.blocks(n_sets):
             closures = self._evaluate_closures(block, passive)
             readings = self._evaluate_readings(block, passive, nuisance)
             dq = -(closures.inverse @ closures.residual[..., None])[..., 0]
@@ -474,10 +497,10 @@ class ReadingLinearisation:
             jacobian[:, entries, n_machine:] = readings.by_nuisance
             self._blocks.append((block, closures))
         reading, opening, jacobian = (model.gather(v) for v in (reading, opening, jacobian))
-        aligned = np.flatnonzero(by_errors.any(axis=1))
+        aligned = np.flatnonzero(alignment_by_theta.any(axis=1))
         by_nuisance = jacobian[:, :, n_machine:]
         if aligned.size:
-            jacobian[:, :, :n_machine] += by_nuisance[:, :, aligned] @ by_errors[aligned]
+            jacobian[:, :, :n_machine] += by_nuisance[:, :, aligned] @ alignment_by_theta[aligned]
         by_nuisance *= free.nuisance_scale
         if (noise_ratio != 1.0).any():
             reading, opening = reading / noise_ratio, opening / noise_ratio
@@ -489,27 +512,28 @@ class ReadingLinearisation:
         """Change of the passive coordinates that closes the loops after a change of θ̂.
 
         Args:
-            change: dθ̂, shape (S, n_free); many changes of one machine are possible, too.
+            change: dθ̂, shape (S, n_free); one machine may have any number of changes.
 
         Returns:
-            Shape (S, n_states, n_passive), [m, rad]; it includes `correction`.
+            Shape (S, n_states, n_passive), [m, rad], including `correction`.
         """
-        d = np.atleast_2d(change)
-        machine = d[:, : self._free.columns.shape[1], None]
+        changes = np.atleast_2d(change)
+        machine = changes[:, : self._free.columns.shape[1], None]
         twists = self._twists.follow(machine)
         drive_errors = (self._by_machine @ machine)[:, None]
         correction = self.correction if self._batch else self.correction[None]
-        result = np.array(np.broadcast_to(correction, (len(d), *correction.shape[1:])))
+        result = np.array(np.broadcast_to(correction, (len(changes), *correction.shape[1:])))
         for block, closures in self._blocks:
-            opened = (closures.by_drive_errors @ drive_errors)[..., 0]
-            moved = twists
+            residual = (closures.by_drive_errors @ drive_errors)[..., 0]
+            block_twists = twists
             if twists.shape[1] > 1:
-                moved = twists[:, self._model.states.variant[block.states]]
-            opened += self._pattern.times(closures.by_twists, moved, opened.shape[2])
-            result[:, block.states] -= (closures.inverse @ opened[..., None])[..., 0]
+                block_twists = twists[:, self._model.states.variant[block.states]]
+            residual += self._pattern.times(closures.by_twists, block_twists, residual.shape[2])
+            result[:, block.states] -= (closures.inverse @ residual[..., None])[..., 0]
         return result if change.ndim > 1 else result[0]
 
     def _evaluate_closures(self, block: _Block, passive: Array) -> _Closures:
+        """Loop closures of a block and their derivatives."""
         n_sets, k = len(passive), block.states.size
         outputs = self._model.functions.closure_jacobian(
             self._machines.actuated[:, block.states].reshape(n_sets * k, -1),
@@ -521,6 +545,7 @@ class ReadingLinearisation:
         return _Closures(g, _inverse(g_q), by_drive_errors, nonzeros[:, :, self._pattern.chosen])
 
     def _evaluate_readings(self, block: _Block, passive: Array, nuisance: Array) -> _Readings:
+        """Readings of a block and their derivatives with constant passive coordinates."""
         model, (k, m) = self._model, block.entries.shape
         n_sets, n_passive = len(passive), passive.shape[2]
         n_drive_errors = self._by_drive_errors.shape[-1]
@@ -532,10 +557,10 @@ class ReadingLinearisation:
             np.zeros((n_sets, k * m, nuisance.shape[1])),
             by_twists,
         )
-        for index, of_second, where, place in block.members:
+        for index, of_second, where, part in block.members:
             group, states = model.groups[index], block.states[where // m]
-            setups = group.setups[place]
-            inputs = model._inputs(group, place, self._machines, passive, nuisance)
+            setups = group.setups[part]
+            inputs = model._inputs(group, part, self._machines, passive, nuisance)
             outputs = group.reading.jacobian(*inputs)
             h, h_a, h_q, nonzeros, h_r, h_nu, *second = (
                 v.reshape(n_sets, where.size, -1) for v in outputs
@@ -544,37 +569,38 @@ class ReadingLinearisation:
                 h_a, h_q = second
             by_drive_errors = h_a[:, :, None] @ self._by_drive_errors[:, states]
             result.by_passive[:, where] = h_q
-            if of_second:  # the other parts belong to the first posture
+            if of_second:  # all other derivatives are those of the first posture
                 result.value[:, where] = 0.0
                 result.by_drive_errors[:, where] = by_drive_errors[:, :, 0]
                 continue
             by_drive_errors += h_r[:, :, None] @ self._by_reference[:, setups]
             result.value[:, where] = h[..., 0]
             result.by_drive_errors[:, where] = by_drive_errors[:, :, 0]
-            result.by_nuisance[:, where[:, None], group.nuisance[place]] = h_nu
+            result.by_nuisance[:, where[:, None], group.nuisance[part]] = h_nu
             _, columns = group.reading.jacobian.pattern("by_twists")
             by_twists.append((where, columns, nonzeros))
         return result
 
     def _machine_rows(self, block: _Block, closures: _Closures, readings: _Readings) -> Array:
-        """∂h by the machine's parameters with the loops closed, shape (S, k m, n_machine)."""
+        """dh/dθ̂ for machine parameters with the loops closed, shape (S, k m, n_machine)."""
         (k, m), n_sets, used = block.entries.shape, len(readings.value), self._pattern.used
-        pull = -(readings.by_passive.reshape(n_sets, k, m, -1) @ closures.inverse)
+        multiplier = -(readings.by_passive.reshape(n_sets, k, m, -1) @ closures.inverse)
         by_drive_errors = readings.by_drive_errors.reshape(n_sets, k, m, -1)
-        by_drive_errors = by_drive_errors + pull @ closures.by_drive_errors
+        by_drive_errors = by_drive_errors + multiplier @ closures.by_drive_errors
         rows = (by_drive_errors @ self._by_machine).reshape(n_sets, k * m, -1)
         if used.size:
             twists = np.zeros((n_sets, k * m, used.size))
             for where, columns, nonzeros in readings.by_twists:
-                moved = np.flatnonzero(self._pattern.place[columns] >= 0)
-                at = self._pattern.place[columns[moved]]
-                twists[:, where[:, None], at] = nonzeros[:, :, moved]
-            dense = self._pattern.dense(closures.by_twists, pull.shape[-1])
-            twists += (pull @ dense).reshape(n_sets, k * m, -1)
+                used_columns = np.flatnonzero(self._pattern.position[columns] >= 0)
+                positions = self._pattern.position[columns[used_columns]]
+                twists[:, where[:, None], positions] = nonzeros[:, :, used_columns]
+            dense = self._pattern.dense(closures.by_twists, multiplier.shape[-1])
+            twists += (multiplier @ dense).reshape(n_sets, k * m, -1)
             rows += self._twists(twists, np.repeat(block.states, m))
         return rows
 
     def _squeeze(self, values: Array) -> Array:
+        """Values without the leading dimension if one machine was linearised."""
         return values if self._batch else values[0]
 
 
@@ -584,9 +610,9 @@ class _TwistChain:
     Args:
         map_: The error map.
         errors: Elementary errors of the machines, shape (S, n_errors), [SI].
-        states: States, with the conditions of their placements.
+        states: Loop closures, with the conditions of their placements.
         free: The free parameters.
-        sparse: Multiply rows with a sparse matrix; for one machine.
+        sparse: Use a sparse matrix, which is possible for one machine.
     """
 
     def __init__(
@@ -596,7 +622,7 @@ class _TwistChain:
         self._used, self._columns, self._variant = pattern.used, free.columns, states.variant
         self._map, self._errors, self._command = map_, errors, commands[0]
         self._sparse = sparse and self._used.size > 0
-        self._inner = map_.twist_columns(errors, free.columns, self._command)
+        self._delta_jacobian = map_.twist_columns(errors, free.columns, self._command)
         self._right = np.zeros((1, len(map_.moved), 6, 6))
         if self._used.size:
             self._right = map_.right_jacobians(errors, self._command)
@@ -604,13 +630,13 @@ class _TwistChain:
         if len(commands) > 1 and self._used.size:
             self._varying = map_.varying_derivatives(errors, free.columns, commands)
             self._of_varying = (6 * map_.varying[:, None] + np.arange(6)).reshape(-1)
-            self._place = pattern.place[self._of_varying]
+            self._positions = pattern.position[self._of_varying]
 
     @cached_property
     def _matrix(self) -> Any:  # noqa: ANN401 - SciPy has no types
-        """∂ξ/∂θ̂ of the twists that parameters move, (S, n_used, n), or sparse and transposed.
+        """∂ξ/∂θ̂ of the used twists, shape (S, n_used, n); or its transpose as a sparse matrix.
 
-        Twists that vary with the conditions are 0.
+        Rows of twists that vary with the conditions are 0.
         """
         jacobian = self._map.jacobian(
             self._errors, self._columns, command=self._command, right=self._right
@@ -625,11 +651,14 @@ class _TwistChain:
         return csr_array(matrix[0].T)
 
     def __call__(self, rows: Array, states: Indices) -> Array:
-        """Rows by machine parameters, (S, n, n_machine), of rows by twists, (S, n, n_used).
+        """Derivatives with respect to machine parameters.
 
         Args:
-            rows: The rows.
-            states: State of each of them, shape (n,).
+            rows: Derivatives with respect to the used twists, shape (S, n, n_used).
+            states: Loop closure of each row, shape (n,).
+
+        Returns:
+            Shape (S, n, n_machine).
         """
         if self._sparse:
             result = np.asarray((self._matrix @ np.ascontiguousarray(rows[0].T)).T[None])
@@ -640,30 +669,32 @@ class _TwistChain:
         return result
 
     def _by_varying(self, varying: VaryingDerivatives, rows: Array, variant: Indices) -> Array:
-        """The part of a call's result through the placements that vary."""
-        by = np.where(self._place >= 0, rows[:, :, self._place], 0.0)
-        by = by.reshape(*rows.shape[:2], -1, 1, 6) @ varying.right[:, variant]
-        local = by.reshape(*rows.shape[:2], -1)
-        curved = (local[:, :, None, varying.rows] @ varying.curved[:, variant])[:, :, 0]
-        return np.asarray(local @ varying.constant + curved @ varying.columns)
+        """Contribution of the placements that vary to the result of a call."""
+        by_xi = np.where(self._positions >= 0, rows[:, :, self._positions], 0.0)
+        by_delta = by_xi.reshape(*rows.shape[:2], -1, 1, 6) @ varying.right[:, variant]
+        by_delta = by_delta.reshape(*rows.shape[:2], -1)
+        by_errors = (by_delta[:, :, None, varying.rows] @ varying.jacobian[:, variant])[:, :, 0]
+        return np.asarray(by_delta @ varying.constant + by_errors @ varying.columns)
 
     def follow(self, change: Array) -> Array:
-        """Twists ∂ξ of changes of machine parameters, (D, n_machine, 1).
+        """Twists ∂ξ for changes of machine parameters.
+
+        Args:
+            change: Changes, shape (D, n_machine, 1).
 
         Returns:
             Shape (D, 1, n_twists), or (D, V, n_twists) if placements vary under V conditions.
         """
-        inner = (self._inner @ change).reshape(len(change), -1, 6, 1)
-        result = np.asarray((self._right @ inner).reshape(len(change), 1, -1))
+        delta = (self._delta_jacobian @ change).reshape(len(change), -1, 6, 1)
+        result = np.asarray((self._right @ delta).reshape(len(change), 1, -1))
         varying = self._varying
         if varying is None:
             return result
         result = np.repeat(result, varying.right.shape[1], axis=1)
-        local = np.repeat((varying.constant @ change)[:, None], result.shape[1], axis=1)
-        curved = varying.curved @ (varying.columns @ change)[:, None]
-        local[:, :, varying.rows] += curved
-        moved = varying.right @ local.reshape(*local.shape[:2], -1, 6, 1)
-        result[:, :, self._of_varying] = moved.reshape(*local.shape[:2], -1)
+        delta = np.repeat((varying.constant @ change)[:, None], result.shape[1], axis=1)
+        delta[:, :, varying.rows] += varying.jacobian @ (varying.columns @ change)[:, None]
+        xi = varying.right @ delta.reshape(*delta.shape[:2], -1, 6, 1)
+        result[:, :, self._of_varying] = xi.reshape(*delta.shape[:2], -1)
         return result
 
 
@@ -675,30 +706,32 @@ def predict_readings(
     passive: Array | None = None,
     nuisance: Array | None = None,
 ) -> Array:
-    """Readings of a machine with known errors, gauge zeros at 0, shape (n_entries,), [m].
+    """Predict the readings of a machine with known errors and gauge zeros at 0.
 
     Args:
         session: Postures, setups and robot.
-        errors: Parameter name to value, [unit of the parameter].
+        errors: Names of parameters, mapped to values, [unit of the parameter]; 0 where absent.
         observations: The entries to predict; those of the session's readings by default.
         passive: Passive coordinates of every state, shape (n_states, n_passive), [m, rad]; solved
-            here by default.
-        nuisance: Nuisance parameters in the order of `nuisance_parameters`, [SI]; 0 by default.
+            by default.
+        nuisance: Nuisance parameters in the order of `nuisance_parameters`, shape (n_nuisance,),
+            [SI]; 0 by default.
+
+    Returns:
+        Shape (n_entries,), [m].
 
     Raises:
         ClosureError: If the machine cannot reach a posture.
     """
-    model, closure = (
-        ObservationModel(session, observations),
-        LoopClosure(session.robot, fixed=errors),
-    )
+    model = ObservationModel(session, observations)
+    closure = LoopClosure(session.robot, fixed=errors)
     if passive is None:
         passive = closure.close(model.states.commands, names=model.states.names)
     return model.predict(closure.errors(), passive, nuisance)
 
 
 def nominal_sensitivity(session: Session) -> Array:
-    """Derivative of a session's readings by all elementary errors, on the nominal machine.
+    """Derivative of readings with respect to all elementary errors, on the nominal machine.
 
     Returns:
         Shape (n_entries, n_errors), [m per SI unit of the error].
@@ -719,4 +752,4 @@ def _inverse(matrices: ArrayLike) -> Array:
     m: Array = np.asarray(matrices)
     if m.shape[-2] == m.shape[-1]:
         return np.asarray(np.linalg.inv(m))
-    return np.asarray(np.linalg.pinv(m, rcond=1e-10))
+    return np.asarray(np.linalg.pinv(m, rcond=RANK_TOLERANCE))

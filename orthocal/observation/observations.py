@@ -1,4 +1,4 @@
-"""Entries of a session: its readings as single ones with gauge zeros, and their conditions."""
+"""Entries of a session: single readings with gauge zeros, and their conditions."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from orthocal.kinematics.loop_closure import LoopClosure, find_loads
 from orthocal.robot.model import Robot
 from orthocal.session.session import Conditions, Reading, Session
 
-TIME_OF_READING = 60.0
-"""Time between successive readings of a setup that states none, [s]."""
+READING_INTERVAL = 60.0
+"""Assumed time between successive readings of a setup without times, [s]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class States:
     """Loop closures of a session.
 
-    A posture is one state, unless its readings differ in a condition on which drives or placements
-    depend: then it is one state for each value.
+    A posture is one state. If its readings differ in a condition on which drives or placements
+    depend, it is one state for each value.
     """
 
     posture: Indices
-    """Posture of each state, in the order of the postures, shape (n_states,)."""
+    """Index of the posture of each state, ascending, shape (n_states,)."""
     commands: Array
     """Commands, shape (n_states, n_command); see `orthocal.kinematics.error_map`."""
     variant: Indices
-    """Index of the conditions of its placements among all such conditions, shape (n_states,)."""
+    """Index of the conditions of placements in each state, shape (n_states,)."""
     variant_commands: Array
-    """A command with the conditions of each variant, shape (n_variants, n_command)."""
+    """Commands with each of these conditions, shape (n_variants, n_command)."""
     names: tuple[str, ...]
-    """Posture of each state, with a number where it has several states."""
+    """Name of the posture of each state, with a number if the posture has several states."""
 
     @property
     def first_of_posture(self) -> Indices:
@@ -51,41 +51,43 @@ class States:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """Readings as the gauge showed them, one an entry; differences are split.
+    """Entries: single readings of a session.
 
-    A reading of a pair of postures is one entry.
+    The difference of two readings has two entries, a reading of a pair of postures has one.
 
-    Differences of one setup and cycle that share postures are equivalent to readings with one free
-    zero: eliminating it gives their covariance, σ² [[2, 1], [1, 2]] for two differences from one
-    posture. So every entry is a single reading with standard deviation σ.
+    Differences of one setup and cycle that share postures are equivalent to single readings with a
+    common free zero. Its elimination gives their covariance, such as σ² [[2, 1], [1, 2]] for two
+    differences from one posture. Every entry is therefore a reading with standard deviation σ.
     """
 
     setup: Indices
-    """Index of the setup, shape (n,)."""
+    """Index of the setup of each entry, shape (n,)."""
     posture: Indices
-    """Index of the posture, shape (n,)."""
+    """Index of the posture of each entry, shape (n,)."""
     zero: Indices
-    """Index of the gauge zero, shape (n,)."""
+    """Index of the zero of each entry, shape (n,)."""
     n_zeros: int
+    """Number of zeros."""
     zero_setup: tuple[str, ...]
     """Setup of each zero."""
     zero_real: tuple[bool, ...]
-    """True for the zero of a gauge, False for one that replaces differences."""
+    """True for the zero of a gauge, False for the common zero of differences."""
     zero_known: Mask
     """Mask of the zeros that are known to be 0, shape (n_zeros,)."""
     plus: Indices
-    """Entry of each row of the session, shape (n_rows,)."""
+    """Index of the entry of each row of the session, shape (n_rows,)."""
     minus: Indices
-    """Entry to subtract, or -1, shape (n_rows,)."""
+    """Index of the entry that a row subtracts, or -1, shape (n_rows,)."""
     state: Indices
-    """Index of the loop closure, shape (n,)."""
+    """Index of the loop closure of each entry, shape (n,)."""
     second: Indices
     """Index of the loop closure in the second posture of a pair, or -1, shape (n,)."""
     place: Indices
-    """Index of setup, posture and approach: entries with the same place repeat each other, (n,)."""
+    """Index of setup, posture and approach, shape (n,): equal for repeated readings."""
     conditions: Mapping[Condition, Array]
-    """Condition to its values, shape (n, size); neutral where not stated."""
+    """Values of each condition, shape (n, size); neutral where not stated."""
     states: States
+    """Loop closures of the entries."""
 
     @property
     def n_free_zeros(self) -> int:
@@ -98,8 +100,8 @@ class Observations:
         return self.setup.size
 
     def only(self, chosen: Mask) -> Observations:
-        """Some of the entries, without rows."""
-        none = np.empty(0, dtype=np.int64)
+        """Masked entries, without the rows of the session."""
+        no_rows = np.empty(0, dtype=np.int64)
         return replace(
             self,
             setup=self.setup[chosen],
@@ -109,12 +111,20 @@ class Observations:
             place=self.place[chosen],
             conditions={c: v[chosen] for c, v in self.conditions.items()},
             zero=self.zero[chosen],
-            plus=none,
-            minus=none,
+            plus=no_rows,
+            minus=no_rows,
         )
 
     def sum_by_zero(self, values: Array, weights: Array) -> Array:
-        """Weighted sums of the values with the same zero, shape (n_zeros, m) of (n, m)."""
+        """Weighted sums of the values of all entries with the same zero.
+
+        Args:
+            values: Values of the entries, shape (n, m).
+            weights: Weights of the entries, shape (n,).
+
+        Returns:
+            Shape (n_zeros, m).
+        """
         order = np.argsort(self.zero, kind="stable")
         starts = np.searchsorted(self.zero[order], np.arange(self.n_zeros))
         result = np.zeros((self.n_zeros, values.shape[1]))
@@ -125,23 +135,22 @@ class Observations:
         return result
 
     def rows(self, entries: Array) -> Array:
-        """Rows of the session from values of the entries, shape (n_rows, ...)."""
-        subtracted = np.where(
-            (self.minus >= 0).reshape(-1, *(1,) * (entries.ndim - 1)), entries[self.minus], 0.0
-        )
+        """Rows of the session, shape (n_rows, ...), from values of the entries, shape (n, ...)."""
+        is_difference = (self.minus >= 0).reshape(-1, *(1,) * (entries.ndim - 1))
+        subtracted = np.where(is_difference, entries[self.minus], 0.0)
         return np.asarray(entries[self.plus] - subtracted)
 
     def values(self, rows: Array) -> Array:
-        """Values of the entries from rows of the session, shape (n,) of (n_rows,), [m].
+        """Values of the entries, shape (n,), from rows of the session, shape (n_rows,), [m].
 
-        Where rows are differences, the first posture of each group is given the value 0.
+        One entry of each group of differences has the value 0.
         """
         result = np.zeros(self.size)
         done = np.zeros(self.size, dtype=bool)
-        raw = self.minus < 0
-        result[self.plus[raw]] = rows[raw]
-        done[self.plus[raw]] = True
-        pending = list(np.flatnonzero(~raw))
+        single = self.minus < 0
+        result[self.plus[single]] = rows[single]
+        done[self.plus[single]] = True
+        pending = list(np.flatnonzero(~single))
         while pending:
             postponed = []
             for row in pending:
@@ -161,13 +170,13 @@ class Observations:
 
 
 def build_observations(session: Session) -> Observations:
-    """Split a session's readings into single ones with gauge zeros."""
+    """Split the readings of a session into single readings with gauge zeros."""
     setups = {name: i for i, name in enumerate(session.setups)}
     postures = {name: i for i, name in enumerate(session.postures)}
     entries: list[tuple[int, int, int]] = []
-    pairs: dict[int, int] = {}  # entry to its second posture
+    pairs: dict[int, int] = {}  # second postures by entry
     conditions: list[Conditions | None] = []
-    # of a gauge by its setup, of a group of differences by setup, cycle and group
+    # key of a gauge: its setup; key of a group of differences: setup, cycle, group
     zeros: dict[tuple[str] | tuple[str, int, str], int] = {}
     nodes: dict[tuple[str, int, str], int] = {}
     plus, minus = [], []
@@ -179,7 +188,7 @@ def build_observations(session: Session) -> Observations:
         conditions.append(reading.conditions if reading.minus is None else None)
         return len(entries) - 1
 
-    def find(reading: Reading, posture: str) -> int:
+    def find_or_add(reading: Reading, posture: str) -> int:
         node = (reading.setup, reading.cycle, posture)
         if node not in nodes:
             nodes[node] = add(reading, posture, (reading.setup, reading.cycle, groups[node]))
@@ -194,8 +203,8 @@ def build_observations(session: Session) -> Observations:
             pairs[plus[-1]] = postures[r.minus]
             minus.append(-1)
         else:
-            plus.append(find(r, r.posture))
-            minus.append(find(r, r.minus))
+            plus.append(find_or_add(r, r.posture))
+            minus.append(find_or_add(r, r.minus))
     table = np.array(entries, dtype=np.int64).reshape(-1, 3)
     values, states, state, second = _observe(session, conditions, table, pairs)
     places = np.hstack([table[:, :2], values["approach"], second[:, None]])
@@ -229,20 +238,21 @@ def _observe(
 
     Args:
         session: The session.
-        conditions: Conditions of the entries as stated.
-        table: Setup, posture and zero of the entries, shape (n, 3).
-        pairs: Entry of a pair of postures to its second posture.
+        conditions: Stated conditions of the entries.
+        table: Indices of setup, posture and zero of the entries, shape (n, 3).
+        pairs: Entries that are pairs of postures, mapped to their second posture.
 
     Returns:
-        Conditions; the loop closures; that of each entry, shape (n,); that of its second posture.
+        Conditions; loop closures; index of the closure of each entry, shape (n,); and of the
+        closure in its second posture or -1, shape (n,).
     """
     n, paired = len(table), np.array(list(pairs), dtype=np.int64)
-    of_second = table[paired]
-    of_second[:, 1] = list(pairs.values())
-    both = np.vstack([table, of_second])
-    values = _all_conditions(session, [*conditions, *[None] * paired.size], both)
-    trims = _find_trims(session, both[:, 0], both[:, 1], values["approach"])
-    states, state = _find_states(session, both[:, 1], values, trims)
+    second_table = table[paired]
+    second_table[:, 1] = list(pairs.values())
+    extended = np.vstack([table, second_table])
+    values = _all_conditions(session, [*conditions, *[None] * paired.size], extended)
+    trims = _find_trims(session, extended[:, 0], extended[:, 1], values["approach"])
+    states, state = _find_states(session, extended[:, 1], values, trims)
     _require_common_placements(states, session, bool(pairs))
     second = np.full(n, -1)
     second[paired] = state[n:]
@@ -250,10 +260,10 @@ def _observe(
 
 
 def _require_common_placements(states: States, session: Session, pairs: bool) -> None:
-    """Refuse pairs of postures on a machine whose placements differ between its postures.
+    """Refuse pairs of postures on a machine whose placements differ between postures.
 
     Raises:
-        SessionError: Naming the session.
+        SessionError: If there are such pairs; names the session.
     """
     if pairs and len(states.variant_commands) > 1:
         raise SessionError(
@@ -264,19 +274,22 @@ def _require_common_placements(states: States, session: Session, pairs: bool) ->
 
 
 def _difference_groups(session: Session) -> dict[tuple[str, int, str], str]:
-    """Posture of a setup and cycle to a name of its group of differences."""
-    leader: dict[tuple[str, int, str], tuple[str, int, str]] = {}
+    """Setup, cycle and posture of differences, mapped to the name of their group.
 
-    def find(node: tuple[str, int, str]) -> tuple[str, int, str]:
-        while (above := leader.setdefault(node, node)) != node:
-            leader[node] = leader.setdefault(above, above)  # half the way next time
-            node = above
+    Differences that share postures, directly or by others, are a group (union-find).
+    """
+    parents: dict[tuple[str, int, str], tuple[str, int, str]] = {}
+
+    def root(node: tuple[str, int, str]) -> tuple[str, int, str]:
+        while (parent := parents.setdefault(node, node)) != node:
+            parents[node] = parents.setdefault(parent, parent)  # halves the path
+            node = parent
         return node
 
     for r in session.readings:
         if r.minus is not None and session.is_difference(r):
-            leader[find((r.setup, r.cycle, r.posture))] = find((r.setup, r.cycle, r.minus))
-    return {node: find(node)[2] for node in list(leader)}
+            parents[root((r.setup, r.cycle, r.posture))] = root((r.setup, r.cycle, r.minus))
+    return {node: root(node)[2] for node in list(parents)}
 
 
 def _all_conditions(
@@ -286,8 +299,8 @@ def _all_conditions(
 
     Args:
         session: The session.
-        stated: Conditions of the entries as stated.
-        table: Setup, posture and zero of the entries, shape (n, 3).
+        stated: Stated conditions of the entries.
+        table: Indices of setup, posture and zero of the entries, shape (n, 3).
     """
     values = _condition_values(session.robot, stated, table[:, 0])
     if "load" in error_map(session.robot).conditions:
@@ -301,11 +314,11 @@ def _all_conditions(
 def _condition_values(
     robot: Robot, conditions: Sequence[Conditions | None], setup: Indices
 ) -> dict[Condition, Array]:
-    """Values of the conditions of entries, neutral where not stated, shape (n, size) each."""
+    """Values of the stated conditions of entries, else neutral, shape (n, size) each."""
     n = len(conditions)
     neutral = neutral_values(robot)
     values = {c: np.full((n, condition_size(robot, c)), v) for c, v in neutral.items()}
-    began: dict[int, datetime] = {}
+    first_times: dict[int, datetime] = {}
     for i, stated in enumerate(conditions):
         if stated is None:
             continue
@@ -314,11 +327,11 @@ def _condition_values(
         if stated.temperature is not None:
             values["temperature"][i] = stated.temperature
         if stated.time is not None:
-            first = began.setdefault(int(setup[i]), stated.time)
+            first = first_times.setdefault(int(setup[i]), stated.time)
             values["time"][i] = (stated.time - first).total_seconds()
-    for k in set(setup.tolist()) - began.keys():
+    for k in set(setup.tolist()) - first_times.keys():
         rows = np.flatnonzero(setup == k)
-        values["time"][rows, 0] = TIME_OF_READING * np.arange(rows.size)
+        values["time"][rows, 0] = READING_INTERVAL * np.arange(rows.size)
     return values
 
 
@@ -326,13 +339,13 @@ def _find_loads(session: Session, setup: Indices, posture: Indices) -> Array:
     """Axial forces of the rods at entries, shape (n, n_rods), [N]."""
     payload = np.array([s.payload for s in session.setups.values()])[setup]
     pairs = np.column_stack([posture, payload])
-    unique, place = np.unique(pairs, axis=0, return_inverse=True)
+    unique, row = np.unique(pairs, axis=0, return_inverse=True)
     drives = drive_table(session)[unique[:, 0].astype(np.int64)]
-    return find_loads(session.robot, drives, unique[:, 1])[place.reshape(-1)]
+    return find_loads(session.robot, drives, unique[:, 1])[row.reshape(-1)]
 
 
 def adjustment_table(session: Session) -> Array:
-    """Adjustments of the setups less those of the session, shape (n_setups, n_adjustments), [m]."""
+    """Adjustments of the setups minus those of the session, (n_setups, n_adjustments), [m]."""
     names, last = list(session.robot.declared.adjustments), session.adjusted
     result = np.zeros((len(session.setups), len(names)))
     for row, setup in zip(result, session.setups.values(), strict=True):
@@ -346,9 +359,8 @@ def _find_trims(session: Session, setup: Indices, posture: Indices, approach: Ar
     """Displacement of the drives by the controller at entries, shape (n, n_drives), [m, rad]."""
     result, drives = np.zeros(approach.shape), drive_table(session)
     active = session.robot.drive_zero - session.zero_drives
-    for i, of_setup in enumerate(session.setups.values()):
-        stated = of_setup.compensation
-        trims = session.compensation if stated is None else stated
+    for i, s in enumerate(session.setups.values()):
+        trims = session.compensation if s.compensation is None else s.compensation
         rows = np.flatnonzero(setup == i)
         if trims and rows.size:
             displayed = drives[posture[rows]] + active[i]
@@ -359,42 +371,42 @@ def _find_trims(session: Session, setup: Indices, posture: Indices, approach: Ar
 def _find_states(
     session: Session, posture: Indices, conditions: Mapping[Condition, Array], trims: Array
 ) -> tuple[States, Indices]:
-    """Loop closures of a session, and the one of each entry.
+    """Loop closures of a session, and the index of the closure of each entry, shape (n,).
 
     Args:
         session: The session.
-        posture: Posture of each entry, shape (n,).
+        posture: Index of the posture of each entry, shape (n,).
         conditions: Conditions of the entries.
         trims: Displacement of the drives by the controller, shape (n, n_drives), [m, rad].
     """
     map_, drives, names = error_map(session.robot), drive_table(session), list(session.postures)
-    count = np.arange(len(names))
+    postures, n_drives = np.arange(len(names)), drives.shape[1]
     if not map_.conditions and not trims.any():
-        one = map_.command(session.robot.drive_zero)[None]
-        return States(count, drives, np.zeros_like(count), one, tuple(names)), posture
+        neutral = map_.command(session.robot.drive_zero)[None]
+        return States(postures, drives, np.zeros_like(postures), neutral, tuple(names)), posture
+    # rows of posture, displacement and conditions: of all entries, then of postures without entries
     read = np.hstack([posture[:, None], trims, *(conditions[c] for c in map_.conditions)])
-    unread = np.setdiff1d(count, posture)
+    unread = np.setdiff1d(postures, posture)
     payload = max(s.payload for s in session.setups.values())
     loaded = LoopClosure(session.robot, conditions=UseConditions(payload=payload))
-    neutral = loaded.commands(drives[unread])[:, drives.shape[1] :]
+    neutral = loaded.commands(drives[unread])[:, n_drives:]
     others = np.column_stack([unread, np.zeros_like(drives[unread]), neutral])
-    rows, place = np.unique(np.vstack([read, others]), axis=0, return_inverse=True)
-    of_state = rows[:, 0].astype(np.int64)
-    moved = drives[of_state] + rows[:, 1 : 1 + drives.shape[1]]
-    commands = np.hstack([moved, rows[:, 1 + drives.shape[1] :]])
-    commands = map_.at_own_coordinates(commands)
+    rows, state = np.unique(np.vstack([read, others]), axis=0, return_inverse=True)
+    posture_of = rows[:, 0].astype(np.int64)
+    displaced = drives[posture_of] + rows[:, 1 : 1 + n_drives]
+    commands = map_.with_coordinates(np.hstack([displaced, rows[:, 1 + n_drives :]]))
     first, variant = np.zeros(1, dtype=np.int64), np.zeros(len(rows), dtype=np.int64)
     if map_.of_placements.any():
         values = commands[:, map_.of_placements]
         _, first, variant = np.unique(values, axis=0, return_index=True, return_inverse=True)
-    number = np.arange(len(rows)) - np.searchsorted(of_state, of_state)
-    several = np.bincount(of_state)[of_state] > 1
+    number = np.arange(len(rows)) - np.searchsorted(posture_of, posture_of)
+    is_numbered = np.bincount(posture_of)[posture_of] > 1
     labels = tuple(
-        f"{names[k]} #{i + 1}" if more else names[k]
-        for k, i, more in zip(of_state, number, several, strict=True)
+        f"{names[k]} #{i + 1}" if numbered else names[k]
+        for k, i, numbered in zip(posture_of, number, is_numbered, strict=True)
     )
-    states = States(of_state, commands, variant.reshape(-1), commands[first], labels)
-    return states, place.reshape(-1)[: posture.size]
+    states = States(posture_of, commands, variant.reshape(-1), commands[first], labels)
+    return states, state.reshape(-1)[: posture.size]
 
 
 def drive_table(session: Session) -> Array:
@@ -405,31 +417,31 @@ def drive_table(session: Session) -> Array:
 def require_conditions(session: Session, free: Collection[str]) -> None:
     """Refuse readings without a condition that the effect of a free parameter needs.
 
-    An effect that only the robot's YAML names may find its conditions in no reading: its errors
-    then keep their tolerances.
+    If no reading states a condition, an effect that was not chosen explicitly is accepted: its
+    errors then keep their tolerances.
 
     Args:
         session: The session.
         free: Names of the free parameters of the machine.
 
     Raises:
-        SessionError: Naming the first such reading.
+        SessionError: If a condition is missing; names the first such reading.
     """
     parameters = session.robot.parameters
     errors = {term for name in free for term, _ in parameters[name].terms}
-    chosen = session.robot.chosen_effects is not None
+    explicit = session.robot.chosen_effects is not None
     for effect in robot_effects(session.robot):
         if not effect.setup_errors and errors.isdisjoint(e.name for e in effect.errors):
             continue
         for condition in effect.conditions:
-            lacking = readings_without(session, condition)
-            if not lacking or (len(lacking) == len(session.readings) and not chosen):
+            missing, total = readings_without(session, condition), len(session.readings)
+            if not missing or (len(missing) == total and not explicit):
                 continue
-            first, among = lacking[0], f"{len(lacking)} of {len(session.readings)} readings"
-            what = "is a difference" if first.minus else f"is a reading without {condition}"
+            first = missing[0]
+            problem = "is a difference" if first.minus else f"is a reading without {condition}"
             raise SessionError(
-                f"{what}; the effect '{effect.name}' needs the {condition} of each reading, "
-                f"which {among} do not state",
+                f"{problem}; the effect '{effect.name}' needs the {condition} of each reading, "
+                f"which {len(missing)} of {total} readings do not state",
                 where=session.where(first),
             )
 
@@ -437,14 +449,14 @@ def require_conditions(session: Session, free: Collection[str]) -> None:
 def readings_without(session: Session, condition: Condition) -> list[Reading]:
     """Readings that do not state a condition.
 
-    Where no reading of a setup states its time, its rows are in the order of time.
+    A setup without any time needs none: its rows are in the order of time.
     """
     if condition in ("adjustment", "coordinates"):  # the session states it
         return []
     if condition == "approach":
         return [r for r in session.readings if r.approach is None or "u" in r.approach]
-    lacking = [r for r in session.readings if getattr(r.conditions, condition, None) is None]
+    missing = [r for r in session.readings if getattr(r.conditions, condition, None) is None]
     if condition == "time":
         timed = {r.setup for r in session.readings if r.conditions and r.conditions.time}
-        return [r for r in lacking if r.minus or r.setup in timed]
-    return lacking
+        return [r for r in missing if r.minus or r.setup in timed]
+    return missing

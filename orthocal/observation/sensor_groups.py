@@ -1,4 +1,4 @@
-"""Sensors of a session by their expression, and their nuisance parameters."""
+"""Groups of sensors with the same expression, and nuisance parameters of a session."""
 
 from __future__ import annotations
 
@@ -20,25 +20,26 @@ class SensorGroup:
     """Entries whose sensors have the same expression."""
 
     reading: CompiledReading
+    """Functions of the sensors."""
     entries: Indices
-    """Shape (n,)."""
+    """Indices of the entries, shape (n,)."""
     setups: Indices
-    """Setup of each entry, shape (n,)."""
+    """Index of the setup of each entry, shape (n,)."""
     constants: Array
-    """Constants of each entry's sensor, then the conditions of the entry on which its reading
-    depends, shape (n, n_constants)."""
+    """Constants of the sensor, then conditions on which the reading depends, for each entry, shape
+    (n, n_constants)."""
     nuisance: Indices
-    """Indices of their nuisance parameters among the session's, shape (n, n_nuisance)."""
+    """Indices of the nuisance parameters of each entry, shape (n, n_nuisance)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NuisanceParameters:
-    """Nuisance parameters of a session's sensors, and those of effects on each setup."""
+    """Nuisance parameters of the sensors of a session, and of effects on its setups."""
 
     parameters: tuple[Parameter, ...]
-    """Named after their setup, or after what several setups share; no errors of the machine."""
+    """Parameters, named after their setup or after the object that several setups share."""
     of_setup: tuple[tuple[int, ...], ...]
-    """Their indices by setup, those of the sensor first."""
+    """Indices of the parameters of each setup, those of the sensor first."""
 
 
 def nuisance_parameters(session: Session) -> NuisanceParameters:
@@ -47,55 +48,53 @@ def nuisance_parameters(session: Session) -> NuisanceParameters:
     of_setup: list[tuple[int, ...]] = []
     read = {r.setup for r in session.readings}
     for setup in session.setups.values():
-        indices = []
         if setup.name not in read:
             of_setup.append(())
             continue
-        of_sensor = [
+        setup_parameters = [
             Parameter(f"{_owner(u, setup, session)}.{u.name}", u.unit, u.prior_std, ())
             for u in setup.sensor.nuisance_parameters
         ]
-        of_sensor += [
+        setup_parameters += [
             Parameter(f"setup.{setup.name}.{e.name}", e.unit, e.prior_std, (), e.positive)
             for effect in reading_effects(session.robot)
             for e in effect.setup_errors
         ]
-        for parameter in of_sensor:
+        for parameter in setup_parameters:
             parameters.setdefault(parameter.name, parameter)
-            indices.append(list(parameters).index(parameter.name))
-        of_setup.append(tuple(indices))
+        of_setup.append(tuple(list(parameters).index(p.name) for p in setup_parameters))
     return NuisanceParameters(tuple(parameters.values()), tuple(of_setup))
 
 
-def _owner(unknown: NuisanceParameter, setup: Setup, session: Session) -> str:
-    """Owner of a nuisance parameter: a gauge, a session's shared object, or the setup itself."""
+def _owner(parameter: NuisanceParameter, setup: Setup, session: Session) -> str:
+    """Owner of a nuisance parameter: a gauge, an object that setups share, or the setup."""
     label, joined, _ = setup.name.partition("/") if session.joined else ("", "", "")
-    if unknown.of_gauge:
+    if parameter.of_gauge:
         gauge = setup.gauge if not label else setup.gauge.partition("/")[2]
         return f"gauge.{gauge}" if gauge else "gauge"
-    if unknown.shared_by is not None:
-        return f"{label}{joined}{unknown.shared_by}"
+    if parameter.shared_by is not None:
+        return f"{label}{joined}{parameter.shared_by}"
     return f"setup.{setup.name}"
 
 
 def group_sensors(session: Session, observations: Observations) -> tuple[SensorGroup, ...]:
-    """Entries by the expression of their sensors."""
+    """Groups of entries whose sensors have the same expression."""
     robot = session.robot
     setups = list(session.setups.values())
     nuisance = nuisance_parameters(session).of_setup
-    members_of: dict[int, tuple[CompiledReading, list[int]]] = {}
+    by_reading: dict[int, tuple[CompiledReading, list[int]]] = {}
     for i in np.unique(observations.setup).tolist():
         reading = compile_reading(robot, setups[i].sensor)
-        members_of.setdefault(id(reading), (reading, []))[1].append(i)
+        by_reading.setdefault(id(reading), (reading, []))[1].append(i)
     groups = []
-    for reading, members in members_of.values():
+    for reading, members in by_reading.values():
         entries = np.flatnonzero(np.isin(observations.setup, members))
         constants = {i: setups[i].sensor.constants(robot) for i in members}
-        of_entry = observations.setup[entries]
-        table = np.array([constants[i] for i in of_entry.tolist()])
+        setup_of = observations.setup[entries]
+        table = np.array([constants[i] for i in setup_of.tolist()])
         conditions = [observations.conditions[c][entries] for c in reading.conditions]
         table = np.hstack([table.reshape(entries.size, -1), *conditions])
-        indices = np.array([nuisance[i] for i in of_entry.tolist()], dtype=np.int64)
+        indices = np.array([nuisance[i] for i in setup_of.tolist()], dtype=np.int64)
         indices = indices.reshape(entries.size, -1)
-        groups.append(SensorGroup(reading, entries, of_entry, table, indices))
+        groups.append(SensorGroup(reading, entries, setup_of, table, indices))
     return tuple(groups)

@@ -1,4 +1,4 @@
-"""Simulated readings of a machine with known errors. Simulated data is always marked as such."""
+"""Simulated readings of a machine with known errors, always marked as simulated."""
 
 from __future__ import annotations
 
@@ -25,20 +25,21 @@ from orthocal.session.session import Reading, Session
 from orthocal.units import MM, to_mm
 
 LARGEST_ZERO = 0.2e-3
-"""Limit of the uniform distribution of a dial's first reading in a setup, [m]."""
+"""Limit of the uniform distribution of the first reading of a setup, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedSession:
-    """A session of simulated readings and the truth behind it."""
+    """Session of simulated readings, and the true values of all parameters."""
 
     session: Session
+    """Session with the simulated readings."""
     errors: Mapping[str, float]
-    """Parameter name to true value, [SI]."""
+    """True values of the error parameters by name, [SI]; 0 where absent."""
     zeros: Mapping[str, float]
-    """Setup to the true zero of its gauge, [m]."""
+    """True gauge zeros by setup, [m]."""
     nuisance: Mapping[str, float] = field(default_factory=dict)
-    """Nuisance parameter to its true value, [SI]."""
+    """True values of the nuisance parameters by name, [SI]."""
 
 
 def draw_errors(
@@ -48,17 +49,20 @@ def draw_errors(
     seed: int,
     tolerances: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
-    """Errors drawn from their priors: independent, normal with mean 0, or half-normal.
+    """Draw errors from their priors: independent, normal with mean 0, or half-normal.
 
-    A tolerance is a limit of ±2 standard deviations, so about one error in twenty exceeds it.
+    A tolerance is ±2 standard deviations, so that about one error in twenty exceeds it.
 
     Args:
         robot: The robot.
-        patterns: Names or globs of the parameters to draw; '!' excludes. Of a sum and its terms
-            only the terms are drawn.
+        patterns: Names or globs of the parameters to draw; '!' excludes. If a sum and its terms are
+            selected, only the terms are drawn.
         seed: Seed of the random numbers.
-        tolerances: Name or glob with its unit, such as `*.offset_mm`, to another tolerance than
-            the robot's, a limit of ±2 standard deviations.
+        tolerances: Names or globs with their unit, such as `*.offset_mm`, mapped to tolerances that
+            replace those of the robot.
+
+    Returns:
+        Names of the parameters, mapped to values, [SI].
 
     Raises:
         ParameterError: If a pattern matches nothing.
@@ -69,15 +73,14 @@ def draw_errors(
     rng = np.random.default_rng(seed)
     parameters = robot.parameters
     chosen = parameters.select(patterns)
-    # a sum and its terms would be drawn twice
     chosen = tuple(
         n
         for n in chosen
         if len(parameters[n].terms) == 1 or not {t for t, _ in parameters[n].terms} & set(chosen)
     )
-    changed = parameters.read_tolerances(tolerances or {})
-    std = {n: value for g, value in changed.items() for n in parameters.select([g])}
-    drawn = {n: float(rng.normal() * std.get(n, parameters[n].prior_std)) for n in chosen}
+    replaced = parameters.read_tolerances(tolerances or {})
+    stds = {n: value for g, value in replaced.items() for n in parameters.select([g])}
+    drawn = {n: float(rng.normal() * stds.get(n, parameters[n].prior_std)) for n in chosen}
     return {n: abs(v) if parameters[n].positive else v for n, v in drawn.items()}
 
 
@@ -89,20 +92,20 @@ def simulate_session(
     sigma: float | None = None,
     exact: bool = False,
 ) -> SimulatedSession:
-    """Readings of a plan (or of another session's rows) on a machine with given errors.
+    """Simulate the readings of a plan, or of the rows of a session, on a machine with errors.
 
     Args:
         plan: Setups, postures and rows.
-        errors: Parameter name to value, [SI]; absent ones are 0. Nuisance parameters of the plan's
-            setups are drawn where they are absent.
+        errors: Names of parameters, mapped to values, [SI]. Absent errors are 0, absent nuisance
+            parameters of the setups are drawn.
         seed: Seed of noise, gauge zeros and nuisance parameters.
-        sigma: Standard deviation of a reading, [m]; the plan's gauge by default.
-        exact: No noise, no rounding and no mounting errors but stated ones; the first reading of
-            each setup is 0.
+        sigma: Standard deviation of a reading, [m]; that of the gauge by default.
+        exact: Simulate no noise, no rounding and no drawn mounting errors; the first reading of
+            each setup is then 0.
 
     Raises:
-        SessionError: If the noise is not stated, or a reading does not exist or leaves the gauge's
-            range.
+        SessionError: If the noise is not stated, a reading does not exist, or it is outside the
+            range of the gauge.
         ClosureError: If the machine cannot reach a posture.
     """
     require_kind(plan, Session, expected="a Session, such as load_plan(...)")
@@ -115,14 +118,14 @@ def simulate_session(
     nuisance = nuisance_parameters(plan).parameters
     drawn = np.zeros(len(nuisance))
     if nuisance and not exact:
-        # a separate generator: the noise does not depend on the nuisance parameters
+        # a separate generator, so that the noise does not depend on nuisance parameters
         normal = np.random.default_rng((seed, 1)).normal(size=len(nuisance))
         drawn = normal * [p.prior_std for p in nuisance]
         drawn = np.where([p.positive for p in nuisance], np.abs(drawn), drawn)
     truth = {p.name: errors.get(p.name, float(v)) for p, v in zip(nuisance, drawn, strict=True)}
-    of_machine = {name: value for name, value in errors.items() if name not in truth}
+    machine_errors = {name: value for name, value in errors.items() if name not in truth}
     entries = predict_readings(
-        plan, of_machine, observations=observations, nuisance=np.array(list(truth.values()))
+        plan, machine_errors, observations=observations, nuisance=np.array(list(truth.values()))
     )
     entries, zeros = show_readings(plan, observations, entries, rng=rng, sigma=sigma, exact=exact)
     rows = observations.rows(entries)
@@ -138,15 +141,18 @@ def simulate_session(
         readings_path=None,
         seed=seed,
     )
-    return SimulatedSession(session, of_machine, zeros, truth)
+    return SimulatedSession(session, machine_errors, zeros, truth)
 
 
 def _require_readable(plan: Session, rows: Array) -> None:
-    """Refuse simulated readings that do not exist or leave the gauge's range.
+    """Refuse simulated readings that do not exist or are outside the range of their gauge.
 
     Args:
         plan: The session whose rows are simulated.
         rows: Readings, shape (n_rows,), [m].
+
+    Raises:
+        SessionError: If a reading is refused.
     """
     for reading, value in zip(plan.readings, rows, strict=True):
         if not math.isfinite(value):
@@ -156,10 +162,10 @@ def _require_readable(plan: Session, rows: Array) -> None:
             )
         gauge_name, limits = plan.setups[reading.setup].gauge, limits_of(plan, reading)
         if limits is not None and not limits[0] <= value <= limits[1]:
-            beyond = limits[0] if value < limits[0] else limits[1]
+            limit = limits[0] if value < limits[0] else limits[1]
             raise SessionError(
                 f"the simulated reading {reading.label} is {value / MM:.3f} mm; the gauge's "
-                f"range ends at {beyond / MM:g} mm. Such a machine needs a gauge with more range, "
+                f"range ends at {limit / MM:g} mm. Such a machine needs a gauge with more range, "
                 "or offsets that are entered before; use smaller errors or another seed",
                 where=_where(plan, gauge_name, "range_mm") if plan.path is not None else None,
             )
@@ -174,25 +180,25 @@ def show_readings(
     sigma: float | None = None,
     exact: bool = False,
 ) -> tuple[Array, dict[str, float]]:
-    """Dial readings of exact entries: with gauge zeros, noise and rounding.
+    """Add gauge zeros, noise and rounding to exact readings.
 
     Args:
         plan: Setups, postures and rows.
         observations: The entries of the plan.
-        entries: Exact readings, gauge zeros at 0, shape (n_entries,), [m].
-        rng: Draws zeros and noise.
-        sigma: Standard deviation of a reading, [m]; the plan's gauge by default.
-        exact: No noise, no mounting errors and no rounding; the first reading of each setup is 0.
+        entries: Exact readings with gauge zeros at 0, shape (n_entries,), [m].
+        rng: Generator of zeros and noise.
+        sigma: Standard deviation of a reading, [m]; that of the gauge by default.
+        exact: Add no noise and no rounding; the first reading of each setup is then 0.
 
     Returns:
-        Shape (n_entries,), [m], and setup to the zero of its gauge, [m].
+        Readings of the gauges, shape (n_entries,), [m], and gauge zeros by setup, [m].
 
     Raises:
         SessionError: If the noise is not stated.
     """
     gauges = [plan.gauges[s.gauge] for s in plan.setups.values()]
-    deviation = np.array([_noise_of(plan, s.gauge, sigma, exact) for s in plan.setups.values()])
-    # the operator sets the dial in the first posture of its setup
+    noise = np.array([_noise_of(plan, s.gauge, sigma, exact) for s in plan.setups.values()])
+    # the operator sets the dial near 0 in the first posture of a setup
     zeros = dict.fromkeys(plan.setups, 0.0)
     for i, (name, setup) in enumerate(plan.setups.items()):
         if setup.zero == "known":
@@ -202,11 +208,12 @@ def show_readings(
             zeros[name] += round(float(rng.uniform(-LARGEST_ZERO, LARGEST_ZERO)), 6)
     entries = entries + np.array(list(zeros.values()))[observations.setup]
     if not exact:
-        entries = entries + deviation[observations.setup] * rng.normal(size=observations.size)
+        entries = entries + noise[observations.setup] * rng.normal(size=observations.size)
         for i, gauge in enumerate(gauges):
             if gauge.resolution is not None:
-                shown = observations.setup == i
-                entries[shown] = np.round(entries[shown] / gauge.resolution) * gauge.resolution
+                of_setup = observations.setup == i
+                divisions = np.round(entries[of_setup] / gauge.resolution)
+                entries[of_setup] = divisions * gauge.resolution
     return entries, zeros
 
 
@@ -220,21 +227,24 @@ def limits_of(plan: Session, reading: Reading) -> tuple[float, float] | None:
 
 def _noise_of(plan: Session, gauge: str, sigma: float | None, exact: bool) -> float:
     """Standard deviation of a gauge's simulated readings, [m]."""
-    deviation = plan.gauges[gauge].sigma if sigma is None else sigma
-    if deviation is None and not exact:
+    noise = plan.gauges[gauge].sigma if sigma is None else sigma
+    if noise is None and not exact:
         raise SessionError(
             "is missing: the noise to simulate is not stated",
             where=_where(plan, gauge, "sigma_mm"),
         )
-    return deviation or 0.0
+    return noise or 0.0
 
 
 def _where(plan: Session, gauge: str, key: str) -> str:
+    """File and key of a gauge, for messages."""
     path = f"gauges.{gauge}.{key}" if gauge else f"gauge.{key}"
     return path if plan.path is None else f"{plan.path}: {path}"
 
 
 class _TruthKeys(BaseModel):
+    """Keys of a file of errors, such as truth.yaml."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     errors: Annotated[dict[str, Number], Field(min_length=1)]
@@ -243,13 +253,13 @@ class _TruthKeys(BaseModel):
 
 
 def load_errors(path: str | Path, robot: Robot) -> dict[str, float]:
-    """Errors from a YAML file: `errors:` with keys such as x_slide.offset_mm.
+    """Load errors from a YAML file: `errors:` with keys such as x_slide.offset_mm.
 
     Returns:
-        Parameter name to value, [SI].
+        Names of parameters, mapped to values, [SI].
 
     Raises:
-        ParameterError: Naming file and key.
+        ParameterError: If a key is not valid; names file and key.
     """
     file = Path(path)
     data = read_yaml(file, error=ParameterError)
@@ -266,18 +276,21 @@ def collect_errors(
     nuisance: Iterable[Parameter] = (),
     seed: int = 0,
 ) -> dict[str, float]:
-    """Errors drawn from priors, from a file and from single values; later ones win.
+    """Collect errors drawn from priors, of a file and of single texts; later ones replace earlier.
 
     Args:
         robot: The robot.
-        file: As for `load_errors`.
+        file: YAML file for `load_errors`.
         single: Texts such as x_slide.offset_mm=1.2.
         draw: Model of the robot, or names and globs separated by commas, to draw.
-        nuisance: Nuisance parameters of a plan, which single values may state, too.
+        nuisance: Nuisance parameters of a plan, which texts may state in addition to errors.
         seed: Seed of the random numbers.
 
+    Returns:
+        Names of parameters, mapped to values, [SI].
+
     Raises:
-        ParameterError: If a name, unit or number does not fit, or there are no errors.
+        ParameterError: If a name, unit or number is not valid, or there are no errors.
     """
     errors: dict[str, float] = {}
     if draw is not None:
@@ -286,7 +299,7 @@ def collect_errors(
         patterns = robot.parameters.patterns(draw) if is_model else tuple(draw.split(","))
         if all(p.startswith("!") for p in patterns):
             raise ParameterError(
-                f"found '{draw}', which only excludes errors; expected those to draw before it, "
+                f"found '{draw}', which only excludes errors; expected errors to draw before it, "
                 f"such as '*,{draw}'",
                 where="--draw",
             )
@@ -308,30 +321,33 @@ def collect_errors(
         value = parse_number(number, where="--error", name=key, error=ParameterError)
         errors.update(read_errors({key: value}, parameters, where="--error"))
     if not errors:
-        raise ParameterError("no errors: give them by --errors, --error or --draw")
+        raise ParameterError("no errors; state them by --errors, --error or --draw")
     return errors
 
 
 def read_errors(
     values: Mapping[str, float], parameters: ParameterSet, *, where: str
 ) -> dict[str, float]:
-    """Errors from keys that carry their unit, [SI].
+    """Read errors from keys with unit suffix.
+
+    Returns:
+        Names of parameters, mapped to values, [SI].
 
     Raises:
-        ParameterError: Naming the key.
+        ParameterError: If a key is unknown or repeated; names it.
     """
     errors: dict[str, float] = {}
     for key, value in values.items():
         with errors_at(where):
             name, si = parameters.read_quantity(key, value)
         if name in errors:
-            raise ParameterError(f"'{name}' is given twice", where=where)
+            raise ParameterError(f"'{name}' is stated twice", where=where)
         errors[name] = si
     return errors
 
 
 def truth_document(simulated: SimulatedSession) -> str:
-    """Text of a truth.yaml: errors, zeros and nuisance parameters of a simulated session."""
+    """Text of truth.yaml: errors, gauge zeros and nuisance parameters of a simulated session."""
     parameters = simulated.session.robot.parameters
     errors = {}
     for name, value in simulated.errors.items():
@@ -342,11 +358,9 @@ def truth_document(simulated: SimulatedSession) -> str:
         "zeros_mm": {name: to_mm(value) for name, value in simulated.zeros.items()},
     }
     if simulated.nuisance:
-        of_sensors = {p.name: p for p in nuisance_parameters(simulated.session).parameters}
+        by_name = {p.name: p for p in nuisance_parameters(simulated.session).parameters}
         document["sensors"] = {
-            f"{name}_{of_sensors[name].edge_unit}": float(
-                f"{value * of_sensors[name].edge_factor:.9g}"
-            )
+            f"{name}_{by_name[name].edge_unit}": float(f"{value * by_name[name].edge_factor:.9g}")
             for name, value in simulated.nuisance.items()
         }
     head = "# The truth behind the simulated readings beside this file. No calibration reads it.\n"

@@ -1,7 +1,7 @@
-"""Candidate readings of a plan: every possible setup in every posture in which it can be read.
+"""Candidate readings of a plan: every possible setup in all its possible postures.
 
-Candidates are a session like any other, for all sensors: contacts, predicted readings and
-Jacobians come from the same functions.
+The candidates are an ordinary session. So contacts, predicted readings and Jacobians of all sensors
+come from the usual functions.
 """
 
 from __future__ import annotations
@@ -34,37 +34,38 @@ from orthocal.session.session import Conditions, Gauge, Posture, Reading, Sessio
 from orthocal.statistics.noise import noise_floor
 from orthocal.units import MM
 
-PLACES_ACROSS = 5
-"""Number of positions across a leg's direction."""
+POSITIONS_ACROSS = 5
+"""Number of positions of the tool across a leg's direction."""
 
-STEEPEST = 0.43
+MAX_BALL_OFFSET = 0.43
 """Largest lateral distance of ball and rod, as a fraction of the sum of their radii: 25°."""
 
-ON_BLADE = 0.4
+MAX_BLADE_OFFSET = 0.4
 """Largest distance of the contact from the centre of a blade, as a fraction of its width."""
 
-WHOLE = 5e-3
+POSITION_STEP = 5e-3
 """Step of the positions, [m]."""
 
 PHASES = 4
-"""Phases of a periodic error in which successive positions along a leg lie."""
+"""Number of phases of a periodic error that successive positions along a leg sample."""
 
-OVERLAP = 1.0
-"""Distance of neighbouring lateral positions of a tip, in half widths."""
+LATERAL_SPACING = 1.0
+"""Distance of neighbouring lateral positions of a tip, in half widths of the tip."""
 
 ON_AXIS = 0.999
-"""Cosine above which a leg is parallel to an axis of the world."""
+"""Smallest cosine between a leg and an axis of the world that count as parallel."""
 
 ZERO_PRIOR = 0.01
-"""Prior standard deviation of a gauge zero, [m]: large beside any reading."""
+"""Prior standard deviation of a gauge zero, [m]; larger than any reading."""
 
-FEWEST = 2
-"""Fewest readings of a setup: one alone only determines the gauge zero."""
+MIN_READINGS = 2
+"""Fewest readings of a setup: a single one only determines the gauge zero."""
 
-FEWEST_POINTS = 4
+MIN_POINTS = 4
 """Fewest points of a setup: three determine the frame of the instrument."""
 
-MOST_CANDIDATES = 60_000
+MAX_CANDIDATES = 60_000
+"""Most candidate readings of a plan, to limit time and memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,49 +73,53 @@ class AlignedParameter:
     """Nuisance parameter that the operator aligns to the machine in a setup's first posture."""
 
     sensitivity: Array
-    """Sensitivity of the readings to it, shape (m,), [m/SI]."""
+    """Sensitivity of the readings to the parameter, shape (m,), [m/SI]."""
     jacobian: Array
-    """Its sensitivity to the state in each posture, less the mean, shape (m, n_state), [SI]."""
+    """Sensitivity of the parameter to the state if it is aligned in each posture, minus the mean
+    of the postures, shape (m, n_state), [SI per prior std]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CandidateSetup:
-    """Possible setup, with the readings that it could have."""
+    """Possible setup with its candidate readings."""
 
     name: str
     """Name in the session of candidates."""
     rows: Indices
-    """Row of each reading, the first one of a point, shape (m,)."""
+    """Row of each reading in that session, the first one of a point, shape (m,)."""
     jacobian: Array
-    """Sensitivity of the readings to the state, shape (m width, n_state), [m per prior std]; with
-    the gauge aligned on the mean of the postures."""
+    """Sensitivity of the readings to the state, shape (m width, n_state), [m per prior std],
+    averaged over the postures in which the gauge may be aligned."""
     covariance: Array
     """Covariance of the readings from the setup's nuisance parameters and zero, shape
     (m width, m width), [m²]."""
     reachable: NDArray[np.bool_]
-    """Whether a gauge that begins in one reading (row) has another (column) in its range,
+    """Mask of readings (columns) within the range of a gauge that begins in another reading (rows),
     shape (m, m)."""
     aligned: tuple[AlignedParameter, ...] = ()
     absolute: bool = False
     """Whether the gauge zero is known."""
     gauge: str = ""
-    """Name of its gauge."""
+    """Name of the gauge."""
     width: int = 1
     """Numbers that the gauge shows in a posture: 3 for a point, in successive rows."""
 
     @property
-    def fewest(self) -> int:
+    def min_readings(self) -> int:
         """Fewest readings of a setup."""
-        return FEWEST if self.width == 1 else FEWEST_POINTS
+        return MIN_READINGS if self.width == 1 else MIN_POINTS
 
     def numbers(self, chosen: Sequence[int] | Indices) -> Indices:
         """Indices in the Jacobian of some readings, shape (..., n_chosen width)."""
         first = np.asarray(chosen, dtype=np.int64)[..., None] * self.width
-        every = first + np.arange(self.width)
-        return every.reshape(*every.shape[:-2], every.shape[-2] * self.width)
+        rows = first + np.arange(self.width)
+        return rows.reshape(*rows.shape[:-2], rows.shape[-2] * self.width)
 
     def jacobian_of(self, chosen: Sequence[int]) -> Array:
-        """Jacobian of some readings, the gauge aligned in the first, (n_chosen width, n_state)."""
+        """Jacobian of some readings if the gauge is aligned in the first.
+
+        The shape is (n_chosen width, n_state).
+        """
         rows = self.numbers(chosen)
         jacobian = self.jacobian[rows]
         for a in self.aligned:
@@ -132,9 +137,9 @@ class Candidates:
     sigma: float
     """Standard deviation of a reading, [m]."""
     state: tuple[str, ...]
-    """Parameters on which more than one setup depends."""
+    """Names of the parameters on which more than one setup may depend."""
     spare_range: float
-    """Part of the gauge's range to either side that the tolerances of the machine need, [m]."""
+    """Range of the gauge to either side that errors within the tolerances need, [m]; median."""
 
     @property
     def count(self) -> int:
@@ -143,18 +148,18 @@ class Candidates:
 
     @property
     def without_session(self) -> Candidates:
-        """Candidates without the session and its problem, which cannot be pickled."""
-        nothing: Any = None
-        return replace(self, session=nothing, problem=nothing)
+        """Copy without the session and its problem, which cannot be pickled."""
+        absent: Any = None
+        return replace(self, session=absent, problem=absent)
 
 
 def list_candidates(robot: Robot, equipment: Equipment, *, reference: str = "") -> Session:
-    """Session of every possible setup in every posture in which it can be read.
+    """Session of every possible setup in all its possible postures.
 
     Args:
         robot: The robot.
         equipment: Gauge, tip and region of the postures.
-        reference: Name of the robot in the session; by default its own.
+        reference: Name of the robot in the session; by default that of the model.
 
     Raises:
         ParameterError: If there are no candidates, or too many.
@@ -163,7 +168,9 @@ def list_candidates(robot: Robot, equipment: Equipment, *, reference: str = "") 
         raise ParameterError(
             f"'{robot.name}' has no legs for a gauge; add orthocal.legs", where="plan"
         )
-    tool = list_tool_candidates(robot, equipment.owned, equipment.box)
+    tool_gauges, tool_postures, tool_setups, tool_readings = list_tool_candidates(
+        robot, equipment.owned, equipment.box
+    )
     dial = DIAL if equipment.owned else ""
     postures: dict[str, Posture] = {}
     setups: dict[str, Setup] = {}
@@ -173,7 +180,7 @@ def list_candidates(robot: Robot, equipment: Equipment, *, reference: str = "") 
         for name, sensor in _sensors(leg, equipment):
             setups[name] = Setup(name, sensor, dial)
             readings += [Reading(name, p) for p in names]
-            if len(readings) > MOST_CANDIDATES * 10:
+            if len(readings) > MAX_CANDIDATES * 10:
                 break
     session = Session(
         robot=robot,
@@ -183,28 +190,27 @@ def list_candidates(robot: Robot, equipment: Equipment, *, reference: str = "") 
         setups=setups,
         readings=tuple(readings),
     )
-    gauges, further, of_tool, more = tool
     if session.readings:  # the noise is that of the first gauge
         session = _with_approaches(_touching(_with_lateral_positions(session)))
-        gauges = {**session.gauges, **gauges}
+        tool_gauges = {**session.gauges, **tool_gauges}
     return replace(
         session,
-        gauges=gauges,
-        postures={**session.postures, **further},
-        setups={**session.setups, **of_tool},
-        readings=(*session.readings, *more),
+        gauges=tool_gauges,
+        postures={**session.postures, **tool_postures},
+        setups={**session.setups, **tool_setups},
+        readings=(*session.readings, *tool_readings),
     )
 
 
 def measure_candidates(
     session: Session, problem: CalibrationProblem, *, spare_range: float
 ) -> Candidates:
-    """Jacobians and covariances of candidate readings, and which of them fit a gauge's range.
+    """Compute Jacobians, covariances and gauge ranges of candidate readings.
 
     Args:
         session: Session of the candidates.
-        problem: Its calibration problem, with priors for all free parameters.
-        spare_range: As in `Equipment`.
+        problem: Calibration problem of that session, with priors for all free parameters.
+        spare_range: Prior standard deviations of readings that must fit into the gauge's range.
     """
     sigma = noise_floor(session.gauge.sigma, session.gauge.resolution)
     h, jacobian = problem.predict_and_jacobian(problem.active_theta)
@@ -212,44 +218,44 @@ def measure_candidates(
     private = {f"setup.{name}" for name in session.setups}
     owners = [name.rpartition(".")[0] for name in problem.free]
     common = [i for i, owner in enumerate(owners) if i < n or owner not in private]
-    setups, needed, aligned_of = [], [], _list_aligned(session, problem)
+    setups, margins, aligned_of = [], [], _list_aligned(session, problem)
     aligned_at, order = session.alignment_postures, list(session.setups)
     for parts in _find_parts(session):
         width, name = len(parts), parts[0].name
         rows = np.flatnonzero(np.isin(o.setup, [order.index(p.name) for p in parts]))
-        if rows.size < FEWEST * width:
+        if rows.size < MIN_READINGS * width:
             continue
-        own = {f"setup.{part.name}" for part in parts}
-        of_setup = [i for i in range(n, len(owners)) if owners[i] in own]
-        shared, mine = jacobian[rows][:, common], jacobian[rows][:, of_setup]
+        of_parts = {f"setup.{part.name}" for part in parts}
+        of_setup = [i for i in range(n, len(owners)) if owners[i] in of_parts]
+        by_state, by_nuisance = jacobian[rows][:, common], jacobian[rows][:, of_setup]
         aligned = []
-        for index, seen in aligned_of.get(name, ()):
+        for index, alignment in aligned_of.get(name, ()):
             sensitivity = jacobian[rows, index] / problem.theta_scale[index]
-            moved = np.zeros_like(shared)
-            moved[:, :n] = seen - seen.mean(axis=0)
-            at = [session.readings[i].posture for i in rows].index(aligned_at[name])
-            shared -= np.outer(sensitivity, moved[at])  # the session aligns the gauge there
-            aligned.append(AlignedParameter(sensitivity, moved))
-        covariance, absolute = mine @ mine.T, parts[0].zero == "known"
+            deviation = np.zeros_like(by_state)
+            deviation[:, :n] = alignment - alignment.mean(axis=0)
+            first = [session.readings[i].posture for i in rows].index(aligned_at[name])
+            by_state -= np.outer(sensitivity, deviation[first])  # the session aligns the gauge here
+            aligned.append(AlignedParameter(sensitivity, deviation))
+        covariance, absolute = by_nuisance @ by_nuisance.T, parts[0].zero == "known"
         reachable = np.ones((rows.size // width, rows.size // width), dtype=np.bool_)
         for c, part in enumerate(parts):
             of_part, ratio = slice(c, None, width), float(problem.noise_ratio[rows[c]])
-            spread = covariance[of_part, of_part]
+            nuisance = covariance[of_part, of_part]
             # the operator places a fixed ball so that its first reading is in the middle of the
             # range
-            unknown = spare_range * ratio * _difference_std(shared[of_part], spread)
-            needed.append(float(unknown.max()))
+            margin = spare_range * ratio * _difference_std(by_state[of_part], nuisance)
+            margins.append(float(margin.max()))
             gauge = session.gauges[part.gauge]
-            reachable &= _find_reachable(gauge, ratio * h[rows[of_part]], unknown)
-            spread += 0.0 if absolute else (ZERO_PRIOR / ratio) ** 2
+            reachable &= _find_reachable(gauge, ratio * h[rows[of_part]], margin)
+            covariance[of_part, of_part] += 0.0 if absolute else (ZERO_PRIOR / ratio) ** 2
         candidate = CandidateSetup(
-            *(name, rows[::width], shared, covariance, reachable, tuple(aligned), absolute),
+            *(name, rows[::width], by_state, covariance, reachable, tuple(aligned), absolute),
             *(names_in_files(parts[0])[1], width),
         )
         setups.append(candidate)
     state = tuple(problem.free[i] for i in common)
-    typical = float(np.median(needed)) if needed else 0.0
-    return Candidates(session, problem, tuple(setups), sigma, state, typical)
+    median = float(np.median(margins)) if margins else 0.0
+    return Candidates(session, problem, tuple(setups), sigma, state, median)
 
 
 def _find_parts(session: Session) -> list[list[Setup]]:
@@ -263,91 +269,104 @@ def _find_parts(session: Session) -> list[list[Setup]]:
 def _list_aligned(
     session: Session, problem: CalibrationProblem
 ) -> dict[str, list[tuple[int, Array]]]:
-    """Nuisance parameters that are aligned to the machine, by setup.
+    """Nuisance parameters that are aligned to the machine.
 
-    Each has its index among the free parameters, and its sensitivity to the machine's parameters
-    in each of the setup's readings, shape (m, n_machine), [SI per prior std].
+    Returns:
+        Pairs by setup: index among the free parameters; and sensitivity to the machine's parameters
+        in the posture of each reading, shape (m, n_machine), [SI per prior std].
     """
-    aligned: dict[str, dict[str, Setup]] = {}
+    by_parameter: dict[str, dict[str, Setup]] = {}
     for name, setup in session.setups.items():
-        for unknown, sensor in setup.sensor.aligned_to(session.robot).items():
-            if unknown in {u.name for u in setup.sensor.nuisance_parameters}:
-                aligned.setdefault(unknown, {})[name] = replace(setup, sensor=sensor)
-    listed: dict[str, list[tuple[int, Array]]] = {}
-    for unknown, setups in aligned.items():
-        # operators align a gauge whatever the approach was
+        for parameter, sensor in setup.sensor.aligned_to(session.robot).items():
+            if parameter in {u.name for u in setup.sensor.nuisance_parameters}:
+                by_parameter.setdefault(parameter, {})[name] = replace(setup, sensor=sensor)
+    aligned: dict[str, list[tuple[int, Array]]] = {}
+    for parameter, setups in by_parameter.items():
+        # the alignment does not depend on the approach
         readings = tuple(replace(r, conditions=None) for r in session.readings if r.setup in setups)
-        views = replace(session, setups=setups, readings=readings)
-        jacobian = nominal_sensitivity(views) @ problem.errors_per_theta
-        setup_of = build_observations(views).setup
+        virtual = replace(session, setups=setups, readings=readings)
+        jacobian = nominal_sensitivity(virtual) @ problem.errors_per_theta
+        setup_of_row = build_observations(virtual).setup
         for k, name in enumerate(setups):
-            index = problem.free.index(f"setup.{name}.{unknown}")
-            listed.setdefault(name, []).append((index, jacobian[setup_of == k]))
-    return listed
+            index = problem.free.index(f"setup.{name}.{parameter}")
+            aligned.setdefault(name, []).append((index, jacobian[setup_of_row == k]))
+    return aligned
 
 
-def _difference_std(jacobian: Array, spread: Array) -> Array:
-    """Prior standard deviations of differences of readings, shape (m, m), [m]."""
-    covariance = jacobian @ jacobian.T + spread
+def _difference_std(jacobian: Array, nuisance: Array) -> Array:
+    """Prior standard deviations of differences of readings, shape (m, m), [m].
+
+    Args:
+        jacobian: Sensitivity to the state, shape (m, n_state), [m per prior std].
+        nuisance: Covariance from nuisance parameters, shape (m, m), [m²].
+    """
+    covariance = jacobian @ jacobian.T + nuisance
     variance = np.diag(covariance)
     square = variance[:, None] + variance[None] - 2.0 * covariance
     return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
 
-def _find_reachable(gauge: Gauge, h: Array, unknown: Array) -> NDArray[np.bool_]:
-    """True if a gauge with the middle of its range in one posture has another in its range."""
+def _find_reachable(gauge: Gauge, h: Array, margin: Array) -> NDArray[np.bool_]:
+    """Mask of readings within the range of a gauge that is centred on another reading, (m, m).
+
+    Args:
+        gauge: The gauge.
+        h: Predicted readings, shape (m,), [m].
+        margin: Part of the range that errors within the tolerances need, shape (m, m), [m].
+    """
     if gauge.range is None:
         return np.ones((h.size, h.size), dtype=np.bool_)
     half = 0.5 * (gauge.range[1] - gauge.range[0])
-    return np.asarray(np.abs(h[:, None] - h[None]) <= half - unknown)
+    return np.asarray(np.abs(h[:, None] - h[None]) <= half - margin)
 
 
 def _add_postures(
     robot: Robot, leg: Leg, equipment: Equipment, postures: dict[str, Posture]
 ) -> list[str]:
-    """Add the postures in which a leg can be read; their names."""
+    """Add the postures in which a leg can be read, and return their names."""
     box = choose_box(robot, equipment.box)
     middle = tool_at_zero(robot)
     coordinates = () if robot.tcp is None else robot.tcp.coordinates
     along = [k for k, c in enumerate(coordinates) if abs(leg.axis[c]) > ON_AXIS]
-    lines = []
+    coordinate_values = []
     for k, (low, high) in enumerate(box):
         if along and k not in along:
-            side = middle[k] + np.linspace(-equipment.across, equipment.across, PLACES_ACROSS)
-            lines.append(np.unique(np.clip(side, low, high)))
+            values = middle[k] + np.linspace(-equipment.across, equipment.across, POSITIONS_ACROSS)
+            coordinate_values.append(np.unique(np.clip(values, low, high)))
         else:
-            line = np.linspace(low, high, equipment.along if along else PLACES_ACROSS)
-            rounded = np.round(line / WHOLE) * WHOLE + _phases(robot, line.size)
-            lines.append(np.unique(np.clip(rounded, low, high).round(9)))
-    points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(lines))
+            values = np.linspace(low, high, equipment.along if along else POSITIONS_ACROSS)
+            values = np.round(values / POSITION_STEP) * POSITION_STEP + _phases(robot, values.size)
+            coordinate_values.append(np.unique(np.clip(values, low, high).round(9)))
+    points = np.stack(np.meshgrid(*coordinate_values, indexing="ij"), axis=-1)
+    points = points.reshape(-1, len(coordinate_values))
     points = np.unique(np.vstack([np.clip(middle, box[:, 0], box[:, 1]), points.round(9)]), axis=0)
     points = points[reachable(robot, points)]
-    if len(points) < FEWEST:
-        raise ParameterError("the machine reaches no posture in it", where="plan: box")
-    names = [posture_name(p, robot, middle) for p in points]
+    if len(points) < MIN_READINGS:
+        raise ParameterError("the machine reaches no posture in this box", where="plan: box")
+    names = [posture_name(robot, p, middle) for p in points]
     for name, posture in place_tool(robot, names, points).items():
         postures.setdefault(name, posture)
     return names
 
 
 def _phases(robot: Robot, count: int) -> Array:
-    """Fractions of a period by which positions along a leg are shifted, shape (count,), [m]."""
+    """Shifts of positions along a leg by fractions of a periodic error's period, (count,), [m]."""
     period = next((e.period for e in robot_effects(robot) if e.period is not None), 0.0)
     return np.asarray(np.arange(count) % PHASES * (period / PHASES))
 
 
 def _sensors(leg: Leg, equipment: Equipment) -> Iterator[tuple[str, LegIndicator]]:
-    """Possible indicators at a leg, with names."""
+    """Names and indicators of all possible setups at a leg."""
     for direction in directions_across(leg):
-        word = direction if isinstance(direction, str) else "d"
-        for part in equipment.sections:
-            for sensor in equipment.list_sensors(leg, direction, part):
+        prefix = direction if isinstance(direction, str) else "d"
+        for fraction in equipment.sections:
+            for sensor in equipment.list_sensors(leg, direction, fraction):
                 rod = "" if sensor.rod is None else f"_{sensor.rod}"
-                yield f"{word}{leg.name}{rod}_{part:g}", sensor
+                yield f"{prefix}{leg.name}{rod}_{fraction:g}", sensor
 
 
 def directions_across(leg: Leg) -> list[Direction]:
-    """Two directions across a leg, along axes of the world that are perpendicular to it."""
+    """Two directions across a leg, along axes of the world if these are perpendicular to it."""
     directions: list[Direction] = [
         name for name, axis in zip("xyz", np.eye(3), strict=True) if abs(axis @ leg.axis) < 1e-6
     ]
@@ -362,58 +381,61 @@ def directions_across(leg: Leg) -> list[Direction]:
 
 
 def _with_lateral_positions(session: Session) -> Session:
-    """Candidates with further gauges where the rod is in displaced postures."""
+    """Add setups with the gauge at further lateral positions, for postures that displace the rod.
+
+    A very wide blade locates the contact with the rod in every posture.
+    """
     robot, wide = session.robot, Tip("blade", 0.0, 10.0)
     sensors = {
         name: sensor
         for name, setup in session.setups.items()
         if (sensor := indicator_of(setup)) is not None
     }
-    views = {
+    on_rods = {
         n: replace(session.setups[n], sensor=s.on_rod(s.rod, wide))
         for n, s in sensors.items()
         if s.rod is not None
     }
-    if not views:
+    if not on_rods:
         return session
-    setups = {n: s for n, s in session.setups.items() if n not in views}
-    readings = [r for r in session.readings if r.setup not in views]
-    read: dict[str, list[Reading]] = {name: [] for name in sensors}
+    setups = {n: s for n, s in session.setups.items() if n not in on_rods}
+    readings = [r for r in session.readings if r.setup not in on_rods]
+    of_setup: dict[str, list[Reading]] = {name: [] for name in sensors}
     for reading in session.readings:
-        read[reading.setup].append(reading)
-    on_rods = tuple(r for name in views for r in read[name])
-    contacts = locate_contacts(replace(session, setups=views, readings=on_rods))
+        of_setup[reading.setup].append(reading)
+    rod_readings = tuple(r for name in on_rods for r in of_setup[name])
+    contacts = locate_contacts(replace(session, setups=on_rods, readings=rod_readings))
     for name, (postures, contact) in contacts.items():
         sensor = sensors[name]
-        constants, half = sensor.constants(robot), _lateral_room(sensor, robot)
+        constants, half = sensor.constants(robot), _max_lateral_distance(sensor, robot)
         side, start = constants[8:11], constants[11:14]
-        aside = dict(zip(postures, ((contact.points - start) @ side).tolist(), strict=True))
-        step = max(round(OVERLAP * half / MM), 1) * MM
-        lowest, highest = (round(f(aside.values()) / step) for f in (min, max))
+        lateral = dict(zip(postures, ((contact.points - start) @ side).tolist(), strict=True))
+        step = max(round(LATERAL_SPACING * half / MM), 1) * MM
+        lowest, highest = (round(f(lateral.values()) / step) for f in (min, max))
         for k in range(lowest, highest + 1):
-            near = [r for r in read[name] if abs(aside[r.posture] - k * step) <= half]
-            view_name = name if k == 0 else f"{name}_{k * step / MM:+.3g}"
+            near = [r for r in of_setup[name] if abs(lateral[r.posture] - k * step) <= half]
+            new_name = name if k == 0 else f"{name}_{k * step / MM:+.3g}"
             x, y, z = (float(v) for v in (k * step * side).round(9) + 0.0)
-            lateral = replace(sensor, beside=(x, y, z))
-            setups[view_name] = replace(session.setups[name], name=view_name, sensor=lateral)
-            readings += [replace(r, setup=view_name) for r in near]
+            displaced = replace(sensor, beside=(x, y, z))
+            setups[new_name] = replace(session.setups[name], name=new_name, sensor=displaced)
+            readings += [replace(r, setup=new_name) for r in near]
     return replace(session, setups=setups, readings=tuple(readings))
 
 
 def indicator_of(setup: Setup) -> LegIndicator | None:
-    """Indicator at a leg of a candidate setup; None for another sensor."""
+    """Indicator of a setup at a leg; None for another sensor."""
     return setup.sensor if isinstance(setup.sensor, LegIndicator) else None
 
 
-def _lateral_room(sensor: LegIndicator, robot: Robot) -> float:
-    """Largest lateral distance of a rod from a tip, [m]."""
+def _max_lateral_distance(sensor: LegIndicator, robot: Robot) -> float:
+    """Largest lateral distance of a rod from the middle of a tip that touches it, [m]."""
     if sensor.tip.form == "ball":
-        return STEEPEST * float(sensor.constants(robot)[14])  # radii of rod and ball
-    return ON_BLADE * sensor.tip.width
+        return MAX_BALL_OFFSET * float(sensor.constants(robot)[14])  # sum of both radii
+    return MAX_BLADE_OFFSET * sensor.tip.width
 
 
 def _with_approaches(session: Session) -> Session:
-    """Each candidate once for every approach that the robot's effects distinguish.
+    """Repeat each candidate for every approach that the robot's effects distinguish.
 
     Raises:
         ParameterError: If no posture can be approached.
@@ -438,19 +460,19 @@ def _with_approaches(session: Session) -> Session:
 
 
 def _touching(session: Session) -> Session:
-    """Candidates whose tip touches the rod on the nominal machine."""
-    good = {
+    """Select the candidates whose tip touches the rod on the nominal machine."""
+    touching = {
         (setup, posture)
         for setup, (postures, contact) in locate_contacts(session).items()
         for posture, problem in zip(postures, contact.problems, strict=True)
         if not problem
     }
-    readings = tuple(r for r in session.readings if (r.setup, r.posture) in good)
+    readings = tuple(r for r in session.readings if (r.setup, r.posture) in touching)
     if not readings:
         raise ParameterError("no gauge touches a rod in any posture", where="plan")
-    if len(readings) > MOST_CANDIDATES:
+    if len(readings) > MAX_CANDIDATES:
         raise ParameterError(
-            f"{len(readings)} candidate readings; expected at most {MOST_CANDIDATES}: choose fewer "
+            f"{len(readings)} candidate readings; expected at most {MAX_CANDIDATES}: choose fewer "
             "sections or positions",
             where="plan",
         )

@@ -1,4 +1,4 @@
-"""Equipment of a plan: the gauge, the places where it may be mounted, and the postures."""
+"""Equipment of a plan: gauge, possible sections, and region of the postures."""
 
 from __future__ import annotations
 
@@ -20,8 +20,12 @@ from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.workspace import tool_at_zero
-from orthocal.measurement.files.schema import GaugeKeys
-from orthocal.observation.conditions import MINUTES_A_READING, MINUTES_A_SETUP, in_course
+from orthocal.measurement.files.session_keys import GaugeKeys
+from orthocal.observation.conditions import (
+    MINUTES_PER_READING,
+    MINUTES_PER_SETUP,
+    schedule_readings,
+)
 from orthocal.planning.expected_error import state_noise
 from orthocal.planning.owned_sensors import Duration, OwnedSensor
 from orthocal.robot.model import Leg, Robot, require_commanded_tool
@@ -33,14 +37,14 @@ from orthocal.session.points import names_in_files, one_row_a_point
 from orthocal.session.session import Gauge, Posture, Session
 from orthocal.units import MM
 
-REACH = 0.1
+DEFAULT_REACH = 0.1
 """Largest default distance of the tool from the mechanical zero, along each coordinate, [m]."""
 
-ROOM = 0.005
-"""Distance kept from the end of the reach, because offsets of the machine reduce it, [m]."""
+REACH_MARGIN = 0.005
+"""Distance of postures from the end of the reach, which offsets of the machine reduce, [m]."""
 
-STEP = 0.01
-"""Step of the ends of the default box, [m]."""
+BOX_STEP = 0.01
+"""Step of the limits of the box, [m]."""
 
 SECTIONS = (0.25, 0.5, 0.75)
 """Default sections, as fractions of a leg's length from its root."""
@@ -49,11 +53,13 @@ ACROSS = 0.02
 """Default displacement of the tool across a leg's direction, [m]."""
 
 SPARE_RANGE = 3.0
+"""Default of `Equipment.spare_range`."""
 
 USUAL_DIAL = Gauge(5e-6, 10e-6, (-5e-3, 5e-3))
 """Dial indicator of ±5 mm with a resolution of 10 µm."""
 
 USUAL_BALL = Tip("ball", 1.5e-3)
+"""Ball of 3 mm diameter."""
 
 MOUNTING_KEYS = ("direction_tolerance_mrad", "section_tolerance_mm", "lateral_tolerance_mm")
 """Keys of dial.yaml that describe the mounting."""
@@ -61,36 +67,35 @@ MOUNTING_KEYS = ("direction_tolerance_mrad", "section_tolerance_mm", "lateral_to
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Equipment:
-    """Gauge, tip and time that are available, and the region in which readings are possible."""
+    """Available gauges, tip and time, and the region of possible readings."""
 
     gauge: Gauge = USUAL_DIAL
     tip: Tip | None = USUAL_BALL
-    """Tip of the gauge; None for readings of the line between a leg's rods, as in the paper."""
+    """Tip of the gauge; None for readings of a leg's centre line, as in the paper."""
     mounting: Mounting = USUAL
     """Mounting uncertainty of the gauge."""
     rods: tuple[str, ...] = ()
     """Rods of each leg that the gauge can touch; by default the first one."""
     sections: tuple[float, ...] = SECTIONS
-    """Fractions of a leg's length, from its root."""
+    """Possible sections, as fractions of a leg's length from its root."""
     box: Array | None = None
     """Limits of the tool's coordinates, shape (n_coordinates, 2), [m]; by default `find_box`."""
     along: int = 9
     """Number of positions along a leg's direction."""
     across: float = ACROSS
-    """Displacement of the tool across a leg's direction, to either side, [m]."""
+    """Largest displacement of the tool to either side across a leg's direction, [m]."""
     spare_range: float = SPARE_RANGE
-    """Standard deviations of readings, before the machine is calibrated, for which the gauge's
-    range has room."""
-    minutes_a_setup: float = MINUTES_A_SETUP
-    minutes_a_reading: float = MINUTES_A_READING
+    """Prior standard deviations of readings that must fit into the gauge's range."""
+    minutes_a_setup: float = MINUTES_PER_SETUP
+    minutes_a_reading: float = MINUTES_PER_READING
     temperatures: tuple[float, float] | None = None
-    """Temperature at the first and at the last reading, [°C]; by default that at which the nominal
-    dimensions hold."""
+    """Temperatures at the first and at the last reading, [°C]; by default the reference temperature
+    of the nominal dimensions."""
     owned: tuple[OwnedSensor, ...] = ()
     """Available sensors at the tool."""
 
     def list_sensors(self, leg: Leg, direction: Direction, fraction: float) -> list[LegIndicator]:
-        """Indicators at a section of a leg: one for each rod that the tip can touch.
+        """Indicators at a section of a leg, one for each rod that the tip can touch.
 
         Raises:
             ParameterError: If the leg has no such rod.
@@ -108,38 +113,40 @@ class Equipment:
         return [line.on_rod(rod, self.tip) for rod in self.rods or tuple(leg.rods)[:1]]
 
     def minutes(self, setups: int, readings: int) -> float:
-        """Duration of setups at legs and their readings."""
+        """Minutes of setups at legs and their readings."""
         return setups * self.minutes_a_setup + readings * self.minutes_a_reading
 
     def durations(self, session: Session) -> dict[str, Duration]:
-        """Duration of setups and readings with each gauge of a session."""
-        usual = Duration(self.minutes_a_setup, self.minutes_a_reading)
-        known = {sensor.name: sensor.duration for sensor in self.owned}
-        used = [session.gauges, [names_in_files(s)[1] for s in session.setups.values()]]
-        return {name: known.get(name, usual) for name in itertools.chain(*used)}
+        """Durations of a setup and a reading with each gauge of a session."""
+        at_legs = Duration(self.minutes_a_setup, self.minutes_a_reading)
+        at_tool = {sensor.name: sensor.duration for sensor in self.owned}
+        in_files = [names_in_files(setup)[1] for setup in session.setups.values()]
+        return {name: at_tool.get(name, at_legs) for name in (*session.gauges, *in_files)}
 
     @property
     def once(self) -> frozenset[str]:
-        """Sensors of which a plan has one setup at most: they see the same in each."""
+        """Names of the sensors with at most one setup in a plan: they see the same in each."""
         return frozenset(s.name for s in self.owned if s.keys["sensor"] in ("probe", "points"))
 
     def minutes_of(self, plan: Session) -> float:
-        """Duration of a session's setups and readings."""
+        """Minutes of all setups and readings of a session."""
         durations, plan = self.durations(plan), one_row_a_point(plan)
         of_setup = {n: durations[names_in_files(s)[1]] for n, s in plan.setups.items()}
         setups = sum(duration.setup for duration in of_setup.values())
         return setups + sum(of_setup[r.setup].reading for r in plan.readings)
 
     def in_course(self, plan: Session) -> Session:
-        """Planned readings with the times and temperatures at which they will be taken."""
-        return in_course(plan, temperatures=self.temperatures, durations=self.durations(plan))
+        """Planned readings with their expected times and temperatures."""
+        return schedule_readings(
+            plan, temperatures=self.temperatures, durations=self.durations(plan)
+        )
 
 
 @cached_per_robot(maxsize=8)
 def find_box(robot: Robot) -> Array:
-    """Reach of the tool along each coordinate through the mechanical zero, at most 100 mm.
+    """Limits of the tool along each coordinate through the mechanical zero, at most ±100 mm.
 
-    Shape (n_coordinates, 2), [m].
+    The shape is (n_coordinates, 2), [m].
 
     Raises:
         RobotError: If the robot's drives do not command its tool.
@@ -154,24 +161,25 @@ def find_box(robot: Robot) -> Array:
     )
 
 
-def choose_box(robot: Robot, asked: Array | None) -> Array:
-    """Box of the postures to choose from: `find_box`, or the reachable part of another one.
+def choose_box(robot: Robot, requested: Array | None) -> Array:
+    """Box of the candidate postures: `find_box`, or the reachable part of a requested one.
 
-    Postures are evenly spaced in it, so that limits out of reach would leave few of them.
+    Postures are evenly spaced in the box. Limits beyond the reach would lose many of them.
 
     Args:
         robot: The robot.
-        asked: Limits of the tool's coordinates, shape (n_coordinates, 2), [m].
+        requested: Limits of the tool's coordinates, shape (n_coordinates, 2), [m].
 
     Returns:
-        The same with limits in reach, in whole steps from the mechanical zero.
+        Reachable limits, shape (n_coordinates, 2), [m]. Changed ones are multiples of BOX_STEP from
+        the mechanical zero.
 
     Raises:
         RobotError: If the robot's drives do not command its tool.
     """
-    if asked is None:
+    if requested is None:
         return find_box(robot)
-    ranges, middle = np.array(asked, dtype=np.float64), tool_at_zero(robot)
+    ranges, middle = np.array(requested, dtype=np.float64), tool_at_zero(robot)
     for k, way in itertools.product(range(middle.size), (-1.0, 1.0)):
         end = 0 if way < 0.0 else 1
         point = np.array(middle)
@@ -179,46 +187,40 @@ def choose_box(robot: Robot, asked: Array | None) -> Array:
         if way * (point[k] - middle[k]) <= 0.0 or reachable(robot, point[None])[0]:
             continue
         near, far = 0.0, abs(point[k] - middle[k])
-        while far - near > ROOM:
-            point[k] = middle[k] + way * 0.5 * (near + far)
-            reached = reachable(robot, point[None])[0]
-            near, far = (0.5 * (near + far), far) if reached else (near, 0.5 * (near + far))
-        steps = math.floor(max(near - ROOM, 0.0) / STEP + 1e-9)
-        ranges[k, end] = middle[k] + way * STEP * steps
-    beyond = ranges[:, 0] > ranges[:, 1]  # nothing is in reach, and there will be no postures
-    ranges[beyond] = asked[beyond]
+        while far - near > REACH_MARGIN:
+            half = 0.5 * (near + far)
+            point[k] = middle[k] + way * half
+            near, far = (half, far) if reachable(robot, point[None])[0] else (near, half)
+        steps = math.floor(max(near - REACH_MARGIN, 0.0) / BOX_STEP + 1e-9)
+        ranges[k, end] = middle[k] + way * BOX_STEP * steps
+    beyond = ranges[:, 0] > ranges[:, 1]  # nothing is reachable: no postures will result
+    ranges[beyond] = requested[beyond]
     return read_only(ranges)
 
 
 def _reach(robot: Robot, middle: Array, coordinate: int, way: float) -> float:
-    """Reach of the tool along a coordinate, in whole steps, [m]."""
-    steps = np.arange(1, round((REACH + ROOM) / ROOM) + 1)
+    """Reach of the tool along a coordinate in one direction, rounded down to BOX_STEP, [m]."""
+    steps = np.arange(1, round((DEFAULT_REACH + REACH_MARGIN) / REACH_MARGIN) + 1)
     points = np.repeat(middle[None], steps.size, axis=0)
-    points[:, coordinate] += way * ROOM * steps
+    points[:, coordinate] += way * REACH_MARGIN * steps
     reached = reachable(robot, points)
-    far = ROOM * float(np.argmin(np.append(reached, False))) - ROOM
-    return max(math.floor(far / STEP + 1e-9) * STEP, 0.0)
+    far = REACH_MARGIN * float(np.argmin(np.append(reached, False))) - REACH_MARGIN
+    return max(math.floor(far / BOX_STEP + 1e-9) * BOX_STEP, 0.0)
 
 
 def reachable(robot: Robot, points: Array) -> NDArray[np.bool_]:
-    """Mask of tool positions that the nominal machine reaches, shape (n,)."""
+    """Mask of tool positions that the nominal machine reaches within its travel, shape (n,).
+
+    Args:
+        robot: The robot.
+        points: Coordinates of the tool, shape (n, n_coordinates), [m].
+    """
     failures = Failures()
     drives = nominal_closure(robot).inverse(points, failures=failures)
     lower, upper = np.array([(d.lower, d.upper) for d in robot.drives]).T
     reached = np.asarray(((drives >= lower) & (drives <= upper)).all(axis=1))
     reached[list(failures)] = False
     return reached
-
-
-def posture_name(point: Array, robot: Robot, middle: Array) -> str:
-    """Name of a posture: displacement from the mechanical zero, such as x+60_y-10."""
-    letters = "" if robot.tcp is None else ["xyz"[c] for c in robot.tcp.coordinates]
-    parts = [
-        f"{letter}{round(v / MM, 3):+g}"
-        for letter, v in zip(letters, point - middle, strict=True)
-        if abs(v) > 1e-9
-    ]
-    return "_".join(parts) or "zero"
 
 
 def place_tool(robot: Robot, names: Sequence[str], points: Array) -> dict[str, Posture]:
@@ -236,17 +238,35 @@ def place_tool(robot: Robot, names: Sequence[str], points: Array) -> dict[str, P
     return {n: Posture(n, "tcp", p, d) for n, p, d in zip(names, points, drives, strict=True)}
 
 
+def posture_name(robot: Robot, point: Array, middle: Array) -> str:
+    """Name of a posture: displacement from the mechanical zero, such as x+60_y-10.
+
+    Args:
+        robot: The robot.
+        point: Coordinates of the tool, shape (n_coordinates,), [m].
+        middle: Coordinates in the mechanical zero, shape (n_coordinates,), [m].
+    """
+    letters = "" if robot.tcp is None else ["xyz"[c] for c in robot.tcp.coordinates]
+    parts = [
+        f"{letter}{round(v / MM, 3):+g}"
+        for letter, v in zip(letters, point - middle, strict=True)
+        if abs(v) > 1e-9
+    ]
+    return "_".join(parts) or "zero"
+
+
 def load_dial(path: str | Path, equipment: Equipment) -> Equipment:
     """Equipment with the dial indicator that a file describes.
 
     Args:
         path: YAML with `sigma_mm`, `resolution_mm`, `range_mm`, `tip` and `scale_tolerance` as
             under `gauge` in a session.yaml, and `direction_tolerance_mrad`, `section_tolerance_mm`
-            and `lateral_tolerance_mm` as in its setups. Without `tip` a line is read.
+            and `lateral_tolerance_mm` as in its setups. Without `tip` the gauge reads the centre
+            line of a leg.
         equipment: The other equipment.
 
     Raises:
-        SessionError: Naming file and key.
+        SessionError: If the file is invalid; names file and key.
     """
     file = Path(path)
     document = read_yaml(file, error=SessionError)
@@ -274,10 +294,10 @@ def load_dial(path: str | Path, equipment: Equipment) -> Equipment:
 
 
 def equipment_of(session: Session, equipment: Equipment) -> Equipment:
-    """Equipment with the gauge of a session, its tip and its rods.
+    """Equipment with the gauge, the tip and the rods of a session.
 
     Args:
-        session: The session; the first of several gauges and sensors is used.
+        session: The session; of several gauges and sensors, the first is used.
         equipment: The other equipment.
 
     Raises:
@@ -285,7 +305,7 @@ def equipment_of(session: Session, equipment: Equipment) -> Equipment:
     """
     session = state_noise(session)
     sensors = [s.sensor for s in session.setups.values() if isinstance(s.sensor, LegIndicator)]
-    sensors.sort(key=lambda s: s.rod is None)  # those on rods first
+    sensors.sort(key=lambda s: s.rod is None)  # sensors that touch rods come first
     equipment = replace(equipment, gauge=session.gauge, tip=None)
     if not sensors:
         return equipment

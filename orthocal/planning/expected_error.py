@@ -1,7 +1,8 @@
 """Expected tool error after a calibration from planned readings.
 
-It is the mean over machines within their tolerances, each to first order: the posterior covariance
-of the identified parameters, the errors that are not identified, and their effect on the former.
+It is the mean over machines within their tolerances. For each machine the covariance of the errors
+is computed to first order. It includes unmodelled errors and their effect on the identified
+parameters.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.assessment.tool_error import (
-    ErrorSize,
-    ErrorSizes,
+    ErrorStatistics,
+    ToolErrorStatistics,
     ToolUncertainty,
     measure_uncertainty,
 )
@@ -28,11 +29,9 @@ from orthocal.estimation.selection import Selection
 from orthocal.estimation.weighting import split_by_gauge
 from orthocal.kinematics.conditions import UseSamples, effects_by_condition, sample_use
 from orthocal.kinematics.loop_closure import nominal_closure
+from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.sensitivity import ToolSensitivity
-from orthocal.kinematics.workspace import (
-    Workspace,
-    find_workspace,
-)
+from orthocal.kinematics.workspace import Workspace
 from orthocal.observation.observations import build_observations
 from orthocal.robot.model import Robot
 from orthocal.runtime.worker_pool import call_in_parallel, current_worker_budget
@@ -42,9 +41,9 @@ from orthocal.statistics.noise import estimate_repeatability, noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 
 Criterion = Literal["aligned", "relative", "absolute", "worst", "A", "D", "E"]
-"""Criterion of a plan: the RMS tool error in its three forms, the error at the worst point with
-translation and rotation removed, or the trace (A), determinant (D) or largest eigenvalue (E) of the
-covariance of the parameters, in prior std."""
+"""Criterion of a plan. `aligned`, `relative`, `absolute`: RMS tool error. `worst`: error at the
+worst point with translation and rotation removed. A, D, E: trace, determinant or largest eigenvalue
+of the covariance of the parameters, in prior std."""
 
 CRITERIA: tuple[Criterion, ...] = ("aligned", "relative", "absolute", "worst", "A", "D", "E")
 
@@ -52,13 +51,13 @@ OF_GAUGE = "gauge."
 """Beginning of the names of parameters that all sessions with a gauge share."""
 
 WORST_POWER = 8.0
-"""Power of the mean by which the largest variance of the points is approximated."""
+"""Exponent of the power mean that approximates the largest variance of the points."""
 
-MACHINES = 12
+N_MACHINES = 12
 """Number of machines over which the expected error is averaged."""
 
-ENTERED = 0.1
-"""Standard deviation of offsets after they were entered, in prior std."""
+ENTERED_OFFSET_STD = 0.1
+"""Standard deviation of the remaining offsets after offsets were entered, [prior std]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,27 +66,27 @@ class Expected:
 
     tool: ToolUncertainty
     names: tuple[str, ...]
-    """Identified parameters of the machine, then those that are not identified."""
+    """Identified parameters of the machine, then unmodelled ones."""
     prior_stds: Array
-    """[SI]."""
+    """Prior standard deviations of these parameters, shape (n,), [SI]."""
     covariance: Array
     """Covariance of the errors of the estimate, shape (n, n), [SI]."""
     lost: float = 0.0
-    """Fraction of the readings that machines within their tolerances do not allow, because the tip
-    misses the rod."""
+    """Fraction of the readings that are impossible on machines within their tolerances, because the
+    tip misses the rod."""
 
     @property
-    def sizes(self) -> ErrorSizes:
+    def sizes(self) -> ToolErrorStatistics:
         """Tool error in its three forms."""
         return self.tool.sizes
 
     @property
-    def reported(self) -> ErrorSize:
+    def reported(self) -> ErrorStatistics:
         """Tool error in the reported form."""
         return self.tool.sizes.reported
 
     def rms_by(self, criterion: Criterion) -> float:
-        """RMS tool error that a criterion minimises, [m]; NaN for criteria of another kind."""
+        """RMS tool error that a criterion minimises, [m]; NaN if it minimises no RMS tool error."""
         sizes = self.sizes
         forms = {"aligned": sizes.reported, "relative": sizes.relative, "absolute": sizes.absolute}
         return forms[criterion].rms if criterion in forms else math.nan
@@ -98,11 +97,11 @@ class ToolForecast:
 
     Args:
         robot: The robot.
-        selection: Parameters that are identified.
-        others: Parameters that are not identified, with prior standard deviations, [SI]; by
-            default all others of the machine.
+        selection: Identified parameters.
         workspace: Region over which the tool error is computed; by default the robot's.
         use: Conditions of use; by default those that the robot's YAML states.
+        others: Unmodelled parameters with prior standard deviations, [SI]; by default all other
+            errors of the machine.
 
     Raises:
         RobotError: If the drives do not command the tool.
@@ -135,7 +134,7 @@ class ToolForecast:
         nominal = nominal_closure(robot)
         drives, passive = nominal.reach(region.points)
         self.workspace = region.repeat(use.size)
-        """The points, once for each of C conditions of use."""
+        """Workspace with its K points repeated for each of C conditions of use."""
         self.positions = np.tile(nominal.tcp(drives, passive), (use.size, 1))
         tools = [ToolSensitivity(robot, free=self.names, conditions=c) for c in use.conditions]
         closed = [passive]
@@ -152,21 +151,23 @@ class ToolForecast:
         return self._expected(np.diag(self.prior_stds**2))
 
     def align(self, field: Array) -> Array:
-        """Tool errors with translation and rotation removed, shape (K, 3, ...)."""
+        """Tool errors with translation and rotation removed, shape (C K, 3, ...)."""
         return self.workspace.align(field, self.positions)
 
     def problem(self, session: Session) -> CalibrationProblem:
         """Calibration problem of a session's readings."""
-        return weigh_readings(CalibrationProblem(session, self.selection))
+        return with_gauge_noise(CalibrationProblem(session, self.selection))
 
-    def prior_of(
+    def prior_information(
         self, problem: CalibrationProblem, state: Sequence[str], measured: Session | None
     ) -> Array:
-        """Inverse covariance of the state before: from priors, and from measured readings.
+        """Inverse covariance of the state from its priors and from existing readings.
+
+        The shape is (n_state, n_state), in units of the prior standard deviations.
 
         Args:
             problem: Problem whose free parameters include the state.
-            state: Names of its parameters.
+            state: Names of the parameters of the state.
             measured: Existing readings.
         """
         index = [problem.free.index(name) for name in state]
@@ -185,15 +186,16 @@ class ToolForecast:
     ) -> Expected:
         """Expected tool error after a calibration from a session's readings.
 
-        The mean of machines drawn from the priors, with mounting errors of their gauges. Each
-        is linearised about itself, because a ball beside the crest of its rod is less sensitive.
+        The result is the mean over machines drawn from the priors, with mounting errors of their
+        gauges. Each is linearised about itself, because a ball beside the crest of its rod is less
+        sensitive.
 
         Args:
             session: Setups and postures; the values of the readings are not used.
-            weight: Standard deviation with which readings are weighted, [m]: more than that of the
-                gauge if the model omits errors; by default the same.
-            entered: Whether the identified offsets have been entered before, so that those of the
-                drives are small; else they are drawn from their priors.
+            weight: Standard deviation that weights the readings, [m]; by default that of the gauge.
+                It is larger if the model omits errors.
+            entered: True if identified offsets were entered before and the remaining ones are
+                small; False to draw offsets from their priors.
             machines: Machines instead of drawn ones: free parameters of the session's problem,
                 shape (n_free,) each, [SI].
 
@@ -206,18 +208,21 @@ class ToolForecast:
         drawn = list(self._draw(problem, entered=entered)) if machines is None else machines
         _, closed, reached = problem.simulate(np.array(drawn))
 
-        def posteriors(part: Iterable[int]) -> list[tuple[Array | None, float]]:
+        def posteriors(indices: Iterable[int]) -> list[tuple[Array | None, float]]:
             passive = [closed[i] if reached[i] else None for i in range(len(drawn))]
             return [
-                self._posterior(problem, others, drawn[i], noise, weight, passive[i]) for i in part
+                self._posterior(problem, others, drawn[i], noise, weight, passive[i])
+                for i in indices
             ]
 
-        parts = np.array_split(np.arange(len(drawn)), current_worker_budget())
-        each = [
-            f for part in call_in_parallel([partial(posteriors, p) for p in parts]) for f in part
+        blocks = np.array_split(np.arange(len(drawn)), current_worker_budget())
+        results = [
+            result
+            for block in call_in_parallel([partial(posteriors, b) for b in blocks])
+            for result in block
         ]
-        covariances = [covariance for covariance, _ in each if covariance is not None]
-        lost = sum(share / len(drawn) for _, share in each)
+        covariances = [covariance for covariance, _ in results if covariance is not None]
+        lost = sum(fraction / len(drawn) for _, fraction in results)
         if not covariances:
             raise ClosureError(
                 "cannot be read on machines within their tolerances", posture="the planned ones"
@@ -235,24 +240,32 @@ class ToolForecast:
         return self._expected(covariance)
 
     def _jacobian_of_others(self, session: Session) -> Array | None:
-        """Change of a session's readings by one prior std of what is not identified, [m]."""
+        """Change of a session's readings by one prior std of each unmodelled error.
+
+        The shape is (n_entries, n_others), [m]. None without unmodelled errors.
+        """
         if not self.others:
             return None
         n = len(self.selection.names)
         stds = dict(zip(self.others, self.prior_stds[n:].tolist(), strict=True))
-        free = build_problem(session, free=self.others, prior=True, prior_stds=stds)
-        problem = weigh_readings(free)
-        _, slopes = problem.predict_and_jacobian(np.zeros(problem.n_free))
-        return slopes[:, : len(self.others)]
+        problem = with_gauge_noise(
+            build_problem(session, free=self.others, prior=True, prior_stds=stds)
+        )
+        _, jacobian = problem.predict_and_jacobian(np.zeros(problem.n_free))
+        return jacobian[:, : len(self.others)]
 
     def _draw(self, problem: CalibrationProblem, *, entered: bool) -> Iterator[Array]:
-        """Machines within their tolerances, with mounting errors of their gauges, [SI]."""
+        """Draw machines within their tolerances, with mounting errors of their gauges.
+
+        Yields:
+            Free parameters, shape (n_free,), [SI].
+        """
         offsets = [i for i, name in enumerate(problem.free) if name.endswith(".offset")]
-        for seed in range(MACHINES):
+        for seed in range(N_MACHINES):
             drawn = np.random.default_rng(seed).normal(size=problem.n_free) * problem.theta_scale
             if entered:
-                drawn[offsets] *= ENTERED
-            # parameters that are free without a prior are drawn, too
+                drawn[offsets] *= ENTERED_OFFSET_STD
+            # parameters without a prior are drawn, too
             yield problem.active_theta + drawn
 
     def _posterior(
@@ -264,64 +277,75 @@ class ToolForecast:
         weight: float | None = None,
         passive: Array | None = None,
     ) -> tuple[Array | None, float]:
-        """Covariance of the errors of the estimate about a machine, (n_names, n_names), [SI].
+        """Covariance of the errors of the estimate about a machine.
 
-        None where too few readings are possible; with the fraction of impossible ones.
+        Args:
+            problem: Calibration problem of the readings.
+            others: Jacobian of unmodelled errors, shape (n_entries, n_others), [m per prior std].
+            theta: Free parameters of the machine, shape (n_free,), [SI].
+            noise: Standard deviation of a reading, [m].
+            weight: Standard deviation that weights the readings, [m]; by default `noise`.
+            passive: Passive coordinates of the machine, shape (n_states, n_passive).
+
+        Returns:
+            The covariance, shape (n_names, n_names), [SI], or None if too few readings are
+            possible; and the fraction of impossible readings.
         """
         o, n = problem.observations, problem.n_machine
         try:
             _, jacobian = problem.predict_and_jacobian(theta, passive)
         except ClosureError:
             return None, 1.0
-        good = np.asarray(np.isfinite(jacobian).all(axis=1))
-        lost = 1.0 - float(good.mean())
-        if good.sum() <= o.n_zeros:
+        possible = np.asarray(np.isfinite(jacobian).all(axis=1))
+        lost = 1.0 - float(possible.mean())
+        if possible.sum() <= o.n_zeros:
             return None, lost
-        jacobian, part = jacobian[good], o.only(good)
+        o = o.only(possible)
         precision = np.maximum(problem.prior_precision, VAGUE)
         weight = noise if weight is None else weight
-        slopes = project_out_zeros(jacobian, part)
-        inverse = Information(slopes).covariance(sigma=weight, precision=precision)
+        jacobian = project_out_zeros(jacobian[possible], o)
+        inverse = Information(jacobian).covariance(sigma=weight, precision=precision)
         scale = problem.theta_scale[:n]
-        spread = inverse
-        if weight != noise:  # readings scatter less than their weight implies
-            gain = inverse @ slopes.T
-            spread = inverse - (weight**2 - noise**2) / weight**4 * (gain @ gain.T)
-        known = spread[:n, :n] * np.outer(scale, scale)
+        covariance = inverse
+        if weight != noise:  # the scatter of the readings is smaller than their weight implies
+            gain = inverse @ jacobian.T
+            covariance = inverse - (weight**2 - noise**2) / weight**4 * (gain @ gain.T)
+        identified = covariance[:n, :n] * np.outer(scale, scale)
         if others is None:
-            return known, lost
-        other = project_out_zeros(others[good], part)
-        leak = (inverse @ (slopes.T @ other) / weight**2)[:n] * scale[:, None]
+            return identified, lost
+        others = project_out_zeros(others[possible], o)
+        bias = (inverse @ (jacobian.T @ others) / weight**2)[:n] * scale[:, None]
         variance = np.diag(self.prior_stds[n:] ** 2)
-        across = leak * self.prior_stds[n:]
-        return np.block([[known + leak @ leak.T, -across], [-across.T, variance]]), lost
+        cross = bias * self.prior_stds[n:]
+        return np.block([[identified + bias @ bias.T, -cross], [-cross.T, variance]]), lost
 
     def _expected(self, covariance: Array) -> Expected:
+        """Expected tool error for a covariance of the errors, shape (n_names, n_names), [SI]."""
         tool = measure_uncertainty(self.jacobian, covariance, self.workspace, self.positions)
         return Expected(tool, self.names, self.prior_stds, covariance)
 
-    def weigh(self, criterion: Criterion, n_state: int) -> Weigher:
+    def weight_of(self, criterion: Criterion, n_state: int) -> CriterionWeight:
         """Weight of a criterion for a state that begins with the identified parameters."""
         n = len(self.selection.names)
         scaled = self.jacobian[:, :, :n] * self.prior_stds[:n]
         if criterion in ("aligned", "worst"):
             field = self.align(scaled)
         elif criterion == "relative":
-            field = self.workspace.remove_shift(scaled)
+            field = self.workspace.remove_translation(scaled)
         else:
             field = scaled
         padded = np.zeros((*field.shape[:2], n_state))
         padded[:, :, :n] = field
-        return Weigher(criterion, padded, self.workspace.weights, n)
+        return CriterionWeight(criterion, padded, self.workspace.weights, n)
 
 
-class Weigher:
-    """Weight of the state R, with tr(Rᵀ C R) the square of a criterion.
+class CriterionWeight:
+    """Root R of the weight of the state; tr(Rᵀ C R) is the square of a criterion.
 
     Args:
         criterion: The criterion.
-        field: Tool errors by the state, shape (K, 3, n_state), [m per prior std].
-        weights: Weights of the points, shape (K,).
+        field: Jacobian of the tool errors, shape (C K, 3, n_state), [m per prior std].
+        weights: Weights of the points, shape (C K,).
         n: Number of parameters of the machine, which are the first of the state.
     """
 
@@ -341,13 +365,15 @@ class Weigher:
             values, vectors = np.linalg.eigh(covariance[:n, :n])
             root[:n, 0] = vectors[:, -1] if values.size else 0.0
             return root
-        # the derivative of the determinant's n-th root is itself times the inverse, over n
+        # derivative of det(C)^(1/n) with respect to C: det(C)^(1/n) C⁻¹ / n
         values, vectors = np.linalg.eigh(covariance[:n, :n])
-        mean = float(np.exp(np.mean(np.log(np.maximum(values, 1e-300)))))
-        root[:n] = vectors * np.sqrt(mean / (n * np.maximum(values, 1e-300)))
+        values = np.maximum(values, 1e-300)
+        mean = float(np.exp(np.mean(np.log(values))))
+        root[:n] = vectors * np.sqrt(mean / (n * values))
         return root
 
     def _mean_square(self) -> Array:
+        """R of the trace or of the mean square tool error, shape (n_state, p)."""
         if self._criterion == "A":
             size = self._field.shape[2]
             return np.asarray(np.eye(size)[:, : self._n] / np.sqrt(self._n))
@@ -355,6 +381,7 @@ class Weigher:
         return _root(flat.reshape(-1, flat.shape[2]))
 
     def _worst(self, covariance: Array) -> Array:
+        """R of the power mean of the points' variances, shape (n_state, p)."""
         variance = np.einsum("kin,nm,kim->k", self._field, covariance, self._field, optimize=True)
         share = (variance / variance.max()) ** (WORST_POWER - 1.0)
         total = float(np.mean(share * variance / variance.max()))
@@ -364,16 +391,17 @@ class Weigher:
 
 
 def _root(rows: Array) -> Array:
-    """R with R Rᵀ = rowsᵀ rows and as few columns as possible, shape (n, p)."""
+    """R with R Rᵀ = rowsᵀ rows and the smallest number of columns, shape (n, p)."""
     values, vectors = np.linalg.eigh(rows.T @ rows)
     positive = values > values[-1] * 1e-14
     return np.asarray(vectors[:, positive] * np.sqrt(values[positive]))
 
 
 def _information(problem: CalibrationProblem, state: Sequence[str], measured: Session) -> Array:
-    """Information of a session about the state, its other parameters marginalised.
+    """Information of a session about the state, shape (n_state, n_state).
 
-    The places of a session's fixed balls and instruments are not those of further readings.
+    All other parameters of the session are marginalised. They include the positions of its fixed
+    balls and instruments, which further readings do not share.
     """
     _, jacobian = problem.predict_and_jacobian(problem.active_theta)
     jacobian = project_out_zeros(jacobian, problem.observations)
@@ -384,18 +412,18 @@ def _information(problem: CalibrationProblem, state: Sequence[str], measured: Se
         if name in state and (i < problem.n_machine or name.startswith(OF_GAUGE))
     }
     others = [i for i, name in enumerate(problem.free) if name not in lasting]
-    state_columns = [problem.free.index(name) for name in state if name in lasting]
-    where = [i for i, name in enumerate(state) if name in lasting]
-    inner = information[np.ix_(others, others)] + np.diag(
+    columns = [problem.free.index(name) for name in state if name in lasting]
+    places = [i for i, name in enumerate(state) if name in lasting]
+    of_others = information[np.ix_(others, others)] + np.diag(
         np.maximum(problem.prior_precision[others], VAGUE)
     )
-    cross = information[np.ix_(state_columns, others)]
-    shared = information[np.ix_(state_columns, state_columns)]
+    cross = information[np.ix_(columns, others)]
+    marginal = information[np.ix_(columns, columns)]
     if others:
-        shared = shared - cross @ np.linalg.solve(inner, cross.T)
-    result = np.zeros((len(state), len(state)))
-    result[np.ix_(where, where)] = shared
-    return result
+        marginal = marginal - cross @ np.linalg.solve(of_others, cross.T)
+    of_state = np.zeros((len(state), len(state)))
+    of_state[np.ix_(places, places)] = marginal
+    return of_state
 
 
 def noise_of(session: Session) -> float:
@@ -403,8 +431,8 @@ def noise_of(session: Session) -> float:
     return noise_floor(session.gauge.sigma, session.gauge.resolution)
 
 
-def weigh_readings(problem: CalibrationProblem) -> CalibrationProblem:
-    """Problem with readings weighted by the stated repeatability of their gauges."""
+def with_gauge_noise(problem: CalibrationProblem) -> CalibrationProblem:
+    """Problem with noise ratios from the stated repeatability of the gauges."""
     session = problem.session
     groups = split_by_gauge(session, problem.observations)
     if len(groups) < 2:
@@ -417,7 +445,7 @@ def weigh_readings(problem: CalibrationProblem) -> CalibrationProblem:
 
 
 def state_noise(session: Session) -> Session:
-    """Session whose gauges all state their sigma, which is estimated from repeats if necessary.
+    """Session in which all gauges state their noise; if necessary, repeats estimate it.
 
     Raises:
         SessionError: If the repeatability of a gauge is unknown.

@@ -1,4 +1,4 @@
-"""First plan of a machine: sections clear of the hinges, and the paper's plan."""
+"""First plan of a machine: the paper's plan clear of the hinges, or a plan over a bed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from orthocal.arrays import Array
 from orthocal.assessment.effect_limits import EffectLimits, find_limits
 from orthocal.errors import ParameterError, RobotError
 from orthocal.estimation.choice import Choice
-from orthocal.kinematics.workspace import find_workspace, tool_at_zero
+from orthocal.kinematics.reachable_box import find_workspace
+from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import state_common_approach
 from orthocal.planning.candidates import ON_AXIS, directions_across
 from orthocal.planning.equipment import Equipment, choose_box, place_tool, posture_name
@@ -24,25 +25,25 @@ from orthocal.sensors.tool_indicator import Artefact, ToolIndicator
 from orthocal.session.session import Conditions, Gauge, Reading, Session, Setup
 from orthocal.units import MM, read_limit
 
-CLEAR = 0.02
-"""Least distance of a tip from a hinge, [m]; less on legs shorter than five times that."""
+CLEARANCE = 0.02
+"""Smallest distance of a tip from a hinge, [m]; a fifth of the length on shorter legs."""
 
-STEP = 5e-3
+POSTURE_STEP = 5e-3
 """Step of the postures, [m]."""
 
 SECTIONS = (0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65)
 """Possible sections of a first plan, as fractions of the leg."""
 
-LEAST = 0.01
-"""Least reach of the tool to either side of the mechanical zero, [m]."""
+MIN_REACH = 0.01
+"""Smallest reach of the tool to either side of the mechanical zero, [m]."""
 
-BED = "bed"
+BED_SETUP = "bed"
 """Name of the setup over a bed."""
 
-ON_BED = 5
-"""Positions along each side of a bed."""
+BED_POINTS = 5
+"""Number of positions along each side of a bed."""
 
-FLAT = 0.02 * MM
+BED_FLATNESS = 0.02 * MM
 """Tolerance of the flatness of a bed of glass, or of a ground plate, [m]."""
 
 PAPER_GAUGE = Gauge(20e-6, 10e-6, None)
@@ -51,9 +52,9 @@ PAPER_GAUGE = Gauge(20e-6, 10e-6, None)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FixedPlan:
-    """Readings that were not searched, and the expected tool error after the calibration.
+    """Readings of a fixed plan, and the expected tool error after the calibration.
 
-    Fields as in `MeasuringPlan`.
+    The fields correspond to those of `MeasuringPlan`.
     """
 
     session: Session
@@ -80,7 +81,7 @@ def expect_fixed(session: Session, choice: Choice, equipment: Equipment) -> Fixe
         equipment: Gauge and time.
 
     Raises:
-        ParameterError: If there is no such model.
+        ParameterError: If the model is unknown.
     """
     forecast = ToolForecast(session.robot, choice.select(session.robot.parameters))
     course = equipment.in_course(session)
@@ -106,35 +107,37 @@ class Displacements(NamedTuple):
 
 
 def first_equipment(robot: Robot, equipment: Equipment) -> Equipment:
-    """Equipment with sections and postures in which the tip stays clear of the hinges.
+    """Equipment with sections and postures in which the tip is clear of the hinges.
 
     Raises:
-        RobotError: If the tool of the machine hardly moves.
+        RobotError: If the tool reaches less than MIN_REACH to a side of the mechanical zero.
     """
     box = choose_box(robot, equipment.box)
     middle = tool_at_zero(robot)
     low, high = (box - middle[:, None]).T
-    if low.max() > -LEAST or high.min() < LEAST:
+    if low.max() > -MIN_REACH or high.min() < MIN_REACH:
         reach = " × ".join(f"{a / MM:g} … {b / MM:g}" for a, b in box)
         raise RobotError(
-            f"the tool reaches {reach} mm; expected {LEAST / MM:g} mm to either side of the "
-            "mechanical zero, at least; check the travel",
+            f"the tool reaches {reach} mm; expected at least {MIN_REACH / MM:g} mm to either side "
+            "of the mechanical zero; check the travel",
             where=robot.name,
         )
-    least = min(leg.length for leg in robot.legs.values())
-    room = 0.5 * least - min(CLEAR, 0.2 * least)
-    # whole steps, rounded towards zero
-    steps = (np.trunc(np.clip(v, -room, room) / STEP + np.sign(v) * 1e-9) for v in (low, high))
-    low, high = (STEP * v for v in steps)
-    clear = min(CLEAR, 0.2 * least)
+    length = min(leg.length for leg in robot.legs.values())
+    clear = min(CLEARANCE, 0.2 * length)
+    limit = 0.5 * length - clear
+    low, high = (  # rounded towards zero to multiples of the step
+        POSTURE_STEP * np.trunc(np.clip(v, -limit, limit) / POSTURE_STEP + np.sign(v) * 1e-9)
+        for v in (low, high)
+    )
     sections = tuple(
         s
         for s in SECTIONS
-        if s * least + high.max() <= least - clear + 1e-9 and s * least + low.min() >= clear - 1e-9
+        if s * length + high.max() <= length - clear + 1e-9
+        and s * length + low.min() >= clear - 1e-9
     )
-    some = dict.fromkeys((sections[0], sections[len(sections) // 2], sections[-1]))
+    chosen = dict.fromkeys((sections[0], sections[len(sections) // 2], sections[-1]))
     return replace(
-        equipment, box=middle[:, None] + np.stack([low, high], axis=1), sections=tuple(some)
+        equipment, box=middle[:, None] + np.stack([low, high], axis=1), sections=tuple(chosen)
     )
 
 
@@ -142,15 +145,15 @@ def paper_plan(robot: Robot, equipment: Equipment) -> Session:
     """The paper's plan (section 3.1) within the reach of a machine of any dimensions.
 
     Each leg is read at its middle in two directions, in the mechanical zero and at both ends. On an
-    Orthoglide these are six setups and seven postures, +60 and −100 mm. Each setup ends with the
-    zero, where it began.
+    Orthoglide the plan has six setups and seven postures, +60 and −100 mm. Each setup begins and
+    ends in the mechanical zero.
 
     Args:
         robot: The robot.
         equipment: Gauge and tip; its box limits the postures.
 
     Raises:
-        RobotError: If the tool of the machine hardly moves.
+        RobotError: If the tool reaches less than MIN_REACH to a side of the mechanical zero.
     """
     equipment = first_equipment(robot, equipment)
     title = "Zero, largest and least of each leg"
@@ -159,10 +162,10 @@ def paper_plan(robot: Robot, equipment: Equipment) -> Session:
 
 
 def bed_plan(robot: Robot, equipment: Equipment) -> Session:
-    """Plan for machines whose legs do not determine their offsets: a dial at the tool over the bed.
+    """Plan with a dial at the tool over the bed, if readings at the legs do not determine offsets.
 
-    The tool moves in the lowest plane of the workspace, on a square grid, and approaches the bed
-    from above: its drives count upwards. The setup ends with the posture where it began.
+    The tool moves on a square grid in the lowest plane of the workspace and approaches the bed from
+    above, because its drive coordinates grow upwards. The setup begins and ends in one posture.
 
     Args:
         robot: The robot, with a tool that moves along x, y and z.
@@ -173,33 +176,36 @@ def bed_plan(robot: Robot, equipment: Equipment) -> Session:
     """
     middle, box = tool_at_zero(robot), find_workspace(robot).limits
     columns, rows = (
-        (STEP * np.round(np.linspace(low, high, ON_BED) / STEP)).tolist() for low, high in box[:2]
+        (POSTURE_STEP * np.round(np.linspace(low, high, BED_POINTS) / POSTURE_STEP)).tolist()
+        for low, high in box[:2]
     )
     grid = [(x, y) for i, y in enumerate(rows) for x in columns[:: (-1) ** i] if x or y]
     points = np.array([(x, y, box[2, 0]) for x, y in ((0.0, 0.0), *grid)])
     points = (points + middle).round(9) + 0.0
-    names = [posture_name(p, robot, middle) for p in points]
+    names = [posture_name(robot, p, middle) for p in points]
     length = float(np.ptp(box[:2], axis=1).max())
-    plate = Artefact("plate", length=length, form_std=read_limit(FLAT))
+    plate = Artefact("plate", length=length, form_std=read_limit(BED_FLATNESS))
     above = Conditions("n" * len(robot.drives))
-    readings = [Reading(BED, name, conditions=above) for name in names]
+    readings = [Reading(BED_SETUP, name, conditions=above) for name in names]
     return Session(
         robot=robot,
         robot_reference=robot.name,
         title="Dial at the tool over the bed",
         gauges={"": equipment.gauge},
         postures=place_tool(robot, names, points),
-        setups={BED: Setup(BED, ToolIndicator("-z", plate))},
+        setups={BED_SETUP: Setup(BED_SETUP, ToolIndicator("-z", plate))},
         readings=(*readings, replace(readings[0], cycle=2)),
     )
 
 
 def build_paper_plan(robot: Robot, displacements: Displacements, gauge: Gauge) -> Session:
-    """The paper's plan on a machine of the Orthoglide type, with an exact gauge on the legs' lines.
+    """The paper's plan on a machine of the Orthoglide type.
+
+    The gauge is exactly mounted and reads the centre lines of the legs.
 
     Raises:
         ParameterError: If the machine is not of the Orthoglide type.
-        ClosureError: If it cannot reach a posture.
+        ClosureError: If the machine cannot reach a posture.
     """
     legs = list(robot.legs.values())
     fits = [leg.name for leg in legs] == list("xyz") and robot.tcp is not None
@@ -230,8 +236,8 @@ def _read_legs(
         equipment: Gauge and tip.
         box: Limits of the displacements, shape (n_coordinates, 2), [m].
         title: Title of the session.
-        usual: Displacements along each axis, within these limits; by default the paper's.
-        closing: Whether each setup ends with the zero, where it began.
+        usual: Displacements along each axis if these limits allow them; by default the paper's.
+        closing: Whether each setup ends with a reading in the mechanical zero.
     """
     middle, usual = tool_at_zero(robot), usual or Displacements()
     points, setups, readings = {"zero": middle}, {}, []
@@ -261,9 +267,10 @@ def _read_legs(
 
 
 def _axis_of(leg: Leg) -> tuple[str, Array]:
-    """Name and unit vector of the axis of a leg, outwards; an axis of the world if it is along one.
+    """Name and unit vector of the axis of a leg, outwards.
 
-    Exact on an axis of the world, so that postures have whole coordinates.
+    It is exactly an axis of the world if the leg is nearly parallel to it. Then the coordinates of
+    postures are whole numbers.
     """
     axis = int(np.abs(leg.axis).argmax())
     if abs(leg.axis[axis]) > ON_AXIS:

@@ -1,7 +1,7 @@
-"""Readings that would determine effects that a plan does not, and what they bring.
+"""Further readings that determine an effect if a plan does not, and their gain.
 
-For the expansion of a machine they are a second round of the plan on a warmer machine, for the
-drift of a gauge the first posture of each setup once more, some time after its last reading.
+For thermal expansion, a second round of the plan is measured on a warmer machine. For drift of a
+gauge, the first posture of each setup is read again some time after its last reading.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from orthocal.planning.plan_comparison import Comparison
 from orthocal.session.points import one_row_a_point
 from orthocal.session.session import Conditions, Reading, Session
 
-WAITS = (10.0, 20.0, 30.0, 60.0, 120.0)
-"""Minutes between the last reading of a setup and the further one that are tried."""
+WAITING_TIMES = (10.0, 20.0, 30.0, 60.0, 120.0)
+"""Possible times between the last reading of a setup and the further one, [min]."""
 
 
 @dataclass(frozen=True, slots=True)
 class FurtherReadings:
-    """Readings beside a plan for an effect that it does not determine."""
+    """Readings in addition to a plan, for an effect that the plan does not determine."""
 
     limit: EffectLimits
-    """Limit of the effect before the readings and after all of them."""
+    """Limits of the effect before the plan, and after the plan and these readings."""
     readings: int
     minutes: float
-    """Time that they take."""
+    """Additional time, [min]."""
     warmer: float
-    """Kelvin by which the machine is warmer in a second round of the plan; 0 for no such round."""
+    """Temperature rise of the machine in a second round of the plan, [K]; 0 without one."""
     wait: float
-    """Minutes after the last reading of each setup at which its first posture is read again."""
+    """Time after the last reading of each setup when its first posture is read again, [min]."""
     gain: float
-    """Part by which they reduce the tool error, to first order about the nominal machine."""
+    """Relative reduction of the tool error, to first order about the nominal machine."""
 
 
 class _Extension(NamedTuple):
-    """A plan with further readings; fields as in `FurtherReadings`."""
+    """Plan with further readings; numbers as in `FurtherReadings`."""
 
     session: Session
     readings: int
@@ -54,33 +54,35 @@ class _Extension(NamedTuple):
 def find_further_readings(
     comparison: Comparison, limits: Sequence[EffectLimits]
 ) -> tuple[FurtherReadings, ...]:
-    """Readings for each effect that a plan does not determine.
+    """Further readings for each effect that a plan does not determine.
 
     Args:
         comparison: The plan with its equipment.
-        limits: Limits of the effects after it.
+        limits: Limits of the effects after the plan.
 
     Returns:
-        One for each effect: the shortest that determine it, or else the longest that are tried.
-        None for effects that no readings of these kinds would show.
+        The shortest further readings that determine the effect, or else the longest ones. Effects
+        whose limit no further readings reduce have no entry.
     """
     conditions = {e.name: e.conditions for e in measurable_effects(comparison.plan.robot)}
     proposals = []
     for limit in limits:
-        tried = list[FurtherReadings]()
-        if not limit.determined:
-            for extension in _extensions(comparison, conditions[limit.effect]):
-                tried.append(_evaluate(comparison, extension, limit))
-                if tried[-1].limit.determined:
-                    break
-        proposals += [further for further in tried[-1:] if further.limit.after < limit.after]
+        if limit.determined:
+            continue
+        further = None
+        for extension in _extensions(comparison, conditions[limit.effect]):
+            further = _evaluate(comparison, extension, limit)
+            if further.limit.determined:
+                break
+        if further is not None and further.limit.after < limit.after:
+            proposals.append(further)
     return tuple(proposals)
 
 
 def _evaluate(
     comparison: Comparison, extension: _Extension, limit: EffectLimits
 ) -> FurtherReadings:
-    """The limit of an effect after further readings, and their gain at the tool."""
+    """Limit of an effect after further readings, and their gain at the tool."""
     forecast, plan = comparison.forecast, comparison.equipment.in_course(comparison.plan)
     session = comparison.join(extension.session)
     limits = find_limits(forecast.problem(session), noise_of(session))
@@ -106,22 +108,23 @@ def _extensions(comparison: Comparison, conditions: Sequence[Condition]) -> Iter
         minutes = comparison.equipment.minutes_of(plan)
         yield _Extension(_read_again_warmer(plan), readings, minutes, warmer=WARMER)
     if "time" in conditions:
-        for wait in WAITS:
+        for wait in WAITING_TIMES:
             yield _Extension(_read_again_later(plan, wait), setups, wait * setups, wait=wait)
 
 
 def _read_again_warmer(plan: Session) -> Session:
-    """Plan with a second round, for which the gauges are mounted again, on a warmer machine."""
+    """Plan with a second round on a warmer machine, with gauges mounted again."""
     names = {name: f"{name}_warm" for name in plan.setups}
-    again = {names[n]: replace(setup, name=names[n]) for n, setup in plan.setups.items()}
+    warm_setups = {names[n]: replace(setup, name=names[n]) for n, setup in plan.setups.items()}
     reference = neutral_values(plan.robot)["temperature"]
     readings = list(plan.readings)
     for r in plan.readings:
-        known = r.conditions or Conditions()
-        cool = reference if known.temperature is None else known.temperature
-        warm = replace(known, temperature=cool + WARMER)
+        conditions = r.conditions or Conditions()
+        cool = reference if conditions.temperature is None else conditions.temperature
+        warm = replace(conditions, temperature=cool + WARMER)
         readings.append(replace(r, setup=names[r.setup], conditions=warm))
-    return replace(plan, setups={**plan.setups, **again}, readings=tuple(readings), sha256="")
+    setups = {**plan.setups, **warm_setups}
+    return replace(plan, setups=setups, readings=tuple(readings), sha256="")
 
 
 def _read_again_later(plan: Session, wait: float) -> Session:
@@ -129,7 +132,7 @@ def _read_again_later(plan: Session, wait: float) -> Session:
 
     Args:
         plan: The plan, with times.
-        wait: Minutes between the two.
+        wait: Time between these two readings, [min].
     """
     of_setup: dict[str, list[Reading]] = {}
     for r in plan.readings:

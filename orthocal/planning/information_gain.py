@@ -1,7 +1,7 @@
 """Reduction of the expected tool error by the readings of one setup.
 
-With covariance C of the state without this setup, readings S of the setup reduce tr(T C), T being
-the weight of the state at the tool, by
+Let C be the covariance of the state without this setup and T the weight of the state at the tool.
+Readings S of the setup reduce tr(T C) by
 
     tr[(V_SS + σ² I)⁻¹ Q_SS],  V = A C Aᵀ + D,  Q = A C T C Aᵀ
 
@@ -27,14 +27,15 @@ class Pairs:
     """Pairs of readings with which a setup can begin; the gauge is aligned in the first one."""
 
     first: Indices
-    """Shape (n_pairs,)."""
+    """First reading of each pair, shape (n_pairs,)."""
     second: Indices
+    """Second reading of each pair, shape (n_pairs,)."""
     flat: Indices
-    """Index of a pair in a flattened matrix of all readings by all."""
+    """Index of each pair in a flattened matrix of shape (m, m), shape (n_pairs,)."""
 
     @staticmethod
     def of(setup: CandidateSetup, count: int) -> Pairs:
-        """Pairs whose first reading allows a number of readings within the gauge's range."""
+        """Pairs whose first reading has at least `count` readings within the gauge's range."""
         enough = setup.reachable.sum(axis=1) >= count
         allowed = setup.reachable & enough[:, None]
         np.fill_diagonal(allowed, False)
@@ -47,14 +48,14 @@ class Pairs:
 class _AlignedTerms:
     """Terms of a nuisance parameter that is aligned in the first posture of a setup.
 
-    S is its sensitivity to the state, for each posture in which a setup could begin.
+    Each row of S is its sensitivity to the state if the setup begins in that posture.
     """
 
     sensitivity: Array
     """Sensitivity of the readings to the parameter, shape (m,)."""
     jacobian: Array
     """S, shape (m, n_state)."""
-    known: Array
+    jacobian_covariance: Array
     """S C, shape (m, n_state)."""
     spread: Array
     """S C Aᵀ, shape (m, m)."""
@@ -63,12 +64,12 @@ class _AlignedTerms:
 
     def product(self, other: _AlignedTerms) -> Array:
         """Diagonal of S C S'ᵀ with another parameter, shape (m,)."""
-        return np.asarray(np.vecdot(self.known, other.jacobian))
+        return np.asarray(np.vecdot(self.jacobian_covariance, other.jacobian))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetupGain:
-    """Gain of readings of one candidate setup, given all other information."""
+    """Gain by readings of one candidate setup, conditional on all other information."""
 
     setup: CandidateSetup
     spread: Array
@@ -83,7 +84,7 @@ class SetupGain:
 
     @staticmethod
     def of(setup: CandidateSetup, covariance: Array, root: Array, sigma: float) -> SetupGain:
-        """Gain of readings for a covariance of the state without them.
+        """Gain by readings for a covariance of the state without them.
 
         Args:
             setup: The candidate setup.
@@ -91,33 +92,32 @@ class SetupGain:
             root: C R with T = R Rᵀ, shape (n_state, p).
             sigma: Standard deviation of a reading, [m].
         """
-        known = setup.jacobian @ covariance
-        spread = known @ setup.jacobian.T
+        spread = setup.jacobian @ covariance @ setup.jacobian.T
         spread += setup.covariance
         aligned = []
         for a in setup.aligned:
-            moved = a.jacobian @ covariance
-            across, effect = moved @ setup.jacobian.T, a.jacobian @ root
-            aligned.append(_AlignedTerms(a.sensitivity, a.jacobian, moved, across, effect))
+            product = a.jacobian @ covariance
+            cross, effect = product @ setup.jacobian.T, a.jacobian @ root
+            aligned.append(_AlignedTerms(a.sensitivity, a.jacobian, product, cross, effect))
         variance = spread.diagonal().copy()
         return SetupGain(setup, spread, setup.jacobian @ root, variance, sigma**2, tuple(aligned))
 
-    def begun(self, first: int) -> SetupGain:
+    def begin_with(self, first: int) -> SetupGain:
         """Gain with the gauge aligned in the posture of one reading."""
         if not self.aligned:
             return self
         spread, effect = self.spread.copy(), self.effect.copy()
         for a in self.aligned:
-            across = np.outer(a.sensitivity, a.spread[first])
-            spread += across + across.T
+            cross = np.outer(a.sensitivity, a.spread[first])
+            spread += cross + cross.T
             effect += np.outer(a.sensitivity, a.effect[first])
             for other in self.aligned:
-                both = a.known[first] @ other.jacobian[first]
-                spread += both * np.outer(a.sensitivity, other.sensitivity)
+                covariance = a.jacobian_covariance[first] @ other.jacobian[first]
+                spread += covariance * np.outer(a.sensitivity, other.sensitivity)
         return SetupGain(self.setup, spread, effect, spread.diagonal().copy(), self.noise)
 
     def gains(self, sets: Indices) -> Array:
-        """Gains of sets of readings, the gauge aligned in the first of each, shape (n_sets,).
+        """Gains of sets of readings with the gauge aligned in the first of each, shape (n_sets,).
 
         Args:
             sets: Readings of each set, shape (n_sets, k).
@@ -128,50 +128,49 @@ class SetupGain:
         for a in self.aligned:
             sensitivity = a.sensitivity[sets]
             effect += sensitivity[:, :, None] * a.effect[first][:, None, :]
-            across = sensitivity[:, :, None] * a.spread[first[:, None], sets][:, None, :]
-            spread += across + np.swapaxes(across, 1, 2)
+            cross = sensitivity[:, :, None] * a.spread[first[:, None], sets][:, None, :]
+            spread += cross + np.swapaxes(cross, 1, 2)
             for other in self.aligned:
-                both = a.product(other)[first]
+                covariance = a.product(other)[first]
                 outer = sensitivity[:, :, None] * other.sensitivity[sets][:, None, :]
-                spread += both[:, None, None] * outer
+                spread += covariance[:, None, None] * outer
         return np.asarray((effect * np.linalg.solve(spread, effect)).sum(axis=(1, 2)))
 
     def exchange_gains(self, rows: list[int]) -> Array:
-        """Gain of each reading in place of each of those chosen, beside the others, shape (k, m).
+        """Gain of each reading if it replaces each of the chosen ones, shape (k, m).
 
-        With W the inverse of V_SS + σ² I, leaving reading p out changes W by −w wᵀ / w_p, w being
-        its column. Residual effects and variances of all readings change by one product each.
+        Let W be the inverse of V_SS + σ² I and w its column of reading p. Removing p changes W by
+        −w wᵀ / w_p. Residual effects and variances of all readings change by one product each.
         """
         spread = self.spread[rows]
         inverse = np.linalg.inv(self._covariance(spread, rows))
         solved, weighted = inverse @ spread, inverse @ self.effect[rows]
         effect = self.effect - solved.T @ self.effect[rows]
         variance = self.variance - np.vecdot(spread.T, solved.T)
-        own = inverse.diagonal()[:, None]
-        share = solved / own
+        share = solved / inverse.diagonal()[:, None]
         gains = np.vecdot(weighted, weighted)[:, None] * share
         gains += 2.0 * (weighted @ effect.T)
         gains *= share
         gains += np.vecdot(effect, effect)
         return np.asarray(gains / (np.maximum(variance + share * solved, 0.0) + self.noise))
 
-    def best_pairs(self, pairs: Pairs, most: int) -> list[tuple[float, tuple[int, int]]]:
+    def best_pairs(self, pairs: Pairs, count: int) -> list[tuple[float, tuple[int, int]]]:
         """Best pairs of readings with their gains; the gauge is aligned in the first reading.
 
-        Each further pair shares no reading with those before it, or, with an aligned nuisance
-        parameter, begins with another reading.
+        With an aligned nuisance parameter all pairs begin with different readings. Otherwise they
+        have no common reading.
 
         Args:
             pairs: Possible pairs.
-            most: Number of pairs.
+            count: Largest number of pairs.
         """
         i, j = pairs.first, pairs.second
         if not i.size:
             return []
         if self.setup.absolute:
-            gains = self._both(pairs)
+            gains = self._absolute_gains(pairs)
         else:
-            gains = self._begun_differences()[i, j] if self.aligned else self._differences(pairs)
+            gains = self._aligned_gains()[i, j] if self.aligned else self._difference_gains(pairs)
         ranked: list[tuple[float, tuple[int, int]]] = []
         while True:
             best = first_largest(gains)
@@ -179,16 +178,16 @@ class SetupGain:
             if gain < 0.0:
                 return ranked
             ranked.append((gain, pair))
-            if len(ranked) == most:
+            if len(ranked) == count:
                 return ranked
-            if self.aligned:  # the first reading makes the difference
+            if self.aligned:
                 gains[i == pair[0]] = -1.0
                 continue
             for row in pair:
                 gains[(i == row) | (j == row)] = -1.0
 
-    def _differences(self, pairs: Pairs) -> Array:
-        """Gains of pairs, shape (n_pairs,): with a free zero, those of their differences."""
+    def _difference_gains(self, pairs: Pairs) -> Array:
+        """Gains of the differences of pairs, for a free gauge zero, shape (n_pairs,)."""
         i, j, flat = pairs.first, pairs.second, pairs.flat
         product = self.effect @ self.effect.T
         q, v = product.diagonal(), self.variance
@@ -196,18 +195,18 @@ class SetupGain:
         gains /= v[i] + (v + 2.0 * self.noise)[j] - 2.0 * self.spread.reshape(-1)[flat]
         return np.asarray(gains)
 
-    def _both(self, pairs: Pairs) -> Array:
-        """Gains of pairs, shape (n_pairs,): with a known zero, those of both readings."""
+    def _absolute_gains(self, pairs: Pairs) -> Array:
+        """Gains of pairs of absolute readings, for a known gauge zero, shape (n_pairs,)."""
         if self.aligned:
             return self.gains(np.column_stack([pairs.first, pairs.second]))
         product, variance = self.effect @ self.effect.T, self.variance + self.noise
-        own = np.outer(product.diagonal(), variance)
-        gains = own + own.T - 2.0 * product * self.spread
+        gains = np.outer(product.diagonal(), variance)
+        gains = gains + gains.T - 2.0 * product * self.spread
         gains /= np.outer(variance, variance) - self.spread**2
         return np.asarray(gains.reshape(-1)[pairs.flat])
 
-    def _begun_differences(self) -> Array:
-        """Gains of all pairs, the gauge aligned in the first (row), shape (m, m)."""
+    def _aligned_gains(self) -> Array:
+        """Gains of the differences of all pairs, aligned in the first reading (row), (m, m)."""
         product, spread = self.effect @ self.effect.T, self.spread
         gains, spreads = (
             np.add.outer(s.diagonal(), s.diagonal()) - 2.0 * s for s in (product, spread)
@@ -215,56 +214,64 @@ class SetupGain:
         spreads += 2.0 * self.noise
         for a in self.aligned:
             change = a.sensitivity - a.sensitivity[:, None]
-            for total, pairs in ((gains, a.effect @ self.effect.T), (spreads, a.spread)):
-                total += 2.0 * change * (pairs - pairs.diagonal()[:, None])
+            for total, cross in ((gains, a.effect @ self.effect.T), (spreads, a.spread)):
+                total += 2.0 * change * (cross - cross.diagonal()[:, None])
             for other in self.aligned:
-                both = change * (other.sensitivity - other.sensitivity[:, None])
-                gains += both * np.vecdot(a.effect, other.effect)[:, None]
-                spreads += both * a.product(other)[:, None]
+                changes = change * (other.sensitivity - other.sensitivity[:, None])
+                gains += changes * np.vecdot(a.effect, other.effect)[:, None]
+                spreads += changes * a.product(other)[:, None]
         return np.asarray(gains / spreads)
 
     def complete(self, pair: tuple[int, int], count: int) -> tuple[float, tuple[int, ...]]:
-        """Add readings greedily to a pair, with the gain of all of them."""
+        """Add readings greedily to a pair.
+
+        Returns:
+            The gain of all readings, and the readings.
+        """
         gains, chosen = self.grow(pair, count)
         return gains[-1], chosen
 
     def grow(self, pair: tuple[int, int], count: int) -> tuple[tuple[float, ...], tuple[int, ...]]:
-        """Add readings greedily to a pair, with the gains of the first one, of two, and so on.
+        """Add readings greedily to a pair.
 
-        Each reading that is added conditions the others: one more column of the Cholesky factor
-        of V. Fewer readings are added if the range of the gauge allows no more.
+        Each added reading conditions the others by one further column of the Cholesky factor of V.
+
+        Returns:
+            Gains of the first reading, of the first two, and so on; and the readings, fewer than
+            `count` if the range of the gauge allows no more.
         """
         spread, effect, variance = self.spread, self.effect, self.variance
-        steps, shared = np.empty((count, len(variance))), np.empty_like(effect)
+        columns, change = np.empty((count, len(variance))), np.empty_like(effect)
         chosen, gains = list(pair), list[float]()
-        refused = ~self.setup.reachable[pair[0]]
+        excluded = ~self.setup.reachable[pair[0]]
         for k in range(count):
             if k >= len(chosen):
-                refused[chosen] = True
+                excluded[chosen] = True
                 single = self._single_gains(effect, variance)
-                np.putmask(single, refused, -1.0)
+                np.putmask(single, excluded, -1.0)
                 best = first_largest(single)
-                if refused[best]:
+                if excluded[best]:
                     break
                 chosen.append(best)
             row, column = chosen[k], spread[chosen[k]]
             if k:
-                column = column - steps[:k, row] @ steps[:k]
-            size = math.sqrt(column[row] + self.noise)
-            step, share = np.divide(column, size, out=steps[k]), effect[row] / size
+                column = column - columns[:k, row] @ columns[:k]
+            pivot = math.sqrt(column[row] + self.noise)
+            column, share = np.divide(column, pivot, out=columns[k]), effect[row] / pivot
             gains.append(float(share @ share) + (gains[-1] if gains else 0.0))
-            np.multiply(step[:, None], share, out=shared)
-            effect = np.subtract(effect, shared, out=effect if k else None)
-            variance = variance - step**2
+            np.multiply(column[:, None], share, out=change)
+            effect = np.subtract(effect, change, out=effect if k else None)
+            variance = variance - column**2
         return tuple(gains), tuple(chosen)
 
-    def _covariance(self, rest: Array, rows: list[int]) -> Array:
+    def _covariance(self, spread_rows: Array, rows: list[int]) -> Array:
         """V_SS + σ² I of readings, from their rows of V."""
-        variance = rest[:, rows]
-        variance[np.diag_indices(len(rows))] += self.noise
-        return variance
+        covariance = spread_rows[:, rows]
+        covariance[np.diag_indices(len(rows))] += self.noise
+        return covariance
 
     def _single_gains(self, effect: Array, variance: Array) -> Array:
+        """Gain of each reading alone, shape (m,)."""
         scale = np.maximum(variance, 0.0)
         scale += self.noise
         return np.asarray(np.vecdot(effect, effect) / scale)
@@ -272,7 +279,7 @@ class SetupGain:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointGain:
-    """Gain of points of one candidate setup, given all other information.
+    """Gain by points of one candidate setup, conditional on all other information.
 
     The methods are those of `SetupGain`; a point is a block of w rows of A. The instrument is not
     aligned to the machine.
@@ -288,12 +295,12 @@ class PointGain:
 
     @staticmethod
     def of(setup: CandidateSetup, covariance: Array, root: Array, sigma: float) -> PointGain:
-        """Gain of points; arguments as those of `SetupGain.of`."""
+        """Gain by points; the arguments are those of `SetupGain.of`."""
         spread = setup.jacobian @ covariance @ setup.jacobian.T + setup.covariance
         return PointGain(setup, spread, setup.jacobian @ root, sigma**2)
 
-    def begun(self, first: int) -> PointGain:
-        """Gain with a first point, which makes no difference."""
+    def begin_with(self, first: int) -> PointGain:
+        """The same gain: it does not depend on the first point."""
         del first
         return self
 
@@ -305,19 +312,19 @@ class PointGain:
         return np.asarray((effect * np.linalg.solve(spread, effect)).sum(axis=(1, 2)))
 
     def exchange_gains(self, rows: list[int]) -> Array:
-        """Gain of each point in place of each of those chosen, beside the others, shape (k, m).
+        """Gain of each point if it replaces each of the chosen ones, shape (k, m).
 
-        As for single readings, with blocks: leaving point p out changes W by −W_·p W_pp⁻¹ W_p·.
+        As for single readings, with blocks: removing point p changes W by −W_·p W_pp⁻¹ W_p·.
         """
         at, k, w = self.setup.numbers(rows), len(rows), self.setup.width
         inverse = np.linalg.inv(self.spread[np.ix_(at, at)] + self.noise * np.eye(at.size))
         solved, weighted = inverse @ self.spread[at], inverse @ self.effect[at]
         effect = self.effect - solved.T @ self.effect[at]
-        known = self.spread[at].reshape(k * w, -1, w), solved.reshape(k * w, -1, w)
-        spread = self._blocks(self.spread) - np.einsum("sib,sic->ibc", *known)
-        own = np.linalg.inv(self._blocks(np.asarray(inverse)))
+        factors = self.spread[at].reshape(k * w, -1, w), solved.reshape(k * w, -1, w)
+        spread = self._blocks(self.spread) - np.einsum("sib,sic->ibc", *factors)
+        inverse_blocks = np.linalg.inv(self._blocks(np.asarray(inverse)))
         of_point = solved.reshape(k, w, -1, w)
-        share = np.einsum("paib,pac->pibc", of_point, own)
+        share = np.einsum("paib,pac->pibc", of_point, inverse_blocks)
         weighted = weighted.reshape(k, w, -1)
         rows_of_point = effect.reshape(-1, w, effect.shape[1])
         cross = np.einsum("ibr,pcr->pibc", rows_of_point, weighted, optimize=True)
@@ -328,56 +335,56 @@ class PointGain:
         spread = spread + np.einsum("pibc,pcid->pibd", share, of_point)
         return self._trace(gains, spread)
 
-    def best_pairs(self, pairs: Pairs, most: int) -> list[tuple[float, tuple[int, int]]]:
-        """Points of largest gain, each with the best one beside it; the pairs share no point.
+    def best_pairs(self, pairs: Pairs, count: int) -> list[tuple[float, tuple[int, int]]]:
+        """Points of largest gain, each with the best additional one; no pairs share a point.
 
         Args:
             pairs: Possible pairs.
-            most: Number of pairs.
+            count: Largest number of pairs.
         """
         allowed = np.zeros_like(self.setup.reachable)
         allowed.reshape(-1)[pairs.flat] = True
         blocks = self.effect.reshape(len(allowed), -1, self.effect.shape[1])
         gains = self._trace(np.einsum("ibr,icr->ibc", blocks, blocks), self._blocks(self.spread))
         ranked: list[tuple[float, tuple[int, int]]] = []
-        while len(ranked) < most and allowed.any():
+        while len(ranked) < count and allowed.any():
             first = first_largest(np.where(allowed.any(axis=1), gains, -1.0))
-            both, (_, second) = self._grow((first,), 2, ~allowed[first])
-            ranked.append((both[-1], (first, second)))
+            gains_after, (_, second) = self._grow((first,), 2, ~allowed[first])
+            ranked.append((gains_after[-1], (first, second)))
             allowed[[first, second]] = False
             allowed[:, [first, second]] = False
         return ranked
 
     def complete(self, pair: tuple[int, int], count: int) -> tuple[float, tuple[int, ...]]:
-        """Add points greedily to a pair, with the gain of all of them."""
+        """Add points greedily to a pair; see `SetupGain.complete`."""
         gains, chosen = self.grow(pair, count)
         return gains[-1], chosen
 
     def grow(self, pair: tuple[int, int], count: int) -> tuple[tuple[float, ...], tuple[int, ...]]:
-        """Add points greedily to a pair, with the gains of the first one, of two, and so on."""
+        """Add points greedily to a pair; see `SetupGain.grow`."""
         return self._grow(pair, count, ~self.setup.reachable[pair[0]])
 
     def _grow(
-        self, begun: tuple[int, ...], count: int, refused: NDArray[np.bool_]
+        self, first: tuple[int, ...], count: int, excluded: NDArray[np.bool_]
     ) -> tuple[tuple[float, ...], tuple[int, ...]]:
-        """Add points to others: each is w more columns of the Cholesky factor of V."""
+        """Add points to the first ones; each is w further columns of the Cholesky factor of V."""
         w, effect, variance = self.setup.width, self.effect, self._blocks(self.spread)
-        steps = np.empty((count * w, len(self.spread)))
-        chosen, gains = list(begun), list[float]()
-        refused = refused.copy()
+        columns = np.empty((count * w, len(self.spread)))
+        chosen, gains = list(first), list[float]()
+        excluded = excluded.copy()
         for k in range(count):
             if k >= len(chosen):
-                refused[chosen] = True
+                excluded[chosen] = True
                 blocks = effect.reshape(len(variance), w, -1)
                 single = self._trace(np.einsum("ibr,icr->ibc", blocks, blocks), variance)
-                best = first_largest(np.where(refused, -1.0, single))
-                if refused[best]:
+                best = first_largest(np.where(excluded, -1.0, single))
+                if excluded[best]:
                     break
                 chosen.append(best)
-            at, before = self.setup.numbers([chosen[k]]), steps[: k * w]
+            at, before = self.setup.numbers([chosen[k]]), columns[: k * w]
             column = self.spread[at] - before[:, at].T @ before
             root = np.linalg.cholesky(column[:, at] + self.noise * np.eye(w))
-            step = steps[k * w : (k + 1) * w] = np.linalg.solve(root, column)
+            step = columns[k * w : (k + 1) * w] = np.linalg.solve(root, column)
             share = np.linalg.solve(root, effect[at])
             gains.append(float(np.vdot(share, share)) + (gains[-1] if gains else 0.0))
             effect = effect - step.T @ share

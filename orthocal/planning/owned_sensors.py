@@ -1,4 +1,4 @@
-"""Sensors at the tool that are available for a plan, from files."""
+"""Sensors at the tool that are available for a plan, loaded from files."""
 
 from __future__ import annotations
 
@@ -11,34 +11,34 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from orthocal.errors import SessionError
 from orthocal.io.documents import Number, read_yaml, validate
-from orthocal.measurement.files.schema import GaugeKeys
+from orthocal.measurement.files.session_keys import GaugeKeys
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Gauge
 from orthocal.statistics.noise import noise_floor
 
 DIAL = "dial"
-"""Name of the gauge for legs beside sensors at the tool."""
+"""Name of the gauge for legs in plans with sensors at the tool."""
 
 SLACK = 1e-9
-"""Minutes by which rounding may exceed a time."""
+"""Rounding error of a time that is accepted, [min]."""
 
 
 class Duration(NamedTuple):
-    """Minutes that a gauge takes."""
+    """Durations of a setup and a reading with a gauge, [min]."""
 
     setup: float
     reading: float
 
     def of(self, readings: int) -> float:
-        """Minutes of a setup with this number of readings and a closing one."""
+        """Minutes of a setup with `readings` readings and a closing one."""
         return self.setup + (readings + 1) * self.reading
 
-    def most(self, minutes: float, limit: int) -> int:
-        """Largest number of readings of a setup within a time, beside the closing one."""
-        left = minutes - self.setup + SLACK
-        if left < self.reading * (limit + 1):
-            return max(int(left / self.reading) - 1, 0)
-        return limit if left > 0.0 else 0
+    def max_readings(self, minutes: float, limit: int) -> int:
+        """Largest number of readings of a setup within a time, without the closing one."""
+        available = minutes - self.setup + SLACK
+        if available < self.reading * (limit + 1):
+            return max(int(available / self.reading) - 1, 0)
+        return limit if available > 0.0 else 0
 
 
 DURATIONS = {
@@ -47,13 +47,13 @@ DURATIONS = {
     "probe": Duration(2.0, 0.1),
     "tool_indicator": Duration(10.0, 0.5),
 }
-"""Usual durations of each kind of sensor. A probe moves by itself."""
+"""Usual durations by kind of sensor. A probe is read automatically."""
 
 Minutes = Annotated[Number, Field(ge=0.0, le=1e4)]
 
 
 class DurationKeys(BaseModel):
-    """Keys of a sensor's file about time."""
+    """Keys of durations in a sensor's file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
@@ -61,7 +61,7 @@ class DurationKeys(BaseModel):
     minutes_a_reading: Minutes | None = None
 
     def to_duration(self, usual: Duration) -> Duration:
-        """Duration, by default the usual one."""
+        """Stated durations; the usual ones by default."""
         setup, reading = self.minutes_a_setup, self.minutes_a_reading
         return Duration(
             usual.setup if setup is None else float(setup),
@@ -69,54 +69,54 @@ class DurationKeys(BaseModel):
         )
 
 
-PLACED: Mapping[str, Mapping[str, Any]] = {
+PLACEMENT_KEYS: Mapping[str, Mapping[str, Any]] = {
     "ball_bar": {"centre_mm": [0.0, 0.0, 0.0], "ball": "ball"},
     "tool_indicator": {"direction": "x"},
     "probe": {},
     "points": {"station": "station"},
 }
-"""Kinds of sensor that a plan places, with the keys that the plan chooses, and values of them with
-which the other keys are checked."""
+"""Kinds of sensor that a plan can place, with the keys that the plan chooses. Their values here
+are examples for the validation of the other keys."""
 
-PLACED_ARTEFACTS: Mapping[str, Mapping[str, Any]] = {
+ARTEFACT_PLACEMENT_KEYS: Mapping[str, Mapping[str, Any]] = {
     "square": {"along": "y", "name": "square"},
     "straightedge": {"along": "y", "name": "edge"},
     "plate": {},
     "gauge_block": {"table_mm": 0.0},
 }
-"""Kinds of artefact, with such keys of them."""
+"""Kinds of artefact with the keys that the plan chooses, and example values."""
 
-CHOSEN = ("gauge", "postures", "aligned_at", "axis")
-"""Keys of every setup that the plan chooses, or that no file of a session may have."""
+CHOSEN_KEYS = ("gauge", "postures", "aligned_at", "axis")
+"""Keys that the plan chooses in every setup, or that no file of a session may have."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OwnedSensor:
-    """A sensor at the tool that is available for a plan."""
+    """Sensor at the tool that is available for a plan."""
 
     name: str
     gauge: Gauge
     keys: Mapping[str, Any]
-    """Keys of its setups in a session.yaml, without those that the plan chooses."""
+    """Keys of a setup in a session.yaml, without the keys that the plan chooses."""
     file: Path
     duration: Duration
 
 
 def load_owned_sensor(path: str | Path) -> OwnedSensor:
-    """A sensor from a file: the keys of its gauge and those of a setup, without its place.
+    """Load a sensor from a file with the keys of its gauge and of a setup without placement.
 
     Args:
-        path: YAML with `sensor`, `sigma_mm`, `range_mm` and the like, the keys of a setup, and
-            `minutes_a_setup` and `minutes_a_reading`.
+        path: YAML with `sensor`, keys of a gauge such as `sigma_mm` and `range_mm`, keys of a
+            setup, and `minutes_a_setup` and `minutes_a_reading`.
 
     Raises:
-        SessionError: Naming file and key.
+        SessionError: If the file is invalid; names file and key.
     """
     file = Path(path)
     data = read_yaml(file, error=SessionError)
-    if not isinstance(data, dict) or data.get("sensor") not in list(PLACED):
+    if not isinstance(data, dict) or data.get("sensor") not in list(PLACEMENT_KEYS):
         raise SessionError(
-            f"expected the key sensor: {' or '.join(PLACED)}, and those of the sensor",
+            f"expected the key sensor: {' or '.join(PLACEMENT_KEYS)}, and keys of this sensor",
             where=str(file),
         )
     times = {k: data.pop(k) for k in DurationKeys.model_fields if k in data}
@@ -136,18 +136,18 @@ def load_owned_sensor(path: str | Path) -> OwnedSensor:
 
 
 def _require_keys(keys: Mapping[str, Any], file: Path) -> None:
-    """Refuse keys that the plan chooses, and values that no setup may have.
+    """Refuse keys that the plan chooses, and invalid values.
 
     Raises:
-        SessionError: Naming file and key.
+        SessionError: If a key or value is refused; names file and key.
     """
-    chosen = PLACED[keys["sensor"]]
+    chosen = PLACEMENT_KEYS[keys["sensor"]]
     complete, artefact = {**keys, **chosen}, keys.get("artefact")
-    given = [key for key in (*chosen, *CHOSEN) if key in keys]
-    if isinstance(artefact, Mapping) and artefact.get("kind") in list(PLACED_ARTEFACTS):
-        of_artefact = PLACED_ARTEFACTS[artefact["kind"]]
-        given += [f"artefact.{key}" for key in of_artefact if key in artefact]
+    refused = [key for key in (*chosen, *CHOSEN_KEYS) if key in keys]
+    if isinstance(artefact, Mapping) and artefact.get("kind") in list(ARTEFACT_PLACEMENT_KEYS):
+        of_artefact = ARTEFACT_PLACEMENT_KEYS[artefact["kind"]]
+        refused += [f"artefact.{key}" for key in of_artefact if key in artefact]
         complete["artefact"] = {**artefact, **of_artefact}
-    if given:
-        raise SessionError("the plan chooses it; leave it out", where=f"{file}: {given[0]}")
+    if refused:
+        raise SessionError("the plan chooses it; delete this key", where=f"{file}: {refused[0]}")
     read_setup(complete, where=str(file), under="", error=SessionError)

@@ -18,7 +18,7 @@ from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.kinematics.workspace import Workspace
 from orthocal.measurement.motion.approach import usual_approaches
 from orthocal.planning.candidates import (
-    FEWEST,
+    MIN_READINGS,
     Candidates,
     indicator_of,
     list_candidates,
@@ -26,7 +26,7 @@ from orthocal.planning.candidates import (
 )
 from orthocal.planning.cost_curve import (
     HOUR,
-    MOST_SETUPS,
+    MAX_SETUPS,
     Stage,
     compute_curve,
     find_enough,
@@ -56,23 +56,24 @@ from orthocal.session.session import Purpose, Session
 MODEL = "full"
 """Model that a plan identifies by default: the complete machine with priors."""
 
-READINGS_A_SETUP = (3, 5, 9, 16)
-"""Numbers of readings of a setup that are tried for a given time."""
+READINGS_PER_SETUP = (3, 5, 9, 16)
+"""Possible numbers of readings of a setup in a plan for a given time."""
 
 USUAL_SETUPS = 6
+"""Default number of setups."""
 
-GOAL = 0.4
-"""Limit of backlash after a plan, in its limit before, that plans reach if they can: the tool may
-be used from both sides, or the controller compensates backlash."""
+APPROACH_GOAL = 0.4
+"""Largest remaining part of the uncertainty of backlash that a plan aims for. Then the tool can be
+used from both of_approach, or the controller compensates backlash."""
 
-EMPHASIS = 3.0
-"""Factor of tool errors from backlash in the search for a plan that reaches the goal."""
+APPROACH_EMPHASIS = 3.0
+"""Factor of tool errors from backlash in a second search, for a plan that reaches the goal."""
 
-MORE_FOR_APPROACH = 2 / 3
-"""Further readings of a setup where each posture can be approached from either side."""
+EXTRA_FOR_APPROACH = 2 / 3
+"""Additional readings per setup if postures can be approached from either side."""
 
-SIMPLER = 3e-2
-"""Relative increase of the error, in total, for tips on the crests of their rods."""
+SIMPLICITY_TOLERANCE = 3e-2
+"""Accepted relative increase of the error, in total, for tips on the crests of their rods."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,36 +81,36 @@ class MeasuringPlan:
     """Readings in the order of measuring, and the expected tool error after the calibration."""
 
     session: Session
-    """Setups, postures and readings; each setup ends with its first posture. Readings are 0."""
+    """Setups, postures and readings with value 0; each setup ends with its first posture."""
     forecast: ToolForecast
     criterion: Criterion
     minutes: float
     known: Expected
-    """Expected error before: from the priors of the machine; of a session, after its readings."""
+    """Expected error before: from the priors of the machine, or after the readings of a session."""
     expected: Expected
-    """Expected error after, with offsets that are near those that the controller corrects; with
-    readings of a session without active offsets, with offsets anywhere within tolerances."""
+    """Expected error after the plan, with small offsets because the controller corrects them. If
+    the complemented session has no active offsets, they are drawn from their priors."""
     first_round: Expected
-    """The same with offsets anywhere within their tolerances."""
+    """Expected error after the plan, with offsets drawn from their priors."""
     compared: tuple[Alternative, ...]
     """Usual plans at equal cost."""
     helps: tuple[Alternative, ...]
-    """The same readings by other gauges."""
+    """This plan with other gauges."""
     stage: Stage
-    """This plan, without the readings that close its setups."""
+    """This plan as a point of the curve."""
     curve: tuple[Stage, ...]
-    """Expected error with setups added one after the other."""
+    """Expected error after each of several setups that are added one by one."""
     equipment: Equipment
     candidates: int
     """Number of candidate readings."""
     complements: bool
     """Whether the readings complement those of a session."""
     effects: tuple[EffectLimits, ...] = ()
-    """Limits of the effects beside geometry, before and after."""
+    """Limits of the effects beside geometry, before and after the plan."""
     further: tuple[FurtherReadings, ...] = ()
-    """Readings for the effects that this plan does not determine."""
+    """Further readings for the effects that this plan does not determine."""
     complete: Session | None = None
-    """The readings with those that they complement, in the course of a day."""
+    """Planned readings with expected times and temperatures, joined with the existing readings."""
 
     def find_sensor_gains(self) -> tuple[SensorGain, ...]:
         """Gains of an hour with each usual sensor after these readings, the largest first."""
@@ -130,16 +131,17 @@ class MeasuringPlan:
 
     @property
     def better_usual_plans(self) -> list[tuple[float, tuple[PlannedSetup, ...]]]:
-        """Smaller expected errors of usual plans of equal cost, with their setups.
+        """Usual plans of equal cost with a smaller expected error: the errors and the setups.
 
-        The search minimises the error about the nominal machine, and prefers simple setups.
+        They exist because the search minimises the error about the nominal machine and prefers
+        simple setups.
         """
-        errors = [
+        usual_plans = [
             (usual.expected.rms_by(self.criterion), usual.planned)
             for usual in self.compared
             if usual.expected is not None
         ]
-        return [better for better in errors if better[0] < self.expected.rms_by(self.criterion)]
+        return [plan for plan in usual_plans if plan[0] < self.expected.rms_by(self.criterion)]
 
     @property
     def enough(self) -> Stage | None:
@@ -169,48 +171,48 @@ def plan_readings(
     Args:
         robot: The robot.
         choice: Parameters to identify, or a model; by default as `measured` states, or "full".
-        setups: Number of setups; by default 6, or as many as `hours` allow.
-        readings: Number of readings, at least 2 per setup, beside the first postures that are read
-            again; by default 3 per setup, and 4 more in six with backlash, or as `hours` allow.
-        hours: Available time; not with numbers.
+        setups: Number of setups; by default 6, or the number that `hours` allow.
+        readings: Number of readings without the closing ones, at least 2 per setup. By default 3
+            per setup, with backlash 4 more in six setups, or the number that `hours` allow.
+        hours: Available time; excludes `setups` and `readings`.
         equipment: Available gauge, tip and region.
         measured: Existing readings, which the plan complements.
         workspace: Region over which the tool error is computed; by default the robot's.
         criterion: Figure to minimise; see `planning.expected_error.Criterion`.
-        seed: Seed of the random starts; the plan depends on nothing else that is random.
+        seed: Seed of the random starts of the search.
         starts: Number of starts of the search; by default 3, or more for few candidates.
-        reference: Name of the robot in the session; by default its own.
+        reference: Name of the robot in the session; by default that of the model.
         workers: Number of processes; the plan does not depend on it.
         report: Called with a line of text as the work proceeds.
 
     Raises:
-        ParameterError: If numbers contradict each other, or there are no candidates.
+        ParameterError: If numbers contradict each other, or there are no candidate readings.
         RobotError: If the drives do not command the tool.
         SessionError: If the repeatability of the existing readings is unknown.
     """
-    work = _Work(criterion, seed, starts, workers, report or (lambda text: None))
+    work = _SearchOptions(criterion, seed, starts, workers, report or (lambda text: None))
     measured = None if measured is None else state_noise(measured)
     chosen = resolve_choice(choice, measured, default_model=MODEL)
     robot, measured = _with_choice(robot, measured, chosen)
     equipment = equipment or Equipment()
-    counts: Sequence[list[int]] | float
-    counts = options = _list_counts(setups, readings, hours, equipment, robot)
+    counts = _list_counts(setups, readings, hours, equipment, robot)
+    options: Sequence[list[int]] | float = counts
     if equipment.owned and setups is None and readings is None:
-        counts = HOUR * hours if hours is not None else equipment.minutes(*_totals(options[0]))
+        options = HOUR * hours if hours is not None else equipment.minutes(*_totals(counts[0]))
     forecast = ToolForecast(robot, chosen.select(robot.parameters), workspace)
     session = list_candidates(robot, equipment, reference=reference)
     session = replace(session, purpose=Purpose(chosen.model, tuple(chosen.free)))
-    return _plan(session, counts, forecast, equipment, measured, work)
+    return _plan(session, options, forecast, equipment, measured, work)
 
 
 def _totals(counts: Sequence[int]) -> tuple[int, int]:
-    """Numbers of setups and of readings, with the closing ones."""
+    """Numbers of setups and of readings, including the closing ones."""
     return len(counts), sum(counts) + len(counts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Work:
-    """Criterion and course of a search; fields as in `plan_readings`."""
+class _SearchOptions:
+    """Criterion and options of a search; fields as in `plan_readings`."""
 
     criterion: Criterion
     seed: int
@@ -225,17 +227,17 @@ def _plan(
     forecast: ToolForecast,
     equipment: Equipment,
     measured: Session | None,
-    work: _Work,
+    work: _SearchOptions,
 ) -> MeasuringPlan:
     """Plan with the smallest expected error.
 
     Args:
         session: All candidate readings.
-        options: Possible numbers of readings of each setup, or the available time, [min].
+        options: Lists of the numbers of readings of each setup, or the available time, [min].
         forecast: Expected errors of the robot.
         equipment: Gauge, tip and region.
         measured: Existing readings.
-        work: Criterion and course of the search.
+        work: Criterion and options of the search.
     """
     work.report(f"computing {len(session.readings)} candidate readings")
     candidates = measure_candidates(
@@ -243,8 +245,8 @@ def _plan(
     )
     search = SetupSearch.of(
         candidates,
-        forecast.prior_of(candidates.problem, candidates.state, measured),
-        forecast.weigh(work.criterion, len(candidates.state)),
+        forecast.prior_information(candidates.problem, candidates.state, measured),
+        forecast.weight_of(work.criterion, len(candidates.state)),
     )
     timed = TimedSearch(search, equipment.durations(session), equipment.once)
     planned = _search_setups(timed, candidates, options, work)
@@ -258,7 +260,7 @@ def _plan(
     better = min(plan.better_usual_plans, key=lambda usual: usual[0], default=None)
     if better is None:
         return plan
-    work.report("searching from a usual plan, which is better")
+    work.report("searching from a usual plan, because it is better")
     error, setups = better
     improved = search.improve(setups)
     expected = compare(improved).expect_plan()
@@ -270,7 +272,7 @@ def _search_setups(
     timed: TimedSearch,
     candidates: Candidates,
     options: Sequence[list[int]] | float,
-    work: _Work,
+    work: _SearchOptions,
 ) -> PlannedSetups:
     """Setups with the smallest error for a time, or one of the possible numbers of readings."""
     search = timed.search
@@ -282,8 +284,10 @@ def _search_setups(
         work.report(f"choosing setups for {options:.0f} min")
 
         def choose(weighted: SetupSearch) -> PlannedSetups:
-            within = replace(timed, search=weighted)
-            return within.choose(options, starts=work.starts, workers=work.workers, report=report)
+            weighted_timed = replace(timed, search=weighted)
+            return weighted_timed.choose(
+                options, starts=work.starts, workers=work.workers, report=report
+            )
     else:
         counts = options[0]
         if len(options) > 1:
@@ -295,9 +299,9 @@ def _search_setups(
                 counts, seed=work.seed, starts=work.starts, workers=work.workers, report=report
             )
 
-    sides = _find_sides(candidates, candidates.session.robot)
-    planned = _choose_setups(search, sides, choose)
-    return _simplify(candidates, planned, search, sides)
+    of_approach = _find_approach_parameters(candidates, candidates.session.robot)
+    planned = _choose_setups(search, of_approach, choose)
+    return _simplify(candidates, planned, search, of_approach)
 
 
 def _with_choice(
@@ -312,8 +316,8 @@ def _with_choice(
     return robot.with_tolerances(choice.tolerances), None
 
 
-def _find_sides(candidates: Candidates, robot: Robot) -> list[int]:
-    """Indices in the state of the parameters that depend on the side of approach."""
+def _find_approach_parameters(candidates: Candidates, robot: Robot) -> list[int]:
+    """Indices in the state of the parameters of effects that depend on the approach."""
     names = {
         error.name
         for effect in robot_effects(robot)
@@ -324,43 +328,44 @@ def _find_sides(candidates: Candidates, robot: Robot) -> list[int]:
 
 
 def _choose_setups(
-    search: SetupSearch, sides: list[int], choose: Callable[[SetupSearch], PlannedSetups]
+    search: SetupSearch, of_approach: list[int], choose: Callable[[SetupSearch], PlannedSetups]
 ) -> PlannedSetups:
     """Setups with the smallest error that reach the goal for backlash, if any do.
 
-    If those with the smallest error miss it, effects of the side of approach count more.
+    If the best setups miss the goal, a second search emphasises effects of the approach. This is
+    possible only if the weight does not depend on the covariance.
 
     Args:
         search: Search for the smallest error.
-        sides: Indices of the parameters that depend on the side of approach.
-        choose: Choose setups by a search.
+        of_approach: Indices of the parameters that depend on the approach.
+        choose: Function that chooses setups by a search.
     """
     first = choose(search)
     prior = np.asarray(np.linalg.inv(search.prior))
-    root = search.weigh(prior)
-    if search.weigh(prior) is not root or _is_reached(first, sides):
+    root = search.weight(prior)
+    if search.weight(prior) is not root or _is_reached(first, of_approach):
         return first
     emphasised = root.copy()
-    emphasised[sides] *= EMPHASIS
-    planned = choose(replace(search, weigh=lambda covariance: emphasised))
-    if not _is_reached(planned, sides):
+    emphasised[of_approach] *= APPROACH_EMPHASIS
+    planned = choose(replace(search, weight=lambda covariance: emphasised))
+    if not _is_reached(planned, of_approach):
         return first
     return replace(planned, error=search.error_of(planned.information))
 
 
-def _is_reached(planned: PlannedSetups, sides: list[int]) -> bool:
-    """True if all limits, relative to those before, are within the goal."""
-    variance = np.diag(np.linalg.inv(planned.information))[sides]
-    return bool(np.sqrt(variance.max(initial=0.0)) <= GOAL)
+def _is_reached(planned: PlannedSetups, of_approach: list[int]) -> bool:
+    """True if the posterior standard deviations, in prior std, are within the goal."""
+    variance = np.diag(np.linalg.inv(planned.information))[of_approach]
+    return bool(np.sqrt(variance.max(initial=0.0)) <= APPROACH_GOAL)
 
 
 def _evaluate(
     search: TimedSearch,
     planned: PlannedSetups,
     comparison: Comparison,
-    work: _Work,
+    work: _SearchOptions,
 ) -> MeasuringPlan:
-    """Plan with its expected errors, and those of others."""
+    """Compute the expected errors of a plan and of its alternatives."""
     plan, measured, forecast = comparison.plan, comparison.measured, comparison.forecast
     joined = comparison.join(comparison.equipment.in_course(plan))
     setups, readings = len(planned.setups), sum(len(s.chosen) for s in planned.setups)
@@ -384,8 +389,8 @@ def _evaluate(
             ),
             killed=KILLED,
         )
-    stage = Stage(setups, readings, minutes, planned.error)
-    factor, remainder = find_scale(stage.error, expected, nominal, work.criterion)
+    stage = Stage(setups, readings, minutes, planned.error)  # without the closing readings
+    factor, constant = find_scale(stage.error, expected, nominal, work.criterion)
     return MeasuringPlan(
         session=plan,
         forecast=forecast,
@@ -396,8 +401,8 @@ def _evaluate(
         first_round=first_round,
         compared=compared,
         helps=helps,
-        stage=scale_curve([stage], factor, remainder)[0],
-        curve=scale_curve(curve, factor, remainder),
+        stage=scale_curve([stage], factor, constant)[0],
+        curve=scale_curve(curve, factor, constant),
         equipment=comparison.equipment,
         candidates=len(comparison.candidates.session.readings),
         complements=measured is not None,
@@ -414,32 +419,32 @@ def _list_counts(
     equipment: Equipment,
     robot: Robot,
 ) -> list[list[int]]:
-    """Possible numbers of readings of each setup; arguments as for `plan_readings`."""
+    """Possible lists of the numbers of readings of each setup; arguments as in `plan_readings`."""
     if hours is not None:
         if setups is not None or readings is not None:
             raise ParameterError("found with --setups or --readings; expected one", where="--hours")
         options = []
-        for most in READINGS_A_SETUP:
-            count = int(hours * HOUR / equipment.minutes(1, most + 1))
-            if 1 <= count <= MOST_SETUPS:
-                options.append([most] * count)
+        for each in READINGS_PER_SETUP:
+            count = int(hours * HOUR / equipment.minutes(1, each + 1))
+            if 1 <= count <= MAX_SETUPS:
+                options.append([each] * count)
         if not options and not equipment.owned:
-            least = equipment.minutes(1, READINGS_A_SETUP[0] + 1) / HOUR
+            min_hours = equipment.minutes(1, READINGS_PER_SETUP[0] + 1) / HOUR
             raise ParameterError(
-                f"found {hours:g}; expected at least {least:.2g}, a setup of "
-                f"{READINGS_A_SETUP[0]} readings, and at most {MOST_SETUPS} setups",
+                f"found {hours:g}; expected at least {min_hours:.2g}, a setup of "
+                f"{READINGS_PER_SETUP[0]} readings, and at most {MAX_SETUPS} setups",
                 where="--hours",
             )
         return options
     count = USUAL_SETUPS if setups is None else setups
-    each = READINGS_A_SETUP[0] + (MORE_FOR_APPROACH if usual_approaches(robot) else 0.0)
-    total = math.ceil(each * count - 1e-9) if readings is None else readings
-    if not 1 <= count <= MOST_SETUPS:
-        raise ParameterError(f"found {count}; expected 1 to {MOST_SETUPS}", where="--setups")
-    if total < FEWEST * count:
+    mean = READINGS_PER_SETUP[0] + (EXTRA_FOR_APPROACH if usual_approaches(robot) else 0.0)
+    total = math.ceil(mean * count - 1e-9) if readings is None else readings
+    if not 1 <= count <= MAX_SETUPS:
+        raise ParameterError(f"found {count}; expected 1 to {MAX_SETUPS}", where="--setups")
+    if total < MIN_READINGS * count:
         raise ParameterError(
-            f"found {total}; expected at least {FEWEST * count}, {FEWEST} for each of {count} "
-            "setups: the first one only determines the gauge zero",
+            f"found {total}; expected at least {MIN_READINGS * count}, {MIN_READINGS} for each of "
+            f"{count} setups: a single reading only determines the gauge zero",
             where="--readings",
         )
     return [[total // count + (i < total % count) for i in range(count)]]
@@ -449,24 +454,24 @@ def _choose_counts(
     search: SetupSearch, seed: int, workers: int, options: Sequence[list[int]]
 ) -> list[int]:
     """Numbers of readings of each setup with the smallest error after one start."""
-    work = partial(_quick_error, search, seed, options)
-    errors = dict(run_in_parallel(work, range(len(options)), workers, killed=KILLED))
+    error_of = partial(_quick_error, search, seed, options)
+    errors = dict(run_in_parallel(error_of, range(len(options)), workers, killed=KILLED))
     return options[best_of(range(len(options)), lambda i: -errors[i])]
 
 
 def _quick_error(search: SetupSearch, seed: int, options: Sequence[list[int]], which: int) -> float:
-    """Error after one start; infinite where there is no plan."""
+    """Error after one start; infinite without a plan."""
     with suppress(ParameterError):
         return search.choose(options[which], seed=seed, starts=1).error
     return math.inf
 
 
 def _simplify(
-    candidates: Candidates, planned: PlannedSetups, search: SetupSearch, sides: list[int]
+    candidates: Candidates, planned: PlannedSetups, search: SetupSearch, of_approach: list[int]
 ) -> PlannedSetups:
-    """Plan with tips nearer to the rods in the mechanical zero, at little cost.
+    """Place tips nearer to the rods in the mechanical zero if the error grows little.
 
-    A goal for the parameters that depend on the side of approach stays reached.
+    A goal that the plan reaches for the parameters of the approach is still reached.
     """
     session, setups = candidates.session, candidates.setups
 
@@ -482,7 +487,8 @@ def _simplify(
     def without_lateral(which: int) -> LegIndicator:
         return replace(indicators[which], beside=(0.0, 0.0, 0.0))
 
-    most, reached = (1.0 + SIMPLER) * planned.error, _is_reached(planned, sides)
+    max_error = (1.0 + SIMPLICITY_TOLERANCE) * planned.error
+    reached = _is_reached(planned, of_approach)
     for k, old in enumerate(planned.setups):
         if old.candidate not in indicators:
             continue
@@ -503,9 +509,9 @@ def _simplify(
                 continue
             information = others + search.information_of(new)
             error = search.error_of(information)
-            setups_now = (*planned.setups[:k], new, *planned.setups[k + 1 :])
-            changed = PlannedSetups(setups_now, information, error)
-            if error <= most and (_is_reached(changed, sides) or not reached):
+            changed_setups = (*planned.setups[:k], new, *planned.setups[k + 1 :])
+            changed = PlannedSetups(changed_setups, information, error)
+            if error <= max_error and (_is_reached(changed, of_approach) or not reached):
                 planned = changed
                 break
     return planned

@@ -10,7 +10,7 @@ import numpy as np
 from orthocal.errors import OrthocalError
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.joining import join_sessions
-from orthocal.planning.candidates import FEWEST, Candidates, CandidateSetup, indicator_of
+from orthocal.planning.candidates import MIN_READINGS, Candidates, CandidateSetup, indicator_of
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import Expected, ToolForecast
 from orthocal.planning.planned_session import build_session
@@ -20,35 +20,36 @@ from orthocal.sensors.tips import Tip
 from orthocal.session.points import one_row_a_point
 from orthocal.session.session import Gauge, Session
 
-MIDDLE = 0.5
+MIDDLE_SECTION = 0.5
 """Section of the paper's gauges, as a fraction of the leg."""
 
 BLADE = Tip("blade", 0.0, 20e-3)
+"""Blade of 20 mm width."""
 
 PAPER_READINGS = 4
-"""Readings of the paper's setups: zero, both ends, and zero again."""
+"""Readings of each of the paper's setups: mechanical zero, both ends, mechanical zero again."""
 
-FINER = 0.5
+FINE_DIAL_FACTOR = 0.5
 """Factor of sigma and resolution of a finer dial."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alternative:
-    """Another plan, or the same readings by another gauge."""
+    """Another plan, or the same plan with another gauge."""
 
     name: str
     setups: int
     readings: int
     minutes: float
     expected: Expected | None
-    """None where readings are not within the gauge's range."""
+    """Expected tool error; None if readings are out of the gauge's range."""
     planned: tuple[PlannedSetup, ...] = ()
-    """Its setups, without their closing readings; empty for the same readings by another gauge."""
+    """Setups of another plan, without their closing readings; empty for another gauge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Comparison:
-    """Alternatives to a plan."""
+    """A plan and its alternatives."""
 
     candidates: Candidates
     plan: Session
@@ -60,35 +61,36 @@ class Comparison:
     def entered(self) -> bool:
         """True if identified offsets are entered before the readings are taken.
 
-        A session is complemented under its own offsets.
+        Readings that complement a session are taken with the active offsets of the session.
         """
         return self.measured is None or bool(np.any(self.measured.active_offsets))
 
     def join(self, planned: Session) -> Session:
-        """Planned readings with those that they complement."""
+        """Join planned readings with the existing readings, if any."""
         return planned if self.measured is None else join_sessions([self.measured, planned])
 
     def list_usual_plans(self) -> tuple[Alternative, ...]:
-        """Usual plans with as many setups and readings; each setup ends with its first posture.
+        """Usual plans with the same numbers of setups and readings as the plan.
 
-        The paper's: each leg at mid-length in both directions, in the mechanical zero and at the
-        ends of the travel to either side, repeated. And evenly spaced postures on the same lines.
+        The paper's plan reads each leg at its middle in both directions, in the mechanical zero and
+        at both ends of the travel, repeatedly. The even plan has evenly spaced postures on the same
+        lines. Each setup ends with its first posture.
         """
         setups = self._middle_setups()
         if not setups:
             return ()
         count, total = len(self.plan.setups), len(self.plan.readings)
-        if self.equipment.owned:  # setups of the paper's gauges in the same time
+        if self.equipment.owned:  # setups with dials at the legs in the same time
             minutes = self.equipment.minutes_of(self.plan)
             count = max(int(minutes / self.equipment.minutes(1, PAPER_READINGS)), 1)
             total = PAPER_READINGS * count
         chosen = [setups[i % len(setups)] for i in range(count)]
-        each = [total // count + (i < total % count) for i in range(count)]
+        counts = [total // count + (i < total % count) for i in range(count)]
         lines = [self._line(setup) for setup in chosen]
         plans = []
         for name, select in (("the paper's", _ends_and_zero), ("even", _evenly)):
-            rows = [select(*line, n - 1) for line, n in zip(lines, each, strict=True)]
-            if any(len(indices) < FEWEST for indices in rows):
+            rows = [select(*line, n - 1) for line, n in zip(lines, counts, strict=True)]
+            if any(len(indices) < MIN_READINGS for indices in rows):
                 continue
             planned = [self._as_planned(*of_setup) for of_setup in zip(chosen, rows, strict=True)]
             session = build_session(self.candidates, planned, self.measured)
@@ -97,20 +99,21 @@ class Comparison:
         return tuple(plans)
 
     def _as_planned(self, setup: CandidateSetup, rows: Sequence[int]) -> PlannedSetup:
-        """Setup of a plan with these rows."""
-        at = np.searchsorted(setup.rows, rows).tolist()
-        return PlannedSetup(self.candidates.setups.index(setup), tuple(at))
+        """Planned setup with rows of the session of candidates."""
+        chosen = np.searchsorted(setup.rows, rows).tolist()
+        return PlannedSetup(self.candidates.setups.index(setup), tuple(chosen))
 
     def expect_plan(self) -> Expected:
-        """Expected error after the plan."""
+        """Expected tool error after the plan."""
         return self._expect(self.plan)
 
     def _expect(self, session: Session) -> Expected:
+        """Expected tool error after planned readings, joined with the existing ones."""
         joined = self.join(self.equipment.in_course(session))
         return self.forecast.after(joined, entered=self.entered)
 
     def list_alternatives(self) -> tuple[Alternative, ...]:
-        """Plans with a finer dial, a blade, or one square block for each leg."""
+        """The plan with a finer dial, a blade, or one square block per leg."""
         sensors = [s for s in map(indicator_of, self.plan.setups.values()) if s is not None]
         if not sensors:
             return ()
@@ -125,23 +128,24 @@ class Comparison:
             try:
                 alternatives.append(self._assess(name, change(self.plan)))
             except OrthocalError:
-                continue  # a gauge that cannot be mounted is no alternative
+                continue  # this gauge cannot be mounted
         return tuple(alternatives)
 
     def _assess(self, name: str, session: Session, *, in_range: bool = True) -> Alternative:
+        """Alternative with its expected tool error."""
         minutes, rows = self.equipment.minutes_of(session), one_row_a_point(session)
         expected = self._expect(session) if in_range else None
         return Alternative(name, len(rows.setups), len(rows.readings), minutes, expected)
 
     def _middle_setups(self) -> list[CandidateSetup]:
-        """Setups at mid-leg, with the tip on the rod in the mechanical zero."""
+        """Setup nearest to the middle of each leg in each direction, with the tip on the rod."""
         best: dict[tuple[str, object], tuple[float, CandidateSetup]] = {}
         for setup in self.candidates.setups:
             sensor = indicator_of(self.candidates.session.setups[setup.name])
             if sensor is None or any(sensor.beside):
                 continue
             key = (sensor.leg, sensor.direction)
-            distance = abs(sensor.section.value - MIDDLE)
+            distance = abs(sensor.section.value - MIDDLE_SECTION)
             if key not in best or distance < best[key][0]:
                 best[key] = (distance, setup)
         return [setup for _, setup in best.values()]
@@ -149,10 +153,10 @@ class Comparison:
     def _line(self, setup: CandidateSetup) -> tuple[list[int], int]:
         """Readings of a setup on the line along the leg through the mechanical zero.
 
-        All postures are approached from one side.
+        All readings have the same approach.
 
         Returns:
-            Rows in the order of the line, and the index of the one nearest to the zero.
+            Rows in the order of the line, and the index of the row nearest to the mechanical zero.
         """
         session = self.candidates.session
         readings = [session.readings[i] for i in setup.rows]
@@ -160,29 +164,29 @@ class Comparison:
         points -= tool_at_zero(session.robot)
         along = int(np.ptp(points, axis=0).argmax())
         across = np.delete(np.abs(points), along, axis=1).max(axis=1, initial=0.0)
-        same = np.array([r.approach == readings[0].approach for r in readings])
-        on = np.flatnonzero((across < 1e-9) & same)
-        on = on[np.argsort(points[on, along])]
-        nearest = int(np.abs(points[on, along]).argmin()) if on.size else 0
-        return setup.rows[on].tolist(), nearest
+        same_approach = np.array([r.approach == readings[0].approach for r in readings])
+        line = np.flatnonzero((across < 1e-9) & same_approach)
+        line = line[np.argsort(points[line, along])]
+        nearest = int(np.abs(points[line, along]).argmin()) if line.size else 0
+        return setup.rows[line].tolist(), nearest
 
 
 def _is_in_range(setup: CandidateSetup, rows: Sequence[int]) -> bool:
-    """True if the gauge has all readings in its range, with the first one in its middle."""
-    at = np.searchsorted(setup.rows, rows)
-    return bool(setup.reachable[at[:1], at].all())
+    """True if all readings are within the range of a gauge that is centred on the first one."""
+    chosen = np.searchsorted(setup.rows, rows)
+    return bool(setup.reachable[chosen[:1], chosen].all())
 
 
 def _ends_and_zero(line: Sequence[int], zero: int, count: int) -> list[int]:
-    """Zero, last and first posture of a line, repeated."""
+    """Mechanical zero, last and first posture of a line, repeated up to a count."""
     if not line:
         return []
-    three = [line[zero], line[-1], line[0]]
-    return [three[i % 3] for i in range(count)]
+    postures = [line[zero], line[-1], line[0]]
+    return [postures[i % 3] for i in range(count)]
 
 
 def _evenly(line: Sequence[int], zero: int, count: int) -> list[int]:
-    """Evenly spaced postures of a line, beginning with the one nearest to the zero."""
+    """Evenly spaced postures of a line; the one nearest to the mechanical zero comes first."""
     if not line:
         return []
     places = np.linspace(0, len(line) - 1, count).round().astype(int)
@@ -191,15 +195,20 @@ def _evenly(line: Sequence[int], zero: int, count: int) -> list[int]:
 
 
 def _with_finer_dial(session: Session) -> Session:
+    """Session with finer gauges at the legs."""
     gauges = dict(session.gauges)
     for name in {s.gauge for s in session.setups.values() if indicator_of(s) is not None}:
         old = gauges[name]
-        sigma, resolution = (None if v is None else FINER * v for v in (old.sigma, old.resolution))
+        sigma, resolution = (
+            None if v is None else FINE_DIAL_FACTOR * v for v in (old.sigma, old.resolution)
+        )
         gauges[name] = Gauge(sigma, resolution, old.range)
     return replace(session, gauges=gauges)
 
 
 def _with_blocks(session: Session) -> Session:
+    """Session in which all gauges of a leg are mounted on one square block."""
+
     def on_block(s: LegIndicator) -> LegIndicator:
         return replace(s, mounting=replace(s.mounting, stand=f"block_{s.leg}"))
 
@@ -207,13 +216,16 @@ def _with_blocks(session: Session) -> Session:
 
 
 def _with_blade(session: Session) -> Session:
-    def by_blade(s: LegIndicator) -> LegIndicator:
+    """Session in which all gauges at rods have a blade."""
+
+    def with_blade(s: LegIndicator) -> LegIndicator:
         return s if s.rod is None else s.on_rod(s.rod, BLADE, s.beside)
 
-    return _with_sensors(session, by_blade)
+    return _with_sensors(session, with_blade)
 
 
 def _with_sensors(session: Session, change: Callable[[LegIndicator], LegIndicator]) -> Session:
+    """Session with changed indicators at the legs."""
     changed = {
         name: replace(setup, sensor=change(sensor))
         for name, setup in session.setups.items()

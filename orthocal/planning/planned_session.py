@@ -20,39 +20,39 @@ from orthocal.session.session import Posture, Reading, Session, Setup
 def build_session(
     candidates: Candidates, planned: Sequence[PlannedSetup], measured: Session | None = None
 ) -> Session:
-    """Session of planned setups, named, in the order of measuring.
+    """Session of named setups and readings in the order of measuring.
 
     Each setup begins with the posture in which its gauge is aligned, continues with short motions,
-    and ends with the first posture. Postures in which a drive turns round on the path of the tool
-    are omitted if an effect depends on the side: it would be unknown.
+    and ends with the first posture. If an effect depends on the approach, postures in which a drive
+    reverses on the path of the tool are omitted, because their approach is unknown.
     """
     while True:
         plan = _order_readings(candidates, planned, measured)
         names = dict.fromkeys(names_in_files(s)[0] for s in plan.setups.values())
-        unclear = {
+        unknown_approach = {
             (base_name(r.setup), r.posture)
             for r in plan.readings
             if r.conditions is not None and "u" in (r.conditions.approach or "")
         }
-        clear = [
-            _without(candidates, setup, {p for s, p in unclear if s == name})
+        reduced = [
+            _without(candidates, setup, {p for s, p in unknown_approach if s == name})
             for name, setup in zip(names, _in_order(candidates, planned), strict=True)
         ]
-        if sum(len(s.chosen) for s in clear) == sum(len(s.chosen) for s in planned):
+        if sum(len(s.chosen) for s in reduced) == sum(len(s.chosen) for s in planned):
             return plan
-        planned = clear
+        planned = reduced
 
 
 def _without(candidates: Candidates, setup: PlannedSetup, postures: set[str]) -> PlannedSetup:
-    """Setup without some postures, if enough others are left."""
+    """Setup without some postures; unchanged if too few readings would remain."""
     source, candidate = candidates.session, candidates.setups[setup.candidate]
     of_row = [source.readings[i].posture for i in candidate.rows]
     chosen = tuple(i for i in setup.chosen if of_row[i] not in postures)
-    return setup if len(chosen) < candidate.fewest else replace(setup, chosen=chosen)
+    return setup if len(chosen) < candidate.min_readings else replace(setup, chosen=chosen)
 
 
 def _in_order(candidates: Candidates, planned: Sequence[PlannedSetup]) -> list[PlannedSetup]:
-    """Setups in the order of measuring: by leg, then those of sensors at the tool."""
+    """Setups in the order of measuring: at the legs, then with sensors at the tool."""
     source = candidates.session
     legs = list(source.robot.legs)
 
@@ -72,7 +72,7 @@ def _order_readings(
     used_names = set() if measured is None else {base_name(name) for name in measured.setups}
     setups: dict[str, Setup] = {}
     readings: list[Reading] = []
-    used: dict[str, Posture] = {}
+    postures: dict[str, Posture] = {}
     for setup in _in_order(candidates, planned):
         candidate = candidates.setups[setup.candidate]
         base, _ = names_in_files(source.setups[candidate.name])
@@ -89,7 +89,7 @@ def _order_readings(
             cycles[row.place] += 1
             new = name + row.setup.removeprefix(base)
             readings.append(replace(row, setup=new, cycle=cycles[row.place]))
-        used.update((r.posture, source.postures[r.posture]) for r, *_ in lines)
+        postures.update((r.posture, source.postures[r.posture]) for r, *_ in lines)
     gauges = {n for s in setups.values() for n in (s.gauge, names_in_files(s)[1])}
     plan = replace(
         source,
@@ -97,7 +97,7 @@ def _order_readings(
         setups=setups,
         readings=tuple(readings),
         gauges={n: g for n, g in source.gauges.items() if n in gauges},
-        postures={n: p for n, p in source.postures.items() if n in used},
+        postures={n: p for n, p in source.postures.items() if n in postures},
     )
     if measured is None:
         return state_path_approaches(plan)
@@ -110,7 +110,8 @@ def _order_readings(
 def order_postures(points: Array) -> list[int]:
     """Order of points on a short closed path that begins with the first one.
 
-    The nearest point next, then parts are reversed while that shortens the path (2-opt).
+    Each point is followed by the nearest one. Then parts are reversed while this shortens the path
+    (2-opt).
 
     Args:
         points: Tool positions, shape (n, n_coordinates), [m].

@@ -1,7 +1,7 @@
-"""Order of gains and errors in which rounding decides nothing.
+"""Order of gains and errors that does not depend on rounding.
 
-Mirrored readings, such as those of the two sides of approach, have equal gains. Rounding differs
-between processors: without these functions, so would plans.
+Mirrored readings, such as approaches from either side, have equal gains. Without these functions
+plans would differ between processors, because rounding does.
 """
 
 from __future__ import annotations
@@ -15,45 +15,45 @@ from orthocal.arrays import Array
 
 Item = TypeVar("Item")
 
-EQUAL = 1e-7
-"""Relative difference up to which values are equal: far above rounding, far below what matters."""
+EQUALITY_TOLERANCE = 1e-7
+"""Relative difference of values that count as equal, far above rounding errors."""
 
 
 def first_largest(values: Array) -> int:
-    """Index of the first value that is the largest one, or equals it.
+    """Index of the first value that equals the largest one.
 
     Args:
-        values: Shape (n,), n > 0.
+        values: Values, shape (n,), n > 0.
     """
     largest = values.max()
-    return int((values >= largest - EQUAL * abs(largest)).argmax())
+    return int((values >= largest - EQUALITY_TOLERANCE * abs(largest)).argmax())
 
 
 def is_less(value: float, other: float) -> bool:
-    """True if a value is less than another one, and does not equal it."""
-    return value < other - EQUAL * abs(other)
+    """True if a value is less than another one by more than EQUALITY_TOLERANCE."""
+    return value < other - EQUALITY_TOLERANCE * abs(other)
 
 
 def best_of(items: Iterable[Item], value: Callable[[Item], float]) -> Item:
     """First of the items with the largest value.
 
     Args:
-        items: At least one.
-        value: Value of an item.
+        items: The items, at least one.
+        value: Function for the value of an item.
     """
     listed = list(items)
     return listed[first_largest(np.array([value(item) for item in listed]))]
 
 
 def sort_by(items: Sequence[Item], value: Callable[[Item], float]) -> list[Item]:
-    """Items by decreasing value; those of equal values in their order.
+    """Items by decreasing value; items with equal values keep their order.
 
     Args:
         items: The items.
-        value: Value of an item.
+        value: Function for the value of an item.
     """
     values = np.array([value(item) for item in items])
     order = np.argsort(-values, kind="stable")
-    falls = -np.diff(values[order]) > EQUAL * np.abs(values[order[:-1]])
+    falls = -np.diff(values[order]) > EQUALITY_TOLERANCE * np.abs(values[order[:-1]])
     rank = np.concatenate([[0], np.cumsum(falls)])[: order.size]
     return [items[i] for i in order[np.lexsort((order, rank))]]

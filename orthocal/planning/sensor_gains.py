@@ -1,4 +1,4 @@
-"""Gains of an hour with each usual sensor, beside the readings of a plan or a session."""
+"""Gains by an additional hour with each usual sensor, after a plan or a session."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from orthocal.session.session import Gauge, Session
 from orthocal.units import UM
 
 FINE, ORDINARY = Gauge(2.0 * UM, 1.0 * UM), Gauge(5.0 * UM, 10.0 * UM)
-"""Dials of the ball bar, and of the others; their ranges suffice on a machine with entered
+"""Dials of the ball bar and of the other sensors. Their ranges suffice on a machine with entered
 offsets."""
 
 BAR = "usual_bar"
 
-WORDS = {
+DESCRIPTIONS = {
     BAR: "a ball bar of 50 mm",
     "usual_square": "a square and a dial at the tool",
     "usual_plate": "a surface plate and a dial at the tool",
     DIAL: "a dial at the legs",
 }
-"""Usual sensors in words, by the names of their gauges."""
+"""Descriptions of the usual sensors, by the names of their gauges."""
 
 KEYS: Mapping[str, Mapping[str, Any]] = {
     BAR: {"sensor": "ball_bar", "length_mm": 50.0, "length_tolerance_mm": "unknown"},
@@ -58,29 +58,30 @@ KEYS: Mapping[str, Mapping[str, Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class SensorGain:
-    """An hour with a sensor, beside other readings."""
+    """Expected result of an additional hour with a sensor."""
 
     words: str
+    """Description of the sensor."""
     setups: int
     readings: int
-    """With those that close a setup."""
+    """Number of readings, including those that close a setup."""
     minutes: float
     rms: float
-    """Expected tool error with these readings added, [m]."""
+    """Expected RMS tool error after the additional readings, [m]."""
 
 
 def find_sensor_gains(
     forecast: ToolForecast, session: Session, expected: Expected
 ) -> tuple[SensorGain, ...]:
-    """Gains of an hour with each usual sensor, the largest first.
+    """Gains by an additional hour with each usual sensor, the largest first.
 
-    The same choice of setups as in a plan, to first order about the nominal machine. Sensors for
-    which the machine has no place are left out.
+    Setups are chosen as in a plan, to first order about the nominal machine. Sensors that cannot be
+    placed on the machine are omitted.
 
     Args:
         forecast: Expected errors of the robot.
         session: Readings of a plan or a session.
-        expected: Expected tool error after them.
+        expected: Expected tool error after these readings.
     """
     robot = forecast.robot
     usual = [
@@ -89,16 +90,17 @@ def find_sensor_gains(
     ]
     try:
         equipment, listed = _list_candidates(robot, usual)
-    except ParameterError:  # a sensor without a place
+    except ParameterError:  # a sensor cannot be placed
         try:
-            equipment, listed = _list_candidates(robot, [s for s in usual if _has_place(robot, s)])
-        except ParameterError:  # neither legs nor places
+            equipment, listed = _list_candidates(robot, [s for s in usual if _can_place(robot, s)])
+        except ParameterError:  # the machine has no legs, and no sensor can be placed
             return ()
     candidates = measure_candidates(listed, forecast.problem(listed), spare_range=0.0)
-    prior = forecast.prior_of(candidates.problem, candidates.state, session)
-    search = SetupSearch.of(candidates, prior, forecast.weigh("aligned", len(candidates.state)))
+    prior = forecast.prior_information(candidates.problem, candidates.state, session)
+    weight = forecast.weight_of("aligned", len(candidates.state))
+    search = SetupSearch.of(candidates, prior, weight)
     nominal = forecast.about_nominal(session)
-    scale = find_scale(search.empty.error, expected, nominal, "aligned")
+    factor, constant = find_scale(search.empty.error, expected, nominal, "aligned")
     gains = []
     for name, duration in equipment.durations(listed).items():
         timed = TimedSearch(search, {name: duration})
@@ -107,18 +109,18 @@ def find_sensor_gains(
         if plan.setups:
             gains.append(
                 SensorGain(
-                    words=WORDS[name or DIAL],
+                    words=DESCRIPTIONS[name or DIAL],
                     setups=len(plan.setups),
                     readings=sum(len(s.chosen) + 1 for s in plan.setups),
                     minutes=timed.minutes(plan.setups),
-                    rms=scale[0] * math.hypot(plan.error, scale[1]),
+                    rms=factor * math.hypot(plan.error, constant),
                 )
             )
     return tuple(sorted(gains, key=lambda gain: gain.rms))
 
 
 def _list_candidates(robot: Robot, owned: Sequence[OwnedSensor]) -> tuple[Equipment, Session]:
-    """Equipment of a dial and sensors, and the session of its candidates."""
+    """Equipment with a dial and sensors, and the session of its candidate readings."""
     equipment = Equipment(
         gauge=ORDINARY, along=5, across=0.0, sections=(0.5,), spare_range=0.0, owned=tuple(owned)
     )
@@ -126,12 +128,14 @@ def _list_candidates(robot: Robot, owned: Sequence[OwnedSensor]) -> tuple[Equipm
 
 
 def _duration(keys: Mapping[str, Any]) -> Duration:
+    """Usual durations of a sensor."""
     return DURATIONS[keys["sensor"]]
 
 
-def _has_place(robot: Robot, sensor: OwnedSensor) -> bool:
-    """True if the machine has a place for a sensor."""
+def _can_place(robot: Robot, sensor: OwnedSensor) -> bool:
+    """True if a sensor can be placed on the machine."""
     try:
-        return bool(list_tool_candidates(robot, [sensor], None)[3])
+        *_, readings = list_tool_candidates(robot, [sensor], None)
+        return bool(readings)
     except ParameterError:
         return False

@@ -1,8 +1,8 @@
 """Choice of setups of several gauges within a measuring time.
 
-Each gauge has its own times for a setup and a reading. Setups with the largest gain per minute are
-added until the time is used. Then each setup is replaced, by the best one that its time allows or
-by several that gain most per minute, until little is gained.
+Each gauge has separate durations of a setup and a reading. Setups with the largest gain per minute
+are added until the time is used. Then each setup is replaced by the best one that fits, or by
+several with the largest gain per minute, until the gain is small.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from typing import NamedTuple
 from threadpoolctl import threadpool_limits
 
 from orthocal.errors import ParameterError
-from orthocal.planning.candidates import FEWEST
+from orthocal.planning.candidates import MIN_READINGS
 from orthocal.planning.owned_sensors import SLACK, Duration
 from orthocal.planning.ranking import best_of, sort_by
 from orthocal.planning.selection import (
     KILLED,
-    LEAST_IMPROVEMENT,
-    MOST_REFINED,
-    ROUGH,
+    MAX_REFINED,
+    MIN_IMPROVEMENT,
+    ROUNDING_ERROR,
     Gains,
     PlannedSetup,
     PlannedSetups,
@@ -33,19 +33,24 @@ from orthocal.planning.selection import (
 from orthocal.runtime.worker_pool import run_in_parallel
 
 READINGS = (2, 3, 4, 6, 9, 12, 16, 24, 32, 48, 64, 96)
-"""Numbers of readings of a setup that are tried."""
+"""Possible numbers of readings of a setup."""
 
-MOST_ROUNDS = 4
+MAX_ROUNDS = 4
+"""Most rounds of exchanges."""
 
-MOST_PAIRED = 3
-"""Setups up to which two are exchanged together: in a short time single ones do not fit."""
+MAX_PAIRED_SETUPS = 3
+"""Most setups of a plan in which two are exchanged together, because single ones rarely fit into a
+short time."""
 
 UNLIMITED = 1e6
-"""Minutes beyond any plan."""
+"""Time longer than any plan, [min]."""
 
 
 class _Option(NamedTuple):
+    """Possible additional setup."""
+
     gain: float
+    """Reduction of tr(T C)."""
     minutes: float
     planned: PlannedSetup
 
@@ -65,7 +70,8 @@ def _rate(option: _Option) -> float:
     return option.gain / max(option.minutes, SLACK)
 
 
-def _accuracy(plan: PlannedSetups) -> float:
+def _negative_error(plan: PlannedSetups) -> float:
+    """Negative error, to find the best plan."""
     return -plan.error
 
 
@@ -75,9 +81,9 @@ class TimedSearch:
 
     search: SetupSearch
     durations: Mapping[str, Duration]
-    """Of each gauge to use, by its name."""
+    """Durations with each gauge to use, by its name."""
     once: frozenset[str] = frozenset()
-    """Gauges of which a plan has one setup at most: a bed does not move."""
+    """Names of the gauges with at most one setup in a plan: a bed does not move."""
 
     def choose(
         self,
@@ -87,14 +93,14 @@ class TimedSearch:
         workers: int = 1,
         report: Callable[[int, float], None] | None = None,
     ) -> PlannedSetups:
-        """Setups within a time, the best of several starts.
+        """Choose setups within a time as the best of several starts.
 
-        The first start begins with the setup of largest gain per minute, each other one with the
-        best setup of one gauge.
+        The first start begins with the setup of largest gain per minute. Each other start begins
+        with the best setup of one gauge.
 
         Args:
             minutes: Available time.
-            starts: Number of starts; by default one more than gauges.
+            starts: Largest number of starts; by default one more than the number of gauges.
             workers: Number of processes; the result does not depend on it.
             report: Called after each start with its number and its error.
 
@@ -102,20 +108,22 @@ class TimedSearch:
             ParameterError: If no setup fits into the time or the range of its gauge.
         """
         gauges = dict.fromkeys(s.gauge for s in self.search.reduced)
-        begun: list[str | None] = [None, *gauges] if len(gauges) > 1 else [None]
-        begun = begun[:starts]
-        work = partial(_run, self, minutes, begun)
+        first_gauges: list[str | None] = [None, *gauges] if len(gauges) > 1 else [None]
+        first_gauges = first_gauges[:starts]
+        work = partial(_run, self, minutes, first_gauges)
         done: dict[int, PlannedSetups] = {}
-        for which, planned in run_in_parallel(work, range(len(begun)), workers, killed=KILLED):
+        indices = range(len(first_gauges))
+        for which, planned in run_in_parallel(work, indices, workers, killed=KILLED):
             done[which] = planned
             if report is not None:
                 report(len(done), planned.error)
-        best = best_of((done[i] for i in sorted(done)), _accuracy)
+        best = best_of((done[i] for i in sorted(done)), _negative_error)
         if not best.setups:
-            shortest = min(d.of(FEWEST) for d in self.durations.values())
+            shortest = min(d.of(MIN_READINGS) for d in self.durations.values())
             raise ParameterError(
                 f"found {minutes:.3g} min; expected at least {shortest:.3g} min, a setup of "
-                f"{FEWEST} readings, and a gauge whose range the tolerances of the machine allow",
+                f"{MIN_READINGS} readings, and a gauge with a sufficient range for the tolerances "
+                "of the machine",
                 where="plan",
             )
         return best
@@ -125,7 +133,7 @@ class TimedSearch:
 
         Args:
             minutes: Available time.
-            first: Gauge of the first setup; by default the one with the largest gain per minute.
+            first: Gauge of the first setup; None for the setup of largest gain per minute.
         """
         with threadpool_limits(1):  # on several threads sums may be rounded differently
             plan = self.search.empty
@@ -136,34 +144,37 @@ class TimedSearch:
                     best = best_of(of_gauge, lambda o: o.gain)
                     plan = self.search.plan_of([best.planned])
             plan = self._improve(self._fill(plan, minutes), minutes, together=1)
-            if len(plan.setups) > MOST_PAIRED:
+            if len(plan.setups) > MAX_PAIRED_SETUPS:
                 return plan
             return self._improve(plan, minutes, together=2)
 
     def _improve(self, plan: PlannedSetups, minutes: float, *, together: int) -> PlannedSetups:
-        """Plan with setups exchanged, one or two of them at a time, until little is gained."""
-        for _ in range(MOST_ROUNDS):
+        """Exchange setups, one or two at a time, until the gain is small."""
+        for _ in range(MAX_ROUNDS):
             before = plan.error
             for old in combinations(plan.setups, together):
-                if Counter(old) <= Counter(plan.setups):  # and not exchanged since
+                if Counter(old) <= Counter(plan.setups):  # not exchanged in this round
                     plan = self._exchange(plan, old, minutes)
-            if plan.error > before * (1.0 - LEAST_IMPROVEMENT):
+            if plan.error > before * (1.0 - MIN_IMPROVEMENT):
                 break
         return plan
 
     def fill(self, minutes: float) -> PlannedSetups:
-        """Setups within a time, of the largest gain per minute, without exchanges."""
+        """Choose setups of largest gain per minute within a time, without exchanges."""
         return self._fill(self.search.empty, minutes)
 
     def grow(self) -> Iterator[PlannedSetups]:
-        """Plans with one setup more each, or with more readings of a setup that can be used once.
+        """Add setups one by one, or readings to a setup that can be used once.
 
         Each step has the largest gain per minute.
+
+        Yields:
+            The plan after each step.
         """
         plan = self.search.empty
         while steps := [*self._additions(plan), *self._enlargements(plan)]:
             step = best_of(steps, lambda s: s.rate)
-            plan = self._with(self.search.plan_of(step.others), step.planned)
+            plan = self.search.extend(self.search.plan_of(step.others), step.planned)
             yield plan
 
     def _additions(self, plan: PlannedSetups) -> Iterator[_Step]:
@@ -179,59 +190,54 @@ class TimedSearch:
                 continue
             others = tuple(s for s in plan.setups if s is not old)
             without = self.search.plan_of(others)
-            known, used = without.error**2 - plan.error**2, self.minutes([old])
+            old_gain, old_minutes = without.error**2 - plan.error**2, self.minutes([old])
             alone = replace(self, durations={gauge: self.durations[gauge]})
             for option in alone._list_options(without, UNLIMITED):
                 if len(option.planned.chosen) > len(old.chosen):
-                    further = max(option.minutes - used, SLACK)
-                    yield _Step((option.gain - known) / further, others, option.planned)
+                    further = max(option.minutes - old_minutes, SLACK)
+                    yield _Step((option.gain - old_gain) / further, others, option.planned)
 
     def minutes(self, setups: Sequence[PlannedSetup]) -> float:
         """Minutes of setups with their closing readings."""
         return sum(self.durations[self._gauge(s)].of(len(s.chosen)) for s in setups)
 
     def _gauge(self, planned: PlannedSetup) -> str:
+        """Name of the gauge of a setup."""
         return self.search.reduced[planned.candidate].gauge
 
-    def _with(self, plan: PlannedSetups, added: PlannedSetup) -> PlannedSetups:
-        information = plan.information + self.search.information_of(added)
-        error = self.search.error_of(information)
-        return PlannedSetups((*plan.setups, added), information, error)
-
     def _fill(self, plan: PlannedSetups, minutes: float) -> PlannedSetups:
-        """Plan with further setups of largest gain per minute, until none fits."""
+        """Add setups of largest gain per minute until none fits."""
         while True:
-            left = minutes - self.minutes(plan.setups)
-            options = self._list_options(plan, left)
+            options = self._list_options(plan, minutes - self.minutes(plan.setups))
             if not options:
                 return plan
-            plan = self._with(plan, best_of(options, _rate).planned)
+            plan = self.search.extend(plan, best_of(options, _rate).planned)
 
     def _list_options(self, plan: PlannedSetups, minutes: float) -> list[_Option]:
-        """Setups that fit into a time, with their gains beside those of a plan."""
+        """Setups that fit into a time, with their gains in addition to a plan."""
         used = self.once & {self._gauge(setup) for setup in plan.setups}
-        most = {
-            name: 0 if name in used else d.most(minutes, READINGS[-1])
+        max_counts = {
+            name: 0 if name in used else d.max_readings(minutes, READINGS[-1])
             for name, d in self.durations.items()
         }
-        able = {name for name, count in most.items() if count >= FEWEST}
-        if not able:
+        gauges = {name for name, count in max_counts.items() if count >= MIN_READINGS}
+        if not gauges:
             return []
         gains, options = Gains.of(self.search, plan.information), list[_Option]()
-        for which, pair in gains.begin(FEWEST, able):
+        for which, pair in gains.begin(MIN_READINGS, gauges):
             gauge = self.search.reduced[which].gauge
-            reached, chosen = gains.setup(which, pair[0]).grow(pair, most[gauge])
+            gain_after, chosen = gains.setup(which, pair[0]).grow(pair, max_counts[gauge])
             counts = {n for n in READINGS if n < len(chosen)} | {len(chosen)}
-            for count in counts - set(range(self.search.reduced[which].fewest)):
+            for count in counts - set(range(self.search.reduced[which].min_readings)):
                 duration = self.durations[gauge].of(count)
                 planned = PlannedSetup(which, chosen[:count])
-                options.append(_Option(reached[count - 1], duration, planned))
+                options.append(_Option(gain_after[count - 1], duration, planned))
         return options
 
     def _exchange(
         self, plan: PlannedSetups, old: Sequence[PlannedSetup], minutes: float
     ) -> PlannedSetups:
-        """Plan with setups exchanged for those of largest gain, in all or per minute."""
+        """Plan with setups exchanged for those of largest gain, total or per minute."""
         others = list(plan.setups)
         for setup in old:
             others.remove(setup)
@@ -240,31 +246,32 @@ class TimedSearch:
         options = self._list_options(without, minutes - self.minutes(others))
         if not options:
             return plan
-        rate = best_of(options, _rate).planned
-        plans = [plan, self._fill(self._with(without, rate), minutes)]
+        fastest = best_of(options, _rate).planned
+        plans = [plan, self._fill(self.search.extend(without, fastest), minutes)]
         refined = self._refine(without, old[0] if len(old) == 1 else None, options)
         plans.append(self._fill(refined, minutes))
-        return best_of(plans, _accuracy)
+        return best_of(plans, _negative_error)
 
     def _refine(
         self, without: PlannedSetups, old: PlannedSetup | None, options: Sequence[_Option]
     ) -> PlannedSetups:
-        """Plan with the best of several setups added, their readings exchanged."""
+        """Add the best of several setups after exchanging their readings."""
         gains = Gains.of(self.search, without.information)
-        likely: dict[int, PlannedSetup] = {}
+        by_candidate: dict[int, PlannedSetup] = {}
         for option in sort_by(options, lambda o: o.gain):
-            likely.setdefault(option.planned.candidate, option.planned)
-        tried = [*([] if old is None else [old]), *list(likely.values())[:MOST_REFINED]]
+            by_candidate.setdefault(option.planned.candidate, option.planned)
+        setups = [*([] if old is None else [old]), *list(by_candidate.values())[:MAX_REFINED]]
         best: PlannedSetups | None = None
-        for new in dict.fromkeys(gains.exchange_readings(s) for s in tried):
+        for new in dict.fromkeys(gains.exchange_readings(s) for s in setups):
             new = gains.exchange_first(new)
-            if best is None or gains.rough_error(new) <= best.error * (1.0 + ROUGH):
-                changed = self._with(without, new)
-                best = changed if best is None else best_of([best, changed], _accuracy)
+            if best is None or gains.rough_error(new) <= best.error * (1.0 + ROUNDING_ERROR):
+                changed = self.search.extend(without, new)
+                best = changed if best is None else best_of([best, changed], _negative_error)
         return without if best is None else best
 
 
 def _run(
     search: TimedSearch, minutes: float, starts: Sequence[str | None], which: int
 ) -> PlannedSetups:
+    """Setups of one start; a function of the module because processes need one."""
     return search.run(minutes, starts[which])

@@ -1,4 +1,4 @@
-"""Candidate setups of sensors at the tool: places of a bar or an artefact, and their postures."""
+"""Candidate setups of sensors at the tool: placements of bars and artefacts with their postures."""
 
 from __future__ import annotations
 
@@ -23,35 +23,35 @@ from orthocal.session.points import names_in_files, split_setup
 from orthocal.session.session import Conditions, Gauge, Posture, Reading, Setup
 from orthocal.units import MM
 
-ON_CIRCLE = 24
+CIRCLE_POINTS = 24
 """Positions on a circle of a ball bar."""
 
 LATITUDES = (0.0, 0.5, -0.5)
-"""Distances of the planes of circles from the fixed ball, in lengths of the bar."""
+"""Distances of the planes of circles from the fixed ball, in bar lengths."""
 
-ON_EDGE = 9
+EDGE_POINTS = 9
 """Positions along an edge."""
 
-ON_PLATE = 5
+PLATE_POINTS = 5
 """Positions along each side of a plate."""
 
-ON_BED = 11
+BED_POINTS = 11
 """Positions along each side of a bed."""
 
-ON_LINE = 5
+LINE_POINTS = 5
 """Positions of a target along each side of the box."""
 
 IN_PLANE = ("ball_bar", "points")
 """Kinds of sensor for a tool that moves in a plane."""
 
 LEVELS = (-0.5, 0.0, 0.5)
-"""Positions of an artefact across its surface, in the half sides of the box about its middle."""
+"""Positions of an artefact across its surface, relative to the box: middle 0, faces ±1."""
 
 BALLS = (
     *((0.0, 0.0, level) for level in LEVELS),
     *itertools.product((-0.5, 0.5), repeat=3),
 )
-"""Positions of a fixed ball, in the half sides of the box about its middle."""
+"""Positions of a fixed ball, relative to the box: middle 0, faces ±1."""
 
 STEP = 5 * MM
 """Step of the positions, [m]."""
@@ -60,13 +60,14 @@ STEP = 5 * MM
 def list_tool_candidates(
     robot: Robot, owned: Sequence[OwnedSensor], box: Array | None
 ) -> tuple[dict[str, Gauge], dict[str, Posture], dict[str, Setup], list[Reading]]:
-    """Gauges, postures, setups and readings of every place of the sensors.
+    """Gauges, postures, setups and readings of every placement of the sensors.
 
     Args:
         robot: The robot, with two or three tool coordinates.
         owned: The available sensors.
-        box: Limits of the tool's coordinates; by default the workspace that the robot states, or
-            those of `choose_box`: a tool may not go below a bed.
+        box: Limits of the tool's coordinates, shape (n_coordinates, 2), [m]. The default is the
+            workspace that the robot states, because a tool must not go below a bed, or else
+            `choose_box`.
 
     Raises:
         ParameterError: If the machine has no two or three tool coordinates, or no place for a
@@ -79,9 +80,9 @@ def list_tool_candidates(
     stated = robot.workspace if box is None else box
     limits, middle = choose_box(robot, stated), tool_at_zero(robot)
     gauges = {sensor.name: sensor.gauge for sensor in owned}
-    taken = [DIAL, *(sensor.name for sensor in owned)]
+    names = [DIAL, *(sensor.name for sensor in owned)]
     for sensor in owned:
-        if taken.count(sensor.name) > 1:
+        if names.count(sensor.name) > 1:
             raise SessionError(
                 f"two gauges are named '{sensor.name}'; rename the file", where=str(sensor.file)
             )
@@ -135,31 +136,31 @@ def _require_coordinates(robot: Robot, owned: Sequence[OwnedSensor]) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Positions:
-    """Tool positions of all places that the machine reaches: their loops are closed at once."""
+    """Reachable tool positions of all placements, with loops closed at once."""
 
     robot: Robot
     middle: Array
-    """Tool in the mechanical zero, shape (n_coordinates,), [m]."""
+    """Position of the tool in the mechanical zero, shape (n_coordinates,), [m]."""
     postures: dict[str, Posture]
-    able: dict[str, frozenset[str]]
-    """Postures that can be approached so, by the approaches that effects distinguish."""
+    by_approach: dict[str, frozenset[str]]
+    """Approach that effects distinguish, to the names of the postures that allow it."""
 
     @staticmethod
     def of(robot: Robot, middle: Array, points: Array) -> _Positions:
-        """Positions among tool positions of shape (n, n_coordinates), [m]."""
+        """Reachable positions among tool positions of shape (n, n_coordinates), [m]."""
         unique = np.unique(points.round(9), axis=0)
         reached = unique[reachable(robot, unique)]
-        postures = place_tool(robot, [posture_name(p, robot, middle) for p in reached], reached)
+        postures = place_tool(robot, [posture_name(robot, p, middle) for p in reached], reached)
         names, drives = np.array(list(postures)), np.array([p.drives for p in postures.values()])
-        able = {
+        by_approach = {
             a: frozenset(names[can_approach(robot, drives, a)].tolist())
             for a in (usual_approaches(robot) if names.size else ())
         }
-        return _Positions(robot, middle, postures, able)
+        return _Positions(robot, middle, postures, by_approach)
 
     def names(self, points: Array) -> list[str]:
-        """Names of those of some positions that are reached, each once."""
-        names = dict.fromkeys(posture_name(p, self.robot, self.middle) for p in points)
+        """Names of the reachable ones of some positions, each once."""
+        names = dict.fromkeys(posture_name(self.robot, p, self.middle) for p in points)
         return [name for name in names if name in self.postures]
 
     def approached(
@@ -167,19 +168,19 @@ class _Positions:
     ) -> Iterator[tuple[str, Conditions | None]]:
         """Postures with each approach that effects of the machine distinguish.
 
-        Approaches of a sensor that prescribes the path of the tool follow from the complete plan.
+        For a sensor that prescribes the tool path, the approaches follow from the complete plan.
         """
-        if not self.able or tool_path(sensor) is not None:
+        if not self.by_approach or tool_path(sensor) is not None:
             yield from ((name, None) for name in names)
             return
-        for approach, able in self.able.items():
-            yield from ((name, Conditions(approach)) for name in names if name in able)
+        for approach, possible in self.by_approach.items():
+            yield from ((name, Conditions(approach)) for name in names if name in possible)
 
 
 def _places(
     sensor: OwnedSensor, robot: Robot, middle: Array, box: Array
 ) -> Iterator[tuple[str, dict[str, Any], Array]]:
-    """Name, keys and tool positions of each place of a sensor."""
+    """Name, keys and tool positions, shape (n, n_coordinates), [m], of each placement."""
     if sensor.keys["sensor"] == "ball_bar":
         yield from _bars(sensor, robot, box)
         return
@@ -201,19 +202,18 @@ def _places(
 def _bars(
     sensor: OwnedSensor, robot: Robot, box: Array
 ) -> Iterator[tuple[str, dict[str, Any], Array]]:
-    """Spheres about fixed balls: circles in planes through the ball and beside it.
+    """Ball bars about fixed balls: circles in planes through the ball and at both sides of it.
 
     A tool that moves in a plane has one circle about a ball in this plane.
     """
     coordinates, fixed = require_tcp(robot).coordinates, position_at_zero(robot)
     unit, n = np.eye(3)[:, : len(coordinates)], len(coordinates)
     places = np.array(BALLS) if n > 2 else np.unique(np.array(BALLS)[:, :n], axis=0)
-    planes = itertools.product(range(3), LATITUDES) if n > 2 else [(2, 0.0)]
-    planes = list(planes)
+    planes = list(itertools.product(range(3), LATITUDES)) if n > 2 else [(2, 0.0)]
     length = float(sensor.keys.get("length_mm", 0.0)) * MM
     tool = np.array(sensor.keys.get("tool_mm", (0.0, 0.0, 0.0))) * MM
     half, centre = 0.5 * (box[:, 1] - box[:, 0]), box.mean(axis=1)
-    angle = 2.0 * np.pi * np.arange(ON_CIRCLE) / ON_CIRCLE
+    angle = 2.0 * np.pi * np.arange(CIRCLE_POINTS) / CIRCLE_POINTS
     for k, place in enumerate(places):
         ball = np.round((centre + place * half) / STEP) * STEP
         circles = []
@@ -236,38 +236,39 @@ def _bars(
 def _beds(
     sensor: OwnedSensor, middle: Array, box: Array
 ) -> Iterator[tuple[str, dict[str, Any], Array]]:
-    """Points of a bed, in whose plane the origin of the world lies."""
+    """Points on a bed through the origin of the world."""
     axis = "xyz".index(str(sensor.keys.get("direction", "-z"))[-1])
     tip = np.array(sensor.keys.get("tool_mm", (0.0, 0.0, 0.0)))[axis] * MM
-    points = _grid(middle, box, axis, 2.0 * float(np.ptp(box, axis=1).max()), ON_BED)
+    points = _grid(middle, box, axis, 2.0 * float(np.ptp(box, axis=1).max()), BED_POINTS)
     points[:, axis] = -tip
     yield sensor.name, {}, points
 
 
 def _points(box: Array) -> Array:
     """Positions of a target in a box, shape (n, n_coordinates), [m]."""
-    lines = [np.round(np.linspace(low, high, ON_LINE) / STEP) * STEP for low, high in box.tolist()]
+    lines = [
+        np.round(np.linspace(low, high, LINE_POINTS) / STEP) * STEP for low, high in box.tolist()
+    ]
     return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, len(box))
 
 
 def _edges(
     sensor: OwnedSensor, middle: Array, box: Array
 ) -> Iterator[tuple[str, dict[str, Any], Array]]:
-    """Edges along each axis, touched across it; both arms of a square in a plane share it."""
+    """Edges along each axis, touched across it; both arms of a square share its plane."""
     artefact = dict(sensor.keys["artefact"])
     length = float(artefact.get("length_mm", 200.0)) * MM
     for along, direction in itertools.permutations(range(3), 2):
-        other = 3 - along - direction
+        normal = 3 - along - direction
         for k, level in enumerate(LEVELS):
-            place = _at_level(middle, box, other, level)
             line = _line(middle, box, along, length)
-            points = np.repeat(place[None], len(line), axis=0)
+            points = np.repeat(_at_level(middle, box, normal, level)[None], len(line), axis=0)
             points[:, along] = line
             plane = "".join(sorted("xyz"[along] + "xyz"[direction]))
-            named = {"name": f"{sensor.name}_{plane}_{k + 1}"}
+            name = f"{sensor.name}_{plane}_{k + 1}"
             keys = {
                 "direction": "xyz"[direction],
-                "artefact": {**artefact, "along": "xyz"[along], **named},
+                "artefact": {**artefact, "along": "xyz"[along], "name": name},
             }
             yield f"{sensor.name}{'xyz'[along]}{'xyz'[direction]}_{k}", keys, points
 
@@ -279,7 +280,7 @@ def _plates(
     length = float(sensor.keys["artefact"].get("length_mm", 200.0)) * MM
     for axis in range(3):
         for k, level in enumerate(LEVELS):
-            points = _grid(middle, box, axis, length, ON_PLATE)
+            points = _grid(middle, box, axis, length, PLATE_POINTS)
             points[:, axis] = _at_level(middle, box, axis, level)[axis]
             yield f"{sensor.name}{'xyz'[axis]}_{k}", {"direction": f"-{'xyz'[axis]}"}, points
 
@@ -287,7 +288,7 @@ def _plates(
 def _blocks(
     sensor: OwnedSensor, middle: Array, box: Array
 ) -> Iterator[tuple[str, dict[str, Any], Array]]:
-    """Places beside a gauge block and on it, along each axis."""
+    """Positions beside a gauge block and on it, along each axis."""
     artefact = dict(sensor.keys["artefact"])
     height = float(artefact.get("height_mm", 0.0)) * MM
     for axis in range(3):
@@ -296,27 +297,28 @@ def _blocks(
         points[0::2, axis], points[1::2, axis] = low, low + height
         keys = {
             "direction": f"-{'xyz'[axis]}",
-            "artefact": {**artefact, "table_mm": float((low - 0.0) / MM)},
+            "artefact": {**artefact, "table_mm": float(low / MM)},
         }
         yield f"{sensor.name}{'xyz'[axis]}", keys, points
 
 
 def _at_level(middle: Array, box: Array, axis: int, level: float) -> Array:
+    """Mechanical zero displaced along an axis to a level of the box, shape (3,), [m]."""
     place = np.array(middle)
     half = 0.5 * (box[axis, 1] - box[axis, 0])
     place[axis] = np.round((box[axis].mean() + level * half) / STEP) * STEP
     return place
 
 
-def _line(middle: Array, box: Array, axis: int, length: float, count: int = ON_EDGE) -> Array:
-    """Positions along an axis on an artefact about the middle, shape (n,), [m]."""
+def _line(middle: Array, box: Array, axis: int, length: float, count: int = EDGE_POINTS) -> Array:
+    """Coordinates along an axis on an artefact about the mechanical zero, shape (n,), [m]."""
     low = max(float(box[axis, 0]), float(middle[axis]) - 0.5 * length)
     high = min(float(box[axis, 1]), float(middle[axis]) + 0.5 * length)
     return np.unique(np.round(np.linspace(low, high, count) / STEP) * STEP)
 
 
 def _grid(middle: Array, box: Array, axis: int, length: float, count: int) -> Array:
-    """Positions on a square across an axis, shape (n, 3), [m]."""
+    """Positions on a square perpendicular to an axis, shape (n, 3), [m]."""
     sides = [_line(middle, box, k, length, count) for k in range(3) if k != axis]
     pairs = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
     return np.insert(pairs, axis, middle[axis], axis=1)

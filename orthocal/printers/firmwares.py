@@ -1,4 +1,4 @@
-"""The firmwares: recognition and reading of logs, lines with settings."""
+"""Supported firmwares of delta printers, with their functions for logs and settings."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ from orthocal.printers.settings import DeltaSettings, FirmwareName
 
 @dataclass(frozen=True, slots=True)
 class Firmware:
-    """A firmware."""
+    """Firmware of a delta printer."""
 
     title: str
     recognise: Callable[[str], bool]
+    """Function that recognises a log."""
     read_log: Callable[..., PrinterLog]
+    """Function that reads a log."""
     config_lines: Callable[[DeltaSettings], str]
+    """Function that writes settings."""
     file: str
     """Name of the file with new settings."""
     tilts: bool = False
-    """Whether it knows the tilt of the bed."""
+    """Whether the tilt of the bed is a setting."""
 
 
 FIRMWARES: dict[FirmwareName, Firmware] = {
@@ -44,18 +47,18 @@ FIRMWARES: dict[FirmwareName, Firmware] = {
 
 
 def find_firmware(text: str) -> FirmwareName | None:
-    """Firmware of a log, where it is certain."""
-    found = [name for name, firmware in FIRMWARES.items() if firmware.recognise(text)]
-    return found[0] if len(found) == 1 else None
+    """Firmware of a log; None if it is uncertain."""
+    recognised = [name for name, firmware in FIRMWARES.items() if firmware.recognise(text)]
+    return recognised[0] if len(recognised) == 1 else None
 
 
 def require_firmware(name: str, *, option: str) -> FirmwareName:
-    """A firmware by its name.
+    """Check the name of a firmware.
 
     Raises:
-        SessionError: If there is none of this name.
+        SessionError: If the name is unknown.
     """
-    for known in FIRMWARES:
-        if name == known:
-            return known
+    for firmware in FIRMWARES:
+        if name == firmware:
+            return firmware
     raise SessionError(f"found '{name}'; expected {', '.join(FIRMWARES)}", where=option)

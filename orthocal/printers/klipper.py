@@ -32,7 +32,7 @@ from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings
 from orthocal.units import DEG, MM
 
 DECIMALS = 6
-"""Decimals that Klipper writes itself."""
+"""Decimals of settings, as Klipper writes them."""
 
 EXPECTED = (
     "the end of klippy.log after DELTA_CALIBRATE, a printer.cfg with a section [delta_calibrate], "
@@ -40,12 +40,12 @@ EXPECTED = (
 )
 
 PROBES = ("probe", "bltouch", "smart_effector", "probe_eddy_current", "beacon", "cartographer")
-"""Sections with the offsets of a probe; a name may follow."""
+"""Kinds of sections with the offsets of a probe; a name may follow in the section's title."""
 
 TOWERS = "abc"
 Sections = Mapping[str, Mapping[str, str]]
 Pairs = list[tuple[float, tuple[float, float, float]]]
-"""Heights, [mm], and stable positions, [steps]."""
+"""Pairs of height, [mm], and stable position, [steps]."""
 
 _RUN = re.compile(
     r"Calculating delta_calibrate with:\n(?P<heights>\[.*\])\n(?P<distances>\[.*\])\n"
@@ -56,7 +56,7 @@ _NEW_PROBE = re.compile(rf"probe: at ({NUMBER}),({NUMBER}) bed will contact at z
 
 
 def recognise(text: str) -> bool:
-    """True if a text is of Klipper for certain."""
+    """True if a text is certainly from Klipper."""
     return bool(
         re.search(r"delta_calibrate|^\[stepper_a\]", text, re.MULTILINE)
         or _OLD_PROBE.search(text)
@@ -65,15 +65,15 @@ def recognise(text: str) -> bool:
 
 
 def read_log(text: str, *, where: str, radius: float | None = None) -> PrinterLog:
-    """Settings and triggers.
+    """Read settings, triggers and printed distances.
 
     Args:
-        text: The log, and files with settings.
+        text: The log and files with settings.
         where: Name of the log, for messages.
         radius: Not used.
 
     Raises:
-        SessionError: Naming the key or line.
+        SessionError: If the text is invalid; names the key or line.
     """
     del radius
     log = _read_heights(text, where)
@@ -82,7 +82,7 @@ def read_log(text: str, *, where: str, radius: float | None = None) -> PrinterLo
 
 
 def _read_heights(text: str, where: str) -> PrinterLog:
-    """Settings and triggers, with the distances that were saved beside them."""
+    """Settings, triggers and saved distances."""
     sections = _sections(text)
     probe = _probe_offset(sections, where)
     if runs := list(_RUN.finditer(text)):
@@ -90,20 +90,20 @@ def _read_heights(text: str, where: str) -> PrinterLog:
     steps = _saved_heights(sections.get("delta_calibrate", {}), where)
     if steps is not None:
         settings = _settings(sections, probe, where)
-        return _with_steps(*steps, settings, _step_lengths(sections, where), where)
+        return _log_from_steps(*steps, settings, _step_lengths(sections, where), where)
     settings = _settings(sections, probe, where)
     nozzle = [numbers(m.groups(), where=where, name="probe") for m in _OLD_PROBE.finditer(text)]
     contacts = [numbers(m.groups(), where=where, name="probe") for m in _NEW_PROBE.finditer(text)]
     points = np.array([*nozzle, *contacts]).reshape(-1, 3) * MM
-    points[len(nozzle) :] -= settings.probe  # there the point of contact is printed
+    points[len(nozzle) :] -= settings.probe  # newer versions print the point of contact
     name, keys = _probe_section(sections)
     notes = [] if "z_offset" in keys else [unstated_trigger(f"z_offset in [{name}]")]
     return probed_log(settings, points, where=where, expected=EXPECTED, notes=notes)
 
 
 def _read_run(run: re.Match[str], text: str, probe: Array, where: str) -> PrinterLog:
-    """A calculation in klippy.log, which lists its parameters and triggers."""
-    at = place_of(text, run.start(), where)
+    """Settings and triggers of a calculation in klippy.log."""
+    line = place_of(text, run.start(), where)
     try:
         heights, lengths, values = (ast.literal_eval(v) for v in run.groups())
         distances = [(float(d), [[*map(float, p)], [*map(float, q)]]) for d, p, q in lengths]
@@ -115,19 +115,19 @@ def _read_run(run: re.Match[str], text: str, probe: Array, where: str) -> Printe
             [value[f"angle_{k}"] for k in TOWERS],
             [value[f"endstop_{k}"] for k in TOWERS],
             probe,
-            at,
+            line,
         )
         steps = np.array([value[f"stepdist_{k}"] for k in TOWERS]) * MM
     except (ValueError, SyntaxError, TypeError, KeyError, AttributeError, MemoryError) as e:
         raise SessionError(
             f"the calculation of delta_calibrate is damaged ({type(e).__name__}); expected lists "
             "of heights, distances and parameters as Klipper writes them",
-            where=at,
+            where=line,
         ) from None
-    return _with_steps(pairs, [], distances, settings, steps, at)
+    return _log_from_steps(pairs, [], distances, settings, steps, line)
 
 
-def _with_steps(
+def _log_from_steps(
     pairs: Pairs,
     manual: Pairs,
     distances: Distances,
@@ -135,11 +135,21 @@ def _with_steps(
     steps: Array,
     where: str,
 ) -> PrinterLog:
-    """Log from stable positions."""
+    """Log from stable positions.
+
+    Args:
+        pairs: Heights of the probe and stable positions.
+        manual: Manual heights of the nozzle and stable positions.
+        distances: Saved distances.
+        settings: The settings.
+        steps: Travel of each carriage per step, shape (3,), [m].
+        where: File and line, for messages.
+    """
     notes = []
     if manual and any(settings.probe[:2]):
         notes.append(
-            f"{len(manual)} manual heights are not used: they are of the nozzle, beside the probe."
+            f"{len(manual)} manual heights are not used: the probe is at another place than the "
+            "nozzle."
         )
     else:
         pairs = [*manual, *pairs]
@@ -147,8 +157,8 @@ def _with_steps(
     settings.require_plausible(where=where)
     stable = np.array([s for _, s in pairs])
     if stable.shape != (len(pairs), 3) or not np.isfinite(stable).all():
-        raise SessionError("expected three step counts of each height", where=where)
-    if not settings.probe[2]:  # not stated: its height is that of its triggers
+        raise SessionError("expected three step counts per height", where=where)
+    if not settings.probe[2]:  # not stated: the height of the triggers replaces it
         settings = replace(settings, probe=(*settings.probe[:2], -pairs[-1][0] * MM))
     heights = np.array([h for h, _ in pairs]) * MM + settings.probe[2]
     return PrinterLog(
@@ -162,33 +172,33 @@ def _with_steps(
 
 def _saved_heights(saved: Mapping[str, str], where: str) -> tuple[Pairs, Pairs, Distances] | None:
     """Heights of the probe, manual heights and distances; None without any."""
-    found: list[Pairs] = []
+    pairs_by_kind: list[Pairs] = []
     for prefix in ("height", "manual_height"):
         pairs: Pairs = []
         while (key := f"{prefix}{len(pairs)}") in saved:
             a, b, c = _saved_steps(saved, f"{key}_pos", where)
             pairs.append((_number(saved, key, where, "delta_calibrate"), (a, b, c)))
-        found.append(pairs)
+        pairs_by_kind.append(pairs)
     distances: Distances = []
     while (key := f"distance{len(distances)}") in saved:
         ends = [_saved_steps(saved, f"{key}_pos{i}", where) for i in (1, 2)]
         distances.append((_number(saved, key, where, "delta_calibrate"), ends))
-    return (found[0], found[1], distances) if found[0] else None
+    return (pairs_by_kind[0], pairs_by_kind[1], distances) if pairs_by_kind[0] else None
 
 
 def _saved_steps(saved: Mapping[str, str], key: str, where: str) -> list[float]:
     """Stable position of a key."""
-    at = f"{where}: [delta_calibrate] {key}"
-    position = numbers(saved.get(key, "").split(","), where=at, name="steps")
+    where = f"{where}: [delta_calibrate] {key}"
+    position = numbers(saved.get(key, "").split(","), where=where, name="steps")
     if len(position) != 3:
-        raise SessionError(f"found {len(position)} numbers; expected 3", where=at)
+        raise SessionError(f"found {len(position)} numbers; expected 3", where=where)
     return position
 
 
 def _settings(sections: Sections, probe: Array, where: str) -> DeltaSettings:
     """Settings of the sections [printer] and [stepper_a] to [stepper_c].
 
-    A tower without arm_length or position_endstop has that of tower a.
+    The defaults of arm_length and position_endstop are those of tower a.
     """
     steppers = []
     for k in TOWERS:
@@ -215,12 +225,12 @@ def _with_endstops(
     probe: Array,
     where: str,
 ) -> DeltaSettings:
-    """Settings from Klipper's values, [mm], [°]."""
+    """Settings from Klipper's values in mm and degrees; the probe is in m."""
     for rod, k in zip(rods, TOWERS, strict=True):
         if not 0.0 < radius < rod:
             raise SessionError(
-                f"delta_radius is {radius:g}, arm_length of tower {k} {rod:g}; expected a radius "
-                "above 0 and rods that are longer",
+                f"delta_radius is {radius:g}, arm_length of tower {k} {rod:g}; expected a positive "
+                "radius and longer rods",
                 where=where,
             )
     homed = [e + math.sqrt(rod**2 - radius**2) for e, rod in zip(endstops, rods, strict=True)]
@@ -235,33 +245,34 @@ def _with_endstops(
 
 
 def _probe_offset(sections: Sections, where: str) -> Array:
-    """Tip of the probe from the nozzle where it triggers, shape (3,), [m]; 0 if not stated."""
+    """Position of the probe's tip at the trigger relative to the nozzle, (3,), [m]; default 0."""
     name, keys = _probe_section(sections)
     x, y, z = (_number(keys, f"{axis}_offset", where, name, default=0.0) for axis in "xyz")
     return np.array([x, y, 0.0 - z]) * MM
 
 
 def _probe_section(sections: Sections) -> tuple[str, Mapping[str, str]]:
-    """Name and keys of the first section of a probe; an empty [probe] without any."""
-    found = ((name, keys) for name, keys in sections.items() if name.split(" ")[0] in PROBES)
-    return next(found, ("probe", {}))
+    """Name and keys of the first section of a probe; by default [probe] without keys."""
+    probes = ((name, keys) for name, keys in sections.items() if name.split(" ")[0] in PROBES)
+    return next(probes, ("probe", {}))
 
 
 def _step_lengths(sections: Sections, where: str) -> Array:
-    """Travel of a carriage by one step, shape (3,), [m]."""
+    """Travel of each carriage per step, shape (3,), [m]."""
     lengths = []
     for k in TOWERS:
         keys, name = sections[f"stepper_{k}"], f"stepper_{k}"
         if "step_distance" in keys:
             lengths.append(_number(keys, "step_distance", where, name))
             continue
-        turn, micro = (_number(keys, v, where, name) for v in ("rotation_distance", "microsteps"))
-        full = _number(keys, "full_steps_per_rotation", where, name, default=200.0)
+        distance = _number(keys, "rotation_distance", where, name)
+        microsteps = _number(keys, "microsteps", where, name)
+        steps = _number(keys, "full_steps_per_rotation", where, name, default=200.0)
         gears = re.findall(rf"({NUMBER})\s*:\s*({NUMBER})", keys.get("gear_ratio", ""))
         ratio = math.prod(float(a) / float(b) for a, b in gears if float(b))
-        if not turn * micro * full * ratio > 0.0:
+        if not distance * microsteps * steps * ratio > 0.0:
             raise SessionError("expected positive numbers", where=f"{where}: [{name}]")
-        lengths.append(turn / (micro * full * ratio))
+        lengths.append(distance / (microsteps * steps * ratio))
     return np.array(lengths) * MM
 
 
@@ -271,18 +282,18 @@ def _number(
     """Number of a key.
 
     Raises:
-        SessionError: If it is missing or no number.
+        SessionError: If the key is missing or not a number.
     """
-    at = f"{where}: [{section}]"
+    where = f"{where}: [{section}]"
     if key not in keys:
         if default is None:
-            raise SessionError(f"has no {key}; expected a number", where=at)
+            raise SessionError(f"has no {key}; expected a number", where=where)
         return default
-    return parse_number(keys[key], where=at, name=key, error=SessionError)
+    return parse_number(keys[key], where=where, name=key, error=SessionError)
 
 
 def _sections(text: str) -> dict[str, dict[str, str]]:
-    """Sections of a printer.cfg; keys of the saved part at its end replace those above."""
+    """Sections of a printer.cfg; keys saved at its end replace earlier ones."""
     sections: dict[str, dict[str, str]] = {}
     current: dict[str, str] = {}
     for line in text.splitlines():

@@ -1,9 +1,9 @@
-"""Distances on a print of Klipper's calibration object, as `DELTA_ANALYZE` takes them.
+"""Distances on a print of Klipper's calibration object, in the format of `DELTA_ANALYZE`.
 
-The object has a pillar in the middle and six pillars on a circle of 65 mm, with ridges 4.5 mm
-beside the middle of a pillar. A calliper measures from the far side of one pillar to the far side
-of the other. Less the width of one pillar it is the distance of two ridges that face the same way.
-Source: klippy/extras/delta_calibrate.py and docs/Delta_Calibrate.md of Klipper.
+The object has a pillar in the middle and six pillars on a circle of 65 mm. Each pillar has ridges
+at 4.5 mm from its middle. A calliper measures between the far sides of two pillars. This length
+minus the width of one pillar is the distance of two ridges that face in the same direction. Source:
+klippy/extras/delta_calibrate.py and docs/Delta_Calibrate.md of Klipper.
 """
 
 from __future__ import annotations
@@ -21,15 +21,17 @@ from orthocal.units import DEG, MM
 ANGLES = np.array([210, 270, 330, 30, 90, 150]) * DEG
 """Directions of the outer pillars from the middle, [rad]."""
 
-CIRCLE = 65 * MM
-RIDGE = 4.5 * MM
-"""Radius of the circle of pillars, and distance of a ridge from the middle of its pillar, [m]."""
+CIRCLE_RADIUS = 65 * MM
+"""Radius of the circle of pillars, [m]."""
+
+RIDGE_DISTANCE = 4.5 * MM
+"""Distance of a ridge from the middle of its pillar, [m]."""
 
 CENTRE_PILLARS = (0, 2, 1, 0, 2, 1)
-"""Width of the pillar in the middle across each direction."""
+"""Index of the width of the middle pillar in each direction."""
 
-AROUND = 2
-"""Directions between a pillar and the way from it to the next one."""
+NEXT_DIRECTION = 2
+"""Index of the direction from a pillar to the next one, minus the index of the pillar."""
 
 COUNTS = {
     "CENTER_DISTS": 6,
@@ -37,13 +39,13 @@ COUNTS = {
     "OUTER_DISTS": 6,
     "OUTER_PILLAR_WIDTHS": 6,
 }
-"""Measurements of `DELTA_ANALYZE`, and how many numbers each has."""
+"""Measurements of `DELTA_ANALYZE`, and the number of values of each."""
 
 LARGEST_MM = 2000.0
-"""Largest length; a larger one has a wrong unit."""
+"""Largest accepted length, [mm]; a larger one has a wrong unit."""
 
 Distances = list[tuple[float, list[list[float]]]]
-"""Distances without pillars, [mm], and the stable positions at both ends, [steps]."""
+"""Pairs of distance without pillars, [mm], and stable positions at both ends, [steps]."""
 
 _COMMAND = re.compile(r"^[^\n;#]*\bDELTA_ANALYZE\b([^\n;#]*)", re.MULTILINE | re.IGNORECASE)
 _WORD = re.compile(r"\b([A-Z_]+)\s*=\s*(\[[^\]]*\]|[^\s=]*)", re.IGNORECASE)
@@ -58,24 +60,24 @@ def read_analysis(text: str, settings: DeltaSettings, *, where: str) -> tuple[Pr
         where: Name of the log, for messages.
 
     Returns:
-        Twelve distances; none if the text has no measurement.
+        Twelve distances; empty if the text has no measurement.
 
     Raises:
-        SessionError: Naming the line, or the measurement that is missing.
+        SessionError: If a measurement is invalid or missing; names the line or the measurement.
     """
     values: dict[str, list[float]] = {}
     for command in _COMMAND.finditer(text):
-        at = place_of(text, command.start(1), where)
+        line = place_of(text, command.start(1), where)
         for word in _WORD.finditer(command[1]):
             name = word[1].upper()
             if name in COUNTS or name == "SCALE":
-                values[name] = _lengths(name, word[2], at)
+                values[name] = _lengths(name, word[2], line)
     measured = [name for name in COUNTS if name in values]
     if not measured:
         return ()
     if missing := [name for name in COUNTS if name not in values]:
         raise SessionError(
-            f"DELTA_ANALYZE states {', '.join(measured)} without {', '.join(missing)}; expected "
+            f"DELTA_ANALYZE states {', '.join(measured)} but not {', '.join(missing)}; expected "
             "all four",
             where=where,
         )
@@ -84,75 +86,76 @@ def read_analysis(text: str, settings: DeltaSettings, *, where: str) -> tuple[Pr
 
 
 def _lengths(name: str, text: str, where: str) -> list[float]:
-    """Positive numbers of a word."""
+    """Positive numbers of a parameter of `DELTA_ANALYZE`."""
     parts = text.strip("[]").split(",")  # klippy.log has brackets
-    found, count = numbers(parts, where=where, name=name), COUNTS.get(name, 1)
-    if len(found) != count:
-        raise SessionError(f"{name} has {len(found)} numbers; expected {count}", where=where)
-    for value in found:
+    values, count = numbers(parts, where=where, name=name), COUNTS.get(name, 1)
+    if len(values) != count:
+        raise SessionError(f"{name} has {len(values)} numbers; expected {count}", where=where)
+    for value in values:
         if not 0.0 < value <= LARGEST_MM:
             raise SessionError(
                 f"{name} has {value:g}; expected numbers above 0 and at most {LARGEST_MM:g}",
                 where=where,
             )
-    return found
+    return values
 
 
 def _place(
     values: dict[str, list[float]], scale: float, settings: DeltaSettings
 ) -> tuple[PrintedDistance, ...]:
-    """Distances with the carriages at their ends."""
+    """Distances with the coordinates of the carriages at their ends."""
     centre, outer = ends(scale)
     rows = [
         *zip(values["CENTER_DISTS"], CENTRE_PILLARS, centre, strict=True),
         *zip(values["OUTER_DISTS"], range(6), outer, strict=True),
     ]
-    result = []
+    printed = []
     for i, (length, pillar, points) in enumerate(rows):
         part = "center" if i < len(centre) else "outer"
         width = values[f"{part.upper()}_PILLAR_WIDTHS"][pillar]
-        result.append(
+        printed.append(
             PrintedDistance(
                 f"{part}_{i % len(centre) + 1}",
                 (length - width) * MM,
                 settings.inverse(points),
             )
         )
-    return tuple(result)
+    return tuple(printed)
 
 
 def ends(scale: float) -> tuple[Array, Array]:
-    """Nozzle at the far and the near end of each distance, shape (6, 2, 3) each, [m].
+    """Positions of the nozzle at the far and the near end of each distance, [m].
 
     Args:
         scale: Scale of the printed object.
 
     Returns:
-        From the middle outwards, and from each outer pillar to the next one.
+        Distances from the middle outwards, and from each outer pillar to the next one, shape
+        (6, 2, 3) each.
     """
     along = np.column_stack([np.cos(ANGLES), np.sin(ANGLES), np.zeros(len(ANGLES))])
-    ridges = scale * np.array([CIRCLE + RIDGE, RIDGE])
+    ridges = scale * np.array([CIRCLE_RADIUS + RIDGE_DISTANCE, RIDGE_DISTANCE])
     centre = ridges[:, None] * along[:, None]
-    around = np.roll(along, -AROUND, axis=0)
-    outer = scale * CIRCLE * along[:, None] + ridges[:, None] * around[:, None]
+    to_next = np.roll(along, -NEXT_DIRECTION, axis=0)
+    outer = scale * CIRCLE_RADIUS * along[:, None] + ridges[:, None] * to_next[:, None]
     return centre, outer
 
 
 def saved_distances(
     settings: DeltaSettings, steps: Array, distances: Distances, *, where: str
 ) -> tuple[PrintedDistance, ...]:
-    """Distances that Klipper saved with stable positions; they are without pillars.
+    """Distances that Klipper saved with stable positions, without the widths of pillars.
 
     Args:
         settings: The settings.
-        steps: Travel of the carriages by one step, shape (3,), [m].
+        steps: Travel of each carriage per step, shape (3,), [m].
         distances: The distances.
         where: Name of the log, for messages.
 
     Raises:
-        SessionError: Naming the distance.
+        SessionError: If a distance is invalid; names it.
     """
-    result = []
+    printed = []
     for i, (length, stable) in enumerate(distances):
         positions = np.array(stable)
         if positions.shape != (2, 3) or not np.isfinite(positions).all():
@@ -164,5 +167,5 @@ def saved_distances(
                 where=where,
             )
         carriages = np.array(settings.homed) - positions[::-1] * steps
-        result.append(PrintedDistance(f"distance_{i + 1}", length * MM, carriages))
-    return tuple(result)
+        printed.append(PrintedDistance(f"distance_{i + 1}", length * MM, carriages))
+    return tuple(printed)

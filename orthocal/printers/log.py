@@ -1,4 +1,4 @@
-"""Log of a probed bed: settings of the firmware, and carriages where the probe triggered."""
+"""Log of a probed bed: settings of the firmware, and positions of the carriages at the triggers."""
 
 from __future__ import annotations
 
@@ -14,33 +14,37 @@ from orthocal.io.documents import parse_number
 from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings
 from orthocal.units import DEG, MM
 
-FEWEST_POINTS = 3
-MOST_POINTS = 2_000
-"""Points of a log; a calibration takes a posture for each."""
+MIN_POINTS = 3
+"""Fewest points of a log."""
 
-FARTHEST = 2.0
-"""Largest coordinate of a point, [m]: beyond it is a wrong unit or a damaged line."""
+MAX_POINTS = 2_000
+"""Most points of a log; each is a posture of the calibration."""
+
+LARGEST_COORDINATE = 2.0
+"""Largest accepted coordinate of a point, [m]; a larger one has a wrong unit or is damaged."""
 
 SAME_PLACE = 0.05 * MM
-"""Probings of one place in a row are samples of one point."""
+"""Largest distance of successive probings that are samples of one point, along x or y, [m]."""
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
-LARGE_ROD = 1.5 * MM
-LARGE_ANGLE = 2.0 * DEG
-"""Differences of rods and turns of towers that are more likely other errors that they absorb."""
+LARGE_ROD_DIFFERENCE = 1.5 * MM
+"""Difference of a rod from the mean that more likely absorbs another error, [m]."""
+
+LARGE_TOWER_ANGLE = 2.0 * DEG
+"""Angular error of a tower that more likely absorbs another error, [rad]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PrintedDistance:
-    """A distance measured by a calliper between two places of a print."""
+    """Distance between two places of a print, measured with a calliper."""
 
     name: str
-    """Of the distance: center_1, outer_3."""
+    """Name of the distance, such as center_1 or outer_3."""
     length: float
-    """Measured length less the measured width of the pillar, [m]."""
+    """Measured length minus the measured width of the pillar, [m]."""
     carriages: Array
-    """Coordinates at its two ends, shape (2, 3), [m]."""
+    """Coordinates of the carriages at the two ends, shape (2, 3), [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,29 +52,39 @@ class PrinterLog:
     """Content of a log."""
 
     settings: DeltaSettings
-    """With which the bed was probed."""
+    """Settings with which the bed was probed."""
     carriages: Array
-    """Coordinates where the probe triggered, shape (K, 3), [m]."""
+    """Coordinates of the carriages at the triggers, shape (K, 3), [m]."""
     heights: Array
-    """Height of the probe's tip above the bed there, shape (K,), [m]; 0 but for heights that were
-    measured by hand."""
+    """Height of the probe's tip above the bed at the triggers, shape (K,), [m]; 0 except for
+    manually measured heights."""
     notes: tuple[str, ...] = ()
-    """What was left out or is unusual."""
+    """Notes on omitted and unusual content."""
     distances: tuple[PrintedDistance, ...] = ()
+    """Distances measured on a print."""
 
 
 def numbers(texts: Sequence[str], *, where: str, name: str) -> list[float]:
-    """Finite numbers of texts."""
+    """Parse texts as finite numbers.
+
+    Args:
+        texts: The texts.
+        where: File and line, for messages.
+        name: Name of the numbers, for messages.
+
+    Raises:
+        SessionError: If a text is not a finite number.
+    """
     return [parse_number(t.strip(), where=where, name=name, error=SessionError) for t in texts]
 
 
-def place_of(text: str, at: int, name: str) -> str:
+def place_of(text: str, position: int, name: str) -> str:
     """File and line of a position in a text, for messages."""
-    return f"{name}:{text.count(chr(10), 0, at) + 1}"
+    return f"{name}:{text.count(chr(10), 0, position) + 1}"
 
 
 def average_samples(points: Array) -> Array:
-    """Points with samples of one place in a row averaged, shape (K, 3), [m]."""
+    """Average successive samples of the same place, shape (K, 3), [m]."""
     groups: list[list[Array]] = []
     for point in points:
         if groups and np.abs(point[:2] - groups[-1][0][:2]).max() < SAME_PLACE:
@@ -81,15 +95,21 @@ def average_samples(points: Array) -> Array:
 
 
 def require_points(count: int, *, where: str, expected: str) -> None:
-    """Refuse a log without enough points.
+    """Refuse a log with too few or too many points.
+
+    Args:
+        count: Number of points.
+        where: Name of the log, for messages.
+        expected: Description of a complete log, for the message.
 
     Raises:
-        SessionError: With what was expected.
+        SessionError: If the number of points is out of range.
     """
-    if not FEWEST_POINTS <= count <= MOST_POINTS:
-        found = "no probed points" if not count else f"{count} probed points"
+    if not MIN_POINTS <= count <= MAX_POINTS:
+        number = count or "no"
         raise SessionError(
-            f"found {found}; expected {FEWEST_POINTS} to {MOST_POINTS}: {expected}", where=where
+            f"found {number} probed points; expected {MIN_POINTS} to {MAX_POINTS}: {expected}",
+            where=where,
         )
 
 
@@ -101,16 +121,23 @@ def probed_log(
     expected: str,
     notes: Sequence[str] = (),
 ) -> PrinterLog:
-    """Log from nozzle positions at the trigger, shape (K, 3), [m], in the firmware's coordinates.
+    """Log from positions of the nozzle at the triggers.
+
+    Args:
+        settings: The settings.
+        nozzle: Positions in the firmware's coordinates, shape (K, 3), [m].
+        where: Name of the log, for messages.
+        expected: Description of a complete log, for messages.
+        notes: Notes on omitted and unusual content.
 
     Raises:
-        SessionError: If there are too few points, or one is out of reach.
+        SessionError: If the number of points is out of range, or a point is out of reach.
     """
     require_points(len(nozzle), where=where, expected=expected)
-    if np.abs(nozzle).max() > FARTHEST:
+    if np.abs(nozzle).max() > LARGEST_COORDINATE:
         raise SessionError(
             f"found a point at {np.abs(nozzle).max() / MM:g} mm; expected at most "
-            f"{FARTHEST / MM:g} mm",
+            f"{LARGEST_COORDINATE / MM:g} mm",
             where=where,
         )
     settings.require_plausible(where=where)
@@ -126,36 +153,36 @@ def probed_log(
 
 
 def unstated_trigger(key: str) -> str:
-    """Note on a log without the height at which the probe triggers, with its key."""
+    """Note on a log that does not state the trigger height of the probe; `key` would state it."""
     return (
         f"The log and its settings state no {key}: heights are those of the probe's trigger. "
-        f"State {key} (0 if the nozzle is the probe), or the first layer is wrong by it."
+        f"State {key} (0 if the nozzle is the probe). Otherwise the first layer is wrong by it."
     )
 
 
 def unusual_settings(settings: DeltaSettings) -> Iterator[str]:
     """Notes on settings that more likely absorb other errors than describe the printer."""
     mean = float(np.mean(settings.rods))
-    apart = np.array(settings.rods) - mean
-    if np.abs(apart).max() > LARGE_ROD:
-        listed = ", ".join(f"{v / MM:+.3f}" for v in apart)
+    differences = np.array(settings.rods) - mean
+    if np.abs(differences).max() > LARGE_ROD_DIFFERENCE:
+        listed = ", ".join(f"{v / MM:+.3f}" for v in differences)
         yield (
-            f"The firmware's rods differ by {listed} mm from their mean. Rods of one batch do not: "
-            "these settings absorb other errors. The calibration begins with equal rods of "
-            f"{mean / MM:.3f} mm."
+            f"The firmware's rods differ by {listed} mm from their mean. Rods of one batch differ "
+            "less, so these settings absorb other errors. The calibration begins with equal rods "
+            f"of {mean / MM:.3f} mm."
         )
-    turns = np.array(settings.angles) - DESIGN_ANGLES
-    turns -= turns.mean()
-    if np.abs(turns).max() > LARGE_ANGLE:
-        listed = ", ".join(f"{v / DEG:+.2f}" for v in turns)
+    angles = np.array(settings.angles) - DESIGN_ANGLES
+    angles -= angles.mean()
+    if np.abs(angles).max() > LARGE_TOWER_ANGLE:
+        listed = ", ".join(f"{v / DEG:+.2f}" for v in angles)
         yield (
-            f"The firmware's towers are turned by {listed}°, which more likely absorbs other "
-            "errors. The calibration begins with towers 120° apart."
+            f"The firmware's towers are rotated by {listed}° from 120° spacing, which more likely "
+            "absorbs other errors. The calibration begins with a spacing of 120°."
         )
 
 
 def last_words(text: str, pattern: str) -> dict[str, str]:
-    """Letters and values of a G-code command, those of later lines in place of earlier ones."""
+    """Letters and values of a G-code command; later lines replace values of earlier ones."""
     words: dict[str, str] = {}
     for match in re.finditer(rf"^[^;\n]*?\b{pattern}\b([^;\n]*)", text, re.MULTILINE):
         words |= dict(re.findall(rf"\b([A-Z]) ?({NUMBER}(?::{NUMBER})*)", match[1]))

@@ -1,7 +1,7 @@
 """Marlin: settings by M665, M666 and M851, probings by G29, G30 and G33.
 
-Homed, the nozzle is at the height H − z of M851, and each carriage is lowered by its M666. Sources:
-Marlin/src/module/delta.cpp, gcode/calibrate/G33.cpp, M665.cpp, M666.cpp.
+After homing, the nozzle is at the height H − z of M851, and each carriage is lowered by its M666.
+Sources: Marlin/src/module/delta.cpp, gcode/calibrate/G33.cpp, M665.cpp, M666.cpp.
 """
 
 from __future__ import annotations
@@ -26,17 +26,18 @@ from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings
 from orthocal.units import DEG, MM
 
 DECIMALS = 4
+"""Decimals of settings."""
 
 EXPECTED = (
     "lines 'Bed X: Y: Z:' of G30 or G29 V4, the table of G33 V3, or a bilinear leveling grid; and "
     "the settings that M503 prints"
 )
 
-ROUNDED = 0.006
-"""Deviation of a setting that G33 prints with two decimals, [mm, °]."""
+ROUNDING_TOLERANCE = 0.006
+"""Rounding error of a setting that G33 prints with two decimals, [mm, °]."""
 
-TABLE = {"c": None, "x": 210, "xy": 270, "y": 330, "yz": 30, "z": 90, "zx": 150}
-"""Names of the points in G33's table to their directions, [°]; None for the middle."""
+POINT_DIRECTIONS = {"c": None, "x": 210, "xy": 270, "y": 330, "yz": 30, "z": 90, "zx": 150}
+"""Name of a point in G33's table, to its direction, [°]; None for the middle."""
 
 _BED = re.compile(rf"Bed X: *({NUMBER}) +Y: *({NUMBER}) +Z: *({NUMBER})")
 _G33 = re.compile(
@@ -51,56 +52,56 @@ _GRID = re.compile(
 
 
 def recognise(text: str) -> bool:
-    """True if a text is of Marlin for certain."""
+    """True if a text is certainly from Marlin."""
     return bool(_BED.search(text) or _G33.search(text) or _GRID.search(text))
 
 
 def read_log(text: str, *, where: str, radius: float | None = None) -> PrinterLog:
-    """Settings and probed points.
+    """Read settings and probed points.
 
     Args:
-        text: The log, and files with settings.
+        text: The log and files with settings.
         where: Name of the log, for messages.
-        radius: Of the points of G33, half the side of a grid, [m].
+        radius: Radius of the points of G33, or half the side of a grid, [m].
 
     Raises:
-        SessionError: Naming the line or the missing setting.
+        SessionError: If the text is invalid; names the line or the missing setting.
     """
     m851 = last_words(text, "M851")
     x, y, z = numbers([m851.get(k, "0") for k in "XYZ"], where=where, name="M851")
     probe = np.array([x, y, z]) * MM
-    shown = _G33.search(text)
-    settings = _settings(text, shown, probe, where)
+    g33 = _G33.search(text)
+    settings = _settings(text, g33, probe, where)
     points = np.array([numbers(m.groups(), where=where, name="Bed") for m in _BED.finditer(text)])
     if len(points):
         nozzle = points * MM - probe
     else:
-        table = "G33" if shown else "the grid"
-        if shown is None and not _GRID.search(text):
+        table = "G33" if g33 else "the grid"
+        if g33 is None and not _GRID.search(text):
             require_points(0, where=where, expected=EXPECTED)
         if radius is None:
             raise SessionError(
-                f"is missing; {table} does not state where it was probed: give the largest "
-                "distance from the middle (DELTA_PRINTABLE_RADIUS less the margin)",
+                f"is missing; {table} does not state where it was probed: state the largest "
+                "distance from the middle (DELTA_PRINTABLE_RADIUS minus the margin)",
                 where="--radius-mm",
             )
-        points = _table(text, shown, radius, where) if shown else _grid(text, radius, where)
+        points = _table(text, g33, radius, where) if g33 else _grid(text, radius, where)
         nozzle = points - [0.0, 0.0, probe[2]]
-        nozzle[:, :2] -= 0.0 if shown else probe[:2]  # G33 probes with the nozzle at the point
+        nozzle[:, :2] -= 0.0 if g33 else probe[:2]  # G33 probes with the nozzle at the point
     notes = [] if "Z" in m851 else [unstated_trigger("M851 Z")]
     return probed_log(settings, nozzle, where=where, expected=EXPECTED, notes=notes)
 
 
-def _settings(text: str, shown: re.Match[str] | None, probe: Array, where: str) -> DeltaSettings:
-    """Settings of M665 and M666, or those that G33 printed before its table where they differ."""
+def _settings(text: str, g33: re.Match[str] | None, probe: Array, where: str) -> DeltaSettings:
+    """Settings of M665 and M666; different settings that G33 printed replace them."""
     trims = last_words(text, "M666")
     words = {k: "0" for k in "XYZABC"} | last_words(text, "M665")
     words |= {f"E{k}": trims.get(k, "0") for k in "XYZ"}
-    printed = {} if shown is None else {k: v for k, v in shown.groupdict().items() if v is not None}
+    printed = {} if g33 is None else {k: v for k, v in g33.groupdict().items() if v is not None}
     for name, value in printed.items():
         key = {"E": f"E{name[-1].upper()}", "T": name[-1].upper()}.get(name[0], name)
         stated = numbers([value, words.get(key, value)], where=where, name=name)
-        if key not in words or abs(stated[0] - stated[1]) > ROUNDED:
+        if key not in words or abs(stated[0] - stated[1]) > ROUNDING_TOLERANCE:
             words[key] = value
     for letter in "LRH":
         if letter not in words:
@@ -109,23 +110,23 @@ def _settings(text: str, shown: re.Match[str] | None, probe: Array, where: str) 
                 "M665 L R H X Y Z, M666 X Y Z and M851",
                 where=where,
             )
-    rod, reach, height = numbers([words[k] for k in "LRH"], where=where, name="M665")
+    rod, radius, height = numbers([words[k] for k in "LRH"], where=where, name="M665")
     rods = rod + np.array(numbers([words[k] for k in "ABC"], where=where, name="M665"))
     turns = np.array(numbers([words[k] for k in "XYZ"], where=where, name="M665"))
     lowered = np.array(numbers([words[f"E{k}"] for k in "XYZ"], where=where, name="M666"))
-    if not 0.0 < reach < rods.min():
+    if not 0.0 < radius < rods.min():
         raise SessionError(
-            f"M665 has R {reach:g} and rods from {rods.min():g}; expected a radius above 0 and "
-            "rods that are longer",
+            f"M665 has R {radius:g} and rods from {rods.min():g}; expected a positive radius and "
+            "longer rods",
             where=where,
         )
-    middle = np.sqrt(rods**2 - reach**2)
+    middle = np.sqrt(rods**2 - radius**2)
     homed = (height + middle - lowered) * MM - probe[2]
     angles = np.array(DESIGN_ANGLES) + turns * DEG
     a, b, c = (rods * MM).tolist()
     return DeltaSettings(
         "marlin",
-        reach * MM,
+        radius * MM,
         (a, b, c),
         (homed[0].item(), homed[1].item(), homed[2].item()),
         (angles[0].item(), angles[1].item(), angles[2].item()),
@@ -133,36 +134,36 @@ def _settings(text: str, shown: re.Match[str] | None, probe: Array, where: str) 
     )
 
 
-def _table(text: str, shown: re.Match[str], radius: float, where: str) -> Array:
-    """Points of G33's first table, shape (K, 3), [m], which belongs to its first settings."""
+def _table(text: str, g33: re.Match[str], radius: float, where: str) -> Array:
+    """Points of G33's first table, which belongs to its first settings, shape (K, 3), [m]."""
     if averaged := _AVERAGED.search(text):
         raise SessionError(
             f"G33 P{averaged[1]} prints means over arcs, not points; expected G33 P3 V3, or G29 V4",
             where=place_of(text, averaged.start(), where),
         )
-    after = text[shown.end() :]
+    after = text[g33.end() :]
     following = _G33.search(after)
     after = after[: following.start()] if following else after
     points = []
     for match in re.finditer(rf"\b(c|xy|yz|zx|x|y|z): *({NUMBER})", after):
         (height,) = numbers([match[2]], where=where, name=match[1])
-        angle = TABLE[match[1]]
-        at = (0.0, 0.0) if angle is None else (np.cos(angle * DEG), np.sin(angle * DEG))
-        points.append([radius * at[0], radius * at[1], height * MM])
+        angle = POINT_DIRECTIONS[match[1]]
+        x, y = (0.0, 0.0) if angle is None else (np.cos(angle * DEG), np.sin(angle * DEG))
+        points.append([radius * x, radius * y, height * MM])
     return np.array(points).reshape(-1, 3)
 
 
 def _grid(text: str, radius: float, where: str) -> Array:
     """Points of the last bilinear grid within the radius, shape (K, 3), [m]."""
     grid = list(_GRID.finditer(text))[-1]
-    at = place_of(text, grid.start(), where)
+    where = place_of(text, grid.start(), where)
     rows = [
-        numbers(line.split()[1:], where=at, name="grid")
+        numbers(line.split()[1:], where=where, name="grid")
         for line in grid["rows"].splitlines()
         if line.strip()
     ]
     if len({len(row) for row in rows}) != 1:
-        raise SessionError("has rows of different lengths; expected a complete grid", where=at)
+        raise SessionError("has rows of different lengths; expected a complete grid", where=where)
     heights = np.array(rows) * MM
     y, x = np.meshgrid(*(np.linspace(-radius, radius, n) for n in heights.shape), indexing="ij")
     points = np.column_stack([x.ravel(), y.ravel(), heights.ravel()])

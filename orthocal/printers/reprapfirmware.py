@@ -1,6 +1,6 @@
-"""RepRapFirmware: settings by M665, M666 and G31, heights that G30 and G32 report.
+"""RepRapFirmware: settings by M665, M666 and G31, heights reported by G30 and G32.
 
-A height is that of the nozzle at the trigger, less the trigger height of G31. Sources:
+A height is that of the nozzle at the trigger minus the trigger height of G31. Sources:
 src/Movement/Kinematics/LinearDeltaKinematics.cpp, src/Movement/BedProbing/RandomProbePointSet.cpp.
 """
 
@@ -26,6 +26,7 @@ from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings
 from orthocal.units import DEG, MM
 
 DECIMALS = 4
+"""Decimals of settings."""
 
 EXPECTED = (
     "the line 'bed probe heights:' that G30 or G32 with S-1 reports, and the lines 'G30 P X Y' of "
@@ -46,34 +47,34 @@ _M666 = re.compile(
 
 
 def recognise(text: str) -> bool:
-    """True if a text is of RepRapFirmware for certain."""
+    """True if a text is certainly from RepRapFirmware."""
     return bool(_HEIGHTS.search(text) or _M665.search(text))
 
 
 def read_log(text: str, *, where: str, radius: float | None = None) -> PrinterLog:
-    """Settings and probed points.
+    """Read settings and probed points.
 
     Args:
-        text: The log, and files with settings and points.
+        text: The log and files with settings and points.
         where: Name of the log, for messages.
         radius: Not used.
 
     Raises:
-        SessionError: Naming the line or the missing setting.
+        SessionError: If the text is invalid; names the line or the missing setting.
     """
     del radius
     reports = list(_HEIGHTS.finditer(text))
     if not reports:
         require_points(0, where=where, expected=EXPECTED)
     report = reports[-1]
-    at = place_of(text, report.start(), where)
-    heights = numbers(report["values"].split(), where=at, name="a bed probe height")
+    line = place_of(text, report.start(), where)
+    heights = numbers(report["values"].split(), where=line, name="a bed probe height")
     points = _points(text, where)
     if len(points) != len(heights):
         raise SessionError(
             f"reports {len(heights)} heights of {len(points)} points; expected a line 'G30 P X Y' "
             "of bed.g for each height (--settings bed.g)",
-            where=at,
+            where=line,
         )
     g31 = last_words(text, "G31")
     x, y, z = numbers([g31.get(k, "0") for k in "XYZ"], where=where, name="G31")
@@ -84,19 +85,19 @@ def read_log(text: str, *, where: str, radius: float | None = None) -> PrinterLo
 
 
 def _points(text: str, where: str) -> Array:
-    """Points of the commands G30 P, by their numbers, shape (K, 2), [mm]."""
+    """Points of the commands G30 P in the order of their numbers, shape (K, 2), [mm]."""
     places = {}
     for match in _POINT.finditer(text):
         words = dict(re.findall(rf"\b([A-Z])({NUMBER})", match["words"]))
         if {"P", "X", "Y"} <= words.keys():
-            at = place_of(text, match.start(), where)
-            number, x, y = numbers([words[k] for k in "PXY"], where=at, name="G30")
+            line = place_of(text, match.start(), where)
+            number, x, y = numbers([words[k] for k in "PXY"], where=line, name="G30")
             places[number] = (x, y)
     return np.array([places[k] for k in sorted(places)]).reshape(-1, 2)
 
 
 def _settings(text: str, probe: Array, where: str) -> DeltaSettings:
-    """Settings of commands, or of the reports of M665 and M666, which replace them."""
+    """Settings of commands; reports of M665 and M666 replace them."""
     m665, m666 = last_words(text, "M665"), last_words(text, "M666")
     for words, pattern in ((m665, _M665), (m666, _M666)):
         for report in pattern.finditer(text):
@@ -105,7 +106,7 @@ def _settings(text: str, probe: Array, where: str) -> DeltaSettings:
         if letter not in m665:
             raise SessionError(
                 f"has no M665 {letter}; expected M665 L R H of config.g or config-override.g "
-                "(--settings), or what M665 without parameters reports",
+                "(--settings), or the report of M665 without parameters",
                 where=where,
             )
     rods = numbers(m665["L"].split(":"), where=where, name="M665 L")
@@ -116,8 +117,8 @@ def _settings(text: str, probe: Array, where: str) -> DeltaSettings:
     tilts = numbers([m666.get(k, "0") for k in "AB"], where=where, name="M666")
     if not 0.0 < radius < min(rods):
         raise SessionError(
-            f"M665 has R {radius:g} and rods from {min(rods):g}; expected a radius above 0 and "
-            "rods that are longer",
+            f"M665 has R {radius:g} and rods from {min(rods):g}; expected a positive radius and "
+            "longer rods",
             where=where,
         )
     homed = height + np.sqrt(np.array(rods) ** 2 - radius**2) + stops

@@ -1,13 +1,13 @@
 """Settings of a delta printer's firmware, and its closed-form kinematics.
 
-The firmware knows three vertical towers at (radius cos φᵢ, radius sin φᵢ) and rods of length Lᵢ.
-The coordinate of a carriage is the height of its hinges above those of the platform with the
-nozzle at height 0:
+The firmware's model has three vertical towers at (radius cos φᵢ, radius sin φᵢ) and rods of length
+Lᵢ. The coordinate of a carriage is the height of its hinges above the hinges of the platform with
+the nozzle at height 0:
 
     hᵢ = √(Lᵢ² − (x − xᵢ)² − (y − yᵢ)²) + z + x τx + y τy
 
-Only RepRapFirmware has the tilts τ. A homed carriage has the coordinate `homed`, from which the
-firmwares' heights and trims of the endstops follow. Sources: klippy/kinematics/delta.py of Klipper,
+Only RepRapFirmware has the tilts τ. A homed carriage has the coordinate `homed`, which determines
+the heights and trims of the endstops. Sources: klippy/kinematics/delta.py of Klipper,
 Marlin/src/module/delta.cpp of Marlin, LinearDeltaKinematics.cpp of RepRapFirmware.
 """
 
@@ -32,14 +32,14 @@ Positive: TypeAlias = Annotated[Number, Field(gt=0.0)]
 Three: TypeAlias = tuple[Number, Number, Number]
 
 DESIGN_ANGLES = (210 * DEG, 330 * DEG, 90 * DEG)
-"""Directions of the towers a, b and c of every printer as designed, [rad]."""
+"""Nominal directions of the towers a, b and c, [rad]."""
 
-LARGEST_TURN = 10 * DEG
-"""Largest deviation of a tower from its direction by design, [rad]."""
+MAX_TOWER_ANGLE = 10 * DEG
+"""Largest deviation of a tower from its nominal direction, [rad]."""
 
-LARGEST_DIFFERENCE = 0.05
-"""Largest difference of the three rods, relative to their mean. Rods are made in one batch; a
-search without priors may end at rods that differ by a factor of two."""
+MAX_ROD_DIFFERENCE = 0.05
+"""Largest difference of a rod from the mean, relative to the mean. Rods are made in one batch, but
+a fit without priors may yield rods that differ by a factor of two."""
 
 RODS_PER_RADIUS = (1.2, 5.0)
 """Smallest and largest ratio of rod and radius."""
@@ -53,9 +53,9 @@ class DeltaSettings:
 
     firmware: FirmwareName
     radius: Positive
-    """Horizontal distance of the hinges on carriage and platform, nozzle in the middle, [m]."""
+    """Horizontal distance between the hinges of carriage and platform at the middle, [m]."""
     rods: tuple[Positive, Positive, Positive]
-    """[m]"""
+    """Lengths of the rods, [m]."""
     homed: Three
     """Coordinates of the carriages at their endstops, [m]."""
     angles: Three = DESIGN_ANGLES
@@ -63,7 +63,7 @@ class DeltaSettings:
     tilts: tuple[Number, Number] = (0.0, 0.0)
     """Tilts of the bed about y and x, [1]; RepRapFirmware only."""
     probe: Three = (0.0, 0.0, 0.0)
-    """Tip of the probe from the nozzle where it triggers, [m]."""
+    """Position of the probe's tip at the trigger relative to the nozzle, [m]."""
 
     @property
     def towers(self) -> Array:
@@ -78,39 +78,39 @@ class DeltaSettings:
 
     @property
     def endstops(self) -> Array:
-        """Heights of the nozzle at the endstops, shape (3,), [m]: `position_endstop` of Klipper."""
+        """Heights of the nozzle at the endstops (Klipper: position_endstop), shape (3,), [m]."""
         return np.array(self.homed) - self.middle
 
     def inverse(self, points: ArrayLike) -> Array:
-        """Coordinates of the carriages, shape (K, 3), of nozzle positions, shape (K, 3), [m].
+        """Coordinates of the carriages at nozzle positions (K, 3), shape (K, 3), [m].
 
         Raises:
             SessionError: If the rods are too short for a position.
         """
         p = np.atleast_2d(np.asarray(points, dtype=np.float64))
-        apart = p[:, None, :2] - self.towers
-        squared = np.array(self.rods) ** 2 - np.sum(apart**2, axis=2)
+        distance = p[:, None, :2] - self.towers
+        squared = np.array(self.rods) ** 2 - np.sum(distance**2, axis=2)
         if (squared <= 0.0).any():
             x, y, z = p[int(np.argmax((squared <= 0.0).any(axis=1)))] / MM
             raise SessionError(
                 f"the firmware's rods do not reach x {x:g}, y {y:g}, z {z:g} mm; expected a "
                 "position within the radius of the printer"
             )
-        lifted = p[:, 2] + p[:, :2] @ np.array(self.tilts)
-        return np.asarray(np.sqrt(squared) + lifted[:, None])
+        height = p[:, 2] + p[:, :2] @ np.array(self.tilts)
+        return np.asarray(np.sqrt(squared) + height[:, None])
 
     def forward(self, carriages: ArrayLike) -> Array:
-        """Nozzle positions, shape (K, 3), of coordinates of the carriages, shape (K, 3), [m].
+        """Nozzle positions at coordinates of the carriages (K, 3), shape (K, 3), [m].
 
-        Differences of the three spheres |p − cᵢ|² = Lᵢ² are linear; with x and y as functions of
-        z, the first sphere is a quadratic whose lower root is below the carriages.
+        Differences of the three spheres |p − cᵢ|² = Lᵢ² are linear and give x and y as functions of
+        z. The first sphere is then a quadratic equation whose lower root is below the carriages.
         """
         h = np.atleast_2d(np.asarray(carriages, dtype=np.float64))
         t, rods = self.towers, np.array(self.rods)
         power = np.sum(t**2, axis=1) + h**2 - rods**2
-        across = np.linalg.inv(2.0 * (t[1:] - t[0]))
-        base = (power[:, 1:] - power[:, :1]) @ across.T
-        slope = -2.0 * (h[:, 1:] - h[:, :1]) @ across.T
+        inverse = np.linalg.inv(2.0 * (t[1:] - t[0]))
+        base = (power[:, 1:] - power[:, :1]) @ inverse.T
+        slope = -2.0 * (h[:, 1:] - h[:, :1]) @ inverse.T
         start = base - t[0]
         a = 1.0 + np.sum(slope**2, axis=1)
         b = np.sum(start * slope, axis=1) - h[:, 0]
@@ -120,23 +120,26 @@ class DeltaSettings:
         return np.column_stack([xy, z - xy @ np.array(self.tilts)])
 
     def touched(self, carriages: ArrayLike) -> Array:
-        """Positions of the probe's tip, shape (K, 3), of coordinates of the carriages, [m]."""
+        """Positions of the probe's tip at coordinates of the carriages (K, 3), (K, 3), [m]."""
         return np.asarray(self.forward(carriages) + self.probe)
 
     def require_plausible(self, *, where: str) -> None:
-        """Refuse settings that no printer has, such as those of a search that went astray.
+        """Refuse implausible settings, such as the result of a failed fit.
+
+        Args:
+            where: Name of the file, for messages.
 
         Raises:
-            SessionError: Naming the setting; `where` is the file.
+            SessionError: If a setting is implausible; names it.
         """
         mean = float(np.mean(self.rods))
         for rod, tower in zip(self.rods, "abc", strict=True):
-            if abs(rod - mean) > LARGEST_DIFFERENCE * mean:
+            if abs(rod - mean) > MAX_ROD_DIFFERENCE * mean:
                 others = ", ".join(f"{v / MM:g}" for v in self.rods)
                 raise SessionError(
                     f"the rods of tower {tower} are {rod / MM:g} mm (a, b, c: {others}); expected "
-                    f"rods that differ by at most {100 * LARGEST_DIFFERENCE:g} %: enter the "
-                    "lengths that were measured, not those of a search",
+                    f"at most {100 * MAX_ROD_DIFFERENCE:g} % from their mean: state measured "
+                    "lengths, not the result of a fit",
                     where=where,
                 )
         low, high = (self.radius * ratio for ratio in RODS_PER_RADIUS)
@@ -147,9 +150,9 @@ class DeltaSettings:
                 where=where,
             )
         for angle, design, tower in zip(self.angles, DESIGN_ANGLES, "abc", strict=True):
-            if abs(angle - design) > LARGEST_TURN:
+            if abs(angle - design) > MAX_TOWER_ANGLE:
                 raise SessionError(
                     f"tower {tower} is at {angle / DEG:g}°; expected {design / DEG:g}° within "
-                    f"{LARGEST_TURN / DEG:g}°",
+                    f"{MAX_TOWER_ANGLE / DEG:g}°",
                     where=where,
                 )

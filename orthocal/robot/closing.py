@@ -1,8 +1,7 @@
 """Levenberg-Marquardt method with step control, for closing loops from a distant start.
 
 It finds a configuration near a start in which a residual vanishes, or else a local minimum of the
-residual. Rows may depend on each other, and coordinates may be undetermined: steps have minimum
-norm.
+residual. Rows may be linearly dependent and coordinates undetermined: steps have minimum norm.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ Array = NDArray[np.float64]
 Evaluate = Callable[[Array], tuple[Array, Array]]
 """Function of the coordinates: residual, shape (m,), and its Jacobian, shape (m, n)."""
 
-CLOSED = 1e-12
+CLOSURE_TOLERANCE = 1e-12
 """Largest closure residual of closed loops, [m or rad]."""
 
 SMALLEST_SHOWN = 1e-9
@@ -32,10 +31,11 @@ _MAX_TRIALS = 10
 _FIRST_DAMPING = 1e-3
 """Damping relative to the squared residual, with which it vanishes: convergence is quadratic."""
 _WINDOW = 12
-_LEAST_GAIN = 0.1
+"""Steps after which a search with too little progress ends."""
+_MIN_REDUCTION = 0.1
 """Smallest relative reduction of the squared residual within _WINDOW steps."""
-_RANK_TOLERANCE = 1e-10
-"""Singular values below this fraction of the largest count as zero."""
+RANK_TOLERANCE = 1e-10
+"""Singular values of closures below this fraction of the largest one count as zero."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +50,7 @@ class Closing:
     @property
     def closed(self) -> bool:
         """True if the loops are closed."""
-        return largest(self.residual) < CLOSED
+        return largest(self.residual) < CLOSURE_TOLERANCE
 
 
 def close_loops(
@@ -67,13 +67,13 @@ def close_loops(
 
     Args:
         evaluate: Residual and Jacobian as a function of the coordinates.
-        start: Shape (n,), [m, rad].
+        start: Start values of the coordinates, shape (n,), [m, rad].
         row_units: Metres per unit of each row, the diagonal of W, shape (m,).
         units: Metres per unit of each coordinate, the diagonal of U, shape (n,).
         bounds: Lower and upper bounds of the coordinates; steps are clipped to them.
 
     Returns:
-        The last point, with closed loops or without.
+        The last point, whether its loops are closed or not.
     """
     lower, upper = (np.asarray(b, dtype=np.float64) for b in bounds)
     weights, scale = np.asarray(row_units), np.asarray(units)
@@ -83,11 +83,11 @@ def close_loops(
     for _ in range(MAX_STEPS):
         cost = float(np.square(weights * residual).sum())
         costs.append(cost)
-        if largest(residual) < CLOSED or not np.isfinite(cost):
+        if largest(residual) < CLOSURE_TOLERANCE or not np.isfinite(cost):
             break
         if not np.isfinite(jacobian).all():
             break
-        if len(costs) > _WINDOW and cost > (1.0 - _LEAST_GAIN) * costs[-1 - _WINDOW]:
+        if len(costs) > _WINDOW and cost > (1.0 - _MIN_REDUCTION) * costs[-1 - _WINDOW]:
             break
         scaled = weights[:, None] * jacobian / scale
         descent = -(weights * residual) @ scaled
@@ -109,9 +109,9 @@ def close_loops(
 
 
 def _decompose(residual: Array, jacobian: Array) -> Callable[[float], Array]:
-    """Function of the damping that returns the damped step, from one decomposition."""
+    """Function of the damping that returns damped steps from one singular value decomposition."""
     u, values, vt = np.linalg.svd(jacobian, full_matrices=False)
-    rank = values > _RANK_TOLERANCE * values.max(initial=0.0)
+    rank = values > RANK_TOLERANCE * values.max(initial=0.0)
     s, vt, projected = values[rank], vt[rank], (u.T @ residual)[rank]
 
     def damped_step(damping: float) -> Array:
@@ -126,17 +126,18 @@ def largest(values: Array) -> float:
 
 
 def describe_opening(residual: ArrayLike, rotations: ArrayLike) -> str:
-    """Opening of loops in words, separately in mm and mrad.
+    """Description of the opening of loops: largest distance in mm and rotation in mrad.
 
     Args:
         residual: Closure residual, shape (m,), [m, rad].
         rotations: Mask of the rows that are rotations, shape (m,).
     """
     r, mask = np.abs(np.asarray(residual)), np.asarray(rotations, dtype=bool)
-    parts = [(largest(r[~mask]), "mm"), (largest(r[mask]), "mrad")]
-    shown = [part for part in parts if part[0] > SMALLEST_SHOWN] or parts[:1]
+    openings = [(largest(r[~mask]), "mm"), (largest(r[mask]), "mrad")]
+    shown = [opening for opening in openings if opening[0] > SMALLEST_SHOWN] or openings[:1]
     return " and ".join(f"{_three_digits(size * 1e3)} {unit}" for size, unit in shown)
 
 
 def _three_digits(value: float) -> str:
+    """Number with three significant digits, without exponent above 1000."""
     return f"{value:.0f}" if value >= 1000.0 else f"{value:.3g}"

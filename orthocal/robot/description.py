@@ -24,24 +24,27 @@ ClosureKind = Annotated[
     Literal["3d", "6d"],
     BeforeValidator(lambda value: value.lower() if isinstance(value, str) else value),
 ]
-"""Kind of a closure; Gepetto's robots have upper case, too."""
+"""Kind of a closure; Gepetto's robots also have upper case."""
 
 LARGEST_ROD_RADIUS_MM = 500.0
-"""Largest radius of a rod; a larger one is in another unit."""
+"""Largest radius of a rod; larger values have a wrong unit."""
 
 LARGEST_WORKSPACE_MM = 1e4
+"""Largest limit of a workspace; larger values have a wrong unit."""
 
 LOWEST_C, HIGHEST_C = -50.0, 100.0
-"""Temperatures of a machine; others are in another unit, [°C]."""
+"""Lowest and highest temperature of a machine, [°C]; other values have a wrong unit."""
 
 HEAVIEST_KG = 1e4
-"""Largest mass on a tool; a larger one is in another unit, [kg]."""
+"""Largest mass on a tool, [kg]; larger values have a wrong unit."""
 
 MOST_PARTS = 100
 """Largest number of legs, of closures and of named sums."""
 
 
 class _Keys(BaseModel):
+    """Keys that refuse unknown ones."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
@@ -49,14 +52,14 @@ class ClosureKeys(_Keys):
     """Keys that orthocal adds to one pair of `closed_loop`."""
 
     rows: list[Row] | None = None
-    """Rows that are constrained, in the axes of the pair's first frame; all by default."""
+    """Constrained rows, in the axes of the first frame of the pair; all by default."""
 
 
 class JointKeys(_Keys):
     """Joint coordinate of the controller, if it differs from the drive coordinate."""
 
     counts: Literal["up", "down"] = "up"
-    """Sign: up if the joint coordinate grows with the drive coordinate."""
+    """Direction: up if the joint coordinate grows with the drive coordinate."""
     at_zero_mm: Number | None = None
     """Joint coordinate at the mechanical zero, for a prismatic drive; the drive coordinate by
     default."""
@@ -76,17 +79,18 @@ class DriveKeys(_Keys):
 
 
 class RodKeys(_Keys):
-    """A round rod of a leg."""
+    """Round rod of a leg."""
 
     root: Name
     """Frame on the rod's axis, at the drive's end."""
     tip: Name
     """Frame on the rod's axis, at the platform's end."""
     radius_mm: Annotated[PositiveNumber, Field(le=LARGEST_ROD_RADIUS_MM)]
+    """Radius of the rod."""
 
 
 class LegKeys(_Keys):
-    """Leg: the line that a gauge measures, and its rods."""
+    """Leg: its centre line, and its rods."""
 
     root: Name
     """Frame at the drive's end of the leg."""
@@ -97,14 +101,16 @@ class LegKeys(_Keys):
 
 
 class TcpKeys(_Keys):
-    """The tool centre point."""
+    """Tool centre point."""
 
     frame: Name
+    """Frame whose origin it is."""
     coordinates: Annotated[list[Coordinate], Field(min_length=1, max_length=3)] = ["x", "y", "z"]
-    """World coordinates that the drives control; one per drive if postures are tool positions."""
+    """Commanded world coordinates; one per drive if postures are tool positions."""
 
 
 def _require_ascending(limits: list[float]) -> list[float]:
+    """Require limits of a workspace in ascending order and within LARGEST_WORKSPACE_MM."""
     low, high = limits
     if not -LARGEST_WORKSPACE_MM <= low < high <= LARGEST_WORKSPACE_MM:
         raise ValueError(
@@ -122,16 +128,18 @@ WorkspaceBox = Annotated[
     ],
     Field(min_length=1, max_length=3),
 ]
-"""Limits of each coordinate of the tool, relative to the mechanical zero, [mm]."""
+"""Lower and upper limit of each tool coordinate, relative to the mechanical zero, [mm]."""
 
 
 class WorkspaceKeys(_Keys):
     """Workspace: the region over which errors at the tool are reported."""
 
     box_mm: WorkspaceBox
+    """Limits of the box."""
 
 
 def _require_rising(limits: list[float]) -> list[float]:
+    """Require that the first of two numbers is not the larger one."""
     low, high = limits
     if low > high:
         raise ValueError(f"found [{low:g}, {high:g}]; expected [lowest, highest]")
@@ -145,15 +153,16 @@ class UseKeys(_Keys):
     """Conditions under which the machine is used."""
 
     approach: str = "both"
-    """Side from which the tool comes to a point: both, or a letter for each drive: p if its
-    coordinate grows in the last motion, n if it falls, u for both."""
+    """Sides of approach: `both`, or a letter for each drive: p if its coordinate grows in the last
+    motion, n if it falls, u for both."""
     temperature_C: _Range | None = None
     """Lowest and highest temperature; the reference of the effects by default."""
     payload_kg: _Range = [0.0, 0.0]
-    """Lightest and heaviest mass on the tool beside the platform."""
+    """Lightest and heaviest mass on the tool in addition to the platform."""
 
     @model_validator(mode="after")
-    def _within_limits(self) -> UseKeys:
+    def _require_within_limits(self) -> UseKeys:
+        """Refuse temperatures and masses that are out of range, as "KEY|PROBLEM"."""
         ranges = {
             "temperature_C": (self.temperature_C, LOWEST_C, HIGHEST_C, "degrees Celsius"),
             "payload_kg": (self.payload_kg, 0.0, HEAVIEST_KG, "kilograms"),
@@ -168,11 +177,14 @@ class OrthocalKeys(_Keys):
     """Keys below `orthocal`."""
 
     closures: dict[Name, ClosureKeys] | None = None
+    """Names of the pairs of `closed_loop`, in their order, mapped to further keys."""
     drives: dict[Name, DriveKeys] = {}
+    """Names of motors, mapped to further keys."""
     passive_start: dict[Name, Number] = {}
-    """Passive joint with suffix `_mm` or `_deg` to its start value for closing the loops; 0 by
-    default."""
+    """Names of passive joints with suffix `_mm` or `_deg`, mapped to start values for closing the
+    loops; 0 by default."""
     legs: Annotated[dict[Name, LegKeys], Field(max_length=MOST_PARTS)] = {}
+    """Legs by name."""
     tcp: TcpKeys | None = None
     workspace: WorkspaceKeys | None = None
     use: UseKeys = UseKeys()
@@ -181,13 +193,13 @@ class OrthocalKeys(_Keys):
     ] = {}
     """Named sums of elementary errors; a leading '-' subtracts."""
     tolerances: dict[str, Any] = {}
-    """Tolerances of the rigid-body errors, read by `orthocal.effects`."""
+    """Tolerances of geometry and drives, read by `orthocal.effects`."""
     effects: Annotated[dict[Name, dict[str, Any]], Field(max_length=MOST_PARTS)] = {}
-    """Further effects by name; each reads its own keys."""
+    """Further effects by name; each effect reads its keys."""
     adjustments: Annotated[dict[Name, dict[str, Any]], Field(max_length=MOST_PARTS)] = {}
     """Mechanical adjustments by name, read by `orthocal.effects.adjustment`."""
     models: dict[Name, Annotated[list[Name], Field(min_length=1)] | Literal["complete"]] = {}
-    """Patterns of parameter names, or all observable errors."""
+    """Models by name: patterns of parameter names, or `complete` for all observable errors."""
 
 
 class RobotKeys(_Keys):
@@ -201,15 +213,16 @@ class RobotKeys(_Keys):
     type: list[ClosureKind]
     """Kind of each pair: 3d for the same origin, 6d for the same pose."""
     name_mot: Annotated[list[Name], Field(min_length=1)]
-    """Actuated joints (motors)."""
+    """Names of the actuated joints (motors)."""
     joint_name: list[Name] = []
-    """Joints whose type differs from the URDF."""
+    """Names of the joints whose type differs from the URDF."""
     joint_type: list[str] = []
-    """Type of each such joint: FIXED, SPHERICAL, UJOINT_XY (about x, then y) or other axes."""
+    """Type of each of these joints: FIXED, SPHERICAL, UJOINT_XY (about x, then y) or other axes."""
     orthocal: OrthocalKeys = OrthocalKeys()
 
     @model_validator(mode="after")
-    def _lengths_agree(self) -> RobotKeys:
+    def _require_consistent(self) -> RobotKeys:
+        """Refuse lists of different lengths, repeated names and invalid rows of closures."""
         pairs = len(self.closed_loop)
         if len(self.type) != pairs:
             raise ValueError(f"type has {len(self.type)} entries; closed_loop has {pairs}")
@@ -241,6 +254,7 @@ class RobotKeys(_Keys):
         return self
 
     def _check_joint_types(self) -> None:
+        """Refuse invalid joint types."""
         if len(self.joint_name) != len(self.joint_type):
             raise ValueError(
                 f"joint_type has {len(self.joint_type)} entries; joint_name has "
@@ -258,7 +272,7 @@ class RobotKeys(_Keys):
 
     @property
     def joint_types(self) -> dict[str, str]:
-        """Joint to its declared type."""
+        """Declared types by joint."""
         return dict(zip(self.joint_name, self.joint_type, strict=True))
 
 
@@ -267,10 +281,10 @@ def load_description(path: Path, *, content: bytes | None = None) -> RobotKeys:
 
     Args:
         path: The file.
-        content: Content of the file, if it was read before.
+        content: Content of the file; read from it by default.
 
     Raises:
-        RobotError: Naming file and key.
+        RobotError: If a key is missing or invalid; names file and key.
     """
     data = read_yaml(path, error=RobotError, content=content)
     return validate(RobotKeys, data, where=str(path), error=RobotError)

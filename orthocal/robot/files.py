@@ -1,4 +1,4 @@
-"""Files of a robot: its URDF, its YAML, and the meshes that its URDF names."""
+"""Files of a robot: its URDF, its YAML, and the meshes of the URDF."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from orthocal.robot.model import Robot
 from orthocal.robot.urdf import parse_urdf
 
 MESH_FORMATS = (".stl", ".obj", ".dae", ".ply")
+"""File extensions of meshes."""
 
 LARGEST_MESHES = 8 * 2**20
 """Largest total size of the meshes that are stored with a robot, [bytes]."""
@@ -28,14 +29,14 @@ MOST_FILES = 1_000
 
 
 def mesh_path(reference: str) -> Path:
-    """Path of a mesh in the robot's directory, without package name or file://."""
+    """Path of a mesh relative to the robot's directory, without package name or file://."""
     if reference.startswith("package://"):
         return Path(*Path(reference.removeprefix("package://")).parts[1:])
     return Path(reference.removeprefix("file://"))
 
 
 def is_inner_path(name: str) -> bool:
-    """True for a relative path that stays in its directory on every system."""
+    """True for a short relative path that does not leave its directory on any system."""
     parts = PureWindowsPath(name).parts  # separated by / or \\
     outside = PureWindowsPath(name).anchor or ".." in parts
     short = len(name.encode(errors="surrogateescape")) <= LONGEST_NAME
@@ -46,7 +47,8 @@ def is_inner_path(name: str) -> bool:
 def collect_files(robot: Robot) -> Mapping[str, bytes]:
     """Content of all files of a robot by name: URDF, YAML, then meshes.
 
-    Meshes are needed for drawings only. They are left out if they exceed LARGEST_MESHES in total.
+    Meshes are needed for drawings only. They are omitted if their total size exceeds LARGEST_MESHES
+    or their number MOST_FILES.
     """
     if robot.folder is None:
         return robot.content
@@ -57,8 +59,8 @@ def collect_files(robot: Robot) -> Mapping[str, bytes]:
         path = robot.folder / name
         if name in meshes or not is_inner_path(name) or path.suffix.lower() not in MESH_FORMATS:
             continue
-        inside = path.resolve().is_relative_to(robot.folder.resolve())
-        if not (inside and exists(path)):
+        is_inside = path.resolve().is_relative_to(robot.folder.resolve())
+        if not (is_inside and exists(path)):
             continue
         try:
             meshes[name] = read_file(path, error=RobotError, largest=LARGEST_MESHES - size)
@@ -72,7 +74,7 @@ def collect_files(robot: Robot) -> Mapping[str, bytes]:
 
 @contextmanager
 def robot_directory(robot: Robot) -> Iterator[Path]:
-    """Directory with the meshes of a robot: its own, or a temporary one of an embedded robot."""
+    """Directory with the meshes of a robot; a temporary one for an embedded robot."""
     if robot.folder is not None:
         yield robot.folder.resolve()
         return

@@ -13,15 +13,16 @@ from orthocal.errors import RobotError
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Placement of a joint or frame in what carries it."""
+    """Placement of a joint or frame in the joint or frame that carries it."""
 
     index: int
     """Index of the joint or frame in the robot's model."""
     of_frame: bool
+    """True for a frame, False for a joint."""
 
 
 def find_frame(model: pin.Model, name: str, *, where: str) -> int:
-    """Index of the frame of a link, of a fixed joint, or of a moving joint, in this order.
+    """Index of a frame by its name: of a link, a fixed joint or a moving joint, in this order.
 
     Raises:
         RobotError: If there is no such frame.
@@ -42,7 +43,7 @@ def parent_frame(model: pin.Model, frame: int) -> int | None:
 
 
 def carriers(model: pin.Model, frame: int) -> Iterator[int]:
-    """The frame and those on the same joint whose errors move it, upwards."""
+    """Frame and its ancestors on the same joint, whose errors move it, from the frame upwards."""
     current: int | None = frame
     while current is not None:
         yield current
@@ -50,23 +51,23 @@ def carriers(model: pin.Model, frame: int) -> Iterator[int]:
 
 
 def place_frames(model: pin.Model, nominal: pin.Model, twists: Mapping[str, Array]) -> None:
-    """Write frame errors into a model: placement · exp6(δ); child frames move along.
+    """Write frame errors into a model: placement · exp6(δ). Child frames move with their parents.
 
     Args:
         model: The model to change.
         nominal: The model without errors.
-        twists: Name of a frame to its error δ, shape (6,), [m, rad].
+        twists: Names of frames, mapped to their errors δ, shape (6,), [m, rad].
     """
     moved: dict[int, pin.SE3] = {}
     errors = {find_frame(nominal, name, where="frame"): t for name, t in twists.items()}
     for i, frame in enumerate(nominal.frames):
         parent = frame.parentFrame
         error = errors.get(i)
-        hangs = nominal.frames[parent].parentJoint == frame.parentJoint and parent in moved
-        if frame.type == pin.FrameType.JOINT or (error is None and not hangs):
+        is_carried = nominal.frames[parent].parentJoint == frame.parentJoint and parent in moved
+        if frame.type == pin.FrameType.JOINT or (error is None and not is_carried):
             continue
         placement = frame.placement
-        if hangs:
+        if is_carried:
             placement = moved[parent] * nominal.frames[parent].placement.inverse() * placement
         moved[i] = placement if error is None else placement * pin.exp6(error)
         model.frames[i].placement = moved[i]

@@ -1,9 +1,9 @@
-"""Joint types that a robot's YAML declares in place of those in its URDF.
+"""Joint types that a robot's YAML declares instead of those in its URDF.
 
-A URDF has neither ball joints nor universal joints. The keys `joint_name` and `joint_type` of the
-Gepetto "extended URDF" declare which revolute joints represent one. Such a joint becomes revolute
-joints in series at the same place, with links of zero length between them. A ball joint turns about
-x, y and z; it is singular at a quarter turn about y, far beyond the range of a ball joint.
+URDF has neither ball joints nor universal joints. The keys `joint_name` and `joint_type` of the
+Gepetto "extended URDF" declare the revolute joints that represent one. Such a joint is replaced by
+revolute joints in series with a common origin. A ball joint turns about x, y and z. It is singular
+at a quarter turn about y, far beyond the range of a ball joint.
 """
 
 from __future__ import annotations
@@ -20,15 +20,17 @@ Element = Any
 """Element of lxml, which has no types."""
 
 FIXED = "FIXED"
+"""Declared type of a joint that does not move."""
 
 JOINT_TYPES: dict[str, str] = {
     FIXED: "",
     "SPHERICAL": "XYZ",
     **{f"UJOINT_{a}{b}": a + b for a in "XYZ" for b in "XYZ" if a != b},
 }
-"""Type to its rotation axes in the joint's frame, in their order."""
+"""Declared types, mapped to their rotation axes in the joint's frame, in order."""
 
 _AXES = {"X": "1 0 0", "Y": "0 1 0", "Z": "0 0 1"}
+"""Vectors of the axes in the form of URDF."""
 
 
 def retype_joints(root: Element, types: Mapping[str, str], *, where: str) -> list[str]:
@@ -36,15 +38,15 @@ def retype_joints(root: Element, types: Mapping[str, str], *, where: str) -> lis
 
     Args:
         root: Root element of the URDF, which is changed.
-        types: Name of a moving joint to one of `JOINT_TYPES`; joint j of `UJOINT_XY` becomes j_X
-            and j_Y.
+        types: Names of moving joints, mapped to `JOINT_TYPES`. Joint j of type `UJOINT_XY` becomes
+            j_X and j_Y.
         where: File of the declarations, for messages.
 
     Returns:
         Names of the new joints, which have no limits.
 
     Raises:
-        RobotError: If there is no such moving joint, or a new name already exists.
+        RobotError: If a joint does not exist or is fixed, or a new name already exists.
     """
     joints = {j.get("name"): j for j in root.findall("joint")}
     moving = [name for name, joint in joints.items() if joint.get("type") != "fixed"]

@@ -1,4 +1,4 @@
-"""Loading robots: URDF and YAML, checked against each other, with the loops closed."""
+"""Loading of robots: URDF and YAML are checked against each other, and the loops are closed."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ from orthocal.text import shorten
 from orthocal.units import DRIVE_UNITS, MM, Unit
 
 LONGEST_LEG = 20.0
-"""Largest length of a leg; a longer one is in mm, [m]."""
+"""Largest length of a leg, [m]; larger values are in mm."""
 
 MAX_LOADED = 8
-"""Robots held in memory: sessions and calibrations load the same ones repeatedly."""
+"""Robots cached in memory, because sessions and calibrations load the same robot repeatedly."""
 
 
 def packaged_robots() -> dict[str, Path]:
-    """Packaged robots: name to directory."""
+    """Directories of the built-in robots by name."""
     package = Path(str(resources.files("orthocal")))
     for folder in (package / "_robots", package.parent / "robots"):
         if folder.is_dir():
@@ -69,11 +69,11 @@ def load_bare_robot(robot: str | Path, *, beside: Path | None = None) -> Robot:
     the same files return the same object.
 
     Args:
-        robot: Name of a packaged robot, or path to a robot directory.
+        robot: Name of a built-in robot, or path to a robot directory.
         beside: Directory to which a relative path refers; the working directory by default.
 
     Raises:
-        RobotError: If the files are missing or invalid; names file and line or key.
+        RobotError: If the files are missing or invalid; names the file and the line or key.
     """
     packaged = packaged_robots()
     if str(robot) in packaged:
@@ -94,11 +94,11 @@ def load_bare_content(
 
     Args:
         name: Name of the robot.
-        content: Files by name: one URDF and one YAML, and meshes.
-        folder: Directory that they were read from, which need not exist any more.
+        content: File names, mapped to contents: one URDF, one YAML, and meshes.
+        folder: Directory from which the files were read; it need not exist any more.
 
     Raises:
-        RobotError: Naming file and line or key, as in NAME/FILE.
+        RobotError: If the files are invalid; names NAME/FILE and the line or key.
     """
     urdf, yaml = (
         next((file for file in content if file.endswith(suffix)), "")
@@ -111,7 +111,11 @@ def load_bare_content(
 
 
 def robot_digest(robot: str | Path) -> str | None:
-    """SHA-256 of the URDF and the YAML of a packaged robot or a robot directory; None without."""
+    """SHA-256 of the URDF and YAML of a robot; None if they cannot be read.
+
+    Args:
+        robot: Name of a built-in robot, or path to a robot directory.
+    """
     try:
         _, _, (urdf, yaml) = _read_folder(packaged_robots().get(str(robot), Path(robot)))
     except RobotError:
@@ -125,6 +129,7 @@ def content_digest(urdf: bytes, yaml: bytes) -> str:
 
 
 def _load_folder(folder: Path) -> Robot:
+    """Load a robot without error parameters from its directory."""
     require_plain_name(folder.resolve(), error=RobotError)
     urdf_path, yaml_path, content = _read_folder(folder)
     name = folder.resolve().name
@@ -208,14 +213,14 @@ def find_robot_files(folder: Path) -> tuple[Path, Path]:
 
 
 def _find_file(folder: Path, suffix: str, *names: str) -> Path:
-    """File with the first of the names that exists, or the only one."""
+    """File with the first existing one of some names, otherwise the only file with the suffix."""
     preferred = [folder / f"{name}{suffix}" for name in names]
     files = [p for p in preferred if p.is_file()][:1] or sorted(folder.glob(f"*{suffix}"))
     if len(files) != 1:
-        names_found = ", ".join(f.name for f in files) or "none"
+        listed = ", ".join(f.name for f in files) or "none"
         raise RobotError(
             f"expected one {suffix[1:].upper()} file, or one named {preferred[-1].name}; found "
-            f"{names_found}",
+            f"{listed}",
             where=str(folder),
         )
     return files[0]
@@ -228,7 +233,7 @@ def _has_zero(keys: RobotKeys, motor: str) -> bool:
 
 
 def _build_drive(model: pin.Model, motor: str, keys: RobotKeys, where: str) -> Drive:
-    """Drive of a motor: unit, mechanical zero, limits and the controller's joint."""
+    """Build the drive of a motor: unit, mechanical zero, limits and joint of the controller."""
     if not model.existJointName(motor):
         joints = ", ".join(list(model.names)[1:]) or "none"
         raise RobotError(
@@ -238,7 +243,7 @@ def _build_drive(model: pin.Model, motor: str, keys: RobotKeys, where: str) -> D
     unit: Unit = "rad" if np.any(joint_axis(model, joint.id)[3:]) else "m"
     here = f"{where}: orthocal.drives.{motor}"
     entry = keys.orthocal.drives.get(motor, DriveKeys())
-    counting = entry.joint or JointKeys()
+    joint_keys = entry.joint or JointKeys()
     zero = _in_drive_unit(entry, "zero", unit, here) or 0.0
     lower, upper = -np.inf, np.inf
     if joint.nq == 1:
@@ -257,8 +262,8 @@ def _build_drive(model: pin.Model, motor: str, keys: RobotKeys, where: str) -> D
         zero,
         lower,
         upper,
-        direction=1 if counting.counts == "up" else -1,
-        joint_zero=_in_drive_unit(counting, "at_zero", unit, f"{here}.joint"),
+        direction=1 if joint_keys.counts == "up" else -1,
+        joint_zero=_in_drive_unit(joint_keys, "at_zero", unit, f"{here}.joint"),
     )
 
 
@@ -273,6 +278,7 @@ def _in_drive_unit(keys: DriveKeys | JointKeys, key: str, unit: Unit, where: str
 
 
 def _build_closures(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Closure, ...]:
+    """Build the closures of the pairs of frames in the YAML."""
     entries = keys.orthocal.closures or {
         f"closure_{i + 1}": ClosureKeys() for i in range(len(keys.type))
     }
@@ -291,6 +297,7 @@ def _build_closures(model: pin.Model, keys: RobotKeys, where: str) -> tuple[Clos
 
 
 def _build_tcp(model: pin.Model, keys: RobotKeys, where: str) -> Tcp | None:
+    """Build the tool centre point; None without one in the YAML."""
     tcp = keys.orthocal.tcp
     if tcp is None:
         return None
@@ -329,7 +336,7 @@ def _read_use(keys: RobotKeys, where: str) -> Use:
 
 
 def _passive_start(robot: Robot, keys: RobotKeys, where: str) -> Array:
-    """Passive coordinates from which the loops are first closed, shape (n_passive,)."""
+    """Start values of the passive coordinates for closing the loops, (n_passive,), [m, rad]."""
     start = np.zeros(robot.model.nv)
     for key, value in keys.orthocal.passive_start.items():
         here = f"{where}: orthocal.passive_start.{key}"
@@ -355,6 +362,7 @@ def _snap_to_axes(unit_vector: Array) -> Array:
 
 
 def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
+    """Build the legs and their rods in the reference posture."""
     model, legs = robot.model, {}
     data = model.createData()
     q = robot.configuration(robot.reference_posture)
@@ -365,10 +373,10 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
         line = _build_line(model, data, name, entry, here)
         rods = {
             rod: Rod(
-                **_build_line(model, data, rod, keys, f"{here}.rods.{rod}"),
-                radius=keys.radius_mm * MM,
+                **_build_line(model, data, rod, rod_keys, f"{here}.rods.{rod}"),
+                radius=rod_keys.radius_mm * MM,
             )
-            for rod, keys in entry.rods.items()
+            for rod, rod_keys in entry.rods.items()
         }
         jacobian = pin.getFrameJacobian(
             model,
@@ -376,7 +384,7 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
             find_frame(model, entry.root, where=here),
             pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
         )[:3]
-        moved = np.abs(jacobian[:, robot.passive_index]).max(initial=0.0)
+        by_passive = np.abs(jacobian[:, robot.passive_index]).max(initial=0.0)
         motion = jacobian[:, robot.drive_index].sum(axis=1)
         motion /= max(float(np.linalg.norm(motion)), 1e-9)
         legs[name] = Leg(
@@ -384,7 +392,7 @@ def _build_legs(robot: Robot, keys: RobotKeys, where: str) -> dict[str, Leg]:
             axis=read_only(
                 _snap_to_axes((line["reference_tip"] - line["reference_root"]) / line["length"])
             ),
-            root_driven=bool(moved < 1e-9),
+            root_driven=bool(by_passive < 1e-9),
             root_motion=read_only(_snap_to_axes(motion)),
             rods=rods,
         )

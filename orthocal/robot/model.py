@@ -18,15 +18,16 @@ from orthocal.robot.frames import Placement, find_frame, place_frames
 from orthocal.robot.parameters import DeclaredErrors, ElementaryError, ParameterSet
 from orthocal.units import DRIVE_UNITS, InUnit, Unit
 
-ALONG = 0.02
-"""Sine of the largest angle between a slide and a leg that is parallel to it by design."""
+PARALLEL_SINE = 0.02
+"""Sine of the largest angle between a slide and a leg that counts as parallel to it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive(InUnit):
-    """An actuated joint."""
+    """Actuated joint."""
 
     name: str
+    """Name of the joint."""
     unit: Unit
     """m for a prismatic, rad for a revolute drive."""
     zero: float
@@ -36,7 +37,7 @@ class Drive(InUnit):
     upper: float
     """Upper limit, [unit]; inf without a limit in the URDF."""
     zero_computed: bool = False
-    """True if the zero was computed by closing the loops; False if it is that of the YAML."""
+    """True if the zero was computed by closing the loops; False if the YAML states it."""
     direction: int = 1
     """1 if the controller's joint coordinate grows with the drive coordinate, else -1."""
     joint_zero: float | None = None
@@ -44,13 +45,19 @@ class Drive(InUnit):
 
     def to_joint(self, coordinate: ArrayLike) -> Array:
         """Joint coordinates of the controller from drive coordinates, any shape, [unit]."""
-        shown = self.zero if self.joint_zero is None else self.joint_zero
-        return shown + self.direction * (np.asarray(coordinate, dtype=np.float64) - self.zero)
+        return self._displayed_zero + self.direction * (
+            np.asarray(coordinate, dtype=np.float64) - self.zero
+        )
 
     def from_joint(self, joint: ArrayLike) -> Array:
         """Drive coordinates from joint coordinates of the controller, any shape, [unit]."""
-        shown = self.zero if self.joint_zero is None else self.joint_zero
-        return self.zero + self.direction * (np.asarray(joint, dtype=np.float64) - shown)
+        displacement = np.asarray(joint, dtype=np.float64) - self._displayed_zero
+        return self.zero + self.direction * displacement
+
+    @property
+    def _displayed_zero(self) -> float:
+        """Joint coordinate at the mechanical zero, [unit]."""
+        return self.zero if self.joint_zero is None else self.joint_zero
 
     @property
     def joint_limits(self) -> tuple[float, float]:
@@ -59,7 +66,7 @@ class Drive(InUnit):
         return min(ends), max(ends)
 
     def describe_beyond(self, coordinate: float) -> str:
-        """Position of a drive, [unit], and its limits in words, as the controller counts."""
+        """Description of a position, [unit], and of the limits, in joint coordinates."""
         unit, size = DRIVE_UNITS[self.unit]
         low, high = (v / size for v in self.joint_limits)
         value = float(self.to_joint(coordinate)) / size
@@ -71,8 +78,11 @@ class Closure:
     """Pair of frames that coincide, and the constrained rows of their pose error."""
 
     name: str
+    """Name of the closure."""
     frame_a: str
+    """Name of the first frame."""
     frame_b: str
+    """Name of the second frame."""
     kind: str
     """'3d': position of b in a, 3 rows; '6d': log6 of the pose of b in a, 6 rows."""
     rows: tuple[int, ...]
@@ -84,6 +94,7 @@ class Line:
     """Line of a leg, or axis of one of its rods, from root to tip."""
 
     name: str
+    """Name of the leg or rod."""
     root: str
     """Frame at the drive's end."""
     tip: str
@@ -98,10 +109,10 @@ class Line:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Rod(Line):
-    """A round rod of a leg."""
+    """Round rod of a leg."""
 
     radius: float
-    """[m]."""
+    """Radius, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -113,8 +124,8 @@ class Leg(Line):
     root_driven: bool
     """True if no passive joint moves the root."""
     root_motion: Array
-    """Direction of the root in the nominal reference posture as its drives grow, shape (3,); 0 if
-    they do not move it."""
+    """Direction in which the root moves in the nominal reference posture if all drive coordinates
+    grow, shape (3,); 0 if it does not move."""
     rods: Mapping[str, Rod]
     """Round rods that a gauge can touch, by name."""
 
@@ -122,16 +133,17 @@ class Leg(Line):
     def follows_slide(self) -> bool:
         """True if the leg is parallel to the motion of its root in the reference posture."""
         across = np.cross(self.root_motion, self.axis)
-        return bool(self.root_motion.any() and np.abs(across).max() < ALONG)
+        return bool(self.root_motion.any() and np.abs(across).max() < PARALLEL_SINE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tcp:
-    """The tool centre point."""
+    """Tool centre point."""
 
     frame: str
+    """Frame whose origin it is."""
     coordinates: tuple[int, ...]
-    """World coordinates that the drives control: 0, 1, 2 for x, y, z."""
+    """Commanded world coordinates: 0, 1, 2 for x, y, z."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,39 +151,46 @@ class Use:
     """Conditions under which a machine is used, over which tool errors are averaged."""
 
     approach: str
-    """Side from which the tool comes to a point, a letter for each drive: p if its coordinate grows
-    in the last motion, n if it falls, u for both sides."""
+    """Sides of approach, a letter for each drive: p if its coordinate grows in the last motion, n
+    if it falls, u for both sides."""
     temperature: tuple[float, float] | None = None
-    """Lowest and highest, [°C]; the reference of the effects by default."""
+    """Lowest and highest temperature, [°C]; the reference of the effects by default."""
     payload: tuple[float, float] = (0.0, 0.0)
-    """Lightest and heaviest mass on the tool beside the platform, [kg]."""
+    """Lightest and heaviest mass on the tool in addition to the platform, [kg]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Robot:
     """Robot with closed loops.
 
-    Joint coordinates hold one number per degree of freedom (an angle also for unbounded revolute
-    joints), in the order of Pinocchio's velocities.
+    Joint coordinates are one number per degree of freedom, in the order of Pinocchio's velocities.
+    Unbounded revolute joints have one angle.
     """
 
     name: str
+    """Name of the robot."""
     folder: Path | None
     """Directory of its files; None for a robot that is embedded in another file."""
     urdf: Path
+    """Path of the URDF, for messages."""
     yaml: Path
-    """Files of these names, for messages; their content is in `content`."""
+    """Path of the YAML, for messages."""
     content: Mapping[str, bytes]
     """Content of its files by name: URDF and YAML, and the meshes of an embedded robot."""
     sha256: str
     """Digest of the URDF and the YAML."""
     model: pin.Model
+    """Pinocchio model."""
     constraints: tuple[pin.PointAnchorConstraintModel | pin.FrameAnchorConstraintModel, ...]
-    """The closures as Pinocchio's constraint models, all rows."""
+    """Closures as constraint models of Pinocchio, with all rows."""
     drives: tuple[Drive, ...]
+    """Actuated joints, in the order of the YAML."""
     closures: tuple[Closure, ...]
+    """Loop closures."""
     legs: Mapping[str, Leg]
+    """Legs by name."""
     tcp: Tcp | None
+    """Tool centre point; None without one."""
     workspace: Array | None
     """Box in the YAML over which tool errors are reported, relative to the mechanical zero, shape
     (n_coordinates, 2), [m]; None without one."""
@@ -190,18 +209,18 @@ class Robot:
     drive_gain: Array
     """1 + scale error of each drive, shape (n_drives,); 1 for the nominal machine."""
     chosen_effects: tuple[str, ...] | None = None
-    """Effects beside geometry that the machine has; None for those that its YAML names."""
+    """Chosen effects in addition to geometry and drives; None for those of the YAML."""
     adjusted: bool = False
-    """True if its placements depend on the mechanical adjustments under which it was measured."""
+    """True if placements depend on the mechanical adjustments of each session."""
 
     @property
     def effect_names(self) -> tuple[str, ...]:
-        """Effects that the machine has beside those of geometry and drives."""
+        """Effects of the machine in addition to those of geometry and drives."""
         return tuple(self.declared.effects) if self.chosen_effects is None else self.chosen_effects
 
     @property
     def rods(self) -> dict[tuple[str, str], Rod]:
-        """Leg and rod to the rods of all legs, in order."""
+        """Rods of all legs by the names of leg and rod, in order."""
         legs = self.legs.values()
         return {(leg.name, rod.name): rod for leg in legs for rod in leg.rods.values()}
 
@@ -224,7 +243,7 @@ class Robot:
     def characteristic_length(self) -> float:
         """Length that scales rotations to displacements, [m].
 
-        The mean nominal leg length, or without legs the mean distance between joints.
+        It is the mean nominal leg length, or without legs the mean distance between joints.
         """
         if self.legs:
             return float(np.mean([leg.length for leg in self.legs.values()]))
@@ -233,7 +252,7 @@ class Robot:
         return float(np.mean(spans)) if spans else 1.0
 
     def frame_id(self, name: str) -> int:
-        """Pinocchio's index of a frame by its name.
+        """Index of a frame in the Pinocchio model by its name.
 
         Raises:
             RobotError: If there is no such frame.
@@ -241,7 +260,7 @@ class Robot:
         return find_frame(self.model, name, where=str(self.yaml))
 
     def placement_of(self, error: ElementaryError) -> Placement:
-        """The placement that an error of a joint or frame displaces."""
+        """Placement that an error of a joint or frame displaces."""
         if error.of_frame:
             return Placement(self.frame_id(error.owner), True)
         return Placement(int(self.model.getJointId(error.owner)), False)
@@ -255,19 +274,19 @@ class Robot:
         return tuple(dict.fromkeys(frames))
 
     def configuration(self, coordinates: ArrayLike) -> Array:
-        """Pinocchio's configuration of joint coordinates.
+        """Pinocchio configuration of joint coordinates.
 
         Args:
-            coordinates: Shape (nv,), [m, rad].
+            coordinates: Joint coordinates, shape (nv,), [m, rad].
 
         Returns:
-            Shape (nq,): unbounded revolute joints as cosine and sine.
+            Shape (nq,), with cosine and sine of unbounded revolute joints.
         """
         v = np.asarray(coordinates, dtype=np.float64)
         return np.asarray(pin.integrate(self.model, pin.neutral(self.model), v))
 
     def joint_coordinates(self, drives: ArrayLike, passive: ArrayLike) -> Array:
-        """Joint coordinates from commanded drive and passive coordinates, without drive offsets.
+        """Joint coordinates of commanded drive and passive coordinates, without drive offsets.
 
         Args:
             drives: Shape (..., n_drives), [m, rad].
@@ -276,28 +295,27 @@ class Robot:
         Returns:
             Shape (..., nv).
         """
-        d = np.asarray(drives, dtype=np.float64)
-        p = np.asarray(passive, dtype=np.float64)
-        full = np.zeros((*d.shape[:-1], self.model.nv))
-        full[..., self.drive_index] = d * self.drive_gain
-        full[..., self.passive_index] = p
-        return full
+        commanded = np.asarray(drives, dtype=np.float64)
+        result = np.zeros((*commanded.shape[:-1], self.model.nv))
+        result[..., self.drive_index] = commanded * self.drive_gain
+        result[..., self.passive_index] = np.asarray(passive, dtype=np.float64)
+        return result
 
     def close_with_pinocchio(self, drives: ArrayLike, start: ArrayLike) -> Array:
-        """Solve the loop closures of one posture by damped least squares on Pinocchio's models.
+        """Solve the loop closures of one posture by damped least squares on Pinocchio models.
 
-        `start` must be near a solution. Reference for `LoopClosure`, which closes batches of
-        postures from the reference posture.
+        The start values must be near a solution. This is the reference for `LoopClosure`, which
+        closes batches of postures from the reference posture.
 
         Args:
             drives: Commanded drive coordinates, shape (n_drives,), [m, rad].
-            start: Passive coordinates to start from, shape (n_passive,), [m, rad].
+            start: Start values of the passive coordinates, shape (n_passive,), [m, rad].
 
         Returns:
             Shape (n_passive,), [m, rad].
 
         Raises:
-            ClosureError: If the loops stay open.
+            ClosureError: If the loops do not close.
         """
         coordinates = self.joint_coordinates(drives, start)
         closing = self.close_coordinates(coordinates, self.passive_index, limited=False)
@@ -316,9 +334,9 @@ class Robot:
         """Close the loops by some of the joint coordinates, within their limits by default.
 
         Args:
-            start: Joint coordinates to start from, shape (nv,), [m, rad].
+            start: Start values of the joint coordinates, shape (nv,), [m, rad].
             free: Indices of the coordinates that may change.
-            limited: Whether these stay within their limits.
+            limited: Keep these coordinates within their limits.
 
         Returns:
             All joint coordinates, and the residual.
@@ -326,13 +344,13 @@ class Robot:
         lower, upper = coordinate_limits(self)
         data = self.model.createData()
 
-        def complete(part: Array) -> Array:
+        def complete(values: Array) -> Array:
             coordinates = np.array(start)
-            coordinates[free] = part
+            coordinates[free] = values
             return coordinates
 
-        def evaluate(part: Array) -> tuple[Array, Array]:
-            residual, jacobian = self.evaluate_constraints_at(complete(part), data=data)
+        def evaluate(values: Array) -> tuple[Array, Array]:
+            residual, jacobian = self.evaluate_constraints_at(complete(values), data=data)
             return residual, jacobian[:, free]
 
         closing = close_loops(
@@ -345,14 +363,14 @@ class Robot:
         return Closing(complete(closing.coordinates), closing.residual)
 
     def evaluate_constraints(self, drives: ArrayLike, passive: ArrayLike) -> tuple[Array, Array]:
-        """Closure residual and its Jacobian by Pinocchio, constrained rows.
+        """Constrained rows of the closure residual and of its Jacobian, from Pinocchio.
 
         Args:
             drives: Commanded drive coordinates, shape (n_drives,), [m, rad].
-            passive: Shape (n_passive,), [m, rad].
+            passive: Passive coordinates, shape (n_passive,), [m, rad].
 
         Returns:
-            Residual, shape (closure_rows,), [m, rad], and its derivative by the joint
+            Residual, shape (closure_rows,), [m, rad], and its derivative with respect to the joint
             coordinates, shape (closure_rows, nv).
         """
         return self.evaluate_constraints_at(self.joint_coordinates(drives, passive))
@@ -360,11 +378,11 @@ class Robot:
     def evaluate_constraints_at(
         self, coordinates: ArrayLike, *, data: pin.Data | None = None
     ) -> tuple[Array, Array]:
-        """Closure residual and its Jacobian at joint coordinates, as `evaluate_constraints`.
+        """Closure residual and Jacobian at joint coordinates (see `evaluate_constraints`).
 
         Args:
-            coordinates: Shape (nv,), [m, rad].
-            data: Workspace of Pinocchio, to reuse in repeated calls.
+            coordinates: Joint coordinates, shape (nv,), [m, rad].
+            data: Pinocchio data to reuse in repeated calls; created by default.
         """
         data = self.model.createData() if data is None else data
         pin.computeJointJacobians(self.model, data, self.configuration(coordinates))
@@ -382,26 +400,26 @@ class Robot:
             jacobians.append(jacobian[rows])
         return np.concatenate(residuals), np.vstack(jacobians)
 
-    def with_tolerances(self, given: Mapping[str, float]) -> Robot:
-        """Robot with other tolerances of its errors; see `ParameterSet.with_tolerances`.
+    def with_tolerances(self, tolerances: Mapping[str, float]) -> Robot:
+        """Robot with other tolerances of its errors (see `ParameterSet.with_tolerances`).
 
         Raises:
             ParameterError: If a name or unit is unknown, or a number is implausible.
         """
-        parameters = self.parameters.with_tolerances(given)
+        parameters = self.parameters.with_tolerances(tolerances)
         return self if parameters is self.parameters else replace(self, parameters=parameters)
 
     def with_errors(self, values: Mapping[str, float]) -> Robot:
         """Robot with errors written into its Pinocchio placements.
 
-        Joint and frame placements become placement · exp6(δ). An offset moves the placement of a
-        drive along or about the drive's axis. A scale error becomes part of `drive_gain`.
+        Placements of joints and frames become placement · exp6(δ). An offset moves the placement of
+        a drive along or about the drive's axis. A scale error is added to `drive_gain`.
 
         Args:
-            values: Parameter name to value, [unit of the parameter].
+            values: Names of parameters, mapped to values, [unit of the parameter].
 
         Raises:
-            ParameterError: If a name is unknown, or of an effect that placements cannot express.
+            ParameterError: If a name is unknown, or placements cannot express the error.
         """
         gain = np.array(self.drive_gain)
         twists: dict[Placement, Array] = {}
@@ -418,14 +436,14 @@ class Robot:
                 offsets[placement] = value * joint_axis(self.model, placement.index)
             else:
                 twists.setdefault(placement, np.zeros(6))[e.axis] += value
-        displaced = self.displaced(twists).displaced(offsets)  # a drive moves in its own axes
+        displaced = self.displaced(twists).displaced(offsets)  # offsets act in displaced axes
         return replace(displaced, drive_gain=read_only(gain))
 
     def displaced(self, twists: Mapping[Placement, ArrayLike]) -> Robot:
         """Robot with displaced placements of joints and frames: placement · exp6(δ).
 
         Args:
-            twists: Placement to its twist δ, shape (6,), [m, rad].
+            twists: Placements, mapped to their twists δ, shape (6,), [m, rad].
         """
         model = self.model.copy()
         frames: dict[str, Array] = {}
@@ -444,7 +462,7 @@ def require_tcp(robot: Robot) -> Tcp:
     """Tool centre point of a robot.
 
     Raises:
-        RobotError: If the robot has none.
+        RobotError: If the robot has no tool centre point.
     """
     if robot.tcp is None:
         raise RobotError("has no tool centre point; add orthocal.tcp", where=str(robot.yaml))
@@ -452,10 +470,10 @@ def require_tcp(robot: Robot) -> Tcp:
 
 
 def require_commanded_tool(robot: Robot) -> tuple[int, ...]:
-    """World coordinates of the tool that the drives command, as many as drives.
+    """Commanded world coordinates of the tool, one per drive.
 
     Raises:
-        RobotError: If there are none.
+        RobotError: If the drives do not command the tool.
     """
     coordinates = require_tcp(robot).coordinates
     if len(coordinates) != len(robot.drives):
@@ -468,7 +486,7 @@ def require_commanded_tool(robot: Robot) -> tuple[int, ...]:
 
 
 def coordinate_names(model: pin.Model) -> list[str]:
-    """Name of the joint of each joint coordinate, shape (nv,): each joint has one coordinate."""
+    """Name of the joint of each joint coordinate, for models whose joints have one coordinate."""
     return [str(name) for name in model.names][1:]
 
 
@@ -488,7 +506,7 @@ def closure_turns(robot: Robot) -> NDArray[np.bool_]:
 def closure_row_units(robot: Robot) -> Array:
     """Metres per unit of each closure row, shape (closure_rows,), [1 or m/rad].
 
-    1 for translations, the characteristic length for rotations.
+    It is 1 for translations and the characteristic length for rotations.
     """
     return np.where(closure_turns(robot), robot.characteristic_length, 1.0)
 
@@ -505,7 +523,7 @@ def coordinate_units(robot: Robot) -> Array:
 
 
 def coordinate_limits(robot: Robot) -> tuple[Array, Array]:
-    """Bounds of the joint coordinates, shape (nv,); infinite for unbounded revolute joints."""
+    """Lower and upper bounds of the joint coordinates, shape (nv,) each; infinite if unbounded."""
     model = robot.model
     lower, upper = np.full(model.nv, -np.inf), np.full(model.nv, np.inf)
     for joint in list(model.joints)[1:]:
@@ -518,7 +536,7 @@ def coordinate_limits(robot: Robot) -> tuple[Array, Array]:
 def build_constraints(
     model: pin.Model, closures: Sequence[Closure]
 ) -> tuple[pin.PointAnchorConstraintModel | pin.FrameAnchorConstraintModel, ...]:
-    """Pinocchio's constraint models of closures, with the placements of a model."""
+    """Build the constraint models of closures with the placements of a Pinocchio model."""
     result = []
     for closure in closures:
         a, b = (

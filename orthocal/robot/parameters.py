@@ -1,7 +1,7 @@
 """Error parameters of a robot: names, units, tolerances and elementary errors.
 
 Effects define the elementary errors of a machine (`orthocal.effects`). A parameter is one
-elementary error or a named sum of several. All are 0 for the nominal machine.
+elementary error or a named sum of several. Parameters of the nominal machine are 0.
 """
 
 from __future__ import annotations
@@ -28,11 +28,12 @@ from orthocal.units import UNIT_SUFFIXES, InUnit, Unit, read_limit, show_limit
 COMPLETE: Literal["complete"] = "complete"
 """Keyword for a model of all observable errors."""
 
-LARGEST_PRIOR_STD = 200.0
-"""Largest prior standard deviation relative to the robot's; a larger one is in another unit."""
+LARGEST_PRIOR_RATIO = 200.0
+"""Largest ratio of a prior standard deviation to that of the robot; larger values have a wrong
+unit."""
 
 SMALLEST_PRIOR_STD = 1e-9
-"""Smallest prior standard deviation, [m, rad or 1]: parameters are scaled by it."""
+"""Smallest prior standard deviation, [m, rad or 1], because parameters are scaled by it."""
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 """Components of a twist, translation first."""
@@ -40,19 +41,19 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 @dataclass(frozen=True, slots=True)
 class ElementaryError:
-    """One parameter of an effect.
+    """Elementary error: one parameter of an effect.
 
     Args:
         name: Name of the parameter, such as x_slide.offset.
-        kind: "offset" or "scale" of a drive, "translation" or "rotation" of a placement; for other
-            effects the name of the effect.
-        owner: Name of the drive, joint or frame; of the leg, rod or setup for other effects.
+        kind: "offset" or "scale" of a drive, "translation" or "rotation" of a placement, or the
+            name of another effect.
+        owner: Name of the drive, joint or frame; for other effects of the leg, rod or setup.
         unit: SI unit: m, rad, 1, 1/K or m/s.
         prior_std: Standard deviation before the calibration, [unit].
         of_frame: True if the owner is a frame, False if it is a joint.
         axis: Component of the twist of a placement, 0 to 5; -1 for errors of other kinds.
-        complete: True if it is part of the complete model, unless it is redundant. The complete
-            errors of effects beside geometry and drives are part of every model.
+        complete: True if it is part of the complete model, unless it is redundant. Complete errors
+            of effects other than geometry and drives are part of every model.
         positive: True for a value of at least 0 with a half-normal prior.
     """
 
@@ -69,30 +70,32 @@ class ElementaryError:
 
 @dataclass(frozen=True, slots=True)
 class DeclaredErrors:
-    """Errors of a machine as its YAML declares them, in plain data for `orthocal.effects`."""
+    """Errors declared in a robot's YAML, as plain data for `orthocal.effects`."""
 
     tolerances: Mapping[str, Any]
     """Key `orthocal.tolerances`."""
     effects: Mapping[str, Mapping[str, Any]]
-    """Key `orthocal.effects`: effect to its own keys."""
+    """Key `orthocal.effects`: names of effects, mapped to their keys."""
     sums: Mapping[str, Sequence[str]]
-    """Key `orthocal.parameters`: name of a sum to names of elementary errors; '-' subtracts."""
+    """Key `orthocal.parameters`: names of sums, mapped to elementary errors; '-' subtracts."""
     models: Mapping[str, Sequence[str]]
-    """Key `orthocal.models`: name of a model to patterns, or to COMPLETE."""
+    """Key `orthocal.models`: names of models, mapped to patterns or COMPLETE."""
     adjustments: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Key `orthocal.adjustments`: name of a mechanical adjustment to its keys."""
+    """Key `orthocal.adjustments`: names of mechanical adjustments, mapped to their keys."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter(InUnit):
-    """A named error parameter."""
+    """Named error parameter."""
 
     name: str
+    """Name, such as x_slide.offset."""
     unit: Unit
+    """SI unit."""
     prior_std: float
     """Standard deviation before the calibration, [unit]."""
     terms: tuple[tuple[str, float], ...]
-    """Elementary errors of which it is the sum, with coefficients."""
+    """Elementary errors that it adds, with coefficients."""
     positive: bool = False
     """True for a value of at least 0 with a half-normal prior."""
 
@@ -102,8 +105,8 @@ class ParameterSet:
 
     Args:
         elementary: All elementary errors.
-        parameters: The errors and named sums of them.
-        models: Model to patterns of names, or to COMPLETE.
+        parameters: All parameters: elementary errors and named sums.
+        models: Names of models, mapped to patterns of parameter names or COMPLETE.
         find_redundant: Function that finds the redundant elementary errors; called at most once.
     """
 
@@ -122,7 +125,7 @@ class ParameterSet:
         self.defaults: ParameterSet = self
         """Parameters with the tolerances of the robot's YAML."""
         self.stated: Mapping[str, float] = {}
-        """Tolerances in place of those; see `with_tolerances`."""
+        """Tolerances that replace the defaults (see `with_tolerances`)."""
 
     def __iter__(self) -> Iterator[Parameter]:
         return iter(self._parameters.values())
@@ -143,7 +146,7 @@ class ParameterSet:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of all parameters, in order."""
+        """Names of all parameters in order."""
         return tuple(self._parameters)
 
     @property
@@ -152,7 +155,7 @@ class ParameterSet:
         return tuple(self._models)
 
     def patterns(self, model: str) -> tuple[str, ...]:
-        """Patterns of the free parameters of a model, those of effects included, as for `select`.
+        """Patterns for `select` of the free parameters of a model, effects included.
 
         Raises:
             ParameterError: If there is no such model.
@@ -168,7 +171,7 @@ class ParameterSet:
 
     @cached_property
     def complete(self) -> tuple[str, ...]:
-        """Elementary errors of the complete model, in order: all that are not redundant."""
+        """Elementary errors of the complete model in order, without redundant ones."""
         return tuple(n for n in self.of_parts if n not in self.redundant)
 
     @cached_property
@@ -178,7 +181,7 @@ class ParameterSet:
 
     @cached_property
     def of_effects(self) -> tuple[str, ...]:
-        """Errors that every model contains: those of effects beside geometry and drives."""
+        """Complete errors of effects other than geometry and drives, which every model contains."""
         return tuple(
             e.name
             for e in self.elementary.values()
@@ -205,7 +208,7 @@ class ParameterSet:
         return result
 
     def are_offsets(self, name: str) -> bool:
-        """True if a parameter is an offset of a drive, or of several.
+        """True if a parameter is the offset of a drive or a sum of offsets.
 
         Raises:
             ParameterError: If the name is unknown.
@@ -213,7 +216,7 @@ class ParameterSet:
         return all(self.elementary[term].kind == "offset" for term, _ in self[name].terms)
 
     def are_scaled(self, name: str) -> bool:
-        """True for errors of the geometry except offsets: one factor scales their tolerances.
+        """True for rigid-body errors except offsets, whose tolerances one factor scales.
 
         Raises:
             ParameterError: If the name is unknown.
@@ -221,7 +224,7 @@ class ParameterSet:
         return self.are_rigid(name) and not self.are_offsets(name)
 
     def are_rigid(self, name: str) -> bool:
-        """True if placement errors, drive offsets and drive scales can express a parameter.
+        """True if a parameter consists of placement errors, drive offsets and drive scales.
 
         Raises:
             ParameterError: If the name is unknown.
@@ -261,31 +264,32 @@ class ParameterSet:
         """
         return self.select(self.patterns(model))
 
-    def with_tolerances(self, given: Mapping[str, float]) -> ParameterSet:
+    def with_tolerances(self, tolerances: Mapping[str, float]) -> ParameterSet:
         """Parameters with some tolerances replaced.
 
         Args:
-            given: Name or glob with its unit, such as `*.offset_mm`, to a limit of ±2 prior
-                standard deviations in that unit. They are added to those that are stated already,
-                and replace what they match; later ones win.
+            tolerances: Names or globs with unit, such as `*.offset_mm`, mapped to limits of ±2
+                prior standard deviations in that unit. Earlier stated tolerances remain unless
+                these match all their parameters. Later entries replace earlier ones.
 
         Raises:
             ParameterError: If a name or unit is unknown, or a number is implausible.
         """
-        matched = {name for glob in self.read_tolerances(given) for name in self.select([glob])}
-        others = {
+        globs = self.read_tolerances(tolerances)
+        matched = {name for glob in globs for name in self.select([glob])}
+        remaining = {
             key: value
             for key, value in self.stated.items()
             if not matched.issuperset(self.select([self.read_glob(key)[0]]))
         }
-        stated = others | dict(given)
+        stated = remaining | dict(tolerances)
         if stated == self.stated:
             return self
         parameters = {p.name: p for p in self.defaults}
         for glob, value in self.defaults.read_tolerances(stated).items():
             for name in self.defaults.select([glob]):
-                size = require_prior_std(value, self.defaults[name])
-                parameters[name] = replace(parameters[name], prior_std=size)
+                std = require_prior_std(value, self.defaults[name])
+                parameters[name] = replace(parameters[name], prior_std=std)
         result = ParameterSet(
             self.elementary.values(),
             parameters.values(),
@@ -296,42 +300,42 @@ class ParameterSet:
         return result
 
     def read_quantity(self, key: str, value: float) -> tuple[str, float]:
-        """Parameter name and SI value of a key with its unit, such as x_slide.offset_mm.
+        """Parameter name and SI value of a key with unit, such as x_slide.offset_mm.
 
         Raises:
-            ParameterError: If the suffix is missing or of another unit, or the name unknown.
+            ParameterError: If the unit is missing or wrong, or the name is unknown.
         """
         name, unit, factor = split_unit(key)
         _check_unit(key, unit, self[name])
         return name, value * factor
 
     def read_glob(self, key: str) -> tuple[str, float]:
-        """Glob and factor to SI of a key with its unit, such as *.offset_mm.
+        """Glob and factor to SI of a key with unit, such as *.offset_mm.
 
         Raises:
-            ParameterError: If the suffix is missing, or of another unit than what the glob matches.
+            ParameterError: If the unit is missing or wrong, or the glob matches nothing.
         """
         glob, unit, factor = split_unit(key)
         for name in self.select([glob]):
             _check_unit(key, unit, self[name])
         return glob, factor
 
-    def read_tolerances(self, given: Mapping[str, float]) -> dict[str, float]:
-        """Prior standard deviations of stated tolerances: name or glob to value, [SI].
+    def read_tolerances(self, tolerances: Mapping[str, float]) -> dict[str, float]:
+        """Prior standard deviations of stated tolerances by name or glob, [SI].
 
         Args:
-            given: Name or glob with its unit to a limit of ±2 prior standard deviations.
+            tolerances: Names or globs with unit, mapped to limits of ±2 prior standard deviations.
 
         Raises:
             ParameterError: If a name or unit is unknown, or a glob is stated in two units.
         """
-        require_numbers(given, argument="tolerances")
+        require_numbers(tolerances, argument="tolerances")
         result: dict[str, float] = {}
-        for key, value in given.items():
+        for key, value in tolerances.items():
             with errors_at("tolerances"):
                 glob, factor = self.read_glob(key)
                 if glob in result:
-                    raise ParameterError(f"'{glob}' is given twice")
+                    raise ParameterError(f"'{glob}' is stated twice")
             result[glob] = read_limit(value) * factor
         return result
 
@@ -339,30 +343,30 @@ class ParameterSet:
         """Nonzero elementary errors of parameter values.
 
         Args:
-            values: Parameter name to value, [unit of the parameter].
+            values: Names of parameters, mapped to values, [unit of the parameter].
 
         Raises:
-            ParameterError: If a name is unknown.
+            ParameterError: If a name is unknown, or a value is not finite.
         """
         require_numbers(values, argument="errors")
-        total: dict[str, float] = {}
+        totals: dict[str, float] = {}
         for name, value in values.items():
             if not math.isfinite(value):
                 raise ParameterError(f"'{name}' is {value}; expected a finite number")
             for term, coefficient in self[name].terms:
-                total[term] = total.get(term, 0.0) + coefficient * value
-        return {name: value for name, value in total.items() if value != 0.0}
+                totals[term] = totals.get(term, 0.0) + coefficient * value
+        return {name: value for name, value in totals.items() if value != 0.0}
 
 
 def require_prior_std(value: float, parameter: Parameter) -> float:
-    """Refuse an implausible standard deviation.
+    """Refuse an implausible prior standard deviation.
 
     Args:
-        value: [unit of the parameter].
+        value: Prior standard deviation, [unit of the parameter].
         parameter: Parameter with the tolerance of the robot's YAML.
 
     Raises:
-        ParameterError: Naming both.
+        ParameterError: If it is too small or too large; states the tolerance and its limit.
     """
     unit, factor = parameter.edge_unit, show_limit(parameter.edge_factor)
     if not (math.isfinite(value) and value >= SMALLEST_PRIOR_STD):
@@ -370,19 +374,20 @@ def require_prior_std(value: float, parameter: Parameter) -> float:
             f"the tolerance of '{parameter.name}' is {value * factor:g} {unit}; expected at least "
             f"{SMALLEST_PRIOR_STD * factor:g} {unit}"
         )
-    if value > LARGEST_PRIOR_STD * parameter.prior_std:
+    if value > LARGEST_PRIOR_RATIO * parameter.prior_std:
         raise ParameterError(
             f"the tolerance of '{parameter.name}' is {value * factor:g} {unit}; expected at most "
-            f"{LARGEST_PRIOR_STD:g} times the robot's own, {parameter.prior_std * factor:g} {unit}"
+            f"{LARGEST_PRIOR_RATIO:g} times that of the robot, "
+            f"{parameter.prior_std * factor:g} {unit}"
         )
     return float(value)
 
 
 def split_unit(key: str) -> tuple[str, Unit, float]:
-    """Name, unit and factor to SI of a key with its unit as suffix.
+    """Name, unit and factor to SI of a key with unit suffix.
 
     Raises:
-        ParameterError: If there is no known suffix.
+        ParameterError: If the suffix is missing or unknown.
     """
     for suffix, (unit, factor) in UNIT_SUFFIXES.items():
         if key.endswith(suffix):
@@ -406,15 +411,15 @@ def build_parameters(
 
     Args:
         elementary: All elementary errors, in order.
-        sums: Name of a sum to names of elementary errors; a leading '-' subtracts.
-        overrides: Parameter name or glob with its unit as suffix to a tolerance, a limit of ±2
-            prior standard deviations; later ones win.
-        models: Model name to patterns, or to COMPLETE.
-        find_redundant: As for `ParameterSet`.
-        further: Parameters beside the errors and their sums.
+        sums: Names of sums, mapped to elementary errors; a leading '-' subtracts.
+        overrides: Names or globs with unit, mapped to tolerances (±2 prior standard deviations);
+            later entries replace earlier ones.
+        models: Names of models, mapped to patterns or COMPLETE.
+        find_redundant: Function that finds the redundant elementary errors.
+        further: Parameters in addition to the errors and their sums.
 
     Raises:
-        ParameterError: If a name is unknown, stated twice, or of another unit than its sum.
+        ParameterError: If a name is unknown or repeated, or terms of a sum differ in unit.
     """
     by_name = {e.name: e for e in elementary}
     parameters = {
@@ -423,11 +428,11 @@ def build_parameters(
     }
     for name, members in sums.items():
         if name in parameters:
-            raise ParameterError(f"parameters.{name}: this name is taken by an elementary error")
+            raise ParameterError(f"parameters.{name}: an elementary error has this name")
         parameters[name] = _sum_errors(name, members, by_name)
     for parameter in further:
         if parameter.name in parameters:
-            raise ParameterError(f"parameters.{parameter.name}: this name is that of an adjustment")
+            raise ParameterError(f"parameters.{parameter.name}: an adjustment has this name")
         parameters[parameter.name] = parameter
     for key, value in overrides.items():
         glob, unit, factor = split_unit(key)
@@ -449,29 +454,29 @@ def build_parameters(
         except ParameterError as e:
             raise ParameterError(f"models.{model}: {e.problem}") from None
         if not chosen:
-            raise ParameterError(f"models.{model}: leaves no error parameter free")
+            raise ParameterError(f"models.{model}: selects no error parameter")
     return result
 
 
 def _sum_errors(
     name: str, members: Sequence[str], errors: Mapping[str, ElementaryError]
 ) -> Parameter:
-    """A named sum of elementary errors, with the tolerance of the first."""
+    """Named sum of elementary errors, with the tolerance of the first term."""
     terms: dict[str, float] = {}
     for member in members:
-        plain = member.removeprefix("-")
-        if plain not in errors:
+        term = member.removeprefix("-")
+        if term not in errors:
             raise ParameterError(
-                f"parameters.{name}: '{plain}' is not an elementary error{_suggest(plain, errors)}"
+                f"parameters.{name}: '{term}' is not an elementary error{_suggest(term, errors)}"
             )
-        if plain in terms:
-            raise ParameterError(f"parameters.{name}: '{plain}' occurs twice")
-        terms[plain] = -1.0 if plain != member else 1.0
+        if term in terms:
+            raise ParameterError(f"parameters.{name}: '{term}' occurs twice")
+        terms[term] = -1.0 if term != member else 1.0
     first = errors[next(iter(terms))]
-    for plain in terms:
-        if errors[plain].unit != first.unit:
+    for term in terms:
+        if errors[term].unit != first.unit:
             raise ParameterError(
-                f"parameters.{name}: '{plain}' is in {errors[plain].unit}, "
+                f"parameters.{name}: '{term}' is in {errors[term].unit}, "
                 f"'{first.name}' in {first.unit}; a sum needs one unit"
             )
     return Parameter(name, first.unit, first.prior_std, tuple(terms.items()))
@@ -493,7 +498,7 @@ def _suggest(name: str, names: Iterable[str]) -> str:
 
 @contextmanager
 def errors_at(where: str) -> Iterator[None]:
-    """Name the argument or key of parameter errors that name none."""
+    """Add the argument or key to parameter errors that do not name one."""
     try:
         yield
     except ParameterError as e:

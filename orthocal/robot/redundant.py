@@ -1,8 +1,8 @@
-"""Redundant errors: those that neither the tool nor a gauge can observe in any posture.
+"""Redundant errors, which neither the tool nor a gauge can observe in any posture.
 
-An error of a placement is a small motion of everything that it carries. Passive joints follow it
-until the loops are closed again. An error that they compensate entirely is redundant, such as a
-rotation about a hinge's axis.
+An error of a placement moves everything that the placement carries. Passive joints follow until the
+loops are closed again. An error that they compensate completely is redundant, such as a rotation
+about the axis of a hinge.
 """
 
 from __future__ import annotations
@@ -14,17 +14,19 @@ import pinocchio as pin
 
 from orthocal.arrays import Array
 from orthocal.errors import ClosureError
+from orthocal.robot.closing import RANK_TOLERANCE
 from orthocal.robot.frames import Placement, carriers
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import ElementaryError
 
-POSTURES = 4
+N_POSTURES = 4
+"""Number of random postures in which effects are evaluated."""
 
 MAX_ATTEMPTS = 200
-"""Random drive coordinates at most, of which some cannot be reached."""
+"""Largest number of random drive coordinates, some of which cannot be reached."""
 
 UNLIMITED_TRAVEL = 0.2
-"""Travel of a drive without limits to both sides of its zero, [m, rad]."""
+"""Assumed travel of a drive without limits on both sides of its zero, [m, rad]."""
 
 SMALLEST_EFFECT = 1e-9
 """Effect below which an error is redundant, relative to the largest effect of its kind."""
@@ -33,8 +35,8 @@ SMALLEST_EFFECT = 1e-9
 def find_redundant_errors(robot: Robot, elementary: Sequence[ElementaryError]) -> frozenset[str]:
     """Names of the placement errors that the tool and the gauges cannot observe.
 
-    Errors of other kinds are never redundant. Without a tool and legs nothing is observed, and no
-    error counts as redundant.
+    Errors of other kinds are never redundant. Without a tool and legs nothing is observed; no error
+    counts as redundant then.
     """
     errors = [e for e in elementary if e.axis >= 0]
     if robot.tcp is None and not robot.legs:
@@ -60,7 +62,7 @@ def find_redundant_errors(robot: Robot, elementary: Sequence[ElementaryError]) -
 
 
 def _random_postures(robot: Robot) -> Iterator[Array]:
-    """Joint coordinates of postures within the travel of the drives, loops closed."""
+    """Joint coordinates of random postures with closed loops within the travel of the drives."""
     rng = np.random.default_rng(0)
     zero = robot.drive_zero
     lower, upper = np.array([(d.lower, d.upper) for d in robot.drives]).T
@@ -77,16 +79,17 @@ def _random_postures(robot: Robot) -> Iterator[Array]:
             continue
         yield robot.joint_coordinates(drives, passive)
         count += 1
-        if count == POSTURES:
+        if count == N_POSTURES:
             return
 
 
 def _carried_masks(
     robot: Robot, owners: Sequence[Placement], observed: Sequence[int]
 ) -> dict[int, Array]:
-    """Frames of closures and observed frames, with a 0-1 mask of the motions that carry them.
+    """Masks of the motions that move frames of closures and observed frames, by frame.
 
-    The motions are the six of each owner, then those of the passive coordinates.
+    A mask is 1 for motions that move the frame, else 0. The motions are the six twist components of
+    each owner, then the passive coordinates.
     """
     model = robot.model
     ends = [robot.frame_id(n) for c in robot.closures for n in (c.frame_a, c.frame_b)]
@@ -114,9 +117,9 @@ def _sensitivity(
 
     Args:
         robot: The robot.
-        owners: Joints and frames with an error ξ, a twist in their own frame.
-        observed: Frames whose origins p are observed.
-        masks: Motions that carry each frame, as `_carried_masks` returns them.
+        owners: Joints and frames with an error ξ, a twist in their frame.
+        observed: Indices of the frames whose origins p are observed.
+        masks: Result of `_carried_masks`.
         coordinates: Joint coordinates with closed loops, shape (nv,), [m, rad].
 
     Returns:
@@ -137,7 +140,7 @@ def _sensitivity(
     )
 
     def motion(point: Array) -> Array:
-        """Velocity and angular velocity at a point by all motions, in the world, shape (6, n)."""
+        """World velocity and angular velocity at a point per unit of each motion, shape (6, n)."""
         return np.vstack([twists[:3] - pin.skew(point) @ twists[3:], twists[3:]])
 
     rows = [np.zeros((0, twists.shape[1]))]
@@ -148,5 +151,5 @@ def _sensitivity(
         rows.append(relative[list(closure.rows)])
     points = [motion(data.oMf[f].translation)[:3] * masks[f] for f in observed]
     g, p, n = np.vstack(rows), np.vstack(points), 6 * len(owners)
-    following = np.linalg.lstsq(g[:, n:], -g[:, :n], rcond=1e-10)[0]
-    return np.asarray(p[:, :n] + p[:, n:] @ following)
+    passive_motion = np.linalg.lstsq(g[:, n:], -g[:, :n], rcond=RANK_TOLERANCE)[0]
+    return np.asarray(p[:, :n] + p[:, n:] @ passive_motion)

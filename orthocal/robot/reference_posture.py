@@ -1,8 +1,8 @@
 """Reference posture of a robot: closed loops with the drives at their mechanical zero.
 
-The mechanical zero of a drive is the one in the robot's YAML, or 0. If the loops cannot be closed
-there, the drives without a zero in the YAML are moved too, by as little as closes the loops with a
-margin to the nearest singular posture: the smallest motion that closes them ends in one.
+The robot's YAML states the mechanical zero of a drive, which is 0 by default. If the loops cannot
+be closed there, drives without a stated zero are moved by as little as possible. The smallest
+motion that closes the loops ends in a singular posture, so that a margin to it is required.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from orthocal.robot.model import (
 )
 
 MAX_STARTS = 6
-"""Starts of the search: the first from the YAML, the others at random around it, reproducibly."""
+"""Number of starts: the first from the YAML, the others random and reproducible around it."""
 
 START_SPREAD = 0.3
 """Standard deviation of the random starts, [rad] or characteristic lengths."""
@@ -36,22 +36,22 @@ START_SPREAD = 0.3
 MAX_OPERATIONS = 2e8
 """Approximate number of multiplications of all starts; large robots get fewer starts."""
 
-RANK_TOLERANCE = 1e-9
-"""Singular values below this fraction of the largest count as zero."""
+NULL_SPACE_TOLERANCE = 1e-9
+"""Singular values below this fraction of the largest one count as zero."""
 
 LIMIT_TOLERANCE = 1e-9
-"""Distance from a joint limit that counts as rounding error, [m or rad]."""
+"""Distance from a joint limit that counts as a rounding error, [m or rad]."""
 
 SNAP_DISTANCE = 1e-3
-"""Distance at which a moved drive is put exactly at its zero, [rad] or characteristic lengths."""
+"""Distance from its zero at which a drive is set to its zero, [rad] or characteristic lengths."""
 
 MAX_RETURN_STEPS = 60
-"""Steps that bring moved drives back towards their zeros."""
+"""Largest number of steps that move drives back towards their zeros."""
 
 LARGEST_RETURN_STEP = 0.2
 """Largest motion in one of these steps, [rad] or characteristic lengths."""
 
-LEAST_GAIN = 1e-4
+MIN_REDUCTION = 1e-4
 """Smallest relative reduction of the drives' distance from their zeros in such a step."""
 
 SINGULARITY_MARGIN = 0.5
@@ -64,9 +64,9 @@ def find_reference_posture(
     """Find the reference posture of a robot.
 
     Args:
-        robot: The robot with the zeros of its drives from the YAML, 0 for the others.
-        passive_start: Passive coordinates to start from, shape (n_passive,), [m, rad].
-        fixed_zeros: Mask of the drives whose zero is in the YAML, shape (n_drives,).
+        robot: The robot with the stated zeros of its drives, 0 for the others.
+        passive_start: Start values of the passive coordinates, shape (n_passive,), [m, rad].
+        fixed_zeros: Mask of the drives whose zero is stated, shape (n_drives,).
 
     Returns:
         The robot with its reference posture, and with the computed zeros of moved drives.
@@ -89,7 +89,7 @@ def find_reference_posture(
 
 
 def count_free_motions(robot: Robot) -> int:
-    """Number of passive motions that the loops leave free in the reference posture."""
+    """Number of free passive motions in the reference posture."""
     scaled = _scaled_jacobian(robot, robot.reference_posture)
     return int(_null_space(scaled[:, robot.passive_index]).shape[1])
 
@@ -98,11 +98,12 @@ def _search(robot: Robot, start: Array, movable: Indices) -> Array:
     """Joint coordinates with closed loops; movable drives are moved only if necessary."""
     free = np.concatenate([movable, robot.passive_index])
     attempts: list[Closing] = []
-    for moving in (robot.passive_index, free) if movable.size else (free,):
-        for trial in _starts(robot, start, moving):
-            closing = robot.close_coordinates(trial, moving)
+    for drives_move in (False, True) if movable.size else (False,):
+        variables = free if drives_move else robot.passive_index
+        for trial in _starts(robot, start, variables):
+            closing = robot.close_coordinates(trial, variables)
             if closing.closed:
-                if moving is free and movable.size:
+                if drives_move:
                     closing = _return_drives(robot, closing, movable, start)
                 return closing.coordinates
             attempts.append(closing)
@@ -135,7 +136,7 @@ def _explain_open_loops(robot: Robot, best: Closing, drives_moved: bool, outside
     worst = names[int(np.abs(closure_row_units(robot) * best.residual).argmax())]
     rows, turns = np.array(names) == worst, closure_turns(robot)
     # norms of both parts, which do not depend on the axes
-    opening = [float(np.linalg.norm(best.residual[rows & part])) for part in (~turns, turns)]
+    opening = [float(np.linalg.norm(best.residual[rows & kind])) for kind in (~turns, turns)]
     closure = next(c for c in robot.closures if c.name == worst)
     moved = ", with its drives moved too," if drives_moved else ""
     joints = f" (one closes outside the limits of {', '.join(outside)})" if outside else ""
@@ -148,26 +149,32 @@ def _explain_open_loops(robot: Robot, best: Closing, drives_moved: bool, outside
 
 
 def _starts(robot: Robot, start: Array, free: Indices) -> Iterator[Array]:
-    """The start, then random starts around it that differ in the free coordinates."""
+    """Start, then random starts around it that differ in the free coordinates."""
     yield start
     rng = np.random.default_rng(0)
-    spread = START_SPREAD * _coordinate_scales(robot)
+    stds = START_SPREAD * _coordinate_scales(robot)
     operations = MAX_STEPS * robot.closure_rows * robot.model.nv**2
     for _ in range(min(MAX_STARTS - 1, int(MAX_OPERATIONS / max(operations, 1)))):
-        shift = np.zeros(len(start))
-        shift[free] = rng.normal(size=free.size)
-        yield start + spread * shift
+        change = np.zeros(len(start))
+        change[free] = rng.normal(size=free.size)
+        yield start + stds * change
 
 
 def _return_drives(robot: Robot, closing: Closing, movable: Indices, target: Array) -> Closing:
-    """Move drives back towards their zeros with the loops closed.
+    """Move drives back towards their zeros with closed loops.
 
     Each step is the motion in the null space of the closure Jacobian that brings the drives
-    nearest to their targets; the loops are closed again after it.
+    nearest to their zeros. The loops are closed after each step.
+
+    Args:
+        robot: The robot.
+        closing: A posture with closed loops.
+        movable: Indices of the drives that may move.
+        target: Joint coordinates with the drives at their zeros, shape (nv,), [m, rad].
     """
     scales = _coordinate_scales(robot)
     values = _singular_values(robot, closing)
-    last = int((values > RANK_TOLERANCE).sum()) - 1  # dependent rows have no further ones
+    last = int((values > NULL_SPACE_TOLERANCE).sum()) - 1  # others belong to dependent rows
     smallest = SINGULARITY_MARGIN * values[last]
 
     def is_regular(candidate: Closing) -> bool:
@@ -175,41 +182,41 @@ def _return_drives(robot: Robot, closing: Closing, movable: Indices, target: Arr
 
     free = np.concatenate([movable, robot.passive_index])
 
-    def missing(candidate: Closing) -> Array:
+    def distances(candidate: Closing) -> Array:
         return np.asarray((target - candidate.coordinates)[movable] / scales[movable])
 
     factor = 1.0
     for _ in range(MAX_RETURN_STEPS):
         _, jacobian = robot.evaluate_constraints_at(closing.coordinates)
         motions = _null_space(jacobian[:, free] * scales[free])
-        amounts = np.linalg.lstsq(motions[: movable.size], missing(closing), rcond=1e-6)[0]
+        amounts = np.linalg.lstsq(motions[: movable.size], distances(closing), rcond=1e-6)[0]
         step = motions @ amounts
         step *= factor * min(1.0, LARGEST_RETURN_STEP / max(float(np.abs(step).max()), 1e-300))
         trial = np.array(closing.coordinates)
         trial[free] += step * scales[free]
         closed = robot.close_coordinates(trial, free)
-        after, before = (float(np.linalg.norm(missing(c))) for c in (closed, closing))
-        if closed.closed and after < (1.0 - LEAST_GAIN) * before and is_regular(closed):
+        after, before = (float(np.linalg.norm(distances(c))) for c in (closed, closing))
+        if closed.closed and after < (1.0 - MIN_REDUCTION) * before and is_regular(closed):
             closing, factor = closed, min(1.0, 2.0 * factor)
         elif factor < 0.01:
             break
         else:
             factor *= 0.25
     trial = np.array(closing.coordinates)
-    near = movable[np.abs(missing(closing)) < SNAP_DISTANCE]
+    near = movable[np.abs(distances(closing)) < SNAP_DISTANCE]
     trial[near] = target[near]
     closed = robot.close_coordinates(trial, np.setdiff1d(free, near))
     return closed if closed.closed and is_regular(closed) else closing
 
 
 def _scaled_jacobian(robot: Robot, coordinates: Array) -> Array:
-    """Closure Jacobian by joint coordinates, rows and columns scaled to metres."""
+    """Closure Jacobian with respect to joint coordinates, rows and columns scaled to metres."""
     _, jacobian = robot.evaluate_constraints_at(coordinates)
     return np.asarray(closure_row_units(robot)[:, None] * jacobian / coordinate_units(robot))
 
 
 def _singular_values(robot: Robot, closing: Closing) -> Array:
-    """Singular values of the closure Jacobian by passive motions, relative to the largest."""
+    """Singular values of the closure Jacobian of passive motions, relative to the largest one."""
     scaled = _scaled_jacobian(robot, closing.coordinates)
     values = np.linalg.svd(scaled[:, robot.passive_index], compute_uv=False)
     return np.asarray(values / max(float(values.max(initial=0.0)), 1e-300))
@@ -223,7 +230,7 @@ def _coordinate_scales(robot: Robot) -> Array:
 def _null_space(matrix: Array) -> Array:
     """Orthonormal basis of the null space of a matrix, as columns."""
     _, values, right = np.linalg.svd(matrix)
-    rank = int((values > RANK_TOLERANCE * values.max(initial=0.0)).sum())
+    rank = int((values > NULL_SPACE_TOLERANCE * values.max(initial=0.0)).sum())
     return np.asarray(right[rank:].T)
 
 

@@ -1,4 +1,4 @@
-"""URDF files from strangers: checked element by element and by yourdfpy, loaded by Pinocchio."""
+"""Checks of untrusted URDF files, element by element and by yourdfpy, and loading by Pinocchio."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _NUMBERS: dict[str, dict[str, int]] = {
     "mesh": {"scale": 3},
     "color": {"rgba": 4},
 }
-"""Element to the attributes that hold numbers, and their count."""
+"""Elements, mapped to their numeric attributes and the count of numbers of each."""
 
 _SHAPES = {
     "box": ("size",),
@@ -53,13 +53,13 @@ _SHAPES = {
 """Shapes of a <geometry>, with their required attributes."""
 
 _BOUNDED = frozenset({"xyz", "rpy", "size", "radius", "length", "scale", "rgba"})
-"""Attributes for places and dimensions, which have a smaller limit."""
+"""Attributes for positions and dimensions, which have a smaller limit."""
 
 _NAMES = ("name", "link", "joint")
 """Attributes that name elements."""
 
 RESERVED_NAMES = frozenset({"universe"})
-"""Names that Pinocchio uses itself."""
+"""Names that Pinocchio reserves."""
 
 LARGEST_PLACE = 1e4
 """Largest length [m], angle [rad] or scale; loops of metres must close to nanometres."""
@@ -70,10 +70,11 @@ LARGEST_URDF = 16 * 2**20
 MOST_ELEMENTS = 20_000
 """Largest number of XML elements; a humanoid with its hands has some thousands."""
 
-_YES = b"yes"
+_ACCEPTED = b"yes"
+"""Entry of the disk cache for a URDF that yourdfpy accepts."""
 
 MOST_JOINTS = 400
-"""Largest number of joints with fixed ones; urdfdom recurses once per joint of a chain."""
+"""Largest number of joints including fixed ones; urdfdom recurses once per joint of a chain."""
 
 MOST_VISUALS = 500
 """Largest number of visuals; a page draws each as an object."""
@@ -97,17 +98,17 @@ def load_urdf(
 
     Args:
         path: The file.
-        content: Content of the file, if it was read before.
-        joint_types: Joint to its declared type (see `retype_joints`).
+        content: Content of the file; read from it by default.
+        joint_types: Names of joints, mapped to declared types (see `retype_joints`).
         declared_in: File of these declarations, for messages.
 
     Raises:
-        RobotError: Naming file and line, or file and joint.
+        RobotError: If the URDF is invalid; names file and line, or file and joint.
     """
     root = parse_urdf(path, content=content)
     _check_elements(root, path)
     unlimited = _complete_limits(root)
-    # the parsed text, whatever encoding the file claims
+    # the parsed text, independent of the encoding that the file declares
     _validate_with_yourdfpy(str(etree.tostring(root, encoding="unicode")), path)
     retyped = retype_joints(root, joint_types or {}, where=declared_in)
     text = str(etree.tostring(root, encoding="unicode"))
@@ -119,9 +120,9 @@ def load_urdf(
         raise RobotError(f"Pinocchio cannot load it: {reason}", where=str(path)) from None
     for name in (*unlimited, *retyped):
         if model.existJointName(name):
-            place = model.joints[model.getJointId(name)].idx_q
-            model.lowerPositionLimit[place] = -np.inf
-            model.upperPositionLimit[place] = np.inf
+            index = model.joints[model.getJointId(name)].idx_q
+            model.lowerPositionLimit[index] = -np.inf
+            model.upperPositionLimit[index] = np.inf
     return model
 
 
@@ -129,7 +130,7 @@ def _complete_limits(root: Element) -> list[str]:
     """Write URDF's default of 0 for absent bounds, which yourdfpy requires.
 
     Returns:
-        Names of the joints without both bounds.
+        Names of the joints with neither bound.
     """
     unlimited = []
     for joint in root.findall("joint"):
@@ -149,10 +150,10 @@ def parse_urdf(path: Path, *, content: bytes | None = None) -> Element:
 
     Args:
         path: The file.
-        content: Content of the file, if it was read before.
+        content: Content of the file; read from it by default.
 
     Raises:
-        RobotError: Naming file and line.
+        RobotError: If it is not the XML of a URDF; names file and line.
     """
     text = read_text(path, error=RobotError, content=content, largest=LARGEST_URDF)
     parser = etree.XMLParser(
@@ -160,7 +161,7 @@ def parse_urdf(path: Path, *, content: bytes | None = None) -> Element:
         no_network=True,
         load_dtd=False,
         huge_tree=False,
-        encoding="utf-8",  # whatever the file claims: the checks below see all of it
+        encoding="utf-8",  # independent of the declared encoding, so that checks see all text
     )
     try:
         root = etree.fromstring(text.encode(), parser=parser)
@@ -199,7 +200,7 @@ def _place(path: Path, element: Element) -> str:
 
 
 def _check_elements(root: Element, path: Path) -> None:
-    """Refuse invalid elements that yourdfpy and urdfdom accept, or refuse without a message."""
+    """Refuse invalid elements that yourdfpy and urdfdom accept or refuse without a message."""
     links = _check_names(root, path)
     parents: dict[str, str] = {}
     for joint in root.findall("joint"):
@@ -221,7 +222,7 @@ def _check_elements(root: Element, path: Path) -> None:
 
 
 def _check_names(root: Element, path: Path) -> list[str]:
-    """Names of the links; names of links and of joints are unique."""
+    """Names of the links; refuses missing, reserved and repeated names of links and joints."""
     names: dict[str, dict[str, int]] = {"link": {}, "joint": {}}
     for tag, lines in names.items():
         for element in root.findall(tag):
@@ -278,7 +279,7 @@ def _check_joint(joint: Element, path: Path) -> None:
 
 
 def _check_ends(joint: Element, links: Sequence[str], path: Path) -> str:
-    """Name of a joint's child link; both links exist."""
+    """Name of a joint's child link; refuses links that do not exist."""
     link: str | None = None
     for end in ("parent", "child"):
         element = joint.find(end)
@@ -303,7 +304,7 @@ def _check_connected(
     Args:
         root: Root element.
         links: Names of the links.
-        parents: Link to the joint whose child it is.
+        parents: Names of links, mapped to the joint whose child they are.
         path: The file.
     """
     roots = [name for name in links if name not in parents]
@@ -315,14 +316,14 @@ def _check_connected(
         parent = joint.find("parent").get("link")
         children.setdefault(parent, []).append(joint.find("child").get("link"))
     reached, pending = set(roots), list(roots)
-    while pending:  # each link has one parent: none is reached twice
+    while pending:  # each link has one parent and is reached once
         following = children.get(pending.pop(), [])
         reached.update(following)
         pending += following
-    apart = [name for name in links if name not in reached]
-    if apart:
+    unreached = [name for name in links if name not in reached]
+    if unreached:
         raise RobotError(
-            f"the links {', '.join(apart)} are not connected to the root link '{roots[0]}'",
+            f"the links {', '.join(unreached)} are not connected to the root link '{roots[0]}'",
             where=str(path),
         )
 
@@ -351,15 +352,15 @@ def _check_counts(root: Element, path: Path) -> None:
     """Limit the number of joints."""
     joints = root.findall("joint")
     moving = [joint for joint in joints if joint.get("type") != "fixed"]
-    for elements, most, kind in ((joints, MOST_JOINTS, ""), (moving, MOST_MOVING, "moving ")):
-        if len(elements) > most:
+    for elements, limit, kind in ((joints, MOST_JOINTS, ""), (moving, MOST_MOVING, "moving ")):
+        if len(elements) > limit:
             raise RobotError(
-                f"has {len(elements)} {kind}joints; expected at most {most}", where=str(path)
+                f"has {len(elements)} {kind}joints; expected at most {limit}", where=str(path)
             )
 
 
 def _numbers(element: Element, key: str, count: int, where: str) -> list[float] | None:
-    """Numbers of an attribute; None without it."""
+    """Numbers of an attribute; None if it is absent."""
     text = element.get(key)
     if text is None:
         return None
@@ -381,17 +382,18 @@ def _numbers(element: Element, key: str, count: int, where: str) -> list[float] 
 def _validate_with_yourdfpy(text: str, path: Path) -> None:
     """Refuse a URDF that yourdfpy does not accept.
 
-    Accepted ones are recorded in the disk cache, because importing yourdfpy takes 0.8 s.
+    Accepted files are recorded in the disk cache, because importing yourdfpy takes 0.8 s.
     """
     digest = hashlib.sha256(text.encode()).hexdigest()
-    accepted = f"yourdfpy {version('yourdfpy')} accepts {digest}"
-    if cache.load(accepted) == _YES:
+    key = f"yourdfpy {version('yourdfpy')} accepts {digest}"
+    if cache.load(key) == _ACCEPTED:
         return
-    _ask_yourdfpy(text, path)
-    cache.store(accepted, _YES)
+    _run_yourdfpy(text, path)
+    cache.store(key, _ACCEPTED)
 
 
-def _ask_yourdfpy(text: str, path: Path) -> None:
+def _run_yourdfpy(text: str, path: Path) -> None:
+    """Refuse a URDF that yourdfpy does not accept, without the cache."""
     import yourdfpy
 
     logging.getLogger("yourdfpy").setLevel(logging.CRITICAL)
@@ -409,7 +411,7 @@ def _ask_yourdfpy(text: str, path: Path) -> None:
 
 @contextmanager
 def captured_stderr() -> Iterator[list[str]]:
-    """Capture the error stream of C++ code; the list that it yields holds the text afterwards."""
+    """Capture the error stream of C++ code; the yielded list contains the text afterwards."""
     messages: list[str] = []
     with _sink() as sink:
         sys.stderr.flush()

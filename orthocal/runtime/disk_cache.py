@@ -1,9 +1,9 @@
-"""Cache of slow, reproducible results in a directory of the user.
+"""Cache of reproducible results of long computations in a directory of the user.
 
 The directory is ORTHOCAL_CACHE, or `orthocal` in XDG_CACHE_HOME or ~/.cache; ORTHOCAL_CACHE=off
-disables the cache. Directory and files are used only if they belong to the user and nobody else can
-write to them, and if the checksum of key and content is right. Everything else is computed again.
-Failures of the cache never stop a job.
+disables the cache. Directory and files are used only if the user owns them, nobody else can write
+to them, and the checksum of key and content is right. Otherwise the result is computed again.
+Failures of the cache are ignored.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 VARIABLE = "ORTHOCAL_CACHE"
+"""Environment variable with the directory of the cache."""
 
 OFF = frozenset({"", "0", "off", "no", "none"})
 """Values of the variable that disable the cache."""
@@ -28,18 +29,19 @@ LARGEST_ENTRY = 8 * 2**20
 """Largest size of one file, [bytes]."""
 
 MOST_ENTRIES = 400
+"""Largest number of files."""
 
 _SUFFIX = ".kept"
 _MAGIC = b"orthocal cache 1\n"
-_DIGEST = hashlib.sha256().digest_size
-_FOLLOW_NOTHING = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
+_HEADER_SIZE = len(_MAGIC) + hashlib.sha256().digest_size
+_NO_LINKS = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
 
 
 def load(key: str) -> bytes | None:
-    """Content stored for a key; None if there is none that can be trusted.
+    """Content stored for a key; None if there is no trusted content.
 
     Args:
-        key: Everything that the content depends on.
+        key: Text with everything that the content depends on.
     """
     try:
         with _folder(create=False) as folder:
@@ -52,15 +54,15 @@ def store(key: str, content: bytes) -> None:
     """Store content for a key, atomically.
 
     Args:
-        key: Everything that the content depends on.
-        content: At most LARGEST_ENTRY bytes.
+        key: Text with everything that the content depends on.
+        content: The content; more than LARGEST_ENTRY bytes are not stored.
     """
     if len(content) > LARGEST_ENTRY:
         return
     with suppress(OSError, ValueError), _folder(create=True) as folder:
         if folder is not None:
             _write(folder, key, content)
-            _make_room(folder)
+            _remove_oldest(folder)
 
 
 def cache_folder() -> Path | None:
@@ -86,17 +88,17 @@ def _folder(*, create: bool) -> Iterator[int | None]:
         with suppress(FileExistsError):
             path.mkdir(mode=0o700)
     try:
-        folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | _FOLLOW_NOTHING)
+        folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY | _NO_LINKS)
     except OSError:
         yield None
         return
     try:
-        yield folder if _is_own(os.fstat(folder)) else None
+        yield folder if _is_private(os.fstat(folder)) else None
     finally:
         os.close(folder)
 
 
-def _is_own(status: os.stat_result) -> bool:
+def _is_private(status: os.stat_result) -> bool:
     """True for a file or directory that the user owns and nobody else can write to."""
     return status.st_uid == os.geteuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
@@ -111,21 +113,21 @@ def _digest(key: str, content: bytes) -> bytes:
 
 def _read(folder: int, key: str) -> bytes | None:
     descriptor = os.open(
-        _name(key), os.O_RDONLY | _FOLLOW_NOTHING | getattr(os, "O_NONBLOCK", 0), dir_fd=folder
+        _name(key), os.O_RDONLY | _NO_LINKS | getattr(os, "O_NONBLOCK", 0), dir_fd=folder
     )
     with open(descriptor, "rb") as stream:
         status = os.fstat(descriptor)
-        small = status.st_size <= len(_MAGIC) + _DIGEST + LARGEST_ENTRY
-        if not (stat.S_ISREG(status.st_mode) and small and _is_own(status)):
+        is_small = status.st_size <= _HEADER_SIZE + LARGEST_ENTRY
+        if not (stat.S_ISREG(status.st_mode) and is_small and _is_private(status)):
             return None
         data = stream.read(status.st_size)
-    head, content = data[: len(_MAGIC) + _DIGEST], data[len(_MAGIC) + _DIGEST :]
-    return content if head == _MAGIC + _digest(key, content) else None
+    header, content = data[:_HEADER_SIZE], data[_HEADER_SIZE:]
+    return content if header == _MAGIC + _digest(key, content) else None
 
 
 def _write(folder: int, key: str, content: bytes) -> None:
     temporary = f"{secrets.token_hex(8)}.part"
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _FOLLOW_NOTHING
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NO_LINKS
     descriptor = os.open(temporary, flags, 0o600, dir_fd=folder)
     try:
         with open(descriptor, "wb") as stream:
@@ -137,8 +139,8 @@ def _write(folder: int, key: str, content: bytes) -> None:
         raise
 
 
-def _make_room(folder: int) -> None:
-    """Remove the oldest files until the others are within the limits."""
+def _remove_oldest(folder: int) -> None:
+    """Remove the oldest files until the remaining ones are within the limits."""
     entries = []
     for name in os.listdir(folder):
         if name.endswith((_SUFFIX, ".part")):

@@ -1,8 +1,8 @@
-"""Ctrl-C where an exception is not enough: inside C++ code, during a fork, between two renames.
+"""Handling of Ctrl-C inside C++ code, during a fork and between two renames.
 
 Some C++ libraries swallow a KeyboardInterrupt, some report it as a failed import or a wrong
 argument, and one aborts the process. Python itself swallows one that is raised in a destructor or
-in a hook of `os.fork`. The command line therefore raises none: its process ends.
+in a hook of `os.fork`. So Ctrl-C ends the process of the command line without an exception.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ _MESSAGE: ContextVar[str] = ContextVar("message at an interrupt", default="")
 
 
 def _end(number: int, frame: FrameType | None) -> None:
+    """End the process at once, after printing the message."""
     if message := _MESSAGE.get():
         with suppress(OSError):
             os.write(2, f"{message}\n".encode())
@@ -34,7 +35,7 @@ def _end(number: int, frame: FrameType | None) -> None:
 
 @contextmanager
 def _handled(handler: Handler) -> Iterator[None]:
-    """Handle Ctrl-C by a function inside the block."""
+    """Call a function at Ctrl-C inside the block."""
     previous = signal.signal(signal.SIGINT, handler)
     try:
         yield
@@ -54,7 +55,7 @@ def message_at_interrupt(message: str) -> Iterator[None]:
 
 @contextmanager
 def ending_at_interrupt() -> Iterator[None]:
-    """End the process at Ctrl-C, wherever it is: nothing is written, and nothing can swallow it."""
+    """End the process at once at Ctrl-C inside the block; no library can swallow it."""
     handler = signal.getsignal(signal.SIGINT)
     if handler is not signal.default_int_handler or not _in_main_thread():
         yield
@@ -65,9 +66,9 @@ def ending_at_interrupt() -> Iterator[None]:
 
 @contextmanager
 def raised_interrupt() -> Iterator[None]:
-    """Raise a KeyboardInterrupt at Ctrl-C inside the block, where the process would end elsewhere.
+    """Raise a KeyboardInterrupt at Ctrl-C inside a block within `ending_at_interrupt`.
 
-    For code that has something to clean up: partly written files, another process.
+    For code that must clean up partly written files or another process.
     """
     if signal.getsignal(signal.SIGINT) is not _end:
         yield
@@ -80,11 +81,11 @@ def raised_interrupt() -> Iterator[None]:
 def noticed_interrupt() -> Iterator[None]:
     """Raise the KeyboardInterrupt of a Ctrl-C inside the block, even if code there swallowed it.
 
-    CasADi stops its solver at one. It then returns as if the solver had not converged, goes on, or
-    (Python 3.13) raises a SystemError because the interrupt is still pending.
+    CasADi stops its solver at a Ctrl-C. Then it returns as if the solver had not converged, or
+    continues. In Python 3.13 it may raise a SystemError because the interrupt is still pending.
 
     Raises:
-        KeyboardInterrupt: At the end, if there was a Ctrl-C.
+        KeyboardInterrupt: At the end of the block, if there was a Ctrl-C.
     """
     with _recorded_interrupts(pass_on=True) as received:
         try:
@@ -99,7 +100,11 @@ def noticed_interrupt() -> Iterator[None]:
 
 @contextmanager
 def postponed_interrupt() -> Iterator[None]:
-    """Postpone a Ctrl-C to the end of the block: for a few calls that belong together."""
+    """Postpone a Ctrl-C to the end of the block, for a few calls that belong together.
+
+    Raises:
+        KeyboardInterrupt: At the end of the block, if there was a Ctrl-C.
+    """
     with _recorded_interrupts(pass_on=False) as received:
         yield
     if received:
@@ -108,10 +113,10 @@ def postponed_interrupt() -> Iterator[None]:
 
 @contextmanager
 def blocked_interrupt() -> Iterator[None]:
-    """Let the operating system hold a Ctrl-C back to the end of the block.
+    """Let the operating system delay a Ctrl-C to the end of the block.
 
-    Processes that are started inside the block inherit this: no Ctrl-C reaches them before they
-    have chosen what to do about it, and none is lost in the parent.
+    Processes that are started inside the block inherit the blocked signal. So no Ctrl-C reaches
+    them before they have set their handler, and none is lost in the parent.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -127,7 +132,8 @@ def blocked_interrupt() -> Iterator[None]:
 def _recorded_interrupts(*, pass_on: bool) -> Iterator[list[int]]:
     """Record every SIGINT in a list.
 
-    Only the main thread can, and only where the handler is a Python function.
+    The list stays empty in other threads than the main one, and if the handler is not a Python
+    function.
     """
     previous = signal.getsignal(signal.SIGINT)
     received: list[int] = []

@@ -1,4 +1,4 @@
-"""Registry of implementations by name: built in, registered, or from installed packages."""
+"""Registry of implementations by name: built-in, registered, or from installed packages."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Registry(Generic[Kind]):
     Args:
         group: Group of the entry points of packages; an entry point has the name of its kind.
         noun: Noun for a kind in messages, such as sensor.
-        read: Kind from a name and the object of an entry point; raises any error for an invalid
-            object.
+        read: Function from a name and the object of an entry point to a kind. It may raise any
+            error for an invalid object.
         built_in: Kinds of orthocal.
     """
 
@@ -35,7 +35,7 @@ class Registry(Generic[Kind]):
         self._kinds = dict(built_in)
 
     def register(self, name: str, kind: Kind) -> None:
-        """Add a kind; it replaces one of the same name."""
+        """Add a kind; it replaces a kind of the same name."""
         self._kinds[name] = kind
 
     def unregister(self, name: str) -> None:
@@ -44,12 +44,12 @@ class Registry(Generic[Kind]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of all kinds, with those of installed packages."""
-        return tuple(dict.fromkeys([*self._kinds, *(e.name for e in self._offered)]))
+        """Names of all kinds, including those of installed packages."""
+        return tuple(dict.fromkeys([*self._kinds, *(e.name for e in self._entry_points)]))
 
     @property
-    def _offered(self) -> tuple[EntryPoint, ...]:
-        return _list_offered(self._group, tuple(sys.path))
+    def _entry_points(self) -> tuple[EntryPoint, ...]:
+        return _list_entry_points(self._group, tuple(sys.path))
 
     def find(self, name: object, *, where: str, error: type[OrthocalError]) -> Kind:
         """Find the kind of a name.
@@ -64,7 +64,7 @@ class Registry(Generic[Kind]):
         """
         if isinstance(name, str) and name in self._kinds:
             return self._kinds[name]
-        point = next((e for e in self._offered if e.name == name), None)
+        point = next((e for e in self._entry_points if e.name == name), None)
         if point is None:
             expected = f"expected one of {', '.join(self.names)}" if self.names else "there is none"
             raise error(f"found {name!r}; {expected}", where=where)
@@ -79,6 +79,6 @@ class Registry(Generic[Kind]):
 
 
 @lru_cache(maxsize=8)
-def _list_offered(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
-    """Entry points of a group; packages are searched for once in each search path."""
+def _list_entry_points(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    """Entry points of a group in a search path of modules, which is part of the cache key."""
     return tuple(entry_points(group=group))

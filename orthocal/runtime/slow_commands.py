@@ -1,4 +1,4 @@
-"""One line on a terminal while a command works for a long time without output."""
+"""Line on a terminal if a command works for a long time without output."""
 
 from __future__ import annotations
 
@@ -9,27 +9,28 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 STDERR = 2
-"""File descriptor."""
+"""File descriptor of the standard error."""
 
-AFTER = 3.0
-"""Time without output after which a line is printed, [s]."""
+PATIENCE = 3.0
+"""Time without output after which the line is printed, [s]."""
 
 
 @contextmanager
 def announced_if_slow(
-    text: str, *, after: float = AFTER, descriptor: int = STDERR
+    text: str, *, after: float = PATIENCE, descriptor: int = STDERR
 ) -> Iterator[None]:
-    """Print a line on the terminal of stderr if the work takes longer than a few seconds.
+    """Print a line on the terminal of stderr if the block lasts longer than a few seconds.
 
-    Files and pipes receive nothing. A timer of the process serves, not a thread: work may fork.
+    Nothing is printed into files and pipes. The timer of the process is used instead of a thread,
+    because the block may fork.
 
     Args:
         text: The line.
-        after: Time after which it is printed, [s].
+        after: Time after which the line is printed, [s].
         descriptor: File descriptor of the terminal.
     """
-    in_main = threading.current_thread() is threading.main_thread()
-    if not (hasattr(signal, "setitimer") and in_main and os.isatty(descriptor)):
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if not (hasattr(signal, "setitimer") and in_main_thread and os.isatty(descriptor)):
         yield
         return
 
@@ -37,10 +38,10 @@ def announced_if_slow(
         with suppress(OSError):
             os.write(descriptor, f"{text}\n".encode(errors="replace"))
 
-    before = signal.signal(signal.SIGALRM, announce)
+    previous = signal.signal(signal.SIGALRM, announce)
     signal.setitimer(signal.ITIMER_REAL, after)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
+        signal.signal(signal.SIGALRM, previous)

@@ -14,7 +14,7 @@ from orthocal.text import printable
 
 
 class ReaderGoneError(Exception):
-    """The reader of the standard output has closed it, as `head` does; this is not an error."""
+    """Signal that the reader of the standard output has closed it, as `head` does; no error."""
 
 
 class _Guarded:
@@ -48,10 +48,16 @@ class _Guarded:
         return len(text)
 
     def flush(self) -> None:
-        """Write buffered text; raises as `write` does."""
+        """Write buffered text.
+
+        Raises:
+            ReaderGoneError: If the reader has closed the stream.
+            OutputError: If the text cannot be written.
+        """
         self._try(lambda stream: stream.flush())
 
     def _try(self, act: Callable[[TextIO], object]) -> None:
+        """Act on the stream; raise its first failure now and at all later calls."""
         try:
             if self._failure is None:
                 act(self._stream)
@@ -64,17 +70,17 @@ class _Guarded:
             raise self._failure
 
     def _abandon(self) -> None:
-        """Discard buffered text, which Python would write when it ends."""
+        """Discard buffered text, which Python would write at its exit."""
         with suppress(OSError, ValueError, io.UnsupportedOperation):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._stream.fileno())
-            os.close(nowhere)
+            null_device = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null_device, self._stream.fileno())
+            os.close(null_device)
 
 
 class _Silent(_Guarded):
-    """Standard error: failures are ignored, because they cannot be reported anywhere.
+    """Standard error. Failures are ignored, because they cannot be reported anywhere.
 
-    Control characters are escaped, whichever library writes them.
+    Control characters are escaped, also in messages of libraries.
     """
 
     def write(self, text: str) -> int:
@@ -95,13 +101,14 @@ def _unwritable(reason: str) -> OutputError:
 def guarded_streams() -> Iterator[None]:
     """Guard the standard streams of this process, and open the closed ones on the null device.
 
-    Otherwise the next opened file would receive their descriptors, and the output of C++ code.
+    Otherwise the next opened file would get the descriptor of a closed stream, and the output of
+    C++ code.
     """
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest free descriptor
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free descriptor
     original = sys.stdout, sys.stderr
     for stream in original:  # a terminal without ± prints a question mark
         if isinstance(stream, io.TextIOWrapper):

@@ -1,8 +1,8 @@
-"""One pool of worker processes on this machine; the workers end with the process that started them.
+"""Pool of worker processes on this machine, which end with their parent process.
 
-On Linux a process with one thread is forked: the workers share everything that is loaded and
-prepared, and begin at once. Elsewhere joblib starts new processes and sends them pickled work.
-Workers ignore Ctrl-C: the process that started them ends them.
+On Linux a process with one thread is forked. The workers share all data that the parent has loaded
+or computed, and start at once. Otherwise joblib starts new processes and sends them pickled work.
+Workers ignore Ctrl-C, because their parent ends them.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from orthocal.errors import OrthocalError
 from orthocal.runtime.interrupts import blocked_interrupt
 
 PARENT_CHECK_INTERVAL = 0.5
-"""Time between two checks of a worker whether its parent is alive, [s]."""
+"""Interval at which a worker checks that its parent is alive, [s]."""
 
 _BUDGET: ContextVar[int] = ContextVar("worker budget", default=1)
 
 T = TypeVar("T")
 
 Work = Callable[[int], T]
-"""Result of a task by its number. It is pickled where processes cannot be forked."""
+"""Function from the number of a task to its result; pickled if processes cannot be forked."""
 
 
 def available_cores() -> int:
@@ -53,17 +53,17 @@ def worker_budget(count: int) -> Iterator[None]:
 
 
 def current_worker_budget() -> int:
-    """Number of processes that may be used here: 1 unless a caller allows more."""
+    """Allowed number of processes: 1 unless a caller allows more."""
     return _BUDGET.get()
 
 
 def run_in_parallel(
     work: Work[T], tasks: Sequence[int], workers: int, *, killed: str
 ) -> Iterator[tuple[int, T]]:
-    """Numbers and results of tasks in the order in which they end.
+    """Numbers and results of tasks in the order of their completion.
 
     Args:
-        work: Result of a task by its number.
+        work: Function from the number of a task to its result.
         tasks: Numbers of the tasks.
         workers: Number of processes. With one worker or one task, this process runs all in order.
         killed: Message if a worker is killed.
@@ -84,7 +84,7 @@ def call_in_parallel(
 ) -> tuple[Any, ...]:
     """Results of functions, called in parallel within the worker budget.
 
-    They are called one after the other where processes cannot be forked.
+    They are called in sequence if processes cannot be forked.
 
     Args:
         calls: The functions, the slowest first. Their results are pickled.
@@ -99,7 +99,10 @@ def call_in_parallel(
 
 
 def can_fork() -> bool:
-    """True if a fork is safe: with one thread, no lock stays locked in the child."""
+    """True if a fork is safe: on Linux in a process with one thread.
+
+    With several threads a lock could stay locked in the child.
+    """
     if sys.platform != "linux" or threading.active_count() > 1:
         return False
     try:
@@ -111,6 +114,7 @@ def can_fork() -> bool:
 def _run_forked(
     work: Work[T], tasks: Sequence[int], workers: int, killed: str
 ) -> Iterator[tuple[int, T]]:
+    """Numbers and results of tasks from forked workers."""
     context, waiting = multiprocessing.get_context("fork"), list(reversed(tasks))
     running: dict[Connection[Any, Any], ForkProcess] = {}
     try:
@@ -118,7 +122,7 @@ def _run_forked(
             connection, remote = context.Pipe()
             arguments = (work, remote, os.getpid())
             process = context.Process(target=_serve, args=arguments, daemon=True)
-            with blocked_interrupt():  # else the fork may swallow one, or print it in the worker
+            with blocked_interrupt():  # a fork may swallow a Ctrl-C, or print it in the worker
                 process.start()
                 running[connection] = process
             remote.close()
@@ -140,6 +144,7 @@ def _run_forked(
 
 
 def _receive(connection: Connection[Any, Any], killed: str) -> Any:  # noqa: ANN401 - a result
+    """Number and result of a task; raises its error."""
     try:
         answer = pickle.loads(connection.recv_bytes())
     except (EOFError, ConnectionError):
@@ -150,7 +155,7 @@ def _receive(connection: Connection[Any, Any], killed: str) -> Any:  # noqa: ANN
 
 
 def _serve(work: Work[Any], connection: Connection[Any, Any], parent: int) -> None:
-    """Answer the requests of the parent until it closes the connection or is gone."""
+    """Answer the requests of the parent until it closes the connection or ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _BUDGET.set(1)  # the other cores are busy
     try:
@@ -168,7 +173,7 @@ def _serve(work: Work[Any], connection: Connection[Any, Any], parent: int) -> No
 
 
 def _answer(work: Work[Any], task: int) -> bytes:
-    """Number and result of a task, or the error that the parent raises again; pickled."""
+    """Pickled number and result of a task, or the pickled error, which the parent raises."""
     try:
         return pickle.dumps((task, work(task)))
     except Exception as e:
@@ -176,7 +181,7 @@ def _answer(work: Work[Any], task: int) -> bytes:
 
 
 def _picklable(error: Exception) -> Exception:
-    """The error itself, or its text where it cannot be pickled."""
+    """The error itself, or a RuntimeError with its text if it cannot be pickled."""
     try:
         pickle.loads(pickle.dumps(error))
     except Exception:  # pickling runs the error's own code
@@ -187,6 +192,7 @@ def _picklable(error: Exception) -> Exception:
 def _run_spawned(
     work: Work[T], tasks: Sequence[int], workers: int, killed: str
 ) -> Iterator[tuple[int, T]]:
+    """Numbers and results of tasks from new processes of joblib."""
     from joblib import Parallel, delayed, parallel_config
 
     parent = os.getpid()
@@ -206,7 +212,7 @@ def _work_and_watch(work: Work[T], task: int, parent: int) -> tuple[int, T]:
 
 @cache
 def _end_with(parent: int) -> None:
-    """End this process when its parent is gone: a killed parent cannot end it."""
+    """End this process when its parent has ended; a killed parent cannot end its workers."""
 
     def watch() -> None:
         while os.getppid() == parent:

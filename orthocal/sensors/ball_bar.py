@@ -1,14 +1,13 @@
-"""Ball bar: the distance between a ball at the tool and a ball at a fixed place.
+"""Ball bar: distance between a ball at the tool and a fixed ball.
 
-With b the ball at the tool and c the fixed ball, the reading is the length of the bar beyond its
-length at reading 0:
+With b the position of the ball at the tool and c that of the fixed ball, the reading is
 
     h = (1 + s) (|b − c| − L)
 
-s is the error of the dial's scale. Position c, length L and s are nuisance parameters. The length
-and the scale belong to the gauge, so that all setups with one bar share them. If L is known, or has
-a tolerance, the gauge zero is known; readings of a bar of unknown length have a free gauge zero in
-each setup, or share an unknown length.
+L is the length of the bar at reading 0, and s the error of the dial's scale. Position c, length L
+and s are nuisance parameters. All setups with one bar share L and s, which belong to the gauge. If
+L is known or has a tolerance, the gauge zero is known. Otherwise each setup has a free gauge zero,
+or the setups share an unknown length.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from pydantic import Field
 from orthocal.arrays import Array
 from orthocal.io.documents import Name, Number, PositiveNumber
 from orthocal.robot.model import Robot, require_tcp
-from orthocal.sensors.mounting import SCALE
+from orthocal.sensors.mounting import LARGEST_SCALE, SCALE
 from orthocal.sensors.protocol import (
     DIMENSION_STEP,
     Contact,
@@ -39,17 +38,17 @@ from orthocal.sensors.protocol import (
 )
 from orthocal.units import MM, read_limit, show_limit, tidy, to_mm
 
-CENTRE = 1.0 * MM
-"""Position of a fixed ball to which the tool was jogged, [m]."""
+CENTRE_STD = 1.0 * MM
+"""Prior standard deviation of a coordinate of a fixed ball to which the tool was jogged, [m]."""
 
-UNKNOWN = 1.0 * MM
-"""Prior standard deviation of a length that nobody measured but with a ruler, [m]."""
+UNKNOWN_LENGTH_STD = 1.0 * MM
+"""Prior standard deviation of an unknown length, which was measured with a ruler only, [m]."""
 
 SAGITTA = 5e-6
-"""Deviation of a chord from the arc between two readings, [m]."""
+"""Largest deviation of a chord from the arc between two readings, [m]."""
 
 LARGEST_MM = 5000.0
-"""Largest length and coordinate; a larger one has a wrong unit."""
+"""Largest accepted length and coordinate, [mm]; a larger one has a wrong unit."""
 
 Coordinate = Annotated[Number, Field(ge=-LARGEST_MM, le=LARGEST_MM)]
 Point = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
@@ -60,28 +59,30 @@ class BallBarKeys(SetupKeys):
     """Keys of a setup with a ball bar, as in a session.yaml."""
 
     centre_mm: Point
-    """Nominal position of the fixed ball, in the world."""
+    """Nominal position of the fixed ball in the world frame."""
     ball: Name | None = None
-    """Name of the fixed ball, if several setups use one that stays in its place."""
-    centre_tolerance_mm: Tolerance = show_limit(CENTRE) / MM
-    """Of each of its coordinates; 0 if it is known."""
+    """Name of the fixed ball, if it stays in its place for several setups."""
+    centre_tolerance_mm: Tolerance = show_limit(CENTRE_STD) / MM
+    """Tolerance of each coordinate of the fixed ball; 0 if the position is known."""
     tool_mm: Point = Field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Ball at the tool, from the tool centre point, in the tool's frame."""
     length_mm: Annotated[PositiveNumber, Field(le=LARGEST_MM)]
     """Distance of the balls at reading 0."""
     length_tolerance_mm: Tolerance | Literal["unknown"] = 0.0
-    scale_tolerance: Annotated[Number, Field(ge=0.0, le=0.4)] = show_limit(SCALE)
+    """Tolerance of the length; 0 if it is known."""
+    scale_tolerance: Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)] = show_limit(SCALE)
+    """Tolerance of the dial's scale, dimensionless."""
 
 
 @dataclass(frozen=True, slots=True)
 class BallBar(ToolSensor):
-    """A ball bar between the tool and a fixed ball."""
+    """Ball bar between the tool and a fixed ball."""
 
     centre: tuple[float, float, float]
-    """Nominal position of the fixed ball, in the world, [m]."""
+    """Nominal position of the fixed ball in the world frame, [m]."""
     length: float
     """Nominal distance of the balls at reading 0, [m]."""
-    centre_std: float = CENTRE
+    centre_std: float = CENTRE_STD
     """Prior standard deviation of each coordinate of the fixed ball, [m]."""
     length_std: float = 0.0
     """Prior standard deviation of the length, [m]; 0 if it is known."""
@@ -101,13 +102,15 @@ class BallBar(ToolSensor):
     @classmethod
     def from_keys(cls, keys: BallBarKeys) -> BallBar:
         """Build from the keys of a session.yaml."""
-        length, tolerance = keys.length_mm * MM, keys.length_tolerance_mm
-        unknown = tolerance == "unknown"
+        tolerance = keys.length_tolerance_mm
+        length_std = UNKNOWN_LENGTH_STD
+        if tolerance != "unknown":
+            length_std = tidy(read_limit(tolerance) * MM)
         return cls(
             centre=_metres(keys.centre_mm),
-            length=length,
+            length=keys.length_mm * MM,
             centre_std=tidy(read_limit(keys.centre_tolerance_mm) * MM),
-            length_std=UNKNOWN if unknown else tidy(read_limit(float(tolerance)) * MM),
+            length_std=length_std,
             scale_std=read_limit(keys.scale_tolerance),
             tool=_metres(keys.tool_mm),
             ball=keys.ball,
@@ -125,7 +128,7 @@ class BallBar(ToolSensor):
         if any(self.tool):
             keys["tool_mm"] = [to_mm(v) for v in self.tool]
         if self.length_std:
-            unknown = self.length_std == UNKNOWN
+            unknown = self.length_std == UNKNOWN_LENGTH_STD
             tolerance = "unknown" if unknown else tidy(show_limit(self.length_std) / MM)
             keys["length_tolerance_mm"] = tolerance
         if self.scale_std != SCALE:
@@ -133,13 +136,13 @@ class BallBar(ToolSensor):
         return keys
 
     def describe(self) -> str:
-        """Length and fixed ball."""
+        """Short description with length and fixed ball."""
         centre = ", ".join(f"{v / MM:g}" for v in self.centre)
         return f"ball bar of {self.length / MM:g} mm about ({centre}) mm"
 
     @property
     def mounting_steps(self) -> tuple[str, ...]:
-        """Steps that mount the bar."""
+        """Instructions for mounting the bar."""
         x, y, z = (f"{v / MM:g}" for v in self.centre)
         length = f"{self.length / MM:g} mm"
         known = "It is known" if not self.length_std else "Its true length need not be known"
@@ -151,7 +154,7 @@ class BallBar(ToolSensor):
             )
         return (
             "Mount one ball at the tool. Place the other, the fixed ball, on its post only after "
-            f"the tool stands in the alignment posture: at about X{x} Y{y} Z{z} mm from the tool "
+            f"the tool is in the alignment posture: at about X{x} Y{y} Z{z} mm from the tool "
             f"centre point at the mechanical zero, by eye.{stays}",
             f"Put the bar between the balls. Its dial shows 0 at a length of {length}. {known}.",
             "Make the bar longer with your hand. The reading must grow. If it falls, reverse the "
@@ -159,16 +162,16 @@ class BallBar(ToolSensor):
         )
 
     def path(self, start: Array, end: Array, normal: Array | None = None) -> Array:
-        """Corners of an arc about the fixed ball, on which the bar keeps its length.
+        """Corners of a path on which the bar keeps its length: an arc about the fixed ball.
 
         Args:
-            start: Tool centre point, shape (3,), [m].
-            end: The same.
-            normal: Unit vector square to the plane in which the tool moves, shape (3,); None for a
-                tool that moves in space, along a great arc.
+            start: First tool centre point, shape (3,), [m].
+            end: Last tool centre point, shape (3,), [m].
+            normal: Unit normal of the plane in which the tool moves, shape (3,); None for a tool
+                that moves in space, along a great arc.
 
         Returns:
-            Shape (n, 3), [m]; chords deviate from the arc by at most `SAGITTA`.
+            Tool centre points, shape (n, 3), [m]. Chords deviate from the arc by at most `SAGITTA`.
         """
         offset = np.array(self.tool) - np.array(self.centre)
         ends = np.array([start + offset, end + offset])
@@ -178,7 +181,7 @@ class BallBar(ToolSensor):
         radii = np.linalg.norm(ends, axis=1)
         first, last = ends / np.maximum(radii, 1e-12)[:, None]
         across = last - (first @ last) * first
-        if np.linalg.norm(across) < 1e-9:  # the same direction, or the opposite one
+        if np.linalg.norm(across) < 1e-9:  # equal or opposite directions
             across = np.linalg.svd(first[None])[2][-1]
             if normal is not None:
                 across = np.cross(normal, first)
@@ -190,22 +193,22 @@ class BallBar(ToolSensor):
         return np.asarray((radii[0] + share * (radii[1] - radii[0])) * unit - offset)
 
     def frames(self, robot: Robot) -> Frames:
-        """The tool's frame."""
+        """Frame of the tool."""
         return Frames((require_tcp(robot).frame,))
 
     def constants(self, robot: Robot) -> Array:
-        """Fixed ball (3), length (1), ball at the tool (3)."""
+        """Position of the fixed ball (3), length (1), position of the ball at the tool (3), [m]."""
         del robot
         return np.array([*self.centre, self.length, *self.tool])
 
     @property
     def dimensions(self) -> Mapping[str, Sensor]:
-        """The bar with another length."""
+        """Bar with a length that is larger by DIMENSION_STEP."""
         return {"length_mm": replace(self, length=self.length + DIMENSION_STEP)}
 
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
-        """Position of the fixed ball, length and scale with a standard deviation above 0."""
+        """Position of the fixed ball, length and scale, if their standard deviation is above 0."""
         shared = None if self.ball is None else f"ball.{self.ball}"
         parameters = (
             *(
@@ -228,7 +231,10 @@ class BallBar(ToolSensor):
         return ca.SX((1.0 + errors.get("scale", 0.0)) * (ca.norm_2(ball - centre) - length))
 
     def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
-        """Balls at the tool; a reading grows along the bar, towards them on average."""
+        """Positions of the ball at the tool in K postures.
+
+        The direction of a growing reading is that of the bar in the first posture.
+        """
         del at_zero, robot
         poses = frames[0]
         balls = poses[:, :3, 3] + poses[:, :3, :3] @ np.array(self.tool)

@@ -1,7 +1,8 @@
-"""Compiled functions of a sensor's reading, one build for each kind of sensor and its frames.
+"""Compiled functions of a sensor's reading, built once per kind of sensor and frames.
 
-The derivatives by the poses of the frames are those of the sensor's expression. They act on a frame
-like a force f and a moment m; the derivatives of the poses follow the geometry of the machine.
+The derivatives with respect to the poses of the frames follow from the sensor's expression. They
+are equivalent to a force f and a moment m on each frame. The derivatives of the poses follow from
+the kinematics of the machine.
 """
 
 from __future__ import annotations
@@ -30,42 +31,43 @@ from orthocal.sensors.protocol import Frames, Sensor, View, sensor_conditions
 
 INPUTS = ["actuated", "passive", "placements", "zero", "constants", "nuisance"]
 
-OF_SECOND = ["actuated_2", "passive_2"]
-"""Further inputs of a reading of a pair: coordinates in its second posture."""
+SECOND_INPUTS = ["actuated_2", "passive_2"]
+"""Additional inputs for a pair of postures: coordinates in the second posture."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CompiledReading:
     """Functions of the reading of one kind of sensor.
 
-    Their inputs: actuated and passive coordinates, placements, drives in the reference posture,
-    constants and nuisance parameters; for a pair of postures, actuated and passive coordinates in
-    the second one.
+    Their inputs are actuated and passive coordinates, placements, drives in the reference posture,
+    constants and nuisance parameters. For a pair of postures, actuated and passive coordinates in
+    the second posture follow.
     """
 
     value: BatchFunction
-    """h, [m]."""
+    """Reading h, [m]."""
     jacobian: BatchFunction
-    """h; ∂h by actuated, passive, twists, reference drives and nuisance parameters, one row each;
-    the one by twists as nonzeros. For a pair, those by actuated and passive in the second posture
-    follow."""
+    """Reading h, then its derivatives with respect to actuated coordinates, passive coordinates,
+    twists, reference drives and nuisance parameters. Each is one row; the derivative with respect
+    to twists is given by its nonzeros. For a pair, derivatives with respect to the coordinates in
+    the second posture follow."""
     expression: ca.Function
-    """The same with sparse rows, for use in other expressions."""
+    """Function with the outputs of `jacobian` as sparse rows, for use in other expressions."""
     name: str
-    """Distinguishes it from other readings of the robot."""
+    """Name that is unique among the readings of the robot."""
     conditions: tuple[Condition, ...]
-    """Conditions that follow the constants of the sensor among its inputs."""
+    """Conditions that follow the constants of the sensor in the inputs."""
     pairs: bool
     """Whether a reading belongs to a pair of postures."""
     probe: float | None
-    """Value of the expression of a sensor from outside orthocal, at fixed arguments."""
+    """Value of the expression at fixed arguments, for a sensor from another package."""
 
 
 def compile_reading(robot: Robot, sensor: Sensor) -> CompiledReading:
-    """The functions of a sensor; one build for all of its kind with the same frames.
+    """Functions of a sensor's reading, built once for all sensors of its kind and frames.
 
     Raises:
-        OrthocalError: If its expression differs from that of another one of its kind.
+        OrthocalError: If sensors of one kind and with the same frames have different expressions.
     """
     pattern = _Pattern(robot, sensor, sensor.frames(robot))
     reading = _compile(pattern)
@@ -78,15 +80,15 @@ def compile_reading(robot: Robot, sensor: Sensor) -> CompiledReading:
 
 
 class _Pattern:
-    """A sensor's expression; equal for sensors with the same one."""
+    """Key of a sensor's expression; sensors with equal patterns share compiled functions."""
 
     def __init__(self, robot: Robot, sensor: Sensor, frames: Frames) -> None:
         self.robot, self.sensor, self.frames = robot, sensor, frames
         self.conditions = reading_conditions(robot, sensor)
         sizes = (condition_size(robot, c) for c in self.conditions)
         self.n_constants = sensor.constants(robot).size + sum(sizes)
-        of_effects = (e.name for effect in reading_effects(robot) for e in effect.setup_errors)
-        self.nuisance_parameters = (*(u.name for u in sensor.nuisance_parameters), *of_effects)
+        effect_errors = (e.name for effect in reading_effects(robot) for e in effect.setup_errors)
+        self.nuisance_parameters = (*(u.name for u in sensor.nuisance_parameters), *effect_errors)
         self._key = (
             identify(robot),
             type(sensor),
@@ -105,12 +107,12 @@ class _Pattern:
 
     @property
     def name(self) -> str:
-        """Distinguishes it from other patterns of the robot."""
+        """Name that is unique among the patterns of the robot."""
         return repr(self._key[2:])
 
     @cached_property
     def expressions(self) -> tuple[list[ca.SX], list[ca.SX]]:
-        """Inputs and outputs of its functions."""
+        """Inputs and outputs of the compiled functions."""
         return _express(self)
 
     def __eq__(self, other: object) -> bool:
@@ -122,6 +124,7 @@ class _Pattern:
 
 @lru_cache(maxsize=256)
 def _compile(pattern: _Pattern) -> CompiledReading:
+    """Compile the functions of a pattern, or load them from the cache."""
     value, jacobian = (
         cached_function(pattern.robot, f"{name} {pattern.name}", partial(build, pattern))
         for name, build in (("reading", _build_value), ("reading jacobian", _build_jacobian))
@@ -146,22 +149,23 @@ def _compile(pattern: _Pattern) -> CompiledReading:
 
 def _build_value(pattern: _Pattern) -> ca.Function:
     inputs, outputs = pattern.expressions
-    names = [*INPUTS, *OF_SECOND[: len(inputs) - len(INPUTS)]]
+    names = [*INPUTS, *SECOND_INPUTS[: len(inputs) - len(INPUTS)]]
     return ca.Function("h", inputs, [ca.densify(outputs[0])], names, ["h"])
 
 
 def _build_jacobian(pattern: _Pattern) -> ca.Function:
     inputs, outputs = pattern.expressions
-    second = OF_SECOND[: len(inputs) - len(INPUTS)]
-    by = ("actuated", "passive", "twists", "zero", "nuisance", *second)
-    labels = ["h", *(f"by_{name}" for name in by)]
+    second = SECOND_INPUTS[: len(inputs) - len(INPUTS)]
+    variables = ("actuated", "passive", "twists", "zero", "nuisance", *second)
+    labels = ["h", *(f"by_{name}" for name in variables)]
     return ca.Function("jacobian", inputs, outputs, [*INPUTS, *second], labels)
 
 
 def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
-    """Inputs and outputs: h; ∂h by actuated, passive, twists, reference drives and nuisance.
+    """Inputs and outputs of the compiled functions, as in `CompiledReading.jacobian`.
 
-    For a pair, coordinates in the second posture and ∂h by them follow.
+    Each frame contributes fᵀ ∂p + mᵀ ∂φ to the derivatives, with f and m the force and moment that
+    are equivalent to the derivative of the sensor's expression with respect to its pose.
     """
     robot = pattern.robot
     here: RobotFunctions = robot_functions(robot)
@@ -180,9 +184,10 @@ def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
         [*(s for pose in poses for s in (pose.rotation, pose.position)), constants, nuisance],
         [h, *(v for wrench in wrenches for v in wrench), ca.jacobian(h, nuisance)],
     )
-    at = [machine.tree.frame_pose(frame) for machine, frame in trees]
-    values = local(*(s for pose in at for s in (pose.rotation, pose.position)), constants, nuisance)
-    value, by_unknowns = values[0], values[-1]
+    actual_poses = [machine.tree.frame_pose(frame) for machine, frame in trees]
+    arguments = (s for pose in actual_poses for s in (pose.rotation, pose.position))
+    values = local(*arguments, constants, nuisance)
+    value, by_nuisance = values[0], values[-1]
     n_d, n_p = here.actuated.numel(), here.passive.numel()
     by_zero, by_twists = ca.SX(1, n_d), ca.SX(1, here.n_twists)
     by_coordinates = {m: (ca.SX(1, n_d), ca.SX(1, n_p)) for m, _ in trees if m is not there}
@@ -194,10 +199,10 @@ def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
         if machine is there:
             by_zero += actuated
         else:
-            before = by_coordinates[machine]
-            by_coordinates[machine] = before[0] + actuated, before[1] + passive
+            by_actuated, by_passive = by_coordinates[machine]
+            by_coordinates[machine] = by_actuated + actuated, by_passive + passive
     inputs = [*here.symbols, there.actuated, constants, nuisance]
-    outputs = [value, *by_coordinates[here], by_twists, by_zero, by_unknowns]
+    outputs = [value, *by_coordinates[here], by_twists, by_zero, by_nuisance]
     if pattern.pairs:
         inputs += [here.second.actuated, here.second.passive]
         outputs += by_coordinates[here.second]
@@ -207,12 +212,11 @@ def _express(pattern: _Pattern) -> tuple[list[ca.SX], list[ca.SX]]:
 def _sensor_expression(
     pattern: _Pattern, constants: ca.SX, nuisance: ca.SX
 ) -> tuple[list[Pose], ca.SX]:
-    """Symbols of a sensor's frames, and its reading as an expression of them."""
-    parts = [
+    """Symbols of the poses of a sensor's frames, and its reading as an expression of them."""
+    frames, at_zero, second = (
         [Pose(ca.SX.sym("rotation", 3, 3), ca.SX.sym("position", 3)) for _ in names]
         for names in (pattern.frames.in_posture, pattern.frames.at_zero, pattern.frames.in_second)
-    ]
-    frames, at_zero, second = parts
+    )
     h = express_reading(
         pattern.robot, pattern.sensor, frames, at_zero, constants, nuisance, second=second
     )
@@ -229,25 +233,25 @@ def express_reading(
     *,
     second: Sequence[Pose] = (),
 ) -> ca.SX:
-    """Reading with the gauge zero at 0: the sensor's expression under the effects on readings.
+    """Reading with the gauge zero at 0: the sensor's expression, modified by effects on readings.
 
     Args:
         robot: The robot.
         sensor: The sensor.
         frames: Poses of its frames in the posture.
-        at_zero: Poses of its frames in the zero posture.
+        at_zero: Poses of its frames in the reference posture.
         constants: Constants of the sensor, then the conditions of the reading.
         nuisance: Nuisance parameters of the sensor, then those of the effects.
         second: Poses of its frames in the second posture of a pair.
     """
     names = reading_conditions(robot, sensor)
     sizes = [condition_size(robot, c) for c in names]
-    n = constants.numel() - sum(sizes)
-    values = ca.vertsplit(constants, np.cumsum([0, n, *sizes]).tolist())
+    n_constants = constants.numel() - sum(sizes)
+    values = ca.vertsplit(constants, np.cumsum([0, n_constants, *sizes]).tolist())
     conditions = dict(zip(names, values[1:], strict=True))
     first = len(sensor.nuisance_parameters)
-    of_sensor: dict[str, ca.SX] = {c: conditions[c] for c in sensor_conditions(sensor)}
-    view = View(frames, at_zero, values[0], nuisance[:first], of_sensor, second)
+    seen: dict[str, ca.SX] = {c: conditions[c] for c in sensor_conditions(sensor)}
+    view = View(frames, at_zero, values[0], nuisance[:first], seen, second)
     reading = sensor.expression(view, robot)
     for effect in reading_effects(robot):
         errors = {e.name: nuisance[first + i] for i, e in enumerate(effect.setup_errors)}
@@ -257,14 +261,14 @@ def express_reading(
 
 
 def reading_conditions(robot: Robot, sensor: Sensor) -> tuple[Condition, ...]:
-    """Conditions on which the reading of a sensor depends, by itself or by effects."""
+    """Conditions on which the reading of a sensor depends directly or through effects."""
     needed = {c for effect in reading_effects(robot) for c in effect.conditions}
     needed |= set(sensor_conditions(sensor))
     return tuple(c for c in NEUTRAL if c in needed)
 
 
 def _probe(pattern: _Pattern) -> float:
-    """Reading of a sensor at fixed arguments: equal for equal expressions."""
+    """Reading of a sensor at fixed arguments, which is equal for equal expressions."""
     constants = ca.SX.sym("constants", pattern.n_constants)
     nuisance = ca.SX.sym("nuisance", len(pattern.nuisance_parameters))
     poses, h = _sensor_expression(pattern, constants, nuisance)
@@ -275,7 +279,10 @@ def _probe(pattern: _Pattern) -> float:
 
 
 def _wrench(h: ca.SX, pose: Pose) -> tuple[ca.SX, ca.SX]:
-    """Derivatives of a reading by a pose as force and moment, in the world."""
+    """Derivative of a reading with respect to a pose, as force and moment in the world frame.
+
+    f = ∂h/∂p, and m = ∂h/∂φ for a rotation φ of the frame about its origin.
+    """
     force = ca.jacobian(h, pose.position).T
     by_rotation = ca.reshape(ca.jacobian(h, ca.vec(pose.rotation)), 3, 3)
     moment = [ca.dot(by_rotation, ca.skew(ca.SX(np.eye(3)[i])) @ pose.rotation) for i in range(3)]

@@ -1,4 +1,4 @@
-"""Direction of a plunger: an axis of the world or a vector, square to the leg that it touches."""
+"""Direction of a plunger: an axis of the world frame or a vector, perpendicular to its leg."""
 
 from __future__ import annotations
 
@@ -17,35 +17,35 @@ DIRECTIONS: dict[str, tuple[float, float, float]] = {
     "-y": (0.0, -1.0, 0.0),
     "-z": (0.0, 0.0, -1.0),
 }
-"""Names of measured directions, and their unit vectors in the world."""
+"""Unit vectors of measured directions in the world frame, by name."""
 
 Direction = str | tuple[float, float, float]
-"""A name of `DIRECTIONS`, or a vector in the world, of any length."""
+"""Name of `DIRECTIONS`, or vector in the world frame, of any length."""
 
 PARALLEL_DEG = 1.0
-"""Angle to a leg below which a direction counts as along it."""
+"""Angle to a leg below which a direction counts as along the leg."""
 
 
 def direction_vector(direction: Direction) -> Array:
-    """Unit vector of a growing reading in the world, shape (3,); 0 for the vector 0."""
+    """Unit vector of a growing reading in the world frame, shape (3,); 0 for the vector 0."""
     vector = np.array(DIRECTIONS[direction] if isinstance(direction, str) else direction)
     if isinstance(direction, str) or not vector.any():
         return vector
-    vector = vector / np.abs(vector).max()  # its square is not too large for a number
+    vector = vector / np.abs(vector).max()  # avoids an overflow of the square
     return np.asarray(vector / np.linalg.norm(vector))
 
 
 def direction_name(direction: Direction) -> str:
-    """Name of a direction, or its vector in brackets."""
+    """Name of a direction, or its vector in parentheses."""
     if isinstance(direction, str):
         return direction
     return f"({', '.join(f'{v:g}' for v in direction)})"
 
 
 def check_direction(direction: Direction, leg: Leg, largest_deg: float, *, where: str) -> None:
-    """Refuse an unknown direction, and a gauge that does not measure square to the leg.
+    """Refuse an unknown direction, and a direction that is not square to the leg.
 
-    The reading of an oblique plunger also changes when the leg moves along itself.
+    The reading of an oblique plunger also changes when the leg moves along its axis.
 
     Args:
         direction: Direction of the plunger.
@@ -54,7 +54,8 @@ def check_direction(direction: Direction, leg: Leg, largest_deg: float, *, where
         where: File and key, for messages.
 
     Raises:
-        SessionError: With the angle to the leg, and the directions that are square to it.
+        SessionError: If the direction is unknown or oblique; states the angle to the leg and the
+            directions that are square to it.
     """
     if isinstance(direction, str) and direction not in DIRECTIONS:
         raise SessionError(
@@ -67,28 +68,28 @@ def check_direction(direction: Direction, leg: Leg, largest_deg: float, *, where
             where=where,
         )
 
-    def angle(axis: ArrayLike) -> float:
-        return float(np.degrees(np.arccos(np.clip(np.dot(axis, leg.axis), -1.0, 1.0))))
+    def angle_to_leg(vector: ArrayLike) -> float:
+        return float(np.degrees(np.arccos(np.clip(np.dot(vector, leg.axis), -1.0, 1.0))))
 
-    to_leg = angle(direction_vector(direction))
-    if abs(to_leg - 90.0) <= largest_deg:
+    angle = angle_to_leg(direction_vector(direction))
+    if abs(angle - 90.0) <= largest_deg:
         return
-    square = [n for n, a in DIRECTIONS.items() if abs(angle(a) - 90.0) <= largest_deg]
+    square = [n for n, a in DIRECTIONS.items() if abs(angle_to_leg(a) - 90.0) <= largest_deg]
     choice = f"; square to it: {', '.join(square)}" if square else ""
-    acute, named = min(to_leg, 180.0 - to_leg), f"'{direction_name(direction)}'"
+    acute, name = min(angle, 180.0 - angle), direction_name(direction)
     if acute < PARALLEL_DEG:
-        problem = f"{named} is along leg {leg.name}; a gauge measures across it{choice}"
+        problem = f"'{name}' is along leg {leg.name}; a gauge measures across it{choice}"
     else:
         problem = (
-            f"{named} is at {acute:.1f}° to leg {leg.name} in the mechanical zero; expected "
+            f"'{name}' is at {acute:.1f}° to leg {leg.name} in the mechanical zero; expected "
             f"a direction square to the leg, to within {largest_deg:g}°{choice}"
-            + ("" if square else _crooked(leg))
+            + ("" if square else _oblique_leg_hint(leg))
         )
     raise SessionError(problem, where=where)
 
 
-def _crooked(leg: Leg) -> str:
-    """Hint for a leg that lies along no axis of the world."""
+def _oblique_leg_hint(leg: Leg) -> str:
+    """Hint for a leg that is not along an axis of the world frame."""
     along = ", ".join(f"{v:.3f}" for v in leg.axis)
     return (
         f". In the mechanical zero the leg lies along ({along}): where it should lie along an axis "

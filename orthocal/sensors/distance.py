@@ -1,11 +1,12 @@
-"""Distance between two places at which the tool printed or marked, measured by a calliper.
+"""Distance between two positions at which the tool printed or marked, measured by a calliper.
 
-A reading belongs to a pair of postures, that of its row and that in the column `minus`. With p and
-q the tool in both, w the width of the pillar that the calliper includes and s the error of scale,
+A reading belongs to a pair of postures: the posture of its row and the one in the column `minus`.
+With p and q the tool positions in both, w the width of the pillar that the calliper includes, and s
+the scale error of calliper and print,
 
     h = (1 + s) (|p − q| + w)
 
-The distance is absolute. The scale is that of the calliper and of the shrinkage of the print.
+The distance is absolute. The scale error of the print is its shrinkage.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from orthocal.sensors.protocol import (
 from orthocal.units import MM, read_limit, show_limit, tidy, to_mm
 
 LARGEST_MM = 5000.0
-"""Largest distance and width; a larger one has a wrong unit."""
+"""Largest accepted distance and width, [mm]; a larger one has a wrong unit."""
 
 Width = Annotated[Number, Field(ge=-LARGEST_MM, le=LARGEST_MM)]
 Tolerance = Annotated[Number, Field(ge=0.0, le=LARGEST_MM)]
@@ -44,15 +45,17 @@ class DistanceKeys(SetupKeys):
     """Keys of a setup of distances, as in a session.yaml."""
 
     width_mm: Width = 0.0
-    """Width of the pillar that the calliper includes, as measured."""
+    """Measured width of the pillar that the calliper includes."""
     width_tolerance_mm: Tolerance = 0.0
+    """Tolerance of the width; 0 if it is known."""
     scale_tolerance: Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)] = show_limit(SCALE)
-    """Of the calliper and of the shrinkage of the print; setups with one gauge share the error."""
+    """Tolerance of the scale of calliper and print, dimensionless; setups with one gauge share the
+    error."""
 
 
 @dataclass(frozen=True, slots=True)
 class Distance(ToolSensor):
-    """A distance between the tool's positions in two postures."""
+    """Distance between the tool positions in two postures."""
 
     width: float = 0.0
     """Width of the pillar, [m]."""
@@ -91,13 +94,13 @@ class Distance(ToolSensor):
         return keys
 
     def describe(self) -> str:
-        """Kind of distance."""
+        """Short description with the width of the pillar."""
         beyond = f", over a pillar of {self.width / MM:g} mm" if self.width else ""
         return f"printed distance{beyond}"
 
     @property
     def mounting_steps(self) -> tuple[str, ...]:
-        """Steps of the operator."""
+        """Instructions for the operator."""
         return (
             "Print or mark the object at the positions of both postures, and let it cool down.",
             "Measure the distance of both places by a calliper. The reading is what the calliper "
@@ -105,18 +108,18 @@ class Distance(ToolSensor):
         )
 
     def frames(self, robot: Robot) -> Frames:
-        """The tool's frame in both postures."""
+        """Frame of the tool in both postures."""
         tool = (require_tcp(robot).frame,)
         return Frames(tool, in_second=tool)
 
     def constants(self, robot: Robot) -> Array:
-        """Width (1)."""
+        """Width of the pillar (1), [m]."""
         del robot
         return np.array([self.width])
 
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
-        """Width and scale; those with a standard deviation above 0."""
+        """Width and scale, if their standard deviation is above 0."""
         parameters = (
             NuisanceParameter("width", "m", self.width_std, nominal=self.width),
             NuisanceParameter("scale", "1", self.scale_std, of_gauge=True),
@@ -124,7 +127,7 @@ class Distance(ToolSensor):
         return tuple(p for p in parameters if p.prior_std > 0.0)
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
-        """Length that the calliper shows, [m]."""
+        """Reading of the calliper, [m]."""
         del robot
         errors = {p.name: view.nuisance[i] for i, p in enumerate(self.nuisance_parameters)}
         (here,), (there,) = view.frames, view.second
@@ -133,7 +136,7 @@ class Distance(ToolSensor):
         return ca.SX((1.0 + errors.get("scale", 0.0)) * shown)
 
     def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
-        """Tool in K postures; there is nothing to touch."""
+        """Tool positions in K postures; nothing is touched."""
         del at_zero, robot
         points = frames[0][:, :3, 3]
         problems = [""] * len(points)

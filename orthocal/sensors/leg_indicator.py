@@ -1,15 +1,16 @@
-"""An indicator on the base that measures a leg: its line, or a round rod with a blade or a ball.
+"""Indicator on the base that measures the centre line of a leg, or a rod with a blade or a ball.
 
-The line model is the paper's. The gauge touches the leg where its line, from root to tip, crosses
-the plane of the section, like an edge across leg and plunger. If the plunger is square to the leg,
-the reading is the coordinate of that point along the direction of the plunger:
+The line model is that of the paper. The gauge touches the leg where its centre line, from root to
+tip, crosses the plane of the section. For a plunger square to the leg the reading is the coordinate
+of this point along the plunger:
 
     h = d · (root + t (tip − root)),  t = (c − a · root)/(a · (tip − root))
 
-with a the leg's nominal axis and c the plane: a world coordinate, or counted from the root in the
-reference posture (the paper's X-leg midpoint, section 3.2). It is a blade on a rod without a
-radius. At reading 0 the tip on a rod is on the axis of the nominal rod in the mechanical zero, at
-the section of the setup; the gauge zero contains its distance from there along the plunger.
+with d the direction of the plunger, a the nominal axis of the leg and c the coordinate of the plane
+along a. c refers to the world origin, or to the root in the reference posture (the paper's X-leg
+midpoint, section 3.2). The model equals a blade on a rod of radius 0. At reading 0 the tip is on
+the axis of the nominal rod in the mechanical zero, at the section of the setup. The gauge zero
+contains the actual distance of the tip from this point along the plunger.
 """
 
 from __future__ import annotations
@@ -55,18 +56,18 @@ SectionForm = Literal["coordinate_mm", "from_root_mm", "fraction"]
 """Key that states a section."""
 
 OBLIQUITY_DEG = {"line": 1.0, "ball": 30.0, "blade": 10.0}
-"""Largest deviation of a plunger from square to the nominal leg at the mechanical zero. A line has
-no surface for an oblique plunger. A rod pushes the plunger aside, and a blade touches with its
-back."""
+"""Largest deviation of a plunger from square to the nominal leg in the mechanical zero, [°]. A line
+has no surface for an oblique plunger. At larger angles a rod pushes the plunger aside, and a blade
+touches with its back."""
 
 LARGEST_BESIDE_MM = 500.0
-"""Largest displacement across the leg; a larger one has a wrong unit."""
+"""Largest accepted displacement across the leg, [mm]; a larger one has a wrong unit."""
 
 EDGE = Tip("blade", 0.0)
-"""Tip of the line model and of virtual sensors: a view along the plunger."""
+"""Tip of the line model and of virtual sensors: an edge across leg and plunger."""
 
-NOT_ACROSS = 1e-5
-"""Largest component of `beside` along leg or plunger, [m]: rounding."""
+BESIDE_ROUNDING = 1e-5
+"""Largest component of `beside` along leg or plunger that may be a rounding error, [m]."""
 
 Millimetres = Annotated[Number, Field(ge=-LARGEST_BESIDE_MM, le=LARGEST_BESIDE_MM)]
 
@@ -77,11 +78,15 @@ class SectionKeys(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     coordinate_mm: Number | None = None
+    """World coordinate along the axis of the leg."""
     from_root_mm: Number | None = None
+    """Distance from the root in the mechanical zero."""
     fraction: Number | None = None
+    """Distance from the root in the mechanical zero, as a fraction of the leg length."""
 
     @model_validator(mode="after")
-    def _one_form(self) -> SectionKeys:
+    def _require_one_form(self) -> SectionKeys:
+        """Refuse several forms, or none."""
         forms = get_args(SectionForm)
         stated = [k for k in forms if getattr(self, k) is not None]
         if len(stated) != 1:
@@ -97,17 +102,18 @@ class LegKeys(MountingKeys, SetupKeys):
     direction: str | Annotated[list[Number], Field(min_length=3, max_length=3)]
     section: SectionKeys
     touches: str | None = None
-    """Rod of the leg that the tip touches; by default the line between the rods."""
+    """Rod of the leg that the tip touches; None for the centre line between the rods."""
     tip: TipKeys | None = None
     beside_mm: Annotated[list[Millimetres], Field(min_length=3, max_length=3)] | None = None
-    """Displacement of the tip from the rod in the mechanical zero: across leg and plunger, in the
-    world. For readings in postures in which the rod lies elsewhere."""
+    """Displacement of the tip from the rod in the mechanical zero, across leg and plunger, in the
+    world frame. It is needed if the rod is displaced by this amount in the postures to read."""
 
     @field_validator("direction", mode="before")
     @classmethod
-    def _name_or_vector(cls, value: object) -> object:
-        vector = isinstance(value, list) and len(value) == 3 and all(map(_is_number, value))
-        if not vector and not isinstance(value, str):
+    def _require_name_or_vector(cls, value: object) -> object:
+        """Refuse a direction that is neither text nor three numbers."""
+        is_vector = isinstance(value, list) and len(value) == 3 and all(map(_is_number, value))
+        if not is_vector and not isinstance(value, str):
             raise ValueError(
                 f"found {value}; expected one of {', '.join(DIRECTIONS)}, or a vector of three "
                 "numbers such as [0, 1, 1]"
@@ -139,33 +145,33 @@ class Section:
         return {self.form: self.value if self.form == "fraction" else to_mm(self.value)}
 
     def describe(self) -> str:
-        """The position in words."""
+        """Description of the position."""
         if self.form == "fraction":
-            return f"{self.value:g} of its length"
+            return f"{self.value:g} of its length from the slide"
         from_root = " from its hinge on the slide" if self.form == "from_root_mm" else ""
         return f"{'' if from_root else 'coordinate '}{self.value / MM:g} mm{from_root}"
 
 
 @dataclass(frozen=True, slots=True)
 class LegIndicator:
-    """An indicator on the line of a leg, or with a blade on one of its rods."""
+    """Indicator on the centre line of a leg, or with a blade on one of its rods."""
 
     leg: str
     direction: Direction
-    """Direction of a growing reading: x, y, z, -x, -y or -z of the world, or a vector."""
+    """Direction of a growing reading: x, y, z, -x, -y or -z of the world frame, or a vector."""
     section: Section
     mounting: Mounting = USUAL
     rod: str | None = None
-    """Rod that it touches; None for the line of the leg."""
+    """Rod that the tip touches; None for the centre line of the leg."""
     tip: Tip = EDGE
     beside: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Displacement of the tip from the nominal rod in the mechanical zero, [m]."""
+    """Displacement of the tip from the nominal rod in the mechanical zero, shape (3,), [m]."""
 
     kind: ClassVar[str] = "leg"
     keys: ClassVar[type[SetupKeys]] = LegKeys
     ideal: ClassVar[str] = "parallel"
     touch: ClassVar[Callable[..., ca.SX]] = touch_by_blade
-    """Reading of its tip on a rod."""
+    """Function of the reading of the tip on a rod."""
 
     def __post_init__(self) -> None:
         if (self.tip.form == "ball") != isinstance(self, BallIndicator):
@@ -176,10 +182,10 @@ class LegIndicator:
         """Build from the keys of a session.yaml.
 
         Raises:
-            SessionError: If a rod is touched without a tip, or a line is displaced.
+            SessionError: If a rod is stated without a tip, or a displacement without a rod.
         """
-        d = keys.direction
-        direction = d if isinstance(d, str) else (d[0], d[1], d[2])
+        stated = keys.direction
+        direction = stated if isinstance(stated, str) else (stated[0], stated[1], stated[2])
         section, mounting = Section.from_keys(keys.section), Mounting.from_keys(keys)
         indicator = LegIndicator(keys.leg, direction, section, mounting)
         if keys.touches is None:
@@ -196,7 +202,13 @@ class LegIndicator:
     def on_rod(
         self, rod: str, tip: Tip, beside: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ) -> LegIndicator:
-        """The indicator with a tip on one of the leg's rods."""
+        """Indicator with a tip on one of the leg's rods.
+
+        Args:
+            rod: Name of the rod.
+            tip: The tip.
+            beside: Displacement of the tip from the nominal rod, shape (3,), [m].
+        """
         kind = BallIndicator if tip.form == "ball" else LegIndicator
         return kind(self.leg, self.direction, self.section, self.mounting, rod, tip, beside)
 
@@ -212,10 +224,10 @@ class LegIndicator:
         return keys
 
     def require_fit(self, robot: Robot, *, where: str) -> None:
-        """Refuse a leg, rod, direction or section that the robot does not have.
+        """Refuse a leg, rod, direction or section that does not fit the robot.
 
         Raises:
-            SessionError: Naming the key.
+            SessionError: If the setup does not fit; names the key.
         """
         if not robot.legs:
             raise SessionError(
@@ -242,13 +254,14 @@ class LegIndicator:
             self._require_rod(self.rod, robot, where)
 
     def _require_rod(self, rod: str, robot: Robot, where: str) -> None:
+        """Refuse an unknown rod, and a displacement that is not across leg and plunger."""
         rods, side = robot.legs[self.leg].rods, self._side(robot)
         if rod not in rods:
             hint = f"; rods: {', '.join(rods)}" if rods else ": it has none in the robot's YAML"
             raise SessionError(
                 f"'{rod}' is not a rod of leg {self.leg}{hint}", where=f"{where}.touches"
             )
-        if np.abs(np.cross(self.beside, side)).max() > NOT_ACROSS:
+        if np.abs(np.cross(self.beside, side)).max() > BESIDE_ROUNDING:
             stated = ", ".join(f"{v / MM:g}" for v in self.beside)
             across = ", ".join(f"{v:.3g}" for v in side)
             raise SessionError(
@@ -258,11 +271,11 @@ class LegIndicator:
 
     @property
     def place(self) -> tuple[str, str]:
-        """The leg."""
+        """Measured leg."""
         return "leg", self.leg
 
     def describe(self) -> str:
-        """Leg, direction and section; rod and tip."""
+        """Short description with leg, direction and section, and with rod and tip."""
         direction = direction_name(self.direction)
         words = f"leg {self.leg}, gauge in {direction}, at {self.section.describe()}"
         if self.rod is not None:
@@ -275,15 +288,20 @@ class LegIndicator:
         return words
 
     def frames(self, robot: Robot) -> Frames:
-        """Ends of the line; the leg's root in the reference posture for sections from the root."""
+        """Ends of the leg or rod, and the leg's root in the reference posture.
+
+        The root is included only if drives alone move it.
+        """
         leg = robot.legs[self.leg]
         line = leg if self.rod is None else leg.rods[self.rod]
         return Frames((line.root, line.tip), (leg.root,) if leg.root_driven else ())
 
     def constants(self, robot: Robot) -> Array:
-        """Direction (3), plane (1), 1 if it counts from the root else 0, axis of the leg (3).
+        """Constants of the expression, shape (15,), [m].
 
-        Then blade edge (3), tip across the leg (3) and radii of rod and tip (1).
+        Direction (3), plane of the section (1), 1 if the plane refers to the root and 0 otherwise,
+        axis of the leg (3), edge of the blade (3), position of the tip across the leg (3), and sum
+        of the radii of rod and tip (1).
         """
         leg = robot.legs[self.leg]
         plane, from_root = self.plane(robot)
@@ -291,10 +309,10 @@ class LegIndicator:
         if self.rod is not None:
             rod = leg.rods[self.rod]
             radius = rod.radius + self.tip.radius
-            # on the nominal rod in the mechanical zero
-            at = plane + (float(leg.axis @ leg.reference_root) if from_root else 0.0)
+            # point of the nominal rod in the plane of the section, in the mechanical zero
+            coordinate = plane + (float(leg.axis @ leg.reference_root) if from_root else 0.0)
             along = rod.reference_tip - rod.reference_root
-            share = (at - leg.axis @ rod.reference_root) / (leg.axis @ along)
+            share = (coordinate - leg.axis @ rod.reference_root) / (leg.axis @ along)
             point = rod.reference_root + share * along
             across = point - (leg.axis @ point) * leg.axis + self.beside
         direction, side = direction_vector(self.direction), self._side(robot)
@@ -306,7 +324,7 @@ class LegIndicator:
         return self.mounting.nuisance_parameters(ball=self.tip.form == "ball")
 
     def aligned_to(self, robot: Robot) -> Mapping[str, Sensor]:
-        """Virtual sensor of the lateral position: the operator centres a ball on the rod."""
+        """Virtual sensor of the lateral position of a ball; empty for other tips."""
         if self.tip.form != "ball":
             return {}
         x, y, z = self._side(robot).tolist()
@@ -327,7 +345,10 @@ class LegIndicator:
         return ca.SX(gauge.scale * reading)
 
     def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
-        """Points in which the tip touches the rod's surface, or the line the section's plane."""
+        """Points of contact in K postures.
+
+        These are points of the rod's surface, or of the centre line in the plane of the section.
+        """
         constants = self.constants(robot)
         direction, axis, side, start = _place(constants, [pose[:3, 3] for pose in at_zero])
         roots, ends = (pose[:, :3, 3] for pose in frames)
@@ -346,10 +367,10 @@ class LegIndicator:
             tip = TouchingTip(
                 self.tip.radius, None if self.tip.form == "ball" else side, self.tip.width
             )
-            points, problems = self._meet(roots, ends, start, direction, side, constants[14])
+            points, problems = self._rod_contact(roots, ends, start, direction, side, constants[14])
         return Contact(points, direction, axis, problems, "section", tip)
 
-    def _meet(
+    def _rod_contact(
         self,
         roots: Array,
         ends: Array,
@@ -358,66 +379,86 @@ class LegIndicator:
         side: Array,
         radius: float,
     ) -> tuple[Array, list[str]]:
-        """Points of contact in K postures, (K, 3), and reasons why the tip cannot touch."""
+        """Points of contact with a rod in K postures.
+
+        Args:
+            roots: Roots of the rod, shape (K, 3), [m].
+            ends: Far ends of the rod, shape (K, 3), [m].
+            start: Position of the tip at reading 0, shape (3,), [m].
+            direction: Unit vector of the plunger, shape (3,).
+            side: Unit vector across leg and plunger, shape (3,).
+            radius: Sum of the radii of rod and tip, [m].
+
+        Returns:
+            Points of the rod's surface, shape (K, 3), [m], and reasons why the tip cannot touch.
+        """
         along = ends - roots
         lengths = np.linalg.norm(along, axis=1)
         units = along / lengths[:, None]
-        h = np.asarray(_touching(self.tip.form)(roots.T, along.T, radius, start, direction, side))[
-            0
-        ]
-        apart = start - roots
+        touch = _touch_function(self.tip.form)
+        h = np.asarray(touch(roots.T, along.T, radius, start, direction, side))[0]
         across = np.cross(units, direction)
-        lateral = np.einsum("ki,ki->k", across, apart) / np.linalg.norm(across, axis=1)
+        lateral = np.einsum("ki,ki->k", across, start - roots) / np.linalg.norm(across, axis=1)
         centres = start + h[:, None] * direction
         if self.tip.form == "blade":
-            # the edge passes a radius from the rod's axis, along both their normal
+            # the edge is a radius away from the rod's axis, along the normal of both
             normals = np.cross(side, units)
             normals *= (np.sign(normals @ direction) / np.linalg.norm(normals, axis=1))[:, None]
             edges = np.broadcast_to(side, units.shape)
             frames = np.stack([edges, -units, normals], axis=2)
             shifts = np.linalg.solve(frames, (roots - centres)[:, :, None])[:, :, 0]
-            feet, off = roots + shifts[:, 1:2] * units, np.abs(shifts[:, 0])
+            feet, off_middle = roots + shifts[:, 1:2] * units, np.abs(shifts[:, 0])
         else:
             feet = roots + np.einsum("ki,ki->k", centres - roots, units)[:, None] * units
-            normals, off = centres - feet, np.zeros(len(roots))
+            normals, off_middle = centres - feet, np.zeros(len(roots))
             normals /= np.linalg.norm(normals, axis=1)[:, None]
         surface = feet + (radius - self.tip.radius) * normals
         distances = np.einsum("ki,ki->k", feet - roots, units)
         problems = []
         for k, distance in enumerate(distances.tolist()):
-            problem = ""
             if not np.isfinite(h[k]):
                 surface[k] = start
-                problem = (
+                problems.append(
                     f"the ball would pass the rod: it is {abs(lateral[k]) / MM:.1f} mm beside its "
                     f"axis, and they touch up to {radius / MM:.1f} mm"
                 )
-            elif off[k] > 0.5 * self.tip.width and self.tip.form == "blade":
-                problem = (
-                    f"the blade would slide off: it would touch {off[k] / MM:.1f} mm from its "
-                    f"middle, and is {self.tip.width / MM:.1f} mm wide"
-                )
-            elif not 0.0 <= distance <= lengths[k]:
-                problem = (
-                    f"the gauge would touch at {distance / MM:.1f} mm from the root; the rod "
-                    f"reaches from 0 to {lengths[k] / MM:.1f} mm"
-                )
-            problems.append(problem)
+            else:
+                problems.append(self._contact_problem(off_middle[k], distance, lengths[k]))
         return surface, problems
 
+    def _contact_problem(self, off_middle: float, distance: float, length: float) -> str:
+        """Reason why the tip cannot touch a rod; empty if it can.
+
+        Args:
+            off_middle: Distance of the contact from the middle of the blade, [m].
+            distance: Distance of the contact from the root of the rod, [m].
+            length: Length of the rod, [m].
+        """
+        if off_middle > 0.5 * self.tip.width and self.tip.form == "blade":
+            return (
+                f"the blade would slide off: it would touch {off_middle / MM:.1f} mm from its "
+                f"middle, and is {self.tip.width / MM:.1f} mm wide"
+            )
+        if not 0.0 <= distance <= length:
+            return (
+                f"the gauge would touch at {distance / MM:.1f} mm from the root; the rod reaches "
+                f"from 0 to {length / MM:.1f} mm"
+            )
+        return ""
+
     def plane(self, robot: Robot, *, where: str = "") -> tuple[float, bool]:
-        """Plane of the section across the leg, a · p = plane (+ a · root).
+        """Plane of the section across the leg, a · p = c or a · p = c + a · root.
 
         Args:
             robot: The robot.
             where: File and key, for messages.
 
         Returns:
-            Coordinate of the plane along the leg's axis a (from root to tip), [m], and whether it
-            counts from the root in the reference posture.
+            Coordinate c of the plane along the leg's axis a (from root to tip), [m], and whether it
+            refers to the root in the reference posture.
 
         Raises:
-            SessionError: If the section's form does not fit the leg.
+            SessionError: If the form of the section does not fit the leg.
         """
         leg = robot.legs[self.leg]
         form, value = self.section.form, self.section.value
@@ -425,39 +466,43 @@ class LegIndicator:
             return _coordinate_plane(leg, value, where), False
         if not leg.root_driven:
             raise SessionError(
-                f"the root of leg {leg.name} moves with passive joints; give coordinate_mm",
+                f"the root of leg {leg.name} moves with passive joints; state coordinate_mm",
                 where=where,
             )
         return (value * leg.length if form == "fraction" else value), True
 
     def _side(self, robot: Robot) -> Array:
-        """Unit vector across leg and plunger: the edge of a blade."""
+        """Unit vector across leg and plunger, shape (3,): the direction of a blade's edge."""
         side = np.cross(robot.legs[self.leg].axis, direction_vector(self.direction))
         return np.asarray(side / np.linalg.norm(side))
 
 
 class BallIndicator(LegIndicator):
-    """An indicator with a ball on a rod of a leg. Sensors of one class share one expression."""
+    """Indicator with a ball on a rod of a leg.
+
+    It has its own class, because sensors of one class share one expression.
+    """
 
     __slots__ = ()
     touch = touch_by_ball
 
 
 def _coordinate_plane(leg: Leg, value: float, where: str) -> float:
+    """Coordinate along the leg's axis of a plane at a world coordinate, [m]."""
     axis = int(np.abs(leg.axis).argmax())
     if abs(leg.axis[axis]) < 1.0 - 1e-9:
         raise SessionError(
-            f"leg {leg.name} does not lie along a world axis; give from_root_mm or fraction",
+            f"leg {leg.name} is not along a world axis; state from_root_mm or fraction",
             where=where,
         )
     return float(np.sign(leg.axis[axis]) * value)
 
 
 def _place(constants: Matrix, at_zero: Sequence[Matrix]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-    """Direction, axis of the leg, edge, and tip at reading 0, shape (3,) each.
+    """Direction, axis of the leg, edge, and position of the tip at reading 0, shape (3,) each.
 
     Args:
-        constants: As `LegIndicator.constants` returns them.
+        constants: Constants of `LegIndicator.constants`.
         at_zero: Root of the leg in the reference posture, shape (3,), [m], if drives alone move it.
     """
     direction, plane, axis = constants[:3], constants[3], constants[5:8]
@@ -467,8 +512,8 @@ def _place(constants: Matrix, at_zero: Sequence[Matrix]) -> tuple[Matrix, Matrix
 
 
 @cache
-def _touching(form: str) -> ca.Function:
-    """Reading as a function of rods, one per column."""
+def _touch_function(form: str) -> ca.Function:
+    """Reading of a form of tip as a function of rods, one per column."""
     symbols = [ca.SX.sym("s", n) for n in (3, 3, 1, 3, 3, 3)]
     touch = touch_by_ball if form == "ball" else touch_by_blade
     return ca.Function("touching", symbols, [touch(*symbols)])

@@ -1,9 +1,9 @@
 """Mounting uncertainty of a gauge: direction, section, lateral position and dial scale.
 
-Each setup has nuisance parameters with Gaussian priors: roll about the leg and pitch towards it,
-position of the section along the leg, lateral position of a ball. The scale belongs to the dial. On
-the axes of a parallel machine, readings depend on roll, pitch and section only to second order.
-Setups on one square block share its roll, up to the squareness of the block.
+Each setup has nuisance parameters with Gaussian priors: roll about the leg, pitch towards it,
+position of the section along the leg, and lateral position of a ball. The scale belongs to the
+dial. On the axes of a parallel machine, readings depend on roll, pitch and section only to second
+order. Setups on one square block share its roll, up to the squareness of the block.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from orthocal.io.documents import Name, Number
 from orthocal.sensors.protocol import NuisanceParameter
 from orthocal.units import MM, MRAD, read_limit, show_limit, tidy
 
-DIRECTION = 10 * MRAD
-"""Direction of a plunger aligned by eye, [rad]."""
+DIRECTION_STD = 10 * MRAD
+"""Prior standard deviation of the direction of a plunger aligned by eye, [rad]."""
 
-SECTION = 0.5 * MM
-"""Position measured with a ruler, along the leg and across it, [m]."""
+POSITION_STD = 0.5 * MM
+"""Prior standard deviation of a position measured with a ruler, along or across the leg, [m]."""
 
 SCALE = 0.002
-"""Scale of a dial: the lead of its rack, [1]."""
+"""Prior standard deviation of the scale of a dial, [1]: the lead of its rack."""
 
-SQUARE = 0.1 * MRAD
-"""Squareness of a block, [rad]."""
+SQUARE_STD = 0.1 * MRAD
+"""Prior standard deviation of the squareness of a block, [rad]."""
 
 LARGEST_TOLERANCE_MM = 40.0
 LARGEST_TOLERANCE_MRAD = 400.0
@@ -40,13 +40,13 @@ Milliradians = Annotated[Number, Field(ge=0.0, le=LARGEST_TOLERANCE_MRAD)]
 
 
 class MountingKeys(BaseModel):
-    """Mounting uncertainty in a session.yaml; 0 for a parameter that is known exactly."""
+    """Tolerances of a gauge's mounting in a session.yaml; 0 for a parameter without error."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
-    direction_tolerance_mrad: Milliradians = show_limit(DIRECTION) / MRAD
-    section_tolerance_mm: Millimetres = show_limit(SECTION) / MM
-    lateral_tolerance_mm: Millimetres = show_limit(SECTION) / MM
+    direction_tolerance_mrad: Milliradians = show_limit(DIRECTION_STD) / MRAD
+    section_tolerance_mm: Millimetres = show_limit(POSITION_STD) / MM
+    lateral_tolerance_mm: Millimetres = show_limit(POSITION_STD) / MM
     """Lateral position of a ball; other tips have none."""
     scale_tolerance: Annotated[Number, Field(ge=0.0, le=LARGEST_SCALE)] = show_limit(SCALE)
     """Scale of the dial: one for all setups with the same gauge."""
@@ -55,7 +55,8 @@ class MountingKeys(BaseModel):
     square_tolerance_mrad: Milliradians | None = None
 
     @model_validator(mode="after")
-    def _square_of_a_stand(self) -> MountingKeys:
+    def _require_stand(self) -> MountingKeys:
+        """Refuse a tolerance of squareness without a block."""
         if self.square_tolerance_mrad is not None and self.stand is None:
             raise ValueError("square_tolerance_mrad|found without `stand`, a square block")
         return self
@@ -63,20 +64,20 @@ class MountingKeys(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Mounting:
-    """Mounting uncertainty of a gauge: one standard deviation of each parameter."""
+    """Mounting uncertainty of a gauge: prior standard deviation of each parameter."""
 
-    direction: float = DIRECTION
+    direction: float = DIRECTION_STD
     """Roll and pitch, [rad]."""
-    section: float = SECTION
+    section: float = POSITION_STD
     """Position along the leg, [m]."""
-    lateral: float = SECTION
+    lateral: float = POSITION_STD
     """Position across leg and plunger, [m]."""
     scale: float = SCALE
     """Scale of the dial, [1]."""
     stand: str | None = None
     """Name of the square block."""
-    square: float = SQUARE
-    """Squareness of that block, [rad]."""
+    square: float = SQUARE_STD
+    """Squareness of the block, [rad]."""
 
     @staticmethod
     def from_keys(keys: Any) -> Mounting:  # noqa: ANN401 - of any setup with MountingKeys
@@ -88,7 +89,7 @@ class Mounting:
             lateral=tidy(read_limit(keys.lateral_tolerance_mm) * MM),
             scale=read_limit(keys.scale_tolerance),
             stand=keys.stand,
-            square=SQUARE if square is None else tidy(read_limit(square) * MRAD),
+            square=SQUARE_STD if square is None else tidy(read_limit(square) * MRAD),
         )
 
     def to_keys(self) -> dict[str, Any]:
@@ -106,7 +107,11 @@ class Mounting:
         return keys if self.stand is None else {**keys, "stand": self.stand}
 
     def nuisance_parameters(self, *, ball: bool) -> tuple[NuisanceParameter, ...]:
-        """Nuisance parameters with a standard deviation above 0."""
+        """Nuisance parameters with a standard deviation above 0.
+
+        Args:
+            ball: Whether the tip is a ball, which has a lateral position.
+        """
         block = None if self.stand is None else f"stand.{self.stand}"
         parameters = [
             NuisanceParameter("roll", "rad", self.direction, shared_by=block),
@@ -122,7 +127,7 @@ class Mounting:
 
 
 USUAL = Mounting()
-"""Mounting aligned by eye and ruler."""
+"""Mounting by eye and ruler."""
 
 EXACT = Mounting(0.0, 0.0, 0.0, 0.0)
 """Mounting without errors: the gauge of the paper."""
@@ -130,7 +135,7 @@ EXACT = Mounting(0.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MountedGauge:
-    """A gauge with mounting errors, as expressions."""
+    """Gauge with mounting errors, as expressions."""
 
     direction: ca.SX
     """Unit vector of the plunger, shape (3,)."""
@@ -139,7 +144,7 @@ class MountedGauge:
     displacement: ca.SX
     """Displacement of the tip from its nominal position, shape (3,), [m]."""
     scale: ca.SX
-    """Indicated over actual displacement, [1]."""
+    """Ratio of indicated to actual displacement, [1]."""
 
 
 def mount(

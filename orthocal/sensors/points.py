@@ -1,17 +1,19 @@
 """Points: coordinates of a target at the tool, from a tracker, an arm, a camera or a microscope.
 
-The instrument shows the target's position in its own frame, the station. With q the target in the
-world, t and R the pose of the station, and s the error of its scale, the reading along a unit
-vector a of the station is
+The instrument shows the position of the target in the frame of the station. With q the target in
+the world frame, t and R the pose of the station, and s the error of its scale, the reading along a
+unit vector a of the station is
 
     h = (1 + s) aᵀ Rᵀ (Eᵀ (q − e) − t)
 
-Its errors E, e turn and displace the station about the origin of the world, near the machine.
+E and e are the rotation and displacement errors of the station about the world origin, which is
+near the machine.
 
-A reading is one number here, so a setup of points is read as three sensors with orthogonal a: the
-axes of the station, or the principal axes of the covariance of a point, along which its errors are
-independent. They share the station. Its pose is a nuisance parameter: about the best fit of the
-points to the nominal machine if the frame is unknown, and about the world's frame otherwise.
+A reading is one number, so a setup of points is read as three sensors with orthogonal a. These are
+the axes of the station, or the principal axes of the covariance of a point, along which its errors
+are independent. The sensors share the station. The errors of its pose are nuisance parameters. If
+the frame is unknown, the nominal pose is the best fit of the points to the nominal machine.
+Otherwise it is the world frame.
 """
 
 from __future__ import annotations
@@ -42,11 +44,11 @@ from orthocal.sensors.protocol import (
 from orthocal.units import MM, MRAD, UM, read_limit, show_limit, tidy, to_mm
 
 LARGEST_MM = 100_000.0
-"""Largest coordinate: the reach of a laser tracker."""
+"""Largest coordinate, [mm]: the reach of a laser tracker."""
 
 ABOUT_FIT = 20 * MM, 50 * MRAD
-"""Prior standard deviations of an unknown frame about the best fit, [m] and [rad]: ten times what
-errors of the machine change in it."""
+"""Prior standard deviations of an unknown frame about the best fit, [m] and [rad]: ten times the
+changes of the fit by errors of the machine."""
 
 AXES = "xyz"
 
@@ -64,19 +66,19 @@ class _Keys(BaseModel):
 
 
 class FrameKeys(_Keys):
-    """Station at the world's frame, with tolerances."""
+    """Tolerances of a station whose frame is nominally the world frame."""
 
     tolerance_mm: Annotated[Number, Field(ge=0.0, le=1000.0)] = 0.0
     tolerance_mrad: Annotated[Number, Field(ge=0.0, le=400.0)] = 0.0
 
 
 class AxisKeys(_Keys):
-    """One of the three sensors of a setup: what a calibration records."""
+    """Coordinate axis of one of the three sensors of a setup, in the record of a calibration."""
 
     along: Annotated[list[Number], Field(min_length=3, max_length=3)]
-    """Unit vector in the station."""
+    """Unit vector in the frame of the station."""
     station_mm: Vector3
-    """Position of the station's origin in the world."""
+    """Position of the station's origin in the world frame."""
     station_rad: Annotated[list[Number], Field(min_length=3, max_length=3)]
     """Rotation vector of the station."""
 
@@ -85,14 +87,14 @@ class PointKeys(SetupKeys):
     """Keys of a setup of points, as in a session.yaml."""
 
     target_mm: Vector3 = Field(default_factory=lambda: [0.0, 0.0, 0.0])
-    """The target, from the tool centre point, in the tool's frame."""
+    """Position of the target, from the tool centre point, in the tool's frame."""
     frame: Literal["unknown"] | FrameKeys = "unknown"
     station: Name | None = None
     """Name of the station, if several setups share its pose."""
     scale_tolerance: Annotated[Number, Field(ge=0.0, le=0.4)] = 0.0
     covariance_um2: Covariance | None = None
-    """Covariance of the coordinates of a point in the station; by default that of the gauge's
-    sigma_mm along each axis."""
+    """Covariance of the coordinates of a point in the frame of the station; by default independent
+    coordinates with the gauge's sigma_mm."""
     axis: AxisKeys | None = None
 
 
@@ -101,17 +103,18 @@ class Points(ToolSensor):
     """Coordinates of a target at the tool, or the coordinate along one axis of the station."""
 
     target: Triple = (0.0, 0.0, 0.0)
-    """Target, from the tool centre point, in the tool's frame, [m]."""
+    """Position of the target, from the tool centre point, in the tool's frame, [m]."""
     frame_std: tuple[float, float] = ABOUT_FIT
     """Prior standard deviations of the station's position and rotation, [m] and [rad]."""
     station: str | None = None
     scale_std: float = 0.0
     covariance: tuple[Triple, Triple, Triple] | None = None
-    """Covariance of the coordinates of a point, [m²]; None for that of the gauge."""
+    """Covariance of the coordinates of a point, [m²]; None for the standard deviation of the
+    gauge."""
     along: Triple | None = None
-    """Unit vector of the coordinate, in the station; None for all three."""
+    """Unit vector of the coordinate in the frame of the station; None for all three coordinates."""
     position: Triple = (0.0, 0.0, 0.0)
-    """Position of the station in the world, [m]."""
+    """Position of the station in the world frame, [m]."""
     rotation: Triple = (0.0, 0.0, 0.0)
     """Rotation vector of the station, [rad]."""
 
@@ -127,7 +130,7 @@ class Points(ToolSensor):
         """Build from the keys of a session.yaml.
 
         Raises:
-            SessionError: If the covariance is none.
+            SessionError: If the covariance is not symmetric and positive definite.
         """
         frame_std = ABOUT_FIT
         if isinstance(keys.frame, FrameKeys):
@@ -176,14 +179,15 @@ class Points(ToolSensor):
 
     @property
     def in_file(self) -> Points:
-        """All three coordinates, as a session.yaml states them."""
-        none = (0.0, 0.0, 0.0)
-        return replace(self, along=None, position=none, rotation=none)
+        """Sensor of all three coordinates, as a session.yaml states it."""
+        zeros = (0.0, 0.0, 0.0)
+        return replace(self, along=None, position=zeros, rotation=zeros)
 
     def split(self) -> dict[str, tuple[Points, float | None]]:
-        """The three sensors by label, each with the standard deviation of its reading.
+        """The three sensors by label, each with the standard deviation of its reading, [m].
 
-        None stands for that of the gauge. Without correlation they read the axes of the station.
+        It is None if the standard deviation of the gauge applies. Without correlation the sensors
+        read the coordinates of the station.
         """
         if self.covariance is None:
             return {k: (replace(self, along=_unit(i)), None) for i, k in enumerate(AXES)}
@@ -199,40 +203,40 @@ class Points(ToolSensor):
         }
 
     def describe(self) -> str:
-        """Coordinate and target."""
-        target = ", ".join(f"{v / MM:g}" for v in self.target)
-        at = f"target at ({target}) mm" if any(self.target) else "target at the tool"
+        """Short description with coordinate and target."""
+        position = ", ".join(f"{v / MM:g}" for v in self.target)
+        target = f"target at ({position}) mm" if any(self.target) else "target at the tool"
         if self.along is None:
-            return f"position of a {at}"
+            return f"position of a {target}"
         axis = next((k for i, k in enumerate(AXES) if self.along == _unit(i)), None)
         if axis is not None:
-            return f"{axis} coordinate of a {at}"
-        return f"coordinate of a {at} along ({', '.join(f'{v:.3g}' for v in self.along)})"
+            return f"{axis} coordinate of a {target}"
+        return f"coordinate of a {target} along ({', '.join(f'{v:.3g}' for v in self.along)})"
 
     @property
     def mounting_steps(self) -> tuple[str, ...]:
-        """Steps that mount the target."""
+        """Instructions for mounting the target."""
         target = ", ".join(f"{v / MM:g}" for v in self.target)
         return (
-            "Set up the instrument. It must not move until all points of its setups are taken.",
+            "Set up the instrument. It must not move until all points of its setups are measured.",
             f"Mount the target at the tool, ({target}) mm from the tool centre point.",
             "Export the points with posture, x, y and z as a table for `orthocal import`, or type "
             "them into `orthocal record`.",
         )
 
     def frames(self, robot: Robot) -> Frames:
-        """The tool's frame."""
+        """Frame of the tool."""
         return Frames((require_tcp(robot).frame,))
 
     def constants(self, robot: Robot) -> Array:
-        """Coordinate axis in the world (3), station (3), target (3)."""
+        """Coordinate axis in the world frame (3), positions of station (3) and target (3), [m]."""
         del robot
         along = rotation_matrix(self.rotation) @ np.array(self.along or (0.0, 0.0, 0.0))
         return np.array([*along, *self.position, *self.target])
 
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
-        """Pose and scale of the station; those with a standard deviation above 0."""
+        """Pose and scale of the station, if their standard deviation is above 0."""
         owner = f"station.{self.station}" if self.station else None
         length, angle = self.frame_std
         parameters = (
@@ -243,19 +247,19 @@ class Points(ToolSensor):
         return tuple(p for p in parameters if p.prior_std > 0.0)
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
-        """Coordinate along its axis, [m]."""
+        """Coordinate of the target along the sensor's axis, [m]."""
         del robot
         errors = {p.name: view.nuisance[i] for i, p in enumerate(self.nuisance_parameters)}
         along, station, target = (view.constants[i : i + 3] for i in (0, 3, 6))
-        shift = ca.vertcat(*(errors.get(k, 0.0) for k in AXES))
+        displacement = ca.vertcat(*(errors.get(k, 0.0) for k in AXES))
         (tool,) = view.frames
-        seen = tool.position + tool.rotation @ target - shift
+        seen = tool.position + tool.rotation @ target - displacement
         for i in (2, 1, 0):
             seen = rotate(seen, ca.SX(np.eye(3)[i]), -ca.SX(errors.get(f"r{AXES[i]}", 0.0)))
         return ca.SX((1.0 + errors.get("scale", 0.0)) * ca.dot(along, seen - station))
 
     def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
-        """Targets in K postures."""
+        """Positions of the target in K postures."""
         del at_zero
         poses = frames[0]
         targets = poses[:, :3, 3] + poses[:, :3, :3] @ np.array(self.target)
@@ -269,7 +273,7 @@ def read_covariance(rows: Sequence[Sequence[float]]) -> tuple[Triple, Triple, Tr
     """Covariance of a point, [m²], from rows in µm².
 
     Raises:
-        SessionError: If it is not symmetric and positive definite.
+        SessionError: If the matrix is not symmetric and positive definite.
     """
     matrix = np.array(rows, dtype=np.float64)
     if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0):
@@ -284,21 +288,21 @@ def read_covariance(rows: Sequence[Sequence[float]]) -> tuple[Triple, Triple, Tr
 
 
 def fit_station(points: Array, targets: Array) -> tuple[Triple, Triple]:
-    """Station in which points fit targets in the world best (Kabsch, 1976).
+    """Pose of a station with the best fit of points to targets (Kabsch, 1976).
 
     Args:
-        points: In the station, shape (n, 3), [m].
-        targets: In the world, shape (n, 3), [m].
+        points: Points in the frame of the station, shape (n, 3), [m].
+        targets: Targets in the world frame, shape (n, 3), [m].
 
     Returns:
         Position [m] and rotation vector [rad] of the station.
 
     Raises:
-        SessionError: If the points do not determine it.
+        SessionError: If the points do not determine the pose.
     """
     seen, true = points - points.mean(axis=0), targets - targets.mean(axis=0)
-    sizes = np.linalg.svd(seen, compute_uv=False)
-    if len(points) < 3 or not sizes[1] > 1e-3 * sizes[0]:
+    singular_values = np.linalg.svd(seen, compute_uv=False)
+    if len(points) < 3 or not singular_values[1] > 1e-3 * singular_values[0]:
         raise SessionError(
             "unknown, but the points lie on a line; expected three or more points that do not",
             where="frame",
@@ -306,16 +310,12 @@ def fit_station(points: Array, targets: Array) -> tuple[Triple, Triple]:
     u, _, vh = np.linalg.svd(seen.T @ true)
     rotation = vh.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(vh.T @ u.T))]) @ u.T
     position = targets.mean(axis=0) - rotation @ points.mean(axis=0)
-    return _triple(position.tolist()), _triple(_rotation_vector(rotation).tolist())
+    return _triple(position.tolist()), _triple(pin.log3(rotation).tolist())
 
 
 def rotation_matrix(vector: Sequence[float]) -> Array:
     """Rotation matrix of a rotation vector, shape (3, 3)."""
     return np.asarray(pin.exp3(np.array(vector)))
-
-
-def _rotation_vector(matrix: Array) -> Array:
-    return np.asarray(pin.log3(matrix))
 
 
 def _unit(i: int) -> Triple:

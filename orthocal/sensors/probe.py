@@ -1,12 +1,12 @@
 """Touch probe or nozzle on a bed: drive coordinates at the trigger.
 
-Each posture holds the drive coordinates at which the probe triggered, and its reading is the height
-of the surface there, usually 0. The surface is a plane with unknown tilt, with or without a smooth
-deviation from flat. Heights count against the direction of the probe:
+Each posture consists of the drive coordinates at which the probe triggered. Its reading is the
+height of the surface there, usually 0. The surface is a plane of unknown tilt, with or without a
+smooth deviation from flat. Heights are positive against the direction of the probe:
 
     h = −(n · q)/(n · u) − f(q) − o
 
-with the notation of `tool_indicator`, and o the height at which the probe triggers.
+with the notation of `tool_indicator`, and o the trigger height of the probe.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import GaugeZero, NuisanceParameter, SetupKeys, View
 from orthocal.sensors.tool_indicator import (
-    ALIGNMENT,
+    ALIGNMENT_STD,
     LENGTH_MM,
     Artefact,
     Length,
@@ -31,15 +31,15 @@ from orthocal.sensors.tool_indicator import (
 )
 from orthocal.units import MM, MRAD, read_limit, show_limit, tidy, to_mm
 
-TRIGGER = 0.5 * MM
-"""Height of the bed at the trigger, [m]."""
+TRIGGER_STD = 0.5 * MM
+"""Prior standard deviation of the trigger height, [m]."""
 
-SMOOTH = 4
-"""Degree of the deviations of a bed from flat."""
+FORM_DEGREE = 4
+"""Largest degree of the polynomial deviations of a bed from flat."""
 
 
 class SurfaceKeys(BaseModel):
-    """Surface that is not flat."""
+    """Keys of a surface that is not flat."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
@@ -52,20 +52,20 @@ class ProbeKeys(SetupKeys):
 
     direction: Literal["x", "y", "z", "-x", "-y", "-z"] = "-z"
     surface: Literal["plane"] | SurfaceKeys = "plane"
-    direction_tolerance_mrad: Milliradians = show_limit(ALIGNMENT) / MRAD
-    trigger_tolerance_mm: Millimetres = show_limit(TRIGGER) / MM
-    """Of the height at which the probe triggers."""
+    direction_tolerance_mrad: Milliradians = show_limit(ALIGNMENT_STD) / MRAD
+    trigger_tolerance_mm: Millimetres = show_limit(TRIGGER_STD) / MM
+    """Tolerance of the trigger height."""
     tool_mm: Point = Field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Tip of the probe, from the tool centre point, in the tool's frame."""
 
 
 @dataclass(frozen=True, slots=True)
 class Probe(ToolIndicator):
-    """A probe at the tool that triggers at a surface."""
+    """Probe at the tool that triggers at a surface."""
 
     scale_std: float = 0.0
-    trigger_std: float = TRIGGER
-    """Prior standard deviation of the height at which it triggers, [m]."""
+    trigger_std: float = TRIGGER_STD
+    """Prior standard deviation of the trigger height, [m]."""
 
     kind: ClassVar[str] = "probe"
     keys: ClassVar[type[SetupKeys]] = ProbeKeys
@@ -77,14 +77,14 @@ class Probe(ToolIndicator):
     def from_keys(cls, keys: Any) -> Probe:  # noqa: ANN401 - of `keys`
         """Build from the keys of a session.yaml."""
         direction_std = tidy(read_limit(keys.direction_tolerance_mrad) * MRAD)
-        surface = Artefact("plate", direction_std=direction_std, form_degree=SMOOTH)
+        surface = Artefact("plate", direction_std=direction_std, form_degree=FORM_DEGREE)
         if isinstance(keys.surface, SurfaceKeys):
             surface = Artefact(
                 "plate",
                 length=keys.surface.length_mm * MM,
                 direction_std=direction_std,
                 form_std=tidy(read_limit(keys.surface.flat_tolerance_mm) * MM),
-                form_degree=SMOOTH,
+                form_degree=FORM_DEGREE,
             )
         x, y, z = (v * MM for v in keys.tool_mm)
         trigger = tidy(read_limit(keys.trigger_tolerance_mm) * MM)
@@ -108,12 +108,12 @@ class Probe(ToolIndicator):
         return {**keys, **({"tool_mm": [to_mm(v) for v in self.tool]} if any(self.tool) else {})}
 
     def describe(self) -> str:
-        """Direction of the probe and surface."""
+        """Short description with the direction of the probe."""
         return f"probe towards {self.direction}"
 
     @property
     def mounting_steps(self) -> tuple[str, ...]:
-        """Steps of the operator."""
+        """Instructions for the operator."""
         return (
             f"Move the probe towards {self.direction} in each posture until it triggers. Write the "
             "coordinates at the trigger as the posture, and 0 as the reading.",
@@ -121,7 +121,7 @@ class Probe(ToolIndicator):
 
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
-        """Direction and form of the surface, height of the trigger."""
+        """Direction and form of the surface, and the trigger height."""
         surface = ToolIndicator.nuisance_parameters.fget(self)  # type: ignore[attr-defined]
         trigger = (NuisanceParameter("trigger", "m", self.trigger_std),) * (self.trigger_std > 0.0)
         return (*surface, *trigger)

@@ -1,9 +1,9 @@
-"""Protocol of sensors: all that other modules know of a kind of sensor.
+"""Protocol of sensors: the interface between a kind of sensor and other modules.
 
-A reading is an expression of the poses of some frames, in the posture and (for frames that move
-with drives alone) in the reference posture, of constants of the setup and of nuisance parameters.
-The gauge zero of the setup is added, unless it is known to be 0. A reading of a pair of postures
-depends on the poses in both.
+A reading is an expression of poses of frames, constants of the setup and nuisance parameters. Poses
+are those in the posture and, for frames that drives alone move, in the reference posture. The gauge
+zero of the setup is added, unless it is known to be 0. A reading of a pair of postures depends on
+the poses in both postures.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from orthocal.robot.model import Robot
 from orthocal.units import Unit
 
 GaugeZero = Literal["free", "known"]
-"""Gauge zero of a setup: estimated from its readings, or known to be 0, so that its readings are
-absolute."""
+"""Gauge zero of a setup: estimated from its readings, or known to be 0. With a known gauge zero the
+readings are absolute."""
 
 ToolPath = Callable[..., Array]
-"""Corners of the path of the tool from one position to another, shape (3,), [m]: shape (n, 3), with
-both ends. A third argument is given for a tool that moves in a plane: a unit vector square to it,
-shape (3,)."""
+"""Function from two tool positions, shape (3,), [m], to the corners of the path between them, with
+both ends, shape (n, 3), [m]. For a tool that moves in a plane it has a third argument: the unit
+normal of the plane, shape (3,)."""
 
 DIMENSION_STEP = 1e-6
-"""Increment of a dimension for its effect on readings, [m]."""
+"""Increment of a dimension for the derivative of readings with respect to it, [m]."""
 
 LARGEST_READING = 0.3
-"""Largest reading of an indicator; no leg is as far from parallel, [m]."""
+"""Largest reading of an indicator, [m]; no leg is as far from parallel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,17 +44,17 @@ class NuisanceParameter:
     """Error of a sensor or its mounting that is estimated together with the machine."""
 
     name: str
-    """Unique within its setup, or within the setups that share it."""
+    """Name that is unique within its setup, or within the setups that share the parameter."""
     unit: Unit
     prior_std: float
-    """One standard deviation, [unit]; its mean is 0."""
+    """Prior standard deviation, [unit]; the prior mean is 0."""
     shared_by: str | None = None
-    """Name of the object at one place that setups of a session share, such as a square block; None
-    for a parameter of one setup."""
+    """Name of the object that setups share at one place, such as a square block; None for a
+    parameter of one setup."""
     of_gauge: bool = False
-    """True if all setups with the same gauge share it."""
+    """True if all setups with the same gauge share the parameter."""
     nominal: float = 0.0
-    """Quantity of which it is the error, for setups that share it, [unit]."""
+    """Nominal value of the quantity, [unit]; setups that share the parameter must agree in it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,17 +62,17 @@ class View:
     """Arguments of a sensor's expression."""
 
     frames: Sequence[Pose]
-    """Poses of its frames in the posture."""
+    """Poses of the sensor's frames in the posture."""
     at_zero: Sequence[Pose]
-    """Poses of its frames in the reference posture."""
+    """Poses of the sensor's frames in the reference posture."""
     constants: ca.SX
-    """Of its setup, shape (n_constants,)."""
+    """Constants of the setup, shape (n_constants,), [SI]."""
     nuisance: ca.SX
-    """Values of its nuisance parameters, shape (n_nuisance,), [unit]."""
+    """Values of the nuisance parameters, shape (n_nuisance,), [unit]."""
     conditions: Mapping[str, ca.SX] = field(default_factory=dict)
-    """Conditions of the reading that it names under `conditions`."""
+    """Values of the conditions that the sensor lists under `conditions`."""
     second: Sequence[Pose] = ()
-    """Poses of its frames in the second posture of a reading of a pair."""
+    """Poses of the sensor's frames in the second posture of a pair."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,9 +80,11 @@ class Frames:
     """Names of the frames on which a reading depends."""
 
     in_posture: tuple[str, ...]
+    """Frames in the posture."""
     at_zero: tuple[str, ...] = ()
+    """Frames in the reference posture."""
     in_second: tuple[str, ...] = ()
-    """Those in the second posture, for a sensor that reads pairs of postures."""
+    """Frames in the second posture, for a sensor that reads pairs of postures."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,11 +92,11 @@ class TouchingTip:
     """Tip for checks and drawings: a ball, or a blade or pin along an edge."""
 
     radius: float
-    """Of the ball or the pin, [m]; 0 for a blade's edge."""
+    """Radius of the ball or the pin, [m]; 0 for a blade's edge."""
     edge: Array | None = None
-    """Direction of the edge, a unit vector, shape (3,); None for a ball."""
+    """Unit vector of the edge, shape (3,); None for a ball."""
     width: float = 0.0
-    """Of the edge, [m]."""
+    """Width of the edge, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,23 +104,23 @@ class Contact:
     """Points of contact of a sensor in K postures, for scenes and checks."""
 
     points: Array
-    """In the world, shape (K, 3), [m]."""
+    """Points in the world frame, shape (K, 3), [m]."""
     direction: Array
-    """Of a growing reading, shape (3,)."""
+    """Unit vector of a growing reading, shape (3,)."""
     along: Array
-    """Direction along the touched surface with free space beside the sensor, shape (3,)."""
+    """Unit vector along the touched surface, with free space beside the sensor, shape (3,)."""
     problems: Sequence[str]
-    """Reason why it cannot touch, or an empty string; one for each posture."""
+    """Reason why the sensor cannot touch, or an empty string, for each posture."""
     key: str
-    """Key of the setup that says where it touches, for messages."""
+    """Key of the setup that states the place of contact, for messages."""
     tip: TouchingTip | None = None
-    """The tip, if the setup states one."""
+    """Tip, if the setup states one."""
     at_tool: bool = False
-    """True if the gauge moves with the tool: then it is behind its tip, against `direction`."""
+    """True if the gauge moves with the tool; then it is behind its tip, against `direction`."""
     fixed: Array | None = None
-    """Fixed end of a bar whose other end is the contact, in the world, shape (3,), [m]."""
+    """Fixed end of a bar whose other end is the contact, in the world frame, shape (3,), [m]."""
     surface: Array | None = None
-    """Corners of the touched surface of an artefact, in the world, shape (4, 3), [m]."""
+    """Corners of the touched surface of an artefact in the world frame, shape (4, 3), [m]."""
 
 
 class SetupKeys(BaseModel):
@@ -127,69 +129,73 @@ class SetupKeys(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     sensor: str = "leg"
-    """The kind of sensor."""
+    """Kind of sensor."""
     gauge: Name | None = None
-    """Name of the gauge; needed if the session has several."""
+    """Name of the gauge; required if the session has several."""
     postures: Annotated[list[Name], Field(min_length=1)] | None = None
-    """Postures to read, in a plan; all by default."""
+    """Postures to read in a plan; all by default."""
     aligned_at: Name | None = None
-    """Posture in which the operator aligned the gauge; by default the mechanical zero if the setup
-    reads it, otherwise the posture nearest to it."""
+    """Posture in which the operator aligned the gauge. By default it is the mechanical zero if the
+    setup reads it, otherwise the posture nearest to it."""
     zero: GaugeZero | None = None
-    """Gauge zero: estimated, or known to be 0; that of the sensor by default."""
+    """Gauge zero: estimated, or known to be 0; by default the one of the kind of sensor."""
 
 
 class Sensor(Protocol):
-    """A sensor as one setup describes it."""
+    """Sensor of one setup."""
 
     kind: ClassVar[str]
     """Name of the kind. Sensors of one kind with the same frames share one expression."""
     keys: ClassVar[type[SetupKeys]]
-    """Schema of its setups in a session.yaml."""
+    """Schema of the sensor's setups in a session.yaml."""
     ideal: ClassVar[str]
-    """State of the place without deviations, such as parallel."""
+    """State of the measured place without deviations, such as parallel."""
 
-    # conditions: ClassVar[tuple[Condition, ...]], optional: conditions of a reading on which its
+    # conditions: ClassVar[tuple[Condition, ...]], optional: conditions of a reading on which the
     # expression depends (`sensor_conditions`)
 
-    # path: ToolPath, optional: path of the tool between two of its readings; straight by default
+    # path: ToolPath, optional: path of the tool between two readings; straight by default
     # (`tool_path`)
 
-    # mounting_steps: tuple[str, ...], optional: steps that mount it in the alignment posture, for
-    # the operator (`mounting_steps`)
+    # mounting_steps: tuple[str, ...], optional: instructions for mounting the sensor in the
+    # alignment posture (`mounting_steps`)
 
-    # states_readings: ClassVar[bool], optional: whether readings are stated, not shown, so that
-    # equal ones are no sign of a dial that sticks (`states_readings`)
+    # states_readings: ClassVar[bool], optional: whether readings are prescribed, not measured. Then
+    # equal readings do not indicate a sticking dial (`states_readings`)
 
-    # reads_pairs: ClassVar[bool], optional: whether a reading belongs to a pair of postures, that
-    # of its row and that in the column `minus`; it is no difference of two readings (`reads_pairs`)
+    # reads_pairs: ClassVar[bool], optional: whether a reading belongs to a pair of postures: the
+    # posture of its row and the one in the column `minus`. It is a single reading (`reads_pairs`)
 
-    # zero: ClassVar[GaugeZero], optional: gauge zero of its setups unless they state another one;
-    # "free" by default (`default_zero`)
+    # zero: ClassVar[GaugeZero], optional: gauge zero of setups that state none; "free" by default
+    # (`default_zero`)
 
-    # largest_reading: ClassVar[float], optional: largest reading that it shows, [m]; 300 mm by
-    # default (`largest_reading`)
+    # largest_reading: ClassVar[float], optional: largest reading, [m]; 300 mm by default
+    # (`largest_reading`)
 
-    # dimensions: Mapping[str, Sensor], optional: key of a stated dimension in session.yaml, to the
-    # same sensor with a dimension that is larger by DIMENSION_STEP (`stated_dimensions`)
+    # dimensions: Mapping[str, Sensor], optional: sensors with one dimension that is larger by
+    # DIMENSION_STEP, by the key of this dimension in a session.yaml (`stated_dimensions`)
 
     @classmethod
     def from_keys(cls, keys: Any) -> Self:  # noqa: ANN401 - an instance of `keys`
         """Build the sensor from the keys of a session.yaml."""
 
     def to_keys(self) -> dict[str, Any]:
-        """Keys for a session.yaml, without those that all setups share."""
+        """Keys for a session.yaml, without those that all kinds of sensor share."""
 
     def require_fit(self, robot: Robot, *, where: str) -> None:
         """Refuse legs, frames and places that the robot does not have.
 
+        Args:
+            robot: The robot.
+            where: File and key of the setup, for messages.
+
         Raises:
-            SessionError: Naming the key; `where` is the setup's file and key.
+            SessionError: If the sensor does not fit the robot; names the key.
         """
 
     @property
     def place(self) -> tuple[str, str]:
-        """Part of the machine that it measures, as kind and name, such as leg and x."""
+        """Kind and name of the measured part of the machine, such as leg and x."""
 
     def describe(self) -> str:
         """Short description for tables."""
@@ -198,17 +204,17 @@ class Sensor(Protocol):
         """Frames on which a reading depends."""
 
     def constants(self, robot: Robot) -> Array:
-        """Constants of its expression, shape (n_constants,), [SI]."""
+        """Constants of the expression, shape (n_constants,), [SI]."""
 
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
-        """Nuisance parameters of its mounting and scale, besides the zero of its setup."""
+        """Nuisance parameters of mounting and scale, without the gauge zero of the setup."""
 
     def aligned_to(self, robot: Robot) -> Mapping[str, Sensor]:
         """Nuisance parameters that the operator aligns by eye, mapped to the virtual sensor.
 
-        The parameter is measured from the actual position of the rod in the alignment posture. The
-        virtual sensor gives this position, relative to the nominal machine.
+        Such a parameter refers to the actual position of the rod in the alignment posture. The
+        virtual sensor reads this position, relative to the nominal machine.
         """
 
     def expression(self, view: View, robot: Robot) -> ca.SX:
@@ -218,25 +224,25 @@ class Sensor(Protocol):
         """Contact with the machine in K postures.
 
         Args:
-            frames: Poses of its frames in K postures, shape (K, 4, 4) each.
-            at_zero: Poses of its frames in the reference posture, shape (4, 4) each.
+            frames: Poses of the sensor's frames in K postures, shape (K, 4, 4) each.
+            at_zero: Poses of the sensor's frames in the reference posture, shape (4, 4) each.
             robot: The robot.
         """
 
 
 class ToolSensor:
-    """Base of the sensors that measure the tool: of no leg, and with nothing aligned by eye."""
+    """Base of sensors that measure the tool, without parameters that are aligned by eye."""
 
     __slots__ = ()
 
     noun: ClassVar[str]
-    """The sensor in messages, with its article."""
+    """Noun for the sensor in messages, with its article."""
 
     def require_fit(self, robot: Robot, *, where: str) -> None:
         """Refuse a robot without a tool.
 
         Raises:
-            SessionError: Naming the key; `where` is the setup's file and key.
+            SessionError: If the robot has no tool; names the key.
         """
         if robot.tcp is None:
             raise SessionError(
@@ -246,11 +252,11 @@ class ToolSensor:
 
     @property
     def place(self) -> tuple[str, str]:
-        """The tool."""
+        """Kind of the measured part: the tool, without a name."""
         return "tool", ""
 
     def aligned_to(self, robot: Robot) -> Mapping[str, Sensor]:
-        """No parameter depends on the machine."""
+        """Empty mapping: no parameter is aligned by eye."""
         del robot
         return {}
 
@@ -268,25 +274,28 @@ def tool_path(sensor: Sensor) -> ToolPath | None:
 
 
 def mounting_steps(sensor: Sensor) -> tuple[str, ...] | None:
-    """Steps that mount it in the alignment posture; None for an indicator on the base."""
+    """Instructions for mounting a sensor in the alignment posture.
+
+    None for an indicator on the base, whose instructions the sheet contains.
+    """
     steps: tuple[str, ...] | None = getattr(sensor, "mounting_steps", None)
     return steps
 
 
 def largest_reading(sensor: Sensor) -> float:
-    """Largest reading that a sensor shows; a larger one has a wrong unit, [m]."""
+    """Largest reading of a sensor, [m]; a larger one has a wrong unit."""
     largest: float = getattr(sensor, "largest_reading", LARGEST_READING)
     return largest
 
 
 def stated_dimensions(sensor: Sensor) -> Mapping[str, Sensor]:
-    """Keys of the dimensions that a setup states, to the sensor with a larger one."""
+    """Sensors with one dimension larger by DIMENSION_STEP, by the key of the dimension."""
     dimensions: Mapping[str, Sensor] = getattr(sensor, "dimensions", {})
     return dimensions
 
 
 def default_zero(sensor: Sensor) -> GaugeZero:
-    """Gauge zero of a sensor's setups that state none."""
+    """Gauge zero of setups that state none."""
     zero: GaugeZero = getattr(sensor, "zero", "free")
     return zero
 
@@ -301,13 +310,13 @@ def is_difference(minus: str | None, sensor: Sensor) -> bool:
     """True for a row that is the difference of readings in two postures.
 
     Args:
-        minus: Second posture of the row.
+        minus: Second posture of the row; None if it has one posture.
         sensor: Sensor of its setup.
     """
     return minus is not None and not reads_pairs(sensor)
 
 
 def states_readings(sensor: Sensor) -> bool:
-    """True if readings are stated, not shown, so that equal ones say nothing."""
+    """True if readings are prescribed, not measured; then equal readings are no anomaly."""
     stated: bool = getattr(sensor, "states_readings", False)
     return stated

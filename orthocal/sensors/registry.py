@@ -1,4 +1,4 @@
-"""Kinds of sensor that a session may name: packaged, registered, or from installed packages.
+"""Kinds of sensor that a session may name: built-in, registered, or from installed packages.
 
 A package offers a kind by an entry point of the group `orthocal.sensors`. Its name is the kind, and
 its object is the class:
@@ -25,6 +25,7 @@ from orthocal.sensors.protocol import Sensor, SetupKeys
 from orthocal.sensors.tool_indicator import ToolIndicator, ToolIndicatorKeys
 
 DEFAULT = LegIndicator.kind
+"""Kind of sensor of a setup that states none."""
 
 GROUP = "orthocal.sensors"
 """Group of the entry points by which installed packages offer kinds of sensor."""
@@ -33,13 +34,14 @@ Kind = tuple[type[SetupKeys], Callable[[Any], Sensor]]
 """Keys of a kind of sensor, and the function that builds a sensor from them."""
 
 
-def _read_kind(name: str, offered: type[Sensor]) -> Kind:
-    if offered.kind != name or not issubclass(offered.keys, SetupKeys):
-        raise TypeError(f"{offered.__qualname__} is not a sensor with kind = '{name}' and keys")
-    return offered.keys, offered.from_keys
+def _read_kind(name: str, sensor: type[Sensor]) -> Kind:
+    """Kind from the class of an entry point."""
+    if sensor.kind != name or not issubclass(sensor.keys, SetupKeys):
+        raise TypeError(f"{sensor.__qualname__} is not a sensor with kind = '{name}' and keys")
+    return sensor.keys, sensor.from_keys
 
 
-_PACKAGED: dict[str, Kind] = {
+_BUILT_IN: dict[str, Kind] = {
     DEFAULT: (LegKeys, LegIndicator.from_keys),
     BallBar.kind: (BallBarKeys, BallBar.from_keys),
     Distance.kind: (DistanceKeys, Distance.from_keys),
@@ -47,11 +49,11 @@ _PACKAGED: dict[str, Kind] = {
     Points.kind: (PointKeys, Points.from_keys),
     Probe.kind: (ProbeKeys, Probe.from_keys),
 }
-_KINDS = Registry[Kind](GROUP, "sensor", _read_kind, _PACKAGED)
+_KINDS = Registry[Kind](GROUP, "sensor", _read_kind, _BUILT_IN)
 
 
 def register_sensor(kind: type[Sensor]) -> None:
-    """Register a kind of sensor; it replaces one of the same name."""
+    """Register a kind of sensor; it replaces a kind of the same name."""
     _KINDS.register(kind.kind, (kind.keys, kind.from_keys))
 
 
@@ -61,7 +63,7 @@ def unregister_sensor(kind: str) -> None:
 
 
 def sensor_kinds() -> tuple[str, ...]:
-    """Names of all kinds, with those of installed packages."""
+    """Names of all kinds, including those of installed packages."""
     return _KINDS.names
 
 
@@ -77,13 +79,13 @@ def read_setup(
 
     Args:
         data: Keys and values of the setup.
-        where: File, for messages.
-        under: Key of the setup in it.
-        error: Kind of error.
-        gauge: Keys that its gauge states for all its setups.
+        where: Name of the file, for messages.
+        under: Key of the setup in the file.
+        error: Kind of error to raise.
+        gauge: Keys and values that the gauge states for all its setups.
 
     Raises:
-        OrthocalError: Of that kind, naming the key that does not fit.
+        OrthocalError: Of kind `error`, if a key is wrong; names the key.
     """
     name = data.get("sensor", DEFAULT)
     schema, build = _KINDS.find(name, where=f"{where}: {under}.sensor", error=error)
@@ -103,6 +105,7 @@ def write_sensor(sensor: Sensor) -> dict[str, Any]:
 
 
 def _read_recorded(data: object) -> Sensor:
+    """Sensor from plain data; raises ValueError("KEY|PROBLEM")."""
     if not isinstance(data, Mapping):
         raise ValueError("expected keys and values")
     try:

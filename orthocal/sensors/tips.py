@@ -1,16 +1,16 @@
 """Contact of the tip of a plunger with a round rod: closed forms.
 
-A rod has the axis a + s u and the radius r. The plunger moves along the unit vector d, in which the
-reading h grows, on the rod's d side. Its tip is at c + h d.
+A rod has the axis a + s u and the radius r. The plunger moves along the unit vector d of a growing
+reading h, and touches the rod on the side of d. Its tip is at c + h d.
 
-- A blade is an edge along e: it touches where the plane through the edge and along the rod is a
+- A blade is an edge along e. At contact, the plane through the edge and parallel to the rod is a
   radius away from the rod's axis. With n = e × u, its sign such that n · d > 0,
 
-      h = ((a − c) · n + r |n|)/(d · n);
+      h = ((a − c) · n + r |n|)/(d · n).
 
-  without a radius the edge meets the axis. A pin as edge adds its radius to r.
-- A ball of radius R touches where |(c + h d − a) × u| = r + R; of the two roots the larger. Where
-  there is none the plunger passes the rod.
+  For r = 0 the edge meets the axis. If the edge is a pin, its radius is added to r.
+- A ball of radius R touches at |(c + h d − a) × u| = r + R; the larger root applies. Without a root
+  the ball passes the rod.
 """
 
 from __future__ import annotations
@@ -25,29 +25,29 @@ from orthocal.io.documents import Number, PositiveNumber
 from orthocal.units import MM, to_mm
 
 LARGEST_TIP_MM = 100.0
-"""Largest ball or blade of an indicator; a larger one has a wrong unit."""
+"""Largest accepted radius or width of a tip, [mm]; a larger one has a wrong unit."""
 
 
 def touch_by_blade(
-    at: ca.SX, along: ca.SX, radius: ca.SX, tip: ca.SX, direction: ca.SX, edge: ca.SX
+    point: ca.SX, along: ca.SX, radius: ca.SX, tip: ca.SX, direction: ca.SX, edge: ca.SX
 ) -> ca.SX:
     """Reading of an indicator with a blade, [m].
 
     Args:
-        at: A point of the rod's axis, shape (3,), [m].
-        along: The rod's axis, of any length, shape (3,).
-        radius: Of the rod, and of the edge where that is a pin, [m].
-        tip: A point of the edge at reading 0, shape (3,), [m].
-        direction: Of the plunger, in which the reading grows; a unit vector, shape (3,).
-        edge: The blade's edge, of any length, shape (3,).
+        point: Point of the rod's axis, shape (3,), [m].
+        along: Vector along the rod's axis, of any length, shape (3,).
+        radius: Radius of the rod, plus that of an edge that is a pin, [m].
+        tip: Point of the edge at reading 0, shape (3,), [m].
+        direction: Unit vector of the plunger, along which the reading grows, shape (3,).
+        edge: Vector along the blade's edge, of any length, shape (3,).
     """
     normal = ca.cross(edge, along)
     normal = normal * ca.sign(ca.dot(normal, direction))
-    return (ca.dot(at - tip, normal) + radius * ca.norm_2(normal)) / ca.dot(direction, normal)
+    return (ca.dot(point - tip, normal) + radius * ca.norm_2(normal)) / ca.dot(direction, normal)
 
 
 def touch_by_ball(
-    at: ca.SX,
+    point: ca.SX,
     along: ca.SX,
     radius: ca.SX,
     tip: ca.SX,
@@ -57,25 +57,25 @@ def touch_by_ball(
     """Reading of an indicator with a ball, [m]; NaN if the ball passes the rod.
 
     Args:
-        at: A point of the rod's axis, shape (3,), [m].
-        along: The rod's axis, of any length, shape (3,).
-        radius: Of the rod and the ball together, [m].
-        tip: The ball's centre at reading 0, shape (3,), [m].
-        direction: Of the plunger, in which the reading grows; a unit vector, shape (3,).
-        edge: Not used: a ball has none.
+        point: Point of the rod's axis, shape (3,), [m].
+        along: Vector along the rod's axis, of any length, shape (3,).
+        radius: Sum of the radii of rod and ball, [m].
+        tip: Centre of the ball at reading 0, shape (3,), [m].
+        direction: Unit vector of the plunger, along which the reading grows, shape (3,).
+        edge: Not used; for the same signature as `touch_by_blade`.
     """
     del edge
     unit = along / ca.norm_2(along)
-    apart = tip - at
-    apart = apart - ca.dot(apart, unit) * unit
+    offset = tip - point
+    offset = offset - ca.dot(offset, unit) * unit
     across = direction - ca.dot(direction, unit) * unit
-    square, mixed = ca.dot(across, across), ca.dot(apart, across)
-    discriminant = mixed**2 - square * (ca.dot(apart, apart) - radius**2)
-    return (ca.sqrt(discriminant) - mixed) / square
+    a, b = ca.dot(across, across), ca.dot(offset, across)  # a h² + 2 b h + c = 0
+    discriminant = b**2 - a * (ca.dot(offset, offset) - radius**2)
+    return (ca.sqrt(discriminant) - b) / a
 
 
 class BallKeys(BaseModel):
-    """A ball at the end of a plunger."""
+    """Keys of a ball at the end of a plunger."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
@@ -83,13 +83,13 @@ class BallKeys(BaseModel):
 
 
 class BladeKeys(BaseModel):
-    """A straight edge across a rod."""
+    """Keys of a straight edge across a rod."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     width_mm: Annotated[PositiveNumber, Field(le=LARGEST_TIP_MM)]
     radius_mm: Annotated[Number, Field(ge=0.0, le=LARGEST_TIP_MM)] = 0.0
-    """Of an edge that is a pin."""
+    """Radius of an edge that is a pin; 0 for a sharp edge."""
 
 
 class TipKeys(BaseModel):
@@ -101,7 +101,8 @@ class TipKeys(BaseModel):
     blade: BladeKeys | None = None
 
     @model_validator(mode="after")
-    def _one_form(self) -> TipKeys:
+    def _require_one_form(self) -> TipKeys:
+        """Refuse both ball and blade, or none of them."""
         if (self.ball is None) == (self.blade is None):
             text = "none" if self.ball is None else "ball and blade"
             raise ValueError(f"found {text}; expected one of ball, blade")
@@ -114,9 +115,9 @@ class Tip:
 
     form: Literal["ball", "blade"]
     radius: float
-    """Of the ball, or of an edge that is a pin, [m]."""
+    """Radius of the ball, or of an edge that is a pin, [m]."""
     width: float = 0.0
-    """Of a blade, [m]."""
+    """Width of a blade, [m]."""
 
     @staticmethod
     def from_keys(keys: TipKeys) -> Tip:

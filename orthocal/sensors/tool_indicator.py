@@ -1,17 +1,18 @@
 """Indicator at the tool, on a straightedge, a square, a surface plate or a gauge block.
 
-The artefact lies on the table. Its surface is a plane with normal n, nominally the direction d of
-the plunger. The tip q and the plunger's direction u move with the tool:
+The artefact is clamped to the table. Its surface is a plane with normal n, nominally the direction
+d of the plunger. The tip q and the plunger's direction u move with the tool:
 
     h = (1 + s) ((n · q + H) / (n · u) + f(q))
 
-H is the height of a gauge block under the tip, and 0 beside it. Yaw, about the axis square to
-artefact and plunger, and roll, about the artefact, turn n. f is a deviation from straight or flat:
-Legendre polynomials of degree 2 and 3 along an edge, of degree 2 over a plate. All are nuisance
-parameters, and the gauge zero is free.
+s is the scale error of the dial. H is the height of a gauge block under the tip, and 0 beside the
+block. Yaw, about the axis square to artefact and plunger, and roll, about the artefact, turn n. f
+is a deviation from straight or flat: Legendre polynomials of degree 2 and 3 along an edge, of
+degree 2 over a plate. Yaw, roll, f and the errors of H and s are nuisance parameters, and the gauge
+zero is free.
 
-The arms of one square share its yaw, and enclose a right angle with an error. A square, or a
-straightedge, that is turned over shows its errors with the opposite sign (reversal).
+The arms of one square share its yaw. Their angle differs from a right angle by an error. A square
+or a straightedge that is turned over shows its errors with the opposite sign (reversal).
 """
 
 from __future__ import annotations
@@ -42,16 +43,17 @@ from orthocal.sensors.protocol import (
 )
 from orthocal.units import MM, MRAD, read_limit, show_limit, tidy, to_mm
 
-ALIGNMENT = 5.0 * MRAD
-"""Direction of an artefact that was aligned by eye along an axis of the machine, [rad]."""
+ALIGNMENT_STD = 5.0 * MRAD
+"""Prior standard deviation of the direction of an artefact aligned by eye, [rad]."""
 
 LENGTH_MM = 200.0
-"""Length of the artefact that is used, by default."""
+"""Default of the used length of an artefact, [mm]."""
 
 BLADE, BLOCK = 20 * MM, (35 * MM, 9 * MM)
 """Width of a blade, length and width of a gauge block in pictures, [m]."""
 
 LARGEST_MM = 2000.0
+"""Largest accepted length and coordinate, [mm]; a larger one has a wrong unit."""
 
 Kind = Literal["straightedge", "square", "plate", "gauge_block"]
 Axis = Literal["x", "y", "z"]
@@ -67,24 +69,28 @@ STRAIGHT = ("straight_2", "straight_3")
 
 
 def flat_terms(degree: int) -> tuple[str, ...]:
-    """Deviations of a plane: products of Legendre polynomials along its axes, degree 2 or more."""
+    """Names of the deviations of a plane: products of Legendre polynomials along both axes.
+
+    Args:
+        degree: Largest sum of the degrees of both polynomials; the smallest is 2.
+    """
     return tuple(f"flat_{n - j}{j}" for n in range(2, degree + 1) for j in range(n + 1))
 
 
-class _Lying(BaseModel):
+class _ArtefactKeys(BaseModel):
     """Keys of every artefact."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
-    direction_tolerance_mrad: Milliradians = show_limit(ALIGNMENT) / MRAD
+    direction_tolerance_mrad: Milliradians = show_limit(ALIGNMENT_STD) / MRAD
 
 
-class _EdgeKeys(_Lying):
+class _EdgeKeys(_ArtefactKeys):
     along: Axis
     length_mm: Length = LENGTH_MM
     straight_tolerance_mm: Millimetres = 0.0
     reversed: bool = False
-    """Turned over since the other setups with it."""
+    """Whether the artefact is turned over relative to its other setups."""
 
 
 class StraightedgeKeys(_EdgeKeys):
@@ -92,19 +98,20 @@ class StraightedgeKeys(_EdgeKeys):
 
     kind: Literal["straightedge"]
     name: Name | None = None
-    """For setups that share its deviations."""
+    """Name of the straightedge, if several setups share its deviations."""
 
 
 class SquareKeys(_EdgeKeys):
-    """An arm of a square, along an axis."""
+    """Arm of a square along an axis."""
 
     kind: Literal["square"]
     name: Name
-    """Name of the square: the setups on its arms share it."""
+    """Name of the square, which the setups on its arms share."""
     square_tolerance_mrad: Milliradians = 0.0
+    """Tolerance of the right angle."""
 
 
-class PlateKeys(_Lying):
+class PlateKeys(_ArtefactKeys):
     """Surface plate."""
 
     kind: Literal["plate"]
@@ -112,15 +119,15 @@ class PlateKeys(_Lying):
     flat_tolerance_mm: Millimetres = 0.0
 
 
-class GaugeBlockKeys(_Lying):
+class GaugeBlockKeys(_ArtefactKeys):
     """Gauge block on a plane."""
 
     kind: Literal["gauge_block"]
     height_mm: Annotated[PositiveNumber, Field(ge=1.0, le=LARGEST_MM)]
     height_tolerance_mm: Millimetres = 0.0
     table_mm: Annotated[Number, Field(ge=-LARGEST_MM, le=LARGEST_MM)]
-    """Coordinate of the tool centre point along the plunger with the tip on the plane without the
-    block."""
+    """Coordinate of the tool centre point along the plunger while the tip touches the plane beside
+    the block."""
 
 
 ArtefactKeys = Annotated[
@@ -132,7 +139,7 @@ class ToolIndicatorKeys(SetupKeys):
     """Keys of a setup with an indicator at the tool, as in a session.yaml."""
 
     direction: Literal["x", "y", "z", "-x", "-y", "-z"]
-    """Direction in which the plunger points; the reading grows when the tool moves there."""
+    """Direction of the plunger; the reading grows when the tool moves in this direction."""
     artefact: ArtefactKeys
     tool_mm: Point = Field(default_factory=lambda: [0.0, 0.0, 0.0])
     """Tip of the plunger at reading 0, from the tool centre point, in the tool's frame."""
@@ -141,38 +148,38 @@ class ToolIndicatorKeys(SetupKeys):
 
 @dataclass(frozen=True, slots=True)
 class Artefact:
-    """Artefact that the indicator touches, with the standard deviations of its errors."""
+    """Artefact that the indicator touches, with the prior standard deviations of its errors."""
 
     kind: Kind
     along: str | None = None
     """Axis of an edge."""
     name: str | None = None
     length: float = LENGTH_MM * MM
-    """Length that is used, [m]."""
-    direction_std: float = ALIGNMENT
+    """Used length, [m]."""
+    direction_std: float = ALIGNMENT_STD
     """Yaw and roll, [rad]."""
     form_std: float = 0.0
     """Deviation from straight or flat at its ends, [m]."""
     form_degree: int = 2
-    """Largest degree of the deviations from flat; those of degree n have a standard deviation
-    that falls as 1/n², a smooth surface."""
+    """Largest degree of the deviations from flat. Their standard deviation falls as 1/n² with the
+    degree n, because the surface is smooth."""
     square_std: float = 0.0
-    """Angle of a square, [rad]."""
+    """Right angle of a square, [rad]."""
     reversed: bool = False
     height: float = 0.0
     """Height of a gauge block, [m]."""
     height_std: float = 0.0
     table: float = 0.0
-    """Coordinate of the tool centre point along the plunger, with the tip on the plane without the
-    block, [m]."""
+    """Coordinate of the tool centre point along the plunger while the tip touches the plane beside
+    the block, [m]."""
 
 
 @dataclass(frozen=True, slots=True)
 class ToolIndicator(ToolSensor):
-    """An indicator at the tool whose plunger touches an artefact on the table."""
+    """Indicator at the tool whose plunger touches an artefact on the table."""
 
     direction: str
-    """Direction in which the plunger points: x, y, z, -x, -y or -z."""
+    """Direction of the plunger: x, y, z, -x, -y or -z."""
     artefact: Artefact
     tool: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Tip of the plunger at reading 0, from the tool centre point, in the tool's frame, [m]."""
@@ -189,17 +196,17 @@ class ToolIndicator(ToolSensor):
         """Build from the keys of a session.yaml.
 
         Raises:
-            SessionError: If an edge lies along the plunger.
+            SessionError: If an edge is parallel to the plunger.
         """
         a = keys.artefact
-        common: dict[str, Any] = {"direction_std": _std(a.direction_tolerance_mrad, MRAD)}
+        fields: dict[str, Any] = {"direction_std": _std(a.direction_tolerance_mrad, MRAD)}
         if isinstance(a, StraightedgeKeys | SquareKeys):
             if a.along == keys.direction.lstrip("-"):
                 raise SessionError(
                     f"found {a.along}, the direction of the plunger; expected an axis across it",
                     where="artefact.along",
                 )
-            common |= {
+            fields |= {
                 "along": a.along,
                 "name": a.name,
                 "length": a.length_mm * MM,
@@ -207,17 +214,17 @@ class ToolIndicator(ToolSensor):
                 "reversed": a.reversed,
             }
             if isinstance(a, SquareKeys):
-                common["square_std"] = _std(a.square_tolerance_mrad, MRAD)
+                fields["square_std"] = _std(a.square_tolerance_mrad, MRAD)
         elif isinstance(a, PlateKeys):
-            common |= {"length": a.length_mm * MM, "form_std": _std(a.flat_tolerance_mm, MM)}
+            fields |= {"length": a.length_mm * MM, "form_std": _std(a.flat_tolerance_mm, MM)}
         else:
-            common |= {
+            fields |= {
                 "height": a.height_mm * MM,
                 "height_std": _std(a.height_tolerance_mm, MM),
                 "table": a.table_mm * MM,
             }
         x, y, z = (v * MM for v in keys.tool_mm)
-        artefact = Artefact(a.kind, **common)
+        artefact = Artefact(a.kind, **fields)
         return cls(keys.direction, artefact, (x, y, z), read_limit(keys.scale_tolerance))
 
     def to_keys(self) -> dict[str, Any]:
@@ -249,7 +256,7 @@ class ToolIndicator(ToolSensor):
         return keys
 
     def describe(self) -> str:
-        """Direction of the plunger and artefact."""
+        """Short description with the direction of the plunger and the artefact."""
         a = self.artefact
         words = a.kind.replace("_", " ")
         if a.kind == "gauge_block":
@@ -260,7 +267,7 @@ class ToolIndicator(ToolSensor):
 
     @property
     def mounting_steps(self) -> tuple[str, ...]:
-        """Steps that mount the indicator and its artefact."""
+        """Instructions for mounting the indicator and its artefact."""
         a = self.artefact
         words = a.kind.replace("_", " ")
         if a.kind == "gauge_block":
@@ -274,7 +281,7 @@ class ToolIndicator(ToolSensor):
             place = f"Put the {words} on the table, along {a.along} of the machine by eye."
         over = " Turn it over since its other setup." if a.reversed else ""
         return (
-            place + over + " Clamp it: it must stay until all its readings are taken.",
+            place + over + " Clamp it. It must not move until all its readings are taken.",
             f"Mount the indicator at the tool. Its plunger points to {self.direction} and touches "
             f"the {words}.",
             "Push the plunger in with a finger. The reading must grow. If it falls, reverse the "
@@ -282,30 +289,31 @@ class ToolIndicator(ToolSensor):
         )
 
     def frames(self, robot: Robot) -> Frames:
-        """The tool's frame."""
+        """Frame of the tool."""
         return Frames((require_tcp(robot).frame,))
 
     def constants(self, robot: Robot) -> Array:
-        """Plunger (3), artefact (3), axis of its yaw (3), tip (3), half its length (1).
+        """Constants of the expression, shape (17,), [m].
 
-        Then the share of a square's error that is yaw (1), sign of its errors (1), height of a
-        block (1) and level of the plane (1).
+        Directions of plunger (3) and artefact (3), axis of yaw (3), position of the tip (3), half
+        length (1), share of a square's error in the yaw (1), sign of the form errors (1), height of
+        a block (1), and coordinate of the plane along the plunger (1).
         """
         del robot
         a = self.artefact
         d, along = direction_vector(self.direction), self._along
         square_to_both = np.abs(np.cross(along, d))
         sign = -1.0 if a.reversed else 1.0
-        # in the order of the axes x, y, z, x the second arm of a square is turned from the first
-        first = np.cross(along, np.abs(d)).sum() > 0.0
-        share = sign * (-0.5 if first else 0.5) * (a.kind == "square")
+        # half of the error of the right angle is assigned to each arm, with opposite signs
+        is_first_arm = np.cross(along, np.abs(d)).sum() > 0.0
+        share = sign * (-0.5 if is_first_arm else 0.5) * (a.kind == "square")
         level = a.table * float(d.sum())
         numbers = [0.5 * a.length, share, sign, a.height, level]
         return np.array([*d, *along, *square_to_both, *self.tool, *numbers])
 
     @property
     def dimensions(self) -> Mapping[str, Sensor]:
-        """A gauge block of another height."""
+        """Gauge block with a height that is larger by DIMENSION_STEP."""
         if self.artefact.kind != "gauge_block":
             return {}
         higher = replace(self.artefact, height=self.artefact.height + DIMENSION_STEP)
@@ -313,25 +321,25 @@ class ToolIndicator(ToolSensor):
 
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
-        """Direction and errors of the artefact, scale of the dial; those with a deviation above 0.
+        """Direction and errors of the artefact and scale of the dial, if their std is above 0.
 
-        The placement of a square is that of both its arms, until it is turned over.
+        Both arms of a square share its yaw. A square that is turned over has another yaw.
         """
         a = self.artefact
         owner = None if a.name is None else f"{a.kind}.{a.name}"
-        placed = f"{owner}.reversed" if owner and a.reversed else owner
-        of_arm = None if owner is None else f"{owner}.{a.along}"
-        edge = a.along is not None
-        forms = STRAIGHT if edge else flat_terms(a.form_degree)
-        share = np.array([1.0 if edge else 1.0 / sum(map(int, f[-2:])) ** 2 for f in forms])
+        placement = f"{owner}.reversed" if owner and a.reversed else owner
+        arm = None if owner is None else f"{owner}.{a.along}"
+        is_edge = a.along is not None
+        forms = STRAIGHT if is_edge else flat_terms(a.form_degree)
+        share = np.array([1.0 if is_edge else 1.0 / sum(map(int, f[-2:])) ** 2 for f in forms])
         form_std = a.form_std * share / np.linalg.norm(share)
-        yaw_of = placed if a.kind == "square" else None
+        yaw_owner = placement if a.kind == "square" else None
         parameters = (
-            NuisanceParameter("yaw", "rad", a.direction_std, yaw_of),
+            NuisanceParameter("yaw", "rad", a.direction_std, yaw_owner),
             NuisanceParameter("roll", "rad", a.direction_std),
             NuisanceParameter("square", "rad", a.square_std, owner),
             *(
-                NuisanceParameter(name, "m", float(std), of_arm)
+                NuisanceParameter(name, "m", float(std), arm)
                 for name, std in zip(forms, form_std, strict=True)
             ),
             NuisanceParameter("height", "m", a.height_std),
@@ -350,15 +358,15 @@ class ToolIndicator(ToolSensor):
         q = tool.position + tool.rotation @ tip
         yaw = errors.get("yaw", 0.0) + share * errors.get("square", 0.0)
         normal = rotate(rotate(plunger, along, ca.SX(errors.get("roll", 0.0))), across, ca.SX(yaw))
-        above = level - ca.dot(plunger, tool.position) > 0.5 * height
-        raised = ca.if_else(above, height + errors.get("height", 0.0), 0.0)
-        raised = ca.if_else(height > 0.0, raised, 0.0)
+        on_block = level - ca.dot(plunger, tool.position) > 0.5 * height
+        block = ca.if_else(on_block, height + errors.get("height", 0.0), 0.0)
+        block = ca.if_else(height > 0.0, block, 0.0)
         form = sign * _form(errors, ca.dot(along, q) / half, ca.dot(across, q) / half)
-        reading = (ca.dot(normal, q) + raised) / ca.dot(normal, tool.rotation @ plunger) + form
+        reading = (ca.dot(normal, q) + block) / ca.dot(normal, tool.rotation @ plunger) + form
         return ca.SX((1.0 + errors.get("scale", 0.0)) * reading)
 
     def contact(self, frames: Sequence[Array], at_zero: Sequence[Array], robot: Robot) -> Contact:
-        """Tips of the plunger in K postures."""
+        """Positions of the plunger's tip in K postures."""
         del at_zero, robot
         poses = frames[0]
         tips = poses[:, :3, 3] + poses[:, :3, :3] @ np.array(self.tool)
@@ -374,7 +382,11 @@ class ToolIndicator(ToolSensor):
         )
 
     def _surface(self, tips: Array) -> Array:
-        """Corners of the touched surface, under the middle of the tips, shape (4, 3), [m]."""
+        """Corners of the touched surface, centred at the tips, shape (4, 3), [m].
+
+        Args:
+            tips: Positions of the tip, shape (K, 3), [m].
+        """
         a = self.artefact
         across = np.cross(self._along, direction_vector(self.direction))
         length, width = {
@@ -382,26 +394,28 @@ class ToolIndicator(ToolSensor):
             "plate": (a.length, a.length),
         }.get(a.kind, (a.length, BLADE))
         middle = 0.5 * (tips.min(axis=0) + tips.max(axis=0))
-        ways = [(u, v) for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
         return np.array(
-            [middle + 0.5 * (u * length * self._along + v * width * across) for u, v in ways]
+            [
+                middle + 0.5 * (u * length * self._along + v * width * across)
+                for u, v in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+            ]
         )
 
     @property
     def _along(self) -> Array:
-        """Unit vector along the artefact; for a plane, the axis after the plunger's."""
+        """Unit vector along the artefact, shape (3,); for a plane, the axis after the plunger's."""
         if self.artefact.along is not None:
             return direction_vector(self.artefact.along)
         return np.roll(np.abs(direction_vector(self.direction)), 1)
 
 
 def _form(errors: Mapping[str, ca.SX], s: ca.SX, t: ca.SX) -> ca.SX:
-    """Deviation of an artefact from straight or flat.
+    """Deviation of an artefact from straight or flat, [m].
 
     Args:
         errors: Nuisance parameters by name.
-        s: Position along it, in half lengths.
-        t: Position across it, in half lengths.
+        s: Position along the artefact, in half lengths.
+        t: Position across the artefact, in half lengths.
     """
     deviation = ca.SX(0.0)
     for name, value in errors.items():
@@ -414,16 +428,18 @@ def _form(errors: Mapping[str, ca.SX], s: ca.SX, t: ca.SX) -> ca.SX:
 
 
 def _legendre(degree: int, x: ca.SX) -> ca.SX:
-    """Legendre polynomial, by the recursion of Bonnet."""
-    before, present = ca.SX(0.0), ca.SX(1.0)
+    """Legendre polynomial, by Bonnet's recursion."""
+    previous, current = ca.SX(0.0), ca.SX(1.0)
     for n in range(degree):
-        before, present = present, ((2 * n + 1) * x * present - n * before) / (n + 1)
-    return present
+        previous, current = current, ((2 * n + 1) * x * current - n * previous) / (n + 1)
+    return current
 
 
 def _std(tolerance: float, unit: float) -> float:
+    """Standard deviation in SI units of a tolerance in a unit."""
     return tidy(read_limit(tolerance) * unit)
 
 
 def _limit(std: float, unit: float) -> float:
+    """Tolerance in a unit of a standard deviation in SI units."""
     return tidy(show_limit(std) / unit)

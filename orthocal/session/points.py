@@ -12,7 +12,7 @@ from orthocal.session.session import Gauge, Reading, Session, Setup
 
 
 def base_name(name: str) -> str:
-    """Name in the files of a setup of points that was split; any other name as it is."""
+    """Name of a setup in the files, without the bracket of a split setup of points."""
     return name.partition("[")[0]
 
 
@@ -26,12 +26,13 @@ def names_in_files(setup: Setup) -> tuple[str, str]:
 def split_setup(
     base: Setup, gauge: Gauge, number: int = 0
 ) -> tuple[dict[str, Setup], dict[str, Gauge]]:
-    """The three setups of a setup of points, and the gauges that they need in addition.
+    """Split a setup of points into three setups, with the gauges that they need in addition.
 
     Args:
         base: The setup as a session.yaml states it.
         gauge: Its gauge.
-        number: Number of its covariance among those of its rows; 0 for that of the setup.
+        number: Number of the covariance among those of the setup's rows; 0 for the covariance that
+            the setup states.
     """
     setups, gauges = {}, {}
     sensor = cast(Points, base.sensor)
@@ -40,22 +41,22 @@ def split_setup(
         name = f"{base.name}[{label}{number + 1 if number else ''}]"
         setups[name] = replace(base, name=name, sensor=axis)
         if std is not None:
-            further = f"{base_name(base.gauge)}[{name}]"
-            setups[name] = replace(setups[name], gauge=further)
-            gauges[further] = replace(gauge, sigma=std, range=None)
+            gauge_name = f"{base_name(base.gauge)}[{name}]"
+            setups[name] = replace(setups[name], gauge=gauge_name)
+            gauges[gauge_name] = replace(gauge, sigma=std, range=None)
     return setups, gauges
 
 
 def gather_points(readings: Sequence[Reading], setups: Mapping[str, Setup]) -> list[list[Reading]]:
-    """Readings of each line: three of a point, one of another sensor."""
+    """Readings of each line: three for a point, one for another sensor."""
 
-    def line(item: tuple[int, Reading]) -> object:
+    def line_key(item: tuple[int, Reading]) -> object:
         i, r = item
         if not isinstance(setups[r.setup].sensor, Points):
             return i
         return base_name(r.setup), r.posture, r.cycle, r.conditions, r.line
 
-    return [[r for _, r in part] for _, part in groupby(enumerate(readings), line)]
+    return [[r for _, r in group] for _, group in groupby(enumerate(readings), line_key)]
 
 
 def one_row_a_point(session: Session) -> Session:

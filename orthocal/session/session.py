@@ -1,7 +1,7 @@
 """A measuring session: postures, gauge setups and readings, in SI units.
 
-A reading is what the indicator shows in a posture, or the difference of two postures, in which the
-indicator's unknown zero drops out.
+A reading is the value of a gauge in a posture, or the difference of the values in two postures. The
+unknown gauge zero cancels in a difference.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import GaugeZero, Sensor, is_difference
 from orthocal.units import MM
 
-ALIKE = 9
-"""Decimals to which distances of postures from the mechanical zero are compared, [m, rad]."""
+DISTANCE_DECIMALS = 9
+"""Decimals in m and rad to which distances from the mechanical zero are compared."""
 
 
 PostureForm = Literal["tcp", "joints"]
-"""What commands a posture: coordinates of the tool centre point or of the drives."""
+"""Kind of the commanded coordinates: of the tool centre point or of the drives."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,14 +44,14 @@ class Purpose:
     __pydantic_config__ = CLOSED
 
     model: str | None = None
-    """A model of the robot's YAML."""
+    """Model of the robot's YAML."""
     free: tuple[str, ...] = ()
-    """Names or globs that are free too, or instead of a model; '!' takes out."""
+    """Names or globs of free errors in addition to a model, or without one; '!' excludes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gauge:
-    """The indicator.
+    """Gauge: an indicator or another instrument.
 
     Args:
         sigma: Standard deviation of one reading, [m].
@@ -70,8 +70,8 @@ class Posture:
 
     Args:
         name: Name in the session.
-        form: Meaning of `values`: `tcp` or `joints`.
-        values: Commanded coordinates, of the tool centre point [m] or of the drives [m, rad].
+        form: Kind of `values`: `tcp` or `joints`.
+        values: Commanded coordinates of the tool centre point, [m], or of the drives, [m, rad].
         drives: Commanded drive coordinates ρ minus the active offsets, [m, rad].
 
     Raises:
@@ -90,22 +90,22 @@ class Posture:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setup:
-    """A sensor mounted at one place, with one gauge zero.
+    """Mounted sensor with one gauge zero.
 
     Args:
         name: Name in the session.
         sensor: Sensor, with the part of the machine that it measures.
-        gauge: Name of what shows its readings, among the session's gauges.
-        active: Offsets active in the controller during this setup, shape (n_drives,), [m, rad]; by
-            default those of the session.
-        aligned_at: Posture in which the operator aligned the gauge; None for the rule of
+        gauge: Name of its gauge among the gauges of the session.
+        active: Active offsets during this setup, shape (n_drives,), [m, rad]; by default those of
+            the session.
+        aligned_at: Posture in which the operator aligned the gauge; by default the one selected by
             `Session.alignment_postures`.
         zero: Gauge zero: estimated from the setup's readings, or known to be 0 (absolute readings).
-        payload: Mass on the tool while the setup was read, [kg].
+        payload: Mass on the tool during this setup, [kg].
         adjusted: Mechanical adjustments during this setup, name to amount, [m]; by default those of
             the session.
-        compensation: What the controller compensated in the drives during this setup; by default
-            that of the session.
+        compensation: Compensation of the controller during this setup; by default that of the
+            session.
     """
 
     name: str
@@ -124,11 +124,11 @@ CycleNumber = Annotated[int, Field(ge=1, lt=10**9)]
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """Conditions under which a reading was taken, as stated.
+    """Stated conditions of a reading.
 
     Args:
-        approach: A letter for each drive in the robot's order: p if its coordinate grew in its last
-            motion, n if it fell, u if unknown.
+        approach: Letter for each drive in the robot's order: p if its coordinate increased in the
+            last motion, n if it decreased, u if unknown.
         temperature: Temperature of the machine, [°C].
         time: Time of the reading, with or without time zone.
     """
@@ -143,24 +143,22 @@ class Conditions:
 ReadingKey = (
     tuple[str, str, str | None, CycleNumber] | tuple[str, str, str | None, CycleNumber, str]
 )
-"""Setup, posture, posture whose reading is taken off, cycle, and the approach where one is
-known."""
+"""Setup, posture, subtracted posture, cycle, and the approach if it is known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """Reading of the indicator in a posture, or its difference between two.
+    """Reading of a gauge in a posture, or difference of two.
 
     Args:
         setup: Name of the setup.
         posture: Name of the posture.
-        minus: Posture whose reading is subtracted; None for a reading as shown.
-        cycle: Number of the repetition.
-        value: Value, [m]; NaN in a recording before it is read.
+        minus: Posture whose reading is subtracted; None for a single reading.
+        cycle: Number of the repetition, from 1.
+        value: Value, [m]; NaN before it is read.
         line: Line in the CSV, for messages.
-        file: The CSV; that of the session where not given.
-        conditions: Conditions of a reading as shown; None for a difference, or where nothing is
-            stated.
+        file: Path to the CSV; by default that of the session.
+        conditions: Conditions of a single reading; None for a difference, or if none are stated.
     """
 
     setup: str
@@ -184,13 +182,13 @@ class Reading:
 
     @property
     def key(self) -> ReadingKey:
-        """Setup, postures, cycle and known approach, which identify the reading in its session."""
+        """Setup, postures, cycle and known approach. They identify the reading in its session."""
         place = self.setup, self.posture, self.minus, self.cycle
         return place if self.approach is None else (*place, self.approach)
 
     @property
     def postures(self) -> str:
-        """Posture with its approach, or one less another, in words."""
+        """Posture with its approach, or difference of postures, in words."""
         return describe_postures(self.posture, self.minus, self.approach)
 
     @property
@@ -200,12 +198,12 @@ class Reading:
 
     @property
     def label_with_cycle(self) -> str:
-        """Setup and postures in words, and the cycle from the second on."""
+        """Setup and postures in words, and the cycle unless it is the first."""
         return self.label + (f", cycle {self.cycle}" if self.cycle > 1 else "")
 
     @property
     def is_read(self) -> bool:
-        """True if there is a value."""
+        """True if the reading has a value."""
         return not math.isnan(self.value)
 
 
@@ -216,7 +214,7 @@ def known_approach(conditions: Conditions | None) -> str | None:
 
 
 def describe_postures(posture: str, minus: str | None, approach: str | None) -> str:
-    """Postures of a reading in words, with the approach where one is known."""
+    """Postures of a reading in words, with the approach if it is known."""
     if minus:
         return f"{posture} − {minus}"
     return posture if approach is None else f"{posture} (approach {approach})"
@@ -224,35 +222,35 @@ def describe_postures(posture: str, minus: str | None, approach: str | None) -> 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Session:
-    """A session of gauge readings on a robot."""
+    """Session: postures, setups and readings of one robot."""
 
     robot: Robot
     robot_reference: str
-    """As the file names it."""
+    """Name or path of the robot in the session file."""
     title: str = ""
     source: str = ""
     gauges: Mapping[str, Gauge]
-    """Name to gauge; an only one may have the name ""."""
+    """Name to gauge; a single gauge may have the name ""."""
     postures: Mapping[str, Posture]
     setups: Mapping[str, Setup]
     readings: tuple[Reading, ...]
     controller_offsets: Array | None = None
-    """Offsets active in the controller, shape (n_drives,), [m, rad]; None where not stated."""
+    """Active offsets, shape (n_drives,), [m, rad]; None if not stated."""
     compensation: Compensation = ()
-    """Backlash and errors of screws that the controller compensates; empty for none."""
+    """Compensation of backlash and errors of screws by the controller; empty if there is none."""
     firmware: DeltaSettings | None = None
-    """Settings of the firmware of a delta printer, in whose coordinates the postures are."""
+    """Settings of the firmware of a delta printer; postures are in its coordinates."""
     adjusted: Mapping[str, float] = field(default_factory=dict)
-    """Mechanical adjustments since the machine was built, name to amount, [m]; 0 where absent. The
-    errors of the machine are those under these adjustments."""
+    """Mechanical adjustments since the machine was built, name to amount, [m]; absent ones are 0.
+    Readings are taken with these adjustments."""
     path: Path | None = None
-    """The session.yaml, or None for a session that is not from a file."""
+    """Path to the session.yaml; None for a session that is not from a file."""
     readings_path: Path | None = None
     sha256: str = ""
     parts: tuple[Session, ...] = ()
-    """The sessions that were joined into this one, where they are at hand."""
+    """Sessions that were joined into this one, if they are available."""
     joined: bool = False
-    """Whether several were, so that names begin with that of their session and a slash."""
+    """True if sessions were joined. Names then begin with the name of their session and a slash."""
     purpose: Purpose | None = None
     """Model and free errors that the session states."""
     seed: int | None = None
@@ -260,17 +258,17 @@ class Session:
 
     @property
     def gauge(self) -> Gauge:
-        """The gauge; of several the first, by which the others' noise is measured."""
+        """The first gauge. The noise of other gauges is stated relative to it."""
         return next(iter(self.gauges.values()))
 
     def with_gauge(self, gauge: Gauge) -> Session:
-        """Session with one gauge in place of all gauges."""
+        """Session with one gauge for all setups."""
         setups = {name: replace(s, gauge="") for name, s in self.setups.items()}
         return replace(self, gauges={"": gauge}, setups=setups)
 
     @property
     def active_offsets(self) -> Array:
-        """Offsets active in the controller, 0 where not stated, shape (n_drives,), [m, rad]."""
+        """Active offsets, shape (n_drives,), [m, rad]; 0 if not stated."""
         if self.controller_offsets is None:
             return np.zeros(len(self.robot.drives))
         return self.controller_offsets
@@ -287,26 +285,26 @@ class Session:
 
     @property
     def alignment_postures(self) -> dict[str, str]:
-        """Posture in which the operator aligned the gauge, by setup.
+        """Setup to the posture in which the operator aligned its gauge.
 
-        The one that the setup states (`aligned_at`); otherwise, of the postures that the setup
-        reads, the one nearest to the mechanical zero in drive coordinates, the first in the order
-        of `postures` among equals. It does not depend on the order of the readings. A setup without
-        readings counts as one that reads all postures.
+        It is the posture that the setup states (`aligned_at`). Otherwise it is the posture read by
+        the setup that is nearest to the mechanical zero in drive coordinates. Of equally near ones
+        it is the first in the order of `postures`, so that the order of readings does not matter. A
+        setup without readings is treated as one that reads all postures.
         """
-        order = {name: i for i, name in enumerate(self.postures)}
-        read: dict[str, set[int]] = {name: set() for name in self.setups}
+        index = {name: i for i, name in enumerate(self.postures)}
+        postures_read: dict[str, set[int]] = {name: set() for name in self.setups}
         for r in self.readings:
-            read[r.setup].update(order[p] for p in (r.posture, r.minus) if p is not None)
-        names, drives = list(order), np.array([p.drives for p in self.postures.values()])
+            postures_read[r.setup].update(index[p] for p in (r.posture, r.minus) if p is not None)
+        names, drives = list(index), np.array([p.drives for p in self.postures.values()])
         aligned_at = {}
         for setup, zero in zip(self.setups.values(), self.zero_drives, strict=True):
             if setup.aligned_at is not None:
                 aligned_at[setup.name] = setup.aligned_at
                 continue
-            among = np.array(sorted(read[setup.name]) or range(len(names)))
-            distances = np.linalg.norm(drives[among] - zero, axis=1).round(ALIKE)
-            aligned_at[setup.name] = names[among[int(distances.argmin())]]
+            candidates = np.array(sorted(postures_read[setup.name]) or range(len(names)))
+            distances = np.linalg.norm(drives[candidates] - zero, axis=1).round(DISTANCE_DECIMALS)
+            aligned_at[setup.name] = names[candidates[int(distances.argmin())]]
         return aligned_at
 
     @property
@@ -320,7 +318,7 @@ class Session:
         return all(map(self.is_difference, self.readings))
 
     def is_difference(self, reading: Reading) -> bool:
-        """True for a difference of two postures, not for a single reading of one or of a pair."""
+        """True for a difference of two readings, not for one reading of a posture or a pair."""
         return is_difference(reading.minus, self.setups[reading.setup].sensor)
 
     def where(self, reading: Reading) -> str:
@@ -331,43 +329,45 @@ class Session:
         return f"{file}:{reading.line}"
 
     def _repr_html_(self) -> str:
-        """In a notebook: the setups and what was read in each."""
+        """Table of the setups and their readings for a notebook."""
         rows = []
         for setup in self.setups.values():
             values = [r.value / MM for r in self.readings if r.setup == setup.name]
-            span = (f"{min(values):+.3f}", f"{max(values):+.3f}") if values else ("", "")
-            rows.append((setup.name, setup.sensor.describe(), str(len(values)), *span))
+            extremes = (f"{min(values):+.3f}", f"{max(values):+.3f}") if values else ("", "")
+            rows.append((setup.name, setup.sensor.describe(), str(len(values)), *extremes))
         kind = "differences" if self.only_differences else "readings"
-        about = f"{len(self.readings)} {kind} in {len(self.postures)} postures"
-        headers = ("setup", "what is read", kind, "least [mm]", "largest [mm]")
+        summary = f"{len(self.readings)} {kind} in {len(self.postures)} postures"
+        headers = ("setup", "sensor", kind, "smallest [mm]", "largest [mm]")
         return (
             paragraph(f"Session on {self.robot.name}: {self.title}")
             + (paragraph(f"Source: {self.source}") if self.source else "")
             + table(headers, rows, left=2)
-            + paragraph(about)
+            + paragraph(summary)
         )
 
     def select(self, readings: Sequence[Reading]) -> Session:
-        """Session with some of its readings, and the setups and postures they need.
+        """Session with some of its readings, and the setups and postures that they need.
 
-        Gauges stay aligned where they were (`alignment_postures` of the whole session).
+        Alignment postures are those of the complete session.
         """
-        read = {r.setup for r in readings}
-        aligned_at = {n: p for n, p in self.alignment_postures.items() if n in read}
-        used = {p for r in readings for p in (r.posture, r.minus)} | set(aligned_at.values())
+        setups_read = {r.setup for r in readings}
+        aligned_at = {n: p for n, p in self.alignment_postures.items() if n in setups_read}
+        postures_used = {p for r in readings for p in (r.posture, r.minus)} | set(
+            aligned_at.values()
+        )
         return replace(
             self,
             readings=tuple(readings),
             setups={n: replace(self.setups[n], aligned_at=p) for n, p in aligned_at.items()},
-            postures={n: p for n, p in self.postures.items() if n in used},
+            postures={n: p for n, p in self.postures.items() if n in postures_used},
             sha256="",
         )
 
     def with_controller(self, offsets: ArrayLike) -> Session:
-        """Session with other offsets active in the controller than it states.
+        """Session of the same postures with other active offsets.
 
         Args:
-            offsets: Shape (n_drives,), [m, rad].
+            offsets: Active offsets, shape (n_drives,), [m, rad].
         """
         active = require_array(offsets, shape=(len(self.robot.drives),), argument="offsets")
         shift = self.active_offsets - active
@@ -377,26 +377,27 @@ class Session:
         }
         return replace(self, postures=postures, controller_offsets=read_only(active), sha256="")
 
-    def with_tolerances(self, given: Mapping[str, float]) -> Session:
+    def with_tolerances(self, tolerances: Mapping[str, float]) -> Session:
         """Session of the robot with other tolerances.
 
         Args:
-            given: Name or glob with its unit to a limit of ±2 prior standard deviations.
+            tolerances: Name or glob with unit suffix to a tolerance (±2 prior standard deviations).
 
         Raises:
-            ParameterError: If a name or unit is unknown, or a number makes no sense.
+            ParameterError: If a name or unit is unknown, or a number is out of range.
         """
-        robot = self.robot.with_tolerances(given)
+        robot = self.robot.with_tolerances(tolerances)
         return self if robot is self.robot else replace(self, robot=robot)
 
     def with_effects(self, names: Sequence[str] | None) -> Session:
-        """Session of the robot with chosen effects beside those of geometry and drives.
+        """Session of the robot with chosen effects beside geometry and drives.
 
         Args:
-            names: Names of the effects; None for those that the robot's YAML names.
+            names: Names of the effects; None for those of the robot's YAML.
 
         Raises:
-            ParameterError, RobotError: As `orthocal.effects.loading.with_effects`.
+            ParameterError: If an effect is unknown, or a tolerance is of an effect not chosen.
+            RobotError: If an effect needs keys that the robot's YAML lacks.
         """
         return replace(self, robot=with_effects(self.robot, names))
 
@@ -404,8 +405,10 @@ class Session:
         """Session with other readings.
 
         Args:
-            values: Shape (n_readings,), [m].
+            values: Readings, shape (n_readings,), [m].
         """
-        new = require_array(values, shape=(len(self.readings),), argument="values")
-        changed = tuple(replace(r, value=float(v)) for r, v in zip(self.readings, new, strict=True))
-        return replace(self, readings=changed, sha256="")
+        value_array = require_array(values, shape=(len(self.readings),), argument="values")
+        readings = tuple(
+            replace(r, value=float(v)) for r, v in zip(self.readings, value_array, strict=True)
+        )
+        return replace(self, readings=readings, sha256="")

@@ -1,1 +1,1 @@
-"""Statistics of arrays: noise, distributions, information and identifiability. Knows no fit."""
+"""Statistics of readings: noise, distributions, information and identifiability."""

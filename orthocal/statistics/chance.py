@@ -24,13 +24,13 @@ COVERAGE = 2.0
 
 
 def chance_of_excess(chi_square: float, dof: float, *, cycles_dof: float = 0.0) -> float:
-    """Probability that noise alone gives residuals as large, or larger.
+    """Probability of residuals at least as large from noise alone.
 
     Args:
-        chi_square: Σ r²/σ² of single readings, zeros eliminated.
+        chi_square: Σ r²/σ² of single readings with gauge zeros eliminated.
         dof: Degrees of freedom of the residuals.
-        cycles_dof: Degrees of freedom of σ from repeated cycles: an F test of the residuals beyond
-            the scatter of the cycles. 0 for a stated σ: a χ² test.
+        cycles_dof: Degrees of freedom of σ from repeated cycles, for an F test of the residuals
+            without the scatter of the cycles; 0 for a stated σ, for a χ² test.
     """
     if cycles_dof == 0.0:
         return chi_square_tail(dof, chi_square)
@@ -51,7 +51,7 @@ def confidence_factor(dof: float, level: float = 0.95) -> float:
 def coverage_factor(dof: float) -> float:
     """Coverage factor of noise: k = 2, or Student's factor for 95 % if that is larger.
 
-    NaN where nothing determines the noise.
+    NaN if `dof` is not positive, so that the noise is unknown.
     """
     factor = confidence_factor(dof)
     return max(COVERAGE, factor) if math.isfinite(factor) else math.nan
@@ -60,28 +60,28 @@ def coverage_factor(dof: float) -> float:
 def bounded_interval(
     value: float, uncertainty: float, lower: float, upper: float
 ) -> tuple[float, float]:
-    """Shortest interval of a normal distribution about a value, truncated at bounds.
+    """Shortest interval of a normal distribution about a value that is truncated at bounds.
 
-    It has the coverage of the value ± its expanded uncertainty with k = 2, which it is without
-    bounds. NaN for an uncertainty that is unknown.
+    Its coverage is that of the expanded uncertainty with k = 2. Without bounds it is the value ±
+    that uncertainty. NaN if the uncertainty is unknown.
 
     Args:
         value: Most likely value, within the bounds.
         uncertainty: Expanded uncertainty, two standard deviations.
-        lower: Lower bound, -inf for none.
-        upper: Upper bound, inf for none.
+        lower: Lower bound; -inf without one.
+        upper: Upper bound; inf without one.
     """
     if not 0.0 < uncertainty < math.inf:
         return value - uncertainty, value + uncertainty
     to_deviations = COVERAGE / uncertainty / math.sqrt(2.0)
     below, above = ((value - lower) * to_deviations, (upper - value) * to_deviations)
 
-    def share(half: float) -> float:
-        return math.erf(min(half, below)) + math.erf(min(half, above))
+    def doubled_coverage(half_width: float) -> float:
+        return math.erf(min(half_width, below)) + math.erf(min(half_width, above))
 
-    wanted = math.erf(COVERAGE / math.sqrt(2.0)) * share(math.inf)
-    half = least_number(lambda h: share(h) >= wanted) / to_deviations
-    return max(value - half, lower), min(value + half, upper)
+    required = math.erf(COVERAGE / math.sqrt(2.0)) * doubled_coverage(math.inf)
+    half_width = least_number(lambda h: doubled_coverage(h) >= required) / to_deviations
+    return max(value - half_width, lower), min(value + half_width, upper)
 
 
 def expanded_uncertainty(
@@ -89,13 +89,13 @@ def expanded_uncertainty(
 ) -> Array:
     """Expanded uncertainty U of estimates, of any shape, in their unit.
 
-    U² = (k_ν s)² + k_n² (u² − s²), with Student's factor k_ν for the part s that is due to noise
-    estimated with ν degrees of freedom. For the rest k_n = 2, or Student's factor where a scale of
-    the tolerances was estimated from n contrasts.
+    U² = (k_ν s)² + k_n² (u² − s²). k_ν is the coverage factor of the part s from noise, which was
+    estimated with ν degrees of freedom. k_n is 2, or Student's factor if the tolerance scale was
+    estimated from n contrasts.
 
     Args:
         std: Standard deviations u from all contributions.
-        std_scatter: Parts s of them that are due to the noise of the readings.
+        std_scatter: Parts s of them from the noise of the readings.
         dof: Degrees of freedom ν of the noise.
         other_dof: Number n of contrasts.
     """

@@ -1,8 +1,9 @@
 """Identifiability of parameters: rank, indistinguishable parameters, base parameters.
 
-The analysis uses the identification Jacobian with gauge zeros eliminated, each column scaled by the
-prior std of its parameter. A direction is resolvable if one prior std along it changes all readings
-together by more than the noise of one: then the readings are more informative than the prior.
+The analysis uses the identification Jacobian with gauge zeros eliminated and columns scaled by the
+prior standard deviations (std) of the parameters. A direction is resolvable if one prior std
+changes the readings, as a vector, by more than the noise of one reading. The readings are then
+more informative than the prior.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from orthocal.robot.parameters import Parameter
 from orthocal.statistics.information import RANK_THRESHOLD, Information
 
 NEGLIGIBLE = 1e-9
-"""Coefficients of a combination below this, in prior std, are rounding."""
+"""Coefficient of a combination, in prior std, below which it is a rounding error."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,25 +39,27 @@ class Combination:
 
     @property
     def formula(self) -> str:
-        """Formula of the sum: x_slide.offset + x_swivel.x − 0.31 x_slide.ry."""
+        """Formula of the sum, such as "x_slide.offset + x_swivel.x − 0.31 x_slide.ry"."""
         return self.shorten(None)
 
-    def shorten(self, most: int | None) -> str:
-        """Formula with at most `most` terms, the largest coefficients first."""
-        others = sorted(self.terms[1:], key=lambda t: -abs(t[1])) if most else self.terms[1:]
+    def shorten(self, max_terms: int | None) -> str:
+        """Formula with at most `max_terms` terms, the largest coefficients first; None for all."""
+        others = sorted(self.terms[1:], key=lambda t: -abs(t[1])) if max_terms else self.terms[1:]
         text = self.terms[0][0]
-        for name, coefficient in others if most is None else others[: most - 1]:
+        for name, coefficient in others if max_terms is None else others[: max_terms - 1]:
             size = f"{abs(coefficient):.3g}"
             factor = "" if size == "1" else f"{size} "
             text += f" {'+' if coefficient > 0 else '−'} {factor}{name}"
-        omitted = 0 if most is None else len(self.terms) - most
+        omitted = 0 if max_terms is None else len(self.terms) - max_terms
         if omitted <= 0:
             return text
-        return f"{text} and {omitted} more, of at most {abs(others[(most or 1) - 1][1]):.2g} each"
+        return (
+            f"{text} and {omitted} more, of at most {abs(others[(max_terms or 1) - 1][1]):.2g} each"
+        )
 
     @property
     def words(self) -> str:
-        """Description in words, such as a and b: only their sum."""
+        """Description in words, such as "a and b: only their sum"."""
         if len(self.terms) == 2 and f"{abs(self.terms[1][1]):.3g}" == "1":
             kind = "sum" if self.terms[1][1] > 0 else "difference"
             return f"{self.terms[0][0]} and {self.terms[1][0]}: only their {kind}"
@@ -70,50 +73,50 @@ Recorded = Annotated[
     BeforeValidator(lambda terms: {"terms": terms}),
     PlainSerializer(lambda combination: combination.terms),
 ]
-"""A combination as pairs of parameter and coefficient."""
+"""Combination that is recorded as pairs of parameter and coefficient."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identifiability:
-    """Identifiability of the free parameters by the readings."""
+    """Identifiability of the free parameters from the readings."""
 
     __pydantic_config__ = CLOSED
 
     singular_values: Vector
     """Singular values of the scaled identification Jacobian, descending, shape (n_free,), [m per
-    prior std]; with base parameters, of their columns."""
+    prior std]. If base parameters were estimated, of their columns."""
     threshold: Number
     """Smallest singular value of a resolvable direction, [m per prior std]."""
     rank: Count
     """Number of singular values above the threshold."""
     structural_rank: Count
-    """Rank with perfect readings; with base parameters, of all parameters that they represent."""
+    """Rank for readings without noise. If base parameters were estimated, of all parameters."""
     n_postures: Annotated[Count, Field(ge=1)]
     n_readings: Count
-    """Independent readings: repeated ones once, minus gauge zeros."""
+    """Independent readings: readings minus repetitions and gauge zeros."""
     unseen: Many[str]
     """Parameters that change the readings by less than the threshold."""
     resolvable: Many[str]
-    """Parameters with a standard deviation below the prior one from the readings alone."""
+    """Parameters whose standard deviation from the readings alone is below the prior one."""
     alike: Many[Recorded]
-    """Groups of parameters with proportional effects: only their sum is resolvable."""
+    """Groups of parameters with proportional effects, of which only a sum is resolvable."""
     base: Many[Recorded]
     """Base parameters by QR decomposition with pivoting."""
 
     @property
     def condition(self) -> float:
-        """Largest over smallest singular value that counts; infinite if none does."""
-        seen = self.singular_values[: self.rank]
-        return float(seen[0] / seen[-1]) if self.rank else float("inf")
+        """Condition number of the resolvable directions; infinite if there are none."""
+        resolvable = self.singular_values[: self.rank]
+        return float(resolvable[0] / resolvable[-1]) if self.rank else float("inf")
 
     @property
     def observability(self) -> dict[str, float]:
-        """Observability indices O1 to O5 over the singular values that count, [m per prior std].
+        """Observability indices O1 to O5 of the resolvable directions, [m per prior std].
 
         O1 = (∏ s)^(1/r)/√postures (Borm and Menq 1991), O2 = s_r/s_1 (Driels and Pathre 1990, [1]),
         O3 = s_r and O4 = s_r²/s_1 (Nahvi and Hollerbach 1994, 1996), O5 = 1/Σ 1/s (Sun and
-        Hollerbach 2008). 0 where nothing counts. Plans that see different numbers r of directions
-        cannot be compared by any of them.
+        Hollerbach 2008). All are 0 without resolvable directions. The indices do not compare plans
+        with different numbers r of resolvable directions.
         """
         s = self.singular_values[: self.rank]
         if not self.rank:
@@ -138,17 +141,17 @@ def analyse_identifiability(
     """Analyse an identification Jacobian.
 
     Args:
-        information: The Jacobian, zeros eliminated.
-        parameters: The free parameters, in its order.
-        sigma: Standard deviation of a reading, which is the threshold, [m]; 0 or NaN for perfect
-            readings.
+        information: The Jacobian with gauge zeros eliminated.
+        parameters: The free parameters in the order of its columns.
+        sigma: Standard deviation of a reading, which is the threshold, [m]; 0 or NaN for readings
+            without noise.
         n_postures: Postures of the session.
         n_readings: Independent readings of the session.
     """
     factor, s = information.factor, information.singular_values
     smallest = RANK_THRESHOLD * float(s[0])
     threshold = max(sigma, smallest) if sigma > 0.0 else smallest
-    sizes = np.linalg.norm(factor, axis=0)
+    norms = np.linalg.norm(factor, axis=0)
     names = [p.name for p in parameters]
     resolvable = information.determined(sigma=threshold if sigma > 0.0 else np.nan)
     return Identifiability(
@@ -158,7 +161,7 @@ def analyse_identifiability(
         structural_rank=information.rank,
         n_postures=n_postures,
         n_readings=n_readings,
-        unseen=tuple(n for n, size in zip(names, sizes, strict=True) if size <= threshold),
+        unseen=tuple(n for n, size in zip(names, norms, strict=True) if size <= threshold),
         resolvable=tuple(n for n, ok in zip(names, resolvable, strict=True) if ok),
         alike=_find_alike(factor, parameters, threshold),
         base=find_base_parameters(factor, parameters, threshold=threshold),
@@ -170,19 +173,18 @@ def find_base_parameters(
 ) -> tuple[Combination, ...]:
     """Base parameters by QR decomposition with column pivoting (Gautier 1991).
 
-    J P = Q [R₁ R₂], so that J θ̂ = Q R₁ (θ̂₁ + R₁⁻¹ R₂ θ̂₂): the readings determine one sum
-    for each counted column: a leading parameter and multiples of the others.
+    J P = Q [R₁ R₂] with permutation P, so that J θ̂ = Q R₁ (θ̂₁ + R₁⁻¹ R₂ θ̂₂). The readings determine
+    one sum for each column of R₁: a leading parameter plus multiples of the others.
 
     Args:
-        factor: The Jacobian, zeros eliminated, shape (n, n_free), [m per prior std].
-        parameters: The free parameters, in its order.
-        threshold: A column counts if what it adds to those before moves the readings together
-            by more than this per prior std, [m].
+        factor: The Jacobian with gauge zeros eliminated, shape (n, n_free), [m per prior std].
+        parameters: The free parameters in the order of its columns.
+        threshold: Smallest norm of a column of R₁, orthogonal to the columns before it, [m].
     """
     if not np.any(factor):
         return ()
-    sizes = np.linalg.svd(factor, compute_uv=False)
-    if len(sizes) == factor.shape[1] and sizes[-1] > threshold * (1.0 + 1e-9):
+    singular_values = np.linalg.svd(factor, compute_uv=False)
+    if len(singular_values) == factor.shape[1] and singular_values[-1] > threshold * (1.0 + 1e-9):
         return tuple(Combination(((p.name, 1.0),)) for p in parameters)  # all are resolvable
     from scipy import linalg
 
@@ -191,34 +193,34 @@ def find_base_parameters(
     count = int((diagonal > threshold).sum())
     if not count:
         return ()
-    regroup = linalg.solve_triangular(r[:count, :count], r[:count, count:])
-    result = []
+    coefficients = linalg.solve_triangular(r[:count, :count], r[:count, count:])
+    combinations = []
     for i in range(count):
         lead = parameters[order[i]]
         terms = [(lead.name, 1.0)]
-        for j in np.flatnonzero(np.abs(regroup[i]) > NEGLIGIBLE):
+        for j in np.flatnonzero(np.abs(coefficients[i]) > NEGLIGIBLE):
             other = parameters[order[count + j]]
-            coefficient = regroup[i, j] * lead.prior_std / other.prior_std
+            coefficient = coefficients[i, j] * lead.prior_std / other.prior_std
             terms.append((other.name, float(coefficient)))
-        result.append(Combination(tuple(terms)))
-    place = {p.name: i for i, p in enumerate(parameters)}
-    return tuple(sorted(result, key=lambda c: place[c.terms[0][0]]))
+        combinations.append(Combination(tuple(terms)))
+    position = {p.name: i for i, p in enumerate(parameters)}
+    return tuple(sorted(combinations, key=lambda c: position[c.terms[0][0]]))
 
 
 def _find_alike(
     factor: Array, parameters: Sequence[Parameter], threshold: float
 ) -> tuple[Combination, ...]:
-    """Groups of columns that are multiples of one another within the threshold."""
-    sizes = np.linalg.norm(factor, axis=0)
+    """Groups of parameters whose columns are multiples of each other within the threshold."""
+    norms = np.linalg.norm(factor, axis=0)
     products = factor.T @ factor
-    pending = [int(i) for i in np.argsort(-sizes, kind="stable") if sizes[i] > threshold]
+    pending = [int(i) for i in np.argsort(-norms, kind="stable") if norms[i] > threshold]
     groups = []
     while pending:
         lead, *others = pending
-        slope = products[lead, others] / sizes[lead] ** 2
-        square = sizes[others] ** 2 - slope**2 * sizes[lead] ** 2
-        # a difference of squares loses half of the digits
-        floor = (1e-7 * sizes[others]) ** 2
+        slope = products[lead, others] / norms[lead] ** 2
+        square = norms[others] ** 2 - slope**2 * norms[lead] ** 2
+        # half of the digits cancel in a difference of squares
+        floor = (1e-7 * norms[others]) ** 2
         proportional = square <= np.maximum(threshold**2, floor)
         members = sorted([lead, *(i for i, ok in zip(others, proportional, strict=True) if ok)])
         if len(members) > 1:

@@ -16,27 +16,27 @@ from orthocal.observation.observations import Observations
 from orthocal.statistics.zeros import project_out_zeros
 
 RANK_THRESHOLD = 1e-10
-"""Singular values below this part of the largest count as zero."""
+"""Ratio to the largest singular value below which others count as zero."""
 
 VAGUE = 1e-8
-"""Inverse variance of a parameter without a prior, [1 per prior std²]."""
+"""Inverse variance that replaces a missing prior, [1 per prior std²]."""
 
-MOST_NAMED = 6
+MAX_LISTED = 6
 """Largest number of parameters that a message lists."""
 
-MOST_LOST = 2
+MAX_DIRECTIONS = 2
 """Largest number of null space directions that a message lists."""
 
 
 class Information:
-    """Identification Jacobian, zeros eliminated, with its singular value decomposition.
+    """Identification Jacobian with gauge zeros eliminated, and its singular value decomposition.
 
     Args:
         factor: The Jacobian, or another matrix with the same product FᵀF, shape (n, n_free),
             [m per prior std].
 
     Attributes:
-        factor: Such a matrix with at most 2 n_free rows.
+        factor: Matrix with the same product FᵀF and at most 2 n_free rows.
     """
 
     def __init__(self, factor: Array) -> None:
@@ -46,12 +46,13 @@ class Information:
 
     @cached_property
     def _decomposition(self) -> tuple[Array, Array]:
+        """Singular values and right singular vectors."""
         _, values, directions = np.linalg.svd(self.factor, full_matrices=True)
         return np.append(values, np.zeros(len(directions) - len(values))), directions
 
     @property
     def singular_values(self) -> Array:
-        """Descending, shape (n_free,), padded with zeros, [m per prior std]."""
+        """Singular values, descending, padded with zeros, shape (n_free,), [m per prior std]."""
         return self._decomposition[0]
 
     @property
@@ -72,37 +73,37 @@ class Information:
         return np.asarray(np.sqrt((null**2).sum(axis=0)) < 1e-6)
 
     def determined(self, *, sigma: float) -> Mask:
-        """Mask of the parameters with a standard deviation below the prior one without prior.
+        """Mask of the parameters whose standard deviation from the readings is below the prior one.
 
         Args:
-            sigma: Standard deviation of one reading, [m]; NaN if unknown: then all structurally
-                identifiable parameters count.
+            sigma: Standard deviation of one reading, [m]. If it is NaN or 0, the mask contains all
+                identifiable parameters.
 
         Returns:
-            Shape (n_free,).
+            Mask, shape (n_free,).
         """
         if not sigma > 0.0:
             return self.identifiable
-        seen = self.singular_values > RANK_THRESHOLD * self.singular_values[0]
+        nonzero = self.singular_values > RANK_THRESHOLD * self.singular_values[0]
         variance = np.zeros_like(self.singular_values)
-        variance[seen] = (sigma / self.singular_values[seen]) ** 2
+        variance[nonzero] = (sigma / self.singular_values[nonzero]) ** 2
         return np.asarray(((self.directions**2).T @ variance < 1.0) & self.identifiable)
 
     def effective_parameters(
         self, *, sigma: float, precision: Array, at_bound: Mask | None = None
     ) -> float:
-        """Effective number of parameters, n − tr(P⁻¹ cov): the rank without a prior.
+        """Effective number of parameters, n − tr(P⁻¹ C); the rank if there is no prior.
 
         Args:
             sigma: Standard deviation of one reading, [m].
             precision: Diagonal of P⁻¹: 1 or 0, shape (n_free,).
             at_bound: Mask of the parameters at a bound.
         """
-        count = 0 if at_bound is None else int(at_bound.sum())
+        n_at_bound = 0 if at_bound is None else int(at_bound.sum())
         if not precision.any():
-            return float(self.rank - count)
+            return float(self.rank - n_at_bound)
         covariance = self.covariance(sigma=sigma, precision=precision, at_bound=at_bound)
-        return float(len(precision) - count - precision @ np.diag(covariance))
+        return float(len(precision) - n_at_bound - precision @ np.diag(covariance))
 
     def covariance(
         self,
@@ -120,8 +121,8 @@ class Information:
         Args:
             sigma: Standard deviation of one reading, [m].
             precision: Diagonal of P⁻¹: 1 or 0, shape (n_free,).
-            at_bound: Mask of the parameters at a bound, which have no covariance.
-            loss: a, mean of ρ'', and b, mean square of ρ', of the residuals; 1 for squares.
+            at_bound: Mask of the parameters at a bound, whose covariance is 0.
+            loss: Mean a of ρ'' and mean square b of ρ' over the residuals; (1, 1) for squares.
         """
         free = np.ones(len(precision), dtype=bool) if at_bound is None else ~at_bound
         rows = self.factor[:, free] / sigma
@@ -130,11 +131,11 @@ class Information:
         stacked = np.vstack([np.sqrt(gain) * rows, prior])
         inverse = _inverse_square(stacked)
         if loss != (1.0, 1.0):
-            spread = np.hstack([np.sqrt(noise) * inverse @ rows.T, inverse @ prior])
-            inverse = spread @ spread.T
-        result = np.zeros((len(free), len(free)))
-        result[np.ix_(free, free)] = 0.5 * (inverse + inverse.T)
-        return result
+            root = np.hstack([np.sqrt(noise) * inverse @ rows.T, inverse @ prior])
+            inverse = root @ root.T
+        covariance = np.zeros((len(free), len(free)))
+        covariance[np.ix_(free, free)] = 0.5 * (inverse + inverse.T)
+        return covariance
 
     def noise_covariance(
         self,
@@ -144,24 +145,24 @@ class Information:
         at_bound: Mask | None = None,
         loss: tuple[float, float] = (1.0, 1.0),
     ) -> Array:
-        """Part of `covariance` that is due to noise, b A⁻¹ Jᵀ J A⁻¹/σ², shape (n_free, n_free).
+        """Part of `covariance` from noise, b A⁻¹ Jᵀ J A⁻¹/σ², shape (n_free, n_free).
 
         Args:
             sigma: Standard deviation of one reading, [m].
             precision: Diagonal of P⁻¹: 1 or 0, shape (n_free,).
-            at_bound: Mask of the parameters at a bound, which have no covariance.
-            loss: a, mean of ρ'', and b, mean square of ρ', of the residuals; 1 for squares.
+            at_bound: Mask of the parameters at a bound, whose covariance is 0.
+            loss: Mean a of ρ'' and mean square b of ρ' over the residuals; (1, 1) for squares.
         """
         gain, noise = loss
         inverse = self.covariance(
             sigma=sigma / np.sqrt(gain), precision=precision, at_bound=at_bound
         )  # A⁻¹
-        spread = np.sqrt(noise) * inverse @ self.factor.T / sigma
-        return np.asarray(spread @ spread.T)
+        root = np.sqrt(noise) * inverse @ self.factor.T / sigma
+        return np.asarray(root @ root.T)
 
 
 def _inverse_square(matrix: Array) -> Array:
-    """(MᵀM)⁻¹ without forming MᵀM; infinite where M has not full rank."""
+    """(MᵀM)⁻¹ without forming MᵀM; infinite if M does not have full rank."""
     r = np.linalg.qr(matrix, mode="r")
     diagonal = np.abs(np.diag(r))
     if not diagonal.size:
@@ -172,27 +173,27 @@ def _inverse_square(matrix: Array) -> Array:
     return np.asarray(half @ half.T)
 
 
-def marginalise(information: Information, kept: int, *, sigma: float) -> Information:
-    """Information about the first parameters, the others marginalised over their priors.
+def marginalise(information: Information, n_first: int, *, sigma: float) -> Information:
+    """Information about the first parameters after marginalising over the others with their priors.
 
     Args:
         information: Information about all parameters.
-        kept: Number of the first parameters.
+        n_first: Number of the first parameters.
         sigma: Standard deviation of a reading, [m].
     """
-    count = information.factor.shape[1] - kept
-    if not count:
+    n_others = information.factor.shape[1] - n_first
+    if not n_others:
         return information
-    rows = np.vstack([information.factor / sigma, np.zeros((count, kept + count))])
-    rows[-count:, kept:] = np.eye(count)
-    basis, _ = np.linalg.qr(rows[:, kept:])
-    remaining = rows[:, :kept] - basis @ (basis.T @ rows[:, :kept])
+    rows = np.vstack([information.factor / sigma, np.zeros((n_others, n_first + n_others))])
+    rows[-n_others:, n_first:] = np.eye(n_others)
+    basis, _ = np.linalg.qr(rows[:, n_first:])
+    remaining = rows[:, :n_first] - basis @ (basis.T @ rows[:, :n_first])
     return Information(sigma * remaining)
 
 
-def take_for_known(information: Information, kept: int) -> Information:
-    """Information about the first parameters, all others known exactly."""
-    return Information(information.factor[:, :kept])
+def assume_others_known(information: Information, n_first: int) -> Information:
+    """Information about the first parameters if all others are known exactly."""
+    return Information(information.factor[:, :n_first])
 
 
 def decompose(jacobian: Array, observations: Observations) -> Information:
@@ -200,7 +201,7 @@ def decompose(jacobian: Array, observations: Observations) -> Information:
 
     Args:
         jacobian: dh/dθ̂, shape (n_entries, n_free), [m per prior std].
-        observations: Zeros of the entries.
+        observations: Entries with their gauge zeros.
     """
     return Information(project_out_zeros(jacobian, observations))
 
@@ -217,11 +218,11 @@ def require_identifiable(
     Args:
         information: Information of the readings.
         names: Names of the first parameters, which are checked.
-        precision: Diagonal of the prior's precision: 1 or 0, shape (n_free,).
+        precision: Diagonal of P⁻¹: 1 or 0, shape (n_free,).
         where: File, for messages.
 
     Raises:
-        NotIdentifiableError: Naming the parameters.
+        NotIdentifiableError: If a parameter is not identifiable; names the parameters.
     """
     if precision.all():
         return
@@ -229,71 +230,84 @@ def require_identifiable(
     stacked = np.vstack([information.factor / largest, np.diag(precision)])
     _, values, directions = np.linalg.svd(stacked, full_matrices=False)
     null = directions[values <= RANK_THRESHOLD * values[0], : len(names)]
-    lost = tuple(n for n, size in zip(names, (null**2).sum(axis=0), strict=True) if size > 1e-12)
-    if lost:
-        information = take_for_known(information, len(names))
-        advice = _advise_lost(information, names, null)
+    undetermined = tuple(
+        n for n, size in zip(names, (null**2).sum(axis=0), strict=True) if size > 1e-12
+    )
+    if undetermined:
+        information = assume_others_known(information, len(names))
+        advice = _advise(information, names, null)
         raise NotIdentifiableError(
-            f"the readings do not determine {_list_some(lost)}: {information.rank} of "
+            f"the readings do not determine {_list_some(undetermined)}: {information.rank} of "
             f"{len(names)} free parameters are identifiable. {advice} Or use tolerances as a prior "
             "(--prior), or identify base parameters (--base)",
-            parameters=lost,
+            parameters=undetermined,
             where=where,
         )
 
 
-def _advise_lost(information: Information, names: tuple[str, ...], null: Array) -> str:
-    """Advice on the null space of the readings."""
-    sizes = np.linalg.norm(information.factor, axis=0)
-    unread = sizes <= RANK_THRESHOLD * max(float(sizes.max(initial=0.0)), 1e-300)
-    words = []
-    if unread.any():
-        unread_names = [n for n, out in zip(names, unread, strict=True) if out]
-        words.append(
-            f"No reading depends on {_list_some(unread_names)}: read the legs that are "
+def _advise(information: Information, names: tuple[str, ...], null: Array) -> str:
+    """Advice about readings that would determine the parameters.
+
+    Args:
+        information: Information about the parameters.
+        names: Names of the parameters.
+        null: Basis of their null space as rows, shape (k, n).
+    """
+    norms = np.linalg.norm(information.factor, axis=0)
+    without_effect = norms <= RANK_THRESHOLD * max(float(norms.max(initial=0.0)), 1e-300)
+    sentences = []
+    if without_effect.any():
+        names_without_effect = [
+            n for n, has_none in zip(names, without_effect, strict=True) if has_none
+        ]
+        sentences.append(
+            f"No reading depends on {_list_some(names_without_effect)}: read the legs that are "
             "missing, in postures along their own axes."
         )
     # each row of the reduced echelon form is one unobservable change of the others
-    null_rows = _reduce(null[:, ~unread])
-    seen = [n for n, out in zip(names, unread, strict=True) if not out]
-    for row in null_rows[:MOST_LOST]:
+    null_rows = _reduce(null[:, ~without_effect])
+    other_names = [n for n, has_none in zip(names, without_effect, strict=True) if not has_none]
+    for row in null_rows[:MAX_DIRECTIONS]:
         order = np.argsort(-np.round(np.abs(row), 9), kind="stable")
         terms = [i for i in order if abs(row[i]) > 1e-6]
-        ways = [f"{seen[i]} {'up' if row[i] * row[terms[0]] > 0 else 'down'}" for i in terms]
-        words.append(f"No reading depends on this combined change: {_list_some(ways)}.")
-    return " ".join(words)
+        changes = [
+            f"{other_names[i]} {'up' if row[i] * row[terms[0]] > 0 else 'down'}" for i in terms
+        ]
+        sentences.append(f"No reading depends on this combined change: {_list_some(changes)}.")
+    return " ".join(sentences)
 
 
 def _list_some(items: Sequence[str]) -> str:
-    more = f" and {len(items) - MOST_NAMED} more" if len(items) > MOST_NAMED else ""
-    return ", ".join(items[:MOST_NAMED]) + more
+    """First items and the number of the others."""
+    more = f" and {len(items) - MAX_LISTED} more" if len(items) > MAX_LISTED else ""
+    return ", ".join(items[:MAX_LISTED]) + more
 
 
 def _reduce(rows: Array) -> Array:
-    """Reduced echelon form of the space that rows span.
+    """Reduced echelon form of the space that is spanned by rows.
 
-    The pivots are the largest columns; of equal ones, the first.
+    The pivots are the columns with the largest norms; the first of equal ones.
     """
     _, values, basis = np.linalg.svd(rows, full_matrices=False)
     basis = basis[values > 1e-6]
     remaining, pivots = np.array(basis), []
     for _ in range(len(basis)):
-        sizes = np.linalg.norm(remaining, axis=0)
-        pivots.append(int(np.argmax(sizes >= (1.0 - 1e-6) * sizes.max())))
-        along = remaining[:, pivots[-1]] / sizes[pivots[-1]]
-        remaining -= np.outer(along, along @ remaining)
+        norms = np.linalg.norm(remaining, axis=0)
+        pivots.append(int(np.argmax(norms >= (1.0 - 1e-6) * norms.max())))
+        direction = remaining[:, pivots[-1]] / norms[pivots[-1]]
+        remaining -= np.outer(direction, direction @ remaining)
     return np.asarray(np.linalg.solve(basis[:, pivots], basis))
 
 
-def whiten(values: Array, spread: Array, *, sigma: float) -> Array:
+def whiten(values: Array, root: Array, *, sigma: float) -> Array:
     """Whitened values V^(-1/2) y, V = σ² I + S Sᵀ.
 
     Args:
-        values: Shape (n,) or (n, k).
-        spread: S, root of the common covariance, shape (n, m).
-        sigma: Independent standard deviation of each value, [as the values].
+        values: Values y, shape (n,) or (n, k).
+        root: Square root S of the common covariance, shape (n, m), [unit of y].
+        sigma: Independent standard deviation of each value, [unit of y].
     """
-    directions, sizes, _ = np.linalg.svd(spread, full_matrices=False)
-    shrunk = 1.0 - 1.0 / np.sqrt(1.0 + (sizes / sigma) ** 2)
-    common = (directions.T @ values).T * shrunk
-    return np.asarray((values - directions @ common.T) / sigma)
+    directions, singular_values, _ = np.linalg.svd(root, full_matrices=False)
+    shrunk = 1.0 - 1.0 / np.sqrt(1.0 + (singular_values / sigma) ** 2)
+    projected = (directions.T @ values).T * shrunk
+    return np.asarray((values - directions @ projected.T) / sigma)

@@ -1,6 +1,6 @@
 """Noise of the readings: its estimate, its source, and tests of residuals against it.
 
-Tests return True or False, or None if the noise is unknown.
+Tests return None if the noise is unknown.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from orthocal.observation.observations import Observations
 from orthocal.statistics.chance import BY_CHANCE, chance_of_excess
 
 FEW_DOF = 5.0
-"""Degrees of freedom below which residuals replace the stated noise only if they are significant:
-with a prior, a larger sigma leads to larger residuals and would confirm itself."""
+"""Degrees of freedom below which residuals replace the stated noise only if they exceed it
+significantly. With a prior, a larger σ causes larger residuals and would confirm itself."""
 
-LEAST_DOF = 0.5
+MIN_DOF = 0.5
 """Degrees of freedom below which residuals do not determine the noise."""
 
 NoiseSource = Literal["cycles", "residuals", "gauge", "unknown"]
@@ -34,7 +34,7 @@ class Noise:
     __pydantic_config__ = CLOSED
 
     sigma: SizeOrNaN
-    """Standard deviation of a reading, [m]; NaN if unknown. A difference of two has √2 of it."""
+    """Standard deviation of a reading, [m]; NaN if unknown. That of a difference is √2 of it."""
     dof: SizeOrInf
     """Degrees of freedom; infinite for a stated sigma."""
     source: NoiseSource
@@ -42,13 +42,16 @@ class Noise:
     """Standard deviation from repeated cycles, [m]; NaN without cycles."""
     cycles_dof: Count
     residual_sigma: SizeOrNaN
-    """√(Σ r²/(m − n)), [m]; NaN without degrees of freedom."""
+    """Standard deviation from residuals, √(Σ r²/dof), [m]; NaN without degrees of freedom."""
     residual_dof: Size
 
-    def apart_from_residuals(
+    def without_residuals(
         self, gauge: float | None, resolution: float | None
     ) -> tuple[float, float]:
-        """Standard deviation that is stated or that repeated readings show, and its dof.
+        """Standard deviation of a reading without use of the residuals, and its degrees of freedom.
+
+        It is that of repeated readings if this exceeds the lower limit (`noise_floor`), otherwise
+        the limit.
 
         Args:
             gauge: Stated standard deviation of a reading, [m].
@@ -59,8 +62,8 @@ class Noise:
             return self.cycles_sigma, float(self.cycles_dof)
         return floor, math.inf
 
-    def leaves_more(self, gauge: float | None) -> bool | None:
-        """Test for residuals larger than noise, which means a model discrepancy.
+    def exceeded_by_residuals(self, gauge: float | None) -> bool | None:
+        """Test for residuals larger than the noise, which shows unmodelled errors.
 
         Args:
             gauge: Stated standard deviation of a reading, [m]; None if not stated.
@@ -71,33 +74,38 @@ class Noise:
         if self.source in ("cycles", "gauge"):
             return False
         if self.source == "residuals" and self.cycles_dof > 0:
-            return True  # otherwise sigma would come from the cycles
+            return True  # otherwise the noise would be that of the cycles
         if self.source == "unknown" or gauge is None:
             return None
-        return self._chance_in_residuals(gauge) < BY_CHANCE
+        return self._chance_of_residuals(gauge) < BY_CHANCE
 
-    def leaves_less(self, gauge: float | None) -> bool | None:
-        """Test for residuals smaller than the noise of a gauge with standard deviation [m].
+    def exceeds_residuals(self, gauge: float | None) -> bool | None:
+        """Test for residuals smaller than the stated noise of the gauge.
+
+        Args:
+            gauge: Stated standard deviation of a reading, [m]; None if not stated.
 
         Returns:
-            None if it is not stated, or there are no residual degrees of freedom.
+            None if it is not stated, or if the residuals have no degrees of freedom.
         """
         if gauge is None or not self.residual_dof > 0.0 or math.isnan(self.residual_sigma):
             return None
-        return self._chance_in_residuals(gauge) > 1.0 - BY_CHANCE
+        return self._chance_of_residuals(gauge) > 1.0 - BY_CHANCE
 
     def is_finer_than(self, sigma: float, *, dof: float) -> bool | None:
-        """Test for residuals smaller than rounding.
+        """Test for residuals smaller than rounding errors.
 
         Args:
             sigma: Standard deviation of rounding, [m].
-            dof: Degrees of freedom of the residuals; repeated readings may have been rounded alike.
+            dof: Degrees of freedom of the residuals without repetitions, which may have the same
+                rounding error.
         """
-        if dof < 1.0 or not self.residual_dof > LEAST_DOF or math.isnan(self.residual_sigma):
+        if dof < 1.0 or not self.residual_dof > MIN_DOF or math.isnan(self.residual_sigma):
             return None
         return chance_of_excess(dof * (self.residual_sigma / sigma) ** 2, dof) >= 1.0 - BY_CHANCE
 
-    def _chance_in_residuals(self, sigma: float) -> float:
+    def _chance_of_residuals(self, sigma: float) -> float:
+        """Probability of residuals at least as large for a standard deviation of a reading, [m]."""
         chi_square = (self.residual_sigma / sigma) ** 2 * self.residual_dof
         return chance_of_excess(chi_square, self.residual_dof)
 
@@ -114,15 +122,15 @@ class KnownNoise:
 def estimate_repeatability(values: Array, observations: Observations) -> tuple[float, int]:
     """Standard deviation of repeated readings of the same setup in the same posture.
 
-    Within a setup the readings are fitted by one value for each posture and approach and one zero
-    for each group; their residuals are noise, independent of the machine.
+    The readings of a setup are fitted by one value for each posture and approach, and by one gauge
+    zero for each group. The residuals are noise, independent of the machine.
 
     Args:
-        values: Readings as single ones, shape (n_entries,), [m].
-        observations: Setup, place and zero of each entry.
+        values: Single readings, shape (n_entries,), [m].
+        observations: Setup, place and gauge zero of each entry.
 
     Returns:
-        Standard deviation [m] (NaN without repetition) and degrees of freedom.
+        Standard deviation, [m], NaN without repetitions; and degrees of freedom.
     """
     total, dof = 0.0, 0
     for setup in np.unique(observations.setup):
@@ -145,8 +153,8 @@ def estimate_repeatability(values: Array, observations: Observations) -> tuple[f
 def noise_floor(gauge_sigma: float | None, resolution: float | None) -> float:
     """Lower limit of the standard deviation of a reading, [m].
 
-    The stated noise of the gauge, plus rounding, 1/√12 of its resolution. A small scatter of few
-    readings does not disprove either.
+    It combines the stated noise of the gauge and rounding, 1/√12 of the resolution, because a small
+    scatter of few readings does not disprove them.
     """
     return math.hypot(gauge_sigma or 0.0, (resolution or 0.0) / math.sqrt(12.0))
 
@@ -161,36 +169,40 @@ def estimate_noise(
 ) -> Noise:
     """Noise of a reading: from repeated cycles, otherwise from residuals, otherwise as stated.
 
-    Residuals replace cycles if an F test finds them too large: then the model has errors, and the
-    scatter of the cycles would give too small standard deviations. The stated noise of the gauge is
-    a lower limit (`noise_floor`).
+    Residuals replace cycles if an F test shows that they are too large. The model then has errors,
+    and standard deviations from the scatter of the cycles would be too small. The stated noise of
+    the gauge is a lower limit (`noise_floor`).
 
     Args:
         repeatability: From `estimate_repeatability`.
-        residual_square: Σ r² of single readings, zeros eliminated, [m²].
-        residual_dof: Readings minus zeros minus effective parameters.
-        gauge_sigma: The session's `sigma_mm`, [m].
+        residual_square: Σ r² of single readings with gauge zeros eliminated, [m²].
+        residual_dof: Readings minus gauge zeros minus effective parameters.
+        gauge_sigma: Stated standard deviation of a reading, [m]; None if not stated.
         resolution: Resolution of the gauge, [m].
     """
     cycles_sigma, cycles_dof = repeatability
     floor = noise_floor(gauge_sigma, resolution)
     cycles_sigma = max(cycles_sigma, noise_floor(None, resolution)) if cycles_dof else cycles_sigma
-    enough = residual_dof > LEAST_DOF
-    residual_sigma = math.sqrt(residual_square / residual_dof) if enough else math.nan
+    has_dof = residual_dof > MIN_DOF
+    residual_sigma = math.sqrt(residual_square / residual_dof) if has_dof else math.nan
     source: NoiseSource
     if cycles_dof > 0:
-        base, base_dof = (cycles_sigma, cycles_dof) if cycles_sigma > floor else (floor, 0)
+        reference, reference_dof = (
+            (cycles_sigma, cycles_dof) if cycles_sigma > floor else (floor, 0)
+        )
         misfit = False
-        if enough and base > 0.0:
-            chi_square = residual_square / base**2
-            misfit = chance_of_excess(chi_square, residual_dof, cycles_dof=base_dof) < BY_CHANCE
+        if has_dof and reference > 0.0:
+            chi_square = residual_square / reference**2
+            misfit = (
+                chance_of_excess(chi_square, residual_dof, cycles_dof=reference_dof) < BY_CHANCE
+            )
         source = "residuals" if misfit else "cycles"
-    elif enough:
-        provisional = residual_dof < FEW_DOF and floor > 0.0 and gauge_sigma is not None
-        excess = not provisional or (
+    elif has_dof:
+        few_dof = residual_dof < FEW_DOF and floor > 0.0 and gauge_sigma is not None
+        use_residuals = not few_dof or (
             chance_of_excess(residual_square / floor**2, residual_dof) < BY_CHANCE
         )
-        source = "residuals" if excess else "gauge"
+        source = "residuals" if use_residuals else "gauge"
     else:
         source = "gauge" if gauge_sigma is not None else "unknown"
     sigma, dof = {

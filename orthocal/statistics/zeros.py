@@ -1,7 +1,7 @@
 """Exact elimination of gauge zeros.
 
-The optimal zero of several readings is their mean, so readings and Jacobians become deviations from
-the mean over their zero.
+The optimal gauge zero of several readings is their mean. Therefore the mean over all entries with
+the same zero is subtracted from readings and Jacobians.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from orthocal.observation.observations import Observations
 def project_out_zeros(
     values: Array, observations: Observations, *, weights: Array | None = None
 ) -> Array:
-    """Values minus the mean of those with the same free gauge zero, shape (n_entries, ...).
+    """Subtract the mean over all entries with the same free gauge zero, shape (n_entries, ...).
 
-    Values with a known zero do not change.
+    Entries with a known zero do not change.
 
     Args:
-        values: Shape (n_entries, ...).
-        observations: Zeros of the entries.
+        values: Readings or derivatives of the entries, shape (n_entries, ...).
+        observations: Entries with their gauge zeros.
         weights: Weights of the entries in the means, shape (n_entries,); 1 by default.
     """
     flat = values.reshape(len(values), -1)

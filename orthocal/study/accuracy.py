@@ -1,9 +1,9 @@
 """Study of accuracy: random machines are measured by a plan and calibrated.
 
-Each machine has random errors, its gauges have random mounting errors, and its readings are noisy
-and rounded. The calibration may identify fewer errors than the machine has. Where it ignores
-effects beside geometry that the machines have, each machine is also calibrated with these effects,
-which says what ignoring them costs.
+Machines have random errors, gauges have random mounting errors, and readings are noisy and rounded.
+The calibration may identify fewer errors than the machine has. If it ignores effects of the
+machines beside geometry, each machine is also calibrated with these effects. The comparison shows
+the cost of ignoring them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from orthocal.effects.registry import order_effects
 from orthocal.errors import ClosureError, SessionError
 from orthocal.estimation.choice import Choice, resolve_choice
 from orthocal.estimation.selection import Selection
-from orthocal.kinematics.workspace import cube_limits, find_workspace
+from orthocal.kinematics.reachable_box import find_workspace
+from orthocal.kinematics.workspace import cube_limits
 from orthocal.observation.observations import require_conditions
 from orthocal.planning.expected_error import Expected, ToolForecast
 from orthocal.robot.model import Robot
@@ -33,7 +34,7 @@ from orthocal.study.study import Columns, Study, columns_in_edge_units, prepare_
 from orthocal.units import UM
 
 PREDICTED_MACHINES = 60
-"""Machines over which the prediction is averaged: the Jacobian differs from machine to machine."""
+"""Number of machines over which the prediction is averaged, because their Jacobians differ."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,17 +46,17 @@ class AccuracyStudy(Study):
     cases_per_task: ClassVar[int] = 100
 
     choice: Choice
-    """Identified errors; the session's robot has the identified effects."""
+    """Identified errors. The identified effects are those of the session's robot."""
     effects: tuple[str, ...]
     """Effects beside geometry that the machines have."""
     drawn: Mapping[str, float]
-    """Names of the errors that are random, with their standard deviations, [SI]."""
+    """Random errors and their standard deviations, [SI]."""
     fixed: Mapping[str, float]
     """Errors that all machines have, [SI]."""
     machines: int
     seed: int
     box: tuple[tuple[float, float], ...]
-    """Box over which the tool's error is computed, relative to the mechanical zero, [m]."""
+    """Box over which the tool error is computed, relative to the mechanical zero, [m]."""
 
     @property
     def count(self) -> int:
@@ -68,11 +69,11 @@ class AccuracyStudy(Study):
         return tuple(e for e in self.effects if e not in self.session.robot.effect_names)
 
     def prepare(self) -> RandomMachines:
-        """Machines, the models that identify them, and the workspace."""
-        session = self._measured
+        """Random machines, the models that identify them, and the workspace."""
+        session = self._session_of_machines
         models = [(self.session, self.choice)]
         if self.ignored:
-            models.append((self._with_ignored, replace(self.choice, effects=None)))
+            models.append((self._session_with_ignored, replace(self.choice, effects=None)))
         return RandomMachines.of(
             session,
             _true_selection(self, session.robot),
@@ -83,13 +84,13 @@ class AccuracyStudy(Study):
         )
 
     @property
-    def _measured(self) -> Session:
-        """The plan, of the robot with the effects of the machines."""
+    def _session_of_machines(self) -> Session:
+        """Plan with the effects of the machines."""
         return self.session.with_effects(self.effects)
 
     @property
-    def _with_ignored(self) -> Session:
-        """The plan, of the robot with identified and ignored effects."""
+    def _session_with_ignored(self) -> Session:
+        """Plan with identified and ignored effects."""
         return self.session.with_effects((*self.session.robot.effect_names, *self.ignored))
 
     def run(self, prepared: RandomMachines, task: int) -> Columns:
@@ -101,25 +102,27 @@ class AccuracyStudy(Study):
         before, after, *with_ignored = prepared.tool_errors(measured, estimates)
         theta = np.where((status == CALIBRATED)[:, None], estimates[0], np.nan)
         weights = tool.workspace.weights
-        aligned, *others = (
+        aligned, *other_fields = (
             tool.workspace.align(f, tool.positions) for f in (after, before, *with_ignored)
         )
 
         def rms(field: Array) -> list[float]:
             return list(np.sqrt(weights @ (field**2).sum(axis=1)) / UM)
 
-        true = model.identified_part(measured.errors, prepared.error_names)
-        estimate = theta[:, : model.problem.n_machine]
-        true_columns = columns_in_edge_units("true.", model.problem, true)
-        error_columns = columns_in_edge_units("error.", model.problem, estimate - true)
+        true_values = model.identified_part(measured.errors, prepared.error_names)
+        estimated_values = theta[:, : model.problem.n_machine]
+        true_columns = columns_in_edge_units("true.", model.problem, true_values)
+        error_columns = columns_in_edge_units(
+            "error.", model.problem, estimated_values - true_values
+        )
         pairs = zip(true_columns.items(), error_columns.items(), strict=True)
         return {
             "machine": list(numbers),
             "status": list(status),
-            "before_um": rms(others[0]),
+            "before_um": rms(other_fields[0]),
             "tool_um": rms(aligned),
-            **({"tool_all_effects_um": rms(others[1])} if self.ignored else {}),
-            "tool_shift_out_um": rms(tool.workspace.remove_shift(after)),
+            **({"tool_all_effects_um": rms(other_fields[1])} if self.ignored else {}),
+            "tool_shift_out_um": rms(tool.workspace.remove_translation(after)),
             "tool_absolute_um": rms(after),
             "tool_worst_um": list(np.sqrt((aligned**2).sum(axis=1).max(axis=0)) / UM),
             **dict(column for pair in pairs for column in pair),
@@ -127,25 +130,25 @@ class AccuracyStudy(Study):
 
     @cached_property
     def predicted(self) -> Expected | None:
-        """Predicted tool error of such machines, from the covariance at a sample of them.
+        """Predicted tool error of the machines, from the covariance at a sample of them.
 
-        Errors that are not identified count with their prior covariance. None where the model
-        ignores an effect that changes a machine without errors, such as thermal expansion, or a
-        gauge, such as drift.
+        Errors that are not identified contribute their prior covariance. None if the model ignores
+        an effect that acts without errors of the machine, such as thermal expansion, or on gauges,
+        such as drift.
         """
-        session, p = self._with_ignored, prepare_once(self)
+        session, prepared = self._session_with_ignored, prepare_once(self)
         effects = {e.name: e for e in robot_effects(session.robot)}
-        if any(effects[n].setup_errors for n in self.ignored) or not p.alike_without_errors:
+        if any(effects[n].setup_errors for n in self.ignored) or not prepared.alike_without_errors:
             return None
-        selection = p.model.problem.machine_selection
-        workspace = p.tool.workspace.once(p.tool.use.size)
+        selection = prepared.model.problem.machine_selection
+        workspace = prepared.tool.workspace.once(prepared.tool.use.size)
         forecast = ToolForecast(
-            session.robot, selection, workspace, use=p.tool.use, others=self.drawn
+            session.robot, selection, workspace, use=prepared.tool.use, others=self.drawn
         )
         names = forecast.problem(session).free
         count = min(PREDICTED_MACHINES, self.machines)
-        machines = [p.true_values(number, names) for number in range(count)]
-        return forecast.after(session, weight=p.model.sigma, machines=machines)
+        machines = [prepared.true_values(number, names) for number in range(count)]
+        return forecast.after(session, weight=prepared.model.sigma, machines=machines)
 
 
 def build_accuracy_study(
@@ -159,17 +162,17 @@ def build_accuracy_study(
     seed: int = 0,
     half_side: float | None = None,
 ) -> AccuracyStudy:
-    """A study of the tool error that the readings of a plan leave.
+    """Build a study of the tool error after a calibration from the readings of a plan.
 
-    The tool is used under the conditions that the robot's YAML states (`use`), by default from both
+    The tool is used under the conditions that the robot's YAML states (`use`), by default with both
     sides of approach at the reference temperature.
 
     Args:
         session: The planned readings.
         choice: Identified errors, or the name of a model; default: the session's choice, or `full`.
-            Its prior standard deviations also apply to the random errors. Its effects are those
-            that are identified.
-        effects: Effects beside geometry that the machines have; default: those that are identified.
+            Its prior standard deviations also apply to the random errors. Its effects are the
+            identified ones.
+        effects: Effects beside geometry that the machines have; default: the identified ones.
         drawn: Names or globs of the random errors; default: all errors of the machine, or none if
             `fixed` is not empty.
         fixed: Errors that all machines have, [SI].
@@ -186,23 +189,23 @@ def build_accuracy_study(
     chosen = resolve_choice(choice, session, default_model="full")
     if chosen.effects is not None:
         session = session.with_effects(chosen.effects)
-    has = session.robot.effect_names if effects is None else order_effects(effects)
-    measured = session.with_effects(has)
-    robot, fixed = measured.robot, dict(fixed or {})
+    machine_effects = session.robot.effect_names if effects is None else order_effects(effects)
+    plan = session.with_effects(machine_effects)
+    robot, fixed = plan.robot, dict(fixed or {})
     parameters = robot.parameters
     names = _select_drawn(drawn, fixed, parameters)
-    stated = parameters.read_tolerances(chosen.tolerances)
-    stated = {n: std for glob, std in stated.items() for n in parameters.select([glob])}
-    chosen = replace(chosen, effects=None, tolerances=_known_tolerances(chosen, session, measured))
+    stated_stds = parameters.read_tolerances(chosen.tolerances)
+    stated_stds = {n: std for glob, std in stated_stds.items() for n in parameters.select([glob])}
+    chosen = replace(chosen, effects=None, tolerances=_tolerances_of_model(chosen, session, plan))
     chosen.select(session.robot.parameters)
     _require_noise(session)
-    require_conditions(measured, names)
+    require_conditions(plan, names)
     box = find_workspace(robot).limits if half_side is None else cube_limits(robot, half_side)
     return AccuracyStudy(
         session=session.with_values(np.zeros(len(session.readings))),
         choice=chosen,
-        effects=tuple(has),
-        drawn={n: stated.get(n, parameters[n].prior_std) for n in names},
+        effects=tuple(machine_effects),
+        drawn={n: stated_stds.get(n, parameters[n].prior_std) for n in names},
         fixed=fixed,
         machines=machines,
         seed=seed,
@@ -221,21 +224,21 @@ def _require_noise(session: Session) -> None:
             )
 
 
-def _known_tolerances(choice: Choice, session: Session, measured: Session) -> dict[str, float]:
-    """Tolerances of a choice without those of effects that the model ignores."""
+def _tolerances_of_model(choice: Choice, session: Session, measured: Session) -> dict[str, float]:
+    """Tolerances of a choice without those for effects that the model ignores."""
     ignored = set(measured.robot.parameters.names) - set(session.robot.parameters.names)
-    result = {}
+    tolerances = {}
     for key, value in choice.tolerances.items():
         glob, _ = measured.robot.parameters.read_glob(key)
         if not set(measured.robot.parameters.select([glob])) <= ignored:
-            result[key] = value
-    return result
+            tolerances[key] = value
+    return tolerances
 
 
 def _select_drawn(
     drawn: Sequence[str] | None, fixed: Mapping[str, float], parameters: ParameterSet
 ) -> tuple[str, ...]:
-    """Names of the random errors, without sums of others and without fixed ones."""
+    """Names of the random errors, without sums of them and without fixed errors."""
     if drawn is None:
         drawn = () if fixed else parameters.patterns("full")
     names = _without_sums(parameters.select(drawn), parameters) if drawn else ()
@@ -244,7 +247,7 @@ def _select_drawn(
 
 
 def _without_sums(names: Sequence[str], parameters: ParameterSet) -> tuple[str, ...]:
-    """Names without sums of errors that are in the list themselves, and would be drawn twice."""
+    """Names without sums of errors that are also in the list and would be drawn twice."""
     return tuple(
         n
         for n in names
@@ -253,7 +256,7 @@ def _without_sums(names: Sequence[str], parameters: ParameterSet) -> tuple[str, 
 
 
 def _true_selection(study: AccuracyStudy, robot: Robot) -> Selection:
-    """All errors of the machines: random ones with their priors, and fixed ones."""
+    """Selection of all errors of the machines: random ones with their priors, and fixed ones."""
     parameters = tuple(
         replace(robot.parameters[n], prior_std=std) for n, std in study.drawn.items()
     )
@@ -275,7 +278,7 @@ class EstimationError:
 
     parameter: Parameter
     rms: float
-    """[SI]"""
+    """RMS of the errors, [SI]."""
     standard_error: float
     """Sampling standard error of the RMS, [SI]."""
     predicted: float
@@ -293,43 +296,43 @@ class AccuracySummary:
     failed: Mapping[str, int]
     """Reason to number of machines without a calibration."""
     before: float
-    """[m]"""
+    """Tool error before the calibration, [m]."""
     after: float
-    """[m]"""
+    """Tool error after the calibration, [m]."""
     standard_error: float
     """Sampling standard error of `after`, [m]."""
     percentile_95: float
-    """95th percentile of the machines after calibration, [m]."""
+    """95th percentile over the machines after the calibration, [m]."""
     worst_point: float
     """Largest error in the workspace, RMS over the machines, [m]."""
     shift_removed: float
-    """With the translation removed only, [m]."""
+    """Tool error with only the mean translation removed, [m]."""
     absolute: float
-    """[m]"""
+    """Absolute tool error, [m]."""
     all_effects: float | None
-    """With the effects identified that the model ignores, [m]; None if it ignores none."""
+    """Tool error if the ignored effects are identified, too, [m]; None if none is ignored."""
     cost_standard_error: float
-    """Sampling standard error of `after` less `all_effects`, [m]."""
+    """Sampling standard error of `after` − `all_effects`, [m]."""
     predicted: Expected | None
-    """None where nothing can be predicted."""
+    """Predicted tool error; None if it cannot be predicted."""
     parameters: tuple[EstimationError, ...]
-    """Sorted by `relative`, largest first."""
+    """Errors of the estimates, sorted by `relative`, largest first."""
 
 
 def summarise_accuracy(study: AccuracyStudy, table: StudyTable) -> AccuracySummary:
     """Summary of the table of an accuracy study."""
     status = np.array(table.columns.get("status", []), dtype=object)
-    good = status == CALIBRATED
+    calibrated = status == CALIBRATED
 
     def column(name: str) -> Array:
         values = np.array(table.columns.get(name, []), dtype=np.float64)
-        return values[good] if values.size else values
+        return values[calibrated] if values.size else values
 
     def tool(name: str) -> tuple[float, float]:
         return _root_mean_square(column(name) * UM)
 
     try:
-        predicted = study.predicted if good.any() else None
+        predicted = study.predicted if calibrated.any() else None
     except (ClosureError, np.linalg.LinAlgError):
         predicted = None
     errors = []
@@ -348,12 +351,14 @@ def summarise_accuracy(study: AccuracyStudy, table: StudyTable) -> AccuracySumma
             column("tool_um") * UM, column("tool_all_effects_um") * UM
         )
     return AccuracySummary(
-        machines=int(good.sum()),
-        failed={str(s): int((status == s).sum()) for s in sorted(set(status[~good]))},
+        machines=int(calibrated.sum()),
+        failed={str(s): int((status == s).sum()) for s in sorted(set(status[~calibrated]))},
         before=tool("before_um")[0],
         after=after,
         standard_error=standard_error,
-        percentile_95=float(np.quantile(column("tool_um") * UM, 0.95)) if good.any() else np.nan,
+        percentile_95=float(np.quantile(column("tool_um") * UM, 0.95))
+        if calibrated.any()
+        else np.nan,
         worst_point=tool("tool_worst_um")[0],
         shift_removed=tool("tool_shift_out_um")[0],
         absolute=tool("tool_absolute_um")[0],
@@ -376,9 +381,11 @@ def _root_mean_square(values: Array) -> tuple[float, float]:
 
 
 def _standard_error_of_difference(one: Array, other: Array) -> float:
-    """Standard error of the RMS of a sample less that of another of the same machines."""
+    """Standard error of the difference of the RMS of two samples of the same machines."""
     if one.size < 2:
         return np.nan
     # d(rms) = d(mean square)/(2 rms)
-    ours, theirs = (v**2 / (2.0 * max(_root_mean_square(v)[0], 1e-15)) for v in (one, other))
-    return float((ours - theirs).std(ddof=1) / np.sqrt(one.size))
+    one_scaled, other_scaled = (
+        v**2 / (2.0 * max(_root_mean_square(v)[0], 1e-15)) for v in (one, other)
+    )
+    return float((one_scaled - other_scaled).std(ddof=1) / np.sqrt(one.size))

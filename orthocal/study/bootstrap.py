@@ -1,8 +1,8 @@
-"""Bootstrap of a session: the scatter of the estimates that its own readings imply.
+"""Bootstrap of a session: scatter of the estimates from resampled readings.
 
-Each draw resamples the residuals, or whole cycles of each setup (which may drift inside a cycle),
-and repeats the calibration. With priors, the scatter shows the effect of noise on the estimates,
-not their total uncertainty.
+Each draw resamples the residuals, or complete cycles of each setup, and repeats the calibration.
+Cycles preserve a drift within a cycle. With priors, the scatter shows the effect of noise on the
+estimates, not their total uncertainty.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from orthocal.study.study import Columns, Study, columns_in_edge_units, prepare_
 Resampled = Literal["residuals", "cycles"]
 
 SMALLEST_SHARE = 1e-6
-"""Share of a reading's noise below which its residual cannot be rescaled."""
+"""Share of a reading's noise in its residual below which the residual cannot be rescaled."""
 
 
 @dataclass(frozen=True, eq=False)
 class BootstrapStudy(Study):
-    """A session resampled from its own residuals or cycles, and calibrated each time."""
+    """Repeated calibrations of a session with resampled residuals or cycles."""
 
     kind: ClassVar[str] = "bootstrap"
     counted: ClassVar[str] = "draws"
@@ -51,7 +51,7 @@ class BootstrapStudy(Study):
         return self.draws
 
     def prepare(self) -> _Prepared:
-        """Fit of the session, and the data to draw from."""
+        """Fit of the session, and the data to resample."""
         session = self.session
         problem = CalibrationProblem(session, self.choice.select(session.robot.parameters))
         fit = fit_problem(problem, options=SolverOptions(solver="variable-projection"))
@@ -82,11 +82,11 @@ class _Prepared:
     values: Array
     """Single readings, shape (n_entries,), [m of the first gauge]."""
     fitted: Array
-    """Fitted readings, gauge zeros at 0, shape (n_entries,), [m of the first gauge]."""
+    """Fitted readings with gauge zeros of 0, shape (n_entries,), [m of the first gauge]."""
     residuals: Array
-    """Residuals rescaled to the size of the noise, with mean 0, [m of the first gauge]."""
+    """Residuals rescaled to the noise, with mean 0, shape (n,), [m of the first gauge]."""
     cycles: tuple[tuple[NDArray[np.int64], ...], ...]
-    """Entries of each cycle of each setup, in the same order of postures."""
+    """Entries of each cycle of each setup, with the same order of postures in all cycles."""
     program: BatchSolver
 
     def draw(self, rng: np.random.Generator, by: Resampled) -> Array:
@@ -109,19 +109,21 @@ def build_bootstrap_study(
     draws: int = 1000,
     seed: int = 0,
 ) -> BootstrapStudy:
-    """A study of the scatter of estimates that the readings of a session imply.
+    """Build a study of the scatter of estimates from resampled readings.
 
     Args:
         session: The session.
         choice: Identified errors, or the name of a model; default: the session's choice, or
             `offsets`.
-        by: Whether residuals or whole cycles of each setup are resampled.
+        by: Whether residuals or complete cycles of each setup are resampled.
         draws: Number of draws.
         seed: Seed of the draws.
 
     Raises:
         SessionError: If there is nothing to resample.
-        NotIdentifiableError, SolverError, ClosureError: As `calibrate`.
+        NotIdentifiableError: If neither readings nor a prior determine a parameter.
+        SolverError: If the solver does not converge.
+        ClosureError: If the machine cannot reach a posture.
     """
     study = BootstrapStudy(session, resolve_choice(choice, session), by, draws, seed)
     prepare_once(study)  # refuses a session that cannot be resampled
@@ -139,7 +141,7 @@ def find_cycles(
     cycle = np.zeros(observations.size, dtype=np.int64)
     for r, plus, minus in zip(session.readings, observations.plus, observations.minus, strict=True):
         cycle[[plus, minus] if minus >= 0 else [plus]] = r.cycle
-    names, result = list(session.setups), []
+    setup_names, cycles_of_setups = list(session.setups), []
     for setup in np.unique(observations.setup):
         of_setup = np.flatnonzero(observations.setup == setup)
         cycles = []
@@ -153,10 +155,10 @@ def find_cycles(
         if len(cycles) < 2 or len(postures) > 1:
             raise SessionError(
                 f"{problem}, or --by residuals",
-                where=f"{session.path or 'session'}: setups.{names[setup]}",
+                where=f"{session.path or 'session'}: setups.{setup_names[setup]}",
             )
-        result.append(tuple(cycles))
-    return tuple(result)
+        cycles_of_setups.append(tuple(cycles))
+    return tuple(cycles_of_setups)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,10 +173,11 @@ class Scatter:
     standard_error: float
     """Sampling standard error of `std`, [SI]."""
     low: float
+    """Lower end of the interval that contains 95 % of the draws, [SI]."""
     high: float
-    """Ends of the interval that contains 95 % of the draws, [SI]."""
+    """Upper end of the interval that contains 95 % of the draws, [SI]."""
     predicted: float
-    """Standard deviation by noise, from the covariance, [SI]."""
+    """Standard deviation from noise, from the covariance, [SI]."""
     total_std: float
     """Standard deviation that includes the prior, from the covariance, [SI]."""
 
@@ -185,16 +188,16 @@ class BootstrapSummary:
 
     draws: int
     sigma: float
-    """Standard deviation of a reading in the session's own calibration, [m]."""
+    """Standard deviation of a reading in the calibration of the session, [m]."""
     parameters: tuple[Scatter, ...]
     fewest_cycles: int | None
-    """Smallest number of cycles of a setup; None where residuals are resampled."""
+    """Smallest number of cycles of a setup; None if residuals are resampled."""
 
 
 def summarise_bootstrap(study: BootstrapStudy, table: StudyTable) -> BootstrapSummary:
     """Summary of the table of a bootstrap study.
 
-    Draws from c cycles scatter too little, by √((c − 1)/c); the summary corrects this.
+    The scatter of draws from c cycles is too small by the factor √((c − 1)/c), which is corrected.
     """
     prepared: _Prepared = prepare_once(study)
     fit, correction, cycles = prepared.fit, 1.0, None
@@ -226,17 +229,21 @@ def summarise_bootstrap(study: BootstrapStudy, table: StudyTable) -> BootstrapSu
 
 
 def _rescaled_residuals(fit: Fit) -> Array:
-    """Residuals divided by √(1 − leverage): as large as the noise, with mean 0.
+    """Residuals divided by √(1 − leverage), so that they are as large as the noise, with mean 0.
 
     Raises:
-        SessionError: If parameters and gauge zeros explain all of the noise.
+        SessionError: If parameters and gauge zeros explain all residuals.
     """
-    o = fit.problem.observations
-    posterior = fit.information.covariance(
+    observations = fit.problem.observations
+    covariance = fit.information.covariance(
         sigma=fit.sigma, precision=fit.problem.prior_precision, at_bound=fit.at_bound
     )
-    leverage = leverages(fit.jacobian, o, posterior, fit.sigma)
-    share = 1.0 - leverage - 1.0 / np.bincount(o.zero, minlength=o.n_zeros)[o.zero]
+    leverage = leverages(fit.jacobian, observations, covariance, fit.sigma)
+    share = (
+        1.0
+        - leverage
+        - 1.0 / np.bincount(observations.zero, minlength=observations.n_zeros)[observations.zero]
+    )
     if not share.sum() > 1.0:
         raise SessionError(
             "has no residuals to resample: there are not more independent readings than "

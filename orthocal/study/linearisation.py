@@ -1,7 +1,7 @@
-"""Study of linearisation: first-order solutions against the exact one, as errors grow.
+"""Study of linearisation: first-order and exact solutions for increasing errors.
 
-Readings are exact and gauges have no mounting errors, so every error of an estimate comes from the
-equations. Noise and resolution are given for comparison.
+Readings are exact and gauges have no mounting errors, so that errors of estimates result from the
+equations alone. Noise and resolution serve as a comparison.
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ IDENTIFIED = "identified"
 NOT_ASSEMBLED = "cannot be assembled"
 NO_CONTACT = "a tip misses the part it should touch"
 
-MOST_STEPS = 20
+MAX_STEPS = 20
 """Largest number of undamped Gauss-Newton steps."""
 
 CONVERGED = 1e-6
-"""Largest error of an estimate that counts as exact, [m, rad]."""
+"""Error of the estimates below which Gauss-Newton steps have converged, [m, rad]."""
 
 SOLVED = 1e-9
-"""Largest error of the exact solution, [m, rad]."""
+"""Error of the estimates below which they are the exact solution, [m, rad]."""
 
 LARGEST_SIZE = 50.0
-"""Default of the largest error of a machine, [mm or mrad]."""
+"""Default size of the last machine: its largest error component, [mm or mrad]."""
 
 SMALLEST_SIZE = 0.1
-"""Smallest error of a machine, [mm or mrad]."""
+"""Size of the first machine, [mm or mrad]."""
 
 METHODS = ("six", "twelve", "twelve_gls", "first_order", "steps_2", "steps_3", "exact")
 """The paper's equations by ordinary and generalised least squares; the general first-order
@@ -66,7 +66,7 @@ solution, which is one Gauss-Newton step; two and three steps; the exact solutio
 
 @dataclass(frozen=True, eq=False)
 class LinearisationStudy(Study):
-    """Machines with growing errors, identified to first order and exactly."""
+    """Machines with increasing errors that are identified to first order and exactly."""
 
     kind: ClassVar[str] = "linearisation"
     counted: ClassVar[str] = "machines"
@@ -76,7 +76,7 @@ class LinearisationStudy(Study):
     sizes: tuple[float, ...]
     """Largest error component of each machine, [mm or mrad]."""
     directions: tuple[tuple[float, ...], ...]
-    """Errors of machines divided by the largest of them."""
+    """Errors of machines divided by the largest component."""
     displacements: Displacements | None
     """Displacements of the paper's plan; None for other plans, without the paper's equations."""
     sigma: float
@@ -124,7 +124,7 @@ class LinearisationStudy(Study):
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """Largest standard error of an estimate by noise, for each method, [m, rad]."""
+        """Method to the largest standard error of an estimate from noise, [m, rad]."""
         prepared: _Prepared = prepare_once(self)
         return prepared.standard_errors(self.sigma)
 
@@ -137,12 +137,12 @@ class _Prepared:
     linearisation: LinearProblem
     program: VariableProjection
     matrices: Mapping[int, Array]
-    """The paper's matrices by their number of rows; empty for other plans."""
+    """Number of rows to the paper's matrix; empty for other plans."""
     differences: Array
     """The paper's twelve differences of readings, shape (12, n_entries)."""
 
     def paper_methods(self) -> Iterator[tuple[str, Array, Array | None]]:
-        """Name, differences of readings (n_rows, n_entries) and covariance of each of them."""
+        """Name, differences of readings (n_rows, n_entries) and covariance of each paper method."""
         if self.matrices:
             twelve = self.differences
             plus = [TWELVE_ROWS.index(f"{name}+") for name in SIX_ROWS]
@@ -159,51 +159,53 @@ class _Prepared:
         """
         problem = self.problem
         readings, _, assembled = problem.simulate(errors)
-        good = assembled & np.isfinite(readings).all(axis=1)
+        measurable = assembled & np.isfinite(readings).all(axis=1)
         columns: dict[str, list[Any]] = {}
 
         def add(name: str, theta: Array) -> None:
             error = np.abs(theta - errors).max(axis=1) / MM
-            columns[name] = np.where(good, error, np.nan).tolist()
+            columns[name] = np.where(measurable, error, np.nan).tolist()
 
         change = readings - problem.predict(problem.active_theta, problem.active_passive)
         for name, differences, covariance in self.paper_methods():
             matrix = self.matrices[len(differences)]
-            unit = np.eye(len(differences))  # the solver is linear: solve for each row once
-            solve = [solve_equation_8(matrix, y, covariance=covariance).offsets for y in unit]
-            add(name, change @ differences.T @ np.array(solve))
+            unit_rows = np.eye(len(differences))  # the solution is linear in the differences
+            solutions = [
+                solve_equation_8(matrix, y, covariance=covariance).offsets for y in unit_rows
+            ]
+            add(name, change @ differences.T @ np.array(solutions))
         centred = project_out_zeros(change.T, problem.observations).T
-        unit = np.vstack([np.zeros(centred.shape[1]), np.eye(centred.shape[1])])
-        start, *rows = (replace(self.linearisation, residual=y).solve(sigma=1.0) for y in unit)
+        unit_rows = np.vstack([np.zeros(centred.shape[1]), np.eye(centred.shape[1])])
+        start, *rows = (replace(self.linearisation, residual=y).solve(sigma=1.0) for y in unit_rows)
         first_order = start + centred @ (np.array(rows) - start)
         add("first_order", first_order)
-        steps, iterates, exact = self._iterate(readings, first_order, errors, good)
+        steps, iterates, exact = self._iterate(readings, first_order, errors, measurable)
         for k, theta in enumerate(iterates):
             add(f"steps_{k + 2}", theta)
         add("exact", exact)
         linear = errors / problem.theta_scale @ self.linearisation.jacobian.T
-        spread = _largest_difference(centred - linear, problem) / MM
+        nonlinearity = _largest_difference(centred - linear, problem) / MM
         reason = np.where(assembled, NO_CONTACT, NOT_ASSEMBLED)
         return {
-            "status": np.where(good, IDENTIFIED, reason).tolist(),
-            "reading_mm": np.where(good, spread, np.nan).tolist(),
+            "status": np.where(measurable, IDENTIFIED, reason).tolist(),
+            "reading_mm": np.where(measurable, nonlinearity, np.nan).tolist(),
             "steps": [int(n) if n else None for n in steps],
             **columns,
         }
 
     def _iterate(
-        self, readings: Array, first_order: Array, errors: Array, good: Flags
+        self, readings: Array, first_order: Array, errors: Array, measurable: Flags
     ) -> tuple[NDArray[np.int64], list[Array], Array]:
-        """Undamped Gauss-Newton iterations; the first-order solution is the first step.
+        """Undamped Gauss-Newton iterations, of which the first-order solution is the first step.
 
         Returns:
-            Number of steps to convergence, 0 for none, shape (n_sets,); the estimates after two and
-            three steps; the estimates of the exact solver, NaN where it fails.
+            Numbers of steps to convergence, shape (n_sets,), 0 without convergence; the estimates
+            after two and three steps; the exact estimates, NaN if the solver fails.
         """
-        theta, active = np.array(first_order), np.array(good)
+        theta, active = np.array(first_order), np.array(measurable)
         steps, iterates = np.zeros(len(readings), dtype=np.int64), []
         with np.errstate(all="ignore"):
-            for step in range(1, MOST_STEPS + 1):
+            for step in range(1, MAX_STEPS + 1):
                 error = np.abs(theta - errors).max(axis=1)
                 steps = np.where(active & (steps == 0) & (error <= CONVERGED), step, steps)
                 if 1 < step <= 3:
@@ -211,21 +213,21 @@ class _Prepared:
                 active &= (error > SOLVED) | (step <= 3)
                 if not active.any():
                     break
-                theta[active], alive = self.step(readings[active], theta[active])
-                active[np.flatnonzero(active)[~alive]] = False
+                theta[active], succeeded = self.step(readings[active], theta[active])
+                active[np.flatnonzero(active)[~succeeded]] = False
         solved = np.abs(theta - errors).max(axis=1) <= SOLVED
         exact = np.where(solved[:, None], theta, np.nan)
-        for i in np.flatnonzero(good & ~solved):
+        for i in np.flatnonzero(measurable & ~solved):
             with suppress(SolverError, ClosureError):
                 exact[i] = self.program.solve(sigma=1e-6, values=readings[i]).theta
         return steps, iterates, exact
 
     def step(self, readings: Array, theta: Array) -> tuple[Array, Flags]:
-        """One Gauss-Newton step of each machine, NaN where its readings cannot be predicted.
+        """One Gauss-Newton step for each machine; NaN if its readings cannot be predicted.
 
         Args:
-            readings: Shape (n_sets, n_entries), [m of the first gauge].
-            theta: Shape (n_sets, n_free), [SI].
+            readings: Readings, shape (n_sets, n_entries), [m of the first gauge].
+            theta: Parameters, shape (n_sets, n_free), [SI].
         """
         problem = self.problem
         _, passive, closed = problem.simulate(theta)
@@ -234,33 +236,35 @@ class _Prepared:
         predicted, jacobian = problem.predict_and_jacobian(theta[closed], passive[closed])
         finite = np.isfinite(predicted).all(axis=1) & np.isfinite(jacobian).all(axis=(1, 2))
         predicted, jacobian = predicted[finite], jacobian[finite]
-        alive = np.array(closed)
-        alive[np.flatnonzero(closed)[~finite]] = False
-        result = np.full_like(theta, np.nan)
-        if alive.any():
+        predictable = np.array(closed)
+        predictable[np.flatnonzero(closed)[~finite]] = False
+        next_theta = np.full_like(theta, np.nan)
+        if predictable.any():
             by_entry = np.moveaxis(jacobian, 0, -1)
             flat = by_entry.reshape(by_entry.shape[0], -1)
             centred = project_out_zeros(flat, problem.observations).reshape(by_entry.shape)
-            residual = project_out_zeros((readings[alive] - predicted).T, problem.observations).T
+            residual = project_out_zeros(
+                (readings[predictable] - predicted).T, problem.observations
+            ).T
             inverse = np.linalg.pinv(np.moveaxis(centred, -1, 0))
             step = (inverse @ residual[..., None])[..., 0]
-            result[alive] = theta[alive] + step * problem.theta_scale
-        return result, alive
+            next_theta[predictable] = theta[predictable] + step * problem.theta_scale
+        return next_theta, predictable
 
     def standard_errors(self, sigma: float) -> dict[str, float]:
         """Largest standard error of an estimate by noise, for each method, [m, rad]."""
-        result = {}
+        errors = {}
         for name, differences, covariance in self.paper_methods():
             matrix = self.matrices[len(differences)]
             whiten = np.eye(len(matrix))
             if covariance is not None:
                 whiten = np.linalg.inv(np.linalg.cholesky(covariance))
-            gain = np.linalg.pinv(whiten @ matrix) @ whiten @ differences
-            result[name] = sigma * float(np.sqrt((gain**2).sum(axis=1).max()))
+            solution = np.linalg.pinv(whiten @ matrix) @ whiten @ differences
+            errors[name] = sigma * float(np.sqrt((solution**2).sum(axis=1).max()))
         jacobian = self.linearisation.jacobian / self.problem.theta_scale
         variances = np.linalg.inv(jacobian.T @ jacobian).diagonal()
         general = sigma * float(np.sqrt(variances.max()))
-        return {**result, **dict.fromkeys(METHODS[3:], general)}
+        return {**errors, **dict.fromkeys(METHODS[3:], general)}
 
 
 def build_linearisation_study(
@@ -276,57 +280,57 @@ def build_linearisation_study(
     gauge: Gauge | None = None,
     seed: int = 0,
 ) -> LinearisationStudy:
-    """A study of the errors of linearised identification.
+    """Build a study of the errors of linearised identification.
 
     Args:
-        source: An Orthoglide-type robot, measured by the paper's plan; or a session of any robot,
+        source: A robot of Orthoglide type, measured by the paper's plan; or a session of any robot,
             without the paper's equations.
-        free: Names or globs of the errors that grow and are identified.
+        free: Names or globs of the errors that increase and are identified.
         largest: Largest size of a machine, [mm or mrad]: its largest error component.
-        count: Number of sizes, in a geometric sequence from 0.1 mm on.
+        count: Number of sizes, a geometric sequence from 0.1 mm.
         directions: Number of random directions of the errors.
-        along: One direction instead: a number for each error.
-        sizes: Sizes instead of `largest` and `count`, [mm or mrad].
+        along: One direction in place of random ones: a number for each error.
+        sizes: Sizes in place of `largest` and `count`, [mm or mrad].
         displacements: Displacements of the paper's postures.
-        gauge: Gauge whose noise and resolution are given for comparison; default: that of the
-            session, or the paper's.
+        gauge: Gauge of the comparison; default: that of the session, or the paper's.
         seed: Seed of the directions.
 
     Raises:
         ParameterError: If nothing can be identified, or a number is invalid.
-        SessionError, RobotError: If the robot cannot be measured by the paper's plan.
+        RobotError: If the robot cannot be measured by the paper's plan.
     """
     robot = source if isinstance(source, Robot) else source.robot
     names = robot.parameters.select(free)
     if not {robot.parameters[n].unit for n in names} <= {"m", "rad"}:
         raise ParameterError("expected lengths and angles; a scale has no mm", where="--free")
-    paper = None
+    paper_displacements = None
     if isinstance(source, Robot):
-        used = displacements or Displacements()
-        source = build_paper_plan(source, used, gauge or PAPER_GAUGE)
-        paper = used if names == tuple(f"{d.name}.offset" for d in robot.drives) else None
+        displacements = displacements or Displacements()
+        source = build_paper_plan(source, displacements, gauge or PAPER_GAUGE)
+        if names == tuple(f"{d.name}.offset" for d in robot.drives):
+            paper_displacements = displacements
     gauge = gauge or source.gauge
     if along is None:
         vectors = np.random.default_rng(seed).normal(size=(directions, len(names)))
     else:
         vectors = _read_direction(along, names)
     # the size of (1, −0.6, 0.3) is its largest component
-    unit = vectors / np.abs(vectors).max(axis=1, keepdims=True)
+    unit_vectors = vectors / np.abs(vectors).max(axis=1, keepdims=True)
     if sizes is None:
         sizes = np.geomspace(min(SMALLEST_SIZE, largest), largest, count).tolist()
     return LinearisationStudy(
         session=_idealise(source),
         free=tuple(names),
         sizes=tuple(float(f"{v:.4g}") for v in sizes),
-        directions=tuple(tuple(v.tolist()) for v in unit),
-        displacements=paper,
+        directions=tuple(tuple(v.tolist()) for v in unit_vectors),
+        displacements=paper_displacements,
         sigma=noise_floor(gauge.sigma, gauge.resolution),
         resolution=gauge.resolution or 0.0,
     )
 
 
 def _idealise(session: Session) -> Session:
-    """A session with readings of 0 and exact mounting."""
+    """Session with readings of 0 and exact mountings."""
     setups = {
         name: replace(setup, sensor=_without_mounting_errors(setup.sensor))
         for name, setup in session.setups.items()
@@ -347,18 +351,18 @@ def _read_direction(along: Sequence[float], names: Sequence[str]) -> Array:
 
 
 def _paper_differences(session: Session) -> Array:
-    """Maximum and minimum minus zero of each setup of the paper's plan, in the rows of eq. (8)."""
+    """Matrix of the differences between extreme and zero postures, in the rows of eq. (8)."""
     row = {(r.setup, r.posture): i for i, r in enumerate(session.readings)}
-    result = np.zeros((len(TWELVE_ROWS), len(row)))
+    differences = np.zeros((len(TWELVE_ROWS), len(row)))
     for k, name in enumerate(TWELVE_ROWS):
         setup, end = name[:2], "max" if name[2] == "+" else "min"
-        result[k, row[setup, f"{setup[1]}_{end}"]] = 1.0
-        result[k, row[setup, "zero"]] = -1.0
-    return result
+        differences[k, row[setup, f"{setup[1]}_{end}"]] = 1.0
+        differences[k, row[setup, "zero"]] = -1.0
+    return differences
 
 
 def _largest_difference(values: Array, problem: CalibrationProblem) -> Array:
-    """Largest difference of two values that share a gauge zero, shape (n_sets,)."""
+    """Largest difference of two entries with the same gauge zero, shape (n_sets,)."""
     zero = problem.observations.zero
     ranges = [np.ptp(values[:, zero == z], axis=1) for z in np.unique(zero)]
     return np.asarray(np.max(ranges, axis=0))
@@ -370,20 +374,20 @@ def _without_mounting_errors(sensor: Any) -> Any:  # noqa: ANN401 - any sensor w
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MethodErrors:
-    """Errors of one method's estimates as the machine's errors grow."""
+    """Errors of the estimates of one method for increasing errors of the machine."""
 
     name: str
     errors: Array
-    """Largest error of an estimate, RMS over the directions, by size, [mm or mrad]; NaN where the
+    """Largest error of an estimate for each size, RMS over the directions, [mm or mrad]; NaN if the
     method fails in a direction."""
     standard_error: float
-    """Standard error by noise, [mm or mrad]."""
+    """Standard error from noise, [mm or mrad]."""
     exceeds_resolution: float | None
-    """Size from which the error exceeds the resolution of a reading; None for no size."""
+    """Size above which the error exceeds the resolution, [mm or mrad]; None if never."""
     exceeds_noise: float | None
-    """Size from which the error exceeds the standard error."""
+    """Size above which the error exceeds the standard error, [mm or mrad]; None if never."""
     fails: float | None
-    """Size from which the method fails in a direction."""
+    """Smallest size at which the method fails in a direction, [mm or mrad]; None if never."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -391,36 +395,37 @@ class LinearisationSummary:
     """Summary of a linearisation study."""
 
     sizes: Array
-    """[mm or mrad]"""
+    """Sizes of the machines, ascending, [mm or mrad]."""
     methods: tuple[MethodErrors, ...]
     reading: Array
-    """Largest error of a linearised difference of readings, RMS over the directions, [mm]."""
+    """Largest error of a linearised difference of readings for each size, RMS over the directions,
+    [mm]."""
     steps: tuple[int | None, ...]
-    """Gauss-Newton steps to convergence in every direction, by size; None for no convergence."""
+    """Gauss-Newton steps to convergence in all directions for each size; None if any diverges."""
     resolution: float
-    """[mm]"""
+    """Resolution of a reading, [mm]."""
     measurable: float | None
-    """Largest size at which machines can be measured in every direction; None for no size."""
+    """Largest size at which machines can be measured in all directions; None if there is none."""
 
 
 def summarise_linearisation(study: LinearisationStudy, table: StudyTable) -> LinearisationSummary:
     """Summary of the table of a linearisation study."""
     columns = table.columns
     size = np.array(columns["size"], dtype=np.float64)
-    good = np.array(columns["status"], dtype=object) == IDENTIFIED
+    identified = np.array(columns["status"], dtype=object) == IDENTIFIED
     sizes = np.unique(size)
-    complete = [float(s) for s in sizes if good[size == s].all()]
+    measurable_sizes = [float(s) for s in sizes if identified[size == s].all()]
     standard_errors, resolution = study.standard_errors, study.resolution / MM
 
     def by_size(name: str) -> Array:
         values = np.array(columns[name], dtype=np.float64)
-        samples = [values[(size == s) & good] for s in sizes]
+        samples = [values[(size == s) & identified] for s in sizes]
         return np.array([np.sqrt(np.mean(v**2)) if v.size else np.nan for v in samples])
 
     methods = []
     for name in (m for m in METHODS if m in columns):
         errors, standard_error = by_size(name), standard_errors[name] / MM
-        failed = np.isnan(errors) & np.isin(sizes, complete)
+        failed = np.isnan(errors) & np.isin(sizes, measurable_sizes)
         if name == "exact":
             failed |= errors > SOLVED / MM
         methods.append(
@@ -433,21 +438,21 @@ def summarise_linearisation(study: LinearisationStudy, table: StudyTable) -> Lin
                 fails=float(sizes[failed].min()) if failed.any() else None,
             )
         )
-    # infinite without convergence; 0 where nothing could be measured
+    # infinite without convergence; 0 if no machine could be measured
     counts = np.array([n or np.inf for n in columns["steps"]], dtype=np.float64)
-    most = [counts[(size == s) & good].max(initial=0.0) for s in sizes]
+    largest_counts = [counts[(size == s) & identified].max(initial=0.0) for s in sizes]
     return LinearisationSummary(
         sizes=sizes,
         methods=tuple(methods),
         reading=by_size("reading_mm"),
-        steps=tuple(int(n) if 0.0 < n < np.inf else None for n in most),
+        steps=tuple(int(n) if 0.0 < n < np.inf else None for n in largest_counts),
         resolution=resolution,
-        measurable=max(complete) if complete else None,
+        measurable=max(measurable_sizes) if measurable_sizes else None,
     )
 
 
 def _crossing(sizes: Array, values: Array, level: float) -> float | None:
-    """Size from which values exceed a level, interpolated on logarithmic scales; None for none."""
+    """Size above which values exceed a level, interpolated on logarithmic scales; None if never."""
     above = np.flatnonzero(values > level)
     if not above.size or not level > 0.0:
         return None

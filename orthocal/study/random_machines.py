@@ -1,8 +1,7 @@
 """Random machines, their readings of a plan, and the models that identify them.
 
-A model may lack effects beside geometry that the machines have. Errors of a machine are elementary
-errors in the order of its own robot (`ErrorMap.names`), those of an estimate in the order of the
-model's.
+A model may lack effects beside geometry that the machines have. Elementary errors of machines have
+the order of the machines' robot (`ErrorMap.names`), those of estimates that of the model's robot.
 """
 
 from __future__ import annotations
@@ -28,15 +27,15 @@ from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import Workspace, gauss_box
 from orthocal.observation.simulate import limits_of, show_readings
-from orthocal.planning.expected_error import noise_of, weigh_readings
+from orthocal.planning.expected_error import noise_of, with_gauge_noise
 from orthocal.robot.model import Robot
 from orthocal.session.session import Session
 
 PILOT_MACHINES = 9
-"""Machines whose residuals give the weight of a reading where the model omits errors."""
+"""Machines whose residuals determine the weight of a reading if the model omits errors."""
 
 NEGLIGIBLE = 1e-9
-"""Difference of readings or tool positions that does not matter, [m]."""
+"""Difference of readings or tool positions that is negligible, [m]."""
 
 CALIBRATED = "calibrated"
 NO_CONTACT = "a tip misses the part it should touch"
@@ -53,31 +52,32 @@ class MachineModel:
     """A model by which machines are identified."""
 
     problem: CalibrationProblem
-    """Of the identified errors."""
+    """Problem of the identified errors."""
     program: BatchSolver
     sigma: float
     """Standard deviation that weights a reading, [m]."""
 
     @staticmethod
     def of(session: Session, choice: Choice, *, sigma: float) -> MachineModel:
-        """The model of a choice of errors."""
+        """Build the model for a choice of errors."""
         problem = CalibrationProblem(session, choice.select(session.robot.parameters))
-        problem = weigh_readings(problem)
+        problem = with_gauge_noise(problem)
         return MachineModel(problem, BatchSolver(problem), sigma)
 
     @property
     def robot(self) -> Robot:
-        """The nominal robot, with the effects of the model."""
+        """Nominal robot with the effects of the model."""
         return self.problem.robot
 
     def estimate(self, values: Array) -> tuple[Array, Mask]:
-        """Estimates of machines, and whether each calibration converges.
+        """Estimate the errors of machines.
 
         Args:
             values: Readings, shape (n_sets, n_entries), [m of the first gauge].
 
         Returns:
-            Free parameters, shape (n_sets, n_free), [SI], NaN where the calibration fails.
+            Free parameters, shape (n_sets, n_free), [SI], NaN if a calibration fails; and the mask
+            of the machines whose calibrations converge.
         """
         theta = np.full((len(values), self.problem.n_free), np.nan)
         converged = np.ones(len(values), dtype=np.bool_)
@@ -94,32 +94,36 @@ class MachineModel:
 
     @property
     def columns(self) -> Array:
-        """Elementary errors of one unit of each identified parameter, (n_errors, n_machine)."""
+        """Elementary errors per unit of each identified parameter, shape (n_errors, n_machine)."""
         return self.problem.functions.errors.columns(self.problem.machine_selection.names)
 
     def errors(self, theta: Array) -> Array:
-        """Elementary errors of estimates, shape (n_sets, n_errors) of (n_sets, n_free), [SI]."""
+        """Elementary errors of estimates, shape (n_sets, n_errors), [SI].
+
+        Args:
+            theta: Free parameters, shape (n_sets, n_free), [SI].
+        """
         estimated = theta[:, : self.problem.n_machine] @ self.columns.T
         return np.asarray(self.problem.closure.errors() + estimated)
 
     def translate(self, errors: Array, names: Sequence[str]) -> Array:
-        """Errors of a robot with other effects in the order of this one, 0 where it lacks them.
+        """Reorder errors of a robot with other effects to the order of this one, absent ones 0.
 
         Args:
-            errors: Shape (n_sets, n), [SI].
-            names: Names of the errors, shape (n,).
+            errors: Elementary errors, shape (n_sets, n), [SI].
+            names: Names of these errors, shape (n,).
         """
-        place = {name: i for i, name in enumerate(names)}
+        position = {name: i for i, name in enumerate(names)}
         error_names = self.problem.functions.errors.names
-        result = np.zeros((len(errors), len(error_names)))
-        known = [i for i, name in enumerate(error_names) if name in place]
-        result[:, known] = errors[:, [place[error_names[i]] for i in known]]
-        return result
+        translated = np.zeros((len(errors), len(error_names)))
+        common = [i for i, name in enumerate(error_names) if name in position]
+        translated[:, common] = errors[:, [position[error_names[i]] for i in common]]
+        return translated
 
     def identified_part(self, errors: Array, names: Sequence[str]) -> Array:
         """True values of the identified parameters, shape (n_sets, n_machine), [SI].
 
-        A parameter that moves several elementary errors has their least-squares value.
+        A parameter that is a sum of several elementary errors has their least-squares value.
 
         Args:
             errors: All elementary errors, shape (n_sets, n), [SI].
@@ -129,31 +133,36 @@ class MachineModel:
         return np.asarray(self.translate(errors, names) @ (columns / (columns**2).sum(axis=0)))
 
     def explains(self, truth: CalibrationProblem) -> bool:
-        """True if all errors of the machines are identified."""
+        """True if the model identifies all errors of the machines."""
         if not set(truth.robot.effect_names) <= set(self.robot.effect_names):
             return False
         columns = self.columns
-        moved = self.translate(truth.errors_per_theta.T, truth.functions.errors.names).T
-        return np.allclose(columns @ (np.linalg.pinv(columns) @ moved), moved, atol=1e-12)
+        true_errors = self.translate(truth.errors_per_theta.T, truth.functions.errors.names).T
+        return np.allclose(
+            columns @ (np.linalg.pinv(columns) @ true_errors), true_errors, atol=1e-12
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Tool:
-    """Tool positions over a workspace, under the conditions in which machines are used."""
+    """Tool positions at K points of a workspace under C conditions of use.
+
+    Arrays with C K rows hold all points under the first condition, then under the second etc.
+    """
 
     workspace: Workspace
-    """The points, once for each condition."""
+    """The C K points."""
     use: UseSamples
     drives: Array
-    """Commanded for the points, shape (K, n_drives), [m, rad]."""
+    """Commanded drive coordinates of the points, shape (K, n_drives), [m, rad]."""
     passive: Array
-    """Passive coordinates of the nominal machine there, shape (K, n_passive), [m, rad]."""
+    """Passive coordinates of the nominal machine, shape (K, n_passive), [m, rad]."""
     positions: Array
-    """Tool positions of the nominal machine, for each of C conditions, shape (C K, 3), [m]."""
+    """Tool positions of the nominal machine, shape (C K, 3), [m]."""
 
     @staticmethod
     def of(session: Session, box: Sequence[tuple[float, float]]) -> Tool:
-        """The tool of a session's machine with the offsets that are active in its controller."""
+        """Build the tool of the nominal machine with the active offsets of a session."""
         robot = session.robot
         workspace, use = gauss_box(robot, box), sample_use(robot)
         closure = LoopClosure(robot)
@@ -169,11 +178,11 @@ class Tool:
         )
 
     def __call__(self, robot: Robot, errors: Array) -> tuple[Array, Mask]:
-        """Tool positions of machines, shape (C K, 3, n_sets), [m], and whether their loops close.
+        """Tool positions of machines.
 
         Args:
             robot: The nominal robot with the effects of the machines.
-            errors: All elementary errors of each machine, shape (n_sets, n_errors), [SI].
+            errors: Elementary errors of each machine, shape (n_sets, n_errors), [SI].
         """
         conditions = self.use.conditions if effects_by_condition(robot) else (None,)
         closed, positions = np.ones(len(errors), dtype=np.bool_), []
@@ -187,15 +196,15 @@ class Tool:
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class MeasuredMachines:
     """Random machines and their readings."""
 
     errors: Array
-    """All elementary errors, shape (n_sets, n_errors), [SI]."""
+    """Elementary errors, shape (n_sets, n_errors), [SI]."""
     values: Array
     """Single readings, shape (n_sets, n_entries), [m of the first gauge]."""
     rows: Array
-    """Rows of the session, shape (n_sets, n_rows), [m]."""
+    """Readings of the rows of the session, shape (n_sets, n_rows), [m]."""
     status: Status
 
 
@@ -205,12 +214,12 @@ class RandomMachines:
 
     seed: int
     truth: CalibrationProblem
-    """Of all errors that machines have."""
+    """Problem of all errors of the machines."""
     models: tuple[MachineModel, ...]
-    """The model of the study, then the one with all effects of the machines if it is another."""
+    """Model of the study; if it ignores effects, also the model with all effects."""
     tool: Tool
     limits: Array
-    """Smallest and largest value of each row, shape (2, n_rows), [m]."""
+    """Smallest and largest possible reading of each row, shape (2, n_rows), [m]."""
 
     @staticmethod
     def of(
@@ -222,27 +231,27 @@ class RandomMachines:
         seed: int,
         count: int,
     ) -> RandomMachines:
-        """Machines that are measured by a plan, with the weights of their readings.
+        """Build machines that are measured by a plan, and the weights of their readings.
 
         Args:
-            session: The plan, of the robot with all effects of the machines.
+            session: Plan with all effects of the machines.
             truth: All errors of the machines.
-            models: The plan of the robot with the effects of each model, and its identified errors.
-            box: As for `AccuracyStudy`.
+            models: Plan with the effects of each model, and the identified errors.
+            box: Box of the tool error, as in `AccuracyStudy`.
             seed: Seed of errors, gauges and noise.
             count: Number of machines.
         """
         sigma = noise_of(session)
-        identified = [MachineModel.of(s, c, sigma=sigma) for s, c in models]
+        unweighted = [MachineModel.of(s, c, sigma=sigma) for s, c in models]
         limits = [limits_of(session, r) or (-np.inf, np.inf) for r in session.readings]
         machines = RandomMachines(
             seed,
-            CalibrationProblem(session, truth, noise_ratio=identified[0].problem.noise_ratio),
-            tuple(identified),
+            CalibrationProblem(session, truth, noise_ratio=unweighted[0].problem.noise_ratio),
+            tuple(unweighted),
             Tool.of(session, box),
             np.array(limits).T,
         )
-        weighted = [replace(m, sigma=machines.weighting_sigma(m, count)) for m in identified]
+        weighted = [replace(m, sigma=machines.weighting_sigma(m, count)) for m in unweighted]
         return replace(machines, models=tuple(weighted))
 
     @property
@@ -257,16 +266,16 @@ class RandomMachines:
 
     @property
     def alike_without_errors(self) -> bool:
-        """True if model and machines without errors have the same readings and the same tool."""
+        """True if model and machines without errors have equal readings and tool positions."""
         readings, tools = [], []
         for problem in (self.truth, self.model.problem):
-            none = np.zeros((1, len(problem.functions.errors.names)))
+            no_errors = np.zeros((1, len(problem.functions.errors.names)))
             readings.append(problem.predict(np.zeros(problem.n_free)))
-            tools.append(self.tool(problem.robot, none)[0])
+            tools.append(self.tool(problem.robot, no_errors)[0])
         return all(np.abs(one - other).max() < NEGLIGIBLE for one, other in (readings, tools))
 
     def draw(self, number: int) -> tuple[Array, np.random.Generator]:
-        """Scaled true errors of a machine and its gauges, and the generator of its noise."""
+        """Scaled true errors of a machine and its gauges, and the random generator of its noise."""
         rng = np.random.default_rng((self.seed, number))
         drawn = rng.normal(size=self.truth.n_free)
         positive = [p.positive for p in self.truth.parameters]
@@ -277,74 +286,76 @@ class RandomMachines:
 
         Args:
             number: Number of the machine.
-            names: Names of the parameters; nuisance parameters that machines lack are 0.
+            names: Names of the parameters; nuisance parameters that the machines lack are 0.
         """
         truth, n = self.truth, self.truth.n_machine
         scaled = self.draw(number)[0] * truth.theta_scale
         errors = truth.closure.errors(scaled[:n])
-        part = self.model.identified_part(errors[None], self.error_names)[0]
+        identified = self.model.identified_part(errors[None], self.error_names)[0]
         values = dict(zip(truth.free[n:], scaled[n:].tolist(), strict=True))
-        values |= dict(zip(self.model.problem.machine_selection.names, part.tolist(), strict=True))
+        values |= dict(
+            zip(self.model.problem.machine_selection.names, identified.tolist(), strict=True)
+        )
         return np.array([values.get(name, 0.0) for name in names])
 
-    def measure(self, numbers: Sequence[int]) -> Measured:
+    def measure(self, numbers: Sequence[int]) -> MeasuredMachines:
         """Random machines and their readings."""
         draws, generators = zip(*(self.draw(n) for n in numbers), strict=True)
         theta, truth = np.array(draws), self.truth
-        o = truth.observations
+        observations = truth.observations
         predicted, _, closed = truth.simulate(theta * truth.theta_scale)
         status = np.where(closed, CALIBRATED, NOT_ASSEMBLED).astype(object)
         entries = predicted * truth.noise_ratio
         for i, rng in enumerate(generators):
-            entries[i], _ = show_readings(truth.session, o, entries[i], rng=rng)
+            entries[i], _ = show_readings(truth.session, observations, entries[i], rng=rng)
         set_reason(status, np.asarray(~np.isfinite(entries).all(axis=1)), NO_CONTACT)
-        rows = np.array([o.rows(v) for v in entries])
-        beyond = (rows < self.limits[0]) | (rows > self.limits[1])
-        set_reason(status, np.asarray(beyond.any(axis=1)), OUT_OF_RANGE)
+        rows = np.array([observations.rows(v) for v in entries])
+        out_of_range = (rows < self.limits[0]) | (rows > self.limits[1])
+        set_reason(status, np.asarray(out_of_range.any(axis=1)), OUT_OF_RANGE)
         errors = truth.closure.errors() + theta[:, : truth.n_machine] @ truth.errors_per_theta.T
-        return Measured(errors, entries / truth.noise_ratio, rows, status)
+        return MeasuredMachines(errors, entries / truth.noise_ratio, rows, status)
 
-    def estimate(self, measured: Measured) -> list[Array]:
+    def estimate(self, measured: MeasuredMachines) -> list[Array]:
         """Estimates by each model, shape (n_sets, n_free), [SI].
 
-        NaN where a machine cannot be calibrated by one of them; `measured.status` says why.
+        They are NaN if a machine cannot be calibrated; `measured.status` states the reason.
         """
         status = measured.status
-        good = np.flatnonzero(status == CALIBRATED)
+        calibrated = np.flatnonzero(status == CALIBRATED)
         estimates = []
         for model in self.models:
             theta = np.full((len(status), model.problem.n_free), np.nan)
-            if good.size:
-                theta[good], converged = model.estimate(measured.values[good])
-                set_reason(status, good[~converged], NOT_CONVERGED)
+            if calibrated.size:
+                theta[calibrated], converged = model.estimate(measured.values[calibrated])
+                set_reason(status, calibrated[~converged], NOT_CONVERGED)
             estimates.append(theta)
         return estimates
 
-    def tool_errors(self, measured: Measured, estimates: Sequence[Array]) -> list[Array]:
-        """Tool errors before a calibration and after that by each model, (C K, 3, n_sets), [m].
+    def tool_errors(self, measured: MeasuredMachines, estimates: Sequence[Array]) -> list[Array]:
+        """Tool errors before and after calibration by each model, shape (C K, 3, n_sets), [m].
 
         Args:
-            measured: The machines; `status` is changed where the loops of one do not close.
+            measured: The machines; `status` is changed if the loops of a machine do not close.
             estimates: Estimates by each model, shape (n_sets, n_free), [SI].
         """
         status = measured.status
-        good = np.flatnonzero(status == CALIBRATED)
+        calibrated = np.flatnonzero(status == CALIBRATED)
         machines = [(self.truth.robot, measured.errors)]
         machines += [(m.robot, m.errors(t)) for m, t in zip(self.models, estimates, strict=True)]
         tools = np.full((len(machines), *self.tool.positions.shape, len(status)), np.nan)
         for tool, (robot, errors) in zip(tools, machines, strict=True):
-            if good.size:
-                positions, closed = self.tool(robot, errors[good])
-                set_reason(status, good[~closed], NOT_ASSEMBLED)
-                tool[..., good] = positions
+            if calibrated.size:
+                positions, closed = self.tool(robot, errors[calibrated])
+                set_reason(status, calibrated[~closed], NOT_ASSEMBLED)
+                tool[..., calibrated] = positions
         tools[..., status != CALIBRATED] = np.nan
         return [tools[0] - self.tool.positions[..., None], *(tools[0] - t for t in tools[1:])]
 
     def weighting_sigma(self, model: MachineModel, count: int) -> float:
         """Standard deviation that weights a reading, [m].
 
-        It is the stated noise, unless machines have errors that the model does not identify. Then
-        the residuals give it, as in a calibration: the median of a few pilot machines.
+        It is the stated noise if the model identifies all errors of the machines. Otherwise it is
+        the median of the estimates from residuals of a few pilot machines, as in a calibration.
         """
         if model.explains(self.truth):
             return model.sigma
@@ -357,7 +368,13 @@ class RandomMachines:
 
 
 def set_reason(status: Status, which: NDArray[Any], reason: str) -> None:
-    """Record why machines, by flag or index, have no result; an earlier reason stays."""
+    """Record why machines have no result; an earlier reason is not changed.
+
+    Args:
+        status: Status of the machines, shape (n_sets,); it is changed.
+        which: Mask or indices of the machines.
+        reason: The reason.
+    """
     selected = np.zeros(len(status), dtype=np.bool_)
     selected[which] = True
     status[selected & (status == CALIBRATED)] = reason

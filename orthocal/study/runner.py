@@ -1,7 +1,7 @@
-"""Running a study on the cores of this machine or on a Dask cluster; it can be stopped and resumed.
+"""Execution of a study on this machine or on a Dask cluster; it can be stopped and resumed.
 
-The results are a journal, results.jsonl in the directory of the study. Its first line identifies
-the study. Each further line holds one task, and is on disk before the task counts.
+Results are written to a journal, results.jsonl in the directory of the study. Its first line
+identifies the study. Each other line contains one task, which is finished once it is on disk.
 """
 
 from __future__ import annotations
@@ -46,10 +46,11 @@ class Progress:
     done: int
     """Number of finished cases."""
     total: int
+    """Number of all cases."""
     kept: int
     """Number of cases that earlier runs finished."""
     seconds_left: float | None
-    """None before the first task of this run has ended."""
+    """Expected remaining time, [s]; None before the first task of this run has finished."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,11 +78,11 @@ def run_study(
 
     Args:
         study: The study.
-        folder: Directory of the results. A study that was stopped is resumed there.
+        folder: Directory of the results, in which a stopped study is resumed.
         workers: Number of processes on this machine.
-        dask: Address of a Dask scheduler, whose workers are used instead.
+        dask: Address of a Dask scheduler whose workers are used in place of local processes.
         anew: Whether to discard the results in the directory.
-        report: Called after each task.
+        report: Function that is called with the progress before the first and after each task.
 
     Raises:
         OrthocalError: If the directory belongs to another study, or the scheduler does not answer.
@@ -90,12 +91,12 @@ def run_study(
     sizes = study.task_sizes
     total = sum(sizes)
     with open_results(path, study, anew=anew) as (results, store):
-        waiting = [task for task in range(len(sizes)) if task not in results]
+        pending = [task for task in range(len(sizes)) if task not in results]
         completed = sum(sizes[task] for task in results)
         start, done = time.monotonic(), 0
         if report is not None:
             report(Progress(completed, total, completed, None))
-        for task, columns in _run_tasks(study, waiting, workers, dask):
+        for task, columns in _run_tasks(study, pending, workers, dask):
             store(task, columns)
             done += sizes[task]
             if report is not None:
@@ -105,7 +106,7 @@ def run_study(
 
 
 def to_parquet(table: StudyTable) -> bytes:
-    """A table as the bytes of a Parquet file, with the study's document in its metadata."""
+    """Content of a Parquet file with a table, and the document of the study in its metadata."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -121,12 +122,12 @@ def to_parquet(table: StudyTable) -> bytes:
 def open_results(
     path: Path | None, study: Study, *, anew: bool = False
 ) -> Iterator[tuple[Results, Callable[[int, dict[str, list[Cell]]], None]]]:
-    """Results that a study has so far, and a function that stores those of one more task.
+    """Open the results of a study, with a function that stores those of another task.
 
     Args:
-        path: The journal; None to store nothing on disk.
+        path: Path to the journal; None to store nothing on disk.
         study: The study.
-        anew: Whether to discard what the journal holds.
+        anew: Whether to discard the content of the journal.
 
     Raises:
         OrthocalError: If the journal belongs to another study, is damaged, or is in use.
@@ -148,7 +149,7 @@ def open_results(
 
 
 def _read_results(journal: Journal, study: Study) -> Results:
-    """Results in a journal; its first line is written if it is empty."""
+    """Results in a journal. The first line is written if the journal is empty."""
     results: Results = {}
     first = True
     for where, data in journal.entries():
@@ -170,6 +171,7 @@ def _read_results(journal: Journal, study: Study) -> Results:
 
 
 def _require_same_study(data: dict[str, Any], study: Study, path: Path) -> None:
+    """Refuse the journal of another study."""
     if data.get("digest") == study.digest and data.get("format") == FORMAT:
         return
     stored = data.get("study")
@@ -185,6 +187,7 @@ def _require_same_study(data: dict[str, Any], study: Study, path: Path) -> None:
 
 
 def _read_entry(data: dict[str, Any], study: Study, where: str) -> TaskResult:
+    """Number and columns of a task from a line of the journal."""
     task, columns = data.get("task"), data.get("columns")
     if isinstance(task, int) and 0 <= task < len(study.task_sizes) and isinstance(columns, dict):
         cells = list(columns.values())
@@ -196,6 +199,7 @@ def _read_entry(data: dict[str, Any], study: Study, where: str) -> TaskResult:
 def _run_tasks(
     study: Study, tasks: Sequence[int], workers: int, dask: str | None
 ) -> Iterable[TaskResult]:
+    """Run tasks in processes of this machine or on Dask."""
     if not tasks:
         return ()
     if dask is not None:
@@ -207,6 +211,7 @@ def _run_tasks(
 
 
 def _run_on_dask(study: Study, tasks: Sequence[int], address: str) -> Iterator[TaskResult]:
+    """Run tasks on the workers of a Dask scheduler."""
     try:
         from distributed import Client, as_completed
     except ImportError:
@@ -222,7 +227,7 @@ def _run_on_dask(study: Study, tasks: Sequence[int], address: str) -> Iterator[T
             where="--dask",
         ) from None
     with client:
-        # a result that the scheduler computes again if the worker that holds it is lost
+        # shared as a result, which the scheduler computes again if its worker is lost
         shared = client.submit(_return_study, study, pure=False, retries=DASK_RETRIES)
         numbered = [shared] * len(tasks), list(tasks)
         futures = client.map(
@@ -241,15 +246,15 @@ def _run_numbered(study: Study, task: int) -> TaskResult:
 
 
 def _join_columns(results: Results) -> dict[str, list[Cell]]:
-    """Columns of all tasks, in the order of the tasks."""
+    """Columns of all tasks, in the order of the tasks; missing cells are None."""
     columns: dict[str, list[Cell]] = {}
     count = 0
     for task in sorted(results):
-        part = results[task]
-        size = len(next(iter(part.values()), []))
-        for name in part:
+        task_columns = results[task]
+        size = len(next(iter(task_columns.values()), []))
+        for name in task_columns:
             columns.setdefault(name, [None] * count)
         for name, cells in columns.items():
-            cells.extend(part.get(name, [None] * size))
+            cells.extend(task_columns.get(name, [None] * size))
         count += size
     return columns

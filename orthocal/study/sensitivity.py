@@ -1,7 +1,7 @@
-"""Study of sensitivity: derivatives of readings and of the tool position by each error.
+"""Study of sensitivity: derivatives of readings and tool position with respect to each error.
 
-They contain the paper's factors: in a maximum posture, the offset of the drive that moved shifts
-the tool by 1 along its axis and by tan α across it (equation 6).
+They contain the factors of the paper (equation 6). In a maximum posture an offset of the moved
+drive displaces the tool by this offset along the axis, and by tan α times the offset across it.
 """
 
 from __future__ import annotations
@@ -40,40 +40,46 @@ class SensitivityStudy(Study):
 
     @property
     def count(self) -> int:
-        """One table."""
+        """Number of tables: 1."""
         return 1
 
     def prepare(self) -> CalibrationProblem:
-        """The readings, with all parameters free."""
+        """Problem of the readings with all parameters free."""
         return build_problem(self.session, free=self.parameters, prior=True)
 
     def run(self, prepared: CalibrationProblem, task: int) -> Columns:
-        """A row for each parameter of each reading and tool coordinate."""
-        problem, session, o = prepared, prepared.session, prepared.observations
+        """Table rows: one for each parameter and each reading or tool coordinate."""
+        problem, session, observations = prepared, prepared.session, prepared.observations
         setups, postures = list(session.setups), list(session.postures)
         parameters = problem.machine_selection.parameters
         jacobian = problem.predict_and_jacobian(problem.active_theta)[1][:, : len(parameters)]
-        by_std: dict[tuple[str, str], Array] = {}
-        read = {postures[i] for i in o.posture}
+        changes_by_output: dict[tuple[str, str], Array] = {}
+        postures_read = {postures[i] for i in observations.posture}
         if session.robot.tcp is not None:
             tool = ToolSensitivity(session.robot, free=problem.machine_selection.names)
-            by_tool = tool(drive_table(session), names=postures)
-            scaled = by_tool * problem.theta_scale[: len(parameters)]
-            for posture, rows in zip(postures, scaled, strict=True):
-                if posture in read:
-                    by_std.update({(posture, axis): r for axis, r in zip(TOOL, rows, strict=True)})
-        for i in range(o.size):
-            key = postures[o.posture[i]], setups[o.setup[i]]
-            by_std.setdefault(key, jacobian[i] * problem.noise_ratio[i])
+            tool_jacobian = tool(drive_table(session), names=postures)
+            tool_changes = tool_jacobian * problem.theta_scale[: len(parameters)]
+            for posture, rows in zip(postures, tool_changes, strict=True):
+                if posture in postures_read:
+                    changes_by_output.update(
+                        {(posture, axis): r for axis, r in zip(TOOL, rows, strict=True)}
+                    )
+        for i in range(observations.size):
+            key = postures[observations.posture[i]], setups[observations.setup[i]]
+            changes_by_output.setdefault(key, jacobian[i] * problem.noise_ratio[i])
         scales = np.array([p.prior_std * p.edge_factor for p in parameters])
-        n = len(by_std)
+        n = len(changes_by_output)
         return {
-            "posture": [posture for posture, _ in by_std for _ in parameters],
-            "output": [output for _, output in by_std for _ in parameters],
+            "posture": [posture for posture, _ in changes_by_output for _ in parameters],
+            "output": [output for _, output in changes_by_output for _ in parameters],
             "parameter": [p.name for p in parameters] * n,
-            "derivative": [v for row in by_std.values() for v in (row / MM / scales).tolist()],
+            "derivative": [
+                v for row in changes_by_output.values() for v in (row / MM / scales).tolist()
+            ],
             "unit": [f"mm/{p.edge_unit}" for p in parameters] * n,
-            "um_per_prior_std": [v for row in by_std.values() for v in (row / UM).tolist()],
+            "um_per_prior_std": [
+                v for row in changes_by_output.values() for v in (row / UM).tolist()
+            ],
         }
 
 
@@ -84,13 +90,13 @@ def build_sensitivity_study(
     points: Sequence[Sequence[float]] | None = None,
     displacements: Displacements | None = None,
 ) -> SensitivityStudy:
-    """A study of the derivatives of readings and tool position by errors.
+    """Build a study of the derivatives of readings and tool position with respect to errors.
 
     Args:
-        source: An Orthoglide-type robot, measured by the paper's plan; or a session of any robot.
-        free: Names or globs of the errors; default: all that move a reading or the tool.
-        points: Tool positions to read every setup at, instead of its postures: coordinates that
-            the drives control, shape (K, n_coordinates), [m].
+        source: A robot of Orthoglide type, measured by the paper's plan; or a session of any robot.
+        free: Names or globs of the errors; default: all that affect a reading or the tool.
+        points: Tool positions at which every setup is read in place of its postures: commanded
+            coordinates, shape (K, n_coordinates), [m].
         displacements: Displacements of the paper's postures.
 
     Raises:
@@ -113,31 +119,34 @@ def build_sensitivity_study(
 
 
 def _at_points(session: Session, points: Array) -> Session:
-    """The session with every setup read at every point of the tool."""
+    """Session in which every setup is read at every tool position."""
     names = [f"point_{i + 1}" for i in range(len(points))]
-    placed = place_tool(session.robot, names, points)
-    postures = {n: replace(p, drives=p.drives - session.active_offsets) for n, p in placed.items()}
+    postures_at_points = place_tool(session.robot, names, points)
+    postures = {
+        n: replace(p, drives=p.drives - session.active_offsets)
+        for n, p in postures_at_points.items()
+    }
     aligned_at = session.alignment_postures
     setups = {n: replace(s, aligned_at=aligned_at[n]) for n, s in session.setups.items()}
     alignment = {n: session.postures[n] for n in aligned_at.values()}
     readings = tuple(Reading(setup, posture) for setup in setups for posture in postures)
     postures = {**postures, **alignment}
-    moved = replace(session, setups=setups, postures=postures, readings=readings)
-    check_contacts(moved)
-    return moved
+    session_at_points = replace(session, setups=setups, postures=postures, readings=readings)
+    check_contacts(session_at_points)
+    return session_at_points
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensitivitySummary:
-    """Derivatives as a matrix."""
+    """Matrix of the derivatives."""
 
     rows: tuple[tuple[str, str], ...]
-    """Posture, and the setup or tool coordinate."""
+    """Posture and output of each row: a setup or a tool coordinate."""
     parameters: tuple[str, ...]
     units: tuple[str, ...]
-    """Units of the derivatives, by parameter."""
+    """Units of the derivatives, for each parameter."""
     derivatives: Array
-    """Shape (n_rows, n_parameters), [units]."""
+    """Derivatives, shape (n_rows, n_parameters), [units]."""
     per_prior_std: Array
     """Change by one prior standard deviation of each error, shape (n_rows, n_parameters), [m]."""
 

@@ -1,4 +1,4 @@
-"""The protocol of a study: numbered tasks that produce the rows of one table."""
+"""Protocol of a study: numbered tasks that produce the rows of one table."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ Columns = Mapping[str, Sequence[Cell]]
 """Part of a table: column name to cells, the same number in each column."""
 
 DIGITS = 9
-"""Significant digits of a number in a table: later ones depend on the processor's summation."""
+"""Significant digits of numbers in a table. Further digits depend on the processor."""
 
 
 @dataclass(frozen=True, eq=False)
 class Study(ABC):
-    """A study; its fields are its arguments.
+    """Study; its fields are its arguments.
 
-    A study is determined by its record: equal records give equal tables, byte by byte.
+    A study is determined by its document: equal documents yield identical tables.
     """
 
     kind: ClassVar[str]
@@ -44,7 +44,7 @@ class Study(ABC):
     cases_per_task: ClassVar[int] = 250
 
     session: Session
-    """Session of a nominal robot. A worker on any machine builds it from the robot's files."""
+    """Session of a nominal robot, which workers build from the robot's files."""
 
     @property
     @abstractmethod
@@ -53,11 +53,11 @@ class Study(ABC):
 
     @abstractmethod
     def prepare(self) -> Any:  # noqa: ANN401 - the argument of `run`
-        """Data shared by all tasks, prepared once per worker."""
+        """Prepare the data shared by all tasks, once per worker."""
 
     @abstractmethod
     def run(self, prepared: Any, task: int) -> Columns:  # noqa: ANN401 - as above
-        """Rows of one task; they depend on the study and the task's number alone."""
+        """Rows of one task. They depend on the study and the number of the task alone."""
 
     @property
     def task_sizes(self) -> tuple[int, ...]:
@@ -72,13 +72,15 @@ class Study(ABC):
 
     @cached_property
     def document(self) -> dict[str, Any]:
-        """Everything that the table depends on, as plain data: session, fields and version."""
+        """Plain data of everything that determines the table: session, fields and version."""
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         del fields["session"]
         document = {"kind": self.kind, "orthocal": __version__}
         document |= {**_session_record(self.session), **fields}
-        plain: dict[str, Any] = json.loads(json.dumps(document, default=attrgetter("document")))
-        return plain
+        document_as_json: dict[str, Any] = json.loads(
+            json.dumps(document, default=attrgetter("document"))
+        )
+        return document_as_json
 
     @cached_property
     def digest(self) -> str:
@@ -107,7 +109,7 @@ class Study(ABC):
 
 
 def _session_record(session: Session) -> dict[str, Any]:
-    """A session as plain data, without the locations of its files."""
+    """Plain data of a session, without the paths of its files."""
     rows = "\n".join(
         f"{r.setup},{r.posture},{r.minus or ''},{r.cycle},{r.value!r}"
         + (f",{r.conditions}" if r.conditions else "")
@@ -121,7 +123,7 @@ def _session_record(session: Session) -> dict[str, Any]:
 
 
 def run_task(study: Study, task: int) -> dict[str, list[Cell]]:
-    """Rows of one task as they are stored: computed on one thread, with rounded numbers."""
+    """Compute the rows of one task as they are stored, on one thread and with rounded numbers."""
     with threadpool_limits(1):
         columns = study.run(prepare_once(study), task)
     return {name: _round_column(cells) for name, cells in columns.items()}
@@ -136,12 +138,12 @@ def prepare_once(study: Study) -> Any:  # noqa: ANN401 - as `prepare`
 def columns_in_edge_units(
     prefix: str, problem: CalibrationProblem, values: NDArray[np.float64]
 ) -> dict[str, Sequence[float]]:
-    """Columns of parameters, named with the unit that users read.
+    """Columns of parameters in the units that users read, which are a suffix of the names.
 
     Args:
         prefix: Start of each column's name.
         problem: The problem.
-        values: Shape (n_sets, n_machine), [SI].
+        values: Values, shape (n_sets, n_machine), [SI].
     """
     return {
         f"{prefix}{p.name}_{p.edge_unit}": list(values[:, i] * p.edge_factor)
@@ -150,16 +152,17 @@ def columns_in_edge_units(
 
 
 def _round_column(cells: Sequence[Cell]) -> list[Cell]:
+    """Cells as they are stored; see `round_cell`."""
     values = np.asarray(cells) if len(cells) and type(cells[0]) is np.float64 else None
     if values is None or values.dtype != np.float64:
         return [round_cell(v) for v in cells]
-    # in one format operation: half the time of a loop
+    # one format operation needs half the time of a loop
     text = f"%.{DIGITS - 1}e " * len(values) % tuple(values.tolist())
     return [None if number == "nan" else float(number) + 0.0 for number in text.split()]
 
 
 def round_cell(value: object) -> Cell:
-    """A cell as it is stored: None for NaN, numbers with `DIGITS` significant digits."""
+    """Cell as it is stored: numbers with `DIGITS` significant digits, None for NaN."""
     if value is None or isinstance(value, str | bool):
         return value
     if isinstance(value, np.bool_):

@@ -1,4 +1,4 @@
-"""Pictures of pages, taken by Chromium."""
+"""Screenshots of pages with Chromium."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from orthocal.io.files import write_file
 from orthocal.runtime.interrupts import raised_interrupt
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+"""Names of the executable, in the order of the search."""
 
 FLAGS = (
     "--headless",
@@ -29,16 +30,16 @@ FLAGS = (
 )
 
 PAGE_TIME_MS = 4000
-"""Time on the clock of the page before the picture is taken, [ms]."""
+"""Virtual time of the page before the screenshot, [ms]."""
 
-PATIENCE = 120.0
-"""Time before a browser that does not answer is stopped, [s]."""
+BROWSER_TIMEOUT = 120.0
+"""Time after which a browser that does not answer is stopped, [s]."""
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 def find_chromium() -> str:
-    """Path of a Chromium: $ORTHOCAL_CHROMIUM, or the first on the PATH.
+    """Path of Chromium: $ORTHOCAL_CHROMIUM, or the first one on the PATH.
 
     Raises:
         OrthocalError: If Chromium is not installed.
@@ -48,7 +49,7 @@ def find_chromium() -> str:
     if path is None:
         tried = f"'{named}' ($ORTHOCAL_CHROMIUM)" if named else ", ".join(NAMES)
         raise OrthocalError(
-            f"a picture needs Chromium, and there is none ({tried}). Install it (Debian: "
+            f"a picture needs Chromium, which was not found ({tried}). Install it (Debian: "
             "`apt-get install chromium`), or write the page with --html and open it in a browser",
             where="--png",
         )
@@ -56,17 +57,17 @@ def find_chromium() -> str:
 
 
 def chromium_flags() -> tuple[str, ...]:
-    """Flags with which Chromium draws WebGL without a screen and without a network."""
+    """Flags of Chromium for WebGL without a screen and without a network."""
     root = hasattr(os, "geteuid") and os.geteuid() == 0
     return (*FLAGS, "--no-sandbox") if root else FLAGS  # the sandbox does not work for root
 
 
 def take_picture(page: str, path: str | Path, *, width: int = 1400, height: int = 900) -> Path:
-    """Write a picture of a self-contained page.
+    """Write a screenshot of a self-contained page.
 
     Args:
-        page: The page, HTML.
-        path: The PNG file.
+        page: HTML text of the page.
+        path: Path of the PNG file.
         width: Width, [px].
         height: Height, [px].
 
@@ -84,7 +85,7 @@ def take_picture(page: str, path: str | Path, *, width: int = 1400, height: int 
 
 
 def _photograph(chromium: str, page: str, path: Path, width: int, height: int) -> bytes:
-    """Picture of a page as PNG; `path` is named in messages."""
+    """Screenshot of a page as PNG; messages name `path`."""
     with tempfile.TemporaryDirectory(prefix="orthocal-", ignore_cleanup_errors=True) as folder:
         source, picture = Path(folder) / "page.html", Path(folder) / "page.png"
         source.write_text(page, encoding="utf-8")
@@ -98,17 +99,19 @@ def _photograph(chromium: str, page: str, path: Path, width: int, height: int) -
             f"{source.as_uri()}#picture",
         ]
         try:
-            done = subprocess.run(command, capture_output=True, timeout=PATIENCE, check=False)
+            completed = subprocess.run(
+                command, capture_output=True, timeout=BROWSER_TIMEOUT, check=False
+            )
         except subprocess.TimeoutExpired:
             raise OrthocalError(
-                f"{chromium} took no picture in {PATIENCE:g} s", where=str(path)
+                f"{chromium} took no picture in {BROWSER_TIMEOUT:g} s", where=str(path)
             ) from None
         except OSError as e:
             raise OrthocalError(f"cannot run {chromium}: {e.strerror}", where="--png") from None
         data = picture.read_bytes() if picture.is_file() else b""
         if not data.startswith(_SIGNATURE):
-            words = done.stderr.decode(errors="replace").strip().splitlines()
-            reason = f": {words[-1]}" if words else ""
+            lines = completed.stderr.decode(errors="replace").strip().splitlines()
+            reason = f": {lines[-1]}" if lines else ""
             raise OrthocalError(f"{chromium} took no picture{reason}", where=str(path))
     return data
 

@@ -1,7 +1,7 @@
 """Live scenes: a web server in this process that only this machine can reach.
 
-The server ends with the process, however the process ends. It listens on 127.0.0.1 and answers
-only requests for that name from its own pages, so that no other web page can read the scene.
+The server ends with the process in every case. It listens on 127.0.0.1 and answers only requests
+for that name from its own pages. So no other web page can read the scene.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from orthocal.viewer.scene import Scene, viewer_script
 
 ADDRESS = "127.0.0.1"
 FIRST_PORT = 7000
-PORTS_TRIED = 100
+PORT_COUNT = 100
 
-PAUSE = 0.1
-"""Delay before the next connection if no file descriptor is free, [s]."""
+ACCEPT_DELAY = 0.1
+"""Delay before the next attempt to accept a connection if no file descriptor is free, [s]."""
 
 _HOSTS = r"(localhost|127\.0\.0\.1)"  # tornado removes the port
 
 
 class _SameOrigin(tornado.web.RequestHandler):
-    """A handler that refuses requests from pages of other origins.
+    """Handler that refuses requests from pages of other origins.
 
-    Tornado's own check compares the host alone, and trusts `Sec-Fetch-Site`; this one also
-    compares the scheme, and runs for every request before the handler does.
+    Tornado's check compares only the host, and trusts `Sec-Fetch-Site`. This check also compares
+    the scheme. It runs before the handler of every request.
     """
 
     def initialize(self, scene: Scene, listeners: set[_Commands]) -> None:
@@ -51,7 +51,7 @@ class _SameOrigin(tornado.web.RequestHandler):
 
 
 class _Page(_SameOrigin):
-    """The page of the scene."""
+    """Page of the scene."""
 
     def get(self) -> None:
         self.set_header("Cache-Control", "no-store")
@@ -60,7 +60,7 @@ class _Page(_SameOrigin):
 
 
 class _Viewer(_SameOrigin):
-    """meshcat's viewer, sent from memory: a file would need a free descriptor."""
+    """Viewer of meshcat, sent from memory because a file would need a free descriptor."""
 
     def get(self) -> None:
         self.set_header("Content-Type", "text/javascript; charset=utf-8")
@@ -68,10 +68,10 @@ class _Viewer(_SameOrigin):
 
 
 class _Commands(_SameOrigin, tornado.websocket.WebSocketHandler):
-    """The commands of the scene: all so far, then each new one."""
+    """Commands of the scene: all existing ones, then each new one."""
 
     def check_origin(self, origin: str) -> bool:
-        """Accept the origin: `prepare` has checked it."""
+        """Accept the origin, which `prepare` has checked."""
         return True
 
     async def open(self, *args: str, **kwargs: str) -> None:
@@ -97,13 +97,13 @@ class _Commands(_SameOrigin, tornado.websocket.WebSocketHandler):
 
 
 class LiveScene:
-    """A web server that shows a scene; also a context manager.
+    """Web server that shows a scene; also a context manager.
 
-    Commands that are added later by `scene.visualizer` show at once.
+    Commands that `scene.visualizer` adds later are shown immediately.
 
     Args:
         scene: The scene.
-        port: Port to listen on; by default the first free one from 7000 on.
+        port: Port of the server; by default the first free one from 7000 on.
 
     Raises:
         OrthocalError: If no port is free.
@@ -116,7 +116,7 @@ class LiveScene:
         if port is not None and not (isinstance(port, int) and 0 <= port < 2**16):
             raise ValueError(f"the port is {port!r}; expected 0 to 65535")
         self.scene = scene
-        self._parent = os.getppid()  # it may end before `wait` is called
+        self._parent = os.getppid()  # the parent may end before `wait` is called
         self._socket = _listen(port)
         self.port = int(self._socket.getsockname()[1])
         self._ready = threading.Event()
@@ -163,6 +163,7 @@ class LiveScene:
         self.close()
 
     async def _serve(self) -> None:
+        """Run the server until `close`."""
         self._loop, self._end = asyncio.get_running_loop(), asyncio.Event()
         listeners: set[_Commands] = set()
         tasks: set[asyncio.Task[None]] = set()
@@ -172,18 +173,18 @@ class LiveScene:
         def send() -> None:
             for listener in tuple(listeners):
                 task = asyncio.create_task(listener.catch_up())
-                tasks.add(task)  # the loop keeps no reference
+                tasks.add(task)  # the event loop has only a weak reference
                 task.add_done_callback(tasks.discard)
 
-        def change() -> None:
+        def notify() -> None:
             self._loop.call_soon_threadsafe(send)
 
-        self.scene.listeners.append(change)
+        self.scene.listeners.append(notify)
         self._ready.set()
         try:
             await self._end.wait()
         finally:
-            self.scene.listeners.remove(change)
+            self.scene.listeners.remove(notify)
             accepting.cancel()
             await asyncio.wait([accepting])
             self._socket.close()
@@ -193,20 +194,21 @@ class LiveScene:
 
 
 async def _accept(server: tornado.httpserver.HTTPServer, listening: socket.socket) -> None:
-    """Accept connections; they wait while the process has no free file descriptor.
+    """Accept connections, with a delay while the process has no free file descriptor.
 
-    Tornado's own loop would try to accept the same connection again and again.
+    Tornado's loop would try to accept the same connection without a delay.
     """
     while True:
         try:
             connection, address = await asyncio.get_running_loop().sock_accept(listening)
         except OSError:
-            await asyncio.sleep(PAUSE)
+            await asyncio.sleep(ACCEPT_DELAY)
         else:
             server.handle_stream(tornado.iostream.IOStream(connection), address)
 
 
 def _application(scene: Scene, listeners: set[_Commands]) -> tornado.web.Application:
+    """Application with the handlers of the scene."""
     shared = {"scene": scene, "listeners": listeners}
     handlers: list[Any] = [
         (r"/", _Page, shared),
@@ -220,7 +222,12 @@ def _application(scene: Scene, listeners: set[_Commands]) -> tornado.web.Applica
 
 
 def _listen(port: int | None) -> socket.socket:
-    candidates = [port] if port is not None else range(FIRST_PORT, FIRST_PORT + PORTS_TRIED)
+    """Listening socket on a port, or on the first free default port.
+
+    Raises:
+        OrthocalError: If no port is free.
+    """
+    candidates = [port] if port is not None else range(FIRST_PORT, FIRST_PORT + PORT_COUNT)
     reason = ""
     for candidate in candidates:
         try:
@@ -233,6 +240,6 @@ def _listen(port: int | None) -> socket.socket:
     if port is not None:
         raise OrthocalError(f"cannot listen on port {port} of {ADDRESS}: {reason}", where="port")
     raise OrthocalError(
-        f"no port of {ADDRESS} from {FIRST_PORT} to {FIRST_PORT + PORTS_TRIED - 1} is free",
+        f"no port of {ADDRESS} from {FIRST_PORT} to {FIRST_PORT + PORT_COUNT - 1} is free",
         where="port",
     )

@@ -1,4 +1,4 @@
-"""Scene of one robot: ground, axes and camera, its links and its leg lines."""
+"""Scene of a robot: ground, axes, camera, links and leg lines."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ GHOST_COLOUR: Colour = (0.0, 0.62, 0.66)
 GHOST_OPACITY = 0.25
 LINE_COLOUR: Colour = (0.1, 0.1, 0.12)
 SOLID_COLOUR: Colour = (0.5, 0.52, 0.55)
-"""Colour of a machine in the legend; its links have their own colours."""
+"""Colour of a machine in the legend; its links have the colours of their visuals."""
 
 VIEW = (1.0, 0.72, 0.5)
 """Direction from the machine to the camera."""
 
-SAME = 1e-12
+EQUAL_POSES = 1e-12
 """Largest difference of equal poses, [m or 1]."""
 
 
 class MachineScene:
-    """A scene with ground, axes and camera for a robot.
+    """Scene with ground, axes and camera for a robot.
 
     Args:
         robot: The nominal robot.
@@ -61,7 +61,7 @@ class MachineScene:
         ends = [frame for leg in robot.legs.values() for frame in (leg.root, leg.tip)]
         tool = [robot.tcp.frame] if robot.tcp else []
         self.frames = tuple(dict.fromkeys([*links, *ends, *tool]))
-        """Links, ends of the leg lines and tool centre point."""
+        """Names of the links, ends of the leg lines and tool centre point."""
         self.all_frames = tuple(dict.fromkeys([*self.frames, *sensor_frames]))
         """`frames` and the frames that sensors measure."""
         passive = robot.reference_passive
@@ -86,8 +86,8 @@ class MachineScene:
         corners = []
         for visual in self.visuals:
             pose = poses[visual.link]
-            turned = visual.corners @ pose[:, :3, :3].transpose(0, 2, 1)
-            corners.append(turned + pose[:, None, :3, 3])
+            rotated = visual.corners @ pose[:, :3, :3].transpose(0, 2, 1)
+            corners.append(rotated + pose[:, None, :3, 3])
         return np.concatenate(corners, axis=1)
 
     def draw_machine(
@@ -106,13 +106,13 @@ class MachineScene:
             text: Text of the legend.
             timeline: Times of the frames.
             poses: Frame to poses, shape (F, 4, 4), [m].
-            ghost_of: Poses of the solid machine if this is its ghost. A ghost leaves out the
-                links that do not deviate.
+            ghost_of: Poses of the solid machine, if this machine is its ghost. A ghost has only
+                links that deviate.
         """
         counts: dict[str, int] = {}
         for visual in self.visuals:
             link = visual.link
-            if ghost_of is not None and np.abs(poses[link] - ghost_of[link]).max() < SAME:
+            if ghost_of is not None and np.abs(poses[link] - ghost_of[link]).max() < EQUAL_POSES:
                 continue
             counts[link] = counts.get(link, 0) + 1
             look = material(visual.colour, opacity=visual.opacity, shiny=True)
@@ -128,7 +128,7 @@ class MachineScene:
             self.scene.explain(LegendEntry(text, (node,), colour, "ghost" if ghost else "solid"))
 
     def draw_leg_lines(self, timeline: Timeline, poses: Mapping[str, Array]) -> None:
-        """Draw, name and animate the lines from the root to the tip of every leg.
+        """Draw, label and animate the lines from the root to the tip of every leg.
 
         Args:
             timeline: Times of the frames and stops.
@@ -166,7 +166,7 @@ class MachineScene:
         self.scene.camera = Camera(to_triple(middle), VIEW, tuple(to_triple(p) for p in points))
 
     def lower_ground(self, height: float) -> None:
-        """Put the ground below a height, [m], and below all that was drawn before."""
+        """Move the ground below a height, [m], if it is not below it."""
         self._ground[2] = min(self._ground[2], height)
         pose = np.eye(4)
         pose[:3, 3] = self._ground - [0.0, 0.0, 0.03 * self.size]

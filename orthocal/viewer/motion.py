@@ -1,4 +1,4 @@
-"""Motion of a machine from stop to stop, and the poses of its frames on the way."""
+"""Motion of a machine between stops, and the poses of its frames."""
 
 from __future__ import annotations
 
@@ -23,38 +23,40 @@ class Timeline:
     times: Array
     """Times of the frames, shape (F,), [1/30 s]."""
     stops: NDArray[np.int64]
-    """First frame of every stop, shape (S,); the machine rests until the next frame."""
+    """First frame of every stop, shape (S,); the machine is at rest until the next frame."""
 
     @property
     def rests(self) -> Array:
-        """Start and end of every stop, in turn, shape (2 S,), [1/30 s]."""
+        """Start and end times of all stops, alternating, shape (2 S,), [1/30 s]."""
         return np.asarray(self.times[np.stack([self.stops, self.stops + 1], axis=1).reshape(-1)])
 
     def interval(self, stop: int) -> tuple[float, float]:
-        """Start and end of a stop, [s]."""
+        """Start and end time of a stop, [s]."""
         start, end = self.rests[2 * stop : 2 * stop + 2] / FRAME_RATE
         return float(start), float(end)
 
 
 def plan_motion(stops: ArrayLike, *, count: int | None = None) -> Timeline:
-    """Smooth motion from stop to stop; the more stops, the faster.
+    """Smooth motion from stop to stop; it is faster with more stops.
 
     Args:
         stops: Drive coordinates of the stops, shape (S, n_drives), [m, rad].
-        count: Number of stops that decides the speed; default: S.
+        count: Number of stops that determines the speed; S by default.
     """
     points = np.atleast_2d(np.asarray(stops, dtype=np.float64))
     count = len(points) if count is None else count
-    rest, move, between = (45, 24, 8) if count <= 12 else (24, 15, 4) if count <= 40 else (12, 9, 2)
-    share = np.arange(1, between + 1) / (between + 1)
-    eased = share**2 * (3.0 - 2.0 * share)
-    moves = points[:-1, None] + eased[:, None] * np.diff(points, axis=0)[:, None]
-    resting = np.repeat(points[:, None], 2, axis=1)
-    drives = np.concatenate(
-        [np.concatenate([resting[:-1], moves], axis=1).reshape(-1, points.shape[1]), resting[-1]]
+    pause, move, between = (
+        (45, 24, 8) if count <= 12 else (24, 15, 4) if count <= 40 else (12, 9, 2)
     )
-    cycle = np.concatenate([[0.0, rest], rest + move * share])
-    starts = (rest + move) * np.arange(len(points))
+    fraction = np.arange(1, between + 1) / (between + 1)
+    eased = fraction**2 * (3.0 - 2.0 * fraction)
+    moves = points[:-1, None] + eased[:, None] * np.diff(points, axis=0)[:, None]
+    pauses = np.repeat(points[:, None], 2, axis=1)
+    drives = np.concatenate(
+        [np.concatenate([pauses[:-1], moves], axis=1).reshape(-1, points.shape[1]), pauses[-1]]
+    )
+    cycle = np.concatenate([[0.0, pause], pause + move * fraction])
+    starts = (pause + move) * np.arange(len(points))
     times = (starts[:, None] + cycle).reshape(-1)[: len(drives)]
     return Timeline(drives, times, (2 + between) * np.arange(len(points)))
 
@@ -65,7 +67,7 @@ def place_frames(
     """Poses of frames, computed by Pinocchio.
 
     Args:
-        robot: The robot; for a calibrated machine with the errors in its placements.
+        robot: The robot; a calibrated machine has its errors in the placements.
         drives: Drive coordinates, shape (K, n_drives), [m, rad].
         passive: Passive coordinates, shape (K, n_passive), [m, rad].
         frames: Names of the frames.
@@ -85,14 +87,14 @@ def place_frames(
 
 
 def exaggerate(nominal: Array, real: Array, factor: float) -> Array:
-    """Poses with an enlarged deviation from nominal ones.
+    """Poses with an enlarged deviation from nominal ones, shape (F, 4, 4), [m].
 
-    p = p₀ + f (p₁ − p₀), R = R₀ exp(f log(R₀ᵀ R₁)). With f = 1 they are the real poses.
+    p = p₀ + f (p₁ − p₀), R = R₀ exp(f log(R₀ᵀ R₁)). The factor f = 1 yields the real poses.
 
     Args:
         nominal: Nominal poses (p₀, R₀), shape (F, 4, 4), [m].
         real: Real poses (p₁, R₁), shape (F, 4, 4), [m].
-        factor: f.
+        factor: Factor f.
     """
     if factor == 1.0:
         return real
@@ -101,8 +103,8 @@ def exaggerate(nominal: Array, real: Array, factor: float) -> Array:
     enlarged = nominal.copy()
     enlarged[:, :3, 3] += factor * (real[:, :3, 3] - nominal[:, :3, 3])
     start = Rotation.from_matrix(nominal[:, :3, :3])
-    turn = (start.inv() * Rotation.from_matrix(real[:, :3, :3])).as_rotvec()
-    enlarged[:, :3, :3] = (start * Rotation.from_rotvec(factor * turn)).as_matrix()
+    rotation = (start.inv() * Rotation.from_matrix(real[:, :3, :3])).as_rotvec()
+    enlarged[:, :3, :3] = (start * Rotation.from_rotvec(factor * rotation)).as_matrix()
     return enlarged
 
 

@@ -1,7 +1,7 @@
-"""Scenes: recorded meshcat commands, and what a page shows around the 3-D view.
+"""Scenes: recorded meshcat commands, and the content of a page around the 3-D view.
 
-meshcat's own window starts a server that other machines can reach and that outlives its parent
-process. A scene records the commands instead. A page plays them to meshcat's viewer, either from a
+The window of meshcat starts a server that other machines can reach and that outlives its parent
+process. A scene records the commands instead. A page sends them to meshcat's viewer, either from a
 file or from the server of `live`, which only this machine can reach.
 """
 
@@ -36,47 +36,49 @@ _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data: blob:; connect-src {connect}"
 )
-"""A page loads nothing from elsewhere, whatever names the user's files contain."""
+"""Security policy of a page: no content from other sources, regardless of the user's files."""
 
 FRAME_RATE = 30
 """Frames of the animation per second."""
 
-STILL = 1e-12
+SMALLEST_CHANGE = 1e-12
 """Changes below this are not animated, [m or 1]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """A text at a point of the scene; the page places labels so that none covers another."""
+    """Text at a point of the scene; the page places labels without overlap."""
 
     at: tuple[Point, ...]
     """Point in each step of the animation, or one point for all steps, [m]."""
     texts: tuple[str, ...]
     """Text in each step, or one text for all steps; "" for no label."""
     node: str
-    """Path of the node with which the label is hidden."""
+    """Path of the node; the label is hidden with it."""
     rank: float = 0.0
-    """Labels of the highest rank stay if there is no room for all; names have rank -1."""
+    """Priority of the label if not all fit; names have rank -1."""
     uncovered: tuple[tuple[Point, ...], ...] = ()
     """Points in each step that no label may cover, [m]."""
 
 
 @dataclass(frozen=True, slots=True)
 class LegendEntry:
-    """A line of the legend, with a box that shows and hides its nodes."""
+    """Line of the legend, with a check box that shows and hides its nodes."""
 
     text: str
     nodes: tuple[str, ...]
+    """Paths of the nodes."""
     colour: str
     """Colour in CSS."""
     mark: Mark
+    """Symbol before the text."""
     shown: bool = True
-    """Whether the nodes are visible at first."""
+    """Whether the nodes are initially visible."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A stop of the animation."""
+    """Stop of the animation."""
 
     name: str
     caption: str
@@ -93,13 +95,17 @@ class Camera:
     target: Point
     """Point in the middle of the view, [m]."""
     direction: Point
-    """From the target to the camera."""
+    """Direction from the target to the camera."""
     points: tuple[Point, ...] = ((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
-    """Points that are in view at first, [m]."""
+    """Points that are initially in view, [m]."""
 
 
 class _Recorder:
-    """Replacement of meshcat's window that records the commands in their order."""
+    """Replacement of meshcat's window that records the commands in order.
+
+    Args:
+        to_html: Function that returns the page.
+    """
 
     def __init__(self, to_html: Callable[[], str]) -> None:
         self.commands: list[dict[str, Any]] = []
@@ -108,16 +114,17 @@ class _Recorder:
         self._to_html = to_html
 
     def send(self, command: Any) -> None:  # noqa: ANN401 - any of meshcat's commands
+        """Record a command and call the listeners."""
         self.commands.append(self._plain(command.lower()))
         for listener in tuple(self.listeners):
             listener()
 
     def get_scene(self) -> str:
-        """The page, for `static_html` of meshcat's interface."""
+        """Page of the scene, for `static_html` of meshcat's interface."""
         return self._to_html()
 
     def _plain(self, value: Any) -> Any:  # noqa: ANN401 - a JSON-like tree
-        """A copy with plain numbers, and with counters in place of random identifiers."""
+        """Copy with plain numbers, and with counters instead of random identifiers."""
         if isinstance(value, dict):
             return {k: self._plain(v) for k, v in value.items()}
         if isinstance(value, list | tuple):
@@ -133,11 +140,11 @@ class _Recorder:
 
 @dataclass(eq=False)
 class Scene:
-    """A 3-D scene with legend, labels and animation, to be shown in a browser."""
+    """3-D scene with legend, labels and animation for a browser."""
 
     title: str
     headline: str = ""
-    """The main result, in a sentence."""
+    """Main result in a sentence."""
     facts: list[str] = field(default_factory=list)
     """Scales and further facts, one per line."""
     camera: Camera = Camera((0.0, 0.0, 0.0), (1.0, 1.0, 0.7))
@@ -155,7 +162,7 @@ class Scene:
         self._recorder = _Recorder(self.to_html)
         self._clips: dict[NodePath, AnimationClip] = {}
         self.visualizer = meshcat.Visualizer(window=self._recorder)
-        """meshcat's interface to this scene; `scene.visualizer["/Name"]` adds nodes."""
+        """Interface of meshcat to this scene; `scene.visualizer["/Name"]` adds nodes."""
 
     def add(
         self, path: str, geometry: Geometry, material: Material, pose: Array | None = None
@@ -163,7 +170,7 @@ class Scene:
         """Add a shape.
 
         Args:
-            path: Path of its node: names separated by slashes.
+            path: Path of its node, with names separated by slashes.
             geometry: Geometry of meshcat.
             material: Material of meshcat.
             pose: Pose in the parent node, shape (4, 4), [m].
@@ -177,7 +184,7 @@ class Scene:
         self.visualizer[f"/{path}"].set_transform(np.asarray(pose, dtype=np.float64))
 
     def move(self, path: str, times: Array, poses: Array) -> None:
-        """Place a node at its first pose and animate it through all of them.
+        """Place a node at the first of several poses and animate it through all poses.
 
         Args:
             path: Path of the node.
@@ -187,9 +194,9 @@ class Scene:
         from scipy.spatial.transform import Rotation
 
         self.place(path, poses[0])
-        if np.ptp(poses[:, :3, 3], axis=0).max() > STILL:
+        if np.ptp(poses[:, :3, 3], axis=0).max() > SMALLEST_CHANGE:
             self.track(path, "position", "vector3", times, poses[:, :3, 3])
-        if np.ptp(poses[:, :3, :3], axis=0).max() > STILL:
+        if np.ptp(poses[:, :3, :3], axis=0).max() > SMALLEST_CHANGE:
             rotations = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
             self.track(path, "quaternion", "quaternion", times, rotations)
 
@@ -208,7 +215,7 @@ class Scene:
         clip.tracks[name] = AnimationTrack(name, kind, times.tolist(), values.tolist())
 
     def animate(self) -> None:
-        """Add the animation of all tracks; it waits until somebody plays it."""
+        """Add the animation of all tracks; it is initially stopped."""
         self.visualizer.set_animation(
             Animation(self._clips, default_framerate=FRAME_RATE), play=False
         )
@@ -225,12 +232,12 @@ class Scene:
 
     @property
     def listeners(self) -> list[Callable[[], object]]:
-        """Functions that are called after every command; a list to append to."""
+        """Functions that are called after every command; append to this list to add one."""
         return self._recorder.listeners
 
     @property
     def commands(self) -> tuple[Mapping[str, Any], ...]:
-        """All commands so far, in the form of meshcat's viewer."""
+        """All recorded commands, in the form of meshcat's viewer."""
         return tuple(self._recorder.commands)
 
     @property
@@ -262,12 +269,12 @@ class Scene:
             yield umsgpack.packb(command, force_float_precision=precision)
 
     def to_html(self) -> str:
-        """A self-contained page that includes meshcat's viewer."""
+        """Self-contained page that includes meshcat's viewer."""
         packed = [base64.b64encode(data).decode() for data in self.pack()]
         return self._page(packed, viewer=f"<script>{viewer_script()}</script>", connect="'none'")
 
     def to_live_html(self) -> str:
-        """A page that loads the viewer and the commands from its server."""
+        """Page that loads the viewer and the commands from its server."""
         # some browsers do not count web sockets of the same server as 'self'
         server = "'self' ws://127.0.0.1:* ws://localhost:*"
         return self._page([], viewer='<script src="main.min.js"></script>', connect=server)
@@ -282,10 +289,17 @@ class Scene:
         return Path(path)
 
     def _repr_html_(self) -> str:
-        """The page in a frame, for notebooks."""
+        """Page in a frame, for notebooks."""
         return frame_of(self.to_html(), height="560px")
 
     def _page(self, commands: list[str], *, viewer: str, connect: str) -> str:
+        """Page of the scene.
+
+        Args:
+            commands: Packed commands in base64.
+            viewer: Script element with meshcat's viewer.
+            connect: Sources to which the page may connect.
+        """
         policy = _POLICY.format(connect=connect)
         if connect != "'none'":
             policy = policy.replace("script-src", "script-src 'self'")
@@ -300,7 +314,7 @@ class Scene:
             "commands": commands,
             "live": connect != "'none'",
         }
-        # without "<" the data cannot end the script element
+        # escape "<", so that the data cannot end the script element
         data = json.dumps(_printable(content), ensure_ascii=False, allow_nan=False).replace(
             "<", "\\u003c"
         )
@@ -322,18 +336,18 @@ _RESERVED_NAMES = frozenset(
     "__defineGetter__ __defineSetter__ __lookupGetter__ __lookupSetter__ __proto__ "
     "<object>".split()
 )
-"""Keys of every plain object of JavaScript, in which the viewer keeps its nodes; and its name for
-the shape of a node."""
+"""Keys of every plain object of JavaScript, in which the viewer stores its nodes, and
+its name for the shape of a node."""
 
 
 def node_name(name: str) -> str:
-    """Node name for a name from a file: without slashes and without the viewer's own names."""
+    """Node name for a name from a file, without slashes and reserved names of the viewer."""
     text = printable(name.replace("/", "∕"))
     return f"{text} (name)" if text in _RESERVED_NAMES else text
 
 
 def frame_of(page: str, *, height: str) -> str:
-    """A page in a frame of another page."""
+    """HTML of a frame that contains a page."""
     style = f"width:100%;height:{height};border:1px solid #ccc;border-radius:6px"
     source = html.escape(page)
     return f'<iframe title="3-D scene" loading="lazy" srcdoc="{source}" style="{style}"></iframe>'
@@ -341,7 +355,7 @@ def frame_of(page: str, *, height: str) -> str:
 
 @cache
 def viewer_script() -> str:
-    """The viewer of meshcat, from the installed package."""
+    """Script of meshcat's viewer from the installed package."""
     path = resources.files("meshcat") / "viewer" / "dist" / "main.min.js"
     return path.read_text(encoding="utf-8").replace("</script", "<\\/script")
 
@@ -356,7 +370,7 @@ def round_scale(value: float) -> float:
 
 
 def _printable(value: Any) -> Any:  # noqa: ANN401 - a JSON-like tree
-    """A copy with printable texts, without characters that change the direction of writing."""
+    """Copy with printable texts, without characters that change the writing direction."""
     if isinstance(value, str):
         return printable(value, keep="\n")
     if isinstance(value, dict):
@@ -365,4 +379,5 @@ def _printable(value: Any) -> Any:  # noqa: ANN401 - a JSON-like tree
 
 
 def _read(name: str) -> str:
+    """Text of a file in web/."""
     return (resources.files("orthocal.viewer") / "web" / name).read_text(encoding="utf-8")

@@ -22,7 +22,7 @@ AXIS_COLOURS: tuple[Colour, Colour, Colour] = (
 
 
 class _AlongZ(g.Cylinder):  # type: ignore[misc] # meshcat has no types
-    """A cylinder or cone along z.
+    """Cylinder or cone along z.
 
     Args:
         height: Height, [m].
@@ -36,8 +36,8 @@ class _AlongZ(g.Cylinder):  # type: ignore[misc] # meshcat has no types
         self.start = start
 
     def intrinsic_transform(self) -> Array:
-        """Rotation from meshcat's y to z; transposed, because three.js stores columns."""
-        turn = np.array(
+        """Transform from meshcat's y to z, transposed because three.js stores columns."""
+        transform = np.array(
             [
                 [1.0, 0.0, 0.0, 0.0],
                 [0.0, 0.0, -1.0, 0.0],
@@ -45,16 +45,16 @@ class _AlongZ(g.Cylinder):  # type: ignore[misc] # meshcat has no types
                 [0.0, 0.0, 0.0, 1.0],
             ]
         )
-        return turn.T
+        return transform.T
 
 
 def cylinder(height: float, radius: float, *, start: float = 0.0) -> g.Geometry:
-    """A cylinder along z that begins at z = start, [m]."""
+    """Cylinder along z that begins at z = start, [m]."""
     return _AlongZ(height, radius, radius, start=start)
 
 
 def cone(height: float, radius: float, *, start: float = 0.0) -> g.Geometry:
-    """A cone along z whose base is at z = start, [m]."""
+    """Cone along z whose base is at z = start, [m]."""
     return _AlongZ(height, radius, 0.0, start=start)
 
 
@@ -76,21 +76,21 @@ def pose_along(origin: Array, direction: Array) -> Array:
 
 
 def to_triple(point: Array) -> tuple[float, float, float]:
-    """The coordinates of a point as plain numbers."""
+    """Coordinates of a point as plain numbers."""
     return float(point[0]), float(point[1]), float(point[2])
 
 
 def material(colour: Colour, *, opacity: float = 1.0, shiny: bool = False) -> g.Material:
-    """A material; a transparent one does not hide shapes behind it.
+    """Material; a transparent material does not hide shapes behind it.
 
     Args:
         colour: Red, green and blue, 0 to 1.
-        opacity: 0 to 1.
+        opacity: Opacity, 0 to 1.
         shiny: Whether the surface has highlights.
     """
     hexadecimal = sum(round(255 * c) << shift for c, shift in zip(colour, (16, 8, 0), strict=True))
     extra: dict[str, object] = {}
-    if opacity < 1.0:  # a solid shape in the same place is drawn in front
+    if opacity < 1.0:  # a solid shape in the same place appears in front
         extra = {
             "depthWrite": False,
             "polygonOffset": True,
@@ -102,27 +102,27 @@ def material(colour: Colour, *, opacity: float = 1.0, shiny: bool = False) -> g.
 
 
 def head_length(width: float) -> float:
-    """Length of the head of an arrow whose shaft has a diameter `width`, [m]."""
+    """Length of an arrow's head for a shaft of diameter `width`, [m]."""
     return 3.5 * width
 
 
 @dataclass(frozen=True, slots=True)
 class ArrowParts:
-    """Scales and place of the two parts of an arrow, both along z."""
+    """Scales and position of the two parts of an arrow along z."""
 
     shaft: tuple[float, float, float]
     """Scale of a shaft of unit length."""
     foot: float
-    """Start of the head, [m]."""
+    """Coordinate of the start of the head, [m]."""
     head: tuple[float, float, float]
     """Scale of the head."""
 
 
 def arrow_parts(length: float, width: float) -> ArrowParts:
-    """Parts of an arrow of a length; an arrow shorter than its head is a smaller head.
+    """Parts of an arrow; an arrow shorter than its head has a smaller head.
 
     Args:
-        length: Length, negative against the arrow's direction, [m].
+        length: Length, [m]; negative if the arrow points against z.
         width: Diameter of the shaft, [m].
     """
     # three.js needs scales that can be inverted
@@ -143,13 +143,13 @@ def draw_arrow(
     colour: Colour,
     times: Array | None = None,
 ) -> None:
-    """An arrow along z of its node.
+    """Draw an arrow along z of its node.
 
     Args:
         scene: The scene.
         path: Path of the node.
         pose: Pose of the node, shape (4, 4), [m].
-        lengths: Length at the start, or at each of the times; negative against z, [m].
+        lengths: Initial length, or lengths at all times, [m]; negative against z.
         width: Diameter of the shaft, [m].
         colour: Red, green and blue, 0 to 1.
         times: Times of the lengths, shape (F,), [frames].
@@ -171,7 +171,7 @@ def draw_arrow(
 
 
 def dial_distance(size: float) -> float:
-    """Distance from the tip of a gauge to the middle of its dial of radius `size`, [m]."""
+    """Distance from the tip of a gauge to the middle of its dial, with radius `size`, [m]."""
     return 2.3 * size
 
 
@@ -186,14 +186,14 @@ def draw_gauge(
     ball: float | None = None,
     edge: Array | None = None,
 ) -> None:
-    """A dial indicator with its stem along the measured direction.
+    """Draw a dial indicator with its stem along the measured direction.
 
     Args:
         scene: The scene.
         path: Path of the node.
         tip: Point of contact, shape (3,), [m].
         direction: Direction of a growing reading, shape (3,).
-        face: Direction that the dial faces, across `direction`, shape (3,).
+        face: Normal of the dial, perpendicular to `direction`, shape (3,).
         size: Radius of the dial, [m].
         ball: Radius of a ball or pin at the tip, [m].
         edge: Vector from one end of a blade or pin to the other, shape (3,), [m].
@@ -225,11 +225,11 @@ def draw_gauge(
 
 
 BAR = "bar"
-"""Node of the bar within that of a ball bar."""
+"""Name of the node of the bar in the node of a ball bar."""
 
 
 def draw_bar(scene: Scene, path: str, fixed: Array, ball: Array, size: float) -> None:
-    """A ball bar: a fixed ball on a post, and a bar with a ball at its other end.
+    """Draw a ball bar: a fixed ball on a post, and a bar with a ball at its other end.
 
     Args:
         scene: The scene.
@@ -249,14 +249,14 @@ def draw_bar(scene: Scene, path: str, fixed: Array, ball: Array, size: float) ->
 
 
 def _shift(x: float, y: float, z: float) -> Array:
-    """A pose that is shifted but not turned, shape (4, 4), [m]."""
+    """Pose of a pure translation, shape (4, 4), [m]."""
     pose = np.eye(4)
     pose[:3, 3] = x, y, z
     return pose
 
 
 def _draw_edge(scene: Scene, path: str, edge: Array, *, radius: float, height: float) -> None:
-    """A blade, or a pin with a radius, above the origin, [m]."""
+    """Draw a blade, or a pin with a radius, above the origin, [m]."""
     steel, length = material((0.75, 0.76, 0.8), shiny=True), float(np.linalg.norm(edge))
     along, up = edge / length, np.array([0.0, 0.0, 1.0])
     if radius > 0.0:
@@ -269,7 +269,7 @@ def _draw_edge(scene: Scene, path: str, edge: Array, *, radius: float, height: f
 
 
 def draw_ground(scene: Scene, path: str, *, side: float, pitch: float) -> None:
-    """A pale plate with grid lines around the origin of its node.
+    """Draw a pale plate with grid lines around the origin of its node.
 
     Args:
         scene: The scene.
@@ -291,7 +291,7 @@ def draw_ground(scene: Scene, path: str, *, side: float, pitch: float) -> None:
 
 
 def draw_axes(scene: Scene, path: str, *, length: float) -> None:
-    """The axes of the world: x red, y green, z blue."""
+    """Draw the axes of the world: x red, y green, z blue."""
     for name, direction, colour in zip("xyz", np.eye(3), AXIS_COLOURS, strict=True):
         pose = pose_along(np.zeros(3), direction)
         draw_arrow(scene, f"{path}/{name}", pose, [length], width=0.05 * length, colour=colour)
@@ -301,5 +301,5 @@ def draw_axes(scene: Scene, path: str, *, length: float) -> None:
 
 
 def css(colour: Colour) -> str:
-    """A colour in CSS."""
+    """Colour in CSS."""
     return "#" + "".join(f"{round(255 * c):02x}" for c in colour)

@@ -21,21 +21,21 @@ from orthocal.robot.model import Robot
 from orthocal.robot.urdf import LARGEST_PLACE, captured_stderr, parse_urdf
 from orthocal.viewer.shapes import Colour, cylinder, pose_along
 
-LARGEST_REPETITION = 10 * 2**20
-"""Largest size of the repetitions of a mesh file, [bytes]."""
+MAX_REPETITION = 10 * 2**20
+"""Largest total size of the repetitions of a mesh file, [bytes]."""
 
-LONGEST_LINE = 4_000
-"""Characters of the longest line in an OBJ file, a face of some hundred corners."""
+MAX_LINE = 4_000
+"""Most characters of a line in an OBJ file, for a face with some hundred corners."""
 
-MOST_TRIANGLES = 300_000
-"""Triangles of the largest mesh; a page holds each as text."""
+MAX_TRIANGLES = 300_000
+"""Most triangles of a mesh, because a page contains each as text."""
 
 _STICK: Colour = (0.55, 0.58, 0.62)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Visual:
-    """A visible shape of a link."""
+    """Visible shape of a link."""
 
     link: str
     placement: Array
@@ -43,12 +43,13 @@ class Visual:
     geometry: g.Geometry
     colour: Colour
     opacity: float
+    """Opacity, 0 to 1."""
     corners: Array
     """Corners of the bounding box in the frame of the link, shape (8, 3), [m]."""
 
 
 def load_visuals(robot: Robot) -> tuple[Visual, ...]:
-    """Visible shapes of the links of a robot, or sticks between its joints if it has none.
+    """Visible shapes of the links of a robot; without visuals, sticks between its joints.
 
     Raises:
         RobotError: If a mesh file is missing, unreadable or outside the robot's directory.
@@ -59,7 +60,7 @@ def load_visuals(robot: Robot) -> tuple[Visual, ...]:
             with captured_stderr():
                 geometry = pin.buildGeomFromUrdfString(robot.model, text, pin.GeometryType.VISUAL)
         except (ValueError, RuntimeError) as e:
-            # without the place in the source of the library, and its hint
+            # remove the source location and the hint of the library
             reason = " ".join(str(e).split("message:")[-1].split("Hint:")[0].split())
             raise RobotError(
                 f"its visuals cannot be loaded: {reason}", where=str(robot.urdf)
@@ -69,7 +70,10 @@ def load_visuals(robot: Robot) -> tuple[Visual, ...]:
 
 
 def _with_absolute_meshes(robot: Robot, folder: Path) -> str:
-    """Text of the URDF with absolute paths of its meshes; those not embedded are not drawn."""
+    """Text of the URDF with absolute paths of its meshes.
+
+    Visuals with meshes that an embedded robot does not contain are removed.
+    """
     root = parse_urdf(robot.urdf, content=robot.content[robot.urdf.name])
     uses: Counter[Path] = Counter()
     for mesh in list(root.iter("mesh")):
@@ -92,10 +96,10 @@ def _with_absolute_meshes(robot: Robot, folder: Path) -> str:
             _require_short_lines(path, where)
         repeated = path.stat().st_size * uses[path]
         uses[path] += 1
-        if repeated > LARGEST_REPETITION:
+        if repeated > MAX_REPETITION:
             raise RobotError(
                 f"the mesh '{name}' is drawn {uses[path]} times, {repeated / 2**20:.0f} MiB again; "
-                f"expected at most {LARGEST_REPETITION / 2**20:g} MiB",
+                f"expected at most {MAX_REPETITION / 2**20:g} MiB",
                 where=where,
             )
         mesh.set("filename", str(path))
@@ -103,17 +107,18 @@ def _with_absolute_meshes(robot: Robot, folder: Path) -> str:
 
 
 def _require_short_lines(path: Path, where: str) -> None:
-    """Refuse an OBJ file with a face of thousands of corners: triangulation is quadratic."""
+    """Refuse an OBJ file with a face of thousands of corners: its triangulation is quadratic."""
     lines = read_file(path, error=RobotError).split(b"\n")
     longest = max(len(line) for line in lines)
-    if longest > LONGEST_LINE:
+    if longest > MAX_LINE:
         raise RobotError(
-            f"the mesh {path} has a line of {longest} characters; expected at most {LONGEST_LINE}",
+            f"the mesh {path} has a line of {longest} characters; expected at most {MAX_LINE}",
             where=where,
         )
 
 
 def _visual(robot: Robot, part: pin.GeometryObject) -> Visual:
+    """Visible shape from a geometry object of Pinocchio."""
     geometry = _geometry(robot, part)
     frame = robot.model.frames[part.parentFrame]
     placement = frame.placement.inverse() * part.placement
@@ -135,6 +140,11 @@ def _visual(robot: Robot, part: pin.GeometryObject) -> Visual:
 
 
 def _geometry(robot: Robot, part: pin.GeometryObject) -> g.Geometry:
+    """Geometry of meshcat from a geometry object of Pinocchio.
+
+    Raises:
+        RobotError: If the shape is not supported.
+    """
     shape = part.geometry
     if isinstance(shape, coal.Box):
         return g.Box([float(v) for v in 2.0 * np.asarray(shape.halfSide).reshape(3)])
@@ -156,11 +166,15 @@ def _geometry(robot: Robot, part: pin.GeometryObject) -> g.Geometry:
 
 
 def _check_mesh(robot: Robot, part: pin.GeometryObject) -> None:
-    """Refuse a mesh that is too large for a scene."""
+    """Refuse a mesh that is too large for a scene.
+
+    Raises:
+        RobotError: If the mesh has too many triangles or vertices too far away.
+    """
     vertices = np.asarray(part.geometry.vertices())
     problem = None
-    if part.geometry.num_tris > MOST_TRIANGLES:
-        problem = f"has {part.geometry.num_tris} triangles; expected at most {MOST_TRIANGLES}"
+    if part.geometry.num_tris > MAX_TRIANGLES:
+        problem = f"has {part.geometry.num_tris} triangles; expected at most {MAX_TRIANGLES}"
     elif not (np.isfinite(vertices).all() and np.abs(vertices).max(initial=0.0) <= LARGEST_PLACE):
         problem = f"reaches beyond ±{LARGEST_PLACE:g} m"
     if problem:
@@ -168,7 +182,7 @@ def _check_mesh(robot: Robot, part: pin.GeometryObject) -> None:
 
 
 def _sticks(robot: Robot) -> Iterator[Visual]:
-    """A ball at every link, and a stick to each joint mounted on it."""
+    """Ball at every link, and a stick to each joint mounted on it."""
     model, radius = robot.model, 0.012 * robot.characteristic_length
     for i, link in enumerate(model.frames):
         if link.type != pin.FrameType.BODY:
@@ -177,14 +191,15 @@ def _sticks(robot: Robot) -> Iterator[Visual]:
         for mount in model.frames:
             if mount.parentFrame != i:
                 continue
-            place = mount.placement
+            placement = mount.placement
             if mount.type == pin.FrameType.JOINT:
-                place = model.jointPlacements[mount.parentJoint]
-            end = link.placement.inverse() * place
+                placement = model.jointPlacements[mount.parentJoint]
+            end = link.placement.inverse() * placement
             yield _stick(link.name, np.asarray(end.translation), radius)
 
 
 def _stick(link: str, end: Array, radius: float) -> Visual:
+    """Stick from the origin of a link to a point, [m]; a ball if the point is the origin."""
     length = float(np.linalg.norm(end))
     if length < 1e-9:
         geometry, placement = g.Sphere(1.6 * radius), np.eye(4)

@@ -43,8 +43,9 @@ from orthocal.export.formats import export_corrections
 from orthocal.export.linuxcnc.approximation import approximate
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.kinematics.orthoglide import inverse
+from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.sensitivity import ToolSensitivity
-from orthocal.kinematics.workspace import Workspace, cube, find_workspace, tool_at_zero
+from orthocal.kinematics.workspace import Workspace, cube, tool_at_zero
 from orthocal.observation.simulate import load_errors
 from orthocal.output.text.accuracy import accuracy_json
 from orthocal.planning.equipment import Equipment
@@ -158,14 +159,14 @@ def test_equal_parts_of_a_cube_have_the_polynomial_through_its_points(orthoglide
         x, y, z = (points / 0.06).T
         return np.stack([x**4 - 2.0 * y * z**3, 3.0 + z, x * y**2], axis=1)
 
-    found, weights = workspace.spread(field(workspace.points))
+    found, weights = workspace.interpolate_to_cells(field(workspace.points))
     side = (np.arange(12) - 5.5) * 0.01
     middles = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
     assert found == pytest.approx(field(middles), abs=1e-12)
     assert weights == pytest.approx(np.full(1728, 1.0 / 1728.0))
     some = Workspace.even(middles[:7])
-    assert np.array_equal(some.spread(found[:7])[0], found[:7])
-    assert np.array_equal(some.spread(found[:7])[1], some.weights)
+    assert np.array_equal(some.interpolate_to_cells(found[:7])[0], found[:7])
+    assert np.array_equal(some.interpolate_to_cells(found[:7])[1], some.weights)
 
 
 def test_what_95_in_100_errors_stay_below_is_that_of_many_points(orthoglide):
@@ -191,7 +192,7 @@ def test_a_rigid_motion_is_taken_out_and_nothing_else(workspace):
     points = workspace.points
     motion = rng.normal(size=3) + np.cross(rng.normal(size=3), points)
     assert np.abs(workspace.remove_motion(motion, points)).max() < 1e-12
-    assert np.abs(workspace.remove_shift(motion)).max() > 1e-3
+    assert np.abs(workspace.remove_translation(motion)).max() > 1e-3
     stretch = points * [1e-3, 0.0, -2e-3]
     assert workspace.remove_motion(stretch + motion, points) == pytest.approx(stretch, abs=1e-12)
     shear = np.zeros_like(points)
@@ -332,8 +333,8 @@ def test_what_is_entered_is_in_where_the_tool_is_then(calibrated):
     before, after = (
         assess_tool(c, points) for c in (calibrated, replace(calibrated, session=session))
     )
-    assert after.deviation == pytest.approx(before.error_after_offsets, abs=1e-12)
-    assert np.linalg.norm(before.deviation) > 5 * np.linalg.norm(before.error_after_offsets)
+    assert after.deviation == pytest.approx(before.deviation_with_entries, abs=1e-12)
+    assert np.linalg.norm(before.deviation) > 5 * np.linalg.norm(before.deviation_with_entries)
 
 
 def test_offsets_alone_are_as_good_as_the_machines_are(root):

@@ -108,7 +108,7 @@ def test_best_amounts_are_a_minimum(machines):
         for change in (-1e-5, 1e-5):
             trial = np.array(amounts)
             trial[i] += change
-            assert search.error(trial) > own or abs(trial[i]) > search.largest[i]
+            assert search.error(trial) > own or abs(trial[i]) > search.max_amounts[i]
 
 
 def test_the_effects_are_those_of_the_adjusted_machine(machines):
@@ -129,7 +129,7 @@ def test_uncertainties_of_amounts_by_sampling(machines):
     """Best amounts of machines as uncertain as the calibration says."""
     calibration = machines[4][1]
     search = search_of(calibration)
-    search.largest = np.full(15, 1.0)
+    search.max_amounts = np.full(15, 1.0)
     chosen = search.choose()[:2]
     stated = search.uncertainties(chosen) / 2.0
     root = np.linalg.cholesky(search._covariance() + 1e-24 * np.eye(len(search._covariance())))
@@ -139,7 +139,7 @@ def test_uncertainties_of_amounts_by_sampling(machines):
     deviation = search._without_offsets(search.tool.deviation(calibration.active_offsets))
     found = []
     for _ in range(200):
-        search._deviate(deviation + field @ (root @ rng.normal(size=n)))
+        search._set_deviation(deviation + field @ (root @ rng.normal(size=n)))
         found.append(search.fit(chosen)[chosen])
     assert np.std(found, axis=0) == pytest.approx(stated, rel=0.2)
 
@@ -193,7 +193,7 @@ def test_a_second_session_is_refused_as_the_adjustment_is(plan, tmp_path):
 def test_adjustments_that_are_not_worth_doing_are_details(machines, plans):
     _, calibration = machines[4]
     assert plans[4].judgement == "worthwhile"
-    uncertain = replace(plans[4], moved_uncertainty=1.0)
+    uncertain = replace(plans[4], displacement_uncertainty=1.0)
     assert uncertain.judgement == "uncertain gain"
 
     def show(plan, **options):

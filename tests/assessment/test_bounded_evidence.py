@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from scipy.stats import multivariate_normal, norm
 
 from orthocal import load_plan, simulate_session
-from orthocal.assessment.recommendation import SCALES, weigh_model
+from orthocal.assessment.recommendation import TOLERANCE_SCALES, compute_log_evidence
 from orthocal.estimation.selection import complete_model
 from orthocal.hypotheses.likelihood import build_likelihood
 from orthocal.hypotheses.linear_model import ModelLinearisation, linear_model
@@ -74,26 +74,26 @@ def backlash(tmp_path_factory):
     return simulate_session(plan, errors, seed=4).session
 
 
-@pytest.mark.parametrize("scale", [1.0, float(SCALES[30])])
+@pytest.mark.parametrize("scale", [1.0, float(TOLERANCE_SCALES[30])])
 def test_the_evidence_of_a_session_is_that_of_drawn_backlash(backlash, scale):
     """Mean over half-normal draws of the density with all other errors integrated out."""
     model = linear_model(backlash, complete_model(backlash.robot.parameters))
     near = model.most_likely(backlash.values)
-    about = model.linearise(near.theta, (), near.passive, slopes=True)
+    about = model.linearise(near.theta, (), near.passive, keep_jacobian=True)
     deviation = model.entries(backlash.values[None])[0] - about.expected
     positive = np.array([p.positive for p in model.problem.parameters])
     assert positive.sum() == 3
-    one, by_scale = weigh_model(backlash, complete_model(backlash.robot.parameters))
+    one, by_scale = compute_log_evidence(backlash, complete_model(backlash.robot.parameters))
     found = one if scale == 1.0 else float(by_scale[30])
 
     # zeros are projected out: coordinates within what is left
     values, vectors = np.linalg.eigh(np.eye(deviation.size) - _zero_means(model))
     within = vectors[:, values > 0.5]
-    others = scale * within.T @ about.slopes[:, ~positive]
+    others = scale * within.T @ about.jacobian[:, ~positive]
     covariance = others @ others.T + model.sigma**2 * np.eye(within.shape[1])
     root = np.linalg.cholesky(covariance)
     white = np.linalg.solve(root, within.T @ deviation)
-    slopes = np.linalg.solve(root, within.T @ about.slopes[:, positive])
+    slopes = np.linalg.solve(root, within.T @ about.jacobian[:, positive])
     # draws of the prior over those of a normal distribution about the estimate
     normal = slopes.T @ slopes + np.eye(3) / scale**2
     estimate = np.linalg.solve(normal, slopes.T @ white)

@@ -30,7 +30,7 @@ AGREED = 0.03
 
 @pytest.fixture(scope="module")
 def space(orthoglide):
-    return cube(orthoglide, points_a_side=5)
+    return cube(orthoglide, points_per_side=5)
 
 
 def mounted(plan, how):

@@ -81,7 +81,7 @@ def test_one_recommendation_for_calibrate_and_compare(name, request, root):
     compared = request.getfixturevalue(name)
     model, evidence = RECOMMENDED[name]
     assert compared.recommendation.model == model
-    assert compared.recommendation.of("offsets") == pytest.approx(evidence, abs=0.5)
+    assert compared.recommendation.log_evidence_of("offsets") == pytest.approx(evidence, abs=0.5)
     session = load_session(root / "examples" / examples.get(name, name))
     calibration = calibrate(session, solver="variable-projection")
     (first,) = compared.assessment.of_kind("recommended")
@@ -257,6 +257,6 @@ def test_the_summary_shows_all_that_was_promised(table1):
 def test_readings_without_any_deviation_speak_for_offsets_and_small_tolerances(raw_cycles):
     still = raw_cycles.with_values(np.zeros(len(raw_cycles.readings)))
     found = compare_models(still, models=["offsets", "lengths"])
-    assert found.recommendation.of("offsets") > STRONG
+    assert found.recommendation.log_evidence_of("offsets") > STRONG
     assert found.recommendation.tolerance_scale < 0.2
     assert math.isfinite(found["lengths"].exact.aicc)

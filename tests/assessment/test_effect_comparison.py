@@ -103,9 +103,9 @@ def test_left_out_setups_are_predicted_as_by_conditioning(session):
     """Against the conditional mean of the joint normal distribution of all entries."""
     model = LinearModel(session)
     near = model.most_likely(session.values)
-    about = model.linearise(near.theta, (), near.passive, slopes=True)
+    about = model.linearise(near.theta, (), near.passive, keep_jacobian=True)
     deviation = model.entries(session.values[None])[0] - about.expected
-    joint = about.slopes @ about.slopes.T + model.sigma**2 * np.eye(deviation.size)
+    joint = about.jacobian @ about.jacobian.T + model.sigma**2 * np.eye(deviation.size)
     setups = model.problem.observations.setup
     for setup in np.unique(setups):
         out = setups == setup
@@ -154,7 +154,7 @@ def test_the_evidence_counts_where_left_out_setups_disagree(session):
     none, best = found.weighed
     worse = replace(best, unseen_rms=1.5 * none.unseen_rms)
     said = [describe_effects(replace(found, weighed=(none, w)), 40)[0].text for w in (best, worse)]
-    assert ["the evidence counts" in text for text in said] == [False, True]
+    assert ["the evidence of all readings" in text for text in said] == [False, True]
 
 
 def test_the_answer_has_the_recommendation(session):

@@ -11,7 +11,7 @@ from effect_plans import FIRST, write_plan
 
 from orthocal import check_session, load_plan, simulate_session
 from orthocal.assessment.effect_limits import DETERMINED
-from orthocal.assessment.effect_separability import ALIKE, WARMER, find_unshown_effects
+from orthocal.assessment.effect_separability import MAX_R_SQUARED, WARMER, find_unshown_effects
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import select_parameters
 from orthocal.statistics.zeros import project_out_zeros
@@ -114,4 +114,4 @@ def test_growth_of_legs_and_screws_is_alike(plan):
     others = np.delete(jacobian, pair, axis=1)
     weight = np.linalg.inv(others @ others.T + plan.gauge.sigma**2 * np.eye(len(others)))
     a = jacobian[:, pair].T @ weight @ jacobian[:, pair]
-    assert a[0, 1] ** 2 / (a[0, 0] * a[1, 1]) > ALIKE
+    assert a[0, 1] ** 2 / (a[0, 0] * a[1, 1]) > MAX_R_SQUARED

@@ -242,7 +242,7 @@ def test_an_unfinished_session_is_checked_as_far_as_it_was_read(cycles, root, tm
     path.write_text("\n".join([lines[0], *(x.rpartition(",")[0] + "," for x in lines[1:])]) + "\n")
     done = run_orthocal(tmp_path, "check", ".")
     assert (done.returncode, done.stdout) == (2, "")
-    assert "nothing was read yet" in done.stderr
+    assert "no reading is entered yet" in done.stderr
 
 
 def test_readings_are_judged_once(cycles, monkeypatch):
@@ -338,7 +338,7 @@ def test_the_tool_error_is_that_of_the_accuracy(workshop):
     calibration = calibrate(workshop, solver="variable-projection")
     tool, accuracy = calibration.assessment.tool, assess_tool(calibration)
     known = accuracy.after.sizes.reported.rms
-    left = accuracy.measure(accuracy.error_after_offsets).reported.rms
+    left = accuracy.measure(accuracy.deviation_with_entries).reported.rms
     assert tool.entered == pytest.approx(math.hypot(left, known), rel=1e-9)
     assert tool.compensated == pytest.approx(known, rel=1e-9)
     assert tool.region == "±60 mm"

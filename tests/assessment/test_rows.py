@@ -32,7 +32,7 @@ def calibration(experiment_2):
 
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch):
-    monkeypatch.setattr(module, "ROWS_AT_ONCE", 7)
+    monkeypatch.setattr(module, "CHUNK_SIZE", 7)
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def test_rows_before_the_first_that_is_served_are_named_too(orthocal):
 
 def test_memory_does_not_grow_with_the_table(calibration, monkeypatch):
     """What is held is a chunk and the rows themselves."""
-    monkeypatch.setattr(module, "ROWS_AT_ONCE", 100)
+    monkeypatch.setattr(module, "CHUNK_SIZE", 100)
     points = np.random.default_rng(0).uniform(-0.05, 0.05, (1000, 3))
     peaks = []
     for count in (100, 1000):

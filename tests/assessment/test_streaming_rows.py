@@ -65,7 +65,7 @@ def test_a_wrong_line_of_a_pipe_is_named_and_what_came_before_is_served(orthocal
     assert (code, out.count("\n")) == (2, 9)
     assert err == (
         "orthocal: standard input:11: y_mm is 'q'; expected a number; the 8 rows in blocks before "
-        "it were served\n"
+        "it were evaluated\n"
     )
     (tmp_path / "t.csv").write_text(text)
     code, out, err = orthocal("inverse", "", path=tmp_path / "t.csv")

@@ -75,7 +75,7 @@ def calibration(tmp_path_factory):
 @pytest.fixture(scope="module")
 def workspace(calibration):
     robot = calibration.robot
-    return box_workspace(robot, cube_limits(robot), points_a_side=3)
+    return box_workspace(robot, cube_limits(robot), points_per_side=3)
 
 
 def with_use(calibration, **changes):
@@ -112,7 +112,7 @@ def test_conditions_that_nothing_depends_on_are_not_sampled(orthoglide, tmp_path
 def test_a_machine_without_effects_is_assessed_at_each_point_once(orthoglide):
     forecast = ToolForecast(orthoglide, Choice("offsets").select(orthoglide.parameters))
     assert len(forecast.workspace.weights) == 125
-    assert forecast.workspace.copies == 1
+    assert forecast.workspace.n_conditions == 1
 
 
 @pytest.mark.parametrize(
@@ -237,7 +237,7 @@ def test_stated_conditions_are_those_of_the_figures(calibration, workspace):
     drives = nominal_closure(calibration.robot).inverse(workspace.points)
     off = machine.forward(drives - calibration.active_offsets, conditions=use) - accuracy.targets
     assert np.abs(off - accuracy.deviation).max() < 1e-11
-    assert accuracy.unstated is None
+    assert accuracy.deviation_ignoring_conditions is None
     assert summarise_tool(calibration, accuracy).use is None
     with pytest.raises(ParameterError):
         assess_tool(calibration, workspace, conditions=UseConditions("pn"))
@@ -246,9 +246,9 @@ def test_stated_conditions_are_those_of_the_figures(calibration, workspace):
 def test_percentiles_and_single_points_are_over_all_conditions(calibration, workspace):
     accuracy = assess_tool(calibration, workspace)
     field = accuracy.align(accuracy.deviation)
-    parts, weights = accuracy.workspace.spread(field)
+    parts, weights = accuracy.workspace.interpolate_to_cells(field)
     assert weights.sum() == pytest.approx(1.0)
-    one = [workspace.spread(f)[0] for f in field.reshape(8, -1, 3)]
+    one = [workspace.interpolate_to_cells(f)[0] for f in field.reshape(8, -1, 3)]
     assert np.array_equal(np.sort(parts, axis=0), np.sort(np.concatenate(one), axis=0))
     even = assess_tool(calibration, Workspace.even(workspace.points[:3]))
     assert len(even.points) == 3
@@ -385,7 +385,7 @@ def test_a_stated_condition_leaves_the_others_as_they_are(assessed):
         {"approach", "payload"},
         set(),
     ]
-    sizes = [a.measure(a.error_after_offsets).aligned.rms for a in (from_one_side, at_25, both)]
+    sizes = [a.measure(a.deviation_with_entries).aligned.rms for a in (from_one_side, at_25, both)]
     assert sizes[0] < sizes[1] < sizes[2]
 
 

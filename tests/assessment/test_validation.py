@@ -64,7 +64,7 @@ def test_experiment_3_validates_experiment_2_as_in_the_paper(table1):
     assert result.as_expected
     assert result.nothing_to_change
     assert result.repetition.repeats is True
-    assert result.repetition.chance < 0.01
+    assert result.repetition.p_value < 0.01
     assert not result.offsets_stated
     decision = result.assessment.decision
     assert (decision.verdict, decision.exit_code) == ("enter", 0)
@@ -80,9 +80,9 @@ def test_experiment_3_validates_experiment_2_as_in_the_paper(table1):
 
 
 @pytest.mark.parametrize(
-    ("chance", "text"), [(0.22, "in 22 % of cases"), (1e-9, "in less than 0.01 % of cases")]
+    ("chance", "text"), [(0.22, "by chance 22 %"), (1e-9, "by chance below 0.01 %")]
 )
-def test_the_chance_of_a_repetition_is_a_share_of_cases(chance, text):
+def test_the_probability_of_a_repetition_is_printed(chance, text):
     assert text in describe_repetition(Repetition(6, 0.5, chance)).text
 
 
@@ -109,7 +109,7 @@ def test_a_right_calibration_with_noise_alone_does_not_repeat_its_residuals(plan
         entered = np.round([p.value * 1e3 for p in before.free], 3) * 1e-3
         after = simulate_session(with_offsets(plan, entered), TRUTH, seed=seed).session
         fit = repeat_fit(before, after)
-        probabilities.append(judge_deviations(before, fit).chance)
+        probabilities.append(judge_deviations(before, fit).p_value)
         repeats.append(measure_repetition(before, assemble_calibration(fit)).repeats)
     # 1 % and 5 % by construction: more than these of 20 have a chance below 1 %
     assert sum(p < BY_CHANCE for p in probabilities) <= 2
@@ -138,7 +138,7 @@ def test_offsets_that_were_not_identified_need_not_be_the_controllers(table1):
 @pytest.mark.parametrize("number", [2, 3])
 def test_the_readings_of_a_calibration_do_not_validate_it(table1, number):
     both = calibrate([table1[2], table1[3]])
-    with pytest.raises(SessionError, match="no validation"):
+    with pytest.raises(SessionError, match="belongs to the calibration itself"):
         validate_calibration(both, table1[number])
 
 
@@ -254,7 +254,7 @@ def test_validate_and_calibrate_agree_on_the_same_session(root, name, model, see
     result = validate_calibration(calibration, session)
     again = calibrate([first, session], model, solver="variable-projection").assessment
     assert result.confirmed
-    assert result.answer is result.joint
+    assert result.final_calibration is result.joint
     assert result.assessment.decision.verdict == again.decision.verdict == "enter"
     assert result.nothing_to_change is again.keeps_offsets
     stated = [e.enter for e in result.enter]

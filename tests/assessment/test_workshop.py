@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from intervals import assert_coverage, principal_scores
 from workshop import Workshop, draw_crooked
 
 from orthocal import draw_errors, load_plan
@@ -22,7 +23,6 @@ from orthocal.kinematics.workspace import cube
 from orthocal.sensors.mounting import USUAL
 from orthocal.sensors.tips import Tip
 from orthocal.session.session import Gauge
-from orthocal.statistics.chance import confidence_factor
 from orthocal.statistics.information import decompose
 
 NOISE = 5e-6
@@ -70,14 +70,14 @@ def test_the_error_at_the_tool_is_what_is_predicted(root, name, offsets_mm, most
         plan = on_rods(plan)
     robot = plan.robot
     problem = build_problem(plan, model="full", prior_stds={"*.offset": 2e-3})
-    n, scale, space = problem.n_machine, problem.theta_scale, cube(robot, points_a_side=5)
+    n, scale, space = problem.n_machine, problem.theta_scale, cube(robot, points_per_side=5)
     names = problem.free[:n]
     closure = LoopClosure(robot, free=names)
     drives = LoopClosure(robot).inverse(space.points)
     tool = ToolSensitivity(robot, free=names)(drives)
     program = VariableProjection(problem)
     drawn = {"*.offset_mm": 2.0 * offsets_mm}
-    squares, promised, hits = [], [], []
+    squares, promised, scores = [], [], []
     for seed in range(MACHINES):
         rng = np.random.default_rng(seed)
         errors = draw_errors(robot, names, seed=seed, tolerances=drawn)
@@ -95,9 +95,9 @@ def test_the_error_at_the_tool_is_what_is_predicted(root, name, offsets_mm, most
         squares.append(space.weights @ (missed**2).sum(axis=1))
         sizes = measure_uncertainty(tool, covariance[:n, :n], space, space.points).sizes
         promised.append(sizes.aligned.rms**2)
-        std = np.sqrt(np.diag(covariance)[:n])
-        hits.append(np.abs(found.theta[:n] - truth) < confidence_factor(np.inf) * std)
+        inner = covariance[:n, :n] / np.outer(scale[:n], scale[:n])
+        scores.append(principal_scores((found.theta[:n] - truth) / scale[:n], inner)[0])
     achieved, expected = (float(np.sqrt(np.mean(v))) for v in (squares, promised))
     assert 0.75 * expected < achieved < 1.15 * expected
     assert achieved < most
-    assert 0.93 < np.mean(hits) < 0.97
+    assert_coverage(scores)

@@ -137,14 +137,14 @@ def count_pairs(plan, pairs: int) -> dict[str, int]:
         search.MOST_REFITTED, search.MOST_PAIRS_REFITTED = 40, 100
         own, other = _Exhaustive(session, LinearModel(session)).sets(rows)
         search.MOST_REFITTED, search.MOST_PAIRS_REFITTED = refitted
-        can = own >= search.CLEARLY and own - other >= search.NEARLY
+        can = own >= search.CLEAR_LOG_BAYES and own - other >= search.SIMILAR_LOG_BAYES
         kinds = {a.explanation.kind for a in found.found}
         told = frozenset(i for a in found.found for i in a.explanation.rows)
         named = kinds == {"reversed sign"} and told == rows and not found.ambiguous
         counts["made"] += 1
         counts["can be named"] += can
         counts["named"] += can and named
-        beyond = not can and max(own, other) >= search.CLEARLY
+        beyond = not can and max(own, other) >= search.CLEAR_LOG_BAYES
         counts["others beyond 7"] += beyond
         counts["reported"] += beyond and bool(found.found)
     return counts

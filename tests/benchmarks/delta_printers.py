@@ -25,9 +25,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
+from intervals import LIMIT, coverage_band, recorded_scores
 from klipper_peer import calibrate_as_klipper
-from scipy.linalg import solve_triangular
-from scipy.stats import binom
 from simulated_printer import Printer, nominal, read_settings, rings, write_log
 
 from orthocal import calibrate, draw_errors
@@ -143,12 +142,7 @@ def examine(folder, seed, *, solver="variable-projection"):
 
 def intervals(calibration, errors):
     """Whether independent 95 % intervals contain the truth."""
-    chosen = [p for p in calibration.parameters if p.name in errors]
-    at = [calibration.parameters.index(p) for p in chosen]
-    covariance = calibration.total_covariance[np.ix_(at, at)]
-    apart = np.array([errors[p.name] - p.value for p in chosen])
-    scores = solve_triangular(np.linalg.cholesky(covariance), apart, lower=True)
-    return np.abs(scores) < 1.959964
+    return np.abs(recorded_scores(calibration, errors)[0]) < LIMIT
 
 
 def report(results):
@@ -165,7 +159,7 @@ def report(results):
         )
         kept &= len(results) < 20 or ours < WITHIN * expected
     covered = np.concatenate([r.covered for r in results])
-    low, high = binom.interval(0.99, covered.size, 0.95)
+    low, high = coverage_band(covered.size)
     lines.append(
         f"{covered.sum()} of {covered.size} intervals contain the truth (99 % band {low:.0f} to "
         f"{high:.0f})"

@@ -30,6 +30,7 @@ from effect_machines import (
     rms,
     write_plan,
 )
+from intervals import coverage_band
 from scipy.stats import binom
 
 WITHIN = 1.15
@@ -56,7 +57,7 @@ def report(name, outcome):
         ("determined by the readings", outcome.covered[outcome.determined]),
     ):
         inside, n = int(covered.sum()), covered.size
-        low, high = binom.interval(0.99, n, 0.95)
+        low, high = coverage_band(n)
         show(f"  {kind}: {inside} of {n} intervals hold (99 % band {low:.0f} to {high:.0f})")
         kept &= bool(low <= inside <= high)
     if outcome.covered_backlash.size:

@@ -24,9 +24,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
 from commands import run_orthocal
+from intervals import FEWEST, LIMIT, coverage_band, recorded_scores
 from made_mistakes import Sheet, plain_mistakes, sound_machine
-from scipy.linalg import solve_triangular
-from scipy.stats import binom
 
 from orthocal import (
     Machine,
@@ -46,9 +45,6 @@ WITHIN = 1.15
 
 FEWEST_MACHINES = 20
 """Sound machines below which the tool error is not judged: of one it varies by a third."""
-
-FEWEST = 1000
-"""Intervals below which their coverage is not judged."""
 
 
 @dataclass
@@ -154,13 +150,7 @@ def keep_promises(calibration, errors, counts):
     reached = Machine(robot, errors).forward(drives)
     left = tool.measure(reached - tool.targets).aligned.rms
     counts.tool.append((left, calibration.assessment.tool.entered))
-    chosen = [p for p in calibration.parameters if p.name in errors]
-    at = [calibration.parameters.index(p) for p in chosen]
-    covariance = calibration.total_covariance[np.ix_(at, at)]
-    apart = np.array([errors[p.name] - p.value for p in chosen])
-    # components along the Cholesky factor of the covariance are independent
-    scores = solve_triangular(np.linalg.cholesky(covariance), apart, lower=True)
-    counts.covered.extend(np.abs(scores) < 1.959964)
+    counts.covered.extend(np.abs(recorded_scores(calibration, errors)[0]) < LIMIT)
 
 
 def show(line):
@@ -184,7 +174,7 @@ def report(name, counts):
         kept &= len(counts.tool) < FEWEST_MACHINES or left < WITHIN * promised
     covered, n = sum(counts.covered), len(counts.covered)
     if n:
-        low, high = binom.interval(0.99, n, 0.95)
+        low, high = coverage_band(n)
         show(f"  {covered} of {n} intervals contain the truth (99 % band {low:.0f} to {high:.0f})")
         kept &= n < FEWEST or low <= covered <= high
     return kept

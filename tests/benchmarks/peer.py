@@ -18,7 +18,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 
-from orthocal.robot.closing import CLOSED
+from orthocal.robot.closing import CLOSURE_TOLERANCE
 from orthocal.robot.model import Robot
 from orthocal.sensors.leg_indicator import DIRECTIONS
 from orthocal.session.session import Session
@@ -85,7 +85,7 @@ class LoopCloser:
                 constraint.calc(model, data, buffer)
                 residuals.append(buffer.constraint_position_error[rows])
             residual = np.concatenate(residuals)
-            if np.abs(residual).max() < CLOSED:
+            if np.abs(residual).max() < CLOSURE_TOLERANCE:
                 return coordinates[index]
             jacobian = np.concatenate(
                 [c.jacobian(model, data, buffer)[rows] for c, buffer, rows in self._constraints]
@@ -173,8 +173,8 @@ class PeerProblem:
         """Estimate the errors, from 0.
 
         Levenberg-Marquardt needs the fewest evaluations of SciPy's methods here. The variables stay
-        in SI units: the difference step of 1.5e-8 m and rad is far above the CLOSED of the loops,
-        where a step of 1.5e-8 tolerances would be lost in it.
+        in SI units: the difference step of 1.5e-8 m and rad is far above CLOSURE_TOLERANCE,
+        whereas a step of 1.5e-8 tolerances would be lost in it.
         """
         began = time.perf_counter()
         found = least_squares(

@@ -17,6 +17,7 @@ from cases import MODEL, SIGMA, SWEEP
 from effect_plans import write_robot
 from gauges import exact
 from peer import PeerProblem
+from scipy.interpolate import CubicSpline
 from tolerances import KINEMATICS, SAME_OPTIMUM
 
 from orthocal import load_robot, load_session
@@ -29,7 +30,10 @@ from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.nlp import ProgramFunctions
 from orthocal.estimation.solvers.variable_projection import VariableProjection
+from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.kinematics.robot_functions import robot_functions
+from orthocal.measurement.files.session_file import load_rows
+from orthocal.measurement.importing.traces import Trace, with_traces
 from orthocal.observation.model import predict_readings
 from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.equipment import Equipment
@@ -38,7 +42,7 @@ from orthocal.planning.first_plan import first_equipment
 from orthocal.planning.owned_sensors import load_owned_sensor
 from orthocal.planning.plan import plan_readings
 from orthocal.planning.selection import SetupSearch
-from orthocal.session.session import Conditions
+from orthocal.session.session import Conditions, Posture, Reading
 from orthocal.study.accuracy import build_accuracy_study
 from orthocal.study.linearisation import build_linearisation_study
 from orthocal.study.study import run_task
@@ -116,6 +120,10 @@ of what it took when this was 0.13, solving as long as then. Building all again 
 GROWTH = 1.6
 """Seconds and bytes that one more posture takes, in the largest session over the smallest. 0.8 to
 1.0 were measured; what grows with the square of the session would bring it to 3.7."""
+
+BINNED = 4.0
+"""Calibration of 6,000 samples of three circles, each a reading, over averaging 60,000 in bins and
+calibrating these. 7.8 was measured; the bins took 0.3 s."""
 
 BASE = SWEEP
 """Postures of the session that stands for what every session takes: libraries, building."""
@@ -409,7 +417,10 @@ def test_a_plan_is_chosen_faster_than_by_trying(orthoglide, record):
     candidates = measure_candidates(session, forecast.problem(session), spare_range=3.0)
     size = sum(len(k.rows) for k in candidates.setups)
     assert size > 5_000
-    prior, weigh = np.eye(len(candidates.state)), forecast.weigh("aligned", len(candidates.state))
+    prior, weigh = (
+        np.eye(len(candidates.state)),
+        forecast.weight_of("aligned", len(candidates.state)),
+    )
     counts = [9] * 4 + [8] * 8
     began = time.perf_counter()
     search = SetupSearch.of(candidates, prior, weigh)
@@ -500,3 +511,62 @@ def test_what_linearising_costs_is_found_faster_than_one_by_one(orthoglide, reco
         f"linearising 1,000 offsets on one core: {1000 * ours:.1f} s, alone / ours", alone / ours
     )
     assert alone > LINEARISED * ours
+
+
+CIRCLES = {"xy": (0, 1), "yz": (1, 2), "zx": (2, 0)}
+"""Planes of three circles of a ball bar of 50 mm."""
+
+
+def trace_circles(plan, samples):
+    """Traces of a machine with an offset of 0.6 mm, there and back again, with 2 µm of noise."""
+    closure = LoopClosure(plan.robot, fixed={"x_slide.offset": 0.6e-3})
+    turns, traces = np.linspace(0.0, 2.0 * np.pi, 200), {}
+    for seed, (name, plane) in enumerate(CIRCLES.items()):
+        points = np.zeros((2, 200, 3))
+        points[:, :, plane[0]], points[:, :, plane[1]] = 0.05 * np.cos(turns), 0.05 * np.sin(turns)
+        balls = closure.forward(nominal_closure(plan.robot).inverse(points[0]))
+        shown = CubicSpline(turns, np.linalg.norm(balls, axis=1) - 0.05)
+        angle = 2.0 * np.pi * (1.0 - np.abs(np.linspace(-1.0, 1.0, samples)))
+        points = np.zeros((samples, 3))
+        points[:, plane[0]], points[:, plane[1]] = 0.05 * np.cos(angle), 0.05 * np.sin(angle)
+        noise = 2e-6 * np.random.default_rng(seed).normal(size=samples)
+        traces[name] = Trace(points, shown(angle) + noise)
+    return traces
+
+
+def with_samples(plan, traces):
+    """The plan with a reading for each sample."""
+    closure, postures, readings = nominal_closure(plan.robot), {}, []
+    for name, trace in traces.items():
+        drives = closure.inverse(trace.points)
+        for i, (p, d, v) in enumerate(zip(trace.points, drives, trace.values, strict=True)):
+            posture = Posture(f"{name}{i}", "tcp", p, d)
+            postures[posture.name] = posture
+            readings.append(Reading(name, posture.name, value=float(v)))
+    return replace(plan, postures=postures, readings=tuple(readings))
+
+
+def test_bins_of_a_trace_are_calibrated_faster_than_its_samples(tmp_path, record):
+    keys = "sensor: ball_bar, ball: post, centre_mm: [0, 0, 0], length_mm: 50"
+    setups = "".join(f"  {n}: {{{keys}, length_tolerance_mm: unknown}}\n" for n in CIRCLES)
+    (tmp_path / "plan.yaml").write_text(
+        "robot: orthoglide\ncontroller: {offsets_mm: [0, 0, 0]}\n"
+        "gauge: {sigma_mm: 0.002, range_mm: [-5, 5]}\n"
+        "postures: {right: {tcp_mm: [50, 0, 0]}, up: {tcp_mm: [0, 0, 50]}}\n"
+        f"setups:\n{setups}"
+    )
+    plan = load_rows(tmp_path / "plan.yaml")
+    many, few = trace_circles(plan, 20_000), with_samples(plan, trace_circles(plan, 2_000))
+
+    def solve(session):
+        problem = build_problem(session, model=MODEL)
+        values = problem.observations.values(session.values)
+        return VariableProjection(problem).solve(sigma=session.gauge.sigma, values=values)
+
+    assert len(with_traces(plan, many).readings) < 700
+    binned, each = fastest_each(
+        [lambda: solve(with_traces(plan, many)), lambda: solve(few)], rounds=2
+    )
+    record("binned_s", binned)
+    record("binned", each / binned)
+    assert each > BINNED * binned

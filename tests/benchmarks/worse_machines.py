@@ -42,6 +42,13 @@ def report(outcome, *, scaled):
         f"  {covered} of {n} offsets within ± (at least {least:.0f}); tool error over prediction "
         f"{true / predicted:.2f} (at most {WITHIN})\n"
     )
+    if scaled and not outcome.found.all():
+        rest = ~outcome.found
+        true_rest, predicted_rest = np.sqrt(np.mean(outcome.tool[rest] ** 2, axis=0))
+        sys.stdout.write(
+            f"  factor not found: {outcome.covered[rest].mean():.3f} covered; tool error over "
+            f"prediction {true_rest / predicted_rest:.2f}\n"
+        )
     sys.stdout.flush()
     return covered >= least and true < WITHIN * predicted
 

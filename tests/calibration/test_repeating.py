@@ -89,7 +89,7 @@ def test_a_number_that_does_not_follow_from_the_others_is_refused(document, tmp_
     part[place[-1]] = shifted(part[place[-1]])
     path = tmp_path / "calibration.json"
     path.write_text(json.dumps(edited))
-    with pytest.raises(CalibrationFileError, match="by what the file says otherwise it is"):
+    with pytest.raises(CalibrationFileError, match="the other numbers of the file give"):
         load_calibration(path)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import yaml
 from effect_plans import write_robot
 from independent import Expansion, Gauge, IndependentMachine, States
+from intervals import principal_scores
 
 from orthocal import load_plan
 from orthocal.assessment.tool_error import measure_deviations, measure_uncertainty
@@ -37,9 +38,6 @@ ALONG = (0.0, -98.6, -41.3, 39.1, 57.8)
 
 COOLEST, WARMEST, USED_AT = 17.0, 27.0, 22.0
 """Temperatures of readings and of use, [°C]."""
-
-DETERMINED = 0.5
-"""Variance over that of the prior below which a direction is determined by the readings."""
 
 BESIDE_BOUND = 1.2
 """Largest ratio of the RMS tool error to that of the linear Bayesian estimate."""
@@ -133,7 +131,7 @@ class EffectMachines:
         self.problem = build_problem(self.plan, model="full", prior=True, prior_stds=OFFSETS)
         robot = self.plan.robot
         closure = LoopClosure(robot)
-        points = np.repeat(cube(robot, points_a_side=3).points, 2, axis=0)
+        points = np.repeat(cube(robot, points_per_side=3).points, 2, axis=0)
         sides = np.sign(np.random.default_rng(0).normal(size=(len(points) // 2, 3)))
         used_at = USED_AT if temperature is None else temperature
         self.used = States(
@@ -259,13 +257,11 @@ class EffectMachines:
         covered_backlash, predicted = [], []
         for true, theta, at_bound in zip(truth, solved.theta, solved.at_bound, strict=True):
             covariance = self.covariance(theta, at_bound)
-            # in prior standard deviations; components along eigenvectors are independent
             scale = problem.theta_scale[others]
             inner = covariance[np.ix_(others, others)] / np.outer(scale, scale)
-            variances, directions = np.linalg.eigh(inner)
-            scores = directions.T @ ((true - theta)[others] / scale) / np.sqrt(variances)
+            scores, known = principal_scores((theta - true)[others] / scale, inner)
             covered.extend(np.abs(scores) < limit)
-            determined.extend(variances < DETERMINED)
+            determined.extend(known)
             stds = np.sqrt(np.diag(covariance))
             covered_backlash.extend(np.abs(true - theta)[backlash] < limit * stds[backlash])
             predicted.append(predict(covariance))

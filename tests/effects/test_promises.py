@@ -18,6 +18,7 @@ from effect_machines import (
     rms,
     write_plan,
 )
+from intervals import coverage_band
 from scipy.stats import binom
 
 MACHINES = 40
@@ -31,7 +32,7 @@ TOOL = 1.3
 
 def check(outcome):
     for covered in (outcome.covered, outcome.covered[outcome.determined]):
-        low, high = binom.interval(0.99, covered.size, 0.95)
+        low, high = coverage_band(covered.size)
         assert low <= covered.sum() <= high
     assert outcome.ratio < TOOL
     assert rms(outcome.found) < BESIDE_BOUND * outcome.bound

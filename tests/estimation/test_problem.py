@@ -106,7 +106,7 @@ def test_closure_rows_that_depend_on_others_are_named(root, tmp_path):
         "robot: ./biglide\npostures: {zero: {tcp_mm: [0, 0]}}\n"
         "setups:\n  yx: {leg: x, direction: y, section: {fraction: 0.5}}\n"
     )
-    with pytest.raises(RobotError, match=r"closure rows depend on others: z of apex; leave them"):
+    with pytest.raises(RobotError, match=r"closure rows depend on others: z of apex; remove them"):
         build_problem(load_plan(tmp_path / "plan.yaml"), model="offsets")
 
 

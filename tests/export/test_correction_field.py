@@ -269,7 +269,7 @@ def test_line_that_is_too_long_in_bytes_is_not_read_as_two(command):
         (
             "T1 M6\n" + PROGRAM + "T2 M6\n",
             ("--tool", "0,0,-50"),
-            "/p.ngc:4: found T2 after motions of T1, and --tool gives one tip; expected one tool",
+            "/p.ngc:4: found T2 after motions of T1, and --tool states one tip; expected one tool",
         ),
         (
             PROGRAM,

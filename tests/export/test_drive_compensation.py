@@ -38,7 +38,7 @@ from orthocal.gcode.interpreter import Interpreter
 from orthocal.gcode.path import Motion, Paths, arc_about
 from orthocal.gcode.program import ProgramCorrector
 from orthocal.gcode.reversals import split_at_reversals
-from orthocal.measurement.files.linuxcnc_ini import read_ini
+from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
 MM = 1e-3
 
@@ -257,7 +257,7 @@ def enter_export(calibration, folder, options):
         (folder / name).write_text(text)
     session = replace(
         calibration.session,
-        compensation=read_ini(folder / "joints.ini", calibration.robot).compensation,
+        compensation=read_controller_joints(folder / "joints.ini", calibration.robot).compensation,
         controller_offsets=tuple(offsets_to_enter(calibration).tolist()),
     )
     return session, files
@@ -420,7 +420,7 @@ def test_module_with_backlash_states_what_it_leaves(calibration):
     """The phase of the periodic error, shifted by half of the backlash."""
     options = ExportOptions(module=True, latched=LATCHED)
     page = export_calibration(calibration, "linuxcnc", anyway=True, options=options)["README.md"]
-    stated = float(re.search(r"On a side it is off by up to ([\d.]+) µm", page)[1])
+    stated = float(re.search(r"On one side the error is up to ([\d.]+) µm", page)[1])
     periodic = find_periodic_errors(calibration.robot, calibration.errors)
     half = [0.5 * calibration.errors[f"{d.name}.backlash"] for d in calibration.robot.drives]
     at = np.linspace(0.2, 0.21, 4001)[:, None] * np.ones(3)
@@ -571,7 +571,7 @@ def test_motions_are_divided_where_a_drive_reverses():
         turns=1,
         where="",
     )
-    paths = Paths.of(
+    paths = Paths.from_motions(
         [
             Motion((0.0, 0.0, 0.0), (10e-3, 0.0, 0.0)),
             Motion((10e-3, 0.0, 0.0), (10e-3, 0.0, 0.0), arc),
@@ -580,10 +580,10 @@ def test_motions_are_divided_where_a_drive_reverses():
     )
     sides = Plain()
     parts = split_at_reversals(paths, sides)
-    assert parts.of.tolist() == [0, *[1] * 4, 2]
+    assert parts.motion.tolist() == [0, *[1] * 4, 2]
     assert parts.first[1:5] == pytest.approx([0.0, 0.25, 0.5, 0.75], abs=1e-6)
     assert parts.sides.astype(int).tolist() == [
         *([1, 0, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 1]),
     ]
-    assert parts.turned.all()
+    assert parts.reversed.all()
     assert sides.last.tolist() == [-1.0, 1.0, 1.0]

@@ -26,7 +26,7 @@ from orthocal import (
     write_calibration,
 )
 from orthocal.assessment.controller_entries import entered_offsets
-from orthocal.export.urdf import _correct, _find_twists
+from orthocal.export.urdf import _correct_origins, _find_twists
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.observation.simulate import load_errors
 from orthocal.robot.parameters import ElementaryError
@@ -200,12 +200,12 @@ def test_all_forms_of_an_origin_are_rewritten(orthoglide, origin, shape):
         f'<transmission><joint name="a"/></transmission></robot>'
     )
     twist = np.array([1e-3, 0, 0, 0, 0, 0])
-    corrected = _correct(text, {"a": [twist]}, orthoglide)
+    corrected = _correct_origins(text, {"a": [twist]}, orthoglide)
     assert shape in corrected
     assert corrected.count("<joint") == text.count("<joint")
     assert corrected.endswith('<transmission><joint name="a"/></transmission></robot>')
     with pytest.raises(ExportError, match="has no joint 'c' to correct"):
-        _correct(text, {"c": [twist]}, orthoglide)
+        _correct_origins(text, {"c": [twist]}, orthoglide)
 
 
 def test_urdf_is_preserved_byte_for_byte_but_numbers(full, tmp_path):
@@ -222,7 +222,7 @@ def test_urdf_is_preserved_byte_for_byte_but_numbers(full, tmp_path):
     robot = load_robot(folder)
     before = urdf.read_bytes()
     errors = robot.parameters.expand(full.errors)
-    after = _correct(before.decode(), _find_twists(robot, errors), robot).encode()
+    after = _correct_origins(before.decode(), _find_twists(robot, errors), robot).encode()
     numbers = re.compile(rb"(?<=xyz=')[^']*|(?<=rpy=')[^']*")
     assert after != before
     assert numbers.sub(b"", after) == numbers.sub(b"", before)

@@ -247,7 +247,7 @@ REFUSED = {
     "G81 X1 Z-1 R1": "found G81, which is a canned cycle, whose motions the controller makes",
     "G41 D1": "found G41, which is cutter compensation",
     "G43 H1": "found G43, which is a tool length offset",
-    "H1": "found H1, a tool length offset; remove it, and give the tip with --tool",
+    "H1": "found H1, a tool length offset; remove it, and state the tip with --tool",
     "G92 X0": "found G92, which moves the zero of the program; set it before",
     "G93": "found G93, which is inverse time feed; expected G94",
     "G95 F0.1": "found G95, which is feed per revolution",
@@ -257,7 +257,7 @@ REFUSED = {
     "G33 Z1 K1": "found G33, which is a motion synchronised with the spindle",
     "G38.2 Z-1": "found G38.2, which is a probing motion",
     "G123": "found G123, which is unknown; expected G0 to G3",
-    "G55": "found G55, whose zero in machine coordinates is not given; expected "
+    "G55": "found G55, whose zero in machine coordinates is not stated; expected "
     "--work-offset-mm G55=X,Y,Z",
     "M98 P1": "found M98, which calls a subroutine",
     "M100": "found M100, which is unknown",
@@ -275,7 +275,7 @@ REFUSED = {
     "G1 X1 X2": "found the word X twice",
     "G1 G2 X1": "found G2 and another word of its group; expected one",
     "G1 X1 I1": "found I, a word of arcs, and the motion is G1; expected G2 or G3",
-    "G1 X1 P2": "found P or Q without a word that takes it",
+    "G1 X1 P2": "found P or Q without a word that needs it",
     "G2 X1 Y1": "found an arc without a centre; expected I and J, or R",
     "G2 X1 Y1 K1 I0": "found K with G17; expected I and J",
     "G2 X1 Y1 I1 R1": "found R and I; expected one of them",
@@ -388,7 +388,7 @@ def test_first_bad_line_is_named():
 def test_memory_does_not_grow_with_the_program(monkeypatch):
     from orthocal.gcode import program
 
-    monkeypatch.setattr(program, "LINES_AT_ONCE", 100)
+    monkeypatch.setattr(program, "LINES_PER_BLOCK", 100)
 
     def lines(count):
         yield from ("G21 G0 X0 Y0 Z0\n", "F100\n")

@@ -8,7 +8,7 @@ from scipy.integrate import quad
 from scipy.stats import Covariance, multivariate_normal
 
 from orthocal.hypotheses.likelihood import (
-    AMOUNTS,
+    AMOUNT_STDS,
     NOISE_SCALES,
     TOLERANCE_SCALES,
     Products,
@@ -47,9 +47,9 @@ def dense(jacobian, likelihood, deviation, effects=None):
     """Σ w N(y; 0, e² J Jᵀ + s² σ² + τ² W Wᵀ) over all e, s and τ, by SciPy."""
     logs = []
     for weight, covariance in zip(likelihood.weights, covariances(jacobian), strict=True):
-        for tau in AMOUNTS if effects is not None else (0.0,):
+        for tau in AMOUNT_STDS if effects is not None else (0.0,):
             more = 0.0 if effects is None else (tau * SIGMA) ** 2 * effects.T @ effects
-            share = 0.0 if effects is None else np.log(AMOUNTS.size)
+            share = 0.0 if effects is None else np.log(AMOUNT_STDS.size)
             density = log_normal(deviation, covariance + more)
             logs.append(weight - share + density)
     return float(log_of_sum(np.array(logs))) + CONSTANT
@@ -96,14 +96,14 @@ def test_an_unknown_amount_is_integrated_over(case):
         return np.exp(likelihood.score(products)[0])
 
     total = 0.0
-    for tau in AMOUNTS * SIGMA:
+    for tau in AMOUNT_STDS * SIGMA:
         value, _ = quad(
             lambda b, tau=tau: density(b) * np.exp(-0.5 * (b / tau) ** 2) / tau,
             *(-12.0, 12.0),
             epsabs=0.0,
             limit=200,
         )
-        total += value / np.sqrt(2.0 * np.pi) / AMOUNTS.size
+        total += value / np.sqrt(2.0 * np.pi) / AMOUNT_STDS.size
     found = likelihood.score_set(deviations[0], [effects[:1]])
     assert found.log_likelihood == pytest.approx(np.log(total), abs=1e-4)
 
@@ -134,12 +134,12 @@ def test_separate_effects_average_over_their_own_priors(case):
     jacobian, likelihood, deviations, effects = case
     logs = []
     for weight, covariance in zip(likelihood.weights, covariances(jacobian), strict=True):
-        for one in AMOUNTS:
-            for other in AMOUNTS:
+        for one in AMOUNT_STDS:
+            for other in AMOUNT_STDS:
                 scaled = SIGMA * np.array([[one], [other]]) * effects[:2]
                 full = covariance + scaled.T @ scaled
                 density = log_normal(deviations[0], full)
-                logs.append(weight - 2.0 * np.log(AMOUNTS.size) + density)
+                logs.append(weight - 2.0 * np.log(AMOUNT_STDS.size) + density)
     found = likelihood.score_set(deviations[0], [effects[:1], effects[1:2]])
     assert found.log_likelihood == pytest.approx(float(log_of_sum(np.array(logs))) + CONSTANT)
 

@@ -41,16 +41,16 @@ def points(model, rng, *, unreachable=()):
 
 @pytest.mark.parametrize(("unreachable", "most"), [((), 1600), ((), 100), ((1,), 1600)])
 def test_several_machines_are_linearised_as_each_alone(model, unreachable, most, monkeypatch):
-    monkeypatch.setattr(module, "MOST_ENTRIES", most)
+    monkeypatch.setattr(module, "MAX_ENTRIES", most)
     chosen = points(model, np.random.default_rng(3), unreachable=unreachable)
-    together = model.linearise_all(chosen, slopes=True)
+    together = model.linearise_all(chosen, keep_jacobian=True)
     assert [i for i, one in enumerate(together) if one is None] == list(unreachable)
     for point, found in zip(chosen, together, strict=True):
         if found is None:
             continue
-        alone = model.linearise(point.theta, point.shifts, point.start, slopes=True)
-        scale = np.abs(alone.slopes).max()
-        assert np.abs(found.slopes - alone.slopes).max() < 1e-12 * scale
+        alone = model.linearise(point.theta, point.shifts, point.start, keep_jacobian=True)
+        scale = np.abs(alone.jacobian).max()
+        assert np.abs(found.jacobian - alone.jacobian).max() < 1e-12 * scale
         assert np.abs(found.expected - alone.expected).max() < 1e-12 * scale
         assert np.abs(found.passive - alone.passive).max() < 1e-12
         assert np.array_equal(found.theta, point.theta)
@@ -60,9 +60,9 @@ def test_a_change_concerns_the_readings_of_its_sessions(model):
     plain, _, changed, _ = points(model, np.random.default_rng(3))
     later = model.session_of_entry == 1
     given = LinearisationPoint(plain.theta, changed.shifts, plain.start)
-    without, found = model.linearise_all([plain, given], slopes=True)
-    assert np.array_equal(found.slopes[~later], without.slopes[~later])
-    assert np.abs(found.slopes - without.slopes)[later].max() > 1e-8
+    without, found = model.linearise_all([plain, given], keep_jacobian=True)
+    assert np.array_equal(found.jacobian[~later], without.jacobian[~later])
+    assert np.abs(found.jacobian - without.jacobian)[later].max() > 1e-8
 
 
 def test_the_model_of_the_same_rows_is_built_once(joined):

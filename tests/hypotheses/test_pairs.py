@@ -18,13 +18,13 @@ def case():
     """Fourteen edits and six effects."""
     rng = np.random.default_rng(2)
     likelihood, _, _ = build_likelihood(rng.normal(size=(N, 4)), sigma=0.3, dof=N, stated=True)
-    touched = np.zeros((ROWS, N), dtype=bool)
-    touched[np.arange(ROWS), np.arange(ROWS) % N] = True
+    changed_rows = np.zeros((ROWS, N), dtype=bool)
+    changed_rows[np.arange(ROWS), np.arange(ROWS) % N] = True
     singles = Singles(
         rng.normal(size=(EDITS, N)),
         rng.normal(size=(ROWS - EDITS, N)),
         rng.normal(size=ROWS),
-        touched,
+        changed_rows,
     )
     return likelihood, 2.0 * rng.normal(size=N), singles
 
@@ -32,7 +32,7 @@ def case():
 def brute_force(likelihood, deviation, singles):
     found = {}
     for a, b in combinations(range(ROWS), 2):
-        if (singles.touched[a] & singles.touched[b]).any():
+        if (singles.changed_rows[a] & singles.changed_rows[b]).any():
             continue
         changed = deviation + sum(singles.edits[m] for m in (a, b) if m < EDITS)
         effects = [singles.effects[m - EDITS] for m in (a, b) if m >= EDITS]
@@ -54,7 +54,7 @@ def test_all_pairs_have_the_evidence_of_brute_force(case):
 def test_a_bound_leaves_out_only_unlikely_pairs(case):
     every = find_pairs(*case)
     least = float(every.log_posterior[20])
-    some = find_pairs(*case, least=least)
+    some = find_pairs(*case, min_log=least)
     kept = every.log_posterior > least + 4.0
     assert {tuple(sorted(m)) for m in every.members[kept].tolist()} <= {
         tuple(sorted(m)) for m in some.members.tolist()

@@ -11,7 +11,7 @@ import pytest
 from orthocal import load_plan, load_session
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import build_problem
-from orthocal.hypotheses.linear_model import MOST_STEPS, SETTLED, LinearModel
+from orthocal.hypotheses.linear_model import CONVERGED_CHANGE, MAX_STEPS, LinearModel
 from orthocal.hypotheses.search import find_anomalies
 from orthocal.observation.simulate import limits_of, show_readings
 from orthocal.session.session import Reading
@@ -60,7 +60,7 @@ def condition(session, row):
     zeros = problem.zero_incidence[:, ~o.zero_known] * ZERO
     others = np.delete(np.arange(len(session.readings)), row)
     theta = np.zeros(problem.n_free)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         reading, jacobian = problem.predict_and_jacobian(
             problem.active_theta + theta * problem.theta_scale
         )
@@ -69,7 +69,7 @@ def condition(session, row):
         spread = of_rows @ np.hstack([zeros, np.diag(sigma)])
         covariance = jacobian @ jacobian.T + spread @ spread.T
         known = np.linalg.solve(covariance[np.ix_(others, others)], (session.values - mean)[others])
-        if np.abs(jacobian[others].T @ known - theta).max() < SETTLED:
+        if np.abs(jacobian[others].T @ known - theta).max() < CONVERGED_CHANGE:
             break
         theta = jacobian[others].T @ known
     gain = np.linalg.solve(covariance[np.ix_(others, others)], covariance[others, row])

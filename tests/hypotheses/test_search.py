@@ -31,8 +31,8 @@ from orthocal.hypotheses.families.row_offset import row_offsets
 from orthocal.hypotheses.families.single_reading import wrong_readings
 from orthocal.hypotheses.families.swapped_rows import swapped_rows
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
-from orthocal.hypotheses.hypothesis import MOST_DENSE, Rows, to_dense
-from orthocal.hypotheses.linear_model import FURTHEST, LinearModel
+from orthocal.hypotheses.hypothesis import MAX_DENSE_COLUMNS, Rows, to_dense
+from orthocal.hypotheses.linear_model import LARGEST_ERROR, LinearModel
 from orthocal.hypotheses.search import find_anomalies
 
 TOLD = 40
@@ -248,9 +248,9 @@ def test_three_mistakes_in_different_setups_are_found_together(sheet):
 def test_tails_by_cumulative_sums_equal_those_written_out(cycles):
     """Displaced gauges and row offsets, and their products with the linearised model."""
     session = join_sessions([cycles, cycles])
-    assert len(session.readings) > MOST_DENSE  # fewer rows are written out
+    assert len(session.readings) > MAX_DENSE_COLUMNS  # fewer rows are written out
     model, rows = LinearModel(session), Rows(session)
-    about = model.linearise(np.zeros(model.problem.n_free), (), None, slopes=False)
+    about = model.linearise(np.zeros(model.problem.n_free), (), None, keep_jacobian=False)
     deviation = model.entries(session.values[None])[0] - about.expected
     tested = 0
     for family in (*displaced_gauges(rows, model.sigma), *row_offsets(rows)):
@@ -296,4 +296,4 @@ def test_large_offsets_are_no_mistakes(large_machine):
         session = simulate_session(large_machine, errors, seed=seed).session
         assert not find_anomalies(session).found
         sizes = LinearModel(session).most_likely(session.values).theta
-        assert np.abs(sizes).max() < FURTHEST
+        assert np.abs(sizes).max() < LARGEST_ERROR

@@ -33,7 +33,7 @@ from orthocal.hypotheses.likelihood import (
     log_of_sum,
 )
 from orthocal.hypotheses.linear_model import LinearModel
-from orthocal.hypotheses.search import EFFECT_CLEARLY, find_anomalies
+from orthocal.hypotheses.search import CLEAR_EFFECT_LOG_BAYES, find_anomalies
 from orthocal.statistics.distributions import log_positive_share
 
 EFFECTS = "backlash: {}, thermal: {}, drift: {}, screw: {lead_mm: 10}"
@@ -256,7 +256,7 @@ def test_backlashes_of_several_drives_are_nearly_independent(plan, slack):
     """Against the joint probability that all are positive: less than a ninth of what is needed."""
     bare, machine = plan.with_effects([]), plan.with_effects(["backlash"])
     model = LinearModel(bare)
-    about = model.at_reference(slopes=True)
+    about = model.at_reference(keep_jacobian=True)
     (effect,) = (e for e in find_effects(model) if e.name == "backlash")
     vectors = model.entries(effect.columns)
     for seed in range(5):
@@ -274,7 +274,7 @@ def test_backlashes_of_several_drives_are_nearly_independent(plan, slack):
         likelihood = about.likelihood
         pairs = likelihood.log_densities(likelihood.products(deviation[None]))[0]
         independent, exact = (log_of_sum(gain + pairs) for gain in (found, joint))
-        assert abs(independent - exact) < EFFECT_CLEARLY / 9.0
+        assert abs(independent - exact) < CLEAR_EFFECT_LOG_BAYES / 9.0
 
 
 @pytest.mark.slow

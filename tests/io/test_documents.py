@@ -154,7 +154,7 @@ def test_a_calibration_without_free_parameters_is_refused(document, tmp_path):
     empty["noise_covariance"] = []
     empty["unmodelled"]["leakage"] = []
     (tmp_path / "calibration.json").write_text(json.dumps(empty))
-    with pytest.raises(OrthocalError, match="parameters: holds none that is free"):
+    with pytest.raises(OrthocalError, match="parameters: contains no free parameter"):
         load_calibration(tmp_path)
 
 
@@ -200,13 +200,13 @@ def test_an_implausible_estimate_is_refused(raw_cycles, monkeypatch):
         return tuple(replace(p, value=2.6e15) for p in original(*args, **kwargs))
 
     monkeypatch.setattr(module, "_estimates", absurd)
-    with pytest.raises(SolverError, match=r"the result makes no sense \(x_slide.offset is 2.6e"):
+    with pytest.raises(SolverError, match=r"the result is implausible \(x_slide.offset is 2.6e"):
         calibrate(raw_cycles)
 
 
 def test_a_result_that_could_not_be_loaded_is_not_written(experiment_2, tmp_path):
     result = calibrate(experiment_2)
     absurd = replace(result, model_covariance=1e12 * result.model_covariance)
-    with pytest.raises(SolverError, match=r"the result makes no sense \(calibration.json: "):
+    with pytest.raises(SolverError, match=r"the result is implausible \(calibration.json: "):
         write_calibration(absurd, tmp_path / "calibration.json")
     assert not list(tmp_path.iterdir())

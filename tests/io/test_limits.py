@@ -11,8 +11,8 @@ import pytest
 
 from orthocal import load_robot, load_session
 from orthocal.errors import OrthocalError, RobotError, SessionError
-from orthocal.measurement.files.schema import LARGEST_READING_MM, MOST_READINGS
 from orthocal.measurement.files.session_file import load_plan
+from orthocal.measurement.files.session_keys import LARGEST_READING_MM, MOST_READINGS
 from orthocal.robot.urdf import MOST_JOINTS, MOST_MOVING
 from orthocal.viewer.visuals import load_visuals
 

@@ -10,7 +10,8 @@ from orthocal.builder.build import make_robot
 from orthocal.builder.orthoglide import Orthoglide
 from orthocal.errors import ClosureError, RobotError
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.kinematics.workspace import box_workspace, even_grid, find_workspace, gauss_box
+from orthocal.kinematics.reachable_box import find_workspace
+from orthocal.kinematics.workspace import box_workspace, gauss_box, uniform_grid
 
 BOX = ((-0.05, 0.06), (-0.06, 0.05), (-0.07, 0.04))
 
@@ -54,7 +55,7 @@ def test_rules_over_a_box_are_exact_for_polynomials(orthoglide):
         assert space.weights @ (x**2 * y) == pytest.approx(mean, rel=1e-12)
         assert (space.points >= low - 1e-12).all()
         assert (space.points <= high + 1e-12).all()
-    grid = even_grid(orthoglide, BOX, points_a_side=3)
+    grid = uniform_grid(orthoglide, BOX, points_per_side=3)
     assert grid[0] == pytest.approx(low)
     assert grid[-1] == pytest.approx(high)
 
@@ -63,7 +64,7 @@ def test_a_stated_workspace_out_of_reach_is_refused(tmp_path):
     """Drives end 79.75 mm beyond the zero."""
     with pytest.raises(RobotError, match=r"orthocal\.workspace\.box_mm") as e:
         find_workspace(make(tmp_path, ((-0.09, 0.09),) * 3))
-    assert str(e.value).endswith("it reaches ±79 mm")
+    assert str(e.value).endswith("the largest box of this shape is ±79 mm")
 
 
 def test_a_machine_that_reaches_less_has_a_smaller_box_of_the_same_shape(tmp_path):
@@ -88,7 +89,7 @@ def test_a_machine_that_hardly_moves_has_no_workspace(tmp_path):
     def reach(points):
         raise ClosureError("is out of reach", posture="a corner")
 
-    with pytest.raises(ClosureError, match="no region around it"):
+    with pytest.raises(ClosureError, match="no box of ±1 mm around it"):
         find_workspace(make(tmp_path), reach)
 
 

@@ -264,7 +264,7 @@ FORMS = [
     text("two-readings-assigned", "setup;posture;Messwert_mm;Anzeige_mm\nxy;zero;0,5;0,6\n",
          one("0.6"), columns={"reading": "Anzeige_mm"}),
     text("beyond-the-gauge", HEAD + "xy;zero;500,5\n", "{}:2: reading_mm is 500.5; expected a "
-         "number within ±300: no indicator reaches further; for readings in µm use "
+         "number within ±300, the limit of this kind of sensor; for readings in µm use "
          "`orthocal import --unit um`"),
     text("nothing", "", "{}: is empty; expected the headings setup, posture and reading"),
     text("no-rows", HEAD, "{}: holds no readings"),
@@ -517,7 +517,7 @@ def test_readings_that_contradict_the_session_are_refused(session, orthocal):
     table = put(session, "setup;posture;minus;reading_mm\nxy;x_max;zero;0,5\n", PLANNED)
     code, _, err = orthocal("import", table, session)
     assert code == 2
-    assert "setup xy has both readings and differences in cycle 1; give the readings only" in err
+    assert "setup xy has both readings and differences in cycle 1; keep the readings only" in err
     assert (session / "readings.csv").read_text() == PLANNED
 
 

@@ -17,7 +17,7 @@ from orthocal import (
     simulate_session,
     write_calibration,
 )
-from orthocal.measurement.files.linuxcnc_ini import read_ini
+from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
 MM = 1e-3
 
@@ -49,7 +49,7 @@ def folder(tmp_path):
 
 
 def test_joints_are_read(folder, orthoglide):
-    joints = read_ini(folder / "machine.ini", orthoglide)
+    joints = read_controller_joints(folder / "machine.ini", orthoglide)
     assert np.array(joints.home_offsets) / MM == pytest.approx([352.5, 340.0, -3.25])
     assert joints.latched == (-1, 1, 1)
     at = np.array([0.05])
@@ -63,13 +63,13 @@ def test_lines_of_an_export_state_no_direction_of_latching(folder, orthoglide):
     """Which is then assumed and noted, instead of read as positive."""
     lines = [v for v in INI.splitlines() if not v.startswith("HOME_LATCH")]
     (folder / "machine.ini").write_text("\n".join(lines))
-    assert read_ini(folder / "machine.ini", orthoglide).latched is None
+    assert read_controller_joints(folder / "machine.ini", orthoglide).latched is None
 
 
 def test_a_machine_without_compensation_has_none(folder, orthoglide):
     lines = [v for v in INI.splitlines() if not v.startswith(("BACKLASH", "COMP"))]
     (folder / "machine.ini").write_text("\n".join(lines))
-    assert read_ini(folder / "machine.ini", orthoglide).compensation == ()
+    assert read_controller_joints(folder / "machine.ini", orthoglide).compensation == ()
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_wrong_files_are_refused(folder, orthoglide, old, new, where):
     assert old in INI
     (folder / "machine.ini").write_text(INI.replace(old, new))
     with pytest.raises(ParameterError) as caught:
-        read_ini(folder / "machine.ini", orthoglide)
+        read_controller_joints(folder / "machine.ini", orthoglide)
     assert caught.value.where == f"{folder / 'machine.ini'}: {where}"
 
 
@@ -160,7 +160,7 @@ def test_again_states_the_backlash_of_the_file(folder, one, plain):
     entered = [trim.backlash for trim in second.compensation]
     identified = [result.errors[f"{d.name}.backlash"] for d in second.robot.drives]
     assert entered == pytest.approx(np.round(identified, 6), abs=1e-12)
-    assert "x_slide" in done.stdout.partition("take up this backlash")[2]
+    assert "x_slide" in done.stdout.partition("compensate this backlash")[2]
 
 
 def test_again_states_the_tables_of_the_file(folder, one):
@@ -183,4 +183,4 @@ def test_again_without_the_file_states_the_backlash_of_the_answer(folder, one):
     assert any(e.change for e in entries)
     stated = [trim.backlash for trim in second.compensation]
     assert stated == pytest.approx([e.active + e.change for e in entries], abs=5e-7)
-    assert "x_slide" in done.stdout.partition("take up this backlash")[2]
+    assert "x_slide" in done.stdout.partition("compensate this backlash")[2]

@@ -114,7 +114,7 @@ def test_gauge_is_aligned_at_the_first_pause(small, aligned_at, separate):
     motion = plan_motion(session)[0]
     assert (motion.alignment is not None) == separate
     before_first_pause, between, *_ = write_program(session, motion).split("\nM0\n")
-    assert "mount the gauge, centre its ball on the rod" in before_first_pause
+    assert "mount the gauge, align its ball as the sheet shows" in before_first_pause
     assert ("set the dial to 0, then read" in before_first_pause) == (not separate)
     assert ("set the dial to 0, then read" in between) == separate
     if motion.alignment is not None:
@@ -219,7 +219,12 @@ def test_every_drive_approaches_as_its_reading_states(sided):
         way = directions(stop.approach)
         assert np.all(np.diff(drives, axis=0) * way > 0.0)
         assert drives[-1] - drives[0] == pytest.approx(APPROACH * way, abs=3e-7)
-        assert f"approach {stop.approach}; joints" in text
+        signs = "".join(
+            "+" if w * d.direction > 0 else "-"
+            for w, d in zip(way, sided.robot.drives, strict=True)
+        )
+        signs = signs[0] if len(set(signs)) == 1 else signs
+        assert f"approach {signs}; joints" in text
 
 
 def test_an_approach_from_beyond_the_travel_is_refused(sided):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from derivatives import assert_derivative
@@ -47,7 +49,25 @@ setups:
     name: s, along: x, straight_tolerance_mm: 0.01, square_tolerance_mrad: 0.5}}
   plate: {sensor: tool_indicator, direction: -z, artefact: {kind: plate, flat_tolerance_mm: 0.01}}
   bed: {sensor: probe, direction: -z, surface: {flat_tolerance_mm: 0.3, length_mm: 200}}
+  edge: {sensor: tool_indicator, direction: -z, tool_mm: [3, -2, -40], artefact:
+    {kind: straightedge, along: x, length_mm: 150, straight_tolerance_mm: 0.01, reversed: true}}
+  block: {sensor: tool_indicator, direction: -x, tool_mm: [3, -2, -40], artefact:
+    {kind: gauge_block, height_mm: 50, height_tolerance_mm: 0.005, table_mm: 15}}
+  track: {sensor: points, target_mm: [3, -4, -40], frame: {tolerance_mm: 2, tolerance_mrad: 10},
+    scale_tolerance: 0.001, covariance_um2: [[90, 40, -10], [40, 60, 5], [-10, 5, 400]]}
 """
+
+STATION = {"position": (0.21, -0.34, 0.07), "rotation": (0.3, -1.1, 0.5)}
+"""Position [m] and rotation vector of a tracker in the world."""
+
+
+def move_station(plan):
+    """The plan with its tracker at `STATION`."""
+    setups = {
+        n: replace(s, sensor=replace(s.sensor, **STATION)) if s.sensor.kind == "points" else s
+        for n, s in plan.setups.items()
+    }
+    return replace(plan, setups=setups)
 
 
 @pytest.fixture(params=["sweep", "workshop", "tool", "several sensors"])
@@ -59,7 +79,7 @@ def problem(request, root, tmp_path):
         yield build_problem(load_plan(root / "examples/workshop/plan.yaml"), model="full")
     elif request.param == "tool":
         (tmp_path / "plan.yaml").write_text(TOOL_SENSORS)
-        yield build_problem(load_plan(tmp_path / "plan.yaml"), model="full")
+        yield build_problem(move_station(load_plan(tmp_path / "plan.yaml")), model="full")
     else:
         registry.register_sensor(ToolCoordinate)
         (tmp_path / "plan.yaml").write_text(SEVERAL_SENSORS)

@@ -137,7 +137,7 @@ def test_what_was_identified_is_validated(tmp_path, robot):
         confirmed.append(result.confirmed)
         # another dial, as it is predicted
         fit = repeat_fit(found, second.session)
-        chances.append(judge_deviations(found, fit).chance)
+        chances.append(judge_deviations(found, fit).p_value)
         achieved = repeat_calibration(found, second.session).rms_before
         sizes.append((expect_rms(found, fit), achieved))
     # one in a hundred is refused for its deviations
@@ -195,13 +195,13 @@ def test_each_key_has_the_drives_of_its_kind(tmp_path):
     [
         (
             "{offsets_mm: [1, 2, 3], offsets_deg: [3]}",
-            "controller.offsets_mm: has 3 numbers; expected 2, one a prismatic drive: slide, lift",
+            "has 3 numbers; expected 2, one per prismatic drive: slide, lift",
         ),
         (
             "{offsets_mm: [1, 2]}",
-            "controller: states no offset of turn; expected offsets_deg or off",
+            "controller: the offset of drive turn is missing; add offsets_deg or offsets_mrad",
         ),
-        ("{offsets_mrad: [1]}", "controller: states no offset of slide; expected offsets_mm, too"),
+        ("{offsets_mrad: [1]}", "controller: the offset of drive slide is missing; add offsets_mm"),
     ],
 )
 def test_offsets_that_do_not_fit_the_drives_are_refused(tmp_path, controller, message):
@@ -221,9 +221,9 @@ def test_a_session_needs_a_zero_that_is_given(tmp_path):
     legs = "  legs: {a: {root: elbow_a, tip: end_a}}\n"
     folder = write_wide_linkage(tmp_path / "wide", legs)
     message = (
-        r"robot: 'wide' cannot be posed with its drives at 0, and its mechanical zero is not "
-        r"stated; add to orthocal.drives in .*wide.yaml: "
-        r"motor_a.zero_deg \(-?\d+\.\d+ was found\), motor_b"
+        r"robot: the mechanical zero of 'wide' is not stated, and its loops do not close with "
+        r"the drives at 0; add to orthocal.drives in .*wide.yaml: "
+        r"motor_a.zero_deg: -?\d+\.\d+, motor_b"
     )
     with pytest.raises(SessionError, match=message):
         load_plan(write_plan(tmp_path / "plan", folder))

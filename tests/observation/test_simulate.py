@@ -129,7 +129,7 @@ def test_readings_beyond_the_gauge_are_refused(plan):
 
 
 def test_no_errors_are_an_error(orthoglide):
-    with pytest.raises(ParameterError, match="give them by --errors"):
+    with pytest.raises(ParameterError, match="state them by --errors"):
         collect_errors(orthoglide)
 
 

@@ -16,7 +16,7 @@ from orthocal.measurement.files.session_file import check_contacts
 from orthocal.output.sheet.page import sheet_files
 from orthocal.planning.equipment import Equipment, reachable
 from orthocal.planning.first_plan import (
-    CLEAR,
+    CLEARANCE,
     bed_plan,
     expect_fixed,
     first_equipment,
@@ -60,7 +60,7 @@ def test_the_paper_plan_of_other_dimensions_is_within_reach(tmp_path, sizes):
     assert reachable(robot, points).all()
     assert np.abs(points).max() <= 0.1
     equipment = first_equipment(robot, Equipment())
-    clear = min(CLEAR, 0.2 * sizes.leg)
+    clear = min(CLEARANCE, 0.2 * sizes.leg)
     for section in equipment.sections:  # from a hinge, wherever the leg goes
         assert section * sizes.leg + equipment.box.max() <= sizes.leg - clear + 1e-9
         assert section * sizes.leg + equipment.box.min() >= clear - 1e-9
@@ -77,7 +77,7 @@ def test_the_paper_plan_uses_the_given_equipment(orthoglide):
 
 def test_a_machine_that_hardly_moves_is_refused(tmp_path):
     robot = make_robot(Orthoglide(leg=0.25, travel=(0.245, 0.3)), tmp_path / "mine")
-    with pytest.raises(RobotError, match="expected 10 mm to either side of the mechanical zero"):
+    with pytest.raises(RobotError, match="expected at least 10 mm to either side"):
         paper_plan(robot, Equipment())
 
 

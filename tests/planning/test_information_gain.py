@@ -136,7 +136,7 @@ def test_gains_with_the_gauge_aligned_in_the_first_posture(seed):
     assert len({first for _, (first, _) in found}) == len(found) > 0
     for gain, (first, second) in found:
         begun = SetupGain.of(begin(kind, first), covariance, covariance @ root, SIGMA)
-        again = SetupGain.of(kind, covariance, covariance @ root, SIGMA).begun(first)
+        again = SetupGain.of(kind, covariance, covariance @ root, SIGMA).begin_with(first)
         assert again.spread == pytest.approx(begun.spread, abs=1e-10)
         assert again.effect == pytest.approx(begun.effect, abs=1e-10)
         assert again.variance == pytest.approx(begun.variance, abs=1e-10)

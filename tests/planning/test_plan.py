@@ -26,7 +26,8 @@ from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.kinematics.loop_closure import LoopClosure
-from orthocal.kinematics.workspace import cube, find_workspace
+from orthocal.kinematics.reachable_box import find_workspace
+from orthocal.kinematics.workspace import cube
 from orthocal.measurement.files.write_session import write_session
 from orthocal.measurement.joining import join_sessions
 from orthocal.output.text.plan import OUT_OF_RANGE, plan_json
@@ -69,12 +70,12 @@ def test_plans_are_better_than_manual_ones(orthoglide, tip, setups, each, most):
         gauge=DIAL, tip=tip, mounting=Mounting(lateral=0.0), sections=sections, box=box, along=9
     )
     forecast = ToolForecast(
-        orthoglide, choice.select(orthoglide.parameters), cube(orthoglide, points_a_side=5)
+        orthoglide, choice.select(orthoglide.parameters), cube(orthoglide, points_per_side=5)
     )
     session = list_candidates(orthoglide, equipment)
     candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
     n = len(candidates.state)
-    search = SetupSearch.of(candidates, np.eye(n), forecast.weigh("aligned", n))
+    search = SetupSearch.of(candidates, np.eye(n), forecast.weight_of("aligned", n))
     found = search.choose([each] * setups, starts=4 if each == 3 else 1)
     assert round(found.error * 1e6, 1) <= most
 
@@ -172,7 +173,7 @@ def test_a_setup_begins_and_ends_with_the_alignment_posture(planned):
 def test_a_folder_is_ready_to_measure(planned, tmp_path):
     path = write_session(planned.session, tmp_path / "monday", blank=True)
     with pytest.raises(
-        SessionError, match=r"readings.csv: nothing was read yet; `orthocal record` takes"
+        SessionError, match=r"readings.csv: no reading is entered yet; run `orthocal record`"
     ):
         load_session(path)
     again = load_plan(path)
@@ -203,7 +204,7 @@ def test_sections_near_the_tool_are_best_for_the_papers_six_equations(orthoglide
     # the gauge's section is where the leg still is with the tool at its far end
     candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
     n = len(candidates.state)
-    search = SetupSearch.of(candidates, 1e-8 * np.eye(n), forecast.weigh("A", n))
+    search = SetupSearch.of(candidates, 1e-8 * np.eye(n), forecast.weight_of("A", n))
     found = search.choose([2] * 6)
     chosen = [session.setups[candidates.setups[s.candidate].name].sensor for s in found.setups]
     assert {s.section.value for s in chosen} == {0.8}
@@ -296,7 +297,7 @@ def make_search(robot, equipment):
     session = list_candidates(robot, equipment)
     candidates = measure_candidates(session, forecast.problem(session), spare_range=3.0)
     n = len(candidates.state)
-    return SetupSearch.of(candidates, np.eye(n), forecast.weigh("aligned", n))
+    return SetupSearch.of(candidates, np.eye(n), forecast.weight_of("aligned", n))
 
 
 def test_the_memory_of_a_plan_is_released_with_it(orthoglide):

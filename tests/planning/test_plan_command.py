@@ -196,7 +196,7 @@ def test_each_criterion_is_better_met_by_its_own_plan(orthoglide, for_the_headli
     own, other = plan_for(orthoglide, criterion), for_the_headline
     assert own.criterion == criterion
     stage = len(own.session.setups)
-    found = own.forecast.weigh(criterion, len(own.forecast.selection.names))
+    found = own.forecast.weight_of(criterion, len(own.forecast.selection.names))
     for plan in (own, other):
         assert plan.curve[stage].error > 0.0
     n = len(own.forecast.selection.names)
@@ -224,8 +224,8 @@ def test_each_criterion_is_better_met_by_its_own_plan(orthoglide, for_the_headli
         (
             ["orthoglide", "--workspace-mm", "120"],
             "--workspace-mm: the machine does not reach the workspace ±120 mm (cannot be reached: "
-            "joint 'z_slide' would be at 395.1 mm, outside its limits 120 ... 390 mm); it reaches "
-            "±79 mm",
+            "joint 'z_slide' would be at 395.1 mm, outside its limits 120 ... 390 mm); the "
+            "largest box of this shape is ±79 mm",
         ),
         (["orthoglide", "--sections", "0.5,1.5"], "--sections: found 1.5; expected 0 (root) to 1"),
         (["orthoglide", "--sections", "half"], "--sections: part is 'half'; expected a number"),

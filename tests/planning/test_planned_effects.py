@@ -22,13 +22,13 @@ from orthocal.effects.loading import with_effects
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.measurement.motion.approach import can_approach, describe_approach
-from orthocal.observation.conditions import MORNING, in_course
+from orthocal.observation.conditions import MORNING, schedule_readings
 from orthocal.observation.model import predict_readings
 from orthocal.planning.candidates import list_candidates
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.expected_error import noise_of
 from orthocal.planning.first_plan import first_equipment, paper_plan
-from orthocal.planning.further_readings import WAITS
+from orthocal.planning.further_readings import WAITING_TIMES
 from orthocal.planning.plan import plan_readings
 from orthocal.session.session import Gauge
 from orthocal.units import MM, PPM, UM
@@ -201,7 +201,7 @@ def test_further_readings_for_effects_that_a_plan_does_not_determine(orthoglide)
     readings = [r for r in plan.session.readings if r.setup == plan.session.readings[0].setup]
     last = FEW.minutes_a_reading * (len(readings) - 1)
     std, noise = 0.25, noise_of(plan.session) / UM
-    for wait in (w for w in WAITS if w <= further["drift"].wait):
+    for wait in (w for w in WAITING_TIMES if w <= further["drift"].wait):
         times = np.array([0.0, last, last + wait])
         slope = noise / np.sqrt(((times - times.mean()) ** 2).sum())
         limit = 2.0 / np.sqrt(1.0 / std**2 + 1.0 / slope**2)
@@ -218,7 +218,7 @@ def test_further_readings_for_effects_that_a_plan_does_not_determine(orthoglide)
 
 
 def test_a_day_by_the_clock(planned):
-    session = in_course(planned.session, temperatures=(20.0, 28.0))
+    session = schedule_readings(planned.session, temperatures=(20.0, 28.0))
     times = [r.conditions.time for r in session.readings]
     setups = [r.setup for r in session.readings]
     assert times[0] == MORNING

@@ -71,5 +71,5 @@ def test_more_time_is_never_worse_and_too_little_is_refused():
 def test_the_times_of_a_gauge():
     duration = Duration(10.0, 0.5)
     assert duration.of(3) == 12.0
-    assert [duration.most(m, 48) for m in (9.0, 10.0, 11.5, 12.0, 1e6)] == [0, 0, 2, 3, 48]
-    assert Duration(10.0, 0.0).most(10.0, 48) == 48
+    assert [duration.max_readings(m, 48) for m in (9.0, 10.0, 11.5, 12.0, 1e6)] == [0, 0, 2, 3, 48]
+    assert Duration(10.0, 0.0).max_readings(10.0, 48) == 48

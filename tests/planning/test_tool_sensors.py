@@ -382,8 +382,8 @@ def test_the_search_of_points_agrees_with_the_forecast(owned, keys):
     candidates = measure_candidates(session, forecast.problem(session), spare_range=0.0)
     search = SetupSearch.of(
         candidates,
-        forecast.prior_of(candidates.problem, candidates.state, None),
-        forecast.weigh("aligned", len(candidates.state)),
+        forecast.prior_information(candidates.problem, candidates.state, None),
+        forecast.weight_of("aligned", len(candidates.state)),
     )
     planned = search.choose([7], starts=1)
     plan = build_session(candidates, planned.setups)
@@ -401,7 +401,7 @@ def test_an_instrument_stands_elsewhere_in_further_readings(owned):
     session = list_candidates(robot, Equipment(owned=owned(track=TRACKER)))
     forecast = ToolForecast(robot, resolve_choice("lengths", None).select(robot.parameters))
     problem = forecast.problem(session)
-    before, after = (forecast.prior_of(problem, problem.free, m) for m in (None, session))
+    before, after = (forecast.prior_information(problem, problem.free, m) for m in (None, session))
     gained = np.diag(after - before)
     place = np.array([name.startswith("station.") for name in problem.free])
     assert place.sum() == 6

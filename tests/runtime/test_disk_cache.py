@@ -176,8 +176,8 @@ def test_another_machine_has_other_functions(folder, orthoglide):
 
 def test_yourdfpy_checks_the_same_content_once(folder, monkeypatch):
     asked = []
-    ask = urdf._ask_yourdfpy
-    monkeypatch.setattr(urdf, "_ask_yourdfpy", lambda text, path: asked.append(ask(text, path)))
+    ask = urdf._run_yourdfpy
+    monkeypatch.setattr(urdf, "_run_yourdfpy", lambda text, path: asked.append(ask(text, path)))
     load_afresh("orthoglide")
     assert len(asked) == 1
     load_afresh("orthoglide")

@@ -8,24 +8,20 @@ import numpy as np
 import pytest
 from bounds import bound_um
 from machines import frame_pose
+from sensor_machines import assert_promises, calibrate_machines
 from tolerances import CLOSED_FORM
 
-from orthocal import calibrate, draw_errors, load_plan, load_session, write_session
-from orthocal.assessment.tool_error import measure_uncertainty
+from orthocal import calibrate, load_plan, load_session, write_session
 from orthocal.errors import SessionError
-from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.kinematics.loop_closure import LoopClosure
-from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import cube
 from orthocal.observation.model import predict_readings
 from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.observation.simulate import simulate_session
 from orthocal.sensors.ball_bar import BallBar
-from orthocal.statistics.chance import confidence_factor
+from orthocal.units import MM
 
 RADIUS_MM, POINTS = 50.0, 16
-SIGMA_BAR = 2e-6
 ERRORS = {"x_slide.offset": 0.7e-3, "y_slide.offset": -0.4e-3, "z_swivel.rx": 1.5e-3}
 LEGS = """  leg_{d}{leg}: {{leg: {leg}, direction: {d}, section: {{fraction: 0.5}}, gauge: dial,
     postures: [zero, {leg}_max, {leg}_min]}}"""
@@ -93,50 +89,27 @@ def test_readings_are_distances_between_the_balls(tmp_path):
     [("unknown", "known", 5.5), ("0", "known", 4.5), ("0", "free", 5.5)],
 )
 def test_bounds_beside_the_papers_readings(tmp_path, orthoglide, length, zero, published):
-    space = cube(orthoglide, points_a_side=5)
+    space = cube(orthoglide, points_per_side=5)
     found = bound_um(circles(tmp_path, length=length, zero=zero, legs=True), space)
     assert found == pytest.approx(published, rel=0.10)
 
 
 @pytest.mark.slow
-def test_tool_errors_and_intervals_of_machines_with_all_errors(tmp_path):
-    """Readings of 40 machines in closed loops, with all errors at their priors."""
+def test_tool_errors_and_intervals_of_machines_with_all_errors(tmp_path, orthoglide):
+    """All errors at their priors, readings by plain distances in closed loops. They determine 11
+    axes of each machine."""
     plan = circles(tmp_path)
-    robot = plan.robot
-    problem = build_problem(plan, model="full", prior_stds={"*.offset": 0.5e-3})
-    n, scale, space = problem.n_machine, problem.theta_scale, cube(robot, points_a_side=5)
-    names = problem.free[:n]
-    closure, drives = LoopClosure(robot, free=names), LoopClosure(robot).inverse(space.points)
-    program = VariableProjection(problem)
-    tool = ToolSensitivity(robot, free=names)(drives)
+    names = plan.robot.parameters.select_model("full")
+    closure = LoopClosure(plan.robot, free=names)
     commanded = np.array([plan.postures[r.posture].drives for r in plan.readings])
-    squares, promised, hits = [], [], []
-    for seed in range(40):
-        rng = np.random.default_rng(seed)
-        errors = draw_errors(robot, names, seed=seed, tolerances={"*.offset_mm": 1.0})
-        truth = np.array([errors[name] for name in names])
-        balls = closure.forward(commanded, theta=truth)
-        centre, length = 1e-3 * rng.normal(size=3), RADIUS_MM * 1e-3 + 1e-3 * rng.normal()
-        shown = (1.0 + 0.002 * rng.normal()) * (np.linalg.norm(balls - centre, axis=1) - length)
-        values = problem.observations.values(shown + SIGMA_BAR * rng.normal(size=len(shown)))
-        found = program.solve(sigma=SIGMA_BAR, values=values)
-        _, slopes = problem.predict_and_jacobian(found.theta, found.passive)
-        covariance = np.linalg.inv(
-            slopes.T @ slopes / SIGMA_BAR**2 + np.diag(problem.prior_precision)
-        )
-        covariance *= np.outer(scale, scale)
-        missed = closure.forward(drives, theta=found.theta[:n]) - closure.forward(
-            drives, theta=truth
-        )
-        missed = space.remove_motion(missed, space.points)
-        squares.append(space.weights @ (missed**2).sum(axis=1))
-        sizes = measure_uncertainty(tool, covariance[:n, :n], space, space.points).sizes
-        promised.append(sizes.aligned.rms**2)
-        std = np.sqrt(np.diag(covariance)[:n])
-        hits.append(np.abs(found.theta[:n] - truth) < confidence_factor(np.inf) * std)
-    achieved, expected = (float(np.sqrt(np.mean(v))) for v in (squares, promised))
-    assert 0.75 * expected < achieved < 1.15 * expected
-    assert 0.93 < np.mean(hits) < 0.97
+
+    def read(truth):
+        balls = closure.forward(commanded, theta=truth[:, : len(names)])
+        centre, (length, scale) = truth[:, None, len(names) : -2], truth[:, -2:].T[:, :, None]
+        return (1.0 + scale) * (np.linalg.norm(balls - centre, axis=2) - RADIUS_MM * MM - length)
+
+    space = cube(orthoglide, points_per_side=5)
+    assert_promises(calibrate_machines(plan, space, count=95, read=read))
 
 
 def test_a_simulated_session_comes_back_from_its_files(tmp_path):

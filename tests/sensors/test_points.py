@@ -6,24 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bounds import bound_um
 from machines import frame_pose
 from scipy.spatial.transform import Rotation
+from sensor_machines import assert_promises, calibrate_machines
 from tolerances import CLOSED_FORM, SAME_NUMBER
 
 from orthocal import calibrate, draw_errors, load_plan, load_session, write_session
-from orthocal.assessment.tool_error import measure_uncertainty
 from orthocal.errors import SessionError
-from orthocal.estimation.problem import build_problem
-from orthocal.estimation.solvers.variable_projection import VariableProjection
-from orthocal.kinematics.loop_closure import LoopClosure
-from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import cube
 from orthocal.observation.model import predict_readings
 from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.observation.simulate import simulate_session
 from orthocal.sensors.points import fit_station
-from orthocal.statistics.chance import confidence_factor
 
 SIGMA = 10e-6
 TARGET_MM = (3.0, -4.0, -40.0)
@@ -137,38 +131,11 @@ def test_a_row_may_have_a_covariance_of_its_own(tmp_path):
 
 @pytest.mark.slow
 def test_a_tracker_alone_identifies_the_complete_model(tmp_path, orthoglide):
-    """40 machines with all errors, seen from an arbitrary station; closed loops."""
-    plan = grid(tmp_path)
-    robot, space = plan.robot, cube(orthoglide, points_a_side=5)
-    problem = build_problem(plan, model="full", prior_stds={"*.offset": 0.5e-3})
-    n, scale = problem.n_machine, problem.theta_scale
-    names = problem.free[:n]
-    closure, drives = LoopClosure(robot, free=names), LoopClosure(robot).inverse(space.points)
-    program, tool = VariableProjection(problem), ToolSensitivity(robot, free=names)(drives)
-    squares, promised, hits = [], [], []
-    for seed in range(40):
-        errors = draw_errors(robot, names, seed=seed, tolerances={"*.offset_mm": 1.0})
-        truth = np.array([errors[name] for name in names])
-        shown = simulate_session(plan, errors, seed=seed, sigma=SIGMA).session
-        values = problem.observations.values(shown.values)
-        found = program.solve(sigma=SIGMA, values=values)
-        _, jacobian = problem.predict_and_jacobian(found.theta)
-        information = jacobian.T @ jacobian / SIGMA**2 + np.diag(problem.prior_precision)
-        covariance = np.linalg.inv(information)[:n, :n] * np.outer(scale[:n], scale[:n])
-        missed = closure.forward(drives, theta=found.theta[:n])
-        missed = missed - closure.forward(drives, theta=truth)
-        missed = space.remove_motion(missed, space.points)
-        squares.append(space.weights @ (missed**2).sum(axis=1))
-        promised.append(
-            measure_uncertainty(tool, covariance, space, space.points).sizes.aligned.rms ** 2
-        )
-        std = np.sqrt(np.diag(covariance))
-        hits.append(np.abs(found.theta[:n] - truth) < confidence_factor(np.inf) * std)
-    achieved, expected = (float(np.sqrt(np.mean(v))) for v in (squares, promised))
-    assert expected < SIGMA
-    assert 0.75 * expected < achieved < 1.15 * expected
-    assert 0.93 < np.mean(hits) < 0.97
-    assert bound_um(plan, space) == pytest.approx(1e6 * expected, rel=0.05)
+    """Machines with all errors; the readings determine 12 axes of each."""
+    outcome = calibrate_machines(grid(tmp_path), cube(orthoglide, points_per_side=5), count=90)
+    assert_promises(outcome)
+    assert outcome.predicted < SIGMA
+    assert outcome.bound == pytest.approx(outcome.predicted, rel=0.05)
 
 
 def test_a_session_of_points_is_calibrated(tmp_path):

@@ -67,7 +67,7 @@ def test_a_ball_touches_where_solids_do():
     for _ in range(COUNT // 10):
         a, u, d, r, ball = draw(rng)
         c = a + rng.uniform(-0.2, 0.2) * u + rng.uniform(-0.01, 0.01, 3)
-        found = evaluate(touch_by_ball, at=a, along=2.0 * u, radius=r + ball, tip=c, direction=d)
+        found = evaluate(touch_by_ball, point=a, along=2.0 * u, radius=r + ball, tip=c, direction=d)
         expected = come_near(moving(distance_to_axis, c, d, a, u), r + ball, 0.05)
         if expected is None:
             missed += 1
@@ -88,7 +88,7 @@ def test_a_blade_touches_where_solids_do():
         c = a + rng.uniform(-0.2, 0.2) * u + rng.uniform(-0.01, 0.01, 3)
         r = max(r, 1e-5)
         found = evaluate(
-            touch_by_blade, at=a, along=0.3 * u, radius=r, edge=-2.0 * e, tip=c, direction=d
+            touch_by_blade, point=a, along=0.3 * u, radius=r, edge=-2.0 * e, tip=c, direction=d
         )
         expected = come_near(moving(distance_of_lines, c, d, e, a, u), r, 0.2)
         assert found == pytest.approx(expected, abs=AGREED)
@@ -106,14 +106,20 @@ def test_without_a_radius_a_blade_reads_the_axis_in_the_edges_plane():
         crossing = a + (plane - a[0]) / u[0] * u
         tip = np.array([plane, 0.0, 0.0])
         found = evaluate(
-            touch_by_blade, at=a, along=u, radius=0.0, edge=np.cross(axis, d), tip=tip, direction=d
+            touch_by_blade,
+            point=a,
+            along=u,
+            radius=0.0,
+            edge=np.cross(axis, d),
+            tip=tip,
+            direction=d,
         )
         assert found == pytest.approx(crossing[1], abs=1e-12)
 
 
 def test_a_ball_on_a_rod_square_to_it_reads_height_plus_radii():
     """By hand: a rod along x at height 0.1, a ball of 1.5 mm straight above, and 3 mm beside it."""
-    rod = {"at": [0.0, 0.0, 0.1], "along": [1.0, 0.0, 0.0], "radius": 7e-3}
+    rod = {"point": [0.0, 0.0, 0.1], "along": [1.0, 0.0, 0.0], "radius": 7e-3}
     up = {"tip": [0.2, 0.0, 0.0], "direction": [0.0, 0.0, 1.0]}
     assert evaluate(touch_by_ball, **rod, **up) == pytest.approx(0.107, abs=1e-15)
     beside = {**up, "tip": [0.2, 3e-3, 0.0]}
@@ -126,7 +132,7 @@ def test_a_ball_on_a_rod_square_to_it_reads_height_plus_radii():
 @pytest.mark.parametrize("form", [touch_by_ball, touch_by_blade])
 def test_slopes_are_central_differences(form):
     rng = np.random.default_rng(3)
-    names = {"at": 3, "along": 3, "radius": 1, "tip": 3, "direction": 3}
+    names = {"point": 3, "along": 3, "radius": 1, "tip": 3, "direction": 3}
     if form is touch_by_blade:
         names["edge"] = 3
     symbols = {n: ca.SX.sym(n, k) for n, k in names.items()}
@@ -135,7 +141,7 @@ def test_slopes_are_central_differences(form):
     value, slope = ca.Function("h", [x], [h]), ca.Function("s", [x], [ca.jacobian(h, x)])
     for _ in range(50):
         a, u, d, r, ball = draw(rng)
-        given = {"at": a, "along": u, "radius": [r + ball], "tip": a + 0.1 * u, "direction": d}
+        given = {"point": a, "along": u, "radius": [r + ball], "tip": a + 0.1 * u, "direction": d}
         if form is touch_by_blade:
             given["edge"] = np.cross(u, d)
         at = np.concatenate([given[n] for n in names])

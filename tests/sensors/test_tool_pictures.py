@@ -66,7 +66,7 @@ def test_only_a_sheet_with_a_bar_warns_of_its_fixed_ball(plan, files):
     assert "fixed ball" not in words(plate)
     move, mount, *_ = (words(step) for step in bar.findall(".//li"))
     assert "tool at 50, 0, −20 mm" in move
-    assert "after the tool stands in the alignment posture" in mount
+    assert "after the tool is in the alignment posture" in mount
     assert "same ball" in words(bar.findall("p")[-1])
     alone = replace(
         plan,

@@ -106,7 +106,7 @@ def test_sessions_agree_or_are_asked(raw_cycles, stated, tmp_path):
         resolve_choice(None, joined)
     assert str(e.value) == (
         f"model: sessions are for different models: full in {stated.path}; offsets in "
-        f"{offsets.path}; say which"
+        f"{offsets.path}; choose one"
     )
     assert resolve_choice("full", joined).model == "full"
     silent = replace(raw_cycles, purpose=None)

@@ -6,9 +6,9 @@ import pytest
 from scipy import special
 
 from orthocal.statistics.distributions import (
-    beta_share,
     chi_square_tail,
     f_tail,
+    incomplete_beta,
     normal_quantile,
     t_quantile,
 )
@@ -34,4 +34,4 @@ def test_distributions_agree_with_scipy(dof):
 def test_distributions_at_their_ends():
     assert chi_square_tail(3.0, 0.0) == 1.0
     assert chi_square_tail(3.0, float("inf")) == chi_square_tail(0.0, 1.0) == 0.0
-    assert (beta_share(0.5, 2.0, 0.0), beta_share(0.5, 2.0, 1.0)) == (0.0, 1.0)
+    assert (incomplete_beta(0.5, 2.0, 0.0), incomplete_beta(0.5, 2.0, 1.0)) == (0.0, 1.0)

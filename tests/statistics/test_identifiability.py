@@ -204,7 +204,7 @@ def test_base_parameters_have_no_prior(root):
     session = load_session(root / "examples/raw-cycles")
     with pytest.raises(ParameterError, match="without any prior"):
         calibrate(session, Choice(model="full", base=True, prior=True))
-    with pytest.raises(ParameterError, match=r"give x_leg\.length_m as known without ±"):
+    with pytest.raises(ParameterError, match=r"state x_leg\.length_m as known without ±"):
         calibrate(session, Choice(known={"x_leg.length_m": (1e-4, 1e-5)}, base=True))
 
 

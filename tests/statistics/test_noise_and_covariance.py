@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gauges import exact
+from intervals import assert_coverage
 from models import TRUTH
 from scipy import stats
 from tolerances import KINEMATICS
@@ -121,7 +122,7 @@ def test_where_sigma_is_from(repeatability, square, dof, gauge, source, sigma):
     assert noise.source == source
     assert noise.sigma == pytest.approx(sigma, nan_ok=True)
     if repeatability[1] > 0:
-        assert noise.leaves_more(None) is (source == "residuals")
+        assert noise.exceeded_by_residuals(None) is (source == "residuals")
 
 
 @pytest.mark.parametrize("given", [True, False])
@@ -182,7 +183,7 @@ def test_predicted_covariance_is_that_of_many_simulated_calibrations(root, model
     problem = build_problem(plan, model=model)
     rng = np.random.default_rng(0)
     # as the prior says, where there is one
-    truths = rng.normal(size=(300, problem.n_free))
+    truths = rng.normal(size=(340, problem.n_free))
     entries, _, reached = problem.simulate(truths * problem.theta_scale)
     assert reached.all()
     measured = entries + sigma * rng.normal(size=entries.shape)
@@ -205,8 +206,7 @@ def test_predicted_covariance_is_that_of_many_simulated_calibrations(root, model
     edge = np.sqrt(z.shape[1] / n)
     assert (1 - edge) ** 2 - 0.1 < spread.min()
     assert spread.max() < (1 + edge) ** 2 + 0.1
-    inside = np.mean(np.abs(z) < confidence_factor(np.inf))
-    assert 0.93 < inside < 0.97
+    assert_coverage(z)
 
 
 @pytest.mark.parametrize("rows", [4, 9, 40])
@@ -247,8 +247,8 @@ def test_the_chance_of_an_excess_over_cycles_is_an_f_test():
     ],
 )
 def test_residuals_against_the_noise_of_the_gauge(noise, gauge, more, less):
-    assert noise.leaves_more(gauge) is more
-    assert noise.leaves_less(gauge) is less
+    assert noise.exceeded_by_residuals(gauge) is more
+    assert noise.exceeds_residuals(gauge) is less
 
 
 def test_what_is_kept_of_information_is_as_if_the_rest_were_estimated_too():

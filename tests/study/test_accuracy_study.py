@@ -98,7 +98,7 @@ def test_tool_error_of_one_machine_agrees_with_pinocchio(workshop):
 
 
 def test_gauss_points_agree_with_a_fine_grid(orthoglide):
-    few, many = gauss_box(orthoglide, [[-0.06, 0.06]] * 3), cube(orthoglide, points_a_side=21)
+    few, many = gauss_box(orthoglide, [[-0.06, 0.06]] * 3), cube(orthoglide, points_per_side=21)
 
     def square(space):
         x, y, z = space.points.T

@@ -295,7 +295,7 @@ def test_session_shows_the_nominal_machine_and_the_deviations(raw_cycles):
 
 def test_plan_shows_the_places_of_the_gauges(root):
     scene = draw_scene(load_plan(root / "tests/sessions/lines/plan.yaml"))
-    assert scene.headline == "A plan: 270 readings in 135 postures, none taken yet."
+    assert scene.headline == "A plan: 270 readings in 135 postures, none measured yet."
     assert not [p for p in scene.nodes if p.startswith(readings.BEFORE)]
     assert {label.texts[0] for label in scene.labels if label.rank >= 0.0} == {
         *("yx", "zx", "xy", "zy", "xz", "yz")
@@ -361,7 +361,7 @@ def test_every_animated_node_is_one_that_is_drawn(scene):
 
 
 def test_many_postures_are_thinned_out_for_the_animation(monkeypatch):
-    monkeypatch.setattr("orthocal.output.scene.deviations.MOST_STOPS", 20)
+    monkeypatch.setattr("orthocal.output.scene.deviations.MAX_STOPS", 20)
     scene = draw_scene(session_of("sweep"))
     assert len(scene.steps) == 22
     assert any("stops at 20 of 30 postures" in fact for fact in scene.facts)
@@ -386,7 +386,7 @@ def test_errors_of_the_tool_are_those_of_the_calibration(full):
     targets = whole.targets[corners]
     for node, deviation in (
         (tool_errors.TOOL_NOW, whole.align(whole.deviation)[corners]),
-        (tool_errors.TOOL_ENTERED, whole.align(whole.error_after_offsets)[corners]),
+        (tool_errors.TOOL_ENTERED, whole.align(whole.deviation_with_entries)[corners]),
     ):
         for i in (0, 13, 26):
             pose = scene.pose(f"{node}/point {i + 1}")

@@ -26,25 +26,27 @@ HEADLINES: dict[Judgement, str] = {
 
 
 def describe_setting(planned: PlannedAdjustment) -> str:
-    """Instruction for one adjustment, without a sign: how far, and which way."""
+    """Instruction for one adjustment: amount and direction, without a sign."""
     keys, amount = planned.adjustment.keys, planned.amount
     turns = planned.turns
-    how = f"{format_fixed(abs(amount) / MM, 3)} mm"
+    amount_text = f"{format_fixed(abs(amount) / MM, 3)} mm"
     if turns is not None:
-        how = f"{format_fixed(abs(turns), 2)} turns ({abs(turns) * 360.0:.0f}°)"
+        amount_text = f"{format_fixed(abs(turns), 2)} turns ({abs(turns) * 360.0:.0f}°)"
     if keys.lengthens is not None:
-        return f"{'lengthen' if amount > 0.0 else 'shorten'} rod {keys.lengthens} by {how}"
+        return f"{'lengthen' if amount > 0.0 else 'shorten'} rod {keys.lengthens} by {amount_text}"
     direction = np.array(keys.direction) * math.copysign(1.0, amount)
-    return f"{'shim' if turns is None else 'turn'} {how} towards {name_direction(direction)}"
+    return (
+        f"{'shim' if turns is None else 'turn'} {amount_text} towards {name_direction(direction)}"
+    )
 
 
 def describe_gain(plan: AdjustmentPlan) -> list[str]:
-    """Expected tool error before and after, and the least that any adjustment can reach."""
+    """Expected tool error before and after adjustments, and its lower limit."""
     lines = []
     if plan.adjustments:
-        which = "these" if plan.judgement == "worthwhile" else "the best"
+        these = "these" if plan.judgement == "worthwhile" else "the best"
         lines.append(
-            f"Expected tool error with {which} adjustments and offsets: "
+            f"Expected tool error with {these} adjustments and offsets: "
             f"{tool_mm(plan.after.entered)} RMS (offsets alone: {tool_mm(plan.before.entered)})."
         )
     else:
@@ -59,7 +61,7 @@ def describe_gain(plan: AdjustmentPlan) -> list[str]:
 
 
 def describe_limits(plan: AdjustmentPlan) -> list[str]:
-    """Adjustments at their largest amount, and those smaller than their uncertainty."""
+    """Adjustments at their largest amount, and adjustments smaller than their uncertainty."""
     at_limit = [
         p.adjustment.name
         for p in plan.adjustments

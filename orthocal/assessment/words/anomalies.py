@@ -15,18 +15,18 @@ from orthocal.session.session import Session
 from orthocal.text import printable, spans
 from orthocal.units import EDGE_UNITS, MM, UM, Unit
 
-MOST_PLACES = 20
-"""Places of a finding that are kept."""
+MAX_PLACES = 20
+"""Largest number of places in a finding."""
 
 LARGEST_ODDS = 1e6
-"""Odds above which no number is printed."""
+"""Odds above which the number is not printed."""
 
 UNITS = {25.4: "in inches", 1e3: "in m", 1e-3: "in µm"}
-"""Factor that corrects readings to the unit they were written in; otherwise mm read as inches."""
+"""Unit of wrongly written readings by the factor that corrects them; others are mm as inches."""
 
 
 def describe_anomalies(session: Session, result: Anomalies) -> list[Finding]:
-    """Findings of all anomalies, and of readings that they do not explain."""
+    """Findings about all anomalies, and about readings that they do not explain."""
     findings = [describe_anomaly(session, result, a) for a in result.found]
     if not result.explained and (result.found or session.joined):
         findings.append(_unexplained(session, result))
@@ -34,15 +34,15 @@ def describe_anomalies(session: Session, result: Anomalies) -> list[Finding]:
 
 
 def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding:
-    """One anomaly; or several that are nearly as likely."""
+    """Finding about one anomaly, or about several that are nearly equally likely."""
     e = anomaly.explanation
     if not e.rows and not any(c.rows for c in anomaly.alternatives):
         return _between_sessions(session, anomaly)
     if anomaly.alternatives:
         return _ambiguous(session, result, anomaly)
     first = session.readings[e.rows[0]]
-    ways = [_text(session, c) for c in anomaly.causes] or [_text(session, e)]
-    text = f"{_lines(session, e)}it looks as if {' or '.join(ways)}."
+    descriptions = [_text(session, c) for c in anomaly.causes] or [_text(session, e)]
+    text = f"{_lines(session, e)}it looks as if {' or '.join(descriptions)}."
     text = f"{text[0].upper()}{text[1:]}"
     numbers = _numbers(result, anomaly)
     if e.amounts:
@@ -66,47 +66,53 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
 
 
 def _effect_places(session: Session, e: Explanation) -> tuple[Place, ...]:
-    """Setups of a drift; otherwise the parameters of an effect that clearly differ from 0."""
+    """Setups of a drift; for other effects parameters that differ significantly from 0."""
     if e.kind == "drift":
         return _places(session, e)
-    return tuple(Place(parameter=name) for name, *_ in _clear_amounts(e))
+    return tuple(Place(parameter=name) for name, *_ in _significant_amounts(e))
 
 
 def _effect_remedy(session: Session, result: Anomalies) -> str:
-    """Calibration with all effects that were found, beside those that the machine has."""
-    found = [a.explanation.effect for a in result.found if a.explanation.amounts]
-    robot = with_effects(session.robot, (*session.robot.effect_names, *found))
+    """Advice to calibrate with all missing effects in addition to those of the robot."""
+    missing = [a.explanation.effect for a in result.found if a.explanation.amounts]
+    robot = with_effects(session.robot, (*session.robot.effect_names, *missing))
     return identify_effects(robot.effect_names, errors_of_no_model(robot))
 
 
 def _describe_effect(session: Session, name: str) -> str:
-    """An effect that the machine's model lacks, in its own words."""
+    """Description of an effect that the robot's model does not contain."""
     robot = with_effects(session.robot, (*session.robot.effect_names, name))
     return next(e.describe() for e in robot_effects(robot) if e.name == name)
 
 
-def _clear_amounts(e: Explanation) -> list[tuple[str, float, float, Unit]]:
-    """Parameters of an effect that clearly differ from 0, or the clearest: value, std and unit."""
-    every = range(len(e.amounts))
-    amounts = [(e.parameters[i], e.amounts[i], e.stds[i], e.units[i]) for i in every]
+def _significant_amounts(e: Explanation) -> list[tuple[str, float, float, Unit]]:
+    """Parameters of an effect that differ significantly from 0, at least the most significant one.
+
+    Returns:
+        Name, value, standard deviation, [SI], and unit of each.
+    """
+    indices = range(len(e.amounts))
+    amounts = [(e.parameters[i], e.amounts[i], e.stds[i], e.units[i]) for i in indices]
     amounts.sort(key=lambda entry: -abs(entry[1]) / entry[2])
     return [f for f in amounts if abs(f[1]) > 2.0 * f[2]] or amounts[:1]
 
 
 def _ambiguous(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding:
-    every = (*(anomaly.causes or (anomaly.explanation,)), *anomaly.alternatives)
-    texts = dict.fromkeys(f"  {_lines(session, e)}{_text(session, e)}" for e in every)
-    ways = ";\n".join(texts)
+    """Finding about contradictory readings with several explanations."""
+    explanations = (*(anomaly.causes or (anomaly.explanation,)), *anomaly.alternatives)
+    texts = dict.fromkeys(f"  {_lines(session, e)}{_text(session, e)}" for e in explanations)
+    listed = ";\n".join(texts)
     return review(
         "ambiguous",
-        f"The readings contradict each other. One of these may have happened:\n{ways}.",
-        _repeat(session, *every),
-        tuple(p for e in every for p in _places(session, e)[:1]),
+        f"The readings contradict each other. One of these may have happened:\n{listed}.",
+        _repeat(session, *explanations),
+        tuple(p for e in explanations for p in _places(session, e)[:1]),
         **_numbers(result, anomaly),
     )
 
 
 def _unexplained(session: Session, result: Anomalies) -> Finding:
+    """Finding about readings that the anomalies do not explain, or explain only in part."""
     what = "What was found above explains" if result.found else "No single change explains"
     which = "The sessions do" if session.joined else "The readings do"
     return review(
@@ -124,7 +130,7 @@ def _unexplained(session: Session, result: Anomalies) -> Finding:
 
 
 def _between_sessions(session: Session, anomaly: Anomaly) -> Finding:
-    """A machine that changed, or offsets that were entered otherwise than stated."""
+    """Finding about a machine that changed, or offsets that were not entered as stated."""
     e = anomaly.explanation
     text = _text(session, e)
     text = f"{text[0].upper()}{text[1:]}."
@@ -152,12 +158,12 @@ def _between_sessions(session: Session, anomaly: Anomaly) -> Finding:
     )
 
 
-def describe_no_change(sizes: dict[str, float], unseen: Sequence[str]) -> Finding:
-    """Absence of a change between sessions.
+def describe_no_change(sizes: dict[str, float], undetectable: Sequence[str]) -> Finding:
+    """Finding that no change between sessions was detected.
 
     Args:
-        sizes: Smallest change of an offset that would have been detected, by edge unit.
-        unseen: Drives of which no change would have been detected.
+        sizes: Unit to the smallest detectable change of an offset in that unit.
+        undetectable: Drives of which no change can be detected.
     """
     if not sizes:
         return note(
@@ -166,17 +172,18 @@ def describe_no_change(sizes: dict[str, float], unseen: Sequence[str]) -> Findin
             "few setups and postures in common.",
             "Read some of the same setups and postures in each session.",
         )
-    words = joined([f"{plain(size)} {unit}" for unit, size in sizes.items()], "or")
+    changes = joined([f"{plain(size)} {unit}" for unit, size in sizes.items()], "or")
     text = (
-        f"No change between the sessions. A change of one offset by {words} would have been "
+        f"No change between the sessions. A change of one offset by {changes} would have been "
         "detected."
     )
-    if unseen:
-        text += f" A change of {joined(tuple(unseen), 'or')} would not."
+    if undetectable:
+        text += f" A change of {joined(tuple(undetectable), 'or')} would not."
     return note("no change", text, **{f"seen_from_{u}": size for u, size in sizes.items()})
 
 
 def _numbers(result: Anomalies, anomaly: Anomaly) -> dict[str, float]:
+    """Numbers of the finding about an anomaly."""
     return {
         "before_rms_um": result.rms_before / UM,
         "after_rms_um": result.rms_after / UM,
@@ -185,36 +192,37 @@ def _numbers(result: Anomalies, anomaly: Anomaly) -> dict[str, float]:
 
 
 def describe_evidence(finding: Finding) -> str:
-    """Residuals before and after the correction of an anomaly, and the odds; "" without any."""
+    """Residuals before and after the correction of an anomaly, and its odds; "" if unknown."""
     numbers = finding.numbers
-    parts = []
+    sentences = []
     before, after = (numbers.get(f"{n}_rms_um", math.nan) * UM for n in ("before", "after"))
     if math.isfinite(before + after) and finding.kind != "stuck dial":
-        parts.append(f"Residual {um(before)} µm RMS as written, {um(after)} µm once corrected.")
+        sentences.append(f"Residual {um(before)} µm RMS as written, {um(after)} µm once corrected.")
     if "log_likelihood_ratio" in numbers:
         odds = math.exp(min(numbers["log_likelihood_ratio"], math.log(LARGEST_ODDS)))
         number = f"{float(f'{odds:.3g}'):,.0f}"
         if odds > 0.999 * LARGEST_ODDS:
             number = f"more than {LARGEST_ODDS:,.0f}"
-        parts.append(f"Odds that something is wrong: {number} to 1.")
-    return " ".join(parts)
+        sentences.append(f"Odds that something is wrong: {number} to 1.")
+    return " ".join(sentences)
 
 
 def _places(session: Session, e: Explanation) -> tuple[Place, ...]:
+    """Setups or rows that an explanation concerns; otherwise the files of its sessions."""
     if not e.rows:
         return tuple(Place(file=_file_of(session, name)) for name in e.sessions)
     if e.setups:
-        return tuple(Place(setup=name) for name in e.setups[:MOST_PLACES])
-    return tuple(place_of(session, i) for i in e.rows[:MOST_PLACES])
+        return tuple(Place(setup=name) for name in e.setups[:MAX_PLACES])
+    return tuple(place_of(session, i) for i in e.rows[:MAX_PLACES])
 
 
 def place_of(session: Session, row: int) -> Place:
-    """File, line, setup and posture of a row."""
+    """Place of a row: file, line, setup and posture."""
     reading = session.readings[row]
     file = reading.file or session.readings_path
-    known = reading.line is not None
+    has_line = reading.line is not None
     return Place(
-        file=str(file) if known and file is not None else None,
+        file=str(file) if has_line and file is not None else None,
         line=reading.line,
         setup=reading.setup,
         posture=reading.postures,
@@ -222,7 +230,7 @@ def place_of(session: Session, row: int) -> Place:
 
 
 def _file_of(session: Session, label: str) -> str | None:
-    """The session.yaml of a joined session."""
+    """Path to the session.yaml of a joined session; None if unknown."""
     names = list(dict.fromkeys(name.partition("/")[0] for name in session.setups))
     if len(session.parts) != len(names) or label not in names:
         return None
@@ -231,19 +239,19 @@ def _file_of(session: Session, label: str) -> str | None:
 
 
 def _lines(session: Session, e: Explanation) -> str:
-    """Lines of readings.csv that an explanation concerns, with a colon; "" if unknown."""
+    """Lines that an explanation concerns, such as "lines 3 and 4: "; "" if unknown or all."""
     rows = [session.readings[i] for i in e.rows]
     lines = [r.line for r in rows if r.line is not None]
     if not lines or len(lines) == len(session.readings):
         return ""
-    lines = sorted(set(lines))  # the coordinates of a point share theirs
-    file = "" if session.firmware is None else " of readings.csv"  # not those of the log
+    lines = sorted(set(lines))  # the three readings of a point have the same line
+    file = "" if session.firmware is None else " of readings.csv"  # not lines of the log
     return f"{spans(lines, 'line')}{file}: "
 
 
-def _row(session: Session, i: int) -> str:
-    """Setup, postures and cycle of a reading; where the bed was probed in a printer's log."""
-    reading = session.readings[i]
+def _row(session: Session, row: int) -> str:
+    """Setup, postures and cycle of a reading; for a printer's log with the probed point."""
+    reading = session.readings[row]
     if session.firmware is None or reading.minus is not None:
         return reading.label_with_cycle
     x, y = session.firmware.touched(session.postures[reading.posture].drives)[0, :2] / MM
@@ -251,7 +259,7 @@ def _row(session: Session, i: int) -> str:
 
 
 def _subject(session: Session, e: Explanation) -> str:
-    """Readings that an explanation concerns, as a noun."""
+    """Noun phrase for the readings that an explanation concerns."""
     if e.scope == "reading":
         return _row(session, e.rows[0])
     if e.scope == "posture":
@@ -266,7 +274,7 @@ def _subject(session: Session, e: Explanation) -> str:
 
 
 def _text(session: Session, e: Explanation) -> str:
-    """Description of what happened, as a clause."""
+    """Description of an anomaly as a clause."""
     texts: dict[str, Callable[[], str]] = {
         "wrong unit": lambda: _written(
             session, e, UNITS.get(e.factor or 0.0, "in mm and read as inches")
@@ -314,7 +322,7 @@ def _text(session: Session, e: Explanation) -> str:
         "machine changed": lambda: _changed(session, e),
         "offset of one drive": lambda: (
             f"the controller's offset of {joined(e.drives)} in session {joined(e.sessions)} is "
-            f"not the stated one{_by(session, e)}"
+            f"not the stated one{_amount_of_change(session, e)}"
         ),
         "offsets not entered": lambda: _entered(e, "was not entered", "were not entered"),
         "offsets reversed": lambda: _entered(
@@ -327,15 +335,16 @@ def _text(session: Session, e: Explanation) -> str:
 
 
 def _amounts(e: Explanation) -> str:
-    """Parameters of an effect with their limits: x_slide.backlash 0.045 ± 0.010 mm."""
+    """Significant parameters of an effect, such as "x_slide.backlash 0.045 ± 0.010 mm"."""
     texts = []
-    for name, amount, std, unit in _clear_amounts(e):
-        edge, size = EDGE_UNITS[unit]
-        texts.append(f"{name} {plain(amount / size)} ± {plain(2.0 * std / size)} {edge}")
+    for name, amount, std, unit in _significant_amounts(e):
+        edge, factor = EDGE_UNITS[unit]
+        texts.append(f"{name} {plain(amount / factor)} ± {plain(2.0 * std / factor)} {edge}")
     return joined(texts)
 
 
 def _drifted(e: Explanation) -> str:
+    """Clause about a drift of gauges."""
     if len(e.setups) == 1:
         return f"the readings of setup {e.setups[0]} drifted from the first to the last"
     if not e.amounts:
@@ -344,12 +353,14 @@ def _drifted(e: Explanation) -> str:
 
 
 def _written(session: Session, e: Explanation, how: str) -> str:
+    """Clause about readings that were written in a wrong unit or form."""
     subject = _subject(session, e)
     be = "were" if subject.startswith(("all", "setups")) else "was"
     return f"{subject} {be} written {how}"
 
 
 def _displaced(session: Session, e: Explanation) -> str:
+    """Clause about a displaced gauge."""
     if e.scope == "cycle":
         return f"the gauge of setup {e.names[0]} was displaced before cycle {e.cycle}"
     return (
@@ -359,6 +370,7 @@ def _displaced(session: Session, e: Explanation) -> str:
 
 
 def _offset(session: Session, e: Explanation) -> str:
+    """Clause about readings that were written into a wrong row."""
     first = _row(session, e.rows[0])
     if e.missing:
         return (
@@ -372,6 +384,7 @@ def _offset(session: Session, e: Explanation) -> str:
 
 
 def _reversed(session: Session, e: Explanation) -> str:
+    """Clause about a reversed sign."""
     subject = _subject(session, e)
     if e.scope in ("reading", "posture"):
         return f"the sign of {subject} is reversed"
@@ -379,7 +392,7 @@ def _reversed(session: Session, e: Explanation) -> str:
 
 
 def _displaced_artefact(e: Explanation) -> str:
-    """Displacement of an artefact that setups share, such as ball post, with its session."""
+    """Clause about a displaced artefact, such as a ball post, with its session."""
     label, _, artefact = e.names[0].rpartition("/")
     name = f"{artefact.replace('.', ' ')}{f' of session {label}' if label else ''}"
     how = "displaced or turned over" if _can_turn(e) else "displaced"
@@ -399,7 +412,7 @@ def _dimensions_mm(e: Explanation) -> tuple[float, float]:
 
 
 def _other_dimension(session: Session, e: Explanation) -> str:
-    """A dimension that differs from the stated one, with both sizes."""
+    """Clause about a wrong dimension with its true and stated size."""
     true, stated = _dimensions_mm(e)
     what = e.names[0].rpartition(".")[2].removesuffix("_mm")
     return f"the {what} in {_subject(session, e)} is {plain(true)} mm, not {stated:g} mm"
@@ -414,6 +427,7 @@ def _readjusted(e: Explanation) -> str:
 
 
 def _swapped(session: Session, e: Explanation) -> str:
+    """Clause about swapped rows."""
     if e.scope == "setup":
         return f"the readings of setup {e.setups[0]} were written in reverse order"
     half = len(e.rows) // 2
@@ -430,41 +444,46 @@ def _swapped(session: Session, e: Explanation) -> str:
 
 
 def _changed(session: Session, e: Explanation) -> str:
+    """Clause about a change of the machine."""
     what = joined(e.drives) or joined(e.parameters)
     verb = "moved" if e.drives else "changed"
     when = f"before session {e.sessions[0]}"
     if e.apart:
         when = f"for session{'s' * (len(e.sessions) > 1)} {joined(e.sessions)} only"
-    return f"the machine changed: {what} {verb}{_by(session, e)} {when}"
+    return f"the machine changed: {what} {verb}{_amount_of_change(session, e)} {when}"
 
 
-def _by(session: Session, e: Explanation) -> str:
+def _amount_of_change(session: Session, e: Explanation) -> str:
+    """Amount of a change with its limits, such as " by +0.100 ± 0.020 mm"; "" if unknown."""
     if e.amount is None or not e.parameters:
         return ""
     p = session.robot.parameters[e.parameters[0]]
-    spread = "" if e.std is None else f" ± {plain(2.0 * e.std * p.edge_factor)}"
-    return f" by {signed(e.amount * p.edge_factor)}{spread} {p.edge_unit}"
+    uncertainty = "" if e.std is None else f" ± {plain(2.0 * e.std * p.edge_factor)}"
+    return f" by {signed(e.amount * p.edge_factor)}{uncertainty} {p.edge_unit}"
 
 
 def _entered(e: Explanation, one: str, several: str) -> str:
+    """Clause about wrongly entered offsets; the verb phrase is for one or for several offsets."""
     which = f"{'offset' if len(e.drives) == 1 else 'offsets'} of {joined(e.drives)}"
     how = one if len(e.drives) == 1 else several
     return f"in session {e.sessions[0]} the {which} {how}"
 
 
 def _remedy(session: Session, e: Explanation) -> str:
-    """Action for one explanation."""
+    """Action after an anomaly with one explanation."""
     if e.scope == "reading" and (e.factor is not None or e.kind == "misread dial"):
-        old = session.readings[e.rows[0]].value / MM
-        new = old - (e.amount or 0.0) / MM if e.factor is None else old * e.factor
-        return f"If so, write {new:+.6g} instead of {old:+.6g}."
+        stated = session.readings[e.rows[0]].value / MM
+        corrected = stated - (e.amount or 0.0) / MM if e.factor is None else stated * e.factor
+        return f"If so, write {corrected:+.6g} instead of {stated:+.6g}."
     if e.kind == "reversed sign" and e.setups:
-        way = ""
+        reverse_direction = ""
         if all("direction" in session.setups[name].sensor.to_keys() for name in e.setups):
-            way = " If the gauge pointed the other way, reverse `direction` of the setup."
+            reverse_direction = (
+                " If the gauge pointed the other way, reverse `direction` of the setup."
+            )
         return (
             "Look at the mounting of the gauge. If a minus sign was forgotten, reverse the signs."
-            f"{way}"
+            f"{reverse_direction}"
         )
     if e.factor is not None:
         return f"If so, multiply these by {e.factor:.6g}."
@@ -496,22 +515,24 @@ def _remedy(session: Session, e: Explanation) -> str:
     return remedies.get(e.kind) or _repeat(session, e)
 
 
-def _repeat(session: Session, *found: Explanation) -> str:
-    """Repetition or omission of readings, with the command for the first of them."""
-    rows = [session.readings[i] for e in found for i in e.rows]
+def _repeat(session: Session, *explanations: Explanation) -> str:
+    """Action to repeat or omit readings, with commands for the first one."""
+    rows = [session.readings[i] for e in explanations for i in e.rows]
     if session.firmware is not None:
-        again = "Probe the bed again and import that log"
+        repeat = "Probe the bed again and import that log"
         if all(r.minus is not None for r in rows):
-            again = "Measure again and correct the command DELTA_ANALYZE, then import the log again"
-        return f"{again}, or leave out what is wrong."
-    words = "Read it again" if len(rows) == 1 else "Look at these readings. Read them again"
+            repeat = (
+                "Measure again and correct the command DELTA_ANALYZE, then import the log again"
+            )
+        return f"{repeat}, or leave out what is wrong."
+    advice = "Read it again" if len(rows) == 1 else "Look at these readings. Read them again"
     file = rows[0].file or session.readings_path
     if file is None or rows[0].line is None:
-        return f"{words}, or leave out what is wrong."
+        return f"{advice}, or leave out what is wrong."
     line, path = rows[0].line, printable(shlex.quote(str(file.parent)))
     others = "" if len(rows) == 1 else " Other lines likewise."
     return (
-        f"{words}, or leave out what is wrong. In `orthocal record {path}` the command "
+        f"{advice}, or leave out what is wrong. In `orthocal record {path}` the command "
         f"`again {line}` reads line {line} once more, `back {line}` corrects it, and "
         f"`drop {line}` deletes it.{others}"
     )
@@ -519,25 +540,26 @@ def _repeat(session: Session, *found: Explanation) -> str:
 
 def _session_remedy(session: Session, e: Explanation) -> str:
     """Action for a change between sessions."""
-    since = e.sessions[0]
+    first = e.sessions[0]
     if e.kind != "machine changed":
         return (
             f"Compare the offsets in the controller with `controller.offsets_mm` of session "
-            f"{since}. If the session states the wrong ones, correct them there; otherwise enter "
+            f"{first}. If the session states the wrong ones, correct them there; otherwise enter "
             "the right ones and measure again."
         )
     if e.apart:
-        since = f"{joined(e.sessions)} and the others"
+        first = f"{joined(e.sessions)} and the others"
         return (
-            f"Make sure that the sessions state when they were measured. Calibrate {since} apart."
+            f"Make sure that the sessions state when they were measured. Calibrate {first} apart."
         )
-    apart = (
-        f"Calibrate session {since} and later ones without the earlier ones: the values to enter "
+    calibrate_apart = (
+        f"Calibrate session {first} and later ones without the earlier ones: the values to enter "
         "must belong to the present machine."
     )
     if not e.drives:
-        return apart
+        return calibrate_apart
     return (
-        f"First make sure that all sessions state the active offsets (`controller.offsets_mm`): "
-        f"offsets entered in between look the same. Otherwise: {apart[0].lower()}{apart[1:]}"
+        "First make sure that all sessions state the active offsets (`controller.offsets_mm`): "
+        "offsets entered in between look the same. Otherwise: "
+        f"{calibrate_apart[0].lower()}{calibrate_apart[1:]}"
     )

@@ -14,91 +14,106 @@ from orthocal.io.documents import LARGEST_NUMBER
 from orthocal.units import MM, UM
 
 
-def describe_recommendation(found: Recommendation, *, chosen: str | None = None) -> list[Finding]:
-    """The recommended model, and tolerances of another size if they are strongly supported.
+def describe_recommendation(
+    recommendation: Recommendation, *, identified: str | None = None
+) -> list[Finding]:
+    """Findings about the recommended model and the recommended tolerance scale.
 
     Args:
-        found: The recommendation.
-        chosen: The model that was identified.
+        recommendation: The recommendation.
+        identified: The identified model, which may be another one.
     """
-    evidence = found.of(found.model)
+    evidence = recommendation.log_evidence_of(recommendation.model)
     if evidence > 0.0:
         reason = (
-            "The readings support it strongly against the complete model: errors beyond it are "
-            "too small to be seen."
+            "The readings support it strongly against the complete model: the other errors are "
+            "too small to detect."
         )
     else:
         reason = "It is the complete model, and the readings support no smaller one strongly."
-    other = -found.of(chosen) + evidence if chosen is not None else math.nan
     numbers = {"log_evidence": evidence}
-    if math.isfinite(other) and chosen != found.model:
-        # of a gauge that would be far finer than any machine, without meaning as a number
-        numbers["log_evidence_against_chosen"] = min(max(other, -LARGEST_NUMBER), LARGEST_NUMBER)
-    findings = [note("recommended", f"Recommended model: {found.model}. {reason}", **numbers)]
-    if found.tolerance_scale != 1.0:
+    if identified is not None and identified != recommendation.model:
+        against = evidence - recommendation.log_evidence_of(identified)
+        if math.isfinite(against):  # clipped: huge if the stated noise is unrealistically small
+            against = min(max(against, -LARGEST_NUMBER), LARGEST_NUMBER)
+            numbers["log_evidence_against_chosen"] = against
+    findings = [
+        note("recommended", f"Recommended model: {recommendation.model}. {reason}", **numbers)
+    ]
+    if recommendation.tolerance_scale != 1.0:
         findings.append(
             note(
                 "tolerances differ",
-                f"The readings strongly support tolerances of {found.tolerance_scale:.2g} times "
-                "the stated ones.",
-                "State other tolerances in the session or by --tolerance if that is plausible.",
-                tolerance_scale=found.tolerance_scale,
-                log_evidence=found.scale_evidence,
+                "The readings strongly support tolerances of "
+                f"{recommendation.tolerance_scale:.2g} times the stated ones.",
+                "If that is plausible, state these tolerances in the session "
+                "(calibration.tolerances) or by --tolerance.",
+                tolerance_scale=recommendation.tolerance_scale,
+                log_evidence=recommendation.scale_evidence,
             )
         )
     return findings
 
 
-def describe_effects(found: EffectComparison | None, readings: int) -> list[Finding]:
-    """Effects that the readings support, and those that they cannot show.
+def describe_effects(comparison: EffectComparison | None, readings: int) -> list[Finding]:
+    """Findings about recommended effects and about effects whose conditions are missing.
 
     Args:
-        found: The comparison; None without candidates.
+        comparison: The comparison; None without candidates.
         readings: Number of readings.
     """
-    if found is None:
+    if comparison is None:
         return []
     notes = [
         note(
             "effect not weighed",
-            f"{name} was not weighed: {count} of {readings} readings lack its conditions, the "
+            f"{name} was not compared: {count} of {readings} readings lack its conditions, the "
             f"first in {first}.",
             readings=float(count),
         )
-        for name, (count, first) in found.lacking.items()
+        for name, (count, first) in comparison.lacking.items()
     ]
-    if not found.weighed:
+    if not comparison.weighed:
         return notes
-    none, best = found.weighed[0], found.best
-    tried = joined([w.effects[0] for w in found.weighed if len(w.effects) == 1], "or")
-    if not found.recommended:
-        text, action = (
-            f"Recommended effects: none. The readings do not support {tried} strongly.",
-            "",
-        )
+    best = comparison.best
+    if comparison.recommended:
+        text, action = _describe_recommended_effects(comparison)
     else:
-        names, missing = found.recommended, set(found.recommended) - set(found.identified)
-        them, are = ("it", "is") if len(names) == 1 else ("them", "are")
-        worse = round(best.unseen_rms / MM, 3) > round(none.unseen_rms / MM, 3)  # as printed
-        text = (
-            f"Recommended effects: {joined(names)}. The readings are much more likely with {them} "
-            f"(ln evidence {best.log_evidence:+.1f}). Left-out setups are predicted "
-            f"{'worse, ' if worse else ''}to {mm(best.unseen_rms)} mm, without to "
-            f"{mm(none.unseen_rms)} mm"
-        )
-        text += "; the evidence counts, which is of all readings together." if worse else "."
-        action = ""
-        if missing or found.named:
-            every = order_effects({*found.identified, *names})
-            action = identify_effects(every, found.named)
-        else:
-            text += f" {joined(names).capitalize()} {are} identified already."
+        single = [w.effects[0] for w in comparison.weighed if len(w.effects) == 1]
+        text = "Recommended effects: none. The readings do not support "
+        text, action = f"{text}{joined(single, 'or')} strongly.", ""
     numbers = {"log_evidence": best.log_evidence, "unseen_rms_mm": best.unseen_rms / MM}
     return [note("effects recommended", text, action, **numbers), *notes]
 
 
+def _describe_recommended_effects(comparison: EffectComparison) -> tuple[str, str]:
+    """Text and action of the finding about recommended effects."""
+    names, without, best = comparison.recommended, comparison.weighed[0], comparison.best
+    them, are = ("it", "is") if len(names) == 1 else ("them", "are")
+    with_mm, without_mm = mm(best.unseen_rms), mm(without.unseen_rms)
+    text = (
+        f"Recommended effects: {joined(names)}. The readings are much more likely with {them} "
+        f"(ln evidence {best.log_evidence:+.1f}). RMS prediction error of left-out setups: "
+        f"{with_mm} mm with {them}, {without_mm} mm without."
+    )
+    if float(with_mm) > float(without_mm):
+        text += " The recommendation follows the evidence of all readings."
+    if comparison.named or set(names) - set(comparison.identified):
+        effects = order_effects({*comparison.identified, *names})
+        return text, identify_effects(effects, comparison.named)
+    listed = joined(names)
+    return f"{text} {listed[:1].upper()}{listed[1:]} {are} identified already.", ""
+
+
 def not_recommended(model: str, evidence: float, unseen: float, best_unseen: float) -> Finding:
-    """A model that is not recommended, and why."""
+    """Finding about a model that is not recommended.
+
+    Args:
+        model: Name of the model.
+        evidence: Log evidence relative to the recommended model.
+        unseen: RMS cross-validation error of the model, [m].
+        best_unseen: RMS cross-validation error of the recommended model, [m].
+    """
     predicts = f"it predicts left-out setups to {mm(unseen)} mm instead of {mm(best_unseen)} mm"
     return note(
         "not recommended",
@@ -110,12 +125,12 @@ def not_recommended(model: str, evidence: float, unseen: float, best_unseen: flo
 
 
 def not_determined(model: str, reason: str) -> Finding:
-    """A model that the readings do not determine."""
+    """Finding about a model that the readings do not determine."""
     return note("not determined", f"{model}: not determined. {reason}.")
 
 
 def linearisation_cost(rms: float) -> Finding:
-    """Tool error that linearisation costs."""
+    """Finding about the increase of the tool error by linearisation, RMS, [m]."""
     return note(
         "linearisation error",
         f"Linearisation costs {tool_mm(rms)} RMS at the tool.",

@@ -8,33 +8,33 @@ from orthocal.assessment.wording import joined, named, note
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.effects.protocol import Effect
 
-PARTS = {
+EFFECT_NOUNS = {
     "backlash": "backlash",
     "thermal": "thermal expansion",
     "screw": "the periodic error of the screws",
     "drift": "the drift of the gauge",
 }
-"""Effects of orthocal in words."""
+"""Noun phrases for the effects of orthocal."""
 
 
 def identify_effects(effects: Sequence[str], free: Sequence[str]) -> str:
-    """The advice to identify effects.
+    """Advice to identify effects.
 
     Args:
         effects: Names of all effects to identify.
-        free: Names of those of their parameters that no model contains.
+        free: Names of their parameters that no model contains.
     """
     names = ",".join(effects)
     if not free:
         return f"Calibrate with `--effects {names}`."
-    kinds = [f"*.{name.rpartition('.')[2]}" for name in free]  # no part of the model `full`
+    kinds = [f"*.{name.rpartition('.')[2]}" for name in free]
     globs = [k if kinds.count(k) > 1 else n for k, n in zip(kinds, free, strict=True)]
     patterns = ",".join(dict.fromkeys(globs))
     return f"Calibrate with `--effects {names} --model full --free '{patterns}'`."
 
 
 def approach_not_stated() -> Finding:
-    """No reading states from which side its posture was approached."""
+    """Finding about readings without stated side of approach."""
     return note(
         "effect not shown",
         "No reading states from which side its posture was approached: the backlash of the drives "
@@ -44,7 +44,7 @@ def approach_not_stated() -> Finding:
 
 
 def approached_from_one_side(drives: Mapping[str, str]) -> Finding:
-    """Drives that all readings approach from one side.
+    """Finding about drives that all readings approach from one side.
 
     Args:
         drives: Drive to a posture that would show its backlash.
@@ -60,11 +60,11 @@ def approached_from_one_side(drives: Mapping[str, str]) -> Finding:
 
 
 def one_temperature(temperature: float | None, setup: str) -> Finding:
-    """All readings were taken at one temperature, or none states it.
+    """Finding about readings at one temperature, or without stated temperature.
 
     Args:
-        temperature: The temperature, [°C]; None if none states it.
-        setup: Setup that would show more at another temperature; empty if none would.
+        temperature: The temperature, [°C]; None if no reading states it.
+        setup: Setup that would show expansion at another temperature; empty if none would.
     """
     text = (
         "No reading states its temperature"
@@ -85,24 +85,24 @@ def one_temperature(temperature: float | None, setup: str) -> Finding:
 def effects_alike(
     one: Effect, other: Effect, parameters: Sequence[str], partners: Sequence[str]
 ) -> Finding:
-    """Parameters of effects that change the readings alike."""
-    first, second = (PARTS.get(e.name, e.describe()) for e in (one, other))
-    what = f"{joined(parameters)} from {joined(partners)}" if partners else joined(parameters)
-    why = (
+    """Finding about parameters of effects that change the readings alike."""
+    first, second = (EFFECT_NOUNS.get(e.name, e.describe()) for e in (one, other))
+    pairs_text = f"{joined(parameters)} from {joined(partners)}" if partners else joined(parameters)
+    reason = (
         f"{first} and {second} change them alike"
         if one is not other
         else f"these parts of {first} change them alike"
     )
     return note(
         "effects inseparable",
-        f"These readings do not separate {what}: {why}.",
+        f"These readings do not separate {pairs_text}: {reason}.",
         _separating({one.name, other.name}),
         named(*parameters, *partners),
     )
 
 
 def _separating(effects: set[str]) -> str:
-    """The reading that separates effects."""
+    """Advice about readings that separate effects."""
     if effects == {"thermal"}:
         return "A gauge at the tool, read at two temperatures, separates them."
     if "backlash" in effects:

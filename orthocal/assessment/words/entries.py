@@ -1,4 +1,4 @@
-"""Wording of findings about what to enter, and of the decision."""
+"""Wording of findings about values to enter, and of the decision."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from orthocal.assessment.wording import counted, joined, named, note, tool_mm
-from orthocal.assessment.words.anomalies import MOST_PLACES, place_of
+from orthocal.assessment.words.anomalies import MAX_PLACES, place_of
 from orthocal.calibration.assessment_record import Finding, ToolErrorSummary, Verdict
 from orthocal.kinematics.conditions import StatedUse
 from orthocal.measurement.files.readings_checks import describe_missing
@@ -25,10 +25,10 @@ FIRMWARE_HEADLINES: dict[Verdict, str] = {
     "review": "Check these points before you write new settings.",
     "reject": "Write no settings from this log.",
 }
-"""Headlines of a calibration of a printer, whose firmware takes more than offsets."""
+"""Headlines of a calibration of a printer, whose firmware has settings beside offsets."""
 
 FIRMWARE_STEP = "`orthocal export` writes the settings."
-"""The next step with it."""
+"""Next step after the calibration of a printer."""
 
 KEEP_HEADLINE = "Leave the offsets as they are."
 """Headline of a calibration that changes no offset."""
@@ -37,7 +37,7 @@ NOTHING_HEADLINE = "Nothing to enter: no offset was identified."
 """Headline of a calibration without offsets."""
 
 BACKLASH_HEADLINE = "Enter the backlash."
-"""Added to the headline of a calibration that changes no offset."""
+"""Addition to the headline of a calibration that changes no offset."""
 
 SESSION_HEADLINES: dict[Verdict, str] = {
     "enter": "No anomaly found.",
@@ -75,7 +75,7 @@ def readings_missing(session: Session) -> Finding:
         "readings missing",
         f"{describe_missing(session)}.",
         "",
-        [place_of(session, i) for i in missing[:MOST_PLACES]],
+        [place_of(session, i) for i in missing[:MAX_PLACES]],
         readings=float(len(session.readings)),
         missing=float(len(missing)),
     )
@@ -89,19 +89,22 @@ def no_offset() -> Finding:
 def no_change_needed(
     drives: Sequence[str], ratio: float, best: ToolErrorSummary | None, *, share: float
 ) -> Finding:
-    """Finding that the offsets stay as they are.
+    """Finding that the active offsets are kept.
 
     Args:
         drives: Drives with an offset that could be entered.
         ratio: Largest |change| of these offsets, in standard deviations.
         best: Expected tool error with the best offsets; None if unknown.
-        share: Share by which they would have to lower it.
+        share: Relative reduction of the tool error that is required.
     """
     numbers = {"largest_change_over_std": ratio}
     text = "No offset changes by more than its uncertainty."
     if best is not None:
         numbers |= {"now_um": best.now / UM, "best_um": best.entered / UM}
-        text = f"Other offsets would lower the expected tool error by less than {share:.0%}."
+        text = (
+            "Keep the active offsets: others would lower the expected tool error by less than "
+            f"{share:.0%}."
+        )
     return note("no change needed", text, "", named(*drives), **numbers)
 
 
@@ -112,10 +115,12 @@ def must_change(drives: Sequence[str]) -> Finding:
 
 def not_significant(drives: Sequence[str]) -> Finding:
     """Finding about offsets that change by less than their uncertainty."""
-    return note("not significant", _describe_change(drives, "less"), "", named(*drives))
+    text = f"{_describe_change(drives, 'less')} The tool error depends on all offsets together."
+    return note("not significant", text, "", named(*drives))
 
 
 def _describe_change(drives: Sequence[str], compared: str) -> str:
+    """Sentence that drives change by more or less than their uncertainty."""
     change, their = ("changes", "its") if len(drives) == 1 else ("change", "their")
     return f"{joined(drives)} {change} by {compared} than {their} uncertainty."
 
@@ -125,7 +130,7 @@ def controller_not_stated(drives: Sequence[str], *, keep: bool) -> Finding:
 
     Args:
         drives: Drives with a value to enter.
-        keep: Whether the offsets stay as they are.
+        keep: Whether the active offsets are kept.
     """
     if len(drives) == 1:
         meaning = "The value is a change, not a complete offset"
@@ -141,7 +146,7 @@ def controller_not_stated(drives: Sequence[str], *, keep: bool) -> Finding:
 
 
 def earlier_readings() -> Finding:
-    """Finding that the controller has offsets, which readings of another session may have given."""
+    """Finding about active offsets, which may result from readings of another session."""
     return note(
         "earlier readings",
         "The controller had offsets in this session. If they come from earlier readings of this "
@@ -155,7 +160,7 @@ def describe_tool_error(tool: ToolErrorSummary, *, keep: bool = False) -> str:
 
     Args:
         tool: The tool error.
-        keep: Whether the offsets stay as they are.
+        keep: Whether the active offsets are kept.
     """
     backlash = tool.without_backlash is not None
     if keep and not backlash:
@@ -179,7 +184,7 @@ def describe_compensated(rms: float) -> str:
 
 
 def describe_region(tool: ToolErrorSummary) -> str:
-    """Sentence about region, alignment and conditions of use of the tool errors of an answer."""
+    """Sentence about workspace, alignment and conditions of use of tool errors."""
     use = None if tool.use is None else tool.use.stated
     return describe_aligned(f"the workspace {tool.region}", use)
 
@@ -206,25 +211,25 @@ def describe_use(use: StatedUse) -> str:
 
 
 def describe_use_parts(tool: ToolErrorSummary) -> list[str]:
-    """Sentences about the tool error that each varying condition of use adds."""
+    """Sentences about the part of the tool error that each varying condition of use adds."""
     if tool.use is None:
         return []
     lines = []
     for part in tool.use.parts:
         if part.condition == "approach" and tool.without_backlash is not None:
-            if tool.without_backlash - tool.entered >= 0.5 * UM:
+            if tool_mm(tool.without_backlash) != tool_mm(tool.entered):
                 lines.append(describe_without_backlash(tool.without_backlash))
             continue
         without = math.sqrt(max(tool.entered**2 - part.size**2, 0.0))
         added = tool.entered - without
-        little = added < 0.5 * UM
-        amount = "less than 0.001 mm" if little else tool_mm(added)
+        negligible = added < 0.5 * UM
+        amount = "less than 0.001 mm" if negligible else tool_mm(added)
         if part.condition == "approach":
-            what = joined([*part.effects]).capitalize()
+            effects_text = joined([*part.effects]).capitalize()
             verb = "adds" if len(part.effects) == 1 else "add"
-            how = " if the tool is used from both sides"
-            how += "" if little else "; approach from one side avoids it"
-            lines.append(f"{what} {verb} {amount}{how}.")
+            circumstances = " if the tool is used from both sides"
+            circumstances += "" if negligible else "; approach from one side avoids it"
+            lines.append(f"{effects_text} {verb} {amount}{circumstances}.")
         elif part.condition == "temperature" and tool.use.temperature is not None:
             lines.append(
                 f"Temperatures of {_describe_range(tool.use.temperature)} °C add {amount}."
@@ -235,7 +240,11 @@ def describe_use_parts(tool: ToolErrorSummary) -> list[str]:
 
 
 def describe_without_backlash(rms: float) -> str:
-    """Sentence about the tool error with the present backlash of the controller, RMS, [m]."""
+    """Sentence about the tool error with the present backlash of the controller.
+
+    Args:
+        rms: RMS of that tool error, [m].
+    """
     return (
         f"With the controller's present backlash: {tool_mm(rms)}. Approach from one side "
         "avoids the difference."
@@ -243,6 +252,7 @@ def describe_without_backlash(rms: float) -> str:
 
 
 def _describe_range(limits: tuple[float, float]) -> str:
+    """Range of a condition, such as "18…25"."""
     low, high = limits
     return f"{low:g}" if low == high else f"{low:g}…{high:g}"
 

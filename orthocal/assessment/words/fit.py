@@ -4,31 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from orthocal.assessment.wording import mm, named, note, plain, times
+from orthocal.assessment.wording import counted, mm, named, note, plain, times
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.statistics.identifiability import Combination
 from orthocal.units import MM
 
-FEW_NAMES = 6
-"""Parameters up to which all are named."""
+MAX_LISTED = 6
+"""Number of parameters above which they are not listed."""
 
 
 def noise_unknown() -> Finding:
     """Finding that neither residuals nor the session determine the noise."""
     return note(
         "noise unknown",
-        "There are as many parameters as readings and the session does not state the gauge's "
-        "noise: the uncertainty is unknown.",
+        "No independent reading is left to estimate the noise, and the session does not state the "
+        "gauge's noise: the uncertainty is unknown.",
         "State gauge.sigma_mm, or repeat the readings in cycles.",
     )
 
 
 def noise_from_residuals(sigma: float) -> Finding:
-    """Only the residuals say how large the noise is."""
+    """Finding that the noise is known from the residuals only."""
     return note(
         "noise from residuals",
-        "The noise is estimated from the residuals alone, so an error of the model looks like "
+        "The noise is estimated from the residuals alone, so unmodelled errors are counted as "
         "noise.",
         "Repeat readings in cycles, or state gauge.sigma_mm.",
         sigma_mm=sigma / MM,
@@ -36,7 +36,7 @@ def noise_from_residuals(sigma: float) -> Finding:
 
 
 def noise_as_stated(sigma: float) -> Finding:
-    """Uncertainties rest on the stated noise alone."""
+    """Finding that uncertainties depend on the stated noise alone."""
     return note(
         "noise as stated",
         "The uncertainty rests on the stated noise of the gauge.",
@@ -45,7 +45,7 @@ def noise_as_stated(sigma: float) -> Finding:
 
 
 def noise_from_cycles(scatter: float) -> Finding:
-    """Uncertainties rest on the scatter of repeated readings alone."""
+    """Finding that uncertainties depend on the scatter of repeated readings alone."""
     return note(
         "noise as stated",
         "The uncertainty rests on the scatter of repeated readings.",
@@ -54,14 +54,14 @@ def noise_from_cycles(scatter: float) -> Finding:
 
 
 def fits_stated_noise(sigma: float) -> Finding:
-    """Residuals agree with the stated noise."""
+    """Finding that the residuals agree with the stated noise."""
     return note(
         "fits", "The residuals agree with the stated noise of the gauge.", sigma_mm=sigma / MM
     )
 
 
 def fits_cycles(scatter: float) -> Finding:
-    """Residuals agree with the scatter of repeated readings."""
+    """Finding that the residuals agree with the scatter of repeated readings."""
     return note(
         "fits",
         "The residuals agree with the scatter of repeated readings: the model fits.",
@@ -70,24 +70,32 @@ def fits_cycles(scatter: float) -> Finding:
 
 
 def model_error(
-    sigma: float, reference: float, *, source: str, row: str, factor: float, larger: bool
+    sigma: float,
+    reference: float,
+    *,
+    source: str,
+    row_noun: str,
+    row_factor: float,
+    may_enlarge_model: bool,
 ) -> Finding:
-    """Residuals exceed the noise: errors that the model leaves out.
+    """Finding that the residuals exceed the noise because of unmodelled errors.
 
     Args:
         sigma: Standard deviation of a reading from the residuals, [m].
-        reference: The same from the noise, [m].
-        source: Of the reference, in words.
-        row: What a row is: a reading or a difference.
-        factor: Standard deviation of a row over that of a reading.
-        larger: Whether a larger model may explain it.
+        reference: Standard deviation of a reading from the noise, [m].
+        source: Noun phrase for the source of the reference.
+        row_noun: Noun phrase for a row: a reading or a difference.
+        row_factor: Ratio of the standard deviation of a row to that of a reading.
+        may_enlarge_model: Whether a larger model may explain the residuals.
     """
     return note(
         "model error",
-        f"After the fit, {row} still deviates by {mm(sigma * factor)} mm, "
-        f"{times(sigma / reference)} {source} ({mm(reference * factor)} mm). Errors of legs, "
-        "axes and mounting cause this, not noise.",
-        "`orthocal compare` shows whether the readings support a larger model." if larger else "",
+        f"After the fit, {row_noun} typically deviates by {mm(sigma * row_factor)} mm, "
+        f"{times(sigma / reference)} {source} ({mm(reference * row_factor)} mm). Probable cause: "
+        "errors of legs, axes and mounting, not noise.",
+        "`orthocal compare` shows whether the readings support a larger model."
+        if may_enlarge_model
+        else "",
         sigma_mm=sigma / MM,
         noise_mm=reference / MM,
         ratio=sigma / reference,
@@ -95,11 +103,11 @@ def model_error(
 
 
 def gauge_overstated(sigma: float, stated: float) -> Finding:
-    """Residuals are far smaller than the stated noise."""
+    """Finding that the residuals are far smaller than the stated noise."""
     return note(
         "gauge overstated",
-        f"The residuals are only {sigma / stated:.2g} of the stated noise: it is too large, or the "
-        "readings were smoothed.",
+        f"The residuals are only {sigma / stated:.2g} of the stated noise: the stated noise is too "
+        "large, or the readings were smoothed.",
         sigma_mm=sigma / MM,
         gauge_sigma_mm=stated / MM,
         ratio=sigma / stated,
@@ -107,10 +115,10 @@ def gauge_overstated(sigma: float, stated: float) -> Finding:
 
 
 def no_redundancy(readings: int, parameters: int) -> Finding:
-    """The parameters can take up every independent reading."""
+    """Finding that the fit has no redundant readings."""
     return note(
         "no redundancy",
-        f"With {readings} independent readings and {parameters} parameters the fit cannot be "
+        f"With {readings} independent readings for {parameters} unknown errors the fit cannot be "
         "checked against the readings. It relies on the stated tolerances.",
         independent_readings=float(readings),
         parameters=float(parameters),
@@ -118,7 +126,7 @@ def no_redundancy(readings: int, parameters: int) -> Finding:
 
 
 def nothing_depends(names: Sequence[str]) -> Finding:
-    """No reading depends on any free parameter."""
+    """Finding that no reading depends on any free parameter."""
     return note(
         "nothing moved",
         "No reading depends on any free parameter, so all keep their start values.",
@@ -128,7 +136,7 @@ def nothing_depends(names: Sequence[str]) -> Finding:
 
 
 def nothing_deviates(rms: float) -> Finding:
-    """The readings show no deviation that the parameters explain."""
+    """Finding that the readings show no deviation that the parameters explain."""
     return note(
         "nothing moved",
         f"The readings show no deviation that these parameters explain (RMS {mm(rms)} mm).",
@@ -136,34 +144,44 @@ def nothing_deviates(rms: float) -> Finding:
     )
 
 
-def held_by_bound(p: ParameterEstimate, *, offset: bool) -> Finding:
-    """A bound holds a parameter."""
+def held_by_bound(parameter: ParameterEstimate, *, offset: bool) -> Finding:
+    """Finding about a parameter at a bound; `offset` if it is an offset, to be reviewed."""
     return Finding(
         "held by a bound",
         "review" if offset else "note",
-        f"{p.name} is at its {p.at_bound} bound, {p.value * p.edge_factor:g} {p.edge_unit}. The "
-        "readings ask for a value beyond it. Its uncertainty is unknown, and that of the others "
-        "holds with it at the bound.",
+        f"{parameter.name} is at its {parameter.at_bound} bound, "
+        f"{parameter.value * parameter.edge_factor:g} {parameter.edge_unit}. The best fit is "
+        "beyond it. Its uncertainty is unknown; that of the other parameters assumes this value.",
         "Make sure that this bound is intended.",
-        {f"value_{p.edge_unit}" if p.unit != "1" else "value": p.value * p.edge_factor},
-        named(p.name),
+        {
+            f"value_{parameter.edge_unit}" if parameter.unit != "1" else "value": parameter.value
+            * parameter.edge_factor
+        },
+        named(parameter.name),
     )
 
 
-def linearisation_error(p: ParameterEstimate, change: float, std: float) -> Finding:
-    """Largest difference of the linearised and the exact estimate."""
+def linearisation_error(parameter: ParameterEstimate, change: float, std: float) -> Finding:
+    """Finding about the difference of the linearised and the exact estimate of a parameter.
+
+    Args:
+        parameter: Parameter with the largest difference relative to its standard deviation.
+        change: The difference, [SI].
+        std: Standard deviation of the parameter, [SI].
+    """
     return note(
         "linearisation error",
-        f"Linearisation changes the estimates by at most {plain(change * p.edge_factor)} "
-        f"{p.edge_unit} ({p.name}), {change / std:.2g} times its standard deviation.",
+        "Most changed by linearisation, relative to its uncertainty: "
+        f"{parameter.name} by {plain(change * parameter.edge_factor)} {parameter.edge_unit}, "
+        f"{change / std:.2g} times its standard deviation.",
         "",
-        named(p.name),
+        named(parameter.name),
         part_of_std=change / std,
     )
 
 
 def inseparable(combination: Combination) -> Finding:
-    """Parameters that these readings determine only as a sum."""
+    """Finding about parameters that the readings determine only as a linear combination."""
     return note(
         "inseparable",
         f"Determined only in combination: {combination.words}.",
@@ -173,28 +191,35 @@ def inseparable(combination: Combination) -> Finding:
 
 
 def below_noise(names: Sequence[str]) -> Finding:
-    """Parameters that move no reading by more than the noise."""
+    """Finding about parameters whose effect on the readings is smaller than the noise."""
     count = len(names)
-    listed = f" ({', '.join(names)})" if count <= FEW_NAMES else ""
-    noun = "parameter moves" if count == 1 else "parameters move"
+    listed = f" ({', '.join(names)})" if count <= MAX_LISTED else ""
+    effect, remains = ("effect", "remains") if count == 1 else ("effects", "remain")
     return note(
         "below the noise",
-        f"{count} {noun} all readings together by less than the noise, at one prior standard "
-        f"deviation{listed}.",
+        f"The {effect} of {counted(count, 'parameter')}{listed} on the readings {remains} below "
+        "the noise, at one prior standard deviation.",
         "",
         named(*names),
         parameters=float(count),
     )
 
 
-def line_assumed(size: float, setup: str, touches: str, sigma: float) -> Finding:
-    """Readings are modelled as of the line between the rods, which nothing touches."""
+def line_assumed(difference: float, setup: str, touches: str, sigma: float) -> Finding:
+    """Finding about a gauge that is modelled by the centre line of the leg, where there is no rod.
+
+    Args:
+        difference: Difference of the readings on a rod, [m].
+        setup: Setup of the gauge.
+        touches: Value of `touches` for a rod.
+        sigma: Standard deviation of a reading, [m].
+    """
     return note(
         "line assumed",
         "orthocal assumes that the gauge reads the centre line between the two rods of a leg. On "
-        f"a rod the readings differ by about {mm(size)} mm (setup {setup}).",
+        f"a rod the readings differ by about {mm(difference)} mm (setup {setup}).",
         f"If it touched a rod, state `touches: {touches}` and the gauge's `tip`.",
         (Place(setup=setup),),
-        off_line_mm=size / MM,
+        off_line_mm=difference / MM,
         sigma_mm=sigma / MM,
     )

@@ -1,4 +1,4 @@
-"""Wording of findings about readings and settings that no machine or gauge shows."""
+"""Wording of findings about implausible readings and settings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ from orthocal.units import MM, UM
 
 
 def wrong_dimensions(legs: str, nominal: float, measured: float) -> Finding:
-    """The nominal machine would show far more than the gauge saw, [m] RMS."""
+    """Finding that the nominal machine would have moved the gauge far more than it moved.
+
+    Args:
+        legs: Legs of the robot in words.
+        nominal: RMS motion of the gauge on the nominal machine, [m].
+        measured: Measured RMS motion, [m].
+    """
     return reject(
         "wrong dimensions",
         f"The postures do not belong to this machine: the robot with {legs} would have moved the "
@@ -22,7 +28,7 @@ def wrong_dimensions(legs: str, nominal: float, measured: float) -> Finding:
 
 
 def beyond_tolerances(scale: float, limit: float, *, firmware: bool) -> Finding:
-    """Only many times the stated tolerances would explain the readings, or the log of a printer."""
+    """Finding that only errors of many times the stated tolerances explain the readings."""
     check = (
         "Check that the settings of the log are those with which it was probed, and its points."
         if firmware
@@ -39,7 +45,7 @@ def beyond_tolerances(scale: float, limit: float, *, firmware: bool) -> Finding:
 
 
 def above_tolerances(scale: float) -> Finding:
-    """Errors of the machine exceed their tolerances by a plausible factor."""
+    """Finding that errors of the machine exceed their tolerances by a plausible factor."""
     return note(
         "above tolerances",
         f"The errors of this machine are about {times(scale)} the stated tolerances.",
@@ -50,7 +56,7 @@ def above_tolerances(scale: float) -> Finding:
 def finer_than_gauge(
     count: int, total: int, step: float, where: str, value: float, places: Sequence[Place]
 ) -> Finding:
-    """Readings lie between the steps of the gauge."""
+    """Finding about readings between the steps of the gauge."""
     return review(
         "finer than the gauge",
         f"{count} of {total} readings have more digits than the gauge shows (resolution "
@@ -63,7 +69,7 @@ def finer_than_gauge(
 
 
 def coarser_than_range(step: float, limits: tuple[float, float]) -> Finding:
-    """The stated range of the gauge has only a few of its steps."""
+    """Finding that the stated range of the gauge has only a few of its steps."""
     low, high = (limit / MM for limit in limits)
     return review(
         "resolution too coarse",
@@ -78,7 +84,7 @@ def coarser_than_range(step: float, limits: tuple[float, float]) -> Finding:
 def coarser_than_readings(
     count: int, total: int, step: float, where: str, value: float, places: Sequence[Place]
 ) -> Finding:
-    """Readings contradict the stated resolution of the gauge."""
+    """Finding that readings contradict the stated resolution of the gauge."""
     return review(
         "resolution too coarse",
         f"The session states a resolution of {step / MM:g} mm (gauge.resolution_mm), but {count} "
@@ -90,26 +96,26 @@ def coarser_than_readings(
     )
 
 
-def residuals_too_small(left: float, rounding: float, step: float) -> Finding:
-    """Residuals are smaller than rounding to the gauge's steps leaves."""
+def residuals_too_small(residual: float, rounding: float, step: float) -> Finding:
+    """Finding about residuals that are smaller than the rounding to steps of the gauge, [m]."""
     return review(
         "residuals too small",
-        f"The readings agree to {left / UM:.2g} µm. Rounding to the gauge's resolution of "
+        f"The readings agree to {residual / UM:.2g} µm. Rounding to the gauge's resolution of "
         f"{step / MM:g} mm alone leaves {rounding / UM:.2g} µm. They are in another unit, were "
         "computed, or the dial did not move.",
         "Make sure that the readings are what the dial showed, in mm.",
-        residual_um=left / UM,
+        residual_um=residual / UM,
         rounding_um=rounding / UM,
         resolution_mm=step / MM,
     )
 
 
-def sigma_too_large(given: float, *, scatter: float | None = None, step: float = 0.0) -> Finding:
-    """The stated noise of the gauge is far above its scatter, or above its steps.
+def sigma_too_large(stated: float, *, scatter: float | None = None, step: float = 0.0) -> Finding:
+    """Finding about a stated noise far above the scatter or the resolution of the gauge.
 
     Args:
-        given: Stated noise, [m].
-        scatter: Scatter of the readings, [m]; None to compare with the steps.
+        stated: Stated noise, [m].
+        scatter: Scatter of the readings, [m]; None to compare with the resolution.
         step: Resolution of the gauge, [m].
     """
     shown = (
@@ -117,20 +123,20 @@ def sigma_too_large(given: float, *, scatter: float | None = None, step: float =
         if scatter is None
         else f"The readings scatter by {scatter / MM:.2g} mm."
     )
-    other = step if scatter is None else scatter
+    reference = step if scatter is None else scatter
     return review(
         "sigma too large",
-        f"The session states that a reading scatters by {given / MM:g} mm (gauge.sigma_mm). "
+        f"The session states that a reading scatters by {stated / MM:g} mm (gauge.sigma_mm). "
         f"{shown}",
         "Make sure that gauge.sigma_mm is in mm.",
-        given_mm=given / MM,
-        **{"resolution_mm" if scatter is None else "scatter_mm": other / MM},
-        ratio=given / other,
+        given_mm=stated / MM,
+        **{"resolution_mm" if scatter is None else "scatter_mm": reference / MM},
+        ratio=stated / reference,
     )
 
 
 def postures_too_near(posture: str, gap: float, largest: float) -> Finding:
-    """Two postures are hardly apart, beside others that are far apart."""
+    """Finding about a posture that is much closer to another one than the others, [m]."""
     return review(
         "postures too near",
         f"Posture '{posture}' is {gap / MM:.2g} mm from another one. Others are up to "
@@ -143,7 +149,7 @@ def postures_too_near(posture: str, gap: float, largest: float) -> Finding:
 
 
 def legs_differ(legs: str, lengths: dict[str, float]) -> Finding:
-    """Legs have different nominal lengths although all drives are alike."""
+    """Finding about legs of different nominal lengths on a machine with equal drives."""
     return review(
         "legs differ",
         f"The nominal machine has legs of different lengths ({legs}) and drives that are alike.",
@@ -155,7 +161,15 @@ def legs_differ(legs: str, lengths: dict[str, float]) -> Finding:
 def scattered_repeats(
     scatter: float, gauge: float, label: str, shown: str, places: Sequence[Place]
 ) -> Finding:
-    """Repeated readings differ by far more than the gauge's noise."""
+    """Finding about repeated readings that differ by far more than the gauge's noise.
+
+    Args:
+        scatter: Scatter of repeated readings, [m].
+        gauge: Noise of the gauge, [m].
+        label: Reading that differs most.
+        shown: Its values with their lines.
+        places: Places of these values.
+    """
     return review(
         "scattered repeats",
         f"Repeated readings scatter by {mm(scatter)} mm. The gauge's noise explains {mm(gauge)} "

@@ -1,7 +1,7 @@
-"""Deletion diagnostics: a reading or a setup against the prediction from all the others.
+"""Deletion diagnostics: readings and setups compared with the prediction from all others.
 
 Deleting a reading is equivalent to adding an unknown error to it. With y ~ (X θ, σ² S), X with a
-column for every free gauge zero and the prior precision P⁻¹,
+column for every free gauge zero, and the prior precision P⁻¹,
 
     M = S⁻¹ − S⁻¹ X A⁻¹ Xᵀ S⁻¹,  A = Xᵀ S⁻¹ X + σ² P⁻¹
 
@@ -13,8 +13,8 @@ Deleting a setup s changes the estimate, to first order about the solution, by
 
     δ = −A₋ₛ⁻¹ Fₛᵀ rₛ/σ²,  A₋ₛ = FᵀF/σ² + P⁻¹ − FₛᵀFₛ/σ²
 
-with F the Jacobian and r the residuals, zeros eliminated. The prediction error of the
-setup is then rₛ − Fₛ δ.
+with the Jacobian F and the residuals r, zeros eliminated. The prediction error of the setup is then
+rₛ − Fₛ δ.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from orthocal.statistics.information import Information, decompose
 from orthocal.statistics.zeros import project_out_zeros
 
 MIN_REDUNDANCY = 1e-9
-"""Redundancy of a row, relative to its weight, below which no other row predicts it."""
+"""Redundancy of a row relative to its weight, below which the other rows do not predict it."""
 
 MIN_REMAINING_SQUARE = 1e-6
-"""Part of the sum of squares that remains at least when a row is deleted."""
+"""Smallest fraction of the sum of squares that remains when a row is deleted."""
 
 OUTLIER_PROBABILITY = 0.01
 """Probability that a session without wrong readings has an outlier."""
 
 LARGEST_THRESHOLD = 1e6
-"""Studentised residual above which a threshold counts as infinite."""
+"""Threshold of studentised residuals above which it counts as infinite."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,18 +51,18 @@ class Diagnostics:
 
     studentised: Array
     """Studentised deleted residual, shape (n_rows,). Noise from residuals is estimated without the
-    row. NaN if no other row predicts it."""
+    row. NaN if the other rows do not predict it."""
     max_dfbetas: Array
     """Largest |DFBETAS| over the machine's parameters: change of the estimate when the row is
     deleted, in standard deviations of the parameter, shape (n_rows,)."""
     dfbetas_parameter: Indices
-    """Index in `problem.free` of the parameter with that change, shape (n_rows,)."""
+    """Index in `problem.free` of the parameter with the largest change, shape (n_rows,)."""
     outlier_threshold: float
     """Studentised residual above which a row is an outlier."""
 
 
 def diagnose_readings(fit: Fit) -> Diagnostics:
-    """Deletion diagnostics of every reading, to first order about the solution."""
+    """First-order deletion diagnostics of every row."""
     problem, count = fit.problem, fit.problem.observations.plus.size
     sigma, n = fit.noise.sigma, fit.problem.n_machine
     if not (np.isfinite(sigma) and sigma >= SMALLEST_SIGMA):
@@ -78,12 +78,12 @@ def diagnose_readings(fit: Fit) -> Diagnostics:
     std = np.sqrt(np.diag(inverse))[:n]
     with np.errstate(divide="ignore", invalid="ignore"):
         deleted_residual = m_y / redundancy
-        spread, dof = _spread_without(fit, m_y**2 / redundancy)
+        sigma_without, dof = _sigma_without_rows(fit, m_y**2 / redundancy)
         dfbetas = np.abs(gain[:, :n] * (weights * deleted_residual)[:, None])
         dfbetas = np.nan_to_num(dfbetas / np.where(std > 0.0, std, np.inf))
     largest = dfbetas.argmax(axis=1)
     return Diagnostics(
-        studentised=deleted_residual * np.sqrt(redundancy) / spread,
+        studentised=deleted_residual * np.sqrt(redundancy) / sigma_without,
         max_dfbetas=dfbetas[np.arange(count), largest],
         dfbetas_parameter=largest,
         outlier_threshold=_outlier_threshold(dof, count),
@@ -91,9 +91,9 @@ def diagnose_readings(fit: Fit) -> Diagnostics:
 
 
 def _eliminate_zeros(fit: Fit) -> tuple[Array, Array, Array, Array]:
-    """Robust weights of the rows, S⁻¹ X, M y and diag S⁻¹, gauge zeros eliminated.
+    """Robust weights of the rows, S⁻¹ X, M y and diag S⁻¹, with gauge zeros eliminated.
 
-    All but the weights are divided by the weight of the row.
+    The last three are divided by the weight of the row.
     """
     o = fit.problem.observations
     weights = fit.robust_weights[o.plus]
@@ -106,7 +106,7 @@ def _eliminate_zeros(fit: Fit) -> tuple[Array, Array, Array, Array]:
         if precision is not None:
             s_inv_x[group], m_y[group] = precision @ jacobian[group], precision @ m_y[group]
             s_inv_diagonal[group] = np.diag(precision)
-            # robust weights belong to single readings: a row of two of them counts fully
+            # robust weights belong to single readings, so that differences have the weight 1
             weights[group] = 1.0
         elif not o.zero_known[zero]:
             s_inv_diagonal[group] -= weights[group] / weights[group].sum()
@@ -116,8 +116,8 @@ def _eliminate_zeros(fit: Fit) -> tuple[Array, Array, Array, Array]:
 def _outlier_threshold(dof: float, count: int) -> float:
     """Bonferroni threshold of the studentised residuals of `count` readings.
 
-    Infinite if no reading can be judged: with very few degrees of freedom the quantile of Student's
-    distribution is about 1e28.
+    It is infinite with very few degrees of freedom, where the quantile of Student's distribution
+    is about 1e28 and no reading can be judged.
     """
     factor = confidence_factor(dof, 1.0 - OUTLIER_PROBABILITY / count)
     return factor if factor < LARGEST_THRESHOLD else np.inf
@@ -135,6 +135,10 @@ def _inverse_covariance(o: Observations, group: Indices) -> Array | None:
     """Inverse covariance of differences that share postures, for readings of variance 1.
 
     None for single readings, which share only their gauge zero.
+
+    Args:
+        o: The entries.
+        group: Indices of the rows with one zero, shape (n,).
     """
     if o.minus[group[0]] < 0:
         return None
@@ -146,33 +150,34 @@ def _inverse_covariance(o: Observations, group: Indices) -> Array | None:
     return np.asarray(np.linalg.inv(incidence @ incidence.T))
 
 
-def _spread_without(fit: Fit, share: Array) -> tuple[Array, float]:
+def _sigma_without_rows(fit: Fit, contributions: Array) -> tuple[Array, float]:
     """Standard deviation of a reading estimated without each row, and its degrees of freedom.
 
     Args:
         fit: The fit.
-        share: Part of each row in Σ r², shape (n_rows,), [m² of the first gauge].
+        contributions: Contribution of each row to Σ r², shape (n_rows,), [m² of the first gauge].
 
     Returns:
         Standard deviations, shape (n_rows,), [m of the first gauge], and degrees of freedom.
     """
     noise = fit.noise
     if noise.source != "residuals" or fit.loss.robust:
-        return np.full(share.size, noise.sigma), noise.dof
+        return np.full(contributions.size, noise.sigma), noise.dof
     dof = noise.dof - 1.0
     if dof <= 0.0:
-        return np.full(share.size, np.nan), 0.0
-    # to first order the share of an outlier can exceed the total
+        return np.full(contributions.size, np.nan), 0.0
     total = noise.sigma**2 * noise.dof
-    return np.sqrt(np.maximum(total - share, MIN_REMAINING_SQUARE * total) / dof), dof
+    # the first-order contribution of an outlier can exceed the total
+    remaining = np.maximum(total - contributions, MIN_REMAINING_SQUARE * total)
+    return np.sqrt(remaining / dof), dof
 
 
 def cross_validate_setups(fit: Fit) -> Array:
-    """Leave-one-setup-out prediction errors of every row.
+    """Prediction errors of every row from all other setups (leave-one-out cross-validation).
 
     Returns:
-        Measured minus predicted, each with its best gauge zeros, shape (n_rows,), [m of the first
-        gauge]; NaN where the other setups do not determine the parameters.
+        Measured minus predicted reading with the best gauge zeros, shape (n_rows,), [m of the first
+        gauge]; NaN if the other setups do not determine the parameters.
     """
     problem, o = fit.problem, fit.problem.observations
     errors = np.full(o.plus.size, np.nan)
@@ -187,16 +192,16 @@ def cross_validate_setups(fit: Fit) -> Array:
     for setup in setups:
         deleted = o.setup == setup
         if not problem.prior_precision.all():
-            # at the reference: at the solution unobservable directions look slightly observable
+            # at the active offsets: unobservable directions seem observable at the solution
             jacobian = np.where(deleted[:, None], 0.0, fit.linearisation.jacobian)
             try:
                 require_determined(problem, decompose(jacobian, o))
             except NotIdentifiableError:
-                continue  # stays unknown
-        others = factor[~deleted][:, free] / fit.sigma
+                continue
+        remaining = factor[~deleted][:, free] / fit.sigma
         change = np.zeros(problem.n_free)
         change[free] = -np.linalg.solve(
-            others.T @ others + precision,
+            remaining.T @ remaining + precision,
             factor[deleted][:, free].T @ weighted_residual[deleted],
         )
         prediction_error = project_out_zeros(fit.residual - fit.jacobian @ change, o)

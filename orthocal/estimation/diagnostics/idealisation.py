@@ -1,4 +1,4 @@
-"""Model discrepancy of the line model: a gauge touches a rod, not the line between two rods."""
+"""Model discrepancy of the line model, whose gauges measure the centre line of a leg, not a rod."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from orthocal.sensors.tips import Tip
 from orthocal.session.session import Session
 from orthocal.statistics.zeros import project_out_zeros
 
-MOST_READINGS = 60
-"""Largest number of readings that are compared, spread over the session."""
+MAX_READINGS = 60
+"""Largest number of compared readings, distributed over the session."""
 
-EDGE = Tip("blade", 0.0, 1.0)
-"""Tip that differs least from one that touches a line."""
+BLADE = Tip("blade", 0.0, 1.0)
+"""Tip for which the line model has the smallest discrepancy."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,38 +32,38 @@ class Idealised:
     touches: str
     """Name of the rod that the gauge may touch."""
     size: float
-    """Difference of a reading, gauge zeros eliminated: one standard deviation over machines drawn
-    from the priors, [m]."""
+    """RMS difference of a reading over machines drawn from the priors, gauge zeros eliminated,
+    [m]."""
 
 
 def find_idealised(session: Session) -> Idealised | None:
-    """Largest difference of a session's readings from those of a rod; None without a line model."""
-    rods = {
+    """Largest difference between readings of the line model and of a rod; None without such."""
+    rod_sensors = {
         name: sensors
         for name, s in session.setups.items()
         if (sensors := _rod_sensors(s.sensor, session.robot))
     }
-    if not rods:
+    if not rod_sensors:
         return None
-    chosen = [r for r in session.readings if r.setup in rods]
-    few = tuple(chosen[:: -(-len(chosen) // MOST_READINGS)])
-    if not few:
+    readings = [r for r in session.readings if r.setup in rod_sensors]
+    readings = readings[:: max(-(-len(readings) // MAX_READINGS), 1)]
+    if not readings:
         return None
-    part = replace(session.select(few), parts=())
-    of_line = _first_order(part)
-    touched = {n: next(iter(rods[n])) for n in part.setups}
-    setups = {n: replace(s, sensor=rods[n][touched[n]]) for n, s in part.setups.items()}
-    sizes = np.linalg.norm(_first_order(replace(part, setups=setups)) - of_line, axis=1)
+    part = replace(session.select(tuple(readings)), parts=())
+    rods = {name: next(iter(rod_sensors[name])) for name in part.setups}
+    setups = {n: replace(s, sensor=rod_sensors[n][rods[n]]) for n, s in part.setups.items()}
+    difference = _nominal_expansion(replace(part, setups=setups)) - _nominal_expansion(part)
+    sizes = np.linalg.norm(difference, axis=1)
     worst = int(sizes.argmax())
-    return Idealised(few[worst].setup, touched[few[worst].setup], float(sizes[worst]))
+    setup = readings[worst].setup
+    return Idealised(setup, rods[setup], float(sizes[worst]))
 
 
-def _first_order(session: Session) -> Array:
-    """Nominal readings and their change by one standard deviation of each error, [m].
+def _nominal_expansion(session: Session) -> Array:
+    """Nominal readings, and their changes by one prior standard deviation of each error.
 
-    Gauge zeros are eliminated.
-
-    Shape (n_readings, 1 + n_errors).
+    Returns:
+        Gauge zeros eliminated, shape (n_readings, 1 + n_errors), [m].
     """
     problem = build_problem(session, free=machine_errors(session.robot), prior=True)
     h, jacobian = problem.predict_and_jacobian(np.zeros(problem.n_free))
@@ -73,7 +73,7 @@ def _first_order(session: Session) -> Array:
 
 
 def _rod_sensors(sensor: Sensor, robot: Robot) -> dict[str, Sensor]:
-    """Sensors on the rods that a gauge of the line model may touch, by rod; empty for others."""
+    """Sensors on the rods that a gauge of the line model may touch, by rod; else empty."""
     if not isinstance(sensor, LegIndicator) or sensor.rod is not None:
         return {}
-    return {rod: sensor.on_rod(rod, EDGE) for rod in robot.legs[sensor.leg].rods}
+    return {rod: sensor.on_rod(rod, BLADE) for rod in robot.legs[sensor.leg].rods}

@@ -1,12 +1,12 @@
 """Profile-likelihood intervals, which are valid for nonlinear problems.
 
-One parameter is held at a value and all others are estimated again. The interval contains the
-values that increase twice the objective by at most q²,
+One parameter is prescribed and all others are estimated again. The interval contains the values
+with
 
     2 (F(θᵢ) − F(θ̂)) ≤ q²
 
-with q Student's factor, as for a linear problem (Bates and Watts, Nonlinear Regression
-Analysis, 1988, section 6.1). The noise is fixed at its estimate.
+for the objective F and Student's factor q of a linear problem (Bates and Watts, Nonlinear
+Regression Analysis, 1988, section 6.1). The noise is fixed at its estimate.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from orthocal.errors import ClosureError, NotIdentifiableError, SolverError
 from orthocal.estimation.fit import Fit
 from orthocal.statistics.chance import confidence_factor
 
-SETTLED = 1e-3
+END_TOLERANCE = 1e-3
 """Tolerance of the ends of an interval, [standard deviations]."""
 
-MAX_DOUBLINGS = 12
+MAX_TRIALS = 12
+"""Largest number of trials for a value outside the interval."""
 
 
 def profile_interval(fit: Fit, name: str, *, level: float = 0.95) -> tuple[float, float]:
@@ -28,11 +29,11 @@ def profile_interval(fit: Fit, name: str, *, level: float = 0.95) -> tuple[float
 
     Args:
         fit: The solved problem.
-        name: Of the parameter.
-        level: Probability that the interval holds the true value.
+        name: Name of the parameter.
+        level: Probability that the interval contains the true value.
 
     Returns:
-        Lowest and highest value, [SI]; a bound of the parameter where that comes first.
+        Lowest and highest value within the bounds of the parameter, [SI].
 
     Raises:
         NotIdentifiableError: If the noise is unknown.
@@ -50,47 +51,55 @@ def profile_interval(fit: Fit, name: str, *, level: float = 0.95) -> tuple[float
 
 
 def _find_end(fit: Fit, index: int, factor: float, side: float) -> float:
-    """End of the interval, where the square root of twice the rise of the objective is `factor`."""
+    """End of the interval, where 2 (F − F̂) = factor², or the bound before it.
+
+    Args:
+        fit: The solved problem.
+        index: Index of the parameter.
+        factor: Student's factor q.
+        side: -1 for the lower end, 1 for the upper end.
+    """
     problem, best, sigma = fit.problem, fit.solution, fit.sigma
-    base = fit.program.solve(sigma=sigma, start=best.theta, start_passive=best.passive)
-    centre = float(base.theta[index])
+    optimum = fit.program.solve(sigma=sigma, start=best.theta, start_passive=best.passive)
+    centre = float(optimum.theta[index])
     bound = float((problem.selection.lower if side < 0.0 else problem.selection.upper)[index])
-    room = abs(bound - centre)
+    to_bound = abs(bound - centre)
     std = math.sqrt(float(fit.covariance()[index, index]))
     if std == 0.0:  # at a bound
         std = float(problem.theta_scale[index])
 
-    def rise(distance: float) -> float:
+    def excess(distance: float) -> float:
+        """√(2 (F − F̂)) − factor at a distance from the optimum, [SI]."""
         solution = fit.program.solve(
             sigma=sigma,
             start=best.theta,
             start_passive=best.passive,
             prescribed={index: centre + side * distance},
         )
-        # a decrease is rounding
-        return math.sqrt(max(2.0 * (solution.objective - base.objective), 0.0)) - factor
+        increase = max(solution.objective - optimum.objective, 0.0)  # a decrease is rounding
+        return math.sqrt(2.0 * increase) - factor
 
     inside, outside, step = 0.0, None, 1.2 * factor * std
-    for _ in range(MAX_DOUBLINGS):
-        trial = min(inside + step, room)
+    for _ in range(MAX_TRIALS):
+        trial = min(inside + step, to_bound)
         try:
-            beyond = rise(trial) > 0.0
+            is_outside = excess(trial) > 0.0
         except (ClosureError, SolverError):  # the loops do not close at this distance
             step *= 0.25
             continue
-        if beyond:
+        if is_outside:
             outside = trial
             break
-        if trial == room:
+        if trial == to_bound:
             return bound
         inside, step = trial, 2.0 * step
     if outside is None:
         raise SolverError(
-            f"the profile of {problem.free[index]} does not rise enough for an interval: the "
-            "readings contain too little information about it",
+            f"the readings contain too little information about {problem.free[index]} for a "
+            "profile-likelihood interval",
             status="no interval",
-            iterations=MAX_DOUBLINGS,
+            iterations=MAX_TRIALS,
         )
     from scipy.optimize import brentq
 
-    return centre + side * float(brentq(rise, inside, outside, xtol=SETTLED * std))
+    return centre + side * float(brentq(excess, inside, outside, xtol=END_TOLERANCE * std))

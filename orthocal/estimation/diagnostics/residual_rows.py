@@ -16,7 +16,7 @@ from orthocal.session.session import Conditions, describe_postures, known_approa
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualRow:
-    """One row of the session's readings; measured = nominal + deviation = predicted + residual."""
+    """Row of a session's readings: measured = nominal + deviation = predicted + residual."""
 
     __pydantic_config__ = CLOSED
 
@@ -25,9 +25,9 @@ class ResidualRow:
     minus: Annotated[str, Field(min_length=1)] | None
     cycle: Count
     measured: Number
-    """[m]."""
+    """Measured reading, [m]."""
     nominal: Number
-    """Prediction with the active offsets and the best gauge zero, [m]."""
+    """Prediction of the nominal machine with the active offsets and the best gauge zero, [m]."""
     linear: NumberOrNaN
     """Prediction of the linearised estimate, [m]."""
     predicted: Number
@@ -35,17 +35,18 @@ class ResidualRow:
     line: Count | None
     """Line of readings.csv."""
     file: str | None
-    """CSV file, if it is not that of the session."""
+    """CSV file, if it is not the file of the session."""
     studentised: NumberOrNaN
-    """Studentised deleted residual; NaN if no other row predicts it."""
+    """Studentised deleted residual; NaN if the other rows do not predict it."""
     influence: Number
-    """Largest change of a parameter if this row is omitted, in standard deviations of it."""
+    """Largest change of a parameter if this row is deleted, in standard deviations of the
+    parameter."""
     influenced: str
-    """Name of the parameter with this change."""
+    """Name of the parameter with the largest change."""
     unseen: NumberOrNaN
     """Measured minus predicted from all other setups, [m]; NaN if these do not determine it."""
     conditions: Conditions | None = None
-    """Conditions of the reading, where stated."""
+    """Conditions of the reading, if stated."""
 
     @property
     def deviation(self) -> float:
@@ -59,12 +60,12 @@ class ResidualRow:
 
     @property
     def postures(self) -> str:
-        """Posture with its approach, or one less another, in words."""
+        """Description of the posture with its approach, or of the difference of two postures."""
         return describe_postures(self.posture, self.minus, known_approach(self.conditions))
 
     @property
     def label(self) -> str:
-        """Setup and postures in words."""
+        """Setup and postures, for messages."""
         return f"{self.setup} {self.postures}"
 
 

@@ -1,11 +1,11 @@
 """Effect of unmodelled errors of the machine on an estimate.
 
-Offsets fitted to a machine whose legs and axes have errors absorb some of these errors. To first
-order unmodelled errors θᵤ bias the estimate by B θᵤ,
+Offsets that are fitted to a machine with errors of legs and axes absorb some of these errors. To
+first order, unmodelled errors θᵤ bias the estimate by B θᵤ,
 
     B = A⁻¹ Jᵀ Jᵤ/σ²,  A = Jᵀ J/σ² + P⁻¹
 
-so that the priors of θᵤ give a covariance that belongs to every stated uncertainty.
+The priors of θᵤ therefore add a covariance to the uncertainty of the estimate.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from orthocal.robot.model import Robot
 from orthocal.statistics.zeros import project_out_zeros
 
 FULL_MODEL = "full"
-"""Model of all errors that are not redundant, which every loaded robot has."""
+"""Model of all errors that are not redundant; every loaded robot has it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,11 +34,13 @@ class UnmodelledEffect:
     __pydantic_config__ = CLOSED
 
     names: Many[str]
+    """Names of the unmodelled errors."""
     prior_stds: Sizes
-    """Prior standard deviation of each, tolerance scale included, shape (n_unmodelled,), [SI]."""
+    """Prior standard deviation of each error with the tolerance scale, shape (n_unmodelled,),
+    [SI]."""
     leakage: Matrix
-    """Matrix B above and in docs/mathematics.md: bias of the machine's free parameters per unit of
-    each unmodelled error, shape (n_machine, n_unmodelled), [SI per SI]."""
+    """B of the module and of docs/mathematics.md: bias of the machine's free parameters per unit
+    of each unmodelled error, shape (n_machine, n_unmodelled), [SI per SI]."""
     residual_rms: Number
     """Expected RMS of the rows' residuals due to unmodelled errors within their priors, [m of the
     first gauge]."""
@@ -51,8 +53,8 @@ class UnmodelledEffect:
 
         Shape (n_machine, n_machine).
         """
-        spread = self.leakage * self.prior_stds
-        return np.asarray(spread @ spread.T)
+        biases = self.leakage * self.prior_stds
+        return np.asarray(biases @ biases.T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,8 +62,10 @@ class UnmodelledErrors:
     """Errors of the machine that a fit does not model, and their Jacobian."""
 
     names: tuple[str, ...]
+    """Names of the errors."""
     prior_stds: Array
-    """Prior standard deviation of each, tolerance scale included, shape (n_unmodelled,), [SI]."""
+    """Prior standard deviation of each error with the tolerance scale, shape (n_unmodelled,),
+    [SI]."""
     jacobian: Array
     """∂h/∂θ̂ᵤ: change of the readings by one prior standard deviation of each error, zeros
     eliminated, shape (n_entries, n_unmodelled), [m of the first gauge]."""
@@ -69,10 +73,10 @@ class UnmodelledErrors:
 
 @cached_per_robot(maxsize=8)
 def machine_errors(robot: Robot) -> tuple[str, ...]:
-    """Names of all errors that a machine has, in the robot's order.
+    """Names of all errors of a machine, in the robot's order.
 
-    These are the errors of the model `full` and, of the complete set, every drive scale and every
-    error of a closure frame.
+    These are the errors of the model `full`, and the complete errors that are drive scales or
+    errors of closure frames.
     """
     parameters = robot.parameters
     names = set(parameters.select_model(FULL_MODEL))
@@ -89,12 +93,12 @@ def find_unmodelled_errors(fit: Fit, *, represented: Collection[str] = ()) -> Un
 
     Args:
         fit: The fit.
-        represented: Names of parameters that a free base parameter stands for: they count as
+        represented: Names of parameters that free base parameters represent. They count as
             modelled.
     """
     problem = fit.problem
     parameters = problem.robot.parameters
-    # a named sum counts as its first error: the others still differ from it
+    # a sum models its first error; the other errors may differ from it
     free = problem.machine_selection.names
     modelled = {parameters[n].terms[0][0] for n in (*free, *problem.fixed, *represented)}
     names = [
@@ -114,15 +118,15 @@ def find_unmodelled_errors(fit: Fit, *, represented: Collection[str] = ()) -> Un
 
 
 def error_jacobian(fit: Fit, names: Sequence[str]) -> Array:
-    """Jacobian of the readings by errors that are not free, at the solution of a fit.
+    """Jacobian of the readings with respect to errors that are not free, at the solution of a fit.
 
     Args:
         fit: The fit.
         names: Names of the errors.
 
     Returns:
-        ∂h/∂θ̂ᵤ per stated prior standard deviation of each, zeros eliminated, shape (n_entries,
-        n_names), [m of the first gauge].
+        ∂h/∂θ̂ᵤ per stated prior standard deviation of each error, zeros eliminated, shape
+        (n_entries, n_names), [m of the first gauge].
     """
     problem, parameters = fit.problem, fit.problem.robot.parameters
     prior_stds = np.array([parameters[n].prior_std for n in names])
@@ -136,38 +140,38 @@ def error_jacobian(fit: Fit, names: Sequence[str]) -> Array:
     return project_out_zeros(linear.jacobian[:, : len(names)], problem.observations)
 
 
-def propagate_unmodelled(fit: Fit, others: UnmodelledErrors) -> tuple[UnmodelledEffect, Array]:
+def propagate_unmodelled(fit: Fit, errors: UnmodelledErrors) -> tuple[UnmodelledEffect, Array]:
     """Effect of unmodelled errors on an estimate.
 
     Returns:
-        Effect on the machine's parameters; and standard deviations of the effect on the nuisance
+        Effect on the machine's parameters, and standard deviations of the effect on the nuisance
         parameters, shape (n_nuisance,), [SI].
     """
     problem = fit.problem
     n = problem.n_machine
-    if not others.names:
-        none = UnmodelledEffect((), read_only([]), read_only(np.zeros((n, 0))), 0.0, 0.0)
-        return none, np.zeros(problem.n_free - n)
+    if not errors.names:
+        no_effect = UnmodelledEffect((), read_only([]), read_only(np.zeros((n, 0))), 0.0, 0.0)
+        return no_effect, np.zeros(problem.n_free - n)
     o, sigma = problem.observations, fit.sigma
     jacobian = project_out_zeros(fit.jacobian, o)
     inverse = fit.information.covariance(
         sigma=sigma, precision=problem.prior_precision, at_bound=fit.at_bound
     )
-    scaled = inverse @ (jacobian.T @ others.jacobian) / sigma**2
-    residual = o.rows(others.jacobian - jacobian @ scaled)
-    change = scaled * problem.theta_scale[:, None]
+    scaled = inverse @ (jacobian.T @ errors.jacobian) / sigma**2
+    residual = o.rows(errors.jacobian - jacobian @ scaled)
+    bias = scaled * problem.theta_scale[:, None]  # per prior standard deviation of each error
     effect = UnmodelledEffect(
-        names=others.names,
-        prior_stds=others.prior_stds,
-        leakage=read_only((change / others.prior_stds)[:n]),
+        names=errors.names,
+        prior_stds=errors.prior_stds,
+        leakage=read_only((bias / errors.prior_stds)[:n]),
         residual_rms=float(np.sqrt((residual**2).sum() / len(residual))),
         residual_dof=_effective_dof(residual),
     )
-    return effect, np.asarray(np.linalg.norm(change[n:], axis=1))
+    return effect, np.asarray(np.linalg.norm(bias[n:], axis=1))
 
 
 def _effective_dof(matrix: Array) -> float:
-    """Effective degrees of freedom of |S t|², t standard normal: (tr SᵀS)²/tr (SᵀS)²."""
+    """Effective degrees of freedom (tr SᵀS)²/tr (SᵀS)² of |S t|² for a standard normal t."""
     square = matrix.T @ matrix
     total = float(np.trace(square)) ** 2
     return total / float((square**2).sum()) if total > 0.0 else 0.0

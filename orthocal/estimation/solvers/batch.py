@@ -1,9 +1,9 @@
 """Batch solver: the optimum of each of many sets of readings of one problem.
 
-Gauss-Newton runs on all sets at once, from the linearised solutions, with the Jacobian of each set.
-Steps end at the bounds, by an active set for each set of readings that meets one. Sets that do not
-converge or that end far from their prior are solved one by one by variable projection, so that
-every set has the optimum that it has alone.
+The Gauss-Newton method runs on all sets at once, from the linearised solutions, with the Jacobian
+of each set. An active-set method keeps the steps within the bounds. Sets that do not converge, or
+that end far from their prior, are solved one by one by variable projection. Every set therefore has
+the same optimum as if it was solved alone.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from orthocal.arrays import Array, Mask
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.subproblem import RANK_TOLERANCE, are_far, bounded_step
-from orthocal.estimation.solvers.variable_projection import VariableProjection, are_settled
+from orthocal.estimation.solvers.variable_projection import VariableProjection, have_converged
 
 MAX_STEPS = 30
 """Largest number of common iterations."""
 
 MAX_STEP_SIZE = 100.0
-"""Longer steps mark a set that is solved alone, [prior std]."""
+"""Sets with longer steps are solved one by one, [prior std]."""
 
 MAX_JACOBIAN_NUMBERS = 2**21
-"""Largest number of numbers in the Jacobians of the sets that are solved together."""
+"""Largest count of numbers in the Jacobians of the sets that are solved together."""
 
 MAX_BATCH_STATES = 4096
 """Largest number of states of the sets that are solved together."""
@@ -41,20 +41,18 @@ class BatchSolution:
     zeros: Array
     """Gauge zeros, shape (S, n_zeros), [m of the first gauge]."""
     objective: Array
-    """Objectives as in `Solution`, shape (S,)."""
+    """Objectives (see `Solution`), shape (S,)."""
     at_bound: NDArray[np.int8]
-    """-1, 0 or 1 as in `Solution`, shape (S, n_free)."""
+    """-1, 0 or 1 (see `Solution`), shape (S, n_free)."""
     solved_alone: Mask
     """Mask of the sets that were solved one by one, shape (S,)."""
 
 
 class BatchSolver:
-    """A calibration problem for many sets of readings.
-
-    Each set is solved independently of the others.
+    """Solver of a calibration problem for many independent sets of readings.
 
     Args:
-        problem: The problem; the values of its own readings do not matter.
+        problem: The problem; the values of its readings are not used.
         options: Loss, and `max_iterations` of the sets that are solved one by one.
     """
 
@@ -65,14 +63,14 @@ class BatchSolver:
         self.options = options or SolverOptions(solver="variable-projection")
 
     def solve(self, values: ArrayLike, *, sigma: float) -> BatchSolution:
-        """Solve for each set of readings.
+        """Solve the problem for each set of readings.
 
         Args:
             values: Readings of the entries, shape (S, n_entries), [m of the first gauge].
             sigma: Standard deviation of one reading, [m].
 
         Raises:
-            SolverError: If a set does not converge, not even alone.
+            SolverError: If a set does not converge.
             ClosureError: If the machine cannot reach a posture with the start values.
         """
         problem, y = self.problem, np.asarray(values, dtype=np.float64)
@@ -94,15 +92,15 @@ class BatchSolver:
             self._solve_part(shared, y[part], solution, part)
         program = VariableProjection(problem, options=self.options)
         for i in np.flatnonzero(solution.solved_alone).tolist():
-            one = program.solve(sigma=sigma, values=y[i])
-            solution.theta[i], solution.zeros[i] = one.theta, one.zeros
-            solution.objective[i], solution.at_bound[i] = one.objective, one.at_bound
+            single = program.solve(sigma=sigma, values=y[i])
+            solution.theta[i], solution.zeros[i] = single.theta, single.zeros
+            solution.objective[i], solution.at_bound[i] = single.objective, single.at_bound
         return solution
 
     def _solve_part(
         self, shared: _BatchTask, y: Array, solution: BatchSolution, part: slice
     ) -> None:
-        """Gauss-Newton steps for some sets; fills their part of the solution."""
+        """Solve some sets by common Gauss-Newton steps, and fill their part of the solution."""
         problem, sigma = self.problem, shared.sigma
         theta = shared.linearised_solutions(y)
         passive = problem.active_passive + shared.linear.follow(theta - shared.start)
@@ -122,9 +120,9 @@ class BatchSolver:
             passive[active] += linear.follow(step)
             sizes = np.roll(sizes, 1, axis=0)
             sizes[0, active] = np.abs(step).max(axis=1)
-            settled = are_settled(sizes[:, active])
-            converged[active] = settled
-            active = active[~settled & (sizes[0, active] < MAX_STEP_SIZE)]
+            done = have_converged(sizes[:, active])
+            converged[active] = done
+            active = active[~done & (sizes[0, active] < MAX_STEP_SIZE)]
             if not active.size:
                 break
         zeros, objective, good = shared.evaluate(y, theta, reading)
@@ -133,10 +131,9 @@ class BatchSolver:
 
 
 class _BatchTask:
-    """`Task` for many sets at once.
+    """Vectorised `Task` for many sets of readings.
 
-    The same formulas, vectorised over the sets; tests/estimation/solvers/test_batch.py compares
-    both.
+    tests/estimation/solvers/test_batch.py compares both.
     """
 
     def __init__(self, problem: CalibrationProblem, options: SolverOptions, sigma: float) -> None:
@@ -155,13 +152,21 @@ class _BatchTask:
         self._inverse = np.linalg.pinv(normal, rcond=RANK_TOLERANCE, hermitian=True)
 
     def linearised_solutions(self, y: Array) -> Array:
-        """First-order solutions, clipped to the bounds, to start from, shape (S, n_free)."""
+        """Linearised solutions, clipped to the bounds, as start values θ̂, shape (S, n_free)."""
         residual = self._centre(((y - self.linear.reading) / self.sigma).T).T
         gradient = residual @ self._jacobian - self._precision * (self.start - self._mean)
         return np.asarray(np.clip(self.start + gradient @ self._inverse, self.low, self.high))
 
     def residual(self, deviation: Array) -> tuple[Array, Array, Array]:
-        """Residuals (S, n_entries) and zeros (S, n_zeros), [σ], and Σ ρ, (S,), of deviations."""
+        """Residuals with optimal zeros.
+
+        Args:
+            deviation: Readings minus predictions, shape (S, n_entries), [σ].
+
+        Returns:
+            Residuals, shape (S, n_entries), [σ]; gauge zeros, shape (S, n_zeros), [σ]; and Σ ρ,
+            shape (S,).
+        """
         n, o = len(deviation), self.problem.observations
         if self.loss.robust:
             group = (np.arange(n)[:, None] * o.n_zeros + o.zero).reshape(-1)
@@ -184,11 +189,11 @@ class _BatchTask:
 
         Args:
             theta: θ̂, shape (S, n_free).
-            residual: Shape (S, n_entries), [σ].
-            jacobian: Shape (S, n_entries, n_free), [m per prior std].
+            residual: Residuals r, shape (S, n_entries), [σ].
+            jacobian: dh/dθ̂, shape (S, n_entries, n_free), [m per prior std].
 
         Returns:
-            Steps, shape (S, n_free), and the bounds at which they end as in `Solution.at_bound`.
+            Steps, shape (S, n_free), and the bounds at which they end (see `Solution.at_bound`).
         """
         rows = jacobian / self.sigma
         gradient = (self.loss.influence(residual)[:, None] @ rows)[:, 0]
@@ -217,9 +222,16 @@ class _BatchTask:
         return result, at_bound
 
     def evaluate(self, y: Array, theta: Array, reading: Array) -> tuple[Array, Array, Mask]:
-        """Zeros (S, n_zeros), [m of the first gauge], objective (S,), and a mask (S,).
+        """Evaluate solutions of sets of readings.
 
-        The mask is True for sets that are finite and not far from the prior.
+        Args:
+            y: Readings, shape (S, n_entries), [m of the first gauge].
+            theta: θ̂, shape (S, n_free).
+            reading: Predicted readings, shape (S, n_entries), [m of the first gauge].
+
+        Returns:
+            Zeros, shape (S, n_zeros), [m of the first gauge]; objectives, shape (S,); and a mask of
+            the sets that are finite and not far from their prior, shape (S,).
         """
         _, zeros, cost = self.residual((y - reading) / self.sigma)
         objective = cost + 0.5 * (self._precision * (theta - self._mean) ** 2).sum(axis=1)
@@ -227,6 +239,6 @@ class _BatchTask:
         return zeros * self.sigma, objective, good
 
     def _centre(self, values: Array) -> Array:
-        """Rows minus the mean of those with the same free zero, shape as given."""
+        """Rows minus the mean of the rows with the same free zero, shape (n_entries, ...)."""
         means = self._free_incidence.T @ values / self._counts[:, None]
         return np.asarray(values - means[self.problem.observations.zero])

@@ -1,7 +1,7 @@
-"""The exact identification as one nonlinear program, solved by Ipopt.
+"""Exact identification as one nonlinear program that Ipopt solves.
 
 Its variables are θ̂, the gauge zeros ẑ, the passive coordinates q̂_k of every state and the values
-of manually aligned nuisance parameters. The closures of every state and these alignments are
+of manually aligned nuisance parameters. The loop closures of every state and the alignments are
 constraints (see `nlp.py`).
 """
 
@@ -31,34 +31,34 @@ from orthocal.estimation.solvers.program import (
 from orthocal.runtime.interrupts import noticed_interrupt
 
 SMALLEST_WEIGHTING_SIGMA = 5e-6
-"""Least standard deviation by which readings are weighted, [m]. The prior is scaled down with them:
-the optimum is the same, and rounding errors stay below the tolerance."""
+"""Smallest standard deviation by which readings are weighted, [m]. Below it readings and prior are
+scaled down together: the optimum is the same, and rounding errors remain below the tolerance."""
 
 FULL_TOLERANCE_READINGS = 20_000
-"""Readings from which the tolerance grows, like the rounding errors of their sum."""
+"""Number of readings above which the tolerance grows, like the rounding errors of their sum."""
 
-MOST_READINGS_FOR_EXACT_HESSIAN = 2_000
-"""Readings up to which the exact Hessian is tried if the other one does not converge."""
+MAX_EXACT_HESSIAN_READINGS = 2_000
+"""Largest number of readings for which the exact Hessian is tried if Gauss-Newton fails."""
 
-WIDENINGS = (256.0, 64.0, 16.0, 4.0, 2.0, 1.0)
-"""Widths of a robust loss as multiples of the requested one; each solution starts the next. Used
-when outliers are so large that the requested width does not converge at once."""
+WIDTH_FACTORS = (256.0, 64.0, 16.0, 4.0, 2.0, 1.0)
+"""Widths of a robust loss as multiples of the requested one; each solution starts the next. They
+are used if outliers are so large that the requested width does not converge directly."""
 
 CONVERGED = "Solve_Succeeded"
-"""Status of Ipopt for a solution; any other is an error."""
+"""Status of Ipopt for a solution; any other status is an error."""
 
-COMPLEMENTARITY = 1e-11
-"""Largest product of a bound's multiplier and the distance to it, both scaled. A parameter closer
-to its bound than the square root of this counts as at it: 16 nm for a tolerance of 10 mm."""
+COMPLEMENTARITY_TOLERANCE = 1e-11
+"""Largest product of a bound's multiplier and the distance to the bound, both scaled. A parameter
+within the square root of this counts as at its bound: 16 nm for a tolerance of 10 mm."""
 
 LARGEST_BARRIER = 1e-3
-"""Largest barrier parameter. The first step of squares is nearly the solution, so that a larger
-barrier only delays convergence: the parameters and the objective are of order one."""
+"""Largest barrier parameter. Parameters and objective are of order one, and the first step of
+squares nearly reaches the solution: a larger barrier would only delay convergence."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expressions:
-    """A nonlinear program as CasADi expressions of its variables and parameters."""
+    """Nonlinear program as CasADi expressions of its variables and parameters."""
 
     variables: ca.MX
     """x: θ̂, gauge zeros, the passive coordinates of every state and the values of manually
@@ -66,28 +66,28 @@ class Expressions:
     parameters: ca.MX
     """p: readings, weights and noise ratios of the entries, then σ and scales of prior and loss."""
     objective: ca.MX
-    """Σ ρ(r/σ) + ½ (θ − mean)ᵀ P⁻¹ (θ − mean), times (σ/5 µm)² where σ is below 5 µm."""
+    """Σ ρ(r/σ) + ½ (θ − mean)ᵀ P⁻¹ (θ − mean), times (σ/5 µm)² if σ is below 5 µm."""
     constraints: ca.MX
-    """0 where all loops are closed and aligned nuisance parameters have their values."""
+    """Residuals of loop closures and of manual alignments, scaled; 0 at a solution."""
     errors: dict[str, ca.MX]
-    """Free parameter to its value, [SI]: errors of the machine, then nuisance parameters."""
+    """Values of the free parameters by name, [SI]: errors of the machine, nuisance parameters."""
     nuisance: dict[str, ca.MX]
-    """Those of `errors` that are nuisance parameters, each from its manual alignment, [SI]."""
+    """Nuisance parameters among `errors`, as deviations from their manual alignment, [SI]."""
     zeros: ca.MX
     """Gauge zeros, shape (n_zeros,), [m of the first gauge]."""
     readings: ca.MX
-    """Predicted readings with their gauge zeros, shape (n_entries,), [m of the first gauge], in the
-    order of `problem.observations`."""
+    """Predicted readings with gauge zeros, in the order of `problem.observations`, shape
+    (n_entries,), [m of the first gauge]."""
     residuals: ca.MX
-    """Readings minus predicted ones, shape (n_entries,), [m of the first gauge]."""
+    """Measured minus predicted readings, shape (n_entries,), [m of the first gauge]."""
     passive: dict[str, ca.MX]
-    """Name of each state to its passive coordinates q, shape (n_passive,), [m, rad]."""
+    """Passive coordinates q of each state by name, shape (n_passive,), [m, rad]."""
     closures: dict[str, ca.MX]
-    """Name of each state to the residuals g of its loop closures, shape (closure_rows,), [m]."""
+    """Residuals g of the loop closures of each state by name, shape (closure_rows,), [m]."""
 
 
 class NonlinearProgram(Program):
-    """A calibration problem as a nonlinear program, built once for any number of solutions.
+    """Calibration problem as a nonlinear program, built once for any number of solutions.
 
     Args:
         problem: The problem.
@@ -113,63 +113,63 @@ class NonlinearProgram(Program):
         self._solver = self._build_solver()
 
     def with_problem(self, problem: CalibrationProblem) -> NonlinearProgram:
-        """The program for the same problem with other readings or noise ratios.
+        """Program for the same problem with other readings or noise ratios.
 
-        Its compiled functions are kept.
+        It shares the compiled functions.
         """
         other = super().with_problem(problem)
         other.__dict__.pop("_exact", None)
         return other
 
-    def _solve(self, given: SolverInput) -> Solution:
+    def _solve(self, data: SolverInput) -> Solution:
         """Solve, if necessary with the exact Hessian and with a robust loss of decreasing width.
 
         Raises:
             SolverError: If Ipopt does not converge.
             ClosureError: If the machine cannot reach a posture with the start values.
-            KeyboardInterrupt: At Ctrl-C, which CasADi would swallow.
+            KeyboardInterrupt: At Ctrl-C, which CasADi would ignore.
         """
         exact, robust = self.options.hessian == "exact", self.options.loss.robust
         try:
-            return self._run(given)
+            return self._run(data)
         except SolverError:
-            if self.problem.observations.size > MOST_READINGS_FOR_EXACT_HESSIAN or (
+            if self.problem.observations.size > MAX_EXACT_HESSIAN_READINGS or (
                 exact and not robust
             ):
                 raise
         program = self if exact else self._exact
         if not robust:
-            return program._run(given)
-        step = given
+            return program._run(data)
+        step = data
         try:
-            for width_factor in WIDENINGS:  # nearly squares first, then the requested width
+            for width_factor in WIDTH_FACTORS:  # nearly squares first, then the requested width
                 solution = program._run(step, width_factor)
                 step = replace(step, start=solution.theta, start_passive=solution.passive)
         except SolverError:
             if exact:
                 raise
-            return program._run(given)
+            return program._run(data)
         return solution
 
-    def _run(self, given: SolverInput, width_factor: float = 1.0) -> Solution:
-        """One run of Ipopt, with a multiple of the width of a robust loss."""
-        problem, sigma, prescribed = self.problem, given.sigma, given.prescribed
+    def _run(self, data: SolverInput, width_factor: float = 1.0) -> Solution:
+        """Run Ipopt once, with a multiple of the width of a robust loss."""
+        problem, sigma, prescribed = self.problem, data.sigma, data.prescribed
         lower, upper = self._bounds(prescribed)
         theta = np.clip(
-            given.start,
+            data.start,
             lower[: self._n_theta] * problem.theta_scale,
             upper[: self._n_theta] * problem.theta_scale,
         )
         x0 = self.initial_variables(
             theta,
             sigma=sigma,
-            values=given.values,
-            passive=given.start_passive,
+            values=data.values,
+            passive=data.start_passive,
             width_factor=width_factor,
         )
-        p = self._pack(sigma, given.values, given.weights, width_factor)
+        p = self._pack(sigma, data.values, data.weights, width_factor)
         with noticed_interrupt():
-            answer = self._solver(x0=x0, p=p, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
+            result = self._solver(x0=x0, p=p, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
         stats = self._solver.stats()
         status, iterations = str(stats["return_status"]), int(stats["iter_count"])
         if status != CONVERGED:
@@ -179,18 +179,18 @@ class NonlinearProgram(Program):
                 status=status,
                 iterations=iterations,
             )
-        x = np.asarray(answer["x"].full()).reshape(-1)
-        # constraints of manually aligned parameters follow, in prior standard deviations
+        x = np.asarray(result["x"].full()).reshape(-1)
+        # closures come first; constraints of manual alignments follow
         rows = problem.n_states * problem.robot.closure_rows
-        closures = np.abs(np.asarray(answer["g"].full())[:rows]).max(initial=0.0)
-        multipliers = np.asarray(answer["lam_x"].full()).reshape(-1)[: self._n_theta]
+        closures = np.abs(np.asarray(result["g"].full())[:rows]).max(initial=0.0)
+        multipliers = np.asarray(result["lam_x"].full()).reshape(-1)[: self._n_theta]
         first = self._n_theta + self._n_zeros
         passive = slice(first, first + problem.n_states * self._n_passive)
         return Solution(
             theta=x[: self._n_theta] * problem.theta_scale,
             zeros=x[self._n_theta : self._n_theta + self._n_zeros] * LENGTH_SCALE,
             passive=x[passive].reshape(-1, self._n_passive) * problem.passive_scale,
-            objective=float(answer["f"]) / _weighting(sigma)[1],
+            objective=float(result["f"]) / _weighting(sigma)[1],
             status=status,
             iterations=iterations,
             hessian=self.options.hessian,
@@ -207,43 +207,43 @@ class NonlinearProgram(Program):
         passive: Array | None = None,
         width_factor: float = 1.0,
     ) -> Array:
-        """The program's variables x with closed loops and optimal zeros, for free parameters.
+        """Variables x with closed loops and optimal zeros for values of the free parameters.
 
         Args:
             theta: Free parameters, shape (n_free,), [SI]; the active offsets by default.
             sigma: Standard deviation of one reading, [m].
             values: Readings of the entries, shape (n_entries,), [m of the first gauge]; the
                 session's by default.
-            passive: Passive coordinates to start closing the loops from, shape (n_states,
-                n_passive), [m, rad].
+            passive: Start values of the passive coordinates, shape (n_states, n_passive),
+                [m, rad].
             width_factor: Factor on the width of a robust loss.
 
         Raises:
             ClosureError: If the machine cannot reach a posture.
         """
         problem, o, loss = self.problem, self.problem.observations, self.options.loss
-        at = problem.active_theta if theta is None else np.asarray(theta, dtype=np.float64)
-        closed = problem.close(at, start=passive)
+        theta = problem.active_theta if theta is None else np.asarray(theta, dtype=np.float64)
+        closed = problem.close(theta, start=passive)
         y = problem.values if values is None else values
-        residual = (y - problem.predict(at, closed)) / sigma
-        wide = replace(loss, width=loss.width * width_factor)
+        residual = (y - problem.predict(theta, closed)) / sigma
+        widened = replace(loss, width=loss.width * width_factor)
         aligned = problem.model.alignment.aligned
-        zeros = sigma * wide.centres(residual, o.zero, o.n_zeros, weights=np.ones(o.size))
+        zeros = sigma * widened.centres(residual, o.zero, o.n_zeros, weights=np.ones(o.size))
         zeros[o.zero_known] = 0.0
         return np.concatenate(
             [
-                at / problem.theta_scale,
+                theta / problem.theta_scale,
                 zeros / LENGTH_SCALE,
                 (closed / problem.passive_scale).reshape(-1),
-                problem.nuisance_values(at)[aligned]
+                problem.nuisance_values(theta)[aligned]
                 / problem.theta_scale[problem.n_machine :][aligned],
             ]
         )
 
     def expressions(self) -> Expressions:
-        """The program as CasADi expressions, for additional terms and constraints.
+        """Program as CasADi expressions, for additional terms and constraints.
 
-        `initial_variables` and `parameter_values` give values of its variables and parameters.
+        `initial_variables` and `parameter_values` return values of its variables and parameters.
         """
         problem, o, nlp = self.problem, self.problem.observations, self._functions["nlp"]
         x, p = ca.MX.sym("x", nlp.size1_in(0)), ca.MX.sym("p", nlp.size1_in(1))
@@ -286,7 +286,7 @@ class NonlinearProgram(Program):
             sigma: Standard deviation of one reading, [m].
             values: Readings of the entries, shape (n_entries,), [m of the first gauge]; the
                 session's by default.
-            excluded: Entries not to be used, as indices.
+            excluded: Indices of the entries to exclude.
             width_factor: Factor on the width of a robust loss.
         """
         y = self.problem.values if values is None else values
@@ -299,12 +299,12 @@ class NonlinearProgram(Program):
         return np.concatenate([values, weights, self.problem.noise_ratio, [weighted, scale, width]])
 
     def functions(self) -> dict[str, ca.Function]:
-        """The program's functions of (x, p[, lam_f, lam_g]), for checks of their derivatives."""
+        """Functions of (x, p[, lam_f, lam_g]), for checks of their derivatives."""
         return dict(self._functions)
 
     @cached_property
     def _exact(self) -> NonlinearProgram:
-        """Program with the exact Hessian: slower, but it converges in more cases."""
+        """Program with the exact Hessian, which is slower but converges in more cases."""
         return NonlinearProgram(self.problem, options=replace(self.options, hessian="exact"))
 
     def _build_solver(self) -> ca.Function:
@@ -317,15 +317,15 @@ class NonlinearProgram(Program):
         ipopt: dict[str, Any] = {
             "tol": self.options.tolerance * max(1.0, entries / FULL_TOLERANCE_READINGS),
             "constr_viol_tol": self.options.closure_tolerance,
-            "compl_inf_tol": COMPLEMENTARITY,
+            "compl_inf_tol": COMPLEMENTARITY_TOLERANCE,
             "acceptable_iter": 0,
             "max_iter": self.options.max_iterations,
             "print_level": self.options.print_level,
             "sb": "yes",
-            "nlp_scaling_method": "none",  # everything is of order one already
+            "nlp_scaling_method": "none",  # variables and functions are of order one
             "linear_solver": "mumps",
-            "mumps_pivot_order": 6,  # QAMD, made for a few dense rows: the parameters
-            # with bounds: two thirds of the iterations of the monotone strategy
+            "mumps_pivot_order": 6,  # QAMD, for a few dense rows: those of the parameters
+            # two thirds of the iterations of the monotone strategy if there are bounds
             "mu_strategy": "adaptive",
             "mu_max": LARGEST_BARRIER,
             **_plain(self.options.ipopt),
@@ -340,14 +340,14 @@ class NonlinearProgram(Program):
                 "jac_g": self._functions["jac_g"],
                 "hess_lag": self._functions["hess_lag"],
                 "print_time": False,
-                "show_eval_warnings": False,  # a tip that passes its rod has no reading
+                "show_eval_warnings": False,  # a tip that misses its rod has no reading
                 "calc_lam_p": False,
                 "ipopt": ipopt,
             },
         )
 
     def _bounds(self, prescribed: Mapping[int, float]) -> tuple[Array, Array]:
-        """Scaled bounds of the variables, shape (n_variables,) each; a known zero is fixed at 0."""
+        """Scaled bounds of the variables, shape (n_variables,) each; known zeros are fixed at 0."""
         problem = self.problem
         k = problem.n_states * self._n_passive + int(problem.model.alignment.aligned.sum())
         limits = np.full(self._n_zeros + k, np.inf)
@@ -357,7 +357,7 @@ class NonlinearProgram(Program):
 
 
 def _plain(options: Mapping[str, OptionValue]) -> dict[str, float | int | str]:
-    """Options as Ipopt takes them: yes and no for truth values."""
+    """Options in the form of Ipopt, with yes and no for booleans."""
     words = {True: "yes", False: "no"}
     return {k: words[v] if isinstance(v, bool) else v for k, v in options.items()}
 
@@ -366,7 +366,7 @@ def _require_accepted(options: Mapping[str, OptionValue]) -> None:
     """Refuse options that Ipopt does not accept.
 
     Raises:
-        OrthocalError: Naming the option.
+        OrthocalError: If an option is not accepted; names it.
     """
     x = ca.MX.sym("x")
     for name, value in options.items():
@@ -391,9 +391,9 @@ def _weighting(sigma: float) -> tuple[float, float]:
 def _at_bound(
     theta: Array, multipliers: Array, lower: Array, upper: Array, prescribed: Mapping[int, float]
 ) -> NDArray[np.int8]:
-    """-1, 0 or 1 as in `Solution.at_bound`, shape (n_free,).
+    """Values of `Solution.at_bound`, shape (n_free,).
 
-    A parameter is at a bound if the bound's multiplier exceeds the parameter's distance from it.
+    A parameter is at a bound if the multiplier of the bound exceeds the distance to the bound.
     """
     result = np.zeros(theta.size, dtype=np.int8)
     result[-multipliers > np.abs(theta - lower[: theta.size])] = -1

@@ -1,4 +1,4 @@
-"""Identification to first order, as in the paper: one step from the active offsets."""
+"""Linearised identification, as in the paper: one step from the active offsets."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from orthocal.estimation.solvers.subproblem import Task
 
 
 class LinearisedProgram(Program):
-    """A calibration problem with readings to first order about the active offsets.
+    """Calibration problem with readings linearised about the active offsets.
 
-    Its only option is the loss. The start does not matter.
+    The loss is its only option. The start values are not used.
 
     Raises:
         ClosureError: If the solution cannot reach a posture.
@@ -19,15 +19,16 @@ class LinearisedProgram(Program):
 
     kind = "linearised"
 
-    def _solve(self, given: SolverInput) -> Solution:
+    def _solve(self, data: SolverInput) -> Solution:
+        """Solve the linearised problem for one set of readings."""
         problem = self.problem
-        task = Task(problem, self.options.loss, given)
-        active = task.at(problem.active_theta / problem.theta_scale, given.start_passive)
+        task = Task(problem, self.options.loss, data)
+        active = task.at(problem.active_theta / problem.theta_scale, data.start_passive)
         _, jacobian = problem.predict_and_jacobian(problem.active_theta, active.passive)
         jacobian /= task.sigma
         start = task.clip(problem.active_theta)
-        first = task.moved(active, jacobian, start - active.theta)
-        state = task.moved(first, jacobian, task.step(first, jacobian))
+        first = task.linearised_at(active, jacobian, start - active.theta)
+        state = task.linearised_at(first, jacobian, task.step(first, jacobian))
         state = replace(state, theta=state.theta.clip(task.low, task.high))
         theta = state.theta * problem.theta_scale
         passive = problem.close(theta, start=active.passive)

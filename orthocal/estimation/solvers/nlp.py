@@ -1,8 +1,8 @@
 """Functions of the complete nonlinear program, with exact and sparse derivatives.
 
-One posture and one reading are CasADi functions, mapped over postures and readings. Their results
-are gathered into the gradient, Jacobian and Hessian of the program by index, so that the time to
-build it does not grow with the session. The functions are cached in memory and on disk.
+CasADi functions of one posture and of one reading are mapped over all postures and readings. Their
+results are gathered by index into the gradient, Jacobian and Hessian of the program, so that the
+build time does not grow with the session. The functions are cached in memory and on disk.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from orthocal.kinematics.function_cache import cached_function
 
 
 class SparseSum:
-    """Sums of contributions into the nonzeros of one sparse matrix or vector."""
+    """Sparse matrix or vector whose nonzeros are sums of contributions."""
 
     def __init__(self, n_rows: int, n_columns: int) -> None:
         self._shape = (n_rows, n_columns)
@@ -32,13 +32,13 @@ class SparseSum:
         self._values: list[ca.MX] = []
 
     def add(self, rows: Indices, columns: Indices, values: ca.MX) -> None:
-        """Add values (a column vector) at positions."""
+        """Add values, a column vector, at positions of the matrix."""
         self._rows.append(np.asarray(rows, dtype=np.int64).reshape(-1))
         self._columns.append(np.asarray(columns, dtype=np.int64).reshape(-1))
         self._values.append(values)
 
     def build(self) -> ca.MX:
-        """The sparse matrix."""
+        """Build the sparse matrix."""
         rows, columns = np.concatenate(self._rows), np.concatenate(self._columns)
         values = ca.vertcat(*self._values)
         keys = columns * self._shape[0] + rows  # order of compressed columns
@@ -61,6 +61,7 @@ class SparseSum:
 
 
 def _column_starts(columns: Indices, count: int) -> list[int]:
+    """First nonzero of each column, for the columns of all nonzeros in ascending order."""
     starts = np.zeros(count + 1, dtype=np.int64)
     np.cumsum(np.bincount(columns, minlength=count), out=starts[1:])
     return [int(v) for v in starts]
@@ -69,13 +70,14 @@ def _column_starts(columns: Indices, count: int) -> list[int]:
 class ProgramFunctions:
     """Builder of the functions of a problem's program.
 
-    Variables x are θ̂, gauge zeros, the passive coordinates of every posture and the manually
-    aligned nuisance parameters, scaled. Parameters p are readings, weights and noise of each entry,
+    Variables x are θ̂, gauge zeros, the passive coordinates of every state and the manually aligned
+    nuisance parameters, scaled. Parameters p are readings, weights and noise ratios of all entries,
     then σ, the scale of the prior and the width of the loss.
 
     Args:
         problem: The problem.
-        hessian: Hessian of the Lagrangian: exact, or without curvature of readings and closures.
+        hessian: Hessian of the Lagrangian: exact, or Gauss-Newton without the curvature of readings
+            and closures.
         loss: Cost of a residual.
     """
 
@@ -86,13 +88,17 @@ class ProgramFunctions:
         self._n_zeros = problem.observations.n_zeros
         self._n_passive = problem.robot.passive_index.size
         first = self._n_theta + self._n_zeros + problem.n_states * self._n_passive
-        # the value of an aligned nuisance parameter is a variable beside its deviation in θ̂
+        # the value of an aligned nuisance parameter is a variable in addition to its deviation in θ̂
         self._aligned = problem.n_machine + np.flatnonzero(problem.model.alignment.aligned)
         self._value_of = np.arange(self._n_theta)
         self._value_of[self._aligned] = first + np.arange(self._aligned.size)
 
     def build(self) -> dict[str, ca.Function]:
-        """Objective and constraints, gradient, Jacobian and Hessian, of (x, p[, lam_f, lam_g])."""
+        """Build objective and constraints, gradient, Jacobian and Hessian.
+
+        Returns:
+            Functions nlp, grad_f, jac_g of (x, p) and hess_lag of (x, p, lam_f, lam_g).
+        """
         problem = self.problem
         k = problem.n_states
         n = self._n_theta + self._n_zeros + k * self._n_passive + self._aligned.size
@@ -111,13 +117,13 @@ class ProgramFunctions:
         diagonal = np.arange(self._n_theta)
         gradient.add(diagonal, np.zeros_like(diagonal), prior * from_mean)
         hessian.add(diagonal, diagonal, lam_f * prior)
-        for one in self._symbolic.readings:
-            objective += self._add_readings(one, x, p, shared, lam_f, gradient, hessian)
+        for expressions in self._symbolic.readings:
+            objective += self._add_readings(expressions, x, p, shared, lam_f, gradient, hessian)
         constraints, jacobian = self._add_closures(x, lam_g, shared, hessian)
 
         f, g = ca.densify(objective), ca.densify(constraints)
         grad_f = ca.densify(gradient.build())
-        functions = {
+        return {
             "nlp": ca.Function("nlp", [x, p], [f, g], ["x", "p"], ["f", "g"]),
             "grad_f": ca.Function("grad_f", [x, p], [f, grad_f], ["x", "p"], ["f", "grad_f_x"]),
             "jac_g": ca.Function("jac_g", [x, p], [g, jacobian], ["x", "p"], ["g", "jac_g_x"]),
@@ -129,7 +135,6 @@ class ProgramFunctions:
                 ["hess_gamma_x_x"],
             ),
         }
-        return functions
 
     def _passive_variables(self, states: Indices, index: Indices) -> Indices:
         """Positions in x of passive coordinates, shape (n_states, n_index)."""
@@ -137,9 +142,9 @@ class ProgramFunctions:
         return np.asarray(first + states[:, None] * self._n_passive + index[None, :])
 
     def _shared_calls(self, theta: ca.MX) -> list[ca.MX]:
-        """Functions of θ̂ alone, evaluated once for all states and readings.
+        """Values that depend on θ̂ alone, evaluated once for all states and readings.
 
-        The first is θ̂ itself. Those of placements that vary have a column for each variant.
+        The first one is θ̂. Values of placements that vary have one column per variant.
         """
         commands = self.problem.states.variant_commands
         conditions = commands[:, len(self.problem.robot.drives) :]
@@ -148,17 +153,17 @@ class ProgramFunctions:
     def _shared_arguments(
         self, shared: list[ca.MX], states: Indices
     ) -> tuple[list[ca.MX], list[bool]]:
-        """`_shared_calls` of states, and a mask of those that are common to all states."""
-        variant = self.problem.states.variant[states]
+        """Shared values for states, and a mask of the values that are common to all states."""
+        variant = self.problem.states.variant[states].tolist()
         common = [v.size2() == 1 for v in shared]
         arguments = [
-            v if one else v[:, variant.tolist()] for v, one in zip(shared, common, strict=True)
+            v if is_common else v[:, variant] for v, is_common in zip(shared, common, strict=True)
         ]
         return arguments, common
 
     def _add_readings(
         self,
-        one: ReadingExpressions,
+        expressions: ReadingExpressions,
         x: ca.MX,
         p: ca.MX,
         shared: list[ca.MX],
@@ -170,22 +175,22 @@ class ProgramFunctions:
 
         Local variables are (θ̂, ν̂, ẑ, q̂) in the order of x.
         """
-        count, n_t = one.group.entries.size, one.theta_index.size
-        theta = np.tile(one.theta_index, (count, 1))
-        variables = np.hstack([theta, self._local_variables(one)])
+        count, n_t = expressions.group.entries.size, expressions.theta_index.size
+        theta = np.tile(expressions.theta_index, (count, 1))
+        variables = np.hstack([theta, self._local_variables(expressions)])
         local = variables[:, n_t:]
-        arguments, masks = self._reading_arguments(one, local, x, p, shared)
-        functions = self._reading_functions(one)
+        arguments, masks = self._reading_arguments(expressions, local, x, p, shared)
+        functions = self._reading_functions(expressions)
 
         total = functions["objective"].map(count, masks, [True])(*arguments)
-        # the part of the gradient by θ̂ is a sum over readings, and so is that of the Hessian
+        # the parts of gradient and Hessian for θ̂ are sums over readings
         by_theta, by_local = functions["gradient"].map(count, masks, [True, False])(*arguments)
-        gradient.add(one.theta_index, np.zeros_like(one.theta_index), by_theta)
+        gradient.add(expressions.theta_index, np.zeros_like(expressions.theta_index), by_theta)
         gradient.add(local, np.zeros_like(local), ca.vec(by_local))
 
         summed, separate = functions["hessian"].map(count, masks, [True, False])(*arguments)
         rows, columns = np.triu_indices(n_t)
-        hessian.add(one.theta_index[rows], one.theta_index[columns], lam_f * summed)
+        hessian.add(expressions.theta_index[rows], expressions.theta_index[columns], lam_f * summed)
         rows, columns = _rest_of_triangle(variables.shape[1], n_t)
         rows, columns = variables[:, rows], variables[:, columns]
         # nuisance parameters that setups share may have any order
@@ -193,42 +198,44 @@ class ProgramFunctions:
         hessian.add(*upper, lam_f * ca.vec(separate))
         return total
 
-    def _local_variables(self, one: ReadingExpressions) -> Indices:
+    def _local_variables(self, expressions: ReadingExpressions) -> Indices:
         """Positions in x of the (ν̂, ẑ, q̂) of a sensor group's entries, shape (n, n_local)."""
-        o, entries = self.problem.observations, one.group.entries
+        o, entries = self.problem.observations, expressions.group.entries
         return np.hstack(
             [
-                self._value_of[self.problem.n_machine + one.group.nuisance],
+                self._value_of[self.problem.n_machine + expressions.group.nuisance],
                 (self._n_theta + o.zero[entries])[:, None],
-                self._passive_variables(o.state[entries], one.passive_index),
-                self._passive_variables(o.second[entries], one.second_index),
+                self._passive_variables(o.state[entries], expressions.passive_index),
+                self._passive_variables(o.second[entries], expressions.second_index),
             ]
         )
 
     def predict(self, x: ca.MX, p: ca.MX) -> ca.MX:
-        """Predicted readings of all entries, gauge zeros at 0, shape (n_entries,).
+        """Predicted readings of all entries, gauge zeros at 0.
 
         Args:
             x: Variables of the program.
             p: Parameters of the program.
 
         Returns:
-            In metres of the first gauge.
+            Shape (n_entries,), [m of the first gauge].
         """
         shared = self._shared_calls(x[: self.problem.n_machine])
         values, entries = [], []
-        for one in self._symbolic.readings:
-            local = self._local_variables(one)
-            arguments, masks = self._reading_arguments(one, local, x, p, shared)
-            function = self._reading_functions(one)["reading"]
-            values.append(ca.vec(function.map(one.group.entries.size, masks, [False])(*arguments)))
-            entries.append(one.group.entries)
+        for expressions in self._symbolic.readings:
+            local = self._local_variables(expressions)
+            arguments, masks = self._reading_arguments(expressions, local, x, p, shared)
+            function = self._reading_functions(expressions)["reading"]
+            values.append(
+                ca.vec(function.map(expressions.group.entries.size, masks, [False])(*arguments))
+            )
+            entries.append(expressions.group.entries)
         order = np.argsort(np.concatenate(entries)) if entries else np.empty(0, dtype=np.int64)
         return ca.vertcat(ca.MX(0, 1), *values)[order.tolist()]
 
     def _reading_arguments(
         self,
-        one: ReadingExpressions,
+        expressions: ReadingExpressions,
         local: Indices,
         x: ca.MX,
         p: ca.MX,
@@ -237,13 +244,13 @@ class ProgramFunctions:
         """Arguments of the mapped functions of a sensor group, and a mask of the common ones.
 
         Args:
-            one: The reading.
-            local: Positions in x of its (ν̂, ẑ, q̂), shape (n, n_local).
+            expressions: A reading of the group.
+            local: Positions in x of (ν̂, ẑ, q̂) of its entries, shape (n, n_local).
             x: Variables of the program.
             p: Parameters of the program.
-            shared: Functions of θ̂ alone, as `_shared_calls` returns them.
+            shared: Result of `_shared_calls`.
         """
-        problem, o, group = self.problem, self.problem.observations, one.group
+        problem, o, group = self.problem, self.problem.observations, expressions.group
         count, n_u = group.nuisance.shape
         references = problem.model.reference_commands
         prior_stds = problem.theta_scale[problem.n_machine + group.nuisance]
@@ -259,27 +266,27 @@ class ProgramFunctions:
         ]
         if group.reading.pairs:
             separate.append(_columns(problem.states.commands[o.second[group.entries]]))
-        of_machine, of_all = self._shared_arguments(shared, o.state[group.entries])
+        machine, machine_mask = self._shared_arguments(shared, o.state[group.entries])
         common = [p[3 * o.size], p[3 * o.size + 2]]
-        masks = [False] * len(separate) + [True] * len(common) + of_all
-        return [*separate, *common, *of_machine], masks
+        masks = [False] * len(separate) + [True] * len(common) + machine_mask
+        return [*separate, *common, *machine], masks
 
     def _cached(self, name: str, build: Callable[[], ca.Function]) -> ca.Function:
-        """A cached function of one posture or one reading; its constants are part of the key."""
+        """Cached function of one posture or one reading; its constants are part of the key."""
         problem = self.problem
         parts = [name, self.hessian, self.loss.kind, self._symbolic.error_map.digest]
         parts += [problem.passive_scale.tobytes().hex(), str(problem.n_free - problem.n_machine)]
         digest = hashlib.sha256("\n".join(parts).encode()).hexdigest()
         return cached_function(problem.robot, f"program {digest}", build)
 
-    def _reading_functions(self, one: ReadingExpressions) -> dict[str, ca.Function]:
+    def _reading_functions(self, expressions: ReadingExpressions) -> dict[str, ca.Function]:
         """Cached functions of a reading: value, objective, gradient and Hessian."""
-        sensor = one.group.reading.name
+        sensor = expressions.group.reading.name
         built: dict[str, ca.Function] = {}
 
         def build(name: str) -> ca.Function:
-            if not built:  # all of them from the same expressions
-                built.update(self._build_reading(one))
+            if not built:  # all functions at once, from the same expressions
+                built.update(self._build_reading(expressions))
             return built[name]
 
         return {
@@ -287,33 +294,38 @@ class ProgramFunctions:
             for name in ("reading", "objective", "gradient", "hessian")
         }
 
-    def _build_reading(self, one: ReadingExpressions) -> dict[str, ca.Function]:
+    def _build_reading(self, expressions: ReadingExpressions) -> dict[str, ca.Function]:
+        """Functions of a reading by name: value, objective, gradient and Hessian."""
         zero, y, weight = ca.SX.sym("zero"), ca.SX.sym("y"), ca.SX.sym("weight")
         sigma, width, loss = ca.SX.sym("sigma"), ca.SX.sym("width"), self.loss
-        n_t, n_u = one.theta_index.size, one.nuisance.numel()
+        n_t, n_u = expressions.theta_index.size, expressions.nuisance.numel()
         noise, scaled = ca.SX.sym("noise"), ca.SX.sym("scaled", n_u)
         prior_stds = ca.SX.sym("prior_stds", n_u)
-        residual = (y - one.reading / noise - zero * LENGTH_SCALE) / sigma
+        residual = (y - expressions.reading / noise - zero * LENGTH_SCALE) / sigma
         row = -ca.horzcat(
-            one.by_theta / noise,
-            one.by_nuisance @ ca.diag(prior_stds) / noise,
+            expressions.by_theta / noise,
+            expressions.by_nuisance @ ca.diag(prior_stds) / noise,
             LENGTH_SCALE,
-            one.by_passive / noise,
+            expressions.by_passive / noise,
         )
         row = ca.densify(row / sigma)
         influence = weight * loss.influence(residual, width)
         gradient = (influence * row).T
         exact = self.hessian == "exact"
-        # Gauss-Newton uses the secant ρ'/r, which is never below ρ'': at large residuals, where ρ
-        # is nearly straight, a step with ρ'' is much too long
-        bend = loss.curvature(residual, width) if exact else loss.weight(residual, width)
-        second = weight * bend * (row.T @ row)
+        # Gauss-Newton uses the secant ρ'/r, which is never below ρ'': for large residuals, where ρ
+        # is nearly linear, a step with ρ'' is much too long
+        curvature = loss.curvature(residual, width) if exact else loss.weight(residual, width)
+        second = weight * curvature * (row.T @ row)
         if exact:
-            second += influence * self._reading_curvature(one, zero, prior_stds) / (-sigma * noise)
+            second += (
+                influence
+                * self._reading_curvature(expressions, zero, prior_stds)
+                / (-sigma * noise)
+            )
         symbolic = self._symbolic
-        inputs = [scaled, prior_stds, zero, symbolic.passive_of(one), y, weight, noise]
-        inputs += [symbolic.command, symbolic.reference, one.constants]
-        inputs += [symbolic.second[0]] if one.group.reading.pairs else []
+        inputs = [scaled, prior_stds, zero, symbolic.passive_of(expressions), y, weight, noise]
+        inputs += [symbolic.command, symbolic.reference, expressions.constants]
+        inputs += [symbolic.second[0]] if expressions.group.reading.pairs else []
         inputs += [sigma, width, *symbolic.error_map.symbols]
 
         def pick(rows: Indices, columns: Indices) -> ca.SX:
@@ -321,7 +333,7 @@ class ProgramFunctions:
 
         triangle = np.triu_indices(n_t), _rest_of_triangle(row.numel(), n_t)
         outputs = {
-            "reading": [one.reading / noise],
+            "reading": [expressions.reading / noise],
             "objective": [weight * loss.value(residual, width)],
             "gradient": [gradient[:n_t], gradient[n_t:]],
             "hessian": [pick(*triangle[0]), pick(*triangle[1])],
@@ -332,20 +344,22 @@ class ProgramFunctions:
                 name,
                 inputs,
                 [
-                    ca.densify(ca.substitute(v, one.nuisance, nuisance) if n_u else v)
+                    ca.densify(ca.substitute(v, expressions.nuisance, nuisance) if n_u else v)
                     for v in values
                 ],
             )
             for name, values in outputs.items()
         }
 
-    def _reading_curvature(self, one: ReadingExpressions, zero: ca.SX, prior_stds: ca.SX) -> ca.SX:
-        """Second derivatives of h by (θ̂, ν̂, ẑ, q̂)."""
+    def _reading_curvature(
+        self, expressions: ReadingExpressions, zero: ca.SX, prior_stds: ca.SX
+    ) -> ca.SX:
+        """Second derivatives of h with respect to (θ̂, ν̂, ẑ, q̂)."""
         symbolic = self._symbolic
-        theta = symbolic.theta[one.theta_index.tolist()]
-        passive = symbolic.passive_of(one)
-        u = ca.vertcat(theta, one.nuisance, zero, passive)
-        second, _ = ca.hessian(symbolic.direct_reading(one), u)
+        theta = symbolic.theta[expressions.theta_index.tolist()]
+        passive = symbolic.passive_of(expressions)
+        u = ca.vertcat(theta, expressions.nuisance, zero, passive)
+        second, _ = ca.hessian(symbolic.direct_reading(expressions), u)
         ones = ca.SX.ones(theta.numel()), ca.SX.ones(1 + passive.numel())
         scale = ca.diag(ca.vertcat(ones[0], prior_stds, ones[1]))
         return ca.densify(scale @ second @ scale)
@@ -353,7 +367,7 @@ class ProgramFunctions:
     def _add_closures(
         self, x: ca.MX, lam_g: ca.MX, shared: list[ca.MX], hessian: SparseSum
     ) -> tuple[ca.MX, ca.MX]:
-        """Closures of all states and their Jacobian; their curvature goes into the Hessian."""
+        """Closures of all states and their Jacobian; adds their curvature to the Hessian."""
         problem = self.problem
         k, n_p = problem.n_states, self._n_passive
         n_g, first = problem.robot.closure_rows, self._n_theta + self._n_zeros
@@ -367,8 +381,8 @@ class ProgramFunctions:
         machine = np.tile(np.arange(problem.n_machine), (k, 1))
         variables = np.hstack([machine, self._passive_variables(np.arange(k), np.arange(n_p))])
         jacobian = SparseSum(k * n_g + self._aligned.size, x.numel())
-        of_machine, of_all = self._shared_arguments(shared, np.arange(k))
-        arguments, masks = [passive, commands, *of_machine], [False, False, *of_all]
+        values, mask = self._shared_arguments(shared, np.arange(k))
+        arguments, masks = [passive, commands, *values], [False, False, *mask]
         constraints = ca.vec(closure_f.map(k, masks, [False])(*arguments))
         nonzeros = jacobian_f.map(k, masks, [False])(*arguments).nz[:]
         rows = np.arange(k)[:, None] * n_g + pattern_rows[None, :]
@@ -379,12 +393,12 @@ class ProgramFunctions:
         if self._aligned.size:
             matrix, start = self._alignment_constraints()
             constraints = ca.vertcat(constraints, matrix @ x + start)
-            of_rows, columns = (np.array(v) for v in matrix.sparsity().get_triplet())
-            jacobian.add(k * n_g + of_rows, columns, ca.MX(ca.DM(matrix.nonzeros())))
+            rows, columns = (np.array(v) for v in matrix.sparsity().get_triplet())
+            jacobian.add(k * n_g + rows, columns, ca.MX(ca.DM(matrix.nonzeros())))
         return constraints, jacobian.build()
 
     def _closure_function(self, name: str) -> ca.Function:
-        """The closures of a posture, or their sparse Jacobian by (θ̂, q̂)."""
+        """Function of the closures of a posture, or of their sparse Jacobian ∂ĝ/∂(θ̂, q̂)."""
 
         def build() -> ca.Function:
             symbolic = self._symbolic
@@ -396,9 +410,10 @@ class ProgramFunctions:
         return self._cached(name, build)
 
     def _alignment_constraints(self) -> tuple[ca.DM, ca.DM]:
-        """Matrix and constants of A x + b = 0 for the manually aligned nuisance parameters.
+        """Matrix A and constants b of A x + b = 0 for manually aligned nuisance parameters.
 
-        In prior std: alignment (a function of the errors) plus deviation minus value.
+        A x + b is the alignment (a function of the errors) plus the deviation minus the value,
+        [prior std].
         """
         problem, n = self.problem, self.problem.n_machine
         index, scale = self._aligned - n, problem.theta_scale[self._aligned]
@@ -414,7 +429,7 @@ class ProgramFunctions:
     def _add_closure_curvature(
         self, arguments: list[ca.MX], variables: Indices, hessian: SparseSum
     ) -> None:
-        """Σ λᵀ ∇²ĝ of every state; arguments are q̂, commands, θ̂ and λ."""
+        """Add λᵀ ∇²ĝ of every state to the Hessian; arguments are q̂, commands, θ̂ and λ."""
         symbolic = self._symbolic
         multiplier = ca.SX.sym("multiplier", self.problem.robot.closure_rows)
         u = ca.vertcat(symbolic.theta, symbolic.passive)
@@ -432,17 +447,17 @@ class ProgramFunctions:
         masks = [False, False, True, False], [True, False]
         summed, local = function.map(len(variables), *masks)(*arguments)
         hessian.add(rows[summed_part], columns[summed_part], summed)
-        places = variables[:, rows[~summed_part]], variables[:, columns[~summed_part]]
-        hessian.add(*places, ca.vec(local))
+        positions = variables[:, rows[~summed_part]], variables[:, columns[~summed_part]]
+        hessian.add(*positions, ca.vec(local))
 
 
 def _columns(rows: Array) -> ca.MX:
-    """Constants with one row for each call of a mapped function, as columns."""
+    """Constants, one row per call of a mapped function, as columns."""
     return ca.MX(ca.DM(rows.T))
 
 
 def _rest_of_triangle(n: int, n_first: int) -> tuple[Indices, Indices]:
-    """The upper triangle of n variables without that of the first ones."""
+    """Positions in the upper triangle of n variables, except that of the first n_first."""
     rows, columns = np.triu_indices(n)
-    others = columns >= n_first
-    return rows[others], columns[others]
+    rest = columns >= n_first
+    return rows[rest], columns[rest]

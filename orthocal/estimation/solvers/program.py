@@ -1,4 +1,4 @@
-"""Interface of the solvers. The same problem gives the same solution."""
+"""Interface of the solvers, which are deterministic."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from orthocal.estimation.options import Hessian, SolverKind, SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 
 EXCLUDED_WEIGHT = 1e-9
-"""Weight of excluded readings: negligible, but their gauge zeros stay determined."""
+"""Weight of excluded readings: negligible, but it determines their gauge zeros."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,8 +32,9 @@ class Solution:
     objective: float
     """Objective: Σ ρ((y − h − z)/σ) plus the contribution of the prior."""
     status: str
-    """Status as Ipopt names it."""
+    """Status in the terms of Ipopt."""
     iterations: int
+    """Number of iterations."""
     hessian: Hessian
     """Hessian of the solver; always Gauss-Newton for solvers other than Ipopt."""
     closure: float
@@ -44,7 +45,7 @@ class Solution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolverInput:
-    """One set of readings to solve for."""
+    """Set of readings, with start values and prescribed parameters."""
 
     sigma: float
     """Standard deviation of one reading, [m]."""
@@ -53,15 +54,15 @@ class SolverInput:
     weights: Array
     """Weights of the entries, shape (n_entries,): 1, or `EXCLUDED_WEIGHT` for excluded ones."""
     start: Array
-    """Free parameters to start from, shape (n_free,), [SI]."""
+    """Start values of the free parameters, shape (n_free,), [SI]."""
     start_passive: Array | None
-    """Passive coordinates to start closing the loops from, (n_states, n_passive), [m, rad]."""
+    """Start values of the passive coordinates, (n_states, n_passive), [m, rad]."""
     prescribed: Mapping[int, float]
-    """Index of a free parameter to its prescribed value, [SI]."""
+    """Indices of free parameters, mapped to prescribed values, [SI]."""
 
 
 class Program(ABC):
-    """A problem prepared for a solver, for any number of solutions.
+    """Problem prepared for a solver, for any number of solutions.
 
     Args:
         problem: The problem.
@@ -77,9 +78,9 @@ class Program(ABC):
         self.options = options or SolverOptions(solver=self.kind)
 
     def with_problem(self, problem: CalibrationProblem) -> Self:
-        """The program for the same problem with other readings or noise ratios.
+        """Program for the same problem with other readings or noise ratios.
 
-        Its compiled functions are kept.
+        It shares the compiled functions.
         """
         other = copy.copy(self)
         other.problem = problem
@@ -101,14 +102,15 @@ class Program(ABC):
             sigma: Standard deviation of one reading, [m].
             values: Readings of the entries, shape (n_entries,), [m of the first gauge]; the
                 session's by default.
-            start: Free parameters to start from, shape (n_free,), [SI]; the active offsets by
+            start: Start values of the free parameters, shape (n_free,), [SI]; the active offsets by
                 default.
-            start_passive: Passive coordinates to start closing the loops from.
+            start_passive: Start values of the passive coordinates, shape (n_states, n_passive),
+                [m, rad].
             excluded: Indices of the entries to exclude.
-            prescribed: Index of a free parameter to its prescribed value, [SI].
+            prescribed: Indices of free parameters, mapped to prescribed values, [SI].
 
         Raises:
-            SolverError: If it does not converge.
+            SolverError: If the solver does not converge.
             ClosureError: If the machine cannot reach a posture with the start values.
         """
         problem = self.problem
@@ -131,14 +133,14 @@ class Program(ABC):
         return weights
 
     @abstractmethod
-    def _solve(self, given: SolverInput) -> Solution:
+    def _solve(self, data: SolverInput) -> Solution:
         """Solve for one set of readings."""
 
 
 def scaled_bounds(
     problem: CalibrationProblem, prescribed: Mapping[int, float]
 ) -> tuple[Array, Array]:
-    """Lower and upper bounds of θ̂, shape (n_free,), equal for prescribed parameters."""
+    """Lower and upper bounds of θ̂, shape (n_free,) each; equal for prescribed parameters."""
     lower, upper = (
         b / problem.theta_scale for b in (problem.selection.lower, problem.selection.upper)
     )
@@ -148,7 +150,7 @@ def scaled_bounds(
 
 
 def advise(options: SolverOptions) -> str:
-    """Advice after a solver did not converge, or converged to an impossible machine."""
+    """Advice if a solver does not converge, or converges to an impossible machine."""
     return "Look for a reading with a wrong sign or in a wrong row" + (
         "" if options.loss.robust else "; the robust loss ('huber') may show which one"
     )

@@ -1,4 +1,4 @@
-"""The problem in its free parameters alone, for one set of readings, and its Gauss-Newton step.
+"""Problem in its free parameters alone, for one set of readings, and its Gauss-Newton step.
 
 The passive coordinates follow the parameters by the implicit function theorem, ∂q/∂θ = −g_q⁻¹ g_θ.
 Free gauge zeros have their optimal values. The remaining problem is small and dense.
@@ -17,46 +17,47 @@ from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.program import Solution, SolverInput, scaled_bounds
 from orthocal.observation.model import ReadingLinearisation
 
-SETTLED_WITHIN = 1e-11
+SUBPROBLEM_TOLERANCE = 1e-11
 """Last step of a subproblem with a robust loss, [prior std]."""
 
-MOST_STEPS_WITHIN = 100
+MAX_SUBPROBLEM_STEPS = 100
 """Largest number of steps of a subproblem with a robust loss."""
 
 RANK_TOLERANCE = 1e-13
-"""Eigenvalues of the normal matrix below this part of the largest count as zero."""
+"""Eigenvalues of the normal matrix below this fraction of the largest one count as zero."""
 
-FAR = 8.0
-"""Deviation of a parameter from the mean of its prior at which an optimum is doubted, [prior std].
-Machines within their tolerances have none: it is a local minimum, or readings are wrong."""
+MAX_PRIOR_DEVIATION = 8.0
+"""Deviation of a parameter from the mean of its prior above which an optimum is doubtful,
+[prior std]: it is a local minimum, or readings are wrong."""
 
-FEW = 50
-"""Size of systems that NumPy solves faster than SciPy's triangular solver is imported."""
+MAX_NUMPY_SIZE = 50
+"""Largest system that NumPy solves in less time than the import of SciPy takes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Iterate:
-    """The problem at some θ̂, or to first order near it."""
+    """Problem at a point θ̂."""
 
     theta: Array
     """θ̂, shape (n_free,)."""
     passive: Array
-    """Passive coordinates, not updated by first-order changes, (n_states, n_passive), [m, rad]."""
+    """Passive coordinates, (n_states, n_passive), [m, rad]; those of the linearisation if the
+    problem was linearised."""
     deviation: Array
-    """Readings minus predictions, with gauge zeros, shape (n_entries,), [σ]."""
+    """Readings minus predictions without gauge zeros, shape (n_entries,), [σ]."""
     zeros: Array
     """Gauge zeros, shape (n_zeros,), [σ]."""
     objective: float
-    """Objective as in `Solution`."""
+    """Objective (see `Solution`)."""
 
 
 class Task:
-    """One set of readings, with their weights and the bounds of θ̂.
+    """Problem for one set of readings, with their weights and the bounds of θ̂.
 
     Args:
         problem: The problem.
         loss: Cost of a residual.
-        given: Readings, weights, start and prescribed values.
+        data: Readings, weights, start and prescribed values.
 
     Attributes:
         sigma: Standard deviation of one reading, [m].
@@ -65,13 +66,17 @@ class Task:
         high: Upper bounds of θ̂, shape (n_free,).
     """
 
-    def __init__(self, problem: CalibrationProblem, loss: Loss, given: SolverInput) -> None:
-        self.problem, self.loss, self.given = problem, loss, given
-        self.sigma, self.weights = given.sigma, given.weights
-        self.low, self.high = scaled_bounds(problem, given.prescribed)
+    def __init__(self, problem: CalibrationProblem, loss: Loss, data: SolverInput) -> None:
+        self.problem, self.loss, self.data = problem, loss, data
+        self.sigma, self.weights = data.sigma, data.weights
+        self.low, self.high = scaled_bounds(problem, data.prescribed)
 
     def clip(self, theta: Array) -> Array:
-        """θ̂ within the bounds, shape (n_free,) of free parameters in SI."""
+        """θ̂ within the bounds, shape (n_free,).
+
+        Args:
+            theta: Free parameters, shape (n_free,), [SI].
+        """
         return np.clip(theta / self.problem.theta_scale, self.low, self.high)
 
     def solution(
@@ -81,7 +86,7 @@ class Task:
 
         Args:
             state: The optimum.
-            jacobian: dh/dθ̂ there, shape (n_entries, n_free), [σ per prior std].
+            jacobian: dh/dθ̂ at the optimum, shape (n_entries, n_free), [σ per prior std].
             passive: Passive coordinates, shape (n_states, n_passive), [m, rad].
             iterations: Number of iterations.
         """
@@ -89,7 +94,7 @@ class Task:
         at_bound = np.zeros(state.theta.size, dtype=np.int8)
         at_bound[(state.theta <= self.low) & (gradient > 0.0)] = -1
         at_bound[(state.theta >= self.high) & (gradient < 0.0)] = 1
-        at_bound[list(self.given.prescribed)] = 0
+        at_bound[list(self.data.prescribed)] = 0
         return Solution(
             theta=state.theta * self.problem.theta_scale,
             zeros=state.zeros * self.sigma,
@@ -103,112 +108,120 @@ class Task:
         )
 
     def at(self, theta: Array, passive: Array | None) -> Iterate:
-        """The problem at some θ̂, shape (n_free,).
+        """Problem at a point with closed loops.
+
+        Args:
+            theta: θ̂, shape (n_free,).
+            passive: Start values of the passive coordinates, shape (n_states, n_passive), [m, rad].
 
         Raises:
-            ClosureError: If the machine cannot reach a posture there.
+            ClosureError: If the machine cannot reach a posture.
         """
         problem = self.problem
-        si = theta * problem.theta_scale
-        closed = problem.close(si, start=passive)
-        return self._state(
-            theta, closed, (self.given.values - problem.predict(si, closed)) / self.sigma
-        )
+        theta_si = theta * problem.theta_scale
+        closed = problem.close(theta_si, start=passive)
+        deviation = (self.data.values - problem.predict(theta_si, closed)) / self.sigma
+        return self._state(theta, closed, deviation)
 
     def begin(self) -> tuple[Iterate, ReadingLinearisation]:
-        """The problem at the start of a solver.
+        """Problem and its linearisation at the start values.
 
         Raises:
-            ClosureError: If the machine cannot reach a posture there.
-            SolverError: If a sensor has no reading there.
+            ClosureError: If the machine cannot reach a posture.
+            SolverError: If a sensor has no reading.
         """
-        problem, at, passive = (
-            self.problem,
-            self.clip(self.given.start),
-            self.given.start_passive,
-        )
-        at_active = np.array_equal(at * problem.theta_scale, problem.active_theta)
+        problem, passive = self.problem, self.data.start_passive
+        theta = self.clip(self.data.start)
+        at_active = np.array_equal(theta * problem.theta_scale, problem.active_theta)
         if passive is None and at_active:
             passive = problem.active_passive
         else:
             first = problem.active_passive if passive is None else passive
-            passive = problem.close(at * problem.theta_scale, start=first)
-        linear = self.linearise(at, passive)
+            passive = problem.close(theta * problem.theta_scale, start=first)
+        linear = self.linearise(theta, passive)
         if not np.isfinite(linear.jacobian).all():
             raise SolverError(
-                "cannot begin: on the machine that the readings lead to a tip passes what it "
-                "touched, or a sensor shows nothing; look for a wrong sign, row or setup",
+                "cannot start: with the start values of the errors a tip misses its target, or a "
+                "sensor has no reading; look for a wrong sign, row or setup",
                 status="Invalid_Number_Detected",
                 iterations=0,
             )
-        return self.near(at, passive, linear), linear
+        return self.near(theta, passive, linear), linear
 
     def linearise(self, theta: Array, passive: Array) -> ReadingLinearisation:
-        """Readings to first order about some θ̂ and passive coordinates near closed loops."""
+        """Linearise readings about θ̂ and passive coordinates near closed loops."""
         return self.problem.linearise(theta * self.problem.theta_scale, passive)
 
     def near(self, theta: Array, passive: Array, linear: ReadingLinearisation) -> Iterate:
-        """The problem at some θ̂, with loops closed to first order."""
+        """Problem at θ̂, with loops closed to first order."""
         predicted = linear.reading + linear.opening
-        return self._state(theta, passive, (self.given.values - predicted) / self.sigma)
+        return self._state(theta, passive, (self.data.values - predicted) / self.sigma)
 
-    def moved(self, state: Iterate, jacobian: Array, change: Array) -> Iterate:
-        """The problem to first order at another θ̂; arguments as for `step`."""
-        return self._state(state.theta + change, state.passive, state.deviation - jacobian @ change)
-
-    def step(self, state: Iterate, jacobian: Array) -> Array:
-        """Change of θ̂ that solves the problem with readings to first order, shape (n_free,).
-
-        Least squares take one solve. A robust loss takes Newton's method with weights ρ''; where
-        that does not decrease the objective, with the secant ρ'/r, which always does.
+    def linearised_at(self, state: Iterate, jacobian: Array, change: Array) -> Iterate:
+        """Linearised problem at another θ̂.
 
         Args:
             state: The point of linearisation.
-            jacobian: dh/dθ̂ there, shape (n_entries, n_free), [σ per prior std].
+            jacobian: dh/dθ̂ at this point, shape (n_entries, n_free), [σ per prior std].
+            change: Change of θ̂, shape (n_free,).
         """
-        at = state
-        if not self.loss.robust:
-            return self._change(at, jacobian, self.weights)
-        for _ in range(MOST_STEPS_WITHIN):
-            residual = at.deviation - at.zeros[self.problem.observations.zero]
-            for weights in (self.loss.curvature(residual), self.loss.weight(residual)):
-                change = self._change(at, jacobian, self.weights * weights)
-                trial = self.moved(at, jacobian, change)
-                if trial.objective <= at.objective:
-                    break
-            settled = float(np.abs(change).max(initial=0.0)) < SETTLED_WITHIN
-            if settled or trial.objective > at.objective:
-                break
-            at = trial
-        return np.asarray(at.theta - state.theta)
+        return self._state(state.theta + change, state.passive, state.deviation - jacobian @ change)
 
-    def _change(self, at: Iterate, jacobian: Array, weights: Array) -> Array:
+    def step(self, state: Iterate, jacobian: Array) -> Array:
+        """Change of θ̂ that solves the linearised problem, shape (n_free,).
+
+        Squares need one linear solution. A robust loss needs Newton's method with weights ρ''. If
+        this does not decrease the objective, the weights are those of the secant ρ'/r, which always
+        decrease it.
+
+        Args:
+            state: The point of linearisation.
+            jacobian: dh/dθ̂ at this point, shape (n_entries, n_free), [σ per prior std].
+        """
+        present = state
+        if not self.loss.robust:
+            return self._newton_step(present, jacobian, self.weights)
+        for _ in range(MAX_SUBPROBLEM_STEPS):
+            residual = present.deviation - present.zeros[self.problem.observations.zero]
+            for weights in (self.loss.curvature(residual), self.loss.weight(residual)):
+                change = self._newton_step(present, jacobian, self.weights * weights)
+                trial = self.linearised_at(present, jacobian, change)
+                if trial.objective <= present.objective:
+                    break
+            converged = float(np.abs(change).max(initial=0.0)) < SUBPROBLEM_TOLERANCE
+            if converged or trial.objective > present.objective:
+                break
+            present = trial
+        return np.asarray(present.theta - state.theta)
+
+    def _newton_step(self, state: Iterate, jacobian: Array, weights: Array) -> Array:
         """Newton step with weights of the entries, within the bounds, shape (n_free,)."""
-        square = self._square(jacobian, weights)
-        square[np.diag_indices_from(square)] += self.problem.prior_precision
-        limits = self.low - at.theta, self.high - at.theta
-        return bounded_step(square, -self.gradient(at, jacobian), *limits)
+        normal = self._normal_matrix(jacobian, weights)
+        normal[np.diag_indices_from(normal)] += self.problem.prior_precision
+        limits = self.low - state.theta, self.high - state.theta
+        return bounded_step(normal, -self.gradient(state, jacobian), *limits)
 
     def gradient(self, state: Iterate, jacobian: Array) -> Array:
-        """Gradient of the objective by θ̂, shape (n_free,)."""
+        """Gradient of the objective with respect to θ̂, shape (n_free,)."""
         residual = state.deviation - state.zeros[self.problem.observations.zero]
-        prior = self.problem.prior_precision * self._off(state.theta)
+        prior = self.problem.prior_precision * self._from_mean(state.theta)
         return np.asarray(prior - jacobian.T @ (self.weights * self.loss.influence(residual)))
 
     def _state(self, theta: Array, passive: Array, deviation: Array) -> Iterate:
-        o, off = self.problem.observations, self._off(theta)
+        """Problem with optimal gauge zeros for deviations, shape (n_entries,), [σ]."""
+        o, from_mean = self.problem.observations, self._from_mean(theta)
         zeros = self.loss.centres(deviation, o.zero, o.n_zeros, weights=self.weights)
         zeros[o.zero_known] = 0.0
-        prior = 0.5 * float(off @ (self.problem.prior_precision * off))
+        prior = 0.5 * float(from_mean @ (self.problem.prior_precision * from_mean))
         cost = float(self.weights @ self.loss.value(deviation - zeros[o.zero]))
         return Iterate(theta, passive, deviation, zeros, cost + prior)
 
-    def _off(self, theta: Array) -> Array:
+    def _from_mean(self, theta: Array) -> Array:
         """Deviation of θ̂ from the mean of its prior, shape (n_free,)."""
         return np.asarray(theta - self.problem.prior_mean / self.problem.theta_scale)
 
-    def _square(self, jacobian: Array, weights: Array) -> Array:
-        """Jᵀ W J of rows minus the weighted mean of those with the same free zero."""
+    def _normal_matrix(self, jacobian: Array, weights: Array) -> Array:
+        """Normal matrix Jᵀ W J with free zeros eliminated, shape (n_free, n_free)."""
         o = self.problem.observations
         sums = o.sum_by_zero(jacobian, weights)
         sums[o.zero_known] = 0.0
@@ -218,14 +231,16 @@ class Task:
 
 
 def are_far(problem: CalibrationProblem, theta: Array) -> Mask:
-    """Mask of the solutions with a parameter `FAR` from the mean of its prior.
+    """Mask of the solutions with a parameter far from the mean of its prior.
 
     Args:
         problem: The problem.
         theta: θ̂, shape (..., n_free).
     """
-    off = theta - problem.prior_mean / problem.theta_scale
-    return np.asarray((np.abs(off * problem.prior_precision) > FAR).any(axis=-1))
+    deviation = theta - problem.prior_mean / problem.theta_scale
+    return np.asarray(
+        (np.abs(deviation * problem.prior_precision) > MAX_PRIOR_DEVIATION).any(axis=-1)
+    )
 
 
 def bounded_step(square: Array, gradient: Array, low: Array, high: Array) -> Array:
@@ -245,7 +260,7 @@ def bounded_step(square: Array, gradient: Array, low: Array, high: Array) -> Arr
         scaled, target, scale = scaled[np.ix_(order, order)], target[order], scale[order]
     try:
         factor: Array = np.asarray(np.linalg.cholesky(scaled).T, dtype=np.float64)
-    except np.linalg.LinAlgError:  # undetermined parameters: the smallest change
+    except np.linalg.LinAlgError:  # undetermined parameters: shortest step
         values, vectors = np.linalg.eigh(scaled)
         large = values > RANK_TOLERANCE * values.max(initial=0.0)
         step = vectors[:, large] @ ((vectors[:, large].T @ target) / values[large])
@@ -259,8 +274,8 @@ def bounded_step(square: Array, gradient: Array, low: Array, high: Array) -> Arr
 
 
 def _solve_triangular(factor: Array, target: Array, *, transposed: bool = False) -> Array:
-    """Solution s of R s = t, or Rᵀ s = t, R upper triangular, shape (n,)."""
-    if len(factor) <= FEW:
+    """Solution s of R s = t, or of Rᵀ s = t, for an upper triangular R, shape (n,)."""
+    if len(factor) <= MAX_NUMPY_SIZE:
         return np.asarray(np.linalg.solve(factor.T if transposed else factor, target))
     from scipy import linalg
 
@@ -268,23 +283,23 @@ def _solve_triangular(factor: Array, target: Array, *, transposed: bool = False)
 
 
 def _bounded(factor: Array, target: Array, low: Array, high: Array, *, n_limited: int) -> Array:
-    """Vector s that minimises ‖R s − t‖ within bounds, R upper triangular, shape (n,).
+    """Vector s that minimises ‖R s − t‖ within bounds, for an upper triangular R, shape (n,).
 
-    The last components alone have bounds. They minimise the last rows, in which no others appear;
-    the others then solve their rows exactly.
+    Only the last n_limited components have bounds. They minimise the last rows, in which no other
+    component appears. The other components then solve the first rows exactly.
     """
-    open_solution = _solve_triangular(factor, target)
-    if ((open_solution >= low) & (open_solution <= high)).all():
-        return open_solution
+    unbounded = _solve_triangular(factor, target)
+    if ((unbounded >= low) & (unbounded <= high)).all():
+        return unbounded
     from scipy.optimize import lsq_linear
 
     n = len(target) - n_limited
     result = np.where(high > low, 0.0, low)
     movable = n + np.flatnonzero((high > low)[n:])
     corner = factor[n:]
-    remainder = target[n:] - corner @ result
+    right_side = target[n:] - corner @ result
     limits = low[movable], high[movable]
-    solution = lsq_linear(corner[:, movable], remainder, bounds=limits, method="bvls", tol=1e-15)
+    solution = lsq_linear(corner[:, movable], right_side, bounds=limits, method="bvls", tol=1e-15)
     result[movable] = solution.x
     result[:n] = _solve_triangular(factor[:n, :n], target[:n] - factor[:n, n:] @ result[n:])
     return result

@@ -1,4 +1,4 @@
-"""A calibration problem as CasADi expressions of one posture and of one reading.
+"""Calibration problem as CasADi expressions of one posture and of one reading.
 
 The variables are scaled to order one:
 
@@ -24,15 +24,16 @@ from orthocal.sensors.compiled import express_reading
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadingExpressions:
-    """One reading of a sensor group, in the variables that it depends on."""
+    """Reading of a sensor group as expressions of the variables on which it depends."""
 
     group: SensorGroup
+    """The sensor group."""
     passive_index: Indices
-    """Indices of the passive coordinates that it depends on."""
+    """Indices of the passive coordinates on which the reading depends."""
     second_index: Indices
-    """The same in the second posture of a pair; empty for a reading in one posture."""
+    """Indices of the passive coordinates in the second posture of a pair; empty for others."""
     theta_index: Indices
-    """Indices of the free parameters of the machine that it depends on."""
+    """Indices of the free parameters of the machine on which the reading depends."""
     constants: ca.SX
     """Constants of the sensor and conditions of the reading, shape (n_constants,)."""
     nuisance: ca.SX
@@ -40,11 +41,11 @@ class ReadingExpressions:
     reading: ca.SX
     """h, [m]."""
     by_nuisance: ca.SX
-    """∂h by the nuisance parameters, shape (1, n_nuisance)."""
+    """∂h/∂ν, shape (1, n_nuisance), [m per SI unit]."""
     by_passive: ca.SX
-    """∂h/∂q̂ of the passive coordinates, those of the second posture last, shape (1, n), [m]."""
+    """∂h/∂q̂, with the second posture last, shape (1, n), [m]."""
     by_theta: ca.SX
-    """∂h/∂θ̂ of the free parameters, shape (1, n), [m]."""
+    """∂h/∂θ̂, shape (1, n), [m]."""
 
 
 class SymbolicProblem:
@@ -58,7 +59,7 @@ class SymbolicProblem:
         command: Symbol of the command of a posture, shape (n_command,).
         reference: Symbol of the command of the reference posture, shape (n_command,).
         passive: Symbol of q̂ of a posture, shape (n_passive,).
-        second: Symbols of command and q̂ of the second posture of a pair.
+        second: Symbols of the command and of q̂ in the second posture of a pair.
     """
 
     def __init__(self, problem: CalibrationProblem) -> None:
@@ -81,7 +82,7 @@ class SymbolicProblem:
 
     @cached_property
     def closure(self) -> tuple[ca.SX, ca.SX]:
-        """ĝ of one posture, (closure_rows,), and ∂ĝ by (θ̂, q̂), (closure_rows, n)."""
+        """ĝ of one posture, (closure_rows,), and ∂ĝ/∂(θ̂, q̂), (closure_rows, n)."""
         shared, scale = self.error_map, self.problem.passive_scale
         g, g_a, g_q, g_t = self.problem.functions.closure_expressions(
             shared.actuated(self.command), self.passive * scale, shared.placements
@@ -92,15 +93,16 @@ class SymbolicProblem:
 
     @cached_property
     def readings(self) -> tuple[ReadingExpressions, ...]:
-        """One reading of each sensor group."""
+        """Expressions of one reading of each sensor group."""
         return tuple(self._express(group) for group in self.problem.model.groups)
 
     def _express(self, group: SensorGroup) -> ReadingExpressions:
+        """Expressions of one reading of a sensor group."""
         shared, scale = self.error_map, self.problem.passive_scale
         constants = ca.SX.sym("constants", group.constants.shape[1])
         nuisance = ca.SX.sym("nuisance", group.nuisance.shape[1])
         command, passive = self.second
-        of_second = [shared.actuated(command), passive * scale] if group.reading.pairs else []
+        second_posture = [shared.actuated(command), passive * scale]
         h, h_a, h_q, h_t, h_r, h_nu, *by_second = group.reading.expression(
             shared.actuated(self.command),
             self.passive * scale,
@@ -108,7 +110,7 @@ class SymbolicProblem:
             shared.actuated(self.reference),
             constants,
             nuisance,
-            *of_second,
+            *(second_posture if group.reading.pairs else []),
         )
         by_theta = shared.chain(h_t, h_a, self.command)
         by_theta += shared.chain(ca.SX(*h_t.shape), h_r, self.reference)
@@ -116,12 +118,12 @@ class SymbolicProblem:
         if by_second:
             h_a2, h_q2 = by_second
             by_theta += shared.chain(ca.SX(*h_t.shape), h_a2, command)
-        by_theta, parts = ca.sparsify(by_theta), [ca.sparsify(h_q), ca.sparsify(h_q2)]
-        theta_index, indices = _columns_of(by_theta), [_columns_of(part) for part in parts]
+        by_theta, by_q = ca.sparsify(by_theta), [ca.sparsify(h_q), ca.sparsify(h_q2)]
+        theta_index, indices = _used_columns(by_theta), [_used_columns(row) for row in by_q]
         by_passive = ca.horzcat(
             *(
-                part[0, index.tolist()] * ca.SX(scale[index]).T
-                for part, index in zip(parts, indices, strict=True)
+                row[0, index.tolist()] * ca.SX(scale[index]).T
+                for row, index in zip(by_q, indices, strict=True)
             )
         )
         return ReadingExpressions(
@@ -137,10 +139,11 @@ class SymbolicProblem:
             by_theta=by_theta[0, theta_index.tolist()],
         )
 
-    def passive_of(self, one: ReadingExpressions) -> ca.SX:
-        """Symbols of q̂ that a reading depends on, those of the second posture last."""
-        here, second = self.passive, self.second[1]
-        return ca.vertcat(here[one.passive_index.tolist()], second[one.second_index.tolist()])
+    def passive_of(self, expressions: ReadingExpressions) -> ca.SX:
+        """Symbols of q̂ on which a reading depends, with the second posture last."""
+        first, second = self.passive, self.second[1]
+        indices = expressions.passive_index.tolist(), expressions.second_index.tolist()
+        return ca.vertcat(first[indices[0]], second[indices[1]])
 
     # ---- direct expressions of θ̂ and q̂, for second derivatives
 
@@ -150,23 +153,22 @@ class SymbolicProblem:
         scale = closure_row_units(self.problem.robot) / LENGTH_SCALE
         return self._machines[0].closure_residual() * scale
 
-    def direct_reading(self, one: ReadingExpressions) -> ca.SX:
-        """H of a reading, [m]."""
+    def direct_reading(self, expressions: ReadingExpressions) -> ca.SX:
+        """Reading h, [m]."""
         robot, setups = self.problem.robot, list(self.problem.session.setups.values())
-        sensor = setups[int(one.group.setups[0])].sensor
+        sensor = setups[int(expressions.group.setups[0])].sensor
         frames = sensor.frames(robot)
         kinds = frames.in_posture, frames.at_zero, frames.in_second
         poses, at_zero, second = (
             [machine.frame_pose(f) for f in names]
             for machine, names in zip(self._machines, kinds, strict=True)
         )
-        return express_reading(
-            robot, sensor, poses, at_zero, one.constants, one.nuisance, second=second
-        )
+        constants, nuisance = expressions.constants, expressions.nuisance
+        return express_reading(robot, sensor, poses, at_zero, constants, nuisance, second=second)
 
     @cached_property
     def _machines(self) -> tuple[SymbolicRobot, SymbolicRobot, SymbolicRobot]:
-        """The machine in a posture, in the reference posture and in a second posture."""
+        """Machine in a posture, in the reference posture and in a second posture."""
         problem, robot, n = self.problem, self.problem.robot, len(self.problem.robot.drives)
         errors: dict[str, ca.SX | float] = dict(problem.fixed)
         names = problem.machine_selection.names
@@ -185,6 +187,6 @@ class SymbolicProblem:
         )
 
 
-def _columns_of(row: ca.SX) -> Indices:
-    """Indices of the columns of a sparse row that are not empty."""
+def _used_columns(row: ca.SX) -> Indices:
+    """Indices of the nonzeros of a sparse row."""
     return np.array(sorted(set(row.sparsity().get_col())), dtype=np.int64)

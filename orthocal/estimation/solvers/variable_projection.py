@@ -1,15 +1,16 @@
-"""Variable projection: the exact identification by Gauss-Newton on θ alone.
+"""Variable projection: the exact identification by the Gauss-Newton method on θ alone.
 
 Passive joints and gauge zeros are eliminated. About the present θ the problem is linear except for
-a robust loss; this subproblem is solved completely, within the bounds. The passive joints follow
-the step to first order. If the loops stay nearly closed and the objective decreases, their opening
-is corrected in the next step. Otherwise the loops are closed and the step is halved until the
-objective decreases. Steps that take back the last one are relaxed. The optimum is that of the
-complete program, which Ipopt solves.
+a robust loss. This subproblem is solved completely, within the bounds. The passive joints follow
+the step to first order. If the loops remain nearly closed and the objective decreases, their
+opening is corrected in the next step. Otherwise the loops are closed and the step is halved until
+the objective decreases. A step that reverses most of the last one is relaxed. The optimum is that
+of the complete program, which Ipopt solves.
 
-About a start that is far off, the first steps can be so long that they end in a local minimum.
-Where the result is far from its prior, or there is none, the problem is solved again with readings
-of less weight first, which keep the steps short. The better optimum counts.
+From start values far from the optimum, the first steps can be so long that they end in a local
+minimum. If the result is far from its prior, or the solver does not converge, the problem is solved
+again. Readings then have lower weights first, which shortens the steps. The better optimum is
+returned.
 """
 
 from __future__ import annotations
@@ -25,76 +26,79 @@ from orthocal.estimation.solvers.program import Program, Solution, SolverInput, 
 from orthocal.estimation.solvers.subproblem import Iterate, Task, are_far
 from orthocal.observation.model import ReadingLinearisation
 
-SETTLED = 1e-8
+STEP_TOLERANCE = 1e-8
 """Estimated next step at which the solver has converged, extrapolated from the ratio of the last
 steps, [prior std]."""
 
-NEARLY_CLOSED = 1e-3
-"""Largest correction of a passive coordinate that readings are taken to follow to first order,
-[rad] or characteristic lengths: its square moves a reading by less than a micrometre."""
+MAX_CORRECTION = 1e-3
+"""Largest correction of a passive coordinate that readings follow to first order, [rad] or
+characteristic lengths: its square changes a reading by less than a micrometre."""
 
 RELAXATIONS = (16.0, 4.0, 1.0)
 """Factors on the standard deviation of the readings; each solution starts the next."""
 
-MOST_HALVINGS = 12
+MAX_HALVINGS = 12
+"""Largest number of halvings of a step."""
 
 OVERSHOOT = 0.5
-"""Part of a step that the next one takes back from which on steps are relaxed."""
+"""Largest part of a step that the next step may reverse without being relaxed."""
 
-LEAST_SHARE = 0.1
+MIN_SHARE = 0.1
 """Smallest part of a relaxed step."""
 
-ROUNDING = 1e-12
-"""Relative growth of the objective that counts as rounding."""
+OBJECTIVE_TOLERANCE = 1e-12
+"""Relative growth of the objective that counts as a rounding error."""
 
 
 class VariableProjection(Program):
-    """A calibration problem reduced to its free parameters.
+    """Calibration problem that is reduced to its free parameters.
 
-    Its options are iterations and loss; other options do not apply.
+    Its options are `max_iterations` and `loss`.
     """
 
     kind = "variable-projection"
 
-    def _solve(self, given: SolverInput) -> Solution:
+    def _solve(self, data: SolverInput) -> Solution:
+        """Solve directly, and with increasing weights if that fails or ends far from the prior."""
         try:
-            first = self._run(given)
+            direct = self._run(data)
         except (ClosureError, SolverError):
             try:
-                return self._approach(given)
+                return self._solve_relaxed(data)
             except (ClosureError, SolverError):
                 pass
             raise
-        if not are_far(self.problem, first.theta / self.problem.theta_scale):
-            return first
+        if not are_far(self.problem, direct.theta / self.problem.theta_scale):
+            return direct
         try:
-            other = self._approach(given)
+            relaxed = self._solve_relaxed(data)
         except (ClosureError, SolverError):
-            return first
-        iterations = first.iterations + other.iterations
-        return replace(min(first, other, key=lambda s: s.objective), iterations=iterations)
+            return direct
+        iterations = direct.iterations + relaxed.iterations
+        return replace(min(direct, relaxed, key=lambda s: s.objective), iterations=iterations)
 
-    def _approach(self, given: SolverInput) -> Solution:
-        """The solution with readings that gain weight step by step.
+    def _solve_relaxed(self, data: SolverInput) -> Solution:
+        """Solve with weights of the readings that increase step by step.
 
         Raises:
-            SolverError, ClosureError: As `_run`.
+            SolverError: If the solver does not converge.
+            ClosureError: If a solution cannot reach a posture.
         """
-        at, iterations = given, 0
+        step, iterations = data, 0
         for factor in RELAXATIONS:
-            solution = self._run(replace(at, sigma=factor * given.sigma))
-            at = replace(at, start=solution.theta, start_passive=solution.passive)
+            solution = self._run(replace(step, sigma=factor * data.sigma))
+            step = replace(step, start=solution.theta, start_passive=solution.passive)
             iterations += solution.iterations
         return replace(solution, iterations=iterations)
 
-    def _run(self, given: SolverInput) -> Solution:
-        """One descent from the start, with open loops, or else with closed ones.
+    def _run(self, data: SolverInput) -> Solution:
+        """Descend once from the start values with open loops; if that fails, with closed loops.
 
         Raises:
-            SolverError: If it does not converge.
+            SolverError: If the solver does not converge.
             ClosureError: If the solution cannot reach a posture.
         """
-        task = Task(self.problem, self.options.loss, given)
+        task = Task(self.problem, self.options.loss, data)
         start = task.begin()
         try:
             state, jacobian, iterations = self._descend(task, start, follow=True)
@@ -113,20 +117,20 @@ class VariableProjection(Program):
             follow: Let passive joints follow a step to first order.
 
         Raises:
-            SolverError: If it does not converge.
+            SolverError: If the solver does not converge.
             ClosureError: If the solution cannot reach a posture.
         """
-        most = self.options.max_iterations
+        max_iterations = self.options.max_iterations
         sizes, before, share = np.full(3, np.inf), None, 1.0
         state, linear = begin
-        for iterations in range(1, most + 1):
+        for iterations in range(1, max_iterations + 1):
             jacobian = linear.jacobian
             jacobian /= task.sigma  # in place: it may be large, and is not used again
             step = task.step(state, jacobian)
             sizes = np.r_[np.abs(step).max(initial=0.0), sizes[:2]]
             share = _relax(step, before, share)
             before, step = step, share * step
-            if follow and are_settled(sizes):
+            if follow and have_converged(sizes):
                 theta = np.clip(state.theta + step, task.low, task.high)
                 passive = state.passive + linear.follow(theta - state.theta)
                 return task.at(theta, passive), jacobian, iterations
@@ -134,61 +138,64 @@ class VariableProjection(Program):
             if followed is not None:
                 state, linear = followed
                 continue
-            whole = np.abs(step).max(initial=0.0)
+            length = np.abs(step).max(initial=0.0)
             state, step = self._move(task, state, step)
             sizes[0] = np.abs(step).max(initial=0.0)
-            share *= sizes[0] / whole if whole else 1.0
-            if are_settled(sizes):
+            share *= sizes[0] / length if length else 1.0
+            if have_converged(sizes):
                 return state, jacobian, iterations
             linear = task.linearise(state.theta, state.passive)
         raise SolverError(
             f"did not converge: the step is still {sizes[0]:.2g} prior standard deviations "
-            f"after {most} iterations; there is no result. {advise(self.options)}",
+            f"after {max_iterations} iterations; there is no result. {advise(self.options)}",
             status="Maximum_Iterations_Exceeded",
-            iterations=most,
+            iterations=max_iterations,
         )
 
     def _follow(
         self, task: Task, state: Iterate, linear: ReadingLinearisation, step: Array
     ) -> tuple[Iterate, ReadingLinearisation] | None:
-        """A full step with passive joints that follow it; None if the loops open too far."""
+        """State after a full step with open loops; None if they open too far or it is worse."""
         theta = np.clip(state.theta + step, task.low, task.high)
         passive = state.passive + linear.follow(theta - state.theta)
         try:
-            following = task.linearise(theta, passive)
+            linear = task.linearise(theta, passive)
         except np.linalg.LinAlgError:
             return None
-        motion = np.abs(following.correction / task.problem.passive_scale).max(initial=0.0)
-        if not motion * LENGTH_SCALE < NEARLY_CLOSED * task.problem.robot.characteristic_length:
+        correction = np.abs(linear.correction / task.problem.passive_scale).max(initial=0.0)
+        if (
+            not correction * LENGTH_SCALE
+            < MAX_CORRECTION * task.problem.robot.characteristic_length
+        ):
             return None
-        after = task.near(theta, passive, following)
-        return (after, following) if after.objective <= _no_more_than(state) else None
+        trial = task.near(theta, passive, linear)
+        return (trial, linear) if _is_not_worse(trial, state) else None
 
     def _move(self, task: Task, state: Iterate, step: Array) -> tuple[Iterate, Array]:
         """Halve a step until the objective decreases, with closed loops.
 
         Raises:
-            SolverError: If it never does.
+            SolverError: If it does not decrease.
         """
-        for halving in range(MOST_HALVINGS):
+        for halving in range(MAX_HALVINGS):
             part = step * 0.5**halving
             try:
                 trial = task.at(np.clip(state.theta + part, task.low, task.high), state.passive)
-            except ClosureError:  # the machine cannot reach a posture there
+            except ClosureError:  # out of reach: a shorter step
                 continue
-            if trial.objective <= _no_more_than(state):
+            if _is_not_worse(trial, state):
                 return trial, part
-            if np.abs(part).max(initial=0.0) < SETTLED:
+            if np.abs(part).max(initial=0.0) < STEP_TOLERANCE:
                 return state, np.zeros_like(step)
         raise SolverError(
-            "did not converge: no step makes it better; there is no result. "
+            "did not converge: no step improves the fit; there is no result. "
             f"{advise(self.options)}",
             status="Restoration_Failed",
-            iterations=MOST_HALVINGS,
+            iterations=MAX_HALVINGS,
         )
 
 
-def are_settled(sizes: Array) -> Mask:
+def have_converged(sizes: Array) -> Mask:
     """Mask of the solutions whose next step is negligible, extrapolated from the last three.
 
     Args:
@@ -197,27 +204,32 @@ def are_settled(sizes: Array) -> Mask:
     with np.errstate(invalid="ignore", divide="ignore"):
         last = np.where(np.isfinite(sizes[1]), sizes[0] / sizes[1], np.inf)
         before = np.where(np.isfinite(sizes[2]), sizes[1] / sizes[2], 0.0)
-        return np.asarray((sizes[0] <= SETTLED) | (sizes[0] * np.maximum(last, before) <= SETTLED))
+        return np.asarray(
+            (sizes[0] <= STEP_TOLERANCE) | (sizes[0] * np.maximum(last, before) <= STEP_TOLERANCE)
+        )
 
 
 def _relax(step: Array, before: Array | None, share: float) -> float:
-    """Share of a Gauss-Newton step to take, where the last one went too far (Aitken).
+    """Relaxation factor of a Gauss-Newton step, below 1 if the last step went too far (Aitken).
 
-    Gauss-Newton neglects the curvature of readings. Along a parameter that changes them to second
-    order only, such as a fixed ball across the plane of motion, steps alternate and may not shrink.
+    The Gauss-Newton method neglects the curvature of readings. Some parameters change readings only
+    to second order, such as the position of a fixed ball across the plane of motion. Along them
+    steps alternate and may not become shorter.
 
     Args:
         step: The step, shape (n_free,), [prior std].
-        before: The one before, all of it.
-        share: Share of it that was taken.
+        before: The last step without relaxation, shape (n_free,), [prior std]; None at the start.
+        share: Relaxation factor of the last step.
     """
     if before is None:
         return 1.0
     if share == 1.0 and not step @ before < -OVERSHOOT * (before @ before):
         return 1.0
     change = before - step
-    return float(np.clip(share * (before @ change) / (change @ change), LEAST_SHARE, 1.0))
+    return float(np.clip(share * (before @ change) / (change @ change), MIN_SHARE, 1.0))
 
 
-def _no_more_than(state: Iterate) -> float:
-    return state.objective + ROUNDING * max(abs(state.objective), 1.0)
+def _is_not_worse(trial: Iterate, state: Iterate) -> bool:
+    """True if the objective of a trial does not exceed that of a state, except by rounding."""
+    rounding = OBJECTIVE_TOLERANCE * max(abs(state.objective), 1.0)
+    return trial.objective <= state.objective + rounding

@@ -1,12 +1,12 @@
-"""Inverse kinematics of a calibrated machine in few numbers: a closed form and a polynomial.
+"""Approximate inverse kinematics of a calibrated machine: a closed form and a polynomial.
 
     q(p, T) = nominal(p) + f(clamp(p)) + (clamp(T) − T₀) g(clamp(p))
 
 f is a polynomial of the lowest total degree that meets the tolerance. On a machine that expands
-with its temperature T, g is one of the same degree, per kelvin from the reference T₀. Beyond the
-region their argument is clamped to the faces. The error is evaluated at points that are not fitted:
-inside the region and on its faces, edges and corners, at temperatures over their range. There the
-calibrated machine, with its loops closed, is compared with the commanded point.
+with its temperature T, g is a polynomial of the same degree, per kelvin from the reference T₀.
+Beyond the region their argument is clamped to the faces. The error is evaluated at points that are
+not fitted: inside the region and on its faces, edges and corners, over the range of temperatures.
+It is the distance of the calibrated machine, with its loops closed, from the commanded point.
 """
 
 from __future__ import annotations
@@ -38,34 +38,34 @@ from orthocal.units import MM, UM
 LETTERS = "XYZABC"
 """Coordinates of LinuxCNC in its order."""
 
-MOST_DEGREE = {1: 14, 2: 14, 3: 10}
-"""Number of coordinates to the highest degree; higher ones gain less than they cost."""
+MAX_DEGREE = {1: 14, 2: 14, 3: 10}
+"""Highest degree by number of coordinates; higher degrees cost more than they gain."""
 
 EXTRA_NODES = 3
-"""Nodes a side beyond the highest degree."""
+"""Number of nodes per coordinate, minus the highest degree."""
 
-CHECKED = 1000
-"""Number of checked points inside the region, and on its faces, edges and corners."""
+CHECKS = 1000
+"""Number of checked points inside the region, and number on its faces and edges."""
 
-CHECKED_FIRST = 100
-"""Number of points at which degrees that are too low are refused, of those on the surface."""
+QUICK_CHECKS = 100
+"""Number of the last checked points, on the surface, that refuse low degrees quickly."""
 
-RESERVE = 1.1
-"""Factor on the largest error at the checked points."""
+ERROR_MARGIN = 1.1
+"""Assumed ratio of the largest error to the largest error at the checked points."""
 
-BEYOND = 5e-3
-"""Distance beyond a face at which the error is stated, [m]."""
+BEYOND_FACE = 5e-3
+"""Distance beyond a face for which the error is stated, [m]."""
 
-LONGER = 10e-3
-"""Change of the tool's length of which the effect is stated, [m]."""
+LONGER_TOOL = 10e-3
+"""Change of the tool's length for which the error is stated, [m]."""
 
-WARMER = 15.0
-"""Temperatures to both sides of the reference that a module covers at least, [K]."""
+TEMPERATURE_RANGE = 15.0
+"""Smallest range to both sides of the reference temperature that a module covers, [K]."""
 
-HEAVIER = 1.0
-"""Change of the payload of which the effect is stated, [kg]."""
+HEAVIER_PAYLOAD = 1.0
+"""Change of the payload for which the error is stated, [kg]."""
 
-EVERY = slice(None)
+ALL_ROWS = slice(None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,28 +73,34 @@ class ThermalChange:
     """Change of the correction with the temperature of the machine."""
 
     reference: float
-    """Temperature without a change, [°C]."""
+    """Temperature at which the change is 0, [°C]."""
     lowest: float
+    """Lower limit to which the temperature is clamped, [°C]."""
     highest: float
-    """Limits to which the temperature is clamped, [°C]."""
+    """Upper limit to which the temperature is clamped, [°C]."""
     per_kelvin: Polynomial
     """Change of the drive coordinates, [m/K, rad/K]."""
 
     def __call__(self, points: Array, temperature: float) -> Array:
-        """Changes, shape (k, n_drives), [m, rad], at points of the region, shape (k, n), [m]."""
+        """Changes of the drive coordinates, shape (k, n_drives), [m, rad].
+
+        Args:
+            points: Points of the region, shape (k, n), [m].
+            temperature: Temperature of the machine, [°C].
+        """
         warmer = min(max(temperature, self.lowest), self.highest) - self.reference
         return np.asarray(warmer * self.per_kelvin(points))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectedInverse:
-    """Drive coordinates for points of the tool."""
+    """Approximate inverse kinematics: drive coordinates for points of the tool."""
 
     nominal: NominalForm
     correction: Polynomial
     """Correction of the drive coordinates over the region, [m, rad]."""
     thermal: ThermalChange | None = None
-    """Its change with temperature; None for a machine that does not depend on it."""
+    """Change of the correction with temperature; None if the machine does not depend on it."""
 
     @property
     def lower(self) -> Array:
@@ -110,8 +116,8 @@ class CorrectedInverse:
         """Drive coordinates, shape (k, n_drives), [m, rad].
 
         Args:
-            points: Shape (k, n), [m].
-            temperature: Of the machine, [°C]; the reference by default.
+            points: Points of the tool, shape (k, n), [m].
+            temperature: Temperature of the machine, [°C]; the reference by default.
         """
         clamped = np.clip(points, self.lower, self.upper)
         drives = self.nominal(points) + self.correction(clamped)
@@ -125,13 +131,13 @@ class Approximation:
     """Approximate inverse kinematics with their errors."""
 
     inverse: CorrectedInverse
-    """Points of the tool to drive coordinates of the encoders, without offsets."""
+    """Function from points of the tool to encoder coordinates without offsets."""
     tool: Array
     """Tip in the frame of the robot's tool centre point, shape (3,), [m]."""
     coordinates: tuple[int, ...]
-    """World coordinates that the drives control."""
+    """Indices of the world coordinates that the drives command."""
     achieved: float
-    """Largest error of the tip at the checked points, with the reserve, [m]."""
+    """Largest error of the tip at the checked points times ERROR_MARGIN, [m]."""
     checked: int
     """Number of checked points."""
     nominal: float | None
@@ -142,16 +148,17 @@ class Approximation:
     longer: float
     """Largest error for a tip 10 mm farther in any direction, [m]."""
     unheated: float | None
-    """Largest error within the range of temperatures of a module without a thermometer, [m]; None
-    for a machine that does not depend on the temperature."""
+    """Largest error without a thermometer over the range of temperatures, [m]; None if the machine
+    does not depend on temperature."""
     payload: float | None
-    """Mass on the tool for which it holds, [kg]; None for a machine that does not depend on it."""
+    """Mass on the tool for which the approximation holds, [kg]; None if the machine does not depend
+    on it."""
     heavier: float | None
-    """Largest error with 1 kg more on the tool, [m]; None as `payload`."""
+    """Largest error with 1 kg more on the tool, [m]; None if the machine does not depend on it."""
 
     @property
     def region(self) -> str:
-        """Limits of the region, mm: X -60 to 60, Y -60 to 60."""
+        """Limits of the region in mm, such as X -60 to 60, Y -60 to 60."""
         limits = zip(self.coordinates, self.inverse.lower, self.inverse.upper, strict=True)
         return ", ".join(
             f"{LETTERS[k]} {millimetres([low])} to {millimetres([high])}" for k, low, high in limits
@@ -164,7 +171,7 @@ def millimetres(values: Iterable[float]) -> str:
 
 
 def rounded_up(value: float) -> str:
-    """Number with two digits, rounded up."""
+    """Number with two significant digits, rounded up."""
     if not math.isfinite(value) or value <= 0.0:
         return f"{value:g}"
     decimals = 1 - math.floor(math.log10(value))
@@ -184,26 +191,27 @@ class _State:
     """Drive coordinates at the checked points at the reference temperature, shape (n_checks,
     n_drives), [m, rad]."""
     passive: Array
-    """Passive coordinates there, from which loops are closed, (n_checks, n_passive), [m, rad]."""
+    """Passive coordinates at the checked points, from which the closure of the loops starts, shape
+    (n_checks, n_passive), [m, rad]."""
 
     def error(
         self,
         checks: Array,
         inverse: CorrectedInverse,
         *,
-        cold: bool = False,
-        rows: slice = EVERY,
+        at_reference: bool = False,
+        rows: slice = ALL_ROWS,
     ) -> float:
-        """Largest error at the checked points, [m]; infinite out of reach.
+        """Largest error at the checked points, [m]; infinite if a point is out of reach.
 
         Args:
-            checks: Shape (n_checks, n), [m].
+            checks: Checked points, shape (n_checks, n), [m].
             inverse: The approximation.
-            cold: Whether it does not know the temperature.
-            rows: Points that are checked.
+            at_reference: Whether the approximation assumes the reference temperature.
+            rows: Selection of the checked points.
         """
         points = checks[rows]
-        drives = inverse(points, None if cold else self.temperature)
+        drives = inverse(points, None if at_reference else self.temperature)
         tip_error = _tip_error(self.tip, points, drives, start=self.passive[rows])
         return math.inf if tip_error is None else tip_error
 
@@ -218,28 +226,28 @@ def approximate(
 ) -> Approximation:
     """Inverse kinematics of the lowest degree that meets a tolerance.
 
-    Periodic errors of the drives' screws are no part of it (`drive_compensation.py`).
+    Periodic errors of the drives' screws are not included (`drive_compensation.py`).
 
     Args:
         calibration: The calibration.
-        within: Largest distance of the tip from where it belongs, [m].
-        tool: The tip in the frame of the robot's tool centre point, shape (3,), [m].
+        within: Largest error of the tip, [m].
+        tool: Tip in the frame of the robot's tool centre point, shape (3,), [m].
         half_side: Half the side of a cube around the mechanical zero, [m]; by default the region
             is the workspace.
-        payload: Mass on the tool beside the platform, [kg]; none by default.
+        payload: Mass on the tool in addition to the platform, [kg]; none by default.
 
     Raises:
-        ExportError: If no degree meets the tolerance, with the best error; if the machine has no
+        ExportError: If no degree meets the tolerance; states the best error. If the machine has no
             tool or does not reach the region.
-        ParameterError: If the payload is out of range, or nothing depends on it.
+        ParameterError: If the payload is out of range, or the machine does not depend on it.
     """
     robot = calibration.robot
     UseConditions(payload=payload).require_valid(robot, prefix="--")
     box = _find_box(calibration, half_side)
     middle, half = tool_at_zero(robot) + 0.5 * box.sum(axis=1), 0.5 * (box[:, 1] - box[:, 0])
     n = middle.size
-    most = MOST_DEGREE[n]
-    nodes = grid_points(chebyshev_line(most + EXTRA_NODES), n)
+    max_degree = MAX_DEGREE[n]
+    nodes = grid_points(chebyshev_line(max_degree + EXTRA_NODES), n)
     checks = middle + half * check_points(n)
     with _reached(box):
         states = _reach_states(
@@ -253,27 +261,27 @@ def approximate(
     form = find_nominal_form(robot, middle, half)
     corrections = np.asarray(states[0].drives) - form(middle + half * nodes)
     change, refused = _find_change(states), list[CorrectedInverse]()
-    for degree in range(1, most + 1):
+    for degree in range(1, max_degree + 1):
         fit = PolynomialFit(nodes, total_degree(n, degree))
         thermal = None if change is None else change.fitted(fit, middle, half)
         inverse = CorrectedInverse(form, fit(middle, half, corrections), thermal)
-        if _largest_error(states, checks, inverse, rows=slice(-CHECKED_FIRST, None)) <= within:
+        if _largest_error(states, checks, inverse, rows=slice(-QUICK_CHECKS, None)) <= within:
             error = _largest_error(states, checks, inverse)
             if error <= within:
                 return _describe(calibration, states, inverse, checks, error, payload)
         refused.append(inverse)
     best = min(_largest_error(states, checks, inverse) for inverse in refused)
     raise ExportError(
-        f"no polynomial of a degree up to {most} keeps the tool within {within / UM:g} µm "
-        f"over {describe_box(box)}; the best of them reaches {rounded_up(best / UM)} µm"
+        f"no polynomial of a degree up to {max_degree} keeps the tool within {within / UM:g} µm "
+        f"over {describe_box(box)}; the smallest error is {rounded_up(best / UM)} µm"
     )
 
 
 def _largest_error(
-    states: Sequence[_State], checks: Array, inverse: CorrectedInverse, *, rows: slice = EVERY
+    states: Sequence[_State], checks: Array, inverse: CorrectedInverse, *, rows: slice = ALL_ROWS
 ) -> float:
-    """Largest error in all states at the checked points, with the reserve, [m]."""
-    return RESERVE * max(state.error(checks, inverse, rows=rows) for state in states)
+    """Largest error in all states at the checked points, times ERROR_MARGIN, [m]."""
+    return ERROR_MARGIN * max(state.error(checks, inverse, rows=rows) for state in states)
 
 
 def _reach_states(
@@ -285,13 +293,13 @@ def _reach_states(
     nodes: Array,
     checks: Array,
 ) -> list[_State]:
-    """The machine at the reference temperature first, then over the range of temperatures.
+    """Compute states of the machine, first at the reference temperature, then over its range.
 
     Args:
         calibration: The calibration.
-        tool: As for `approximate`.
-        payload: As for `approximate`.
-        corners: Points that are tried first, shape (2^n, n), [m].
+        tool: Tip in the frame of the robot's tool centre point, shape (3,), [m].
+        payload: Mass on the tool, [kg].
+        corners: Points that are reached first, to fail fast, shape (2^n, n), [m].
         nodes: Points of the fit, shape (n_nodes, n), [m].
         checks: Points at which errors are evaluated, shape (n_checks, n), [m].
 
@@ -301,35 +309,35 @@ def _reach_states(
     robot = calibration.robot
     errors = without_periodic_errors(robot, calibration.errors)
     labels, states = ["a point"] * len(nodes), list[_State]()
-    start, checked = None, None
-    for temperature, fitted in _list_temperatures(robot):
+    start, expected = None, None
+    for temperature, is_fitted in _list_temperatures(robot):
         conditions = UseConditions(temperature=temperature, payload=payload)
         tip, drives = ToolTip(calibration, tool, errors=errors, conditions=conditions), None
         if not states:
-            tip.reach(corners)  # fails fast
-        if fitted:
+            tip.reach(corners)
+        if is_fitted:
             drives, passive = tip.reach(nodes, start=start)
             start = np.hstack([drives, passive])
             for failure in find_beyond_travel(robot, drives, labels).values():
                 raise failure
-        checked = tip.reach(checks) if checked is None else checked
-        states.append(_State(temperature, tip, drives, *checked))
+        expected = tip.reach(checks) if expected is None else expected
+        states.append(_State(temperature, tip, drives, *expected))
     return states
 
 
 def _list_temperatures(robot: Robot) -> list[tuple[float | None, bool]]:
-    """Temperatures, [°C], and whether the machine is fitted there.
+    """Temperatures, [°C], and whether the machine is fitted at them.
 
-    First the reference, None without one; then the ends of the range; then temperatures between
-    them, at which the machine is only checked.
+    The reference comes first (None if the machine has none), then the ends of the range, then
+    temperatures between them, which are only checked.
     """
     use = stated_use(robot)
     if use is None or use["temperature"] is None:
         return [(None, True)]
     reference, (low, high) = neutral_values(robot)["temperature"], use["temperature"]
     ends = (
-        max(min(low, reference - WARMER), LOWEST_C),
-        min(max(high, reference + WARMER), HIGHEST_C),
+        max(min(low, reference - TEMPERATURE_RANGE), LOWEST_C),
+        min(max(high, reference + TEMPERATURE_RANGE), HIGHEST_C),
     )
     between = [(0.5 * (end + reference), False) for end in ends]
     return [(reference, True), *((end, True) for end in ends), *between]
@@ -340,27 +348,27 @@ class _Change:
     """Change of the drive coordinates at the nodes with temperature."""
 
     temperatures: Array
-    """The reference first, [°C]."""
+    """Fitted temperatures, the reference first, [°C]."""
     per_kelvin: Array
-    """Shape (n_nodes, n_drives), [m/K, rad/K]."""
+    """Change of the drive coordinates at the nodes, shape (n_nodes, n_drives), [m/K, rad/K]."""
 
     def fitted(self, fit: PolynomialFit, middle: Array, half: Array) -> ThermalChange:
-        """The change as a polynomial of a box."""
+        """Polynomial of the change in a box."""
         t = self.temperatures
         limits = float(t[0]), float(t.min()), float(t.max())
         return ThermalChange(*limits, fit(middle, half, self.per_kelvin))
 
 
 def _find_change(states: Sequence[_State]) -> _Change | None:
-    """The straight line through the reference, the first state, that is nearest to the ends."""
+    """Least-squares line through the first state (the reference) and near the other fitted ones."""
     fitted = [(s.temperature, s.drives) for s in states if s.drives is not None]
     if len(fitted) == 1:
         return None
     temperatures = np.array([t for t, _ in fitted], dtype=np.float64)
     drives = np.array([d for _, d in fitted])
-    warmer = temperatures - temperatures[0]
-    slopes = np.tensordot(warmer, drives - drives[0], axes=1) / (warmer @ warmer)
-    return _Change(temperatures, slopes)
+    differences = temperatures - temperatures[0]
+    per_kelvin = np.tensordot(differences, drives - drives[0], axes=1)
+    return _Change(temperatures, per_kelvin / (differences @ differences))
 
 
 def _describe(
@@ -371,12 +379,12 @@ def _describe(
     error: float,
     payload: float | None,
 ) -> Approximation:
-    """An approximation with its errors; the arguments are those of its making."""
+    """Compute the errors of an approximation."""
     first = states[0]
-    loaded, heavier = "payload" in effects_by_condition(calibration.robot), None
-    if loaded:
+    depends_on_payload, heavier = "payload" in effects_by_condition(calibration.robot), None
+    if depends_on_payload:
         payload = payload or 0.0
-        conditions = UseConditions(temperature=first.temperature, payload=payload + HEAVIER)
+        conditions = UseConditions(temperature=first.temperature, payload=payload + HEAVIER_PAYLOAD)
         errors = without_periodic_errors(calibration.robot, calibration.errors)
         tip = ToolTip(calibration, first.tip.tool, errors=errors, conditions=conditions)
         heavier = replace(first, tip=tip).error(checks, inverse)
@@ -389,24 +397,26 @@ def _describe(
         nominal=_nominal_error(first.tip, inverse.nominal, checks, calibration.active_offsets),
         beyond=_error_beyond(first.tip, inverse, calibration),
         longer=_error_of_longer_tool(first.tip, first.expected, first.passive),
-        unheated=max((s.error(checks, inverse, cold=True) for s in states[1:]), default=None),
+        unheated=max(
+            (s.error(checks, inverse, at_reference=True) for s in states[1:]), default=None
+        ),
         payload=payload,
         heavier=heavier,
     )
 
 
-def check_points(n: int, *, count: int = CHECKED, seed: int = 1) -> Array:
+def check_points(n: int, *, count: int = CHECKS, seed: int = 1) -> Array:
     """Points inside a cube of ±1 and on its faces, edges and corners, shape (2 count + 2^n, n).
 
     Only the corners are nodes of the fit.
     """
     generator = np.random.default_rng(seed)
-    inside, outside = generator.uniform(-1.0, 1.0, (2, count, n))
-    pinned = generator.integers(0, n, count)
-    outside[np.arange(count), pinned] = generator.choice([-1.0, 1.0], count)
+    inside, surface = generator.uniform(-1.0, 1.0, (2, count, n))
+    face = generator.integers(0, n, count)
+    surface[np.arange(count), face] = generator.choice([-1.0, 1.0], count)
     edges = generator.random((count, n)) < 0.3
-    outside[edges] = generator.choice([-1.0, 1.0], int(edges.sum()))
-    return np.concatenate([inside, outside, corners(n)])
+    surface[edges] = generator.choice([-1.0, 1.0], int(edges.sum()))
+    return np.concatenate([inside, surface, corners(n)])
 
 
 def corners(n: int) -> Array:
@@ -426,16 +436,16 @@ def _find_box(calibration: Calibration, half_side: float | None) -> Array:
 
 @contextmanager
 def _reached(box: Array) -> Iterator[None]:
-    """Name the region if the machine does not reach it.
+    """Replace a ClosureError by an error that names the region.
 
     Raises:
-        ExportError: In place of `ClosureError`.
+        ExportError: If the machine does not reach the region.
     """
     try:
         yield
     except ClosureError as e:
         reason = f"the machine does not reach {describe_box(box)} ({e.reason})"
-        raise ExportError(f"{reason}; give a smaller --half-side-mm") from None
+        raise ExportError(f"{reason}; state a smaller --half-side-mm") from None
 
 
 def _tip_error(
@@ -443,10 +453,10 @@ def _tip_error(
 ) -> float | None:
     """Largest distance of the tip from its target at drive coordinates, [m]; None out of reach."""
     try:
-        off = tip.place(drives, start=start) - tip.targets(points)
+        error = tip.place(drives, start=start) - tip.targets(points)
     except ClosureError:
         return None
-    return float(np.linalg.norm(off, axis=1).max())
+    return float(np.linalg.norm(error, axis=1).max())
 
 
 def _nominal_error(tip: ToolTip, form: NominalForm, points: Array, offsets: Array) -> float | None:
@@ -457,10 +467,10 @@ def _nominal_error(tip: ToolTip, form: NominalForm, points: Array, offsets: Arra
 def _error_beyond(
     tip: ToolTip, inverse: CorrectedInverse, calibration: Calibration
 ) -> float | None:
-    """Largest error beyond the faces, [m]."""
+    """Largest error at a distance of BEYOND_FACE from the faces, [m]; None out of reach."""
     box = inverse.correction
-    outside = check_points(box.middle.size, count=100, seed=2)[100:]
-    points = box.middle + (box.half + BEYOND) * outside
+    surface = check_points(box.middle.size, count=100, seed=2)[100:]
+    points = box.middle + (box.half + BEYOND_FACE) * surface
     drives = inverse(points)
     if not np.isfinite(drives).all():
         return None
@@ -470,6 +480,6 @@ def _error_beyond(
 
 
 def _error_of_longer_tool(tip: ToolTip, drives: Array, passive: Array) -> float:
-    """Largest error for a tip farther from the platform, by its tilt, [m]."""
+    """Largest error for a tip displaced by LONGER_TOOL, because of the platform's tilt, [m]."""
     tilt = (tip.poses(drives, start=passive)[:, :3, :3] - tip.level)[:, tip.coordinates]
-    return float(LONGER * np.linalg.svd(tilt, compute_uv=False).max())
+    return float(LONGER_TOOL * np.linalg.svd(tilt, compute_uv=False).max())

@@ -1,7 +1,7 @@
 """C sources of a kinematics module: a core in plain C99, and a LinuxCNC component around it.
 
 Numbers are in the controller's units, mm and degrees, and in its joint directions. The component
-depends on the machine only by the coordinates that the drives command.
+depends on the machine only through the coordinates that the drives command.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ def write_core(
     approximation: Approximation,
     homes: Sequence[JointHome],
 ) -> dict[str, str]:
-    """Texts of orthocal_core.c and orthocal_core.h, which need no LinuxCNC.
+    """Texts of orthocal_core.c and orthocal_core.h, which do not depend on LinuxCNC.
 
     Args:
         calibration: The calibration.
-        approximation: Inverse kinematics without periodic errors of screws.
-        homes: Joints with their compensation by the controller.
+        approximation: Approximate inverse kinematics without periodic errors of screws.
+        homes: Joints with their compensation in the controller.
     """
     drives, inverse = calibration.robot.drives, approximation.inverse
     polynomial = inverse.correction
@@ -80,7 +80,7 @@ def write_core(
 
 
 def write_component(approximation: Approximation) -> dict[str, str]:
-    """Text of orthocal_kins.c, the core as a kinematics module."""
+    """Text of orthocal_kins.c, the kinematics module around the core."""
     coordinates = approximation.coordinates
     identity = [k for k in range(len(LETTERS)) if k not in coordinates]
     values = {"commanded": braced(coordinates), "identity": braced(identity)}
@@ -88,7 +88,7 @@ def write_component(approximation: Approximation) -> dict[str, str]:
 
 
 def _write_thermal(change: ThermalChange | None, to_joints: Array) -> dict[str, object]:
-    """Change of the joints per kelvin, its reference and the limits of the temperature."""
+    """Values of the template: change of the joints per kelvin, reference and limits."""
     if change is None:
         zeros: dict[str, object] = dict.fromkeys(("reference", "lowest", "highest"), "0.0")
         return {**zeros, "thermal": 0, "per_kelvin": "{{0.0}}"}
@@ -102,9 +102,9 @@ def _write_thermal(change: ThermalChange | None, to_joints: Array) -> dict[str, 
 
 
 def _write_screws(calibration: Calibration, homes: Sequence[JointHome]) -> dict[str, object]:
-    """Periodic errors of the screws, and what homing with backlash adds to each joint."""
+    """Values of the template: periodic errors of the screws, and trims of the joints at home."""
     drives, active = calibration.robot.drives, calibration.active_offsets
-    sizes = np.array([DRIVE_UNITS[d.unit][1] for d in drives])
+    units = np.array([DRIVE_UNITS[d.unit][1] for d in drives])
     directions = np.array([d.direction for d in drives])
     at_zero = np.array([d.to_joint(v) for d, v in zip(drives, active, strict=True)])
     home = [h.compensation.trim_at_home(h.old) - h.was.trim_at_home(h.old) for h in homes]
@@ -115,29 +115,29 @@ def _write_screws(calibration: Calibration, homes: Sequence[JointHome]) -> dict[
         else np.array([periodic.sine, periodic.cosine]) * directions
     )
     return {
-        "home": braced(home / sizes),
+        "home": braced(home / units),
         "periodic": int(periodic is not None),
         "rate": repr(0.0 if periodic is None else 2.0 * np.pi * MM / periodic.lead),
-        "sine": braced(sine / sizes),
-        "cosine": braced(cosine / sizes),
+        "sine": braced(sine / units),
+        "cosine": braced(cosine / units),
         "screw_direction": braced(directions),
-        "screw_zero": braced(at_zero / sizes),
+        "screw_zero": braced(at_zero / units),
     }
 
 
 def _write_nominal(form: NominalForm, drives: tuple[Drive, ...], active: Array) -> str:
-    """Nominal form in joints, with the offsets that stay active in the controller."""
+    """C source of the nominal form in joints, with the active offsets of the controller."""
     directions = np.array([d.direction for d in drives])
-    sizes = np.array([DRIVE_UNITS[d.unit][1] for d in drives])
+    units = np.array([DRIVE_UNITS[d.unit][1] for d in drives])
 
     def joints(coordinates: Array) -> Array:
         values = zip(drives, coordinates + active, strict=True)
-        return np.asarray(np.array([d.to_joint(v) for d, v in values]) / sizes)
+        return np.asarray(np.array([d.to_joint(v) for d, v in values]) / units)
 
     if isinstance(form, Tangent):
         values = {
             "at_middle": braced(joints(form.values)),
-            "jacobian": braced(form.jacobian * (directions * MM / sizes)[:, None]),
+            "jacobian": braced(form.jacobian * (directions * MM / units)[:, None]),
         }
         return fill_template("tangent.c", values)
     values = {
@@ -152,7 +152,12 @@ def _write_nominal(form: NominalForm, drives: tuple[Drive, ...], active: Array) 
 
 
 def braced(values: ArrayLike, *, indent: int = 4) -> str:
-    """C initializer of an array: integers, or doubles with all digits."""
+    """C initializer of an array of integers, or of doubles with all digits.
+
+    Args:
+        values: The array.
+        indent: Indentation of its rows.
+    """
     array = np.asarray(values)
     pad = " " * indent
     if array.ndim > 1:
@@ -166,10 +171,10 @@ def braced(values: ArrayLike, *, indent: int = 4) -> str:
     if len(line) <= LONGEST_LINE:
         return line
     lines = [", ".join(texts[i : i + 3]) for i in range(0, len(texts), 3)]
-    return "{\n" + ",\n".join(f"{pad}{part}" for part in lines) + f"\n{' ' * (indent - 4)}}}"
+    return "{\n" + ",\n".join(f"{pad}{line}" for line in lines) + f"\n{' ' * (indent - 4)}}}"
 
 
 def fill_template(name: str, values: Mapping[str, object]) -> str:
-    """Text of a file in templates/ with values in place of its $names."""
+    """Text of a file in templates/ with its $names replaced by values."""
     template = files("orthocal.export.linuxcnc").joinpath("templates", name)
     return Template(template.read_text(encoding="utf-8")).substitute(values)

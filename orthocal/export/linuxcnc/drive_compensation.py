@@ -5,17 +5,17 @@ motion:
 
     motor = j + T_s(j) − T_l(h) + constant,  T_s(j) = s b/2 with BACKLASH = b.
 
-Homing latches the switch in the direction l and displays HOME_OFFSET h there, so that the trim of
-that direction does not change the motor's position at the switch. With the wanted displacement Δ of
-the display HOME_OFFSET is therefore
+Homing latches the switch in the direction l and displays HOME_OFFSET h there. So the trim of that
+direction does not change the motor's position at the switch. For a displacement Δ of the display,
+HOME_OFFSET is therefore
 
     h_new = h_old + Δ + T_l(h_old) − T_l(h_new),
 
-where T_l(h_old) is that of the compensation that was active while measuring.
+where T_l(h_old) is the trim of the compensation that was active during the measurement.
 
 A table of COMP_FILE (type 1) lists T₊ and T₋ over the travel and replaces BACKLASH. It has at most
-256 entries, so a kinematics module contains the periodic errors, for the middle of both sides, and
-leaves to BACKLASH or COMP_FILE what depends on the side.
+256 entries. So a kinematics module contains the periodic errors for the middle of both sides.
+BACKLASH or COMP_FILE then contain only the part that depends on the side.
 """
 
 from __future__ import annotations
@@ -36,22 +36,23 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.effects.backlash import Backlash
 from orthocal.effects.compensation import JointTrim, table_name
 from orthocal.effects.loading import robot_effects
-from orthocal.effects.screw import KINDS, Screw
+from orthocal.effects.screw import SCREW_COMPONENTS, Screw
 from orthocal.errors import ExportError, ParameterError
 from orthocal.io.fields import read_only
 from orthocal.robot.model import Robot
 from orthocal.units import UM
 
-SMALLEST = 0.1 * UM
-"""Smallest backlash and amplitude that is compensated, [m or rad]."""
+NEGLIGIBLE = 0.1 * UM
+"""Smallest backlash and amplitude that are compensated, [m or rad]."""
 
-MOST_ENTRIES = 256
+MAX_ENTRIES = 256
 """Largest number of entries of a COMP_FILE."""
 
-MOST_ITERATIONS = 20
+MAX_ITERATIONS = 20
+"""Number of fixed-point iterations of `PeriodicErrors.invert`."""
 
-CHECKED_BETWEEN = 8
-"""Positions between two entries at which a table is compared with the exact trim."""
+CHECKS_PER_INTERVAL = 8
+"""Number of intervals between two entries at whose ends a table is compared with exact trims."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,10 +60,11 @@ class PeriodicErrors:
     """Periodic errors of the drives' screws: A sin(2πρ/lead) + B cos(2πρ/lead)."""
 
     lead: float
-    """[m]."""
+    """Lead of the screws, [m]."""
     sine: Array
+    """A, shape (n_drives,), [m]; 0 for drives without a periodic error."""
     cosine: Array
-    """A and B, shape (n_drives,), [m]; 0 for drives without one."""
+    """B, shape (n_drives,), [m]; 0 for drives without a periodic error."""
 
     def __call__(self, coordinates: ArrayLike) -> Array:
         """Errors at commanded coordinates, shape (..., n_drives), [m]."""
@@ -70,34 +72,35 @@ class PeriodicErrors:
         return np.asarray(self.sine * np.sin(phase) + self.cosine * np.cos(phase))
 
     def invert(self, positions: ArrayLike) -> Array:
-        """Commanded coordinates at which the screws are at positions, shape (..., n_drives)."""
-        wanted = np.asarray(positions, dtype=np.float64)
-        coordinates = wanted
-        for _ in range(MOST_ITERATIONS):
-            coordinates = wanted - self(coordinates)
+        """Commanded coordinates that bring the screws to positions, shape (..., n_drives), [m]."""
+        target = np.asarray(positions, dtype=np.float64)
+        coordinates = target
+        for _ in range(MAX_ITERATIONS):
+            coordinates = target - self(coordinates)
         return np.asarray(coordinates)
 
 
 def find_periodic_errors(robot: Robot, errors: Mapping[str, float]) -> PeriodicErrors | None:
-    """Periodic errors of a machine; None if there are none.
+    """Periodic errors of a machine; None without any.
 
     Args:
         robot: The robot.
-        errors: Parameter to value, [SI].
+        errors: Values by parameter name, [SI].
     """
     screw = next((e for e in robot_effects(robot) if isinstance(e, Screw)), None)
     if screw is None:
         return None
     sine, cosine = (
-        np.array([errors.get(f"{d.name}.{kind}", 0.0) for d in robot.drives]) for kind in KINDS
+        np.array([errors.get(f"{d.name}.{kind}", 0.0) for d in robot.drives])
+        for kind in SCREW_COMPONENTS
     )
-    if np.hypot(sine, cosine).max() < SMALLEST:
+    if np.hypot(sine, cosine).max() < NEGLIGIBLE:
         return None
     return PeriodicErrors(screw.lead, read_only(sine), read_only(cosine))
 
 
 def without_periodic_errors(robot: Robot, errors: Mapping[str, float]) -> dict[str, float]:
-    """Errors of a machine whose screws have no periodic error."""
+    """Errors of a machine without the periodic errors of its screws."""
     screws = [e for e in robot_effects(robot) if isinstance(e, Screw)]
     periodic = {error.name for screw in screws for error in screw.errors}
     return {name: value for name, value in errors.items() if name not in periodic}
@@ -108,15 +111,15 @@ class JointCompensation(JointTrim):
     """Compensation of one joint, with the direction in which homing latches its switch."""
 
     latched: int = 1
-    """Sign of HOME_LATCH_VEL."""
+    """Sign of HOME_LATCH_VEL, 1 or -1."""
     error: float = 0.0
-    """Largest error that it leaves in the joint, [m, rad]: of the table between its entries, or of
-    a backlash that does not follow the periodic error of the screw."""
+    """Largest remaining error of the joint, [m, rad]: of a table between its entries, or of a
+    constant backlash that shifts the phase of a periodic error."""
     beside_module: bool = False
     """Whether the table is used with a kinematics module, which contains the periodic errors."""
 
     def file_name(self, joint: int) -> str:
-        """File name of the table of a joint."""
+        """File name of the table of joint number `joint`."""
         name = table_name(joint)
         return name.replace(".comp", "_module.comp") if self.beside_module else name
 
@@ -124,20 +127,20 @@ class JointCompensation(JointTrim):
         """T_l: trim in the latching direction at HOME_OFFSET, [m, rad].
 
         Args:
-            home: HOME_OFFSET, [m, rad]; it only matters for a table, whose trim is 0 without it.
-            opposite: Latch in the other direction.
+            home: HOME_OFFSET, [m, rad]; if it is None, the trim of a table is 0.
+            opposite: Whether homing latches in the other direction.
         """
         if self.table is not None and home is None:
             return 0.0
-        grew = (self.latched > 0) != opposite
-        return float(self(np.array([home or 0.0]))[0, 0 if grew else 1])
+        positive = (self.latched > 0) != opposite
+        return float(self(np.array([home or 0.0]))[0, 0 if positive else 1])
 
 
 def require_latched(robot: Robot, latched: Sequence[int] | None) -> tuple[int, ...]:
-    """Directions in which homing latches the switches, 1 or -1; 1 where they are not stated.
+    """Directions in which homing latches the switches, 1 or -1; 1 if not stated.
 
     Raises:
-        ParameterError: If they are not as many as the drives.
+        ParameterError: If the numbers of directions and drives differ.
     """
     drives = robot.drives
     if latched is None:
@@ -155,10 +158,10 @@ def require_latched(robot: Robot, latched: Sequence[int] | None) -> tuple[int, .
 def find_old_compensation(
     calibration: Calibration, latched: Sequence[int] | None
 ) -> tuple[JointCompensation, ...]:
-    """Compensation that was active while measuring, in the order of the drives.
+    """Active compensation during the measurement, in the order of the drives.
 
     Raises:
-        ParameterError: As `require_latched`.
+        ParameterError: If the numbers of directions and drives differ.
     """
     signs = require_latched(calibration.robot, latched)
     trims = calibration.session.compensation or (JointTrim(),) * len(signs)
@@ -171,13 +174,13 @@ def find_old_compensation(
 def find_compensation(
     calibration: Calibration, latched: Sequence[int] | None
 ) -> tuple[JointCompensation, ...]:
-    """Compensation of backlash alone, in the order of the drives: what is worth entering.
+    """Compensation of backlash to enter, in the order of the drives.
 
-    If the model has neither backlash nor periodic errors, it is that which was active.
+    If the model has neither backlash nor periodic errors, the active compensation is unchanged.
 
     Raises:
-        ParameterError: As `require_latched`.
-        ExportError: If tables were active, and the model has only one of both.
+        ParameterError: If the numbers of directions and drives differ.
+        ExportError: If tables were active, and the model has only one of both effects.
     """
     robot, old = calibration.robot, find_old_compensation(calibration, latched)
     modelled = {type(e) for e in robot_effects(robot)} & {Backlash, Screw}
@@ -185,7 +188,7 @@ def find_compensation(
         return old
     if len(modelled) < 2 and any(joint.table is not None for joint in old):
         raise ExportError(
-            "the controller has tables (comp_file) of backlash and periodic errors; identify both, "
+            "the controller has tables (comp_file) of backlash and periodic errors; identify both "
             "with --effects backlash,screw"
         )
     if Backlash not in modelled:
@@ -195,7 +198,7 @@ def find_compensation(
         enter.get(d.name, joint.backlash) for d, joint in zip(robot.drives, old, strict=True)
     ]
     return tuple(
-        JointCompensation(b if b >= SMALLEST else 0.0, None, joint.latched)
+        JointCompensation(b if b >= NEGLIGIBLE else 0.0, None, joint.latched)
         for b, joint in zip(backlash, old, strict=True)
     )
 
@@ -203,7 +206,7 @@ def find_compensation(
 def round_backlash(
     compensation: Sequence[JointCompensation], before: Sequence[JointCompensation]
 ) -> tuple[JointCompensation, ...]:
-    """Compensation with each BACKLASH to enter as it is printed; tables and old values stay.
+    """Round each BACKLASH to enter as it is printed; tables and unchanged values are not rounded.
 
     Args:
         compensation: Compensation to enter.
@@ -223,13 +226,13 @@ def tabulate(
     before: Sequence[JointCompensation],
     offsets: Array,
 ) -> tuple[JointCompensation, ...]:
-    """Tables of backlash and periodic errors, for joints with periodic errors worth entering.
+    """Tables of backlash and periodic errors, for joints with significant periodic errors.
 
     Args:
         calibration: The calibration.
         compensation: Compensation of backlash.
-        before: Compensation during the measurement; a table of which nothing changes stays.
-        offsets: Offsets in the controller with which the tables are used, (n_drives,), [m, rad].
+        before: Compensation during the measurement; unchanged tables are kept.
+        offsets: Offsets in the controller with these tables, shape (n_drives,), [m, rad].
 
     Raises:
         ExportError: If a drive with a periodic error has no limits of travel.
@@ -242,23 +245,23 @@ def tabulate(
         return tuple(compensation)
     changed = {e.drive for e in screws if e.change.any()}
     changed |= {e.drive for e in find_backlash(calibration) if e.change}
-    result = []
-    for i, (d, joint, was) in enumerate(zip(robot.drives, compensation, before, strict=True)):
-        if was.table is not None and d.name not in changed:
-            result.append(was)
+    tabulated = []
+    for i, (d, joint, old) in enumerate(zip(robot.drives, compensation, before, strict=True)):
+        if old.table is not None and d.name not in changed:
+            tabulated.append(old)
             continue
         if not (periodic.sine[i] or periodic.cosine[i]):
-            result.append(joint)
+            tabulated.append(joint)
             continue
         if not np.isfinite([d.lower, d.upper]).all():
             raise ExportError(
-                f"{d.name} has no limits of travel over which a table of its periodic error "
-                "extends; state them in the URDF"
+                f"{d.name} has no limits of travel, which a table of its periodic error needs; "
+                "state them in the URDF"
             )
         travel = d.to_joint(np.array([d.lower, d.upper]) + offsets[i])
         trims = _Trims(robot, i, offsets[i], 0.5 * joint.backlash, periodic)
-        result.append(_tabulate_joint(joint, trims, np.sort(travel)))
-    return tuple(result)
+        tabulated.append(_tabulate_joint(joint, trims, np.sort(travel)))
+    return tuple(tabulated)
 
 
 def compensate_beside_module(
@@ -268,9 +271,9 @@ def compensate_beside_module(
 ) -> tuple[JointCompensation, ...]:
     """Compensation of backlash beside a kinematics module that contains the periodic errors.
 
-    A joint that had a table during the measurement has one again, which replaces it. It lists what
-    the module, which does not know the side, cannot contain: the backlash, and the difference of
-    the periodic error on both sides. A table that the model does not describe remains.
+    If a joint had a table during the measurement, a new table replaces it. It contains the part
+    that depends on the side: the backlash, and the difference of the periodic error between both
+    sides. A table that the model does not describe is kept.
 
     Args:
         calibration: The calibration.
@@ -279,19 +282,19 @@ def compensate_beside_module(
     """
     robot, offsets = calibration.robot, calibration.active_offsets
     periodic = find_periodic_errors(robot, calibration.errors)
-    result = []
-    for i, (joint, was) in enumerate(zip(compensation, before, strict=True)):
+    compensated = []
+    for i, (joint, old) in enumerate(zip(compensation, before, strict=True)):
         half = 0.5 * joint.backlash
-        if joint.table is None and was.table is not None:
+        if joint.table is None and old.table is not None:
             trims = _Trims(robot, i, offsets[i], half, periodic, beside_module=True)
-            table = _tabulate_joint(joint, trims, was.table[[0, -1], 0])
-            result.append(replace(table, beside_module=True))
+            table = _tabulate_joint(joint, trims, old.table[[0, -1], 0])
+            compensated.append(replace(table, beside_module=True))
         elif joint.table is None and periodic is not None:
             slope = 2.0 * np.pi / periodic.lead * np.hypot(periodic.sine[i], periodic.cosine[i])
-            result.append(replace(joint, error=float(slope) * half))
+            compensated.append(replace(joint, error=float(slope) * half))
         else:
-            result.append(joint)
-    return tuple(result)
+            compensated.append(joint)
+    return tuple(compensated)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -300,7 +303,7 @@ class _Trims:
 
     robot: Robot
     drive: int
-    """Index of its drive."""
+    """Index of the drive."""
     offset: float
     """Offset in the controller, [m, rad]."""
     half: float
@@ -310,28 +313,28 @@ class _Trims:
     """Whether the commanded position is already corrected for the middle of both sides."""
 
     def __call__(self, joints: Array) -> Array:
-        """Trims of both sides at positions of the joint, shape (n, 2), [m, rad]."""
+        """Trims of both sides at positions (n,) of the joint, shape (n, 2), [m, rad]."""
         drive, periodic = self.robot.drives[self.drive], self.periodic
         commanded = np.tile(self.robot.drive_zero, (len(joints), 1))
         commanded[:, self.drive] = drive.from_joint(joints) - self.offset
-        wanted = commanded
+        target = commanded
         if self.beside_module and periodic is not None:
-            wanted = commanded + periodic(commanded)
+            target = commanded + periodic(commanded)
         columns = []
         for side in (1.0, -1.0):
-            at = np.array(wanted)
-            at[:, self.drive] += drive.direction * side * self.half
-            at = at if periodic is None else periodic.invert(at)
-            columns.append(drive.direction * (at - commanded)[:, self.drive])
+            trimmed = np.array(target)
+            trimmed[:, self.drive] += drive.direction * side * self.half
+            trimmed = trimmed if periodic is None else periodic.invert(trimmed)
+            columns.append(drive.direction * (trimmed - commanded)[:, self.drive])
         return np.stack(columns, axis=1)
 
 
 def _tabulate_joint(joint: JointCompensation, trims: _Trims, travel: Array) -> JointCompensation:
-    """A joint with a table of its trims over a range of positions, shape (2,), [m, rad]."""
+    """Joint with a table of its trims over a range of positions, shape (2,), [m, rad]."""
     low, high = travel.tolist()
-    places = np.linspace(low, high, MOST_ENTRIES)
-    between = np.linspace(low, high, CHECKED_BETWEEN * (MOST_ENTRIES - 1) + 1)
-    table = np.column_stack([places, trims(places)])
-    exact = trims(between)
-    linear = np.stack([np.interp(between, places, table[:, k]) for k in (1, 2)], axis=1)
+    positions = np.linspace(low, high, MAX_ENTRIES)
+    checks = np.linspace(low, high, CHECKS_PER_INTERVAL * (MAX_ENTRIES - 1) + 1)
+    table = np.column_stack([positions, trims(positions)])
+    exact = trims(checks)
+    linear = np.stack([np.interp(checks, positions, table[:, k]) for k in (1, 2)], axis=1)
     return replace(joint, table=read_only(table), error=float(np.abs(linear - exact).max()))

@@ -31,7 +31,7 @@ from orthocal.export.linuxcnc.instructions import (
 from orthocal.export.tool_tip import require_tip
 from orthocal.units import MM, UM
 
-WITHIN = 0.1 * UM
+DEFAULT_TOLERANCE = 0.1 * UM
 """Default tolerance of a kinematics module, [m]."""
 
 OPTIONS = {
@@ -43,10 +43,10 @@ OPTIONS = {
     "payload": "--payload",
     "module": "--module or --offsets",
 }
-"""Fields of ExportOptions to their options on the command line."""
+"""Fields of ExportOptions, to their options on the command line."""
 
 MODULE_OPTIONS = ("within", "tool", "half_side", "payload")
-"""Options of a kinematics module alone."""
+"""Fields that are options of a kinematics module only."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,11 +64,13 @@ class ExportOptions:
     home_offsets: tuple[float, ...] | None = None
     """HOME_OFFSET of each joint during the measurement, [m, rad]."""
     latched: tuple[int, ...] | None = None
-    """Sign of HOME_LATCH_VEL of each joint, 1 or -1; 1 by default. It matters with backlash."""
+    """Sign of HOME_LATCH_VEL of each joint, 1 or -1; 1 by default. It has an effect with backlash
+    only."""
     half_side: float | None = None
     """Half the side of the module's region around the mechanical zero, [m]."""
     payload: float | None = None
-    """Mass on the tool beside the platform for which the module holds, [kg]; none by default."""
+    """Mass on the tool, in addition to the platform, for which the module holds, [kg]; none by
+    default."""
     module: bool | None = None
     """Whether to write a kinematics module or HOME_OFFSET; by default a module if the calibration
     identified more than offsets."""
@@ -95,17 +97,17 @@ class ExportOptions:
 
 
 def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[str, str]:
-    """Files for LinuxCNC.
+    """Export a calibration for LinuxCNC.
 
     Returns:
-        README.md, joints.ini and a joint_N.comp for each drive with a periodic error, if the
-        calibration identified offsets only, or if they are requested; else README.md,
-        kinematics.ini, orthocal_kins.c, orthocal_core.c and orthocal_core.h, and a
-        joint_N_module.comp for each joint that had a table during the measurement.
+        Texts of files by file name. HOME_OFFSET (if it is requested, or the calibration identified
+        offsets only): README.md, joints.ini and a joint_N.comp for each drive with a periodic
+        error. Module: README.md, kinematics.ini, orthocal_kins.c, orthocal_core.c, orthocal_core.h,
+        and a joint_N_module.comp for each joint that had a table during the measurement.
 
     Raises:
         ExportError: If there is no offset to enter, or no module meets the tolerance.
-        ParameterError: If an option of a module is given for HOME_OFFSET, or values are missing.
+        ParameterError: If an option of a module is stated for HOME_OFFSET, or values are missing.
     """
     compensation = find_compensation(calibration, options.latched)
     before = find_old_compensation(calibration, options.latched)
@@ -132,7 +134,7 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
     homes = find_homes(calibration, compensation, before, old=options.home_offsets)
     approximation = approximate(
         calibration,
-        within=WITHIN if options.within is None else options.within,
+        within=DEFAULT_TOLERANCE if options.within is None else options.within,
         tool=(0.0, 0.0, 0.0) if options.tool is None else options.tool,
         half_side=options.half_side,
         payload=options.payload,
@@ -151,12 +153,12 @@ def _write_tables(
     compensation: Sequence[JointCompensation],
     before: Sequence[JointCompensation],
 ) -> dict[str, str]:
-    """Texts of the tables of joints by their file names, less those that were active before."""
+    """Texts of new tables of joints by file name."""
     joints = zip(calibration.robot.drives, compensation, before, strict=True)
     return {
         joint.file_name(i): format_table(joint, drive)
-        for i, (drive, joint, was) in enumerate(joints)
-        if joint.table is not None and joint.table is not was.table
+        for i, (drive, joint, old) in enumerate(joints)
+        if joint.table is not None and joint.table is not old.table
     }
 
 
@@ -164,7 +166,7 @@ def _refuse_module_options(options: ExportOptions) -> None:
     """Refuse options of a module for HOME_OFFSET.
 
     Raises:
-        ParameterError: Naming the first such option.
+        ParameterError: If there is such an option; names the first one.
     """
     unused = [OPTIONS[name] for name in options.requested if name in MODULE_OPTIONS]
     if unused:
@@ -182,10 +184,10 @@ def _require_change(
     compensation: Sequence[JointCompensation],
     before: Sequence[JointCompensation],
 ) -> None:
-    """Refuse lines for the INI file that would change nothing.
+    """Refuse an export that changes nothing.
 
     Raises:
-        ExportError: If the offsets and what is compensated stay as they are.
+        ExportError: If neither the offsets nor the compensation change.
     """
     assessment = assessment_of(calibration)
     if assessment.keeps_offsets and compensates_alike(compensation, before):
@@ -194,7 +196,11 @@ def _require_change(
 
 
 def _require_home_offsets(options: ExportOptions, joints: Sequence[JointCompensation]) -> None:
-    """Refuse tables of trims without HOME_OFFSET, on which the trim at the home switch depends."""
+    """Refuse tables of trims without HOME_OFFSET, which determines the trim at the home switch.
+
+    Raises:
+        ParameterError: If there is a table and no HOME_OFFSET.
+    """
     if options.home_offsets is None and any(joint.table is not None for joint in joints):
         raise ParameterError(
             "is missing; the trim of a table at the home switch depends on it",
@@ -203,7 +209,7 @@ def _require_home_offsets(options: ExportOptions, joints: Sequence[JointCompensa
 
 
 def assumes_latching(calibration: Calibration, options: ExportOptions) -> bool:
-    """True if files depend on signs of HOME_LATCH_VEL that the options do not state."""
+    """True if the export depends on signs of HOME_LATCH_VEL that the options do not state."""
     if options.latched is not None:
         return False
     old, new = (f(calibration, None) for f in (find_old_compensation, find_compensation))

@@ -1,13 +1,12 @@
 """HOME_OFFSET and soft limits of the controller's joints, before and after a calibration.
 
 Homing assigns HOME_OFFSET to the joint at its switch. An offset o is the difference between the
-drive's coordinate and the one that the joint displays. With the direction s of the joint,
+drive coordinate and the displayed coordinate of the joint. With the direction s of the joint and
+the change ΔT of the trim at the home switch (`drive_compensation.py`),
 
-    HOME_OFFSET_new = HOME_OFFSET_old + s (o_new − o_active),
+    HOME_OFFSET_new = HOME_OFFSET_old + s (o_new − o_active) − ΔT.
 
-less the change of the trim with which the controller compensates backlash and periodic errors in
-the direction in which it latches the home switch (`drive_compensation.py`). Soft limits belong to
-positions of the slide and change by s (o_new − o_active).
+Soft limits are positions of the slide. They change by s (o_new − o_active).
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ class JointHome:
     drive: str
     unit: Unit
     direction: int
-    """1 if the joint grows with the drive's coordinate, -1 if it falls."""
+    """Sign of the joint's change if the drive coordinate grows, 1 or -1."""
     change: float
     """Change of HOME_OFFSET, [unit]."""
     limit_change: float
@@ -70,7 +69,7 @@ class JointHome:
         return "up" if self.direction > 0 else "down"
 
     def show(self, value: float, *, sign: bool = False) -> str:
-        """Value in the joint's unit: to 1 µm, to 0.1 µm where it has more, or to 1e-6 degrees."""
+        """Value in the joint's unit, to 0.1 µm or 1e-6 degrees, without a last zero."""
         unit, size = DRIVE_UNITS[self.unit]
         text = format_fixed(value / size, 4 if unit == "mm" else 6, sign=sign)
         return text.removesuffix("0")
@@ -87,18 +86,19 @@ def find_homes(
 
     Args:
         calibration: The calibration.
-        compensation: Compensation of each joint by the controller.
+        compensation: New compensation of each joint by the controller.
         before: Compensation during the measurement.
         old: HOME_OFFSET of each joint during the measurement, [m, rad].
 
     Raises:
-        ParameterError: If the number of old values is not that of the drives.
+        ParameterError: If the numbers of old values and drives differ.
     """
     drives = calibration.robot.drives
     if old is not None and len(old) != len(drives):
         names = ", ".join(d.name for d in drives)
         raise ParameterError(
-            f"found {len(old)} values; expected {len(drives)}, of {names}", where="--home-offset"
+            f"found {len(old)} values; expected {len(drives)}, one for each of {names}",
+            where="--home-offset",
         )
     entered = {e.drive for e in find_entries(calibration)}
     changes = offsets_to_enter(calibration) - calibration.active_offsets
@@ -111,22 +111,22 @@ def find_homes(
             limits = float(lowest), float(highest)
         change = d.direction * float(changes[i]) if d.name in entered else 0.0
         home, joint = None if old is None else old[i], compensation[i]
-        by_trim = [0.0, 0.0]
+        home_changes = [0.0, 0.0]
         for k, opposite in enumerate((False, True)):
-            trim = was = before[i].trim_at_home(home, opposite=opposite)
-            for _ in range(2):  # a table is nearly constant over a trim
-                place = None if home is None else home + change + was - trim
-                trim = joint.trim_at_home(place, opposite=opposite)
-            by_trim[k] = change + was - trim
+            trim = old_trim = before[i].trim_at_home(home, opposite=opposite)
+            for _ in range(2):  # converges because a table is nearly constant over such a change
+                new_home = None if home is None else home + change + old_trim - trim
+                trim = joint.trim_at_home(new_home, opposite=opposite)
+            home_changes[k] = change + old_trim - trim
         homes.append(
             JointHome(
                 drive=d.name,
                 unit=d.unit,
                 direction=d.direction,
-                change=by_trim[0],
+                change=home_changes[0],
                 limit_change=change,
                 old=home,
-                opposite=by_trim[1],
+                opposite=home_changes[1],
                 compensation=joint,
                 was=before[i],
                 limits=limits,

@@ -1,4 +1,4 @@
-"""Instructions for a LinuxCNC machine: lines of its INI, and a page (README.md)."""
+"""Instructions for a LinuxCNC machine: lines of its INI file, and README.md."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from orthocal.assessment.controller_entries import (
 )
 from orthocal.calibration.calibration import Calibration
 from orthocal.export.linuxcnc.approximation import (
-    BEYOND,
-    HEAVIER,
+    BEYOND_FACE,
+    HEAVIER_PAYLOAD,
     LETTERS,
-    LONGER,
+    LONGER_TOOL,
     Approximation,
     millimetres,
     rounded_up,
 )
 from orthocal.export.linuxcnc.c_source import fill_template
-from orthocal.export.linuxcnc.drive_compensation import SMALLEST, JointCompensation
+from orthocal.export.linuxcnc.drive_compensation import NEGLIGIBLE, JointCompensation
 from orthocal.export.linuxcnc.home_offsets import JointHome
 from orthocal.export.linuxcnc.nominal_form import Tangent
 from orthocal.text import comment_safe
 from orthocal.units import DRIVE_UNITS, MM, UM, format_fixed
 
 SMALLEST_ERROR = 1e-9
-"""Smallest error that a page states, [m]."""
+"""Smallest error that README.md states, [m]."""
 
 
 def write_home_lines(homes: Sequence[JointHome], *, stated: bool) -> str:
@@ -57,7 +57,7 @@ def write_home_lines(homes: Sequence[JointHome], *, stated: bool) -> str:
 
 
 def write_module_lines(approximation: Approximation, homes: Sequence[JointHome]) -> str:
-    """INI lines for the kinematics module: axes limited to the region, joints as they were."""
+    """INI lines for the kinematics module: limits of the axes, unchanged joints."""
     coordinates, inverse = approximation.coordinates, approximation.inverse
     lines = [
         "# Calibrated kinematics module. HOME_OFFSET remains that of the measurement.",
@@ -90,21 +90,23 @@ def write_module_lines(approximation: Approximation, homes: Sequence[JointHome])
 
 
 def _opposite_line(home: JointHome) -> list[str]:
-    """Comment with HOME_OFFSET for the other sign of HOME_LATCH_VEL, where it matters."""
+    """Comment with HOME_OFFSET for the other sign of HOME_LATCH_VEL, if it differs."""
     if not _depends_on_latching(home):
         return []
-    other = f"present value {home.show(home.opposite, sign=True)}"
-    if home.old is not None:
-        other = home.show(home.old + home.opposite)
-    return [f"# if HOME_LATCH_VEL of this joint is negative: HOME_OFFSET = {other}"]
+    if home.old is None:
+        value = f"present value {home.show(home.opposite, sign=True)}"
+    else:
+        value = home.show(home.old + home.opposite)
+    return [f"# if HOME_LATCH_VEL of this joint is negative: HOME_OFFSET = {value}"]
 
 
 def _depends_on_latching(home: JointHome) -> bool:
-    """True if HOME_OFFSET depends on the direction of latching, to its last digit."""
+    """True if the printed HOME_OFFSET depends on the direction of latching."""
     return home.show(home.change) != home.show(home.opposite)
 
 
 def _limit_lines(home: JointHome, limits: tuple[float, float] | None) -> list[str]:
+    """MIN_LIMIT and MAX_LIMIT of a joint; a change each if the limits are None."""
     names = ("MIN_LIMIT", "MAX_LIMIT")
     values = (None, None) if limits is None else limits
     return [
@@ -115,6 +117,7 @@ def _limit_lines(home: JointHome, limits: tuple[float, float] | None) -> list[st
 
 
 def _line(name: str, home: JointHome, value: float | None, change: float) -> str:
+    """INI line with a value, or a comment with its change if the value is None."""
     if value is None:
         return f"# {name} = present value {home.show(change, sign=True)}"
     return f"{name} = {home.show(value)}"
@@ -135,7 +138,7 @@ def _compensation_lines(joint: int, home: JointHome) -> list[str]:
 
 def _describe_compensation(homes: Sequence[JointHome], *, stated: bool) -> str:
     """Paragraph about BACKLASH and COMP_FILE; empty without them."""
-    texts = []
+    paragraphs = []
     with_backlash = [(i, h) for i, h in enumerate(homes) if h.compensation.backlash]
     if with_backlash:
         listed = ", ".join(
@@ -143,37 +146,37 @@ def _describe_compensation(homes: Sequence[JointHome], *, stated: bool) -> str:
             f"{'+' if h.compensation.latched > 0 else '-'} direction)"
             for i, h in with_backlash
         )
-        texts.append(
+        paragraphs.append(
             f"**Backlash:** {listed}.\nLinuxCNC compensates it by the lines BACKLASH, or by the "
             "columns of COMP_FILE. HOME_OFFSET contains half of\nthe backlash, with the sign of "
             "HOME_LATCH_VEL. HOME_LATCH_VEL and HOME_SEARCH_VEL must have the signs stated here."
         )
         if not stated and any(map(_depends_on_latching, homes)):
-            texts[-1] += (
+            paragraphs[-1] += (
                 "\nThe signs + are assumed, because no option states them. `--ini FILE` reads them "
                 "from your INI file,\n`--latched` states them."
             )
     tables = [h.compensation for h in homes if h.compensation.table is not h.was.table]
     tables = [c for c in tables if c.table is not None]
     if any(c.beside_module for c in tables):
-        texts.append(
+        paragraphs.append(
             "**Tables:** copy the files `joint_*_module.comp` beside your INI file. They replace\n"
             "the tables of the measurement. The periodic errors of the screws are in the module;\n"
             "the tables contain the part that depends on the side." + _between_entries(tables)
         )
     elif tables:
-        texts.append(
+        paragraphs.append(
             "**Periodic error of the screws:** copy the files `joint_*.comp` beside your INI file."
             f"{_between_entries(tables)} A kinematics module\n(`--module`) corrects it exactly."
         )
-    uneven = max((h.compensation.error for h in homes if h.compensation.table is None), default=0.0)
-    if uneven > SMALLEST:
-        texts.append(
+    error = max((h.compensation.error for h in homes if h.compensation.table is None), default=0.0)
+    if error > NEGLIGIBLE:
+        paragraphs.append(
             "**Periodic error of the screws:** the module corrects it for the middle of both\n"
-            f"sides. On a side it is off by up to {rounded_up(uneven / UM)} µm: the backlash "
+            f"sides. On one side the error is up to {rounded_up(error / UM)} µm, because backlash "
             "shifts its phase."
         )
-    return "".join(f"\n{text}\n" for text in texts)
+    return "".join(f"\n{paragraph}\n" for paragraph in paragraphs)
 
 
 def _between_entries(tables: Sequence[JointCompensation]) -> str:
@@ -183,8 +186,8 @@ def _between_entries(tables: Sequence[JointCompensation]) -> str:
 
 
 def _describe_conditions(approximation: Approximation) -> str:
-    """Paragraphs about temperature and payload; empty for a machine that depends on neither."""
-    texts, change = [], approximation.inverse.thermal
+    """Paragraphs about temperature and payload; empty if the machine depends on neither."""
+    paragraphs, change = [], approximation.inverse.thermal
     if change is not None and approximation.unheated is not None:
         values = {
             "reference": f"{change.reference:g}",
@@ -192,20 +195,20 @@ def _describe_conditions(approximation: Approximation) -> str:
             "highest": f"{change.highest:g}",
             "unheated": rounded_up(approximation.unheated / MM),
         }
-        texts.append(fill_template("temperature.md", values))
+        paragraphs.append(fill_template("temperature.md", values))
     if approximation.payload is not None and approximation.heavier is not None:
         values = {
             "payload": f"{approximation.payload:g}",
-            "more": f"{HEAVIER:g}",
+            "more": f"{HEAVIER_PAYLOAD:g}",
             "error": rounded_up(max(approximation.heavier, SMALLEST_ERROR) / UM),
         }
-        texts.append(fill_template("payload.md", values))
-    return "".join(f"\n{text}" for text in texts)
+        paragraphs.append(fill_template("payload.md", values))
+    return "".join(f"\n{paragraph}" for paragraph in paragraphs)
 
 
 def _describe_undetermined(calibration: Calibration) -> str:
     """Paragraph about drives whose change of backlash is not determined; empty without any."""
-    return _describe_kept(
+    return _describe_unchanged(
         calibration,
         "Backlash",
         [
@@ -217,21 +220,21 @@ def _describe_undetermined(calibration: Calibration) -> str:
 
 
 def _describe_undetermined_screws(calibration: Calibration) -> str:
-    """Periodic errors of screws that are not in the tables, because they are undetermined."""
+    """Paragraph about periodic errors that are undetermined and not in the tables; may be empty."""
     screws = [e for e in find_screws(calibration) if not e.change.any()]
-    return _describe_kept(
+    return _describe_unchanged(
         calibration, "Periodic error of the screw", [(e.drive, e.uncertainty) for e in screws]
     )
 
 
-def _describe_kept(
-    calibration: Calibration, what: str, uncertainties: Sequence[tuple[str, float]]
+def _describe_unchanged(
+    calibration: Calibration, quantity: str, uncertainties: Sequence[tuple[str, float]]
 ) -> str:
-    """Paragraph about drives whose compensation stays; empty without any.
+    """Paragraph about drives whose compensation does not change; empty without any.
 
     Args:
         calibration: The calibration.
-        what: What is compensated.
+        quantity: Compensated quantity.
         uncertainties: Drives, and the expanded uncertainty of each, [m, rad].
     """
     joints = {d.name: (i, d) for i, d in enumerate(calibration.robot.drives)}
@@ -243,11 +246,17 @@ def _describe_kept(
     if not texts:
         return ""
     listed = ", ".join(texts)
-    return f"\n**{what} unchanged, since its change is not determined:** {listed}.\n"
+    return f"\n**{quantity} unchanged, because its change is not determined:** {listed}.\n"
 
 
 def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, stated: bool) -> str:
-    """README.md for offsets that are entered as HOME_OFFSET; `stated` as for the lines."""
+    """README.md for offsets that are entered as HOME_OFFSET.
+
+    Args:
+        calibration: The calibration.
+        homes: The joints.
+        stated: Whether the directions in which homing latches the switches were stated.
+    """
     half = {e.drive: expanded_uncertainty(calibration, e) for e in find_entries(calibration)}
     rows = []
     for i, home in enumerate(homes):
@@ -256,8 +265,8 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, sta
             entered = f"present value {change}"
         else:
             entered = f"{home.show(home.old)} → **{home.show(home.new)}**"
-        of_drive = round(half.get(home.drive, math.nan), ENTERED_DECIMALS)
-        uncertainty = "" if math.isnan(of_drive) else f"± {home.show(of_drive)}"
+        expanded = round(half.get(home.drive, math.nan), ENTERED_DECIMALS)
+        uncertainty = "" if math.isnan(expanded) else f"± {home.show(expanded)}"
         cells = (
             f"JOINT_{i}",
             comment_safe(home.drive),
@@ -277,7 +286,7 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, sta
             "if the controller corrects nothing else."
         )
     if assessment_of(calibration).keeps_offsets:
-        scope = "The offsets stay as they are."
+        scope = "The offsets do not change."
     values = {
         "robot": comment_safe(calibration.robot.name),
         "scope": scope,
@@ -298,11 +307,19 @@ def write_module_page(
     *,
     stated: bool,
 ) -> str:
-    """README.md of a kinematics module: how to build and enter it, its errors and its limits."""
+    """README.md of a kinematics module: steps to build and enter it, errors and limits.
+
+    Args:
+        calibration: The calibration.
+        approximation: The inverse kinematics of the module.
+        homes: The joints.
+        stated: Whether the directions in which homing latches the switches were stated.
+    """
     inverse = approximation.inverse
     polynomial = inverse.correction
     letters = [c for k, c in enumerate(LETTERS) if k not in approximation.coordinates]
-    form = f"a polynomial of degree {polynomial.degree} ({len(polynomial.exponents)} terms a joint)"
+    terms = f"{len(polynomial.exponents)} terms per joint"
+    form = f"a polynomial of degree {polynomial.degree} ({terms})"
     if isinstance(inverse.nominal, Tangent):
         form = f"The inverse kinematics are {form}."
     else:
@@ -314,7 +331,7 @@ def write_module_page(
         )
     if approximation.beyond is not None:
         error = rounded_up(approximation.beyond / UM)
-        beyond = f" {BEYOND / MM:g} mm beyond a face the error is up to {error} µm."
+        beyond = f" {BEYOND_FACE / MM:g} mm beyond a face the error is up to {error} µm."
     reason = "The calibration identified more than offsets."
     if calibration.only_offsets:
         reason = "The calibration identified offsets only; a module was requested."
@@ -336,7 +353,7 @@ def write_module_page(
         "drives": ", ".join(comment_safe(h.drive) for h in homes),
         "others": ", ".join(letters),
         "beyond": beyond,
-        "longer_mm": f"{LONGER / MM:g}",
+        "longer_mm": f"{LONGER_TOOL / MM:g}",
         "longer": rounded_up(approximation.longer / UM),
     }
     return fill_template("kinematics.md", values)

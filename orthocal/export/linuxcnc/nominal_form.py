@@ -1,6 +1,7 @@
 """Closed form of a robot's nominal inverse kinematics, identified from points of its model.
 
-A slide along a unit vector u that holds the tool by a rod or a parallelogram of length L is at
+A slide along a unit vector u holds the tool by a rod or a parallelogram of length L. Its coordinate
+is
 
     r = u · d + s √(L² − |d|² + (u · d)²),  d = p − a,  s = ±1,
 
@@ -8,10 +9,10 @@ where a is the tool position at which rod and slide coordinate are zero. The Ort
 and a = 0, equation 2), linear deltas and biglides have this form. Squared, it is linear in the
 unknowns,
 
-    2 a · p + 2 r (u · p) − 2 m r + k = |p|² + r²,  m = u · a, k = L² − |a|²,
+    2 a · p + 2 r (u · p) − 2 m r + k = |p|² + r²,  m = u · a, k = L² − |a|².
 
-so that a few points of the model identify them. For any other robot the nominal form is the tangent
-at the middle of the region.
+So a few points of the model identify them. For any other robot the nominal form is the tangent at
+the middle of the region.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ TOLERANCE = 1e-9
 """Largest difference of the closed form from the model, [m]."""
 
 DECIMALS = 12
-"""Decimals of the identified numbers; further ones are rounding errors."""
+"""Decimals of the identified numbers; further decimals are rounding errors."""
 
 POINTS = 60
 """Number of points for the identification."""
@@ -44,13 +45,13 @@ class SlidesWithRods:
     """Inverse kinematics of slides that hold the tool by rods."""
 
     axes: Array
-    """u, unit vectors, shape (n, n)."""
+    """Unit vectors u of the slides, shape (n, n)."""
     anchors: Array
-    """a, shape (n, n), [m]."""
+    """Tool positions a, shape (n, n), [m]."""
     lengths: Array
-    """L, shape (n,), [m]."""
+    """Lengths L of the rods, shape (n,), [m]."""
     signs: Array
-    """s, shape (n,)."""
+    """Signs s of the roots, shape (n,)."""
 
     def __call__(self, points: Array) -> Array:
         """Drive coordinates, shape (k, n), [m]; NaN out of reach."""
@@ -67,11 +68,11 @@ class Tangent:
     """Inverse kinematics linearised at the middle of a region."""
 
     middle: Array
-    """Shape (n,), [m]."""
+    """Middle of the region, shape (n,), [m]."""
     values: Array
     """Drive coordinates at the middle, shape (n,), [m, rad]."""
     jacobian: Array
-    """Derivatives of the drive coordinates, shape (n, n), [1 or rad/m]."""
+    """Jacobian of the drive coordinates, shape (n, n), [1 or rad/m]."""
 
     def __call__(self, points: Array) -> Array:
         """Drive coordinates, shape (k, n), [m, rad]."""
@@ -94,7 +95,7 @@ def find_nominal_form(robot: Robot, middle: Array, half: Array) -> NominalForm:
     inverse = nominal_closure(robot).inverse
     try:
         drives = inverse(points)
-    except ClosureError:  # the nominal machine may not reach the region of the calibrated one
+    except ClosureError:  # the region of the calibrated machine may be out of nominal reach
         drives = None
     if drives is not None and all(d.unit == "m" for d in robot.drives):
         slides = _identify_slides(points, drives)
@@ -108,9 +109,9 @@ def find_nominal_form(robot: Robot, middle: Array, half: Array) -> NominalForm:
 
 
 def _identify_slides(points: Array, drives: Array) -> SlidesWithRods | None:
-    """Closed form of slides with rods through points; None if it does not fit them."""
+    """Closed form of slides with rods that fits points of the model; None if none does."""
     n = points.shape[1]
-    parts = []
+    slides_of_drives = []
     for r in drives.T:
         columns = [2.0 * points, 2.0 * r[:, None] * points, -2.0 * r[:, None], np.ones((len(r), 1))]
         rows, right = np.concatenate(columns, axis=1), (points**2).sum(axis=1) + r**2
@@ -120,9 +121,10 @@ def _identify_slides(points: Array, drives: Array) -> SlidesWithRods | None:
         if abs(np.linalg.norm(axis) - 1.0) > TOLERANCE or square <= 0.0:
             return None
         sign = np.sign(r - (points - anchor) @ axis)
-        parts.append((axis, anchor, np.sqrt(square), sign[0]))
+        slides_of_drives.append((axis, anchor, np.sqrt(square), sign[0]))
     axes, anchors, lengths, signs = (
-        read_only(np.round(np.array(p), DECIMALS) + 0.0) for p in zip(*parts, strict=True)
+        read_only(np.round(np.array(values), DECIMALS) + 0.0)
+        for values in zip(*slides_of_drives, strict=True)
     )
     slides = SlidesWithRods(axes, anchors, lengths, signs)
     return slides if np.abs(slides(points) - drives).max() < TOLERANCE else None

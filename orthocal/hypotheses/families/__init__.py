@@ -1,1 +1,1 @@
-"""Families of hypotheses, one topic per module: what may have gone wrong with a session."""
+"""Families of hypotheses about mistakes in a session, one topic per module."""

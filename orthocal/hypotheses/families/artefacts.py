@@ -1,8 +1,8 @@
-"""Artefacts of sensors at the tool: displaced between setups, or of another dimension than stated.
+"""Artefacts of sensors at the tool: displaced between setups, or with a wrong stated dimension.
 
 Setups share an artefact, such as the fixed ball of a bar, a square, or the station of a tracker. If
-it is displaced before one of them, its placement and its errors are others in all later setups. A
-square that is turned over without a statement is such a displacement: its error changes its sign.
+it is displaced before a setup, its placement and its errors have new values in all later setups. A
+square that was turned over without a statement is such a case: its error changes its sign.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from orthocal.session.session import Session
 if TYPE_CHECKING:
     from orthocal.hypotheses.linear_model import LinearModel
 
-LEAST_COLUMN = 0.5
-"""Part of the noise by which one prior std of a placement must move the readings to be considered.
-"""
+MIN_RELATIVE_CHANGE = 0.5
+"""Smallest change of the readings by one prior std of a considered parameter, relative to the
+noise."""
 
 
 def wrong_artefacts(model: LinearModel, rows: Rows) -> Iterator[Family]:
@@ -42,69 +42,69 @@ def wrong_artefacts(model: LinearModel, rows: Rows) -> Iterator[Family]:
 
 
 def shared_placements(session: Session) -> dict[str, dict[str, Indices]]:
-    """Artefacts that setups share, each with its setups and their parameters of it.
+    """Nuisance parameters of artefacts that several setups share.
 
     Returns:
-        Artefact, such as `ball.post`, to setup, to indices of its nuisance parameters among those
-        of the session.
+        Artefact, such as `ball.post`, to setup, to indices of the artefact's parameters among the
+        nuisance parameters of the session.
     """
     shared: dict[str, dict[str, Indices]] = {}
     nuisance = nuisance_parameters(session)
     for setup, indices in zip(session.setups.values(), nuisance.of_setup, strict=True):
         label = setup.name.rpartition("/")[0] if session.joined else ""
-        places: dict[str, list[int]] = {}
+        indices_by_artefact: dict[str, list[int]] = {}
         for u, i in zip(setup.sensor.nuisance_parameters, indices, strict=False):
             if u.shared_by is not None and not u.of_gauge:
                 artefact = ".".join(u.shared_by.split(".")[:2])
-                places.setdefault(f"{label}/{artefact}".lstrip("/"), []).append(i)
-        for artefact, of_setup in places.items():
-            shared.setdefault(artefact, {})[setup.name] = np.array(of_setup)
+                indices_by_artefact.setdefault(f"{label}/{artefact}".lstrip("/"), []).append(i)
+        for artefact, of_artefact in indices_by_artefact.items():
+            shared.setdefault(artefact, {})[setup.name] = np.array(of_artefact)
     return {artefact: setups for artefact, setups in shared.items() if len(setups) > 1}
 
 
 def _displaced(model: LinearModel, rows: Rows) -> Family | None:
-    """An artefact displaced before a setup, with all its parameters new from there on."""
+    """An artefact displaced before a setup: all its parameters have new values from there on."""
     explanations, groups = [], []
     columns = model.nuisance_columns()
     for artefact, placements in shared_placements(rows.session).items():
         names = sorted(placements, key=lambda name: rows.setups[name][0])
         for k in range(1, len(names)):
             later = names[k:]
-            at = rows.of_setups(later)
-            if rows.of_setups(names[:k]).max() > at.min():
+            later_rows = rows.of_setups(later)
+            if rows.of_setups(names[:k]).max() > later_rows.min():
                 continue
             parameters = np.unique(np.concatenate([placements[name] for name in later]))
             changes = np.zeros((parameters.size, rows.count))
-            changes[:, at] = columns[np.ix_(parameters, at)]
+            changes[:, later_rows] = columns[np.ix_(parameters, later_rows)]
             sizes = np.abs(changes).max(axis=1)
-            seen = sizes > LEAST_COLUMN * model.sigma
-            if seen.any():
-                every, setups = tuple(at.tolist()), tuple(later)
+            visible = sizes > MIN_RELATIVE_CHANGE * model.sigma
+            if visible.any():
+                concerned, setups = tuple(later_rows.tolist()), tuple(later)
                 explanations.append(
-                    Explanation("displaced artefact", "setups", every, setups, (artefact,))
+                    Explanation("displaced artefact", "setups", concerned, setups, (artefact,))
                 )
-                groups.append(changes[seen] / sizes[seen, None])
+                groups.append(changes[visible] / sizes[visible, None])
     return Family.of(explanations, groups=groups) if explanations else None
 
 
 def _other_dimensions(model: LinearModel, rows: Rows) -> Family | None:
-    """A dimension of another size in one setup, or in all setups that state the same one."""
+    """A wrong stated dimension in one setup, or in all setups that state it."""
     explanations: list[Explanation] = []
     shapes: list[Array] = []
-    for size, changes in model.dimension_changes().items():
+    for dimension, changes in model.dimension_changes().items():
         for setups in _each_and_all(changes):
             change = np.sum([changes[name] for name in setups], axis=0)
-            at = np.flatnonzero(change)
+            concerned = np.flatnonzero(change)
             explanations.append(
                 Explanation(
                     "wrong dimension",
                     "setup" if len(setups) == 1 else "setups",
-                    tuple(at.tolist()),
+                    tuple(concerned.tolist()),
                     setups,
-                    size,
+                    dimension,
                 )
             )
-            shapes.append(change[at])
+            shapes.append(change[concerned])
     return Family.with_effects(rows, explanations, shapes) if explanations else None
 
 
@@ -112,7 +112,7 @@ def _readjusted(model: LinearModel, rows: Rows) -> Family | None:
     """A dimension that differs in several setups of a gauge from one session on."""
     explanations: list[Explanation] = []
     shapes: list[Array] = []
-    for size, changes in model.dimension_changes().items():
+    for dimension, changes in model.dimension_changes().items():
         gauges: dict[str, list[str]] = {}
         for name in changes:
             gauge = rows.session.setups[name].gauge.partition("/")[2]
@@ -124,16 +124,21 @@ def _readjusted(model: LinearModel, rows: Rows) -> Family | None:
                 if not 1 < len(setups) < len(of_gauge):  # one setup: `_other_dimensions`
                     continue
                 change = np.sum([changes[name] for name in setups], axis=0)
-                at = np.flatnonzero(change)
-                names, every = (*size, later[0]), tuple(at.tolist())
+                concerned = np.flatnonzero(change)
                 explanations.append(
-                    Explanation("readjusted dimension", "setups", every, setups, names)
+                    Explanation(
+                        "readjusted dimension",
+                        "setups",
+                        tuple(concerned.tolist()),
+                        setups,
+                        (*dimension, later[0]),
+                    )
                 )
-                shapes.append(change[at])
+                shapes.append(change[concerned])
     return Family.with_effects(rows, explanations, shapes) if explanations else None
 
 
 def _each_and_all(changes: Mapping[str, Array]) -> list[tuple[str, ...]]:
-    """Each setup, and all of them together if there are several."""
+    """Each setup alone, and all of them if there are several."""
     each: list[tuple[str, ...]] = [(name,) for name in changes]
     return [*each, tuple(changes)] if len(each) > 1 else each

@@ -1,6 +1,6 @@
-"""Displaced gauge and stuck dial: what changes while a setup is read.
+"""Displaced gauge and stuck dial: changes while a setup is read.
 
-Differences of postures do not show a displaced gauge.
+A displaced gauge is invisible in rows that are differences of postures.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from orthocal.hypotheses.anomaly import Explanation
 from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, Tails, sparse_rows
 from orthocal.sensors.protocol import states_readings
 
-FEWEST = 4
-"""Readings of a setup below which a tail is not distinguished from an outlier."""
+MIN_READINGS = 4
+"""Fewest readings of a setup in which a displacement differs from an outlier."""
 
-FEWEST_STUCK = 3
-"""Equal readings in a row from which on a dial may have stuck."""
+MIN_STUCK = 3
+"""Fewest equal consecutive readings of a stuck dial."""
 
-MOST_STUCK = 16
-"""Readings of a run that are used."""
+MAX_STUCK = 16
+"""Most readings of a run of equal ones that are used."""
 
 
 def displaced_gauges(rows: Rows, sigma: float) -> Iterator[Family]:
@@ -37,10 +37,11 @@ def displaced_gauges(rows: Rows, sigma: float) -> Iterator[Family]:
 
 
 def _displaced(rows: Rows) -> Family | None:
+    """A gauge displaced within a setup: all later rows change by the same amount."""
     segments = [
         (indices, np.ones(indices.size))
         for indices in rows.setups.values()
-        if rows.single[indices].all() and indices.size >= FEWEST
+        if rows.single[indices].all() and indices.size >= MIN_READINGS
     ]
     if not segments:
         return None
@@ -60,20 +61,21 @@ def _displaced(rows: Rows) -> Family | None:
 
 
 def _cycle_apart(rows: Rows) -> Family | None:
-    """An inner cycle; before the second and the last one the gauge was displaced for good."""
+    """A gauge displaced for one inner cycle; at the first and last cycle `_displaced` applies."""
     explanations = []
     for (name, cycle), indices in rows.cycles.items():
         setup = rows.setups[name]
         inner = indices[0] != setup[0] and indices[-1] != setup[-1]
         if inner and indices.size > 1 and rows.single[indices].all():
-            at = tuple(indices.tolist())
+            concerned = tuple(indices.tolist())
             explanations.append(
-                Explanation("displaced gauge", "cycle", at, names=(name,), cycle=cycle)
+                Explanation("displaced gauge", "cycle", concerned, names=(name,), cycle=cycle)
             )
     return Family.with_effects(rows, explanations) if explanations else None
 
 
 def _stuck(rows: Rows, sigma: float) -> Family | None:
+    """Runs of equal readings of different postures; all but the first carry no information."""
     runs: list[Indices] = []
     for indices in rows.setups.values():
         setup = rows.session.setups[rows.session.readings[indices[0]].setup]
@@ -81,7 +83,7 @@ def _stuck(rows: Rows, sigma: float) -> Family | None:
             continue
         ends = np.flatnonzero(np.append(np.diff(rows.values[indices]) != 0.0, True))
         begins = np.append(0, ends[:-1] + 1)
-        for k in np.flatnonzero(ends - begins >= FEWEST_STUCK - 1):
+        for k in np.flatnonzero(ends - begins >= MIN_STUCK - 1):
             run = indices[begins[k] : ends[k] + 1]
             if len({rows.session.readings[i].posture for i in run}) > 1:
                 runs.append(run)
@@ -92,7 +94,7 @@ def _stuck(rows: Rows, sigma: float) -> Family | None:
         Explanation("stuck dial", "setup", tuple(run.tolist()), names=(setup,))
         for run, setup in zip(runs, setups, strict=True)
     ]
-    silent = [run[1 : MOST_STUCK + 1] for run in runs]
+    silent = [run[1 : MAX_STUCK + 1] for run in runs]
     steps = np.array([rows.gauge(int(run[0])).resolution or sigma for run in runs])
     volume = -np.log(steps) * [len(indices) for indices in silent]
-    return Family.of(explanations, size=rows.count * MOST_STUCK, log_volume=volume, silent=silent)
+    return Family.of(explanations, size=rows.count * MAX_STUCK, log_volume=volume, silent=silent)

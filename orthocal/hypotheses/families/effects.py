@@ -1,8 +1,7 @@
-"""Systematic effects that readings show although the machine's model lacks them.
+"""Systematic effects that the readings show but the machine's model lacks.
 
-How an effect changes the readings, and how large it may be, comes from the effect itself
-(`LinearModel.linearise_effect`). So effects of other packages are sought like those of orthocal.
-Effects that the model has are not sought.
+Each effect states its parameters and their priors (`LinearModel.linearise_effect`). So effects of
+other packages are tested like those of orthocal. Effects of the model are not tested.
 """
 
 from __future__ import annotations
@@ -21,15 +20,16 @@ from orthocal.hypotheses.linear_model import LinearModel
 from orthocal.observation.observations import readings_without
 from orthocal.session.session import Session
 
-FEWEST = 4
-"""Readings of a setup below which a drift is not distinguished from an outlier."""
+MIN_READINGS = 4
+"""Fewest readings of a setup in which a drift differs from an outlier."""
 
-LEAST_COLUMN = 1e-3
-"""Part of the noise by which a parameter must move the readings to be considered."""
+MIN_RELATIVE_CHANGE = 1e-3
+"""Smallest change of the readings by one prior std of a considered parameter, relative to the
+noise."""
 
 
 def missing_effects(session: Session) -> tuple[str, ...]:
-    """Names of the effects with parameters that the robot of a session could have, and has not."""
+    """Names of the effects with parameters that the robot's YAML allows but its model lacks."""
     present, names = session.robot.effect_names, []
     for name in order_effects(effect_names()):
         if name in present:
@@ -44,30 +44,31 @@ def missing_effects(session: Session) -> tuple[str, ...]:
 
 
 def rows_without(session: Session, name: str) -> Indices:
-    """Rows that lack a condition which an effect needs."""
-    kind = find_effect(name, where="effects", error=RobotError)
-    lacking = {id(r) for c in kind.conditions for r in readings_without(session, c)}
+    """Rows without a condition that an effect needs."""
+    effect = find_effect(name, where="effects", error=RobotError)
+    lacking = {id(r) for c in effect.conditions for r in readings_without(session, c)}
     return np.flatnonzero([id(r) in lacking for r in session.readings])
 
 
 def find_effects(model: LinearModel) -> list[SystematicEffect]:
-    """Effects that the readings of a session could show, but the model lacks."""
+    """Effects that the model lacks but the readings of a session could show."""
     return model.share("effects", lambda: _find_effects(model))
 
 
 def _find_effects(model: LinearModel) -> list[SystematicEffect]:
+    """Linearised effects with their visible parameters."""
     session, effects = model.problem.session, []
     for name in missing_effects(session):
         lacking = rows_without(session, name)
         if lacking.size == len(session.readings):
             continue
         effect = model.linearise_effect(name)
-        seen = np.abs(effect.columns).max(axis=1) > LEAST_COLUMN * model.sigma
-        if lacking.size:  # those of setups whose rows all have the conditions
-            seen &= ~effect.columns[:, lacking].any(axis=1)
-            seen &= [p.name.startswith("setup.") for p in effect.parameters]
-        if seen.any():
-            effects.append(effect.select(seen))
+        visible = np.abs(effect.columns).max(axis=1) > MIN_RELATIVE_CHANGE * model.sigma
+        if lacking.size:  # only parameters of setups whose rows all state the conditions
+            visible &= ~effect.columns[:, lacking].any(axis=1)
+            visible &= [p.name.startswith("setup.") for p in effect.parameters]
+        if visible.any():
+            effects.append(effect.select(visible))
     return effects
 
 
@@ -76,34 +77,34 @@ def unmodelled_effects(rows: Rows, effects: Sequence[SystematicEffect]) -> Itera
 
     Args:
         rows: The rows.
-        effects: Of `find_effects`.
+        effects: The effects, as from `find_effects`.
     """
     for effect in effects:
         if effect.name == "drift":
             yield from _drifts(rows, effect)
-        every = np.flatnonzero(effect.change.astype(bool) | effect.columns.any(axis=0))
-        setups = tuple(dict.fromkeys(rows.session.readings[i].setup for i in every))
+        concerned = np.flatnonzero(effect.change.astype(bool) | effect.columns.any(axis=0))
+        setups = tuple(dict.fromkeys(rows.session.readings[i].setup for i in concerned))
         kind = EFFECT_KINDS.get(effect.name, "other effect")
-        e = Explanation(kind, "session", tuple(every.tolist()), setups, effect=effect.name)
+        e = Explanation(kind, "session", tuple(concerned.tolist()), setups, effect=effect.name)
         yield Family.of([e], systematic=[effect])
 
 
 def _drifts(rows: Rows, effect: SystematicEffect) -> Iterator[Family]:
-    """Drift of each setup by any amount, and the same drift of all."""
+    """Drift of each setup by an unknown amount, and one common drift of all setups."""
     session, explanations, ramps = rows.session, [], []
     of_setup = group_rows(r.setup for r in session.readings)
     for column in effect.columns:
         setup = session.readings[int(np.abs(column).argmax())].setup
-        if of_setup[setup].size >= FEWEST:
+        if of_setup[setup].size >= MIN_READINGS:
             explanations.append(
                 Explanation("drift", "setup", tuple(of_setup[setup].tolist()), (setup,))
             )
             ramp = column[of_setup[setup]]
             ramps.append(ramp / np.ptp(ramp))
     if len(explanations) > 1:
-        every = tuple(i for e in explanations for i in e.rows)
+        concerned = tuple(i for e in explanations for i in e.rows)
         names = tuple(e.setups[0] for e in explanations)
-        explanations.append(Explanation("drift", "session", every, names))
+        explanations.append(Explanation("drift", "session", concerned, names))
         ramps.append(np.concatenate(ramps))
     if explanations:
         yield Family.with_effects(rows, explanations, ramps)

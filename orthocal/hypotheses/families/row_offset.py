@@ -1,4 +1,4 @@
-"""Row offset: a step was missed or written twice, so that later readings are one row off."""
+"""Row offset: a reading was skipped or written twice, so that later readings are one row off."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from orthocal.arrays import Array, Indices
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, Tails, sparse_rows
 
-FEWEST = 3
-"""Rows of a setup below which a row offset is a swap."""
+MIN_ROWS = 3
+"""Fewest rows of a setup; a row offset of two rows is a swap."""
 
 
 class _Offsets(NamedTuple):
@@ -23,43 +23,42 @@ class _Offsets(NamedTuple):
     base: Array
     """Correction of each row from the start on, shape (m,), [m]."""
     position: Indices
-    """Place of the first row that is wrong, shape (h,)."""
+    """Place in `rows` of the first wrong row, shape (h,)."""
     start: Indices
-    """Place from which on `base` applies, shape (h,)."""
-    at: Indices
+    """Place in `rows` from which on `base` applies, shape (h,)."""
+    corrected: Indices
     """Row with a separate correction, shape (h,)."""
-    value: Array
-    """That correction, shape (h,), [m]."""
+    correction: Array
+    """Separate correction of that row, shape (h,), [m]."""
     lost: Indices
     """Row whose reading is lost, shape (h,)."""
 
 
 def row_offsets(rows: Rows) -> Iterator[Family]:
-    """A step missed or written twice in a setup or in one cycle of it.
+    """A reading skipped or written twice, in a setup or in one of its cycles.
 
-    If a step is missed, the last row is empty or holds what belongs into the first of the rows;
-    if one is written twice, the last reading is lost. The lost reading is of unknown size.
+    If a reading was skipped, the last row contains the reading of the first wrong row, or another
+    one. If a reading was written twice, the last one is lost. The lost reading has an unknown
+    value.
     """
     setups = {n: i for n, i in rows.setups.items() if not rows.paired[i].any()}
-    segments = [indices for indices in setups.values() if indices.size >= FEWEST]
+    segments = [indices for indices in setups.values() if indices.size >= MIN_ROWS]
     segments += [
         indices
         for (name, _), indices in rows.cycles.items()
-        if name in setups and FEWEST <= indices.size < setups[name].size
+        if name in setups and MIN_ROWS <= indices.size < setups[name].size
     ]
     if not segments:
         return
-    offsets = [
-        _offsets(indices, rows.values[indices], m) for indices in segments for m in (True, False)
-    ]
+    offsets = [_offsets(i, rows.values[i], missing=m) for i in segments for m in (True, False)]
     sizes = [o.position.size for o in offsets]
-    which = np.repeat(np.arange(len(offsets)), sizes)
-    position, start, at, value, lost = (
+    group = np.repeat(np.arange(len(offsets)), sizes)
+    position, start, corrected, correction, lost = (
         np.concatenate([getattr(o, name) for o in offsets]) for name in _Offsets._fields[2:]
     )
 
     def explain(h: int) -> Explanation:
-        indices = offsets[which[h]].rows[position[h] :]
+        indices = offsets[group[h]].rows[position[h] :]
         cycles = {rows.session.readings[i].cycle for i in indices}
         return Explanation(
             "row offset",
@@ -67,22 +66,23 @@ def row_offsets(rows: Rows) -> Iterator[Family]:
             tuple(indices.tolist()),
             names=(rows.session.readings[indices[0]].setup,),
             cycle=cycles.pop() if len(cycles) == 1 else None,
-            missing=int(which[h]) % 2 == 0,
+            missing=int(group[h]) % 2 == 0,
         )
 
-    count, ones = which.size, np.ones((which.size, 1))
-    tails = Tails([(o.rows, o.base) for o in offsets], which, start)
-    edits = Patterns(sparse_rows(list(at[:, None]), list(value[:, None]), rows.count), tails)
+    count, ones = group.size, np.ones((group.size, 1))
+    tails = Tails([(o.rows, o.base) for o in offsets], group, start)
+    separate = sparse_rows(list(corrected[:, None]), list(correction[:, None]), rows.count)
+    edits = Patterns(separate, tails)
     effects = Patterns(sparse_rows(list(lost[:, None]), list(ones), rows.count))
     yield Family(explain, count, count, edits, effects)
 
 
-def _offsets(indices: Indices, values: Array, missing: bool) -> _Offsets:
-    """Row offsets of one kind in some rows, one per row from which on it may begin."""
+def _offsets(indices: Indices, values: Array, *, missing: bool) -> _Offsets:
+    """Row offsets of one kind in some rows, one per row in which it may begin."""
     k = np.arange(0 if missing else 1, indices.size - 1)
-    if missing:  # rows after k get the reading before, row k gets the last one
+    if missing:  # rows after k get the reading of the row before, row k gets the last one
         base = np.append(0.0, values[:-1] - values[1:])
         return _Offsets(indices, base, k, k + 1, indices[k], values[-1] - values[k], indices[k])
-    # rows from k on get the reading after, the last one is lost
+    # rows from k on get the reading of the row after, the last one is lost
     base = np.append(values[1:] - values[:-1], 0.0)
     return _Offsets(indices, base, k, k, indices[k], np.zeros(k.size), np.full(k.size, indices[-1]))

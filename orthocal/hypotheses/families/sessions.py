@@ -1,6 +1,6 @@
-"""Changes between joined sessions: other offsets in the controller than stated, a changed machine.
+"""Changes between joined sessions: offsets that differ from the stated ones, a changed machine.
 
-A session whose offsets E are stated but whose controller holds C shows a machine that is E − C off.
+If a session states the offsets E but its controller has C, its machine appears to differ by E − C.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from orthocal.hypotheses.hypothesis import Family, MachineShift
 from orthocal.hypotheses.linear_model import LinearModel, linear_model
 from orthocal.session.session import Session
 
-MOST_DRIVES = 6
-"""Drives up to which all choices among them are considered."""
+MAX_DRIVES = 6
+"""Most drives of a robot of which all subsets are considered."""
 
-MOST_DIVIDED = 5
-"""Sessions up to which all divisions in two are considered, in whatever order they were joined."""
+MAX_DIVIDED = 5
+"""Most sessions of which all divisions into two groups are considered, in any order."""
 
-DETECTED = 5.5
-"""Change, over its standard deviation, from which on its evidence is clear."""
+DETECTABLE_CHANGE = 5.5
+"""Smallest change, relative to its standard deviation, with clear evidence."""
 
 ROUNDING = 1e-6
-"""Difference of offsets that counts as none, [m, rad]."""
+"""Differences of offsets up to this are neglected, [m, rad]."""
 
 
 def changes_between_sessions(model: LinearModel) -> Iterator[Family]:
-    """Offsets that are not as stated, and machines that changed; none for a single session."""
+    """Wrongly entered offsets and changes of the machine; none for a single session."""
     if len(model.labels) < 2:
         return
     offsets = _wrong_offsets(model)
@@ -40,31 +40,33 @@ def changes_between_sessions(model: LinearModel) -> Iterator[Family]:
 
 
 def _wrong_offsets(model: LinearModel) -> Family | None:
+    """Offsets of a session that were entered wrongly, each mistake once."""
     drives = [d.name for d in model.problem.robot.drives]
     place, active, labels = model.offsets, model.active, model.labels
     scale = model.problem.theta_scale
-    tried: list[tuple[AnomalyKind, int, tuple[int, ...], Array]] = []
-    befores = [np.zeros(len(drives)), *active[model.order]]
-    for before, k in zip(befores, model.order.tolist(), strict=False):
-        tried += [(kind, k, moved, c) for kind, moved, c in enter_wrongly(before, active[k])]
-    if not tried or len(place) < len(drives):
+    mistakes: list[tuple[AnomalyKind, int, tuple[int, ...], Array]] = []
+    previous = [np.zeros(len(drives)), *active[model.order]]
+    for before, k in zip(previous, model.order.tolist(), strict=False):
+        for kind, concerned, entered in enter_wrongly(before, active[k]):
+            mistakes.append((kind, k, concerned, entered))
+    if not mistakes or len(place) < len(drives):
         return None
 
     explanations = [
         Explanation(
             kind,
             "session",
-            drives=tuple(drives[i] for i in moved),
-            offsets=tuple(c.tolist()),
+            drives=tuple(drives[i] for i in concerned),
+            offsets=tuple(entered.tolist()),
             sessions=(labels[k],),
         )
-        for kind, k, moved, c in tried
+        for kind, k, concerned, entered in mistakes
     ]
     shifts = []
-    for _, k, _, c in tried:
+    for _, k, _, entered in mistakes:
         direction = np.zeros(scale.size)
         for i, name in enumerate(drives):
-            direction[place[name]] = (active[k, i] - c[i]) / scale[place[name]]
+            direction[place[name]] = (active[k, i] - entered[i]) / scale[place[name]]
         shifts.append(MachineShift(np.arange(len(labels)) == k, direction))
     return Family.of(explanations, shifts=shifts)
 
@@ -72,17 +74,18 @@ def _wrong_offsets(model: LinearModel) -> Family | None:
 def enter_wrongly(
     before: Array, stated: Array
 ) -> Iterator[tuple[AnomalyKind, tuple[int, ...], Array]]:
-    """Offsets that may be in a controller instead of those stated.
+    """Offsets that the controller may have instead of the stated ones.
 
     Args:
-        before: Offsets that were active before, shape (n_drives,), [m, rad].
+        before: Previously active offsets, shape (n_drives,), [m, rad].
         stated: Offsets that were to be entered, shape (n_drives,), [m, rad].
 
     Yields:
-        Kind, drives concerned, and the offsets, each set of offsets once.
+        Kind of mistake, indices of the drives concerned, and offsets in the controller, shape
+        (n_drives,), [m, rad]; each set of offsets once.
     """
     change, n = stated - before, stated.size
-    ways: tuple[tuple[AnomalyKind, Array], ...] = (
+    mistakes: tuple[tuple[AnomalyKind, Array], ...] = (
         ("offsets not entered", before),
         ("offsets not entered", np.zeros(n)),
         ("offsets reversed", -stated),
@@ -99,41 +102,41 @@ def enter_wrongly(
         seen.add(key)
         return new
 
-    for kind, values in ways:
-        other = np.flatnonzero(np.abs(values - stated) > ROUNDING).tolist()
-        sizes = range(len(other), 0, -1) if n <= MOST_DRIVES else (len(other),)
-        for drives in (d for count in sizes if count for d in combinations(other, count)):
+    for kind, values in mistakes:
+        differing = np.flatnonzero(np.abs(values - stated) > ROUNDING).tolist()
+        sizes = range(len(differing), 0, -1) if n <= MAX_DRIVES else (len(differing),)
+        for drives in (d for count in sizes if count for d in combinations(differing, count)):
             entered = stated.copy()
             entered[list(drives)] = values[list(drives)]
             if is_new(entered):
                 yield kind, drives, entered
-    if n > MOST_DRIVES:
+    if n > MAX_DRIVES:
         return
     for order in permutations(range(n)):
         entered = stated[list(order)]
         if is_new(entered):
-            moved = np.abs(entered - stated) > ROUNDING
-            yield "offsets interchanged", tuple(np.flatnonzero(moved).tolist()), entered
+            changed = np.abs(entered - stated) > ROUNDING
+            yield "offsets interchanged", tuple(np.flatnonzero(changed).tolist()), entered
 
 
 def _changed(model: LinearModel) -> Iterator[Family]:
-    """One parameter that differs from a session on, by an unknown amount."""
+    """One parameter that changes between sessions by an unknown amount."""
     problem = model.problem
     parameters, drive_of = problem.robot.parameters, {v: k for k, v in model.offsets.items()}
     place = {name: i for i, name in enumerate(problem.free[: problem.n_machine])}
-    single: list[tuple[str, Array]] = []
-    other: list[tuple[str, Array]] = []
+    of_offsets: list[tuple[str, Array]] = []
+    of_others: list[tuple[str, Array]] = []
     for name, i in place.items():
         direction = np.zeros(problem.n_free)
         direction[i] = 1.0 / problem.theta_scale[i]
-        (single if i in drive_of else other).append((name, direction))
+        (of_offsets if i in drive_of else of_others).append((name, direction))
     for p in parameters:
         if len(p.terms) > 1 and p.name not in place and all(t in place for t, _ in p.terms):
             direction = np.zeros(problem.n_free)
             for term, coefficient in p.terms:
                 direction[place[term]] = coefficient / problem.theta_scale[place[term]]
-            other.append((p.name, direction))
-    for directions in (single, other):
+            of_others.append((p.name, direction))
+    for directions in (of_offsets, of_others):
         if directions:
             yield _steps(model, directions, drive_of, place)
 
@@ -144,13 +147,21 @@ def _steps(
     drive_of: dict[int, str],
     place: dict[str, int],
 ) -> Family:
+    """Change in each direction for each division of the sessions.
+
+    Args:
+        model: The linearised model.
+        directions: Names of parameters and their changes, shape (n_free,), [prior std].
+        drive_of: Index of the offset of a drive among the free parameters, to the drive.
+        place: Name of a parameter to its index among the free parameters.
+    """
     labels, active = model.labels, model.active
     explanations, shifts = [], []
     for later, apart in divide_sessions(model.order):
         sessions = np.isin(np.arange(len(labels)), later)
-        named = tuple(labels[k] for k in (later if apart else later[:1]))
-        between = np.abs(active[sessions][:, None] - active[~sessions]).max(axis=2)
-        entered = bool(between.min() > ROUNDING)
+        names = tuple(labels[k] for k in (later if apart else later[:1]))
+        differences = np.abs(active[sessions][:, None] - active[~sessions]).max(axis=2)
+        entered = bool(differences.min() > ROUNDING)
         for name, direction in directions:
             drive = drive_of.get(place.get(name, -1))
             explanations.append(
@@ -159,7 +170,7 @@ def _steps(
                     "session",
                     drives=() if drive is None else (drive,),
                     parameters=(name,),
-                    sessions=named,
+                    sessions=names,
                     apart=apart,
                 )
             )
@@ -168,38 +179,39 @@ def _steps(
 
 
 def divide_sessions(order: Indices) -> Iterator[tuple[list[int], bool]]:
-    """Sessions in which a machine may differ from the others.
+    """Divide sessions into two groups between which the machine may differ.
 
     Args:
         order: Sessions in the order of measuring, shape (n_sessions,).
 
     Yields:
-        Those from one on, in the order of measuring. Of few sessions also any others, not more than
-        half of them, as their order may have been stated wrongly; and whether they are such.
+        Sessions of one group, and False for all sessions from one on. With at most MAX_DIVIDED
+        sessions also True for any other group of at most half of them, because the order may be
+        stated wrongly.
     """
     sessions, n = order.tolist(), len(order)
     for k in range(1, n):
         yield sessions[k:], False
-    if n > MOST_DIVIDED:
+    if n > MAX_DIVIDED:
         return
     steps = [set(sessions[k:]) for k in range(1, n)] + [set(sessions[:k]) for k in range(1, n)]
-    seen: list[set[int]] = []
+    yielded: list[set[int]] = []
     for size in range(1, n // 2 + 1):
-        for some in map(list, combinations(sessions, size)):
-            others = set(sessions) - set(some)
-            if set(some) not in steps and others not in seen:
-                seen.append(set(some))
-                yield some, True
+        for group in map(list, combinations(sessions, size)):
+            others = set(sessions) - set(group)
+            if set(group) not in steps and others not in yielded:
+                yielded.append(set(group))
+                yield group, True
 
 
 def detectable_changes(session: Session) -> dict[str, float]:
-    """Smallest change of each drive's offset between joined sessions that would be detected.
+    """Smallest detectable change of each drive's offset between joined sessions.
 
     Args:
         session: Joined sessions.
 
     Returns:
-        Drive to size, [SI]; infinite where no change would be. Empty for a single session.
+        Drive to change, [SI]; infinite if no change is detectable. Empty for a single session.
 
     Raises:
         ClosureError: If the machine cannot reach a posture.
@@ -208,8 +220,8 @@ def detectable_changes(session: Session) -> dict[str, float]:
     if len(model.labels) < 2 or model.dof < 1:
         return {}
     problem, offsets = model.problem, model.offsets
-    about = model.at_reference(slopes=True)
-    sizes = dict.fromkeys(offsets, 0.0)
+    about = model.at_reference(keep_jacobian=True)
+    changes = dict.fromkeys(offsets, 0.0)
     sessions = np.arange(len(model.labels))
     steps = [np.isin(sessions, later) for later, apart in divide_sessions(model.order) if not apart]
     for drive, i in offsets.items():
@@ -218,5 +230,5 @@ def detectable_changes(session: Session) -> dict[str, float]:
         shifts = [MachineShift(later, direction) for later in steps]
         effects = np.array([model.shift_entries(about, s) for s in shifts])
         _, stds = about.likelihood.estimate_amounts(np.zeros_like(about.expected), effects)
-        sizes[drive] = DETECTED * float(stds.max())
-    return sizes
+        changes[drive] = DETECTABLE_CHANGE * float(stds.max())
+    return changes

@@ -1,4 +1,4 @@
-"""Single readings: outlier, reversed sign, decimal point, misread dial; also in all cycles."""
+"""Mistakes in a single reading, or in one posture of a setup in all its cycles."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from orthocal.hypotheses.families.unit_and_sign import DECIMAL_POINTS, multiplie
 from orthocal.hypotheses.hypothesis import Family, Rows
 
 MISREAD = (1e-3, 0.5e-3, 0.2e-3, 0.1e-3)
-"""Amounts by which a dial is misread: a turn, half a turn, a turn of a fine dial, a numbered mark,
+"""Typical misreading of a dial: one turn, half a turn, one turn of a fine dial, one numbered mark,
 [m]."""
 
-FEWEST_POSTURES = 3
-"""Postures of a setup from which on one may be wrong in all cycles."""
+MIN_POSTURES = 3
+"""Fewest postures of a setup of which one may be wrong in all cycles."""
 
 
 def wrong_readings(rows: Rows) -> Iterator[Family]:
-    """Errors of one reading, or of one posture of a setup in all cycles."""
+    """Mistakes in one reading, or in one posture of a setup in all cycles."""
     single = [np.array([i]) for i in range(rows.count)]
     yield _outliers(rows, single)
     yield _multiplied(rows, single, (-1.0,), "reversed sign")
     yield _multiplied(rows, single, DECIMAL_POINTS, "decimal point")
     if dials := [np.array([i]) for i in np.flatnonzero(~rows.paired)]:
         yield _misread(rows, dials)
-    several = [
+    in_all_cycles = [
         indices
         for (setup, *_), indices in rows.repeated.items()
-        if len(indices) > 1 and len(rows.setups[setup]) >= FEWEST_POSTURES * len(indices)
+        if len(indices) > 1 and len(rows.setups[setup]) >= MIN_POSTURES * len(indices)
     ]
-    if several:
-        yield _outliers(rows, several)
-        yield _multiplied(rows, several, (-1.0,), "reversed sign")
-        yield _multiplied(rows, several, DECIMAL_POINTS, "decimal point")
+    if in_all_cycles:
+        yield _outliers(rows, in_all_cycles)
+        yield _multiplied(rows, in_all_cycles, (-1.0,), "reversed sign")
+        yield _multiplied(rows, in_all_cycles, DECIMAL_POINTS, "decimal point")
 
 
 def _explain(
@@ -46,11 +46,11 @@ def _explain(
     factor: float | None = None,
     amount: float | None = None,
 ) -> Explanation:
-    """Explanation that concerns one reading, or one posture in all cycles."""
+    """Explanation of one wrong reading, or of one posture that is wrong in all cycles."""
     scope: Scope = "reading" if len(indices) == 1 else "posture"
     names = (rows.posture(int(indices[0])),)
-    at = tuple(indices.tolist())
-    return Explanation(kind, scope, at, names=names, factor=factor, amount=amount)
+    concerned = tuple(indices.tolist())
+    return Explanation(kind, scope, concerned, names=names, factor=factor, amount=amount)
 
 
 def _outliers(rows: Rows, groups: Sequence[Indices]) -> Family:
@@ -61,11 +61,11 @@ def _outliers(rows: Rows, groups: Sequence[Indices]) -> Family:
 def _multiplied(
     rows: Rows, groups: Sequence[Indices], factors: Sequence[float], kind: AnomalyKind
 ) -> Family:
-    tried = [_explain(rows, i, kind, factor=factor) for factor in factors for i in groups]
-    return multiplied(rows, tried)
+    explanations = [_explain(rows, i, kind, factor=factor) for factor in factors for i in groups]
+    return multiplied(rows, explanations)
 
 
 def _misread(rows: Rows, groups: Sequence[Indices]) -> Family:
     amounts = [sign * size for size in MISREAD for sign in (-1.0, 1.0)]
-    tried = [_explain(rows, i, "misread dial", amount=a) for a in amounts for i in groups]
-    return Family.edited(rows, tried, [np.array([-(e.amount or 0.0)]) for e in tried])
+    explanations = [_explain(rows, i, "misread dial", amount=a) for a in amounts for i in groups]
+    return Family.edited(rows, explanations, [np.array([-(e.amount or 0.0)]) for e in explanations])

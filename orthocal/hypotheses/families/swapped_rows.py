@@ -1,7 +1,7 @@
-"""Swapped rows: two readings, postures, setups or legs swapped.
+"""Swapped rows: two readings, postures, setups or legs.
 
-In sessions of more than `FAR_APART` rows two rows of a setup are considered only if they are
-neighbours, and a family of more than `MOST` pairs is not considered at all.
+In sessions of more than MAX_ROWS_FOR_ALL_PAIRS rows, rows of a setup are paired with their
+neighbours only. A family of more than MAX_PAIRS pairs is not considered.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from orthocal.arrays import Indices
 from orthocal.hypotheses.anomaly import Explanation, Scope
 from orthocal.hypotheses.hypothesis import Family, Rows, group_rows
 
-FAR_APART = 400
-"""Rows of a session above which only neighbours in a setup are considered."""
+MAX_ROWS_FOR_ALL_PAIRS = 400
+"""Most rows of a session in which all pairs of rows of a setup are considered."""
 
-MOST = 60_000
-"""Pairs of a family above which none is considered."""
+MAX_PAIRS = 60_000
+"""Most pairs of a family that is considered."""
 
 
 def swapped_rows(rows: Rows) -> Iterator[Family]:
-    """Swapped rows of every scope, one family each."""
+    """Swapped rows, one family per scope."""
     for pairs in (
         _of_setup(rows),
         _across_setups(rows),
@@ -33,17 +33,18 @@ def swapped_rows(rows: Rows) -> Iterator[Family]:
         _legs(rows),
         _backwards(rows),
     ):
-        if 0 < len(pairs) <= MOST:
+        if 0 < len(pairs) <= MAX_PAIRS:
             yield _swapped(rows, pairs)
 
 
 def _swapped(rows: Rows, pairs: Sequence[Explanation]) -> Family:
-    change = []
+    """Corrections that swap the rows back."""
+    changes = []
     for pair in pairs:
         one, other = np.array(pair.rows).reshape(2, -1)
-        gain = rows.values[other] - rows.values[one]
-        change.append(np.concatenate([gain, -gain]))
-    return Family.edited(rows, pairs, change)
+        difference = rows.values[other] - rows.values[one]
+        changes.append(np.concatenate([difference, -difference]))
+    return Family.edited(rows, pairs, changes)
 
 
 def _pair(
@@ -53,7 +54,7 @@ def _pair(
     setups: tuple[str, ...] = (),
     names: tuple[str, ...] = (),
 ) -> Explanation:
-    """Rows that may be swapped."""
+    """Explanation of two swapped groups of rows."""
     both = (*one.tolist(), *other.tolist())
     return Explanation("swapped rows", scope, both, setups, names)
 
@@ -63,18 +64,19 @@ def _rows(one: int, other: int) -> Explanation:
 
 
 def _of_setup(rows: Rows) -> list[Explanation]:
-    near = rows.count > FAR_APART
+    """Pairs of rows of a setup and cycle."""
+    neighbours_only = rows.count > MAX_ROWS_FOR_ALL_PAIRS
     return [
         _rows(i, j)
         for indices in rows.cycles.values()
-        for i, j in (pairwise(indices) if near else combinations(indices, 2))
+        for i, j in (pairwise(indices) if neighbours_only else combinations(indices, 2))
     ]
 
 
 def _across_setups(rows: Rows) -> list[Explanation]:
-    """Pairs of the same posture in two setups, as in a line of the sheet with slipped columns."""
+    """One posture in two setups, as if a number was written into the wrong column of the sheet."""
     by_state = group_rows((r.postures, r.cycle) for r in rows.session.readings)
-    if sum(len(indices) ** 2 for indices in by_state.values()) > 2 * MOST:
+    if sum(len(indices) ** 2 for indices in by_state.values()) > 2 * MAX_PAIRS:
         return []
     return [
         _rows(i, j)
@@ -90,7 +92,7 @@ def _postures_of_setup(rows: Rows) -> list[Explanation]:
     for (setup, *_), indices in rows.repeated.items():
         if len(indices) > 1:
             by_setup.setdefault(setup, []).append(indices)
-    if sum(len(groups) ** 2 for groups in by_setup.values()) > 2 * MOST:
+    if sum(len(groups) ** 2 for groups in by_setup.values()) > 2 * MAX_PAIRS:
         return []
     return [
         _pair("posture", a, b, names=(setup, rows.posture(int(a[0])), rows.posture(int(b[0]))))
@@ -105,7 +107,7 @@ def _postures(rows: Rows) -> list[Explanation]:
     by_label: dict[str, dict[tuple[str, int], int]] = {}
     for i, r in enumerate(rows.session.readings):
         by_label.setdefault(rows.posture(i), {})[r.setup, r.cycle] = i
-    if len(by_label) ** 2 > 2 * MOST or len(by_label) * rows.count > 100 * MOST:
+    if len(by_label) ** 2 > 2 * MAX_PAIRS or len(by_label) * rows.count > 100 * MAX_PAIRS:
         return []
     explanations: list[Explanation] = []
     for a, b in combinations(by_label, 2):
@@ -118,7 +120,7 @@ def _postures(rows: Rows) -> list[Explanation]:
 
 def _setups(rows: Rows) -> list[Explanation]:
     """Two setups of one session."""
-    if len(rows.setups) ** 2 > 2 * MOST:
+    if len(rows.setups) ** 2 > 2 * MAX_PAIRS:
         return []
 
     def session(setup: str) -> str:
@@ -132,7 +134,7 @@ def _setups(rows: Rows) -> list[Explanation]:
 
 
 def _legs(rows: Rows) -> list[Explanation]:
-    """All setups of two legs, in their order."""
+    """All setups of two legs, in the order of the setups."""
     legs = {name: setups for (scope, name), setups in rows.groups.items() if scope == "leg"}
     explanations: list[Explanation] = []
     for a, b in combinations(legs, 2):
@@ -144,7 +146,7 @@ def _legs(rows: Rows) -> list[Explanation]:
 
 
 def _backwards(rows: Rows) -> list[Explanation]:
-    """The rows of a setup written from the last to the first."""
+    """All rows of a setup, written in reverse order."""
     explanations: list[Explanation] = []
     for name, indices in rows.setups.items():
         half = indices.size // 2

@@ -14,26 +14,26 @@ from orthocal.hypotheses.hypothesis import Family, Rows
 from orthocal.units import MM
 
 UNITS = (25.4, 1.0 / 25.4, 1e3, 1e-3)
-"""Factors that correct inches, mm taken for inches, m, and µm."""
+"""Factors that correct readings in inches, readings in mm stated as inches, m, and µm."""
 
 DECIMAL_POINTS = (10.0, 0.1, 100.0, 0.01)
 """Factors that correct a misplaced decimal point."""
 
-COARSEST = 10.0
-"""Step of the corrected numbers, over the noise, beyond which a unit is not considered."""
+MAX_RELATIVE_STEP = 10.0
+"""Largest step of the corrected numbers, relative to the noise, of a considered unit."""
 
-FINEST = 1e-3
-"""Step of the corrected numbers, over the noise, below which a unit is not considered: computed
-numbers have more digits than any dial."""
+MIN_RELATIVE_STEP = 1e-3
+"""Smallest step of the corrected numbers, relative to the noise, of a considered unit: finer
+numbers are computed, not read from a dial."""
 
-MOST_DECIMALS = 9
-"""Decimals of numbers in mm that are considered."""
+MAX_DECIMALS = 9
+"""Most decimals of a number in mm for which the step is sought."""
 
-FINER = 1e-3
-"""Part of a step by which numbers may miss it."""
+STEP_TOLERANCE = 1e-3
+"""Largest distance of a number from a multiple of the step, in steps."""
 
-MOST_PAIRED = 24
-"""Setups above which pairs of them are not considered."""
+MAX_PAIRED_SETUPS = 24
+"""Most setups of a session of which pairs are considered."""
 
 
 def wrong_units_and_signs(rows: Rows, sigma: float) -> Iterator[Family]:
@@ -46,7 +46,7 @@ def wrong_units_and_signs(rows: Rows, sigma: float) -> Iterator[Family]:
     groups = _groups(rows)
     yield multiplied(rows, groups)
     names = list(rows.setups)
-    if 3 < len(names) <= MOST_PAIRED:
+    if 3 < len(names) <= MAX_PAIRED_SETUPS:
         pairs = combinations(names, 2)
         yield multiplied(rows, [_reversed("setups", rows.of_setups(p), p) for p in pairs])
     groups += [
@@ -58,19 +58,23 @@ def wrong_units_and_signs(rows: Rows, sigma: float) -> Iterator[Family]:
     yield _scaled(rows, groups, "decimal point", DECIMAL_POINTS, sigma)
 
 
-def multiplied(rows: Rows, found: Sequence[Explanation], *, size: int | None = None) -> Family:
-    """Readings that the factors of explanations correct.
+def multiplied(
+    rows: Rows, explanations: Sequence[Explanation], *, size: int | None = None
+) -> Family:
+    """Family of explanations that correct their rows by a factor.
 
     Args:
         rows: The rows.
-        found: The explanations.
-        size: Number of ways in which it could have happened; by default as many as explanations.
+        explanations: The explanations, with factors.
+        size: Number of possible mistakes of this kind; the number of explanations by default.
     """
-    factors = np.array([e.factor for e in found], dtype=np.float64)
-    change = [(f - 1.0) * rows.values[list(e.rows)] for f, e in zip(factors, found, strict=True)]
-    dimensions = np.array([_dimensions(rows, e) for e in found])
+    factors = np.array([e.factor for e in explanations], dtype=np.float64)
+    changes = [
+        (f - 1.0) * rows.values[list(e.rows)] for f, e in zip(factors, explanations, strict=True)
+    ]
+    dimensions = np.array([_dimensions(rows, e) for e in explanations])
     volume = dimensions * np.log(np.abs(factors))
-    return Family.edited(rows, found, change, size=size, log_volume=volume)
+    return Family.edited(rows, explanations, changes, size=size, log_volume=volume)
 
 
 def _reversed(
@@ -80,18 +84,19 @@ def _reversed(
     names: tuple[str, ...] = (),
     cycle: int | None = None,
 ) -> Explanation:
-    at = tuple(indices.tolist())
-    return Explanation("reversed sign", scope, at, setups, names, cycle, factor=-1.0)
+    """Explanation of a group of rows with reversed sign."""
+    concerned = tuple(indices.tolist())
+    return Explanation("reversed sign", scope, concerned, setups, names, cycle, factor=-1.0)
 
 
 def _groups(rows: Rows) -> list[Explanation]:
-    """Groups of readings that may share a factor, with their signs reversed."""
-    every = tuple(rows.setups)
-    explanations = [_reversed("session", np.arange(rows.count), every)]
+    """Reversed sign of each group of readings that may share a factor."""
+    setup_names = tuple(rows.setups)
+    explanations = [_reversed("session", np.arange(rows.count), setup_names)]
     for (scope, name), setups in rows.groups.items():
         kind: Scope = "leg" if scope == "leg" else "gauge"
         explanations.append(_reversed(kind, rows.of_setups(setups), setups, (name,)))
-    if len(every) > 1:
+    if len(setup_names) > 1:
         explanations += [
             _reversed("setup", indices, (name,)) for name, indices in rows.setups.items()
         ]
@@ -105,18 +110,19 @@ def _scaled(
     factors: tuple[float, ...],
     sigma: float,
 ) -> Family:
+    """Groups of readings multiplied by a factor, if the corrected step is plausible."""
     steps = [_step(rows.values[list(g.rows)]) for g in groups]
-    tried = [
+    explanations = [
         replace(g, kind=kind, factor=factor)
         for factor in factors
         for g, step in zip(groups, steps, strict=True)
-        if factor < 1.0 or FINEST * sigma <= factor * step <= COARSEST * sigma
+        if factor < 1.0 or MIN_RELATIVE_STEP * sigma <= factor * step <= MAX_RELATIVE_STEP * sigma
     ]
-    return multiplied(rows, tried, size=len(groups) * len(factors))
+    return multiplied(rows, explanations, size=len(groups) * len(factors))
 
 
 def _dimensions(rows: Rows, group: Explanation) -> int:
-    """Independent numbers in a group of rows: those of whole setups less their gauge zeros."""
+    """Number of independent readings in rows: that of rows minus zeros of complete setups."""
     if not group.setups:
         return len(group.rows)
     readings = rows.session.readings
@@ -124,9 +130,9 @@ def _dimensions(rows: Rows, group: Explanation) -> int:
 
 
 def _step(values: Array) -> float:
-    """Step in which numbers are written, a power of ten of 1 mm, [m]."""
-    for decimals in range(MOST_DECIMALS):
+    """Decimal step of numbers, a power of ten of 1 mm, [m]; 0 if it is too fine."""
+    for decimals in range(MAX_DECIMALS):
         step = 10.0**-decimals * MM
-        if np.abs(values / step - np.round(values / step)).max() < FINER:
+        if np.abs(values / step - np.round(values / step)).max() < STEP_TOLERANCE:
             return step
     return 0.0

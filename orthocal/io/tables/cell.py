@@ -46,17 +46,17 @@ BLANK = Cell("")
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A row with at least one cell that is not blank."""
+    """Row with at least one cell that is not blank."""
 
     line: int
     """Number of the row, from 1, as in an editor or a spreadsheet program."""
     cells: tuple[Cell, ...]
-    """Cells without the blank ones at the end."""
+    """Cells without blank cells at the end."""
     width: int
     """Number of cells, including blank ones at the end."""
 
     def cell(self, index: int | None) -> Cell:
-        """The cell of a column; a blank cell beyond the end."""
+        """Cell of a column; blank beyond the end of the row or without an index."""
         return self.cells[index] if index is not None and index < len(self.cells) else BLANK
 
 

@@ -37,7 +37,7 @@ SEPARATORS = {"semicolon": ";", "tab": "\t", "comma": ",", "pipe": "|"}
 """Names and characters of separators."""
 
 HEADER_ROWS = 100
-"""Number of rows among which the headings are searched."""
+"""Number of first rows in which the headings are searched."""
 
 FindHeader = Callable[[Sequence[Row]], int | None]
 """Function that finds the row with the expected headings among the first rows of a table."""
@@ -78,8 +78,8 @@ def decode(content: bytes, *, where: str, encoding: str | None = None) -> Decode
 
     The encoding follows from the byte order mark, then from zeros in every second byte (UTF-16),
     then from valid UTF-8. Any other file is decoded as cp1252, the default of spreadsheet programs
-    on Windows. All one-byte encodings agree in digits, separators and ASCII names, so a wrong one
-    does not change a number.
+    on Windows. All one-byte encodings agree in digits, separators and ASCII names. So a wrongly
+    detected encoding does not change a number.
 
     Args:
         content: Content of the file.
@@ -87,7 +87,8 @@ def decode(content: bytes, *, where: str, encoding: str | None = None) -> Decode
         encoding: One of ENCODINGS; detected by default.
 
     Raises:
-        SessionError: If the content is too large, is not text, or not in the requested encoding.
+        SessionError: If the content is too large, is not text, or has another encoding than the
+            requested one.
     """
     for signature, problem in _OTHER_FILES:
         if content.startswith(signature):
@@ -117,7 +118,7 @@ def decode(content: bytes, *, where: str, encoding: str | None = None) -> Decode
 
 
 def _find_encoding(content: bytes, requested: str | None, where: str) -> tuple[str, str]:
-    """Name of the encoding, and the evidence for it."""
+    """Name of the encoding and the evidence for it."""
     mark = next((name for mark, name in _BYTE_ORDER_MARKS if content.startswith(mark)), None)
     if requested is not None:
         if requested not in ENCODINGS:
@@ -147,7 +148,10 @@ def _find_encoding(content: bytes, requested: str | None, where: str) -> tuple[s
 
 
 def _find_utf16(content: bytes) -> str | None:
-    """Encoding of UTF-16 text without a mark, by zeros in every second byte of its beginning."""
+    """Encoding of UTF-16 text without a byte order mark; None for other text.
+
+    Such text has zeros in every second byte of its beginning.
+    """
     beginning = content[:4096]
     pairs = len(beginning) // 2
     even, odd = beginning[0::2].count(0), beginning[1::2].count(0)
@@ -165,13 +169,13 @@ def find_separator(
 
     Args:
         text: Text of the table.
-        find_header: Search for the expected headings.
+        find_header: Function that finds the expected headings.
         where: Path of the file, for messages.
         requested: Name of the separator; detected by default.
 
     Returns:
-        Name of the separator, and the evidence for it. Without evidence it is the most frequent
-        separator.
+        Name of the separator and the evidence for it. Without evidence, the most frequent separator
+        is returned.
 
     Raises:
         SessionError: If the headings appear with several separators.
@@ -209,11 +213,11 @@ def find_separator(
 
 
 def stated_separator(text: str) -> str | None:
-    """Name of the separator that the first line states, such as `sep=;`."""
-    first = _SEPARATOR_LINE.fullmatch(text, 0, text.find("\n") if "\n" in text else len(text))
-    if not first:
+    """Name of the separator in a first line such as `sep=;`; None if the line states none."""
+    match = _SEPARATOR_LINE.fullmatch(text, 0, text.find("\n") if "\n" in text else len(text))
+    if not match:
         return None
-    return next((name for name, s in SEPARATORS.items() if s == first[1]), None)
+    return next((name for name, s in SEPARATORS.items() if s == match[1]), None)
 
 
 def split_rows(text: str, separator: str, *, where: str) -> Iterator[Row]:
@@ -243,7 +247,7 @@ def split_rows(text: str, separator: str, *, where: str) -> Iterator[Row]:
         lines(), delimiter=SEPARATORS[separator], skipinitialspace=True, strict=True
     )
     count = 0
-    first = 2 if stated_separator(text) is not None else 1
+    first_line = 2 if stated_separator(text) is not None else 1
     try:
         for fields in reader:
             line, length = reader.line_num, 0
@@ -254,7 +258,7 @@ def split_rows(text: str, separator: str, *, where: str) -> Iterator[Row]:
                     f"has {len(fields)} columns; expected at most {MOST_COLUMNS}",
                     where=f"{where}:{line}",
                 )
-            if line < first:
+            if line < first_line:
                 continue
             row = make_row(line, [Cell(field) if field else BLANK for field in fields])
             if row is None:

@@ -1,7 +1,7 @@
 """Numbers as text: numerals of table cells, their decimal sign, and typed readings.
 
 A numeral can have two values: `1,234` is 1.234 with a decimal comma and 1234 with a decimal point.
-The other numerals of the table decide. Where they do not, the ambiguity is returned as data.
+The other numerals of the table decide. If they do not, the result contains the ambiguous numeral.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Sign = Literal["point", "comma"]
 """Decimal sign."""
 
 _MINUS = dict.fromkeys(map(ord, "\u2212\u2010\u2011\u2012\u2013\ufe63\uff0d"), "-")
-"""Typographic minus signs, hyphens and dashes that spreadsheets and fonts use for a minus."""
+"""Translation of typographic minus signs, hyphens and dashes to a hyphen."""
 
 _BLANKS = " \t\n\u00a0\u2007\u2009\u202f"
 _INVISIBLE = dict.fromkeys(map(ord, "\u200b\u200e\u200f\u2060\ufeff\u00ad\u202a\u202c"), "")
@@ -38,6 +38,7 @@ _DASHES = re.compile(r"[-\u2012-\u2015\u2212_./…]+")
 
 
 def _pattern(decimal: str, group: str) -> re.Pattern[str]:
+    """Pattern of a numeral with a decimal sign and another separator of thousands."""
     grouped = (
         rf"[1-9][0-9]{{0,2}}(?P<group>[{group}{_BLANKS}'’])[0-9]{{3}}(?:(?P=group)[0-9]{{3}})*"
     )
@@ -66,12 +67,12 @@ def tidy_text(text: str) -> str:
 
 
 def plain_minus(text: str) -> str:
-    """Text with a hyphen for every typographic minus."""
+    """Text in which a hyphen replaces every typographic minus."""
     return text.translate(_MINUS)
 
 
 def is_missing(text: str) -> bool:
-    """True for an empty cell and for texts that mark a missing reading."""
+    """True for an empty cell and for text that marks a missing reading."""
     text = tidy_text(text)
     return text.casefold() in MISSING or _DASHES.fullmatch(text) is not None
 
@@ -81,7 +82,7 @@ def parse_numeral(text: str, sign: Sign) -> Decimal | None:
     text = plain_minus(tidy_text(text))
     if len(text) > LONGEST_NUMBER:
         return None
-    if text.startswith("'"):  # by which spreadsheet programs mark a number as text
+    if text.startswith("'"):  # marks a number as text in spreadsheet programs
         text = text[1:]
     match = _PATTERNS[sign].fullmatch(text)
     if not match:
@@ -95,7 +96,7 @@ def parse_numeral(text: str, sign: Sign) -> Decimal | None:
 
 
 def format_decimal(value: Decimal | None) -> str:
-    """Plain decimal notation without trailing zeros."""
+    """Plain decimal notation without trailing zeros; exponents beyond ±30 keep their form."""
     if value is None:
         return "no number"
     text = f"{value:f}" if -30 < value.adjusted() < 30 else f"{value:e}"
@@ -104,7 +105,7 @@ def format_decimal(value: Decimal | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Numeral:
-    """A numeral and its line."""
+    """Numeral and its line."""
 
     text: str
     line: int
@@ -117,9 +118,9 @@ class DecimalSign:
     sign: Sign | None
     """None if the numerals are ambiguous or contradict each other."""
     evidence: Numeral | None
-    """A numeral that has this sign; None if no numeral has a decimal sign."""
+    """First numeral that determines the sign; None if there is none."""
     rival: Numeral | None = None
-    """A numeral that is ambiguous, or has the other sign than the evidence."""
+    """Ambiguous numeral, or numeral with the other sign than the evidence."""
 
     @property
     def contradictory(self) -> bool:
@@ -130,21 +131,22 @@ class DecimalSign:
 def infer_decimal_sign(numerals: Iterable[Numeral]) -> DecimalSign:
     """Infer the common decimal sign of the numerals of a table.
 
-    A numeral that is a number with one sign only decides for all. Whole numbers need no sign.
+    A numeral that is a number with one of the signs only determines the sign of the table. Integers
+    have no sign.
     """
-    unique: dict[Sign, Numeral] = {}
+    evidence: dict[Sign, Numeral] = {}
     ambiguous: Numeral | None = None
     for numeral in numerals:
         point, comma = parse_numeral(numeral.text, "point"), parse_numeral(numeral.text, "comma")
         if point is None and comma is not None:
-            unique.setdefault("comma", numeral)
+            evidence.setdefault("comma", numeral)
         elif comma is None and point is not None:
-            unique.setdefault("point", numeral)
+            evidence.setdefault("point", numeral)
         elif point != comma and ambiguous is None:
             ambiguous = numeral
-    if len(unique) == 2:
-        return DecimalSign(None, unique["comma"], unique["point"])
-    for sign, numeral in unique.items():
+    if len(evidence) == 2:
+        return DecimalSign(None, evidence["comma"], evidence["point"])
+    for sign, numeral in evidence.items():
         return DecimalSign(sign, numeral)
     if ambiguous is not None:
         return DecimalSign(None, None, ambiguous)
@@ -152,13 +154,13 @@ def infer_decimal_sign(numerals: Iterable[Numeral]) -> DecimalSign:
 
 
 def parse_typed_reading(text: str) -> float:
-    """Reading that was typed, [m].
+    """Reading typed by the operator, [m].
 
     Args:
         text: Number in mm, such as 0.12, -0,35 or +1.2 mm.
 
     Raises:
-        SessionError: If it is not a number, has another unit, or has two possible values.
+        SessionError: If the text is not a number, has another unit, or has two possible values.
     """
     shown = shorten(text.strip())
     plain = " ".join(plain_minus(text).split()) if len(text) <= 2 * LONGEST_NUMBER else ""
@@ -186,14 +188,14 @@ def parse_typed_reading(text: str) -> float:
 
 
 def parse_typed_point(text: str) -> Array:
-    """Coordinates of a point that were typed, shape (3,), [m].
+    """Coordinates of a point typed by the operator, shape (3,), [m].
 
     Args:
-        text: Three numbers in mm with blanks, semicolons or tabs between them, or with commas where
-            the numbers have decimal points.
+        text: Three numbers in mm, separated by blanks, semicolons or tabs. Commas may separate
+            numbers with decimal points.
 
     Raises:
-        SessionError: If they are not three numbers.
+        SessionError: If the text is not three numbers.
     """
     for separator in (";", None, ","):
         parts = [part.strip() for part in text.strip().rstrip(";,").split(separator)]

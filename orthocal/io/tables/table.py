@@ -23,18 +23,19 @@ from orthocal.text import shorten
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table with headings."""
+    """Table with headings."""
 
     path: Path
     header: tuple[str, ...]
     """Headings without blank ones at the end."""
     header_line: int
+    """Line of the row of headings."""
     header_width: int
-    """Number of cells of the heading, including blank ones at the end."""
+    """Number of cells of the row of headings, including blank ones at the end."""
     above: tuple[int, ...]
-    """Lines above the heading that are not blank."""
+    """Lines above the row of headings that are not blank."""
     rows: tuple[Row, ...]
-    """Rows below the heading that are not blank."""
+    """Rows below the row of headings that are not blank."""
     encoding: str | None = None
     """Encoding of a text file."""
     encoding_reason: str | None = None
@@ -54,23 +55,22 @@ class Table:
         """File and line of a row, or worksheet and cell, for messages."""
         if self.sheet is None:
             return f"{self.path}:{line}"
-        at = f"row {line}" if column is None else f"{column_letters(column)}{line}"
-        return f"{self.path}: sheet '{self.sheet}' {at}"
+        cell = f"row {line}" if column is None else f"{column_letters(column)}{line}"
+        return f"{self.path}: sheet '{self.sheet}' {cell}"
 
     def fill_merged(self, columns: Iterable[int]) -> Iterator[Row]:
-        """Rows in which every merged cell of some columns has the content of its first cell."""
-        tops = {row.line: row for row in self.rows}
-        spans = {c: [m for m in self.merged if m[0] == c] for c in columns}
-        spans = {column: merged for column, merged in spans.items() if merged}
+        """Rows in which the content of merged cells of some columns is repeated."""
+        row_by_line = {row.line: row for row in self.rows}
+        merged_by_column = {c: [m for m in self.merged if m[0] == c] for c in columns}
         for row in self.rows:
             cells = list(row.cells)
-            for column, merged in spans.items():
-                at = bisect_right(merged, row.line, key=lambda m: m[1]) - 1
-                if at < 0 or merged[at][2] < row.line:
+            for column, merged in merged_by_column.items():
+                index = bisect_right(merged, row.line, key=lambda m: m[1]) - 1
+                if index < 0 or merged[index][2] < row.line:
                     continue
-                top = tops.get(merged[at][1])
+                first_row = row_by_line.get(merged[index][1])
                 cells += [BLANK] * (column + 1 - len(cells))
-                cells[column] = BLANK if top is None else top.cell(column)
+                cells[column] = BLANK if first_row is None else first_row.cell(column)
             yield Row(row.line, tuple(cells), row.width)
 
 
@@ -84,19 +84,19 @@ def read_table(
     separator: str | None = None,
     encoding: str | None = None,
 ) -> Table:
-    """Read the table of a file that has the expected headings.
+    """Read the table with the expected headings from a file.
 
     Args:
         path: Path of the file, for messages.
         content: Content of the file.
-        find_header: Search for the expected headings.
+        find_header: Function that finds the expected headings.
         expected: Description of the headings, for messages.
         sheet: Worksheet of a workbook; by default the only one with these headings.
         separator: Name of the separator; detected by default.
         encoding: Name of the encoding; detected by default.
 
     Raises:
-        SessionError: If the file has no such table, or several.
+        SessionError: If the file has no such table, or several tables.
     """
     if content.startswith(ZIP_SIGNATURE):
         for option, value in (("--separator", separator), ("--encoding", encoding)):
@@ -110,13 +110,13 @@ def read_table(
         raise SessionError(f"is empty; expected {expected}", where=str(path))
     name, reason = find_separator(decoded.text, find_header, where=str(path), requested=separator)
     rows = tuple(split_rows(decoded.text, name, where=str(path)))
-    at = find_header(rows[:HEADER_ROWS])
-    if at is None:
+    header_index = find_header(rows[:HEADER_ROWS])
+    if header_index is None:
         raise _no_header(str(path), rows, expected, f" with {name} as separator")
     return _make_table(
         path,
         rows,
-        at,
+        header_index,
         encoding=decoded.encoding,
         encoding_reason=decoded.reason,
         separator=name,
@@ -127,8 +127,9 @@ def read_table(
 def _read_sheet(
     path: Path, content: bytes, find_header: FindHeader, expected: str, sheet: str | None
 ) -> Table:
+    """Table with the expected headings from a workbook."""
     sheets = read_workbook(content, where=str(path), sheet=sheet)
-    matching = [(s, at) for s in sheets if (at := find_header(s.rows[:HEADER_ROWS])) is not None]
+    matching = [(s, i) for s in sheets if (i := find_header(s.rows[:HEADER_ROWS])) is not None]
     names = ", ".join(f"'{s.name}'" for s, _ in matching) or ", ".join(
         f"'{s.name}'" for s in sheets
     )
@@ -140,11 +141,11 @@ def _read_sheet(
         raise SessionError(
             f"several sheets have {expected}: {names}; choose one by --sheet NAME", where=str(path)
         )
-    chosen, at = matching[0]
+    chosen, header_index = matching[0]
     return _make_table(
         path,
         chosen.rows,
-        at,
+        header_index,
         sheet=chosen.name,
         merged=chosen.merged,
         formulas=chosen.formulas,
@@ -152,27 +153,28 @@ def _read_sheet(
     )
 
 
-def _make_table(path: Path, rows: tuple[Row, ...], at: int, **origin: Any) -> Table:  # noqa: ANN401 - fields of a table
-    """Table whose headings are in one of some rows."""
+def _make_table(path: Path, rows: tuple[Row, ...], header_index: int, **origin: Any) -> Table:  # noqa: ANN401 - fields of a table
+    """Table of rows, one of which contains the headings."""
+    header = rows[header_index]
     return Table(
         path=path,
-        header=tuple(c.text for c in rows[at].cells),
-        header_line=rows[at].line,
-        header_width=rows[at].width,
-        above=tuple(r.line for r in rows[:at]),
-        rows=rows[at + 1 :],
+        header=tuple(c.text for c in header.cells),
+        header_line=header.line,
+        header_width=header.width,
+        above=tuple(r.line for r in rows[:header_index]),
+        rows=rows[header_index + 1 :],
         **origin,
     )
 
 
-def _no_header(place: str, rows: tuple[Row, ...], expected: str, how: str) -> SessionError:
+def _no_header(where: str, rows: tuple[Row, ...], expected: str, remark: str) -> SessionError:
     """Error for a table without the expected headings; it shows the widest row."""
     if not rows:
-        return SessionError(f"is empty; expected {expected}", where=place)
+        return SessionError(f"is empty; expected {expected}", where=where)
     widest = max(rows[:HEADER_ROWS], key=lambda r: len(r.cells))
     shown = shorten(", ".join(f"'{' '.join(c.text.split())}'" for c in widest.cells))
     return SessionError(
-        f"no row has {expected}; row {widest.line} has {shown}{how}; assign columns by --column "
+        f"no row has {expected}; row {widest.line} has {shown}{remark}; assign columns by --column "
         "ROLE=HEADING",
-        where=place,
+        where=where,
     )

@@ -49,10 +49,10 @@ MOST_PARTS = 2_000
 """Maximum number of parts of a workbook."""
 
 MOST_TAGS = 5 * MOST_CELLS
-"""Maximum number of XML tags of a part; a cell takes four, with a formula six."""
+"""Maximum number of XML tags of a part; a cell has four, with a formula six."""
 
 LONGEST_FORMAT = 255
-"""Maximum length of a number format; the limit of Excel."""
+"""Maximum length of a number format, as in Excel."""
 
 _SAFE = {
     "resolve_entities": False,
@@ -84,7 +84,7 @@ MergedCells = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A worksheet."""
+    """Worksheet of a workbook."""
 
     name: str
     rows: tuple[Row, ...]
@@ -99,7 +99,7 @@ class Sheet:
 
 @dataclass(frozen=True, slots=True)
 class NumberFormat:
-    """Meaning of a number format."""
+    """Interpretation of a number format."""
 
     kind: CellKind
     """`number`, `date` or `scaled number`."""
@@ -147,7 +147,7 @@ def _require_workbook(names: list[str], where: str) -> None:
 
 
 class _Workbook:
-    """Parts of a workbook, unpacked within a budget."""
+    """Parts of a workbook, unpacked within limits of their size."""
 
     def __init__(self, archive: zipfile.ZipFile, where: str) -> None:
         self._archive = archive
@@ -177,7 +177,7 @@ class _Workbook:
         self._epoch = datetime.datetime(*((1904, 1, 1) if old_epoch else (1899, 12, 30)))
 
     def read(self, name: str | None) -> list[Sheet]:
-        """Read the visible sheets, or the one that is named."""
+        """Read the visible sheets, or the sheet with a name."""
         if not self._sheets:
             raise SessionError("is a workbook without worksheets", where=self._where)
         chosen = [s for s in self._sheets if s[1]] or self._sheets
@@ -194,6 +194,7 @@ class _Workbook:
         return [self._read_sheet(title, part) for title, _, part in chosen]
 
     def _read_sheet(self, title: str, part: str) -> Sheet:
+        """Read the rows and merged cells of a sheet."""
         where = f"{self._where}: sheet '{title}'"
         rows: list[Row] = []
         merged: list[MergedCells] = []
@@ -202,9 +203,9 @@ class _Workbook:
         for element in self._elements(part, "c", "row", "mergeCell"):
             kind = _local_name(element)
             if kind == "c":
-                address, before = element.get("r"), column
-                column = before + 1 if address is None else _parse_address(address)[1]
-                if column <= before:
+                address, previous = element.get("r"), column
+                column = previous + 1 if address is None else _parse_address(address)[1]
+                if column <= previous:
                     raise ValueError(f"cell {address} is out of order")
                 children = {_local_name(child): child for child in reversed(element)}
                 formulas += "f" in children
@@ -218,10 +219,10 @@ class _Workbook:
                 cells += [BLANK] * (column - len(cells))
                 cells.append(cell)
             elif kind == "row":
-                after = _parse_index(element.get("r", str(line + 1)))
-                if after <= line:
-                    raise ValueError(f"row {after} follows row {line}")
-                line, column = after, -1
+                number = _parse_index(element.get("r", str(line + 1)))
+                if number <= line:
+                    raise ValueError(f"row {number} follows row {line}")
+                line, column = number, -1
                 hidden += element.get("hidden") in ("1", "true")
                 row = make_row(line, cells)
                 cells = []
@@ -243,7 +244,7 @@ class _Workbook:
 
         Args:
             element: Element of the cell.
-            children: Its first children, by their names.
+            children: First child element of each name, by name.
             where: File and worksheet, for messages.
         """
         if not children:
@@ -270,7 +271,7 @@ class _Workbook:
         return Cell(text)
 
     def _read_number(self, text: str, style: int) -> Cell:
-        """Number to the 15 digits that a spreadsheet program shows."""
+        """Number rounded to the 15 digits of a spreadsheet program, or a date."""
         value = math.nan
         if len(text) <= LONGEST_NUMBER and _NUMBER.fullmatch(text):
             value = float(text)
@@ -278,14 +279,14 @@ class _Workbook:
             return Cell(text)
         form = self._formats[style] if self._formats else NumberFormat("number")
         if form.kind == "date":
-            with suppress(OverflowError):  # a number beyond the calendar is shown as it is
+            with suppress(OverflowError):  # a number beyond the calendar remains a number
                 text = str(self._epoch + datetime.timedelta(days=value))
             return Cell(text, kind="date")
         number = Decimal(f"{value:.15g}")
         return Cell(format_decimal(number), number, form.kind, form.unit)
 
     def _relations(self, part: str) -> dict[str, tuple[str, str]]:
-        """Kinds and targets of the relations of a part, by their identifiers."""
+        """Kinds and targets of the relations of a part, by identifier."""
         folder, name = posixpath.split(part)
         root = self._tree(posixpath.join(folder, "_rels", f"{name}.rels"))
         return {
@@ -314,7 +315,7 @@ class _Workbook:
         """Content of a part.
 
         Raises:
-            SessionError: If it is missing, too large, damaged, or not plain XML.
+            SessionError: If the part is missing, too large, damaged, or not plain XML.
         """
         try:
             info = self._archive.getinfo(part)
@@ -350,7 +351,7 @@ class _Workbook:
 
 
 def _read_formats(styles: Any) -> list[NumberFormat]:  # noqa: ANN401 - lxml has no types
-    """Number formats of the cell styles, in their order."""
+    """Number formats of the cell styles, in the order of the styles."""
     codes = {
         e.get("numFmtId"): e.get("formatCode", "") for e in styles.iterfind("{*}numFmts/{*}numFmt")
     }
@@ -363,10 +364,10 @@ def _read_formats(styles: Any) -> list[NumberFormat]:  # noqa: ANN401 - lxml has
 
 
 def parse_number_format(code: str) -> NumberFormat:
-    """Meaning of a number format such as `0.0" mm"`.
+    """Interpret a number format such as `0.0" mm"`.
 
     Raises:
-        ValueError: If it is longer than spreadsheet programs permit.
+        ValueError: If the format is longer than spreadsheet programs permit.
     """
     if len(code) > LONGEST_FORMAT:
         raise ValueError(f"a number format has more than {LONGEST_FORMAT} characters")
@@ -380,7 +381,7 @@ def parse_number_format(code: str) -> NumberFormat:
 
 
 def _local_name(element: Any) -> str:  # noqa: ANN401 - lxml has no types
-    """Name of an element without its namespace, which has two forms (ECMA-376 and ISO 29500)."""
+    """Name of an element without its namespace, which differs in ECMA-376 and ISO 29500."""
     return str(element.tag.rpartition("}")[2])
 
 

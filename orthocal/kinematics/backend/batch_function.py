@@ -19,27 +19,26 @@ Backend = Literal["casadi", "llvm"]
 LARGE_BLOCK, SMALL_BLOCK = 32, 8
 """Points of one call of a mapped CasADi function."""
 
-CALL = 2000
-"""Instructions that take as long as a call."""
+CALL_COST = 2000
+"""Duration of a call, in instructions."""
 
 MIN_POINTS, MIN_OPERATIONS = 3, 2e3
-"""Points of a call, and instructions times points, from which the LLVM backend is used. It takes
-the time of two to three points of CasADi for up to 16 points, and 0.03 s once to start."""
+"""Points, and points times instructions, from which a call uses the LLVM backend. It needs as long
+for 16 points as CasADi for two or three, and 0.03 s once to start."""
 
 
 class BatchFunction:
-    """A CasADi function of column vectors, evaluated at many points.
+    """CasADi function of column vectors that is evaluated at many points.
 
-    Both backends execute the same instructions in the same order and give the same numbers, bit by
-    bit. The choice between them depends only on the function, the number of points and whether
-    llvmlite is installed.
+    Both backends execute the same instructions in the same order and give identical numbers. The
+    choice depends only on the function, the number of points and whether llvmlite is installed.
 
     Args:
-        function: Its inputs are column vectors.
-        matrices: Names of the outputs that are matrices, though they may have one column.
-        sparse: Names of the outputs of which the nonzeros are returned, in the order of `pattern`;
-            other outputs are dense.
-        key: Key by which the function's instructions are cached on disk; not cached by default.
+        function: Function whose inputs are column vectors.
+        matrices: Names of the outputs that are matrices even if they have one column.
+        sparse: Names of the outputs whose nonzeros are returned, in the order of `pattern`. Other
+            outputs are dense.
+        key: Key of the function's instructions on disk; not cached by default.
     """
 
     def __init__(
@@ -72,12 +71,12 @@ class BatchFunction:
         """Evaluate the function at K points.
 
         Args:
-            inputs: Shape (K, n) each; (K/m, n) where each row holds for m successive points, such
-                as the postures of one machine; (n,) where one row holds for all.
+            inputs: Shape (K, n) each; (K/m, n) if each row applies to m successive points, such as
+                the postures of one machine; (n,) if one row applies to all.
 
         Returns:
-            Each output with shape (K, rows, columns), or (K, rows) for a column vector; `matrices`
-            keep their one column; sparse outputs have shape (K, nnz).
+            Each output with shape (K, rows, columns). Column vectors that are not `matrices` have
+            shape (K, rows), sparse outputs (K, nnz).
         """
         count = self._count(inputs)
         large = count >= MIN_POINTS and self._n_instructions * count >= MIN_OPERATIONS
@@ -85,7 +84,7 @@ class BatchFunction:
         return self.evaluate(*inputs, backend="llvm" if fast else "casadi")
 
     def evaluate(self, *inputs: ArrayLike, backend: Backend) -> tuple[Array, ...]:
-        """Evaluate with one backend; arguments and result as for a call.
+        """Evaluate with a stated backend; arguments and result are those of `__call__`.
 
         CasADi evaluates functions with an instruction that the LLVM backend lacks.
         """
@@ -111,11 +110,12 @@ class BatchFunction:
 
     @cached_property
     def _n_instructions(self) -> int:
+        """Number of instructions of the function."""
         return int(self.function.n_instructions())
 
     @cached_property
     def _program(self) -> llvm.Program | None:
-        """The function's instructions; None where one of them is unknown."""
+        """Instructions of the function; None if the LLVM backend lacks one of them."""
         return llvm.load_program(self.function, key=self._key)
 
     def _run_casadi(self, arrays: Sequence[Array], count: int) -> list[Array]:
@@ -135,14 +135,14 @@ class BatchFunction:
         return results
 
     def _block_size(self, count: int) -> int:
-        """Points of the next call; a few more than there are, where that saves calls."""
+        """Points of the next call; may exceed the remaining ones if that saves calls."""
         if count >= LARGE_BLOCK:
             return LARGE_BLOCK
-        more = (SMALL_BLOCK - count) * self._n_instructions
-        return SMALL_BLOCK if more <= (count - 1) * CALL else 1
+        surplus = (SMALL_BLOCK - count) * self._n_instructions
+        return SMALL_BLOCK if surplus <= (count - 1) * CALL_COST else 1
 
     def _block(self, size: int) -> _MappedBlock:
-        """The mapped function of a number of points, with memory of this thread."""
+        """Function mapped over a number of points, with memory of this thread."""
         if not hasattr(self._local, "blocks"):
             self._local.blocks = {}
         blocks: dict[int, _MappedBlock] = self._local.blocks
@@ -152,7 +152,7 @@ class BatchFunction:
 
 
 class _MappedBlock:
-    """A function mapped over a number of points, with the memory that it reads and writes.
+    """Function mapped over a number of points, with its input and output memory.
 
     CasADi converts results through Python lists; its buffers avoid that.
     """
@@ -170,7 +170,7 @@ class _MappedBlock:
 
 
 def _densified(function: ca.Function, *, sparse: Sequence[str]) -> ca.Function:
-    """The function with dense outputs, except for some."""
+    """Function with dense outputs, except the sparse ones."""
     names = function.name_out()
     if all(n in sparse or function.sparsity_out(i).is_dense() for i, n in enumerate(names)):
         return function

@@ -1,9 +1,9 @@
-"""LLVM backend: CasADi functions executed for several points at once.
+"""LLVM backend, which executes CasADi functions for several points at once.
 
 A CasADi function of scalar expressions is a list of instructions. An interpreter in machine code,
 compiled by llvmlite for the present processor, executes each instruction for LANES points at once.
-It does the operations of CasADi's virtual machine in the same order, correctly rounded or by the C
-library, and therefore gives the same numbers in about a tenth of the time.
+Its operations are those of CasADi's virtual machine, in the same order, correctly rounded or from
+the C library. The numbers are therefore the same, in about a tenth of the time.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from orthocal.arrays import Array, Indices
 from orthocal.runtime import disk_cache
 
 LANES = 16
-"""Points for which an instruction is executed at once."""
+"""Points for which one instruction is executed at once."""
 
 MIN_CACHED = 1000
-"""Instructions of a function from which its program is cached on disk."""
+"""Smallest number of instructions of a program that is cached on disk."""
 
 _COMPUTED = {
     "ASSIGN": "{y} = select i1 true, {row} {a}, {row} {a}",
@@ -39,8 +39,8 @@ _COMPUTED = {
     "SQ": "{y} = fmul {row} {a}, {a}",
     "TWICE": "{y} = fadd {row} {a}, {a}",
     "INV": "{y} = fdiv {row} {one}, {a}",
-    "SQRT": "{y} = call {row} @llvm.sqrt.v{lane}f64({row} {a})",
-    "FABS": "{y} = call {row} @llvm.fabs.v{lane}f64({row} {a})",
+    "SQRT": "{y} = call {row} @llvm.sqrt.v{lanes}f64({row} {a})",
+    "FABS": "{y} = call {row} @llvm.fabs.v{lanes}f64({row} {a})",
     "IF_ELSE_ZERO": "{p} = fcmp une {row} {a}, {zero}\n{y} = select {flags} {p}, {row} {b}, "
     "{row} {zero}",
     "SIGN": "{p} = fcmp olt {row} {a}, {zero}\n{q} = fcmp ogt {row} {a}, {zero}\n"
@@ -69,16 +69,16 @@ _CODES = {getattr(ca, f"OP_{name}"): code for code, name in enumerate(OPERATIONS
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Program:
-    """The instructions of a function."""
+    """Instructions of a function."""
 
     table: NDArray[np.int32]
     """Operation, result and two operands of each instruction, shape (n, 4)."""
     constants: Array
     """Values of constant instructions, 0 elsewhere, shape (n,)."""
     n_work: int
-    """Work variables."""
+    """Number of work variables."""
     output_starts: Indices
-    """Start of each output among the nonzeros of all, shape (n_out + 1,)."""
+    """First nonzero of each output among those of all outputs, shape (n_out + 1,)."""
 
 
 @lru_cache(maxsize=1)
@@ -88,11 +88,11 @@ def is_installed() -> bool:
 
 
 def load_program(function: ca.Function, *, key: str | None = None) -> Program | None:
-    """The instructions of a function, from disk or listed now; None if one of them is unknown.
+    """Load the instructions of a function from disk, or list them; None if one is unknown.
 
     Args:
-        function: A function of SX expressions.
-        key: Key of the function on disk; not cached without one.
+        function: Function of SX expressions.
+        key: Key of the function on disk; not cached by default.
     """
     if key is None or function.n_instructions() < MIN_CACHED:
         return list_instructions(function)
@@ -105,7 +105,7 @@ def load_program(function: ca.Function, *, key: str | None = None) -> Program | 
 
 
 def _decode(content: bytes | None, function: ca.Function) -> Program | None:
-    """A program as cached on disk; None if it does not fit the function."""
+    """Decode a program from disk; None if it does not fit the function."""
     n, outputs = function.n_instructions(), function.n_out()
     if content is None or len(content) != 24 * n + 8 * (outputs + 2):
         return None
@@ -120,7 +120,7 @@ def _decode(content: bytes | None, function: ca.Function) -> Program | None:
 
 
 def list_instructions(function: ca.Function) -> Program | None:
-    """The instructions of a function; None if one of them is unknown."""
+    """List the instructions of a function; None if one is unknown."""
     count = function.n_instructions()
     output_starts = np.cumsum([0, *(function.nnz_out(i) for i in range(function.n_out()))])
     starts = output_starts.tolist()
@@ -149,7 +149,7 @@ def run(program: Program, inputs: Sequence[Array], count: int) -> list[Array] | 
 
     Args:
         program: The program.
-        inputs: Shape (n_rows, n) each; each row holds for count/n_rows successive points.
+        inputs: Shape (n_rows, n) each; each row applies to count/n_rows successive points.
         count: Number of points.
 
     Returns:
@@ -159,7 +159,7 @@ def run(program: Program, inputs: Sequence[Array], count: int) -> list[Array] | 
     if interpreter is None:
         return None
     arrays = [np.ascontiguousarray(a) for a in inputs]
-    # of each input: address, numbers in a row, points of a row
+    # per input: address, numbers per row, points per row
     layout = np.array(
         [
             [a.ctypes.data for a in arrays],
@@ -186,18 +186,17 @@ def run(program: Program, inputs: Sequence[Array], count: int) -> list[Array] | 
 
 
 class Interpreter:
-    """The compiled interpreter; its machine code lives as long as the engine.
+    """Compiled interpreter, whose machine code exists as long as the engine.
 
     Its arguments are addresses of arrays, and numbers:
 
-        table      int32, shape (n, 4): operation, result, first and second operand; of an input its
-                   index and its column in place of operands, of an output its column in place of
-                   the result
+        table      int32, shape (n, 4): operation, result, first and second operand. INPUT has the
+                   index and the column of the input as operands, OUTPUT the nonzero as result.
         n          number of instructions
         constants  shape (n,)
         inputs     addresses of the inputs, shape (n_in,)
-        strides    numbers from a row of each input to the next, int64
-        shares     successive points for which a row of each input holds, int64
+        strides    numbers per row of each input, int64
+        shares     successive points to which a row of each input applies, int64
         n_in
         points     number of points
         outputs    shape (points, n_out)
@@ -218,7 +217,7 @@ class Interpreter:
 
 @lru_cache(maxsize=1)
 def compile_interpreter() -> Interpreter | None:
-    """The interpreter, compiled once; None if that fails on this machine."""
+    """Compile the interpreter, once; None if that fails on this machine."""
     from llvmlite import binding
 
     try:
@@ -242,18 +241,22 @@ def compile_interpreter() -> Interpreter | None:
 
 
 class _Source:
-    """Source of the interpreter in LLVM's intermediate representation."""
+    """Source of the interpreter in the intermediate representation of LLVM.
 
-    def __init__(self, lane: int) -> None:
-        self._lane, self._row = lane, f"<{lane} x double>"
+    Args:
+        lanes: Points for which one instruction is executed at once.
+    """
+
+    def __init__(self, lanes: int) -> None:
+        self._lanes, self._row = lanes, f"<{lanes} x double>"
         self._lines: list[str] = []
         self._names = 0
 
     def text(self) -> str:
-        """The complete source."""
-        row, size = self._row, self._lane
+        """Complete source."""
+        row, lanes = self._row, self._lanes
         declared = [
-            f"declare {row} @llvm.{name}.v{size}f64({row})\n" for name in ("sqrt", "fabs")
+            f"declare {row} @llvm.{name}.v{lanes}f64({row})\n" for name in ("sqrt", "fabs")
         ] + [
             f"declare double @{name.lower()}({', '.join(['double'] * count)})\n"
             for name, count in _CALLED.items()
@@ -261,13 +264,13 @@ class _Source:
         self._put("define void @run(ptr %table, i64 %n, ptr %constants, ptr %inputs, ptr %strides,")
         self._put("ptr %shares, i64 %n_in, i64 %points, ptr %outputs, i64 %n_out, ptr %work) {")
         self._put("entry:")
-        begins = self._new(f"alloca ptr, i64 {self._new(f'mul i64 %n_in, {size}')}")
-        ends = self._new(f"alloca ptr, i64 {size}")
+        begins = self._new(f"alloca ptr, i64 {self._new(f'mul i64 %n_in, {lanes}')}")
+        ends = self._new(f"alloca ptr, i64 {lanes}")
         last = self._new("sub i64 %points, 1")
-        blocks = self._new(f"udiv i64 {self._new(f'add i64 %points, {size - 1}')}, {size}")
+        blocks = self._new(f"udiv i64 {self._new(f'add i64 %points, {lanes - 1}')}, {lanes}")
         with self._loop(blocks) as block:
-            first = self._new(f"mul i64 {block}, {size}")
-            with self._loop(str(size)) as lane:
+            first = self._new(f"mul i64 {block}, {lanes}")
+            with self._loop(str(lanes)) as lane:
                 self._find_point(first, lane, last, begins, ends)
             with self._loop("%n") as k:
                 self._execute(k, begins, ends)
@@ -275,10 +278,10 @@ class _Source:
         return "".join(declared) + "\n".join(self._lines) + "\n"
 
     def _find_point(self, first: str, lane: str, last: str, begins: str, ends: str) -> None:
-        """Addresses a lane reads and writes; a lane beyond the last point repeats the last."""
-        there = self._new(f"add i64 {first}, {lane}")
-        within = self._new(f"icmp slt i64 {there}, {last}")
-        point = self._new(f"select i1 {within}, i64 {there}, i64 {last}")
+        """Store the addresses of a lane; lanes beyond the last point repeat the last point."""
+        index = self._new(f"add i64 {first}, {lane}")
+        within = self._new(f"icmp slt i64 {index}, {last}")
+        point = self._new(f"select i1 {within}, i64 {index}, i64 {last}")
         end = self._at("%outputs", self._new(f"mul i64 {point}, %n_out"), "double")
         self._store("ptr", end, self._at(ends, lane, "ptr"))
         with self._loop("%n_in") as i:
@@ -288,7 +291,7 @@ class _Source:
             row = self._new(f"udiv i64 {point}, {share}")
             array = self._load("ptr", self._at("%inputs", i, "ptr"))
             begin = self._at(array, self._new(f"mul i64 {row}, {stride}"), "double")
-            place = self._new(f"add i64 {self._new(f'mul i64 {i}, {self._lane}')}, {lane}")
+            place = self._new(f"add i64 {self._new(f'mul i64 {i}, {self._lanes}')}, {lane}")
             self._store("ptr", begin, self._at(begins, place, "ptr"))
 
     def _execute(self, k: str, begins: str, ends: str) -> None:
@@ -300,7 +303,8 @@ class _Source:
         )
         to, a, b = (self._new(f"sext i32 {v} to i64") for v in places)
         to_row, a_row, b_row = (
-            self._at("%work", self._new(f"mul i64 {v}, {self._lane}"), "double") for v in (to, a, b)
+            self._at("%work", self._new(f"mul i64 {v}, {self._lanes}"), "double")
+            for v in (to, a, b)
         )
         done, labels = self._label(), [self._label() for _ in OPERATIONS]
         cases = " ".join(f"i32 {i}, label %{label}" for i, label in enumerate(labels))
@@ -308,20 +312,20 @@ class _Source:
         for name, label in zip(OPERATIONS, labels, strict=True):
             self._put(f"{label}:")
             if name == "INPUT":
-                first = self._new(f"mul i64 {a}, {self._lane}")
-                for lane in range(self._lane):
+                first = self._new(f"mul i64 {a}, {self._lanes}")
+                for lane in range(self._lanes):
                     place = self._at(begins, self._new(f"add i64 {first}, {lane}"), "ptr")
                     value = self._load("double", self._at(self._load("ptr", place), b, "double"))
                     self._store("double", value, self._at(to_row, str(lane), "double"))
             elif name == "OUTPUT":
-                for lane in range(self._lane):
+                for lane in range(self._lanes):
                     value = self._load("double", self._at(a_row, str(lane), "double"))
                     end = self._load("ptr", self._at(ends, str(lane), "ptr"))
                     self._store("double", value, self._at(end, to, "double"))
             elif name == "CONST":
                 value = self._load("double", self._at("%constants", k, "double"))
                 one = self._new(f"insertelement {self._row} poison, double {value}, i32 0")
-                same = f"<{self._lane} x i32> zeroinitializer"
+                same = f"<{self._lanes} x i32> zeroinitializer"
                 row = self._new(f"shufflevector {self._row} {one}, {self._row} poison, {same}")
                 self._store(self._row, row, to_row)
             elif name in _CALLED:
@@ -333,23 +337,25 @@ class _Source:
         self._put(f"{done}:")
 
     def _compute(self, name: str, to_row: str, a_row: str, b_row: str) -> None:
+        """Execute an operation of vectors."""
         form = _COMPUTED.get(name) or _COMPARED[name]
         operands = {"a": self._load(self._row, a_row)}
         if "{b}" in form:
             operands["b"] = self._load(self._row, b_row)
         names = {v: self._name() for v in "ypqr"}
         numbers = {
-            v: f"<{', '.join([f'double {number}'] * self._lane)}>"
+            v: f"<{', '.join([f'double {number}'] * self._lanes)}>"
             for v, number in (("zero", "0.0"), ("one", "1.0"), ("minus", "-1.0"))
         }
-        types = {"row": self._row, "flags": f"<{self._lane} x i1>", "lane": self._lane}
+        types = {"row": self._row, "flags": f"<{self._lanes} x i1>", "lanes": self._lanes}
         self._put(form.format(**names, **operands, **numbers, **types))
         if name in _COMPARED:
-            self._put(f"{names['y']} = uitofp <{self._lane} x i1> {names['p']} to {self._row}")
+            self._put(f"{names['y']} = uitofp <{self._lanes} x i1> {names['p']} to {self._row}")
         self._store(self._row, names["y"], to_row)
 
     def _call(self, function: str, to_row: str, rows: Sequence[str]) -> None:
-        with self._loop(str(self._lane)) as lane:
+        """Call a function of the C library for each lane."""
+        with self._loop(str(self._lanes)) as lane:
             values = [self._load("double", self._at(row, lane, "double")) for row in rows]
             arguments = ", ".join(f"double {v}" for v in values)
             result = self._new(f"call double @{function}({arguments})")
@@ -359,39 +365,46 @@ class _Source:
     def _loop(self, count: str) -> Iterator[str]:
         """Repeat the enclosed code for 0, 1, ... count − 1."""
         before, head, body, end = (self._label() for _ in range(4))
-        index, following, on = (self._name() for _ in range(3))
+        index, following, within = (self._name() for _ in range(3))
         last = self._label()
         self._put(f"br label %{before}\n{before}:\nbr label %{head}\n{head}:")
         self._put(f"{index} = phi i64 [ 0, %{before} ], [ {following}, %{last} ]")
-        self._put(f"{on} = icmp ult i64 {index}, {count}")
-        self._put(f"br i1 {on}, label %{body}, label %{end}\n{body}:")
+        self._put(f"{within} = icmp ult i64 {index}, {count}")
+        self._put(f"br i1 {within}, label %{body}, label %{end}\n{body}:")
         yield index
         self._put(f"br label %{last}\n{last}:\n{following} = add i64 {index}, 1")
         self._put(f"br label %{head}\n{end}:")
 
     def _at(self, array: str, index: str, kind: str) -> str:
+        """Address of an element of an array."""
         return self._new(f"getelementptr {kind}, ptr {array}, i64 {index}")
 
     def _load(self, kind: str, place: str) -> str:
+        """Value at an address."""
         align = ", align 8" if kind == self._row else ""
         return self._new(f"load {kind}, ptr {place}{align}")
 
     def _store(self, kind: str, value: str, place: str) -> None:
+        """Store a value at an address."""
         align = ", align 8" if kind == self._row else ""
         self._put(f"store {kind} {value}, ptr {place}{align}")
 
     def _new(self, instruction: str) -> str:
+        """Name of the result of a new instruction."""
         name = self._name()
         self._put(f"{name} = {instruction}")
         return name
 
     def _name(self) -> str:
+        """New name of a variable."""
         self._names += 1
         return f"%v{self._names}"
 
     def _label(self) -> str:
+        """New label of a block."""
         self._names += 1
         return f"b{self._names}"
 
     def _put(self, line: str) -> None:
+        """Add a line to the source."""
         self._lines.append(line)

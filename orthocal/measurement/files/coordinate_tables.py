@@ -31,24 +31,25 @@ TOOL_COLUMNS = {"x_mm": MM, "y_mm": MM, "z_mm": MM}
 
 def drive_columns(robot: Robot) -> dict[str, float]:
     """Columns of drive coordinates and their factors to SI units."""
-    return {f"{d.name}_{unit}": size for d in robot.drives for unit, size in [DRIVE_UNITS[d.unit]]}
+    units = [DRIVE_UNITS[d.unit] for d in robot.drives]
+    return {f"{d.name}_{unit}": f for d, (unit, f) in zip(robot.drives, units, strict=True)}
 
 
 def read_points(path: Path, robot: Robot) -> Block:
-    """Read tool points: the coordinates that the drives control; others are ignored.
+    """Read the commanded coordinates of tool points; other coordinates are ignored.
 
     Returns:
         File and line of every row, and values, shape (K, n_coordinates), [m].
 
     Raises:
-        SessionError: Naming file and line.
+        SessionError: If the table or a row is wrong; names file and line.
     """
     blocks = list(stream_points(path, robot, name=str(path), most=MOST_CSV_ROWS))
     return [name for names, _ in blocks for name in names], np.concatenate([v for _, v in blocks])
 
 
 def stream_joints(source: Path | BinaryIO, robot: Robot, *, name: str) -> Iterator[Block]:
-    """Read drive coordinates of any number, block by block.
+    """Read drive coordinates block by block; their number is unlimited.
 
     Args:
         source: A file, or an open stream.
@@ -56,7 +57,7 @@ def stream_joints(source: Path | BinaryIO, robot: Robot, *, name: str) -> Iterat
         name: Name of the source, for messages.
 
     Raises:
-        SessionError: Naming file and line.
+        SessionError: If the table or a row is wrong; names file and line.
     """
     yield from _stream(source, drive_columns(robot), name=name)
 
@@ -64,25 +65,30 @@ def stream_joints(source: Path | BinaryIO, robot: Robot, *, name: str) -> Iterat
 def stream_points(
     source: Path | BinaryIO, robot: Robot, *, name: str, most: int | None = None
 ) -> Iterator[Block]:
-    """Read tool points of any number like `read_points`, block by block.
+    """Read the commanded coordinates of tool points block by block.
 
     Args:
         source: A file, or an open stream.
         robot: The robot.
         name: Name of the source, for messages.
-        most: Largest number of rows.
+        most: Largest number of rows; None for any number.
 
     Raises:
-        SessionError: Naming file and line.
+        SessionError: If the table or a row is wrong; names file and line.
     """
-    controlled = range(3) if robot.tcp is None else robot.tcp.coordinates
-    columns = {name: f for i, (name, f) in enumerate(TOOL_COLUMNS.items()) if i in controlled}
+    commanded = range(3) if robot.tcp is None else robot.tcp.coordinates
+    columns = {name: f for i, (name, f) in enumerate(TOOL_COLUMNS.items()) if i in commanded}
     ignored = tuple(name for name in TOOL_COLUMNS if name not in columns)
     yield from _stream(source, columns, ignored=ignored, name=name, most=most)
 
 
 def format_rows(columns: dict[str, float], values: Array) -> str:
-    """Lines of CSV of values in SI units; rows with NaN become empty cells."""
+    """Lines of a CSV table; rows with NaN become empty cells.
+
+    Args:
+        columns: Columns and their factors to SI units.
+        values: Shape (K, n_columns), [SI].
+    """
     scaled = values / np.array(list(columns.values()))
     empty = "," * (len(columns) - 1)
     return "".join(

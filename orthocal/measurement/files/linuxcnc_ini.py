@@ -15,17 +15,17 @@ from orthocal.errors import ParameterError, SessionError
 from orthocal.io.documents import parse_number, read_text
 from orthocal.io.fields import read_only
 from orthocal.io.files import content_withheld_outside
-from orthocal.measurement.files.schema import LARGEST_TRIM
+from orthocal.measurement.files.session_keys import LARGEST_TRIM
 from orthocal.robot.model import Drive, Robot
 from orthocal.units import DRIVE_UNITS
 
-TABLE_COLUMNS = ("position", "forward trim", "reverse trim")
+COMP_FILE_COLUMNS = ("position", "forward trim", "reverse trim")
 """Columns of a COMP_FILE of type 1."""
 
-MOST_TABLE_ROWS = 256
-"""Largest number of lines of a COMP_FILE."""
+MAX_COMP_FILE_ROWS = 256
+"""Largest number of entries of a COMP_FILE."""
 
-MILLIMETRES = ("mm", "metric")
+METRIC_UNITS = ("mm", "metric")
 """Values of LINEAR_UNITS with which lengths are in mm."""
 
 
@@ -36,12 +36,12 @@ class ControllerJoints:
     home_offsets: tuple[float, ...]
     """HOME_OFFSET, [m, rad]."""
     latched: tuple[int, ...] | None
-    """Sign of HOME_LATCH_VEL, 1 or -1; None if no joint states one, as in lines of an export."""
+    """Sign of HOME_LATCH_VEL, 1 or -1; None if no joint states one, as in an exported fragment."""
     compensation: Compensation
     """BACKLASH and COMP_FILE; empty if no joint has any."""
 
 
-def read_ini(path: Path, robot: Robot) -> ControllerJoints:
+def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
     """Joints of a LinuxCNC machine: JOINT_0 is the first drive, and so on.
 
     Args:
@@ -49,53 +49,78 @@ def read_ini(path: Path, robot: Robot) -> ControllerJoints:
         robot: The robot.
 
     Raises:
-        ParameterError: Naming the file and section, if a joint or a number is missing or wrong.
-        SessionError: If a table is wrong.
+        ParameterError: If a joint or a number is missing or wrong; names file and section.
+        SessionError: If a COMP_FILE is wrong.
     """
     sections = _read_sections(path)
     units = sections.get("TRAJ", {}).get("LINEAR_UNITS", "mm")
-    if units not in MILLIMETRES:
+    if units not in METRIC_UNITS:
         raise ParameterError(f"LINEAR_UNITS is {units}; expected mm", where=f"{path}: [TRAJ]")
-    homes, latched, trims = list[float](), list[int](), list[JointTrim]()
+    homes, latched, trims = list[float](), list[int | None](), list[JointTrim]()
     for i, drive in enumerate(robot.drives):
-        where, size = f"{path}: [JOINT_{i}]", DRIVE_UNITS[drive.unit][1]
-        if f"JOINT_{i}" not in sections:
+        where = f"{path}: [JOINT_{i}]"
+        keys = sections.get(f"JOINT_{i}")
+        if keys is None:
             raise ParameterError(
-                f"is missing; expected a section for each drive, this one of {drive.name}",
-                where=where,
+                f"the section is missing; it belongs to drive {drive.name}", where=where
             )
-        keys = sections[f"JOINT_{i}"]
-        numbers = {
-            key: parse_number(keys.get(key, "0"), where=where, name=key, error=ParameterError)
-            for key in ("HOME_OFFSET", "HOME_LATCH_VEL", "BACKLASH", "COMP_FILE_TYPE")
-        }
-        homes.append(numbers["HOME_OFFSET"] * size)
-        latched.append(-1 if numbers["HOME_LATCH_VEL"] < 0.0 else 1)
-        if not 0.0 <= numbers["BACKLASH"] <= LARGEST_TRIM:
-            raise ParameterError(
-                f"BACKLASH is {numbers['BACKLASH']:g}; expected 0 to {LARGEST_TRIM:g}", where=where
-            )
-        name, table = keys.get("COMP_FILE"), None
-        if name is not None:
-            if numbers["COMP_FILE_TYPE"] != 1.0:
-                raise ParameterError(
-                    "has a COMP_FILE of another type; expected COMP_FILE_TYPE = 1", where=where
-                )
-            table = read_trims(path.parent, name, drive, where)
-        trims.append(JointTrim(numbers["BACKLASH"] * size, table))
+        home, latch, trim = _read_joint(keys, drive, folder=path.parent, where=where)
+        homes.append(home)
+        latched.append(latch)
+        trims.append(trim)
     compensated = any(t.backlash or t.table is not None for t in trims)
-    stated = any("HOME_LATCH_VEL" in sections[f"JOINT_{i}"] for i in range(len(homes)))
+    stated = any(latch is not None for latch in latched)
     return ControllerJoints(
-        tuple(homes), tuple(latched) if stated else None, tuple(trims) if compensated else ()
+        tuple(homes),
+        tuple(latch or 1 for latch in latched) if stated else None,
+        tuple(trims) if compensated else (),
     )
 
 
+def _read_joint(
+    keys: Mapping[str, str], drive: Drive, *, folder: Path, where: str
+) -> tuple[float, int | None, JointTrim]:
+    """Home offset, [m, rad], sign of HOME_LATCH_VEL and compensation of a joint.
+
+    Args:
+        keys: Keys of its section.
+        drive: Its drive.
+        folder: Directory to which the name of its COMP_FILE is relative.
+        where: File and section, for messages.
+
+    Raises:
+        ParameterError: If a number is wrong.
+        SessionError: If the COMP_FILE is wrong.
+    """
+    numbers = {
+        key: parse_number(keys.get(key, "0"), where=where, name=key, error=ParameterError)
+        for key in ("HOME_OFFSET", "HOME_LATCH_VEL", "BACKLASH", "COMP_FILE_TYPE")
+    }
+    unit, factor = DRIVE_UNITS[drive.unit]
+    if not 0.0 <= numbers["BACKLASH"] <= LARGEST_TRIM:
+        raise ParameterError(
+            f"BACKLASH is {numbers['BACKLASH']:g} {unit}; expected 0 to {LARGEST_TRIM:g} {unit}",
+            where=where,
+        )
+    name, table = keys.get("COMP_FILE"), None
+    if name is not None:
+        if numbers["COMP_FILE_TYPE"] != 1.0:
+            raise ParameterError(
+                f"COMP_FILE_TYPE is {numbers['COMP_FILE_TYPE']:g}; expected 1", where=where
+            )
+        table = read_comp_file(folder, name, drive, where)
+    latch = None
+    if "HOME_LATCH_VEL" in keys:
+        latch = -1 if numbers["HOME_LATCH_VEL"] < 0.0 else 1
+    return numbers["HOME_OFFSET"] * factor, latch, JointTrim(numbers["BACKLASH"] * factor, table)
+
+
 def _read_sections(path: Path) -> Mapping[str, Mapping[str, str]]:
-    """Sections of an INI file; of keys that stand twice the first, as LinuxCNC reads them."""
+    """Sections of an INI file. The first of repeated keys counts, as in LinuxCNC."""
     sections = dict[str, dict[str, str]]()
     current = dict[str, str]()
     for line in read_text(path, error=ParameterError).splitlines():
-        bare = re.sub(r"(^|\s)[#;].*", "", line).strip()
+        bare = re.sub(r"(^|\s)[#;].*", "", line).strip()  # without its comment
         if bare.startswith("[") and bare.endswith("]"):
             current = sections.setdefault(bare[1:-1].strip(), {})
         elif "=" in bare:
@@ -104,21 +129,26 @@ def _read_sections(path: Path) -> Mapping[str, Mapping[str, str]]:
     return sections
 
 
-def read_trims(folder: Path, name: str, drive: Drive, where: str) -> Array:
-    """Table of a COMP_FILE of type 1: positions and trims, shape (n, 3), [m, rad].
+def read_comp_file(folder: Path, name: str, drive: Drive, where: str) -> Array:
+    """Table of a COMP_FILE of type 1: position, forward trim, reverse trim.
+
+    The content of a file outside the directory is not quoted in messages.
 
     Args:
-        folder: Directory of the file that names the table.
-        name: Name of the table, relative to it.
+        folder: Directory to which `name` is relative.
+        name: Name of the table.
         drive: Drive of the joint.
-        where: File and section or key that name it, for messages.
+        where: File and section, or file and key, for messages.
+
+    Returns:
+        Shape (n, 3), [m, rad].
 
     Raises:
-        SessionError: Naming the file and the line.
+        SessionError: If the table is wrong; names file and line.
     """
     if not name.strip() or "\0" in name:
-        raise SessionError(f"found {name!r}; expected the name of a file", where=where)
-    file, (unit, size) = folder / name, DRIVE_UNITS[drive.unit]
+        raise SessionError(f"found {name!r}; expected a file name", where=where)
+    file, (unit, factor) = folder / name, DRIVE_UNITS[drive.unit]
     with content_withheld_outside(folder, file):
         text = read_text(file, error=SessionError)
         rows = list[list[float]]()
@@ -126,28 +156,28 @@ def read_trims(folder: Path, name: str, drive: Drive, where: str) -> Array:
             at = f"{file}:{number}"
             if not (cells := line.split()):
                 continue
-            if len(cells) != len(TABLE_COLUMNS):
+            if len(cells) != len(COMP_FILE_COLUMNS):
                 raise SessionError(
-                    f"has {len(cells)} numbers; expected {', '.join(TABLE_COLUMNS)}", where=at
+                    f"has {len(cells)} numbers; expected {', '.join(COMP_FILE_COLUMNS)}", where=at
                 )
             row = [
                 parse_number(cell, where=at, name=column, error=SessionError)
-                for cell, column in zip(cells, TABLE_COLUMNS, strict=True)
+                for cell, column in zip(cells, COMP_FILE_COLUMNS, strict=True)
             ]
-            if rows and not row[0] > rows[-1][0]:
+            if rows and row[0] <= rows[-1][0]:
                 raise SessionError(
-                    f"the position {row[0]:g} {unit} does not exceed that of the line before",
+                    f"positions must increase: {row[0]:g} {unit} follows {rows[-1][0]:g} {unit}",
                     where=at,
                 )
             if max(map(abs, row[1:])) > LARGEST_TRIM:
                 raise SessionError(
                     f"found a trim of {max(row[1:], key=abs):g} {unit}; expected at most "
-                    f"{LARGEST_TRIM:g}, as in a table of COMP_FILE_TYPE = 1",
+                    f"{LARGEST_TRIM:g} {unit}; is the table of COMP_FILE_TYPE = 0?",
                     where=at,
                 )
             rows.append(row)
-        if not 1 < len(rows) <= MOST_TABLE_ROWS:
+        if not 1 < len(rows) <= MAX_COMP_FILE_ROWS:
             raise SessionError(
-                f"has {len(rows)} lines; expected 2 to {MOST_TABLE_ROWS}", where=str(file)
+                f"has {len(rows)} entries; expected 2 to {MAX_COMP_FILE_ROWS}", where=str(file)
             )
-    return read_only(np.array(rows) * size)
+    return read_only(np.array(rows) * factor)

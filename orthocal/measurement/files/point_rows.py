@@ -1,8 +1,8 @@
-"""Rows of points: three coordinates in a line, which a session reads as three sensors.
+"""Rows of measured points: three coordinates in a line, which a session reads as three sensors.
 
-A setup `track` becomes `track[x]`, `track[y]` and `track[z]`. With a covariance that correlates the
-coordinates they are `track[1]` to `track[3]`, along its principal axes. A row with a covariance of
-its own has setups of its own: `track[x2]`.
+A setup `track` becomes `track[x]`, `track[y]` and `track[z]`. If its covariance correlates the
+coordinates, the setups are `track[1]` to `track[3]`, along the principal axes. A row that states
+another covariance has additional setups: `track[x2]`.
 """
 
 from __future__ import annotations
@@ -36,51 +36,53 @@ def split_points(session: Session) -> Session:
                 "has brackets; expected a name without them for a setup of points",
                 where=f"{session.path or 'session'}: setups.{setup.name}",
             )
-        parts, further = split_setup(setup, session.gauges[setup.gauge])
-        setups |= parts
-        gauges |= further
+        axis_setups, axis_gauges = split_setup(setup, session.gauges[setup.gauge])
+        setups |= axis_setups
+        gauges |= axis_gauges
     used = dict.fromkeys(s.gauge for s in setups.values())
     return replace(session, setups=setups, gauges={n: gauges[n] for n in [*used, *gauges]})
 
 
 @dataclass
 class PointRows:
-    """Readings of rows with three coordinates."""
+    """Setups of the rows of a table, with additional ones for the covariances of rows."""
 
-    plan: Session
+    session: Session
+    """The session as its files state it, with split setups of points."""
     setups: dict[str, Setup] = field(default_factory=dict)
-    """All setups, with those for the covariances of rows."""
+    """All setups by name, additional ones included."""
     gauges: dict[str, Gauge] = field(default_factory=dict)
-    _parts: dict[str, list[str]] = field(default_factory=dict)
-    """Base name to its setups."""
-    _numbers: dict[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
-    """Base name and covariance as text to the setups of its rows."""
+    """Their gauges by name."""
+    _setups_by_base: dict[str, list[str]] = field(default_factory=dict)
+    """Setups of points by base name."""
+    _setups_by_covariance: dict[tuple[str, str], tuple[str, ...]] = field(default_factory=dict)
+    """Additional setups by base name and text of the covariance."""
 
     def __post_init__(self) -> None:
-        self.setups, self.gauges = dict(self.plan.setups), dict(self.plan.gauges)
+        self.setups, self.gauges = dict(self.session.setups), dict(self.session.gauges)
         for name, setup in self.setups.items():
             if isinstance(setup.sensor, Points):
-                self._parts.setdefault(base_name(name), []).append(name)
+                self._setups_by_base.setdefault(base_name(name), []).append(name)
 
     @property
     def names(self) -> list[str]:
         """Names of all setups as in the files."""
-        return list(dict.fromkeys(map(base_name, self.plan.setups)))
+        return list(dict.fromkeys(map(base_name, self.session.setups)))
 
     @property
-    def any(self) -> bool:
+    def has_points(self) -> bool:
         """True if the session has a setup of points."""
-        return bool(self._parts)
+        return bool(self._setups_by_base)
 
     def is_point(self, row: RawReading) -> bool:
         """True for a row of a setup of points."""
-        return row.setup in self._parts
+        return row.setup in self._setups_by_base
 
     def check_columns(self, row: RawReading) -> None:
         """Refuse a row with numbers in columns of other sensors.
 
         Raises:
-            SessionError: Naming file, line and column.
+            SessionError: If there is such a number; names file, line and column.
         """
         point = self.is_point(row)
         wrong = ("reading_mm",) if point else (*COORDINATES, *COVARIANCES)
@@ -98,13 +100,13 @@ class PointRows:
             )
 
     def split(self, row: RawReading, values: Sequence[float]) -> dict[str, float]:
-        """Setups of a row and their readings, [m].
+        """Readings of a row, [m], by setup.
 
         Args:
             row: The row.
-            values: Coordinates, shape (3,), [m].
+            values: Coordinates of the point, shape (3,), [m].
         """
-        names = self._parts[row.setup][:3]
+        names = self._setups_by_base[row.setup][:3]
         if any(getattr(row, c) for c in COVARIANCES):
             names = list(self._with_covariance(row))
         return {
@@ -113,9 +115,10 @@ class PointRows:
         }
 
     def _with_covariance(self, row: RawReading) -> tuple[str, ...]:
+        """Setups for the covariance of a row, added if the covariance is new."""
         texts = [getattr(row, c) for c in COVARIANCES]
         key = row.setup, " ".join(texts)
-        if key not in self._numbers:
+        if key not in self._setups_by_covariance:
             numbers = [
                 parse_number(text, where=row.where, name=c, error=SessionError)
                 for c, text in zip(COVARIANCES, texts, strict=True)
@@ -125,32 +128,31 @@ class PointRows:
                 covariance = read_covariance([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
             except SessionError as e:
                 raise SessionError(f"the covariance {e.problem}", where=row.where) from None
-            first = self.setups[self._parts[row.setup][0]]
+            first = self.setups[self._setups_by_base[row.setup][0]]
             sensor = replace(cast(Points, first.sensor).in_file, covariance=covariance)
             base = replace(first, name=row.setup, sensor=sensor)
-            number = 1 + sum(name == row.setup for name, _ in self._numbers)
-            gauge = self.plan.gauges[first.gauge]
+            number = 1 + sum(name == row.setup for name, _ in self._setups_by_covariance)
+            gauge = self.session.gauges[first.gauge]
             setups, gauges = split_setup(base, gauge, number)
             self.setups |= setups
             self.gauges |= gauges
-            self._numbers[key] = tuple(setups)
-        return self._numbers[key]
+            self._setups_by_covariance[key] = tuple(setups)
+        return self._setups_by_covariance[key]
 
 
 def find_point(rows: Sequence[Reading], index: int) -> list[int]:
-    """Indices of the rows of one line: the three of a point, or one; in their order."""
-    row = rows[index]
-    place = base_name(row.setup), row.place[1:], row.cycle, row.line
+    """Indices of the rows of one line, in their order: three for a point, or one."""
 
-    def is_same(i: int) -> bool:
-        other = rows[i]
-        return (base_name(other.setup), other.place[1:], other.cycle, other.line) == place
+    def line_key(i: int) -> object:
+        row = rows[i]
+        return base_name(row.setup), row.place[1:], row.cycle, row.line
 
     first, last = index, index
-    while "[" in row.setup and first > 0 and is_same(first - 1):
-        first -= 1
-    while "[" in row.setup and last + 1 < len(rows) and is_same(last + 1):
-        last += 1
+    if "[" in rows[index].setup:
+        while first > 0 and line_key(first - 1) == line_key(index):
+            first -= 1
+        while last + 1 < len(rows) and line_key(last + 1) == line_key(index):
+            last += 1
     return list(range(first, last + 1))
 
 
@@ -183,16 +185,16 @@ def is_of_row(name: str) -> bool:
 
 
 def locate_stations(session: Session, *, partial: bool = False) -> Session:
-    """Session whose stations of unknown frame begin at the best fit to the nominal machine.
+    """Session whose stations of unknown frame start at the best fit to the nominal machine.
 
     Args:
-        session: The session; empty rows do not take part.
-        partial: Whether points may be missing: a station that they do not determine stays.
+        session: The session; empty rows are ignored.
+        partial: Whether points may be missing; a station that they do not determine is not changed.
 
     Raises:
         SessionError: If the points of a station do not determine it.
     """
-    seen: dict[str, tuple[list[Array], list[Array], str]] = {}
+    by_station: dict[str, tuple[list[Array], list[Array], str]] = {}
     unknown = {
         name: s.sensor
         for name, s in session.setups.items()
@@ -206,13 +208,13 @@ def locate_stations(session: Session, *, partial: bool = False) -> Session:
         if sensor is None or any(np.isnan(r.value) for r in part):
             continue
         postures, contact = contacts[part[0].setup]
-        points, targets, _ = seen.setdefault(
+        points, targets, _ = by_station.setdefault(
             sensor.station or "", ([], [], base_name(part[0].setup))
         )
         points.append(point_of(part, session.setups))
         targets.append(contact.points[postures.index(part[0].posture)])
     setups = dict(session.setups)
-    for station, (points, targets, base) in seen.items():
+    for station, (points, targets, base) in by_station.items():
         try:
             position, rotation = fit_station(np.array(points), np.array(targets))
         except SessionError as e:

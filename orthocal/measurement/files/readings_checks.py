@@ -1,10 +1,9 @@
-"""Rows of readings against their session: names, numbers, the gauge's range, repetitions."""
+"""Validation of reading rows against their session: names, numbers, range, repetitions."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable
-from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from orthocal.io.documents import parse_number
 from orthocal.kinematics.conditions import find_approach_problem
 from orthocal.measurement.files.point_rows import PointRows
 from orthocal.measurement.files.readings_file import CONDITIONS, COORDINATES, RawReading
-from orthocal.measurement.files.schema import MOST_READINGS
+from orthocal.measurement.files.session_keys import MOST_READINGS
 from orthocal.robot.description import HIGHEST_C, LOWEST_C
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import (
@@ -26,60 +25,73 @@ from orthocal.session.session import Conditions, Gauge, Reading, ReadingKey, Ses
 from orthocal.text import shorten, spans
 from orthocal.units import MM
 
-IN_UM = "; for readings in µm use `orthocal import --unit um`"
-"""Remedy for readings in another unit."""
+UNIT_HINT = "; for readings in µm use `orthocal import --unit um`"
+"""Action in case of a wrong unit."""
 
-FAR = 5.0
-"""Ratio of a reading to the range of the gauge above which its unit may be another."""
+UNIT_HINT_RATIO = 5.0
+"""Ratio of a reading to the range of the gauge above which a wrong unit is suspected."""
+
+ROUNDING_MM = 1e-9
+"""Excess over the range of a gauge that may be a rounding error, [mm]."""
 
 
 def check_readings(
-    rows: Iterable[RawReading], plan: Session, *, file: Path
+    rows: Iterable[RawReading], session: Session, *, file: Path
 ) -> tuple[tuple[Reading, ...], PointRows]:
     """Readings of a table, checked against their session and each other; NaN for empty cells.
 
-    Rows of points may have covariances of their own, and with them setups beside the planned ones.
+    Measured points may state a covariance per row, which creates additional setups.
 
     Args:
         rows: The rows.
-        plan: The session, for its setups, postures and gauges.
+        session: The session with its setups, postures and gauges.
         file: File of the rows, for messages.
 
+    Returns:
+        The readings, and all setups of the session with the additional ones.
+
     Raises:
-        SessionError: Naming file and line.
+        SessionError: If a row is wrong; names file and line.
     """
-    checked, points = _CheckedReadings(file), PointRows(plan)
+    accepted, points = _AcceptedReadings(file), PointRows(session)
     for row in rows:
-        for reading in parse_row(row, plan, points):
+        for reading in parse_row(row, session, points):
             setup = points.setups[reading.setup]
-            checked.add(row, reading, of_pair=reads_pairs(setup.sensor))
-    if not checked.readings:
+            accepted.add(row, reading, of_pair=reads_pairs(setup.sensor))
+    if not accepted.readings:
         raise SessionError("holds no readings", where=str(file))
-    return tuple(checked.readings), points
+    return tuple(accepted.readings), points
 
 
 def require_read(session: Session, *, partial: bool = False) -> None:
-    """Refuse a session with readings that are missing; with `partial`, one without any reading.
+    """Refuse a session with missing readings.
+
+    Args:
+        session: The session.
+        partial: Whether some of the readings may be missing, but not all.
 
     Raises:
-        SessionError: Naming file, number and lines.
+        SessionError: If readings are missing; names file, number and lines.
     """
     missing = [r for r in session.readings if not r.is_read]
     if len(missing) == len(session.readings):
         raise SessionError(
-            "nothing was read yet; `orthocal record` takes the readings",
+            "no reading is entered yet; run `orthocal record`",
             where=str(session.readings_path),
         )
     if missing and not partial:
         raise SessionError(
-            f"{describe_missing(session)}; `orthocal record` takes them or drops their lines, and "
-            "`orthocal check` looks at the others",
+            f"{describe_missing(session)}; complete or delete them with `orthocal record`, or "
+            "check the others with `orthocal check`",
             where=str(session.readings_path),
         )
 
 
 def describe_missing(session: Session) -> str:
-    """Number and lines of missing readings: 9 of 24 readings are missing (lines 14, 17 to 24)."""
+    """Number and lines of missing readings.
+
+    For example "9 of 24 readings are missing (lines 14, 17 to 24)".
+    """
     missing = [r for r in session.readings if not r.is_read]
     lines = sorted({r.line for r in missing if r.line is not None})
     where = f" ({spans(lines, 'line')})" if lines else ""
@@ -87,28 +99,36 @@ def describe_missing(session: Session) -> str:
     return f"{len(missing)} of {len(session.readings)} readings {verb} missing{where}"
 
 
-def parse_row(row: RawReading, plan: Session, points: PointRows) -> list[Reading]:
-    """Reading of a row, or the three of a point, checked against its session; NaN if empty.
+def parse_row(row: RawReading, session: Session, points: PointRows) -> list[Reading]:
+    """Readings of a row: one, or three for a measured point; NaN if its cells are empty.
 
     Raises:
-        SessionError: Naming file and line.
+        SessionError: If the row contradicts the session; names file and line.
     """
-    _check_names(row, plan, points)
+    _check_names(row, session, points)
     columns = COORDINATES if points.is_point(row) else ("reading_mm",)
     values = [_parse_value(row, column) * MM for column in columns]
     missing = [c for c, v in zip(columns, values, strict=True) if math.isnan(v)]
     if missing and len(missing) < len(values):
-        raise SessionError(f"{missing[0]} is empty; expected all of a point", where=row.where)
-    cycle, conditions = parse_cycle(row.cycle, row.where), read_conditions(row, plan.robot)
-    of_setups = points.split(row, values) if points.is_point(row) else {row.setup: values[0]}
+        raise SessionError(
+            f"{missing[0]} is empty; expected all three coordinates of the point", where=row.where
+        )
+    cycle, conditions = parse_cycle(row.cycle, row.where), parse_conditions(row, session.robot)
+    value_by_setup = points.split(row, values) if points.is_point(row) else {row.setup: values[0]}
+    minus = row.minus or None
     readings = []
-    for name, value in of_setups.items():
+    for name, value in value_by_setup.items():
         setup = points.setups[name]
-        largest = largest_reading(setup.sensor)
-        difference = is_difference(row.minus or None, setup.sensor)
-        check_range(value / MM, points.gauges[setup.gauge], difference, row.where, largest)
-        reading = Reading(name, row.posture, row.minus or None, cycle, value, row.line)
-        readings.append(replace(reading, conditions=conditions))
+        check_range(
+            value / MM,
+            points.gauges[setup.gauge],
+            difference=is_difference(minus, setup.sensor),
+            where=row.where,
+            largest=largest_reading(setup.sensor),
+        )
+        readings.append(
+            Reading(name, row.posture, minus, cycle, value, row.line, conditions=conditions)
+        )
     return readings
 
 
@@ -119,7 +139,7 @@ def _parse_value(row: RawReading, column: str) -> float:
     return parse_number(text, where=row.where, name=column, error=SessionError)
 
 
-class _CheckedReadings:
+class _AcceptedReadings:
     """Readings of a session that neither repeat nor contradict each other.
 
     Args:
@@ -130,20 +150,20 @@ class _CheckedReadings:
         self.readings: list[Reading] = []
         self._file = file
         self._first_lines: dict[ReadingKey, int] = {}
-        self._zone_lines: dict[bool, int] = {}
+        self._first_line_by_zoned: dict[bool, int] = {}
         self._absolute: set[tuple[str, int]] = set()
         self._differences: dict[tuple[str, int], dict[str, str]] = {}
 
     def add(self, row: RawReading, reading: Reading, *, of_pair: bool) -> None:
-        """Add a reading, if it agrees with those before it.
+        """Add a reading that agrees with the previous ones.
 
         Args:
             row: The row.
             reading: Its reading.
-            of_pair: Whether it belongs to a pair of postures: such readings are independent.
+            of_pair: Whether the sensor reads pairs of postures; these readings are independent.
 
         Raises:
-            SessionError: Naming file and line.
+            SessionError: If the reading disagrees with the previous ones; names file and line.
         """
         if reading.key in self._first_lines:
             raise SessionError(
@@ -153,28 +173,31 @@ class _CheckedReadings:
                 where=row.where,
             )
         self._first_lines[reading.key] = row.line
-        self._check_zone(row, reading.conditions)
+        self._require_consistent_time_zone(row, reading.conditions)
         if len(self.readings) >= MOST_READINGS:
             raise SessionError(f"holds more than {MOST_READINGS} readings", where=str(self._file))
         if not of_pair:
-            self._check_form(reading, row.where)
+            self._require_independent(reading, row.where)
         self.readings.append(reading)
 
-    def _check_zone(self, row: RawReading, conditions: Conditions | None) -> None:
+    def _require_consistent_time_zone(self, row: RawReading, conditions: Conditions | None) -> None:
         """Refuse times with and without time zone in one session."""
         if conditions is None or conditions.time is None:
             return
         zoned = conditions.time.tzinfo is not None
-        self._zone_lines.setdefault(zoned, row.line)
-        if len(self._zone_lines) > 1:
+        self._first_line_by_zoned.setdefault(zoned, row.line)
+        if len(self._first_line_by_zoned) > 1:
             raise SessionError(
                 f"time is '{row.time}'; expected all times of a session with a time zone, or all "
-                f"without one, as in line {self._zone_lines[not zoned]}",
+                f"without one, as in line {self._first_line_by_zoned[not zoned]}",
                 where=row.where,
             )
 
-    def _check_form(self, reading: Reading, where: str) -> None:
-        """Refuse readings that determine each other within one cycle of one setup."""
+    def _require_independent(self, reading: Reading, where: str) -> None:
+        """Refuse linearly dependent differences, and a mix of readings and differences.
+
+        Both refer to one cycle of one setup.
+        """
         group = (reading.setup, reading.cycle)
         if reading.minus is None:
             self._absolute.add(group)
@@ -184,46 +207,48 @@ class _CheckedReadings:
             if first == second:
                 raise SessionError(
                     f"{reading.label} follows from the other differences of setup "
-                    f"{reading.setup} in cycle {reading.cycle}; leave it out, or give it its own "
-                    "cycle if it was measured apart",
+                    f"{reading.setup} in cycle {reading.cycle}; delete it, or use another cycle "
+                    "if it was measured separately",
                     where=where,
                 )
             leaders[first] = second
         if group in self._absolute and group in self._differences:
             raise SessionError(
                 f"setup {reading.setup} has both readings and differences in cycle "
-                f"{reading.cycle}; give the readings only",
+                f"{reading.cycle}; keep the readings only",
                 where=where,
             )
 
 
 def _find_leader(leaders: dict[str, str], name: str) -> str:
-    """Representative of the postures that differences connect with a posture."""
-    while (above := leaders.get(name, name)) != name:
-        leaders[name] = leaders.get(above, above)  # halves the path
-        name = above
+    """Union-find root of a posture among postures that differences connect (path halving)."""
+    while (parent := leaders.get(name, name)) != name:
+        leaders[name] = leaders.get(parent, parent)
+        name = parent
     return name
 
 
 def require_name(name: str, names: Collection[str], noun: str, *, where: str) -> None:
-    """Refuse a name that is not among those of a session.
+    """Refuse a name that the session does not have.
 
     Raises:
-        SessionError: With the names of the session.
+        SessionError: If the name is unknown; lists the names of the session.
     """
     if name not in names:
         raise SessionError(f"'{name}' is not a {noun}; {noun}s: {', '.join(names)}", where=where)
 
 
-def _check_names(row: RawReading, plan: Session, points: PointRows) -> None:
-    """Refuse a setup or postures that the session does not have."""
+def _check_names(row: RawReading, session: Session, points: PointRows) -> None:
+    """Refuse a setup or postures that the session does not have, and cells of other sensors."""
     require_name(row.setup, points.names, "setup", where=row.where)
     points.check_columns(row)
     for name in (row.posture, row.minus) if row.minus else (row.posture,):
-        require_name(name, plan.postures, "posture", where=row.where)
+        require_name(name, session.postures, "posture", where=row.where)
     if row.minus == row.posture:
-        raise SessionError(f"takes posture '{row.posture}' off itself", where=row.where)
-    setup = plan.setups.get(row.setup)
+        raise SessionError(
+            f"posture and minus are both '{row.posture}'; expected two postures", where=row.where
+        )
+    setup = session.setups.get(row.setup)
     if setup is not None and reads_pairs(setup.sensor) and not row.minus:
         raise SessionError(
             f"minus is empty; expected the second posture of the pair: setup {row.setup} has a "
@@ -232,11 +257,11 @@ def _check_names(row: RawReading, plan: Session, points: PointRows) -> None:
         )
 
 
-def read_conditions(row: RawReading, robot: Robot) -> Conditions | None:
+def parse_conditions(row: RawReading, robot: Robot) -> Conditions | None:
     """Conditions of a row; None if it states none.
 
     Raises:
-        SessionError: Naming file, line and column.
+        SessionError: If a condition is wrong; names file, line and column.
     """
     stated = {column: text for column in CONDITIONS if (text := getattr(row, column))}
     if not stated:
@@ -248,65 +273,77 @@ def read_conditions(row: RawReading, robot: Robot) -> Conditions | None:
             "conditions belong to single readings",
             where=row.where,
         )
+    if row.approach:
+        require_approach(row.approach, robot, row.where)
     return Conditions(
-        parse_approach(row.approach, robot, row.where) if row.approach else None,
+        row.approach or None,
         parse_temperature(row.temperature_C, row.where) if row.temperature_C else None,
         parse_time(row.time, row.where) if row.time else None,
     )
 
 
-def check_conditions(conditions: Conditions, robot: Robot, difference: bool, where: str) -> None:
+def check_conditions(conditions: Conditions, robot: Robot, *, difference: bool, where: str) -> None:
     """Refuse conditions that a reading cannot have.
 
+    Args:
+        conditions: The conditions.
+        robot: The robot.
+        difference: Whether the reading is a difference of two postures.
+        where: File and line, or name of the reading, for messages.
+
     Raises:
-        SessionError: At `where`.
+        SessionError: If the reading cannot have the conditions.
     """
     if difference:
         raise SessionError(
             "is a difference of two postures; conditions belong to single readings", where=where
         )
     if conditions.approach is not None:
-        parse_approach(conditions.approach, robot, where)
+        require_approach(conditions.approach, robot, where)
     if conditions.temperature is not None:
-        parse_temperature(str(conditions.temperature), where)
+        _require_temperature(conditions.temperature, where)
 
 
-def parse_approach(text: str, robot: Robot, where: str) -> str:
-    """Directions of the drives' last motions.
+def require_approach(text: str, robot: Robot, where: str) -> None:
+    """Refuse an approach that is not a letter for each drive.
 
     Raises:
-        SessionError: If it is not a letter for each drive.
+        SessionError: If the approach is wrong.
     """
     problem = find_approach_problem(text, robot)
     if problem:
         raise SessionError(f"approach is {problem}", where=where)
-    return text
 
 
 def parse_temperature(text: str, where: str) -> float:
-    """A temperature, [°C].
+    """Temperature, [°C].
 
     Raises:
-        SessionError: If it is not one of a workshop.
+        SessionError: If the text is not a number from LOWEST_C to HIGHEST_C.
     """
     value = parse_number(text, where=where, name="temperature_C", error=SessionError)
+    _require_temperature(value, where)
+    return value
+
+
+def _require_temperature(value: float, where: str) -> None:
+    """Refuse a temperature, [°C], that no workshop has."""
     if not LOWEST_C <= value <= HIGHEST_C:
         raise SessionError(
             f"temperature_C is {value:g}; expected degrees Celsius from {LOWEST_C:g} to "
             f"{HIGHEST_C:g}",
             where=where,
         )
-    return value
 
 
 def parse_time(text: str, where: str) -> datetime:
     """Date and time of day.
 
     Raises:
-        SessionError: If it is not in the form of ISO 8601.
+        SessionError: If the text is not in the form of ISO 8601.
     """
     try:
-        if len(text) <= len("2025-03-14"):
+        if len(text) <= len("2025-03-14"):  # a date alone is not enough
             raise ValueError
         return datetime.fromisoformat(text)
     except ValueError:
@@ -318,10 +355,10 @@ def parse_time(text: str, where: str) -> datetime:
 
 
 def parse_cycle(text: str, where: str) -> int:
-    """The cycle of a row; 1 where none is given.
+    """Cycle of a row; 1 if its cell is empty.
 
     Raises:
-        SessionError: If it is no number from 1 on.
+        SessionError: If the text is not a positive integer.
     """
     if not text:
         return 1
@@ -333,19 +370,27 @@ def parse_cycle(text: str, where: str) -> int:
 def check_range(
     value_mm: float,
     gauge: Gauge,
+    *,
     difference: bool,
     where: str,
     largest: float = LARGEST_READING,
 ) -> None:
-    """Refuse a reading that no indicator shows, or not this one; accept NaN.
+    """Refuse a reading beyond the range of the gauge or of its kind of sensor. NaN passes.
+
+    Args:
+        value_mm: Reading, [mm].
+        gauge: The gauge.
+        difference: Whether the reading is a difference of two postures.
+        where: File and line, or name of the reading, for messages.
+        largest: Largest reading of the kind of sensor, [m].
 
     Raises:
-        SessionError: At `where`.
+        SessionError: If the reading is out of range.
     """
     if abs(value_mm) > largest / MM:
         raise SessionError(
-            f"reading_mm is {value_mm:g}; expected a number within ±{largest / MM:g}: no "
-            f"indicator reaches further{IN_UM}",
+            f"reading_mm is {value_mm:g}; expected a number within ±{largest / MM:g}, the limit "
+            f"of this kind of sensor{UNIT_HINT}",
             where=where,
         )
     if gauge.range is None:
@@ -353,9 +398,9 @@ def check_range(
     lowest, highest = (v / MM for v in gauge.range)
     if difference:
         lowest, highest = lowest - highest, highest - lowest
-    if value_mm < lowest - 1e-9 or value_mm > highest + 1e-9:
+    if value_mm < lowest - ROUNDING_MM or value_mm > highest + ROUNDING_MM:
         kind = "a difference" if difference else "a reading"
-        hint = IN_UM if abs(value_mm) > FAR * max(-lowest, highest) else ""
+        hint = UNIT_HINT if abs(value_mm) > UNIT_HINT_RATIO * max(-lowest, highest) else ""
         raise SessionError(
             f"reading_mm is {value_mm:g}; the gauge's range allows {kind} from "
             f"{lowest:g} to {highest:g}{hint}",

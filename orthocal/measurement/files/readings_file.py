@@ -1,8 +1,8 @@
 """Rows of a readings.csv, as orthocal writes it or as a spreadsheet saved it.
 
-The house form is UTF-8 with commas, decimal points and mm. What a spreadsheet makes of it, with
-semicolons or tabs, decimal commas, another encoding, German headings or a typographic minus, is
-taken where it can mean one thing only; whatever is less clear is for `orthocal import`.
+orthocal writes UTF-8 with commas, decimal points and mm. A spreadsheet may save semicolons or tabs,
+decimal commas, another encoding, German headings or a typographic minus. Such a file is read if it
+has one meaning only; ambiguous files need `orthocal import`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from orthocal.io.tables.numerals import (
 )
 from orthocal.io.tables.table import Table, read_table
 from orthocal.io.tables.workbook import ZIP_SIGNATURE
-from orthocal.measurement.files.schema import MOST_READINGS
+from orthocal.measurement.files.session_keys import MOST_READINGS
 from orthocal.measurement.importing.headings import EXPECTED, Columns, choose_columns, find_header
 from orthocal.text import composed, shorten
 from orthocal.units import trim_zeros
@@ -39,7 +39,10 @@ from orthocal.units import trim_zeros
 
 @dataclass(frozen=True, slots=True)
 class RawReading:
-    """A row of a table of readings, as text; fields after the first two are the columns."""
+    """Row of a table of readings, as text. The fields after the first two are the columns.
+
+    Numbers have a decimal point.
+    """
 
     where: str
     """File and line, for messages."""
@@ -49,13 +52,12 @@ class RawReading:
     minus: str = ""
     cycle: str = ""
     reading_mm: str = ""
-    """With a decimal point."""
     x_mm: str = ""
-    """Coordinates of a point, likewise."""
+    """Coordinates of a measured point, x to z."""
     y_mm: str = ""
     z_mm: str = ""
     cov_xx_um2: str = ""
-    """Covariance of a point, where rows differ, likewise."""
+    """Covariance of the point, xx to yz, if it is not the one of its setup."""
     cov_yy_um2: str = ""
     cov_zz_um2: str = ""
     cov_xy_um2: str = ""
@@ -63,7 +65,6 @@ class RawReading:
     cov_yz_um2: str = ""
     approach: str = ""
     temperature_C: str = ""
-    """With a decimal point."""
     time: str = ""
 
 
@@ -76,14 +77,14 @@ COVARIANCES = tuple(name for name in COLUMNS if name.startswith("cov_"))
 REQUIRED = ("setup", "posture", "reading_mm")
 OPTIONAL = tuple(name for name in COLUMNS if name not in (*REQUIRED, *COORDINATES, *COVARIANCES))
 
-OF_POINTS = ("setup", "posture", *COORDINATES)
+REQUIRED_OF_POINTS = ("setup", "posture", *COORDINATES)
 """Required columns of a table with points; the others are optional."""
 
 NUMBERS = ("reading_mm", *COORDINATES, *COVARIANCES, "temperature_C")
 """Columns of numbers that may have a decimal sign."""
 
 COLUMN_OF_ROLE = {"reading": "reading_mm", "temperature": "temperature_C"}
-"""Roles of columns in other tables, where the column of a readings.csv has another name."""
+"""Columns of a readings.csv whose name differs from their role in other tables, by role."""
 
 CONDITIONS = ("approach", "temperature_C", "time")
 """Columns that state conditions."""
@@ -91,7 +92,10 @@ CONDITIONS = ("approach", "temperature_C", "time")
 MEASURED = ("temperature_C", "time")
 """Conditions that are measured with a reading, not planned."""
 
-UNSTATED = {"cycle": "1"}
+FIRST_LINE = 2
+"""Line of the first row of a readings.csv, after the header."""
+
+OPTIONAL_DEFAULTS = {"cycle": "1"}
 """Values of optional columns that need not be stated."""
 
 
@@ -106,18 +110,21 @@ def format_readings(
 
     Args:
         rows: The rows.
-        blank: Leave the cells of measured conditions empty.
-        needed: Optional columns to be filled in, with or without content.
-        required: Columns that the table has in any case.
+        blank: Whether to write empty cells for measured conditions.
+        needed: Optional columns that the operator fills in.
+        required: Required columns.
     """
     columns = [
         c
         for c in COLUMNS
         if c in (*required, *needed)
-        or any(getattr(r, c) not in ("", UNSTATED.get(c)) for r in rows)
+        or any(getattr(r, c) not in ("", OPTIONAL_DEFAULTS.get(c)) for r in rows)
     ]
     cells = [
-        ["" if blank and c in MEASURED else getattr(r, c) or UNSTATED.get(c, "") for c in columns]
+        [
+            "" if blank and c in MEASURED else getattr(r, c) or OPTIONAL_DEFAULTS.get(c, "")
+            for c in columns
+        ]
         for r in rows
     ]
     lines = [columns, *cells]  # ISO 8601 allows a comma in a fraction of a second
@@ -125,11 +132,11 @@ def format_readings(
 
 
 def mm_text(value: Decimal) -> str:
-    """A reading in mm as a readings.csv has it: exactly, with two decimals at least."""
+    """Text of a reading in mm in a readings.csv: exact, with at least two decimals."""
     return trim_zeros(f"{value:f}") if -30 < value.adjusted() < 30 else f"{value:e}"
 
 
-def is_house(header: Iterable[str]) -> bool:
+def has_standard_headings(header: Iterable[str]) -> bool:
     """True for the exact headings of a readings.csv."""
     names = [composed(name.strip()) for name in header]
     required, optional = _schema(names)
@@ -140,22 +147,22 @@ def _schema(header: Collection[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Required and optional columns of a table, with points or without."""
     if not set(COORDINATES) & set(header):
         return REQUIRED, OPTIONAL
-    return OF_POINTS, tuple(name for name in COLUMNS if name not in OF_POINTS)
+    return REQUIRED_OF_POINTS, tuple(name for name in COLUMNS if name not in REQUIRED_OF_POINTS)
 
 
 def decide_sign(
-    cells: Sequence[Numeral], *, house: bool, ask: str, place: Callable[[int], str]
+    cells: Sequence[Numeral], *, standard: bool, advice: str, place: Callable[[int], str]
 ) -> DecimalSign:
-    """The decimal sign of readings, which have one only.
+    """Common decimal sign of the readings of a table.
 
     Args:
         cells: The readings.
-        house: Whether headings are those of a readings.csv: then a point is a decimal point.
-        ask: What to do where it is not certain.
-        place: Line to file and line, for messages.
+        standard: Whether the headings are those of a readings.csv; then a point is a decimal point.
+        advice: Action for the user in case of an ambiguous sign.
+        place: Function from a line to file and line, for messages.
 
     Raises:
-        SessionError: Where two signs are possible.
+        SessionError: If two signs are possible, or both occur.
     """
     sign = infer_decimal_sign(cells)
     if sign.sign is not None:
@@ -167,33 +174,35 @@ def decide_sign(
             "use one decimal sign",
             where=place(sign.rival.line),
         )
-    open_cells = (c for c in cells if _is_open(c.text) and not (house and "," not in c.text))
-    rival = next(open_cells, None)
-    if rival is None:
+    ambiguous_cells = (
+        c for c in cells if _is_ambiguous(c.text) and not (standard and "," not in c.text)
+    )
+    ambiguous = next(ambiguous_cells, None)
+    if ambiguous is None:
         return DecimalSign("point", None)
-    comma, point = parse_numeral(rival.text, "comma"), parse_numeral(rival.text, "point")
+    comma, point = parse_numeral(ambiguous.text, "comma"), parse_numeral(ambiguous.text, "point")
     raise SessionError(
-        f"the reading '{rival.text}' is {format_decimal(comma)} with a decimal comma and "
-        f"{format_decimal(point)} with a decimal point, and no other reading decides; {ask}",
-        where=place(rival.line),
+        f"the reading '{ambiguous.text}' is {format_decimal(comma)} with a decimal comma and "
+        f"{format_decimal(point)} with a decimal point, and no other reading decides; {advice}",
+        where=place(ambiguous.line),
     )
 
 
-def _is_open(text: str) -> bool:
-    """True for a numeral that is a number with either decimal sign."""
-    both = parse_numeral(text, "comma"), parse_numeral(text, "point")
-    return None not in both and both[0] != both[1]
+def _is_ambiguous(text: str) -> bool:
+    """True for a numeral with different values for decimal comma and decimal point."""
+    comma, point = parse_numeral(text, "comma"), parse_numeral(text, "point")
+    return comma is not None and point is not None and comma != point
 
 
 def read_rows(path: Path, content: bytes) -> Iterator[RawReading]:
-    """Rows of a session's own table of readings, with numbers in the house form.
+    """Rows of the readings.csv of a session, with decimal points.
 
     Args:
         path: The file, for messages.
-        content: What it holds.
+        content: Content of the file.
 
     Raises:
-        SessionError: Naming file and line.
+        SessionError: If the table is wrong or ambiguous; names file and line.
     """
     if content.startswith(ZIP_SIGNATURE):
         raise SessionError(
@@ -204,8 +213,8 @@ def read_rows(path: Path, content: bytes) -> Iterator[RawReading]:
         decoded = decode(content, where=str(path))
     except SessionError:
         return _plain_rows(path, content)
-    first = decoded.text.partition("\n")[0]
-    if any(is_house(first.split(separator)) for separator in ",;"):
+    first_line = decoded.text.partition("\n")[0]
+    if any(has_standard_headings(first_line.split(separator)) for separator in ",;"):
         if decoded.encoding != "utf-8":
             content = decoded.text.encode()
         return _plain_rows(path, content)
@@ -232,30 +241,31 @@ def _plain_rows(path: Path, content: bytes) -> Iterator[RawReading]:
     sign: Sign | None = None
     if not content.isascii() or b'"' in content or b";" in content:
         numerals = []
-        # what is wrong with a row is told when it is read
-        with suppress(SessionError):
+        with suppress(SessionError):  # a wrong row is refused when it is read below
             for line, row in islice(rows(), MOST_READINGS + 1):
                 names = ("reading_mm", *COORDINATES)
                 numerals += [Numeral(row[name], line) for name in names if row.get(name)]
         sign = _plain_sign(numerals, path)
     for line, cells in rows():
         if sign is not None:
-            cells |= {name: _house_number(cells.get(name, ""), sign) for name in NUMBERS}
+            cells |= {name: _with_decimal_point(cells.get(name, ""), sign) for name in NUMBERS}
         yield RawReading(f"{path}:{line}", line, **cells)
 
 
-ASK = "write it with a decimal point, or use `orthocal import --decimal comma|point`"
+SIGN_ADVICE = "write it with a decimal point, or use `orthocal import --decimal comma|point`"
 
 
 def _plain_sign(cells: Sequence[Numeral], path: Path) -> Sign | None:
-    """The decimal sign below the headings of a readings.csv, where a point is a decimal point."""
+    """Decimal sign below the headings of a readings.csv, where a point is a decimal point."""
     if not any("," in cell.text for cell in cells) or infer_decimal_sign(cells).contradictory:
         return "point"
-    return decide_sign(cells, house=True, ask=ASK, place=lambda line: f"{path}:{line}").sign
+    return decide_sign(
+        cells, standard=True, advice=SIGN_ADVICE, place=lambda line: f"{path}:{line}"
+    ).sign
 
 
-def _house_number(text: str, sign: Sign) -> str:
-    """A number in the form of a readings.csv; other text is left to be refused later."""
+def _with_decimal_point(text: str, sign: Sign) -> str:
+    """Number with a decimal point; other text is returned unchanged and refused later."""
     if sign == "point":
         return plain_minus(text)
     value = parse_numeral(text, sign)
@@ -263,25 +273,27 @@ def _house_number(text: str, sign: Sign) -> str:
 
 
 def _clean_table(path: Path, content: bytes) -> tuple[Table, Columns] | None:
-    """A table that a spreadsheet saved, with nothing beside the readings; None if it is none.
+    """Table saved by a spreadsheet program, without text above the headings; None for other files.
 
     Raises:
-        SessionError: For a column that is nothing of a session's.
+        SessionError: If a column does not belong to a session.
     """
     try:
         table = read_table(path, content, find_header, expected=EXPECTED)
         columns = choose_columns(table.header, {}, where=f"{path}:{table.header_line}")
     except SessionError:
         return None
-    first = table.header_line == 1 or stated_separator(decode(content, where="").text) is not None
-    if table.above or not first:
+    is_first = (
+        table.header_line == 1 or stated_separator(decode(content, where="").text) is not None
+    )
+    if table.above or not is_first:
         return None
-    strange = [
+    unknown = [
         *columns.extra,
         *(i for i, h in columns.readings.items() if h.unit != "mm" or h.cycle is not None),
     ]
-    if strange:
-        name = " ".join(table.header[min(strange)].split())
+    if unknown:
+        name = " ".join(table.header[min(unknown)].split())
         raise SessionError(
             f"unknown column '{shorten(name)}'; expected {', '.join(REQUIRED)} and optionally "
             f"{', '.join(OPTIONAL)}",
@@ -291,10 +303,16 @@ def _clean_table(path: Path, content: bytes) -> tuple[Table, Columns] | None:
 
 
 def _table_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
-    require_whole_cells(table, columns)
+    """Rows of a table saved by a spreadsheet program."""
+    require_unsplit_numbers(table, columns)
     (reading,) = columns.readings
     numerals = [Numeral(row.cell(reading).text, row.line) for row in table.rows]
-    sign = decide_sign(numerals, house=is_house(table.header), ask=ASK, place=table.place).sign
+    sign = decide_sign(
+        numerals,
+        standard=has_standard_headings(table.header),
+        advice=SIGN_ADVICE,
+        place=table.place,
+    ).sign
     width = len(table.header)
     for row in table.rows:
         where = table.place(row.line)
@@ -318,38 +336,40 @@ def _table_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
 def _is_grouped(row: Row, pairs: Collection[tuple[int, int]]) -> bool:
     """True if two cells of a row may be one number with a comma between thousands."""
     cells = [(row.cell(i).text.strip(), row.cell(j).text.strip()) for i, j in pairs]
-    return any(_WHOLE.fullmatch(a) and _GROUP.fullmatch(b) for a, b in cells)
+    return any(_INTEGER.fullmatch(a) and _GROUP.fullmatch(b) for a, b in cells)
 
 
-_WHOLE = re.compile(r"[-+\u2212\u2013]?[0-9]+(?:[\s'\u2019][0-9]{3})*")
+_INTEGER = re.compile(r"[-+\u2212\u2013]?[0-9]+(?:[\s'\u2019][0-9]{3})*")
 _DIGITS = re.compile(r"[0-9]+")
 _GROUP = re.compile(r"[0-9]{3}(\.[0-9]*)?")
 
 
-def require_whole_cells(table: Table, columns: Columns, *, sure: bool = False) -> None:
+def require_unsplit_numbers(
+    table: Table, columns: Columns, *, separator_known: bool = False
+) -> None:
     """Refuse a table with commas as separators in which a comma may be a decimal sign as well.
 
-    Who writes 3,5 without quotes between commas makes two cells of a number: the row has a cell
-    more than the headings, or, where nothing followed, looks like two whole numbers. 1,000.0 does
-    the same: a row alone does not decide, but another row with other cells does.
+    An unquoted 3,5 between commas becomes two cells. Then the row has more cells than the headings.
+    If its last cell is empty, it looks like a row with two integers. An unquoted 1,000.0 does the
+    same. A table is accepted if some row cannot be read in this way.
 
     Args:
         table: The table.
-        columns: Which column is what.
-        sure: Whether it was said that commas separate.
+        columns: Roles of the columns.
+        separator_known: Whether the user stated that commas separate cells.
 
     Raises:
-        SessionError: Naming the row.
+        SessionError: If a number may be split; names the row.
     """
     if table.separator != "comma":
         return
     readings = list(columns.readings)
     texts = [row.cell(i).text for row in table.rows for i in readings]
-    sure = sure or is_house(table.header)
-    certain = sure or any("." in t or "," in t for t in texts)
+    separator_known = separator_known or has_standard_headings(table.header)
+    sign_known = separator_known or any("." in t or "," in t for t in texts)
     pairs = {(i, i + 1) for i in readings} | {(i - 1, i) for i in readings if i}
     pairs -= {(i - 1, i) for i in readings if i - 1 in columns.keys}
-    grouped = not sure and all(_is_grouped(row, pairs) for row in table.rows)
+    grouped = not separator_known and all(_is_grouped(row, pairs) for row in table.rows)
     for row in table.rows:
         if row.width > table.header_width:
             raise SessionError(
@@ -357,11 +377,11 @@ def require_whole_cells(table: Table, columns: Columns, *, sure: bool = False) -
                 "between commas? Save the table with semicolons, or its numbers in quotes",
                 where=table.place(row.line),
             )
-        if certain and not grouped:
+        if sign_known and not grouped:
             continue
         for first, second in sorted(pairs):
             a, b = row.cell(first).text.strip(), row.cell(second).text.strip()
-            if _WHOLE.fullmatch(a) and (_GROUP if grouped else _DIGITS).fullmatch(b):
+            if _INTEGER.fullmatch(a) and (_GROUP if grouped else _DIGITS).fullmatch(b):
                 sign = "comma between thousands" if grouped else "decimal comma"
                 raise SessionError(
                     f"'{shorten(a)},{shorten(b)}' may be two cells or one number with a {sign}; "

@@ -1,6 +1,6 @@
-"""Sessions from files: session.yaml with its readings in a CSV beside it, in mm.
+"""Reading of sessions: a session.yaml with its readings in a CSV beside it, in mm.
 
-They are checked against the robot and the nominal machine.
+Sessions are checked against the robot and the nominal machine.
 """
 
 from __future__ import annotations
@@ -28,14 +28,18 @@ from orthocal.io.files import (
 from orthocal.measurement.files.point_rows import locate_stations, split_points
 from orthocal.measurement.files.readings_checks import check_readings, require_name, require_read
 from orthocal.measurement.files.readings_file import read_rows
-from orthocal.measurement.files.schema import MOST_READINGS, CalibrationKeys, GaugeKeys, SessionKeys
-from orthocal.measurement.files.session_robot import (
+from orthocal.measurement.files.session_controller import (
     build_compensation,
     build_firmware,
     build_offsets,
-    build_postures,
-    require_given_zero,
 )
+from orthocal.measurement.files.session_keys import (
+    MOST_READINGS,
+    CalibrationKeys,
+    GaugeKeys,
+    SessionKeys,
+)
+from orthocal.measurement.files.session_postures import build_postures, require_mechanical_zero
 from orthocal.observation.contacts import locate_contacts
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import (
@@ -52,25 +56,25 @@ from orthocal.units import MM, show_limit
 
 SESSION = "session.yaml"
 
-MOST_LOOKED_AT = 200
-"""Largest number of subdirectories searched for sessions."""
+MAX_SEARCHED = 200
+"""Largest number of directory entries searched for a session."""
 
-MOST_NAMED = 5
+MAX_LISTED = 5
 """Largest number of sessions of subdirectories in a message."""
 
-OTHER_KINDS = (".csv", ".json", ".urdf")
-"""Suffixes of files of other kinds."""
+OTHER_SUFFIXES = (".csv", ".json", ".urdf")
+"""Suffixes of files that are not a session.yaml."""
 
 
 def load_session(path: str | Path, *, partial: bool = False) -> Session:
     """Read a session: its YAML, its CSV and its robot, checked against each other.
 
     Args:
-        path: The session.yaml, or the folder that holds it.
-        partial: Whether some of the readings may be missing: their values are NaN.
+        path: The session.yaml, or its directory.
+        partial: Whether some of the readings may be missing; their values are NaN.
 
     Raises:
-        SessionError: Naming file and line or key, what was found and what was expected.
+        SessionError: If a file is wrong; names file and line or key, and the expected content.
         RobotError: If the robot does not load.
     """
     file, content, keys = _read_keys(Path(path))
@@ -80,7 +84,7 @@ def load_session(path: str | Path, *, partial: bool = False) -> Session:
 
 
 def _load_session(file: Path, content: bytes, keys: SessionKeys) -> Session:
-    """A session with readings, stations not located; readings of empty cells are NaN."""
+    """Session with readings, stations not located; readings of empty cells are NaN."""
     plan, readings_path = _build_unread(file, keys)
     table = read_file(readings_path, error=SessionError)
     with content_withheld_outside(file.parent, readings_path):
@@ -102,13 +106,13 @@ def _load_session(file: Path, content: bytes, keys: SessionKeys) -> Session:
 
 
 def load_unread(path: str | Path) -> tuple[Session, Path]:
-    """Read a session without its readings, and where they are or shall be.
+    """Read a session without its readings, and the path of its readings.csv, which may be missing.
 
     Args:
-        path: The session.yaml, or the folder that holds it.
+        path: The session.yaml, or its directory.
 
     Raises:
-        SessionError: Naming file and key.
+        SessionError: If the session.yaml is wrong; names file and key.
         RobotError: If the robot does not load.
     """
     file, _, keys = _read_keys(Path(path))
@@ -116,6 +120,7 @@ def load_unread(path: str | Path) -> tuple[Session, Path]:
 
 
 def _build_unread(file: Path, keys: SessionKeys) -> tuple[Session, Path]:
+    """Session without its readings, and the path of its readings.csv."""
     if keys.readings is None:
         raise SessionError("is missing; expected the name of a CSV file", where=f"{file}: readings")
     require_plain_name(file, error=SessionError)
@@ -130,12 +135,12 @@ def _build_unread(file: Path, keys: SessionKeys) -> tuple[Session, Path]:
 def load_plan(path: str | Path) -> Session:
     """Read a plan: a session.yaml without `readings`; each planned reading is 0.
 
-    A setup is read in all postures, or in those its `postures` names; `cycles` times. A sensor that
+    A setup is read `cycles` times in all postures, or in those of its `postures`. A sensor that
     reads pairs of postures reads the first and second one, the third and fourth one and so on. A
-    session that has readings is a plan too: that of its rows, filled in or not.
+    session with readings is a plan of its rows; empty cells are 0.
 
     Raises:
-        SessionError: Naming file and key.
+        SessionError: If a file is wrong; names file and line or key.
         RobotError: If the robot does not load.
     """
     session = load_rows(path)
@@ -146,48 +151,50 @@ def load_plan(path: str | Path) -> Session:
 
 
 def load_rows(path: str | Path) -> Session:
-    """Read a plan as `load_plan` does; readings that are not there yet are NaN.
+    """Read a plan as `load_plan` does; missing readings are NaN.
 
-    These are the empty cells of a session with readings; else all, and it has no `readings_path`.
+    In a plan without a readings.csv all readings are missing, and its `readings_path` is None.
 
     Raises:
-        SessionError: Naming file and key.
+        SessionError: If a file is wrong; names file and line or key.
         RobotError: If the robot does not load.
     """
     file, content, keys = _read_keys(Path(path))
     if keys.readings is not None:
         return locate_stations(_load_session(file, content, keys), partial=True)
-    read = _read_setups(file, keys)
-    count = keys.cycles * sum(len(s.postures or keys.postures) for s, _ in read.values())
+    stated = _read_setups(file, keys)
+    count = keys.cycles * sum(len(s.postures or keys.postures) for s, _ in stated.values())
     if count > MOST_READINGS:
         raise SessionError(
             f"plans {count} readings, {keys.cycles} times those of all setups; expected at most "
             f"{MOST_READINGS}",
             where=f"{file}: cycles",
         )
-    plan = _build_plan(file, keys, read)
-    parts: dict[str, list[str]] = {}
+    plan = _build_plan(file, keys, stated)
+    split: dict[str, list[str]] = {}  # a setup of points is split into three
     for name in plan.setups:
-        parts.setdefault(name if name in read else base_name(name), []).append(name)
+        split.setdefault(name if name in stated else base_name(name), []).append(name)
     readings = tuple(
-        Reading(part, posture, minus, cycle, math.nan)
-        for name, (setup, sensor) in read.items()
+        Reading(axis, posture, minus, cycle, math.nan)
+        for name, (setup, sensor) in stated.items()
         for cycle in range(1, keys.cycles + 1)
-        for posture, minus in _planned(name, sensor, [*(setup.postures or plan.postures)], file)
-        for part in parts[name]
+        for posture, minus in _pair_postures(
+            name, sensor, [*(setup.postures or plan.postures)], file
+        )
+        for axis in split[name]
     )
     session = replace(plan, readings=readings)
     check_contacts(session)
     return session
 
 
-def _planned(
+def _pair_postures(
     setup: str, sensor: Sensor, postures: list[str], file: Path
 ) -> list[tuple[str, str | None]]:
-    """Planned postures of a setup; those of a pair are neighbours in its list.
+    """Planned postures of a setup, each with the other posture of its pair, or with None.
 
     Raises:
-        SessionError: If a posture has no partner.
+        SessionError: If a sensor that reads pairs has an odd number of postures.
     """
     if not reads_pairs(sensor):
         return [(posture, None) for posture in postures]
@@ -217,55 +224,53 @@ def read_purpose(
     """
     if keys is None:
         return None, robot
-    at = "effects"
+    key = "effects"
     try:
         if keys.effects is not None:
             robot = with_effects(robot, keys.effects)
         parameters = robot.parameters
-        at = "model"
+        key = "model"
         patterns = [] if keys.model is None else parameters.patterns(keys.model)
-        at = "free"
+        key = "free"
         free = parameters.select([*patterns, *keys.free])
-        at = "tolerances"
+        key = "tolerances"
         robot = robot.with_tolerances(keys.tolerances)
     except (ParameterError, RobotError) as e:
-        raise SessionError(e.problem, where=f"{where}.{at}") from None
+        raise SessionError(e.problem, where=f"{where}.{key}") from None
     if keys.model is None and not keys.free:
         return None, robot
     if not free:
-        raise SessionError("leaves no error free", where=f"{where}.free")
+        raise SessionError("selects no error", where=f"{where}.free")
     return Purpose(keys.model, tuple(keys.free)), robot
 
 
 def check_contacts(session: Session) -> None:
-    """Check, on the nominal machine, that a sensor touches in every posture it is read in.
+    """Check that every sensor of the nominal machine touches in all postures of its readings.
 
     Raises:
-        SessionError: Naming the setup and the posture.
+        SessionError: If a sensor does not touch; names the setup and the posture.
     """
     for setup, (postures, contact) in locate_contacts(session).items():
         for posture, problem in zip(postures, contact.problems, strict=True):
             if problem:
+                key = f"setups.{setup}.{contact.key}"
                 raise SessionError(
                     f"in posture '{posture}' {problem}",
-                    where=_where(session.path, f"setups.{setup}.{contact.key}"),
+                    where=key if session.path is None else f"{session.path}: {key}",
                 )
 
 
-def _where(path: Path | None, key: str) -> str:
-    return key if path is None else f"{path}: {key}"
-
-
 def _read_keys(path: Path) -> tuple[Path, bytes, SessionKeys]:
+    """Path, content and keys of the session.yaml at a path or in a directory."""
     file = path / SESSION if is_folder(path) else path
-    if file.suffix.lower() in OTHER_KINDS:
+    if file.suffix.lower() in OTHER_SUFFIXES:
         raise SessionError("is no session.yaml", where=str(file))
     if file is not path and not exists(file):
         raise SessionError(_describe_content(path), where=str(path))
-    if not exists(file) and (near := get_close_matches(path.name, _names_in(path.parent), n=1)):
-        meant = path.with_name(near[0])
+    if not exists(file) and (similar := get_close_matches(path.name, _names_in(path.parent), n=1)):
         raise SessionError(
-            f"there is no such file or directory; did you mean {meant}?", where=str(path)
+            f"there is no such file or directory; did you mean {path.with_name(similar[0])}?",
+            where=str(path),
         )
     content = read_file(file, error=SessionError)
     data = read_yaml(file, error=SessionError, content=content)
@@ -273,20 +278,20 @@ def _read_keys(path: Path) -> tuple[Path, bytes, SessionKeys]:
 
 
 def _describe_content(folder: Path) -> str:
-    """Problem of a directory without a session: a calibration, or sessions below it."""
+    """Problem of a directory without a session.yaml: it is a calibration, or contains sessions."""
     if exists(folder / "calibration.json"):
         return "is a calibration; name the session that it was made from"
-    sessions = sorted(f.parent for f in islice(folder.glob(f"*/{SESSION}"), MOST_LOOKED_AT))
+    sessions = sorted(f.parent for f in islice(folder.glob(f"*/{SESSION}"), MAX_SEARCHED))
     if not sessions:
         return f"is a directory without {SESSION}"
-    named = [str(s) for s in sessions[:MOST_NAMED]] + ["..."] * (len(sessions) > MOST_NAMED)
-    return f"is a directory without {SESSION}; sessions in it: {', '.join(named)}"
+    listed = [str(s) for s in sessions[:MAX_LISTED]] + ["..."] * (len(sessions) > MAX_LISTED)
+    return f"is a directory without {SESSION}; sessions in it: {', '.join(listed)}"
 
 
 def _names_in(folder: Path) -> list[str]:
-    """Names of files and directories in a directory; none if it cannot be read."""
+    """Names of files and directories in a directory; empty if it is not readable."""
     try:
-        return [f.name for f in islice(folder.iterdir(), MOST_LOOKED_AT)]
+        return [f.name for f in islice(folder.iterdir(), MAX_SEARCHED)]
     except OSError:
         return []
 
@@ -297,11 +302,13 @@ _Setups = Mapping[str, tuple[SetupKeys, Sensor]]
 def _read_setups(file: Path, keys: SessionKeys) -> _Setups:
     """Keys and sensor of each setup."""
     gauges = keys.named_gauges
-    only = next(iter(gauges.values())) if len(gauges) == 1 else GaugeKeys()
+    single_gauge = next(iter(gauges.values())) if len(gauges) == 1 else GaugeKeys()
     setups = {}
     for name, data in keys.setups.items():
-        named = data.get("gauge")
-        gauge = gauges.get(named, only) if isinstance(named, str) else only
+        gauge_name = data.get("gauge")
+        gauge = single_gauge
+        if isinstance(gauge_name, str):
+            gauge = gauges.get(gauge_name, single_gauge)
         defaults = gauge.model_dump(include={"tip", "scale_tolerance"}, exclude_none=True)
         setups[name] = read_setup(
             data, where=str(file), under=f"setups.{name}", error=SessionError, gauge=defaults
@@ -309,15 +316,15 @@ def _read_setups(file: Path, keys: SessionKeys) -> _Setups:
     return setups
 
 
-def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
-    """The session without its readings."""
+def _build_plan(file: Path, keys: SessionKeys, stated: _Setups) -> Session:
+    """Session without its readings."""
     try:
         robot = load_robot(keys.robot, beside=file.parent)
     except RobotError as e:
         if e.where is None:
             raise SessionError(e.problem, where=f"{file}: robot") from None
         raise
-    require_given_zero(robot, f"{file}: robot")
+    require_mechanical_zero(robot, f"{file}: robot")
     purpose, robot = read_purpose(keys.calibration, robot, where=f"{file}: calibration")
     where = f"{file}: controller"
     offsets = build_offsets(keys.controller, robot, where)
@@ -327,16 +334,15 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
         require_adjustment(robot, name, where=f"{file}: adjusted_mm", error=SessionError)
     gauges = {name: g.to_gauge() for name, g in keys.named_gauges.items()}
     setups = {}
-    for name, (setup, sensor) in read.items():
+    for name, (setup, sensor) in stated.items():
         where = f"{file}: setups.{name}"
         sensor.require_fit(robot, where=where)
         _check_postures(setup, keys.postures, where)
-        gauge, zero = _gauge_of(setup, gauges, where), setup.zero or default_zero(sensor)
         setups[name] = Setup(
             name,
             sensor,
-            gauge,
-            zero=zero,
+            _gauge_of(setup, gauges, where),
+            zero=setup.zero or default_zero(sensor),
             aligned_at=setup.aligned_at,
             payload=keys.payload_kg,
         )
@@ -362,7 +368,7 @@ def _build_plan(file: Path, keys: SessionKeys, read: _Setups) -> Session:
 
 
 def _check_shared(setups: Mapping[str, Setup], file: str) -> None:
-    """Refuse setups that share a parameter at another place or with another tolerance."""
+    """Refuse setups that share a parameter but differ in its place, tolerance or nominal value."""
     first: dict[tuple[str, str], tuple[Setup, NuisanceParameter]] = {}
     for setup in setups.values():
         for parameter in setup.sensor.nuisance_parameters:
@@ -371,7 +377,7 @@ def _check_shared(setups: Mapping[str, Setup], file: str) -> None:
                 continue
             before, other = first.setdefault((owner, parameter.name), (setup, parameter))
             if not parameter.of_gauge and before.sensor.place != setup.sensor.place:
-                problem = f"stands at {' '.join(before.sensor.place)}"
+                problem = f"is mounted at {' '.join(before.sensor.place)}"
             elif other.prior_std != parameter.prior_std:
                 problem = f"states a tolerance of {show_limit(other.prior_std):g} {other.unit}"
             elif other.nominal != parameter.nominal:
@@ -393,20 +399,20 @@ def _gauge_of(setup: SetupKeys, gauges: Mapping[str, Gauge], where: str) -> str:
             )
         return next(iter(gauges))
     if setup.gauge not in gauges or not setup.gauge:
-        named = ", ".join(name for name in gauges if name)
+        names = ", ".join(name for name in gauges if name)
         raise SessionError(
             f"'{setup.gauge}' is not a gauge; "
-            + (f"gauges: {named}" if named else "the session names none under `gauges`"),
+            + (f"gauges: {names}" if names else "the session names none under `gauges`"),
             where=f"{where}.gauge",
         )
     return setup.gauge
 
 
 def _check_postures(setup: SetupKeys, postures: Collection[str], where: str) -> None:
-    """Refuse postures of a setup that do not exist, or are planned twice."""
+    """Refuse postures of a setup that do not exist or are listed twice."""
     if setup.aligned_at is not None:
         require_name(setup.aligned_at, postures, "posture", where=f"{where}.aligned_at")
     for posture, count in Counter(setup.postures or ()).items():
         require_name(posture, postures, "posture", where=f"{where}.postures")
         if count > 1:
-            raise SessionError(f"'{posture}' stands twice", where=f"{where}.postures")
+            raise SessionError(f"'{posture}' is listed twice", where=f"{where}.postures")

@@ -1,4 +1,4 @@
-"""Sessions to files: session.yaml with its readings in a CSV beside it, in mm."""
+"""Writing of sessions: a session.yaml with its readings in a CSV beside it, in mm."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from orthocal.measurement.files.point_rows import (
 )
 from orthocal.measurement.files.readings_file import (
     COLUMN_OF_ROLE,
-    OF_POINTS,
     REQUIRED,
+    REQUIRED_OF_POINTS,
     RawReading,
     format_readings,
 )
@@ -38,7 +38,7 @@ from orthocal.units import DEG, DRIVE_UNITS, MM, tidy, to_mm, trim_zeros
 
 
 def session_document(session: Session) -> dict[str, Any]:
-    """The session.yaml of a session, as plain data."""
+    """Content of the session.yaml of a session, as plain data."""
     document: dict[str, Any] = {"robot": session.robot_reference}
     if session.title:
         document["title"] = session.title
@@ -105,12 +105,12 @@ def _payload(session: Session) -> float:
     """Mass on the tool, [kg].
 
     Raises:
-        SessionError: If it differs among the setups, as in sessions that were joined.
+        SessionError: If setups differ in it, as they may after joining sessions.
     """
     payloads = {s.payload for s in session.setups.values()}
     if len(payloads) > 1:
-        stated = ", ".join(f"{v:g}" for v in sorted(payloads))
-        raise SessionError(f"has setups under {stated} kg; a file has one payload_kg")
+        listed = ", ".join(f"{v:g}" for v in sorted(payloads))
+        raise SessionError(f"has setups under {listed} kg; a file has one payload_kg")
     return payloads.pop()
 
 
@@ -128,7 +128,7 @@ def _calibration_document(session: Session) -> dict[str, Any]:
 
 
 def _controller_document(session: Session) -> dict[str, Any]:
-    """Offsets of prismatic drives in mm, of revolute ones in mrad, and what is compensated."""
+    """Offsets of prismatic drives in mm, of revolute drives in mrad, and the compensation."""
     document: dict[str, Any] = {}
     if session.controller_offsets is not None:
         for drive, offset in zip(session.robot.drives, session.active_offsets, strict=True):
@@ -136,8 +136,8 @@ def _controller_document(session: Session) -> dict[str, Any]:
             document.setdefault(key, []).append(tidy(float(offset) / MM))
     if any(joint.backlash for joint in session.compensation):
         for drive, joint in zip(session.robot.drives, session.compensation, strict=True):
-            unit, size = DRIVE_UNITS[drive.unit]
-            document.setdefault(f"backlash_{unit}", []).append(tidy(joint.backlash / size))
+            unit, factor = DRIVE_UNITS[drive.unit]
+            document.setdefault(f"backlash_{unit}", []).append(tidy(joint.backlash / factor))
     if any(joint.table is not None for joint in session.compensation):
         document["comp_file"] = [
             None if joint.table is None else table_name(i)
@@ -162,7 +162,7 @@ def firmware_document(settings: DeltaSettings) -> dict[str, Any]:
 
 
 def _tables(session: Session) -> dict[str, str]:
-    """Tables of trims of a session, file name to text."""
+    """Tables of trims of a session: text by file name."""
     drives = zip(session.robot.drives, session.compensation, strict=False)
     return {
         table_name(i): format_table(joint, drive)
@@ -180,29 +180,29 @@ def write_session(
     extra: Mapping[str, str] | None = None,
     blank: bool = False,
 ) -> Path:
-    """Write session.yaml and readings.csv into a folder, both or neither.
+    """Write session.yaml and readings.csv into a directory, both or neither.
 
-    The files of a robot that has no directory are written into a subdirectory before.
+    The files of a robot without a directory are written into a subdirectory before.
 
     Args:
         session: The session.
-        folder: Made if need be.
+        folder: The directory; created if it does not exist.
         decimals: Decimals of a reading in mm.
-        comment: Lines put first into the YAML.
-        extra: Other files of the folder, name to text, written with them.
-        blank: Whether readings are left empty, to be filled in.
+        comment: Text of comment lines at the top of the YAML.
+        extra: Text of other files in the directory by name, written together with them.
+        blank: Whether to write empty cells for readings and measured conditions.
 
     Returns:
         Path of the session.yaml.
 
     Raises:
-        OrthocalError: If the folder cannot be written to.
+        OrthocalError: If the directory is not writable.
     """
     folder = Path(folder)
     document = session_document(session)
     document["robot"] = _place_robot(session, folder)
-    head = "".join(f"# {line}\n" for line in comment.splitlines())
-    text = head + yaml.safe_dump(
+    heading = "".join(f"# {line}\n" for line in comment.splitlines())
+    text = heading + yaml.safe_dump(
         document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=100
     )
     conditions = needed_conditions(session.robot) if blank else ()
@@ -216,10 +216,10 @@ def write_session(
 
 
 def _place_robot(session: Session, folder: Path) -> str:
-    """Reference to the robot in a session.yaml; files of an embedded robot are written.
+    """Reference to the robot in a session.yaml; writes the files of an embedded robot.
 
     Raises:
-        SessionError: If the robot's directory exists and holds another robot.
+        SessionError: If the robot's directory exists and contains another robot.
     """
     robot = session.robot
     if robot.folder is not None:
@@ -248,23 +248,24 @@ def readings_table(
         readings: The readings, in order.
         setups: Their setups.
         decimals: Decimals of a reading in mm.
-        blank: Leave readings and measured conditions empty.
-        needed: Optional columns to be filled in.
+        blank: Whether to write empty cells for readings and measured conditions.
+        needed: Optional columns that the operator fills in.
     """
     rows, required = [], set[str]()
-    for part in gather_points(readings, setups):
-        r, point = part[0], isinstance(setups[part[0].setup].sensor, Points)
+    for group in gather_points(readings, setups):
+        r = group[0]
+        is_point = isinstance(setups[r.setup].sensor, Points)
         conditions, value, temperature = r.conditions or Conditions(), "", ""
-        cells = point_cells(part, setups, decimals) if point and not blank else {}
-        required |= set(OF_POINTS if point else REQUIRED)
-        if r.is_read and not blank and not point:
+        cells = point_cells(group, setups, decimals) if is_point and not blank else {}
+        required |= set(REQUIRED_OF_POINTS if is_point else REQUIRED)
+        if r.is_read and not blank and not is_point:
             value = trim_zeros(f"{r.value / MM:.{decimals}f}")
         if conditions.temperature is not None:
             temperature = f"{conditions.temperature:.12g}"
         row = RawReading(
             where="",
             line=0,
-            setup=base_name(r.setup) if point else r.setup,
+            setup=base_name(r.setup) if is_point else r.setup,
             posture=r.posture,
             minus=r.minus or "",
             cycle=str(r.cycle),

@@ -1,7 +1,7 @@
 """Headings of a table of readings, in English or German.
 
-A heading gives the role of its column, the unit of its readings, and the cycle where several cycles
-are side by side.
+A heading states the role of its column, the unit of its readings, and the cycle if cycles are side
+by side.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Role = (
     | Coordinate
     | Literal["nominal x", "nominal y", "nominal z"]
 )
-"""Role of a column; nominal coordinates are those of a commanded point."""
+"""Role of a column. A nominal coordinate belongs to a commanded point."""
 
 KEYS: tuple[Role, ...] = ("setup", "posture", "minus", "cycle")
 """Roles of columns that identify a reading."""
@@ -34,7 +34,7 @@ NOMINAL: tuple[Role, ...] = ("nominal x", "nominal y", "nominal z")
 """Roles of the commanded point that identifies a posture, in a session with points."""
 
 SINGLE: tuple[Role, ...] = (*KEYS, "approach", "temperature", "time")
-"""Roles of one column at most."""
+"""Roles that at most one column has."""
 
 POINT: tuple[Role, ...] = get_args(Coordinate)
 """Roles of the columns of points, in place of readings."""
@@ -84,7 +84,7 @@ WORDS: dict[Role, tuple[str, ...]] = {
         *("zeitpunkt", "zeitstempel", "datum und uhrzeit", "datum uhrzeit"),
     ),
 }
-"""Headings of every role, in lower case, with single blanks."""
+"""Headings of every role, in lower case with single blanks."""
 
 for _axis in POINT:
     WORDS[_axis] = (
@@ -142,7 +142,7 @@ class Heading:
 
     role: Role
     cycle: int | None = None
-    """Cycle of all readings of a column; None if the rows give it."""
+    """Cycle of all readings of the column; None if the rows state it."""
     unit: UnitName | None = None
 
 
@@ -153,8 +153,8 @@ class Columns:
     single: Mapping[Role, int]
     """Indices of the columns with a role in SINGLE, in that order."""
     readings: Mapping[int, Heading]
-    """Indices of the columns of readings and points, with their headings. Without a column of
-    postures also those of the commanded points."""
+    """Headings of the columns of readings and points, by index. Columns of commanded points are
+    included if there is no column of postures."""
     extra: tuple[int, ...]
     """Columns with a heading that has no role."""
 
@@ -165,7 +165,7 @@ class Columns:
 
 
 def parse_unit(text: str) -> UnitName | None:
-    """The unit that a text such as µm names; None if it names none."""
+    """Unit named by a text such as µm; None for other text."""
     return _UNIT_WORDS.get(" ".join(tidy_text(text).casefold().split()))
 
 
@@ -175,8 +175,8 @@ def read_heading(text: str) -> Heading | None:
     heading = _read_words(plain)
     if heading is not None:
         return heading
-    warm, degrees = split_degrees(plain)
-    if degrees is not None and _ROLES.get(" ".join(_BREAK.split(warm)).strip()) == "temperature":
+    words, degrees = split_degrees(plain)
+    if degrees is not None and _ROLES.get(" ".join(_BREAK.split(words)).strip()) == "temperature":
         return Heading("temperature")
     words, unit = _split_unit(plain)
     heading = None if unit is None else _read_words(words)
@@ -186,7 +186,7 @@ def read_heading(text: str) -> Heading | None:
 
 
 def split_degrees(text: str) -> tuple[str, Degrees | None]:
-    """Text before the unit of a temperature at its end, and the unit; the text without one."""
+    """Split the unit of a temperature from the end of a text; the unit is None if there is none."""
     plain = _normalize(text)
     for match in _DEGREES.finditer(plain):
         if match.end() == len(plain):
@@ -202,21 +202,21 @@ def _normalize(text: str) -> str:
 
 
 def _split_unit(plain: str) -> tuple[str, UnitName | None]:
-    """Words of a heading without its unit, and the unit; no unit if there are several.
+    """Words of a heading without its unit, and the unit; None if there is none or several.
 
-    A unit in brackets precedes any other. The word "in" is a preposition after a blank, and the
-    inch after any other sign.
+    A unit in brackets has priority. The word "in" is a preposition after a blank, and the unit inch
+    after any other character.
     """
     plain = _THOU.sub("thou", plain)
     for bracket in _BRACKETED.finditer(plain):
         if unit := parse_unit(bracket[1].removeprefix("in ")):
             return f"{plain[: bracket.start()]} {plain[bracket.end() :]}", unit
     words = [word for word in _BREAK.split(plain) if word]
-    units = [(at, unit) for at, w in enumerate(words) if w != "in" and (unit := parse_unit(w))]
+    units = [(i, unit) for i, w in enumerate(words) if w != "in" and (unit := parse_unit(w))]
     if len({unit for _, unit in units}) == 1:
-        at, unit = units[0]
-        first = at - 1 if at and words[at - 1] == "in" else at
-        return " ".join(words[:first] + words[at + 1 :]), unit
+        index, unit = units[0]
+        first = index - 1 if index and words[index - 1] == "in" else index
+        return " ".join(words[:first] + words[index + 1 :]), unit
     if not units and (inch := _INCH.search(plain)):
         return f"{plain[: inch.start()]} {plain[inch.end() :]}", "inch"
     return plain, None
@@ -246,27 +246,27 @@ def find_header(
 
     Args:
         rows: The first rows of a table.
-        assigned: As for `choose_columns`.
-        points: Whether the table may have points.
+        assigned: Headings or numbers of columns by role, as in `choose_columns`.
+        points: Whether the table may contain measured points.
     """
-    for at, row in enumerate(rows):
+    for index, row in enumerate(rows):
         texts = [c.text for c in row.cells]
         headings = _read_headings(texts, assigned or {}, points)
         roles = {h.role for h in headings if h is not None}
         if {"setup", "posture", "reading"} <= roles:
-            return at
+            return index
         if roles.issuperset(POINT) and ("posture" in roles or roles.issuperset(NOMINAL)):
-            return at
+            return index
     return None
 
 
 def _read_headings(
     texts: Sequence[str], assigned: Mapping[str, str], points: bool
 ) -> list[Heading | None]:
-    """Meaning of every heading of a row; columns that the user assigned come first."""
-    places = {key: _find_column(texts, name) for key, name in assigned.items()}
-    by_index = {at[0]: parse_role(key) for key, at in places.items() if len(at) == 1}
-    roles = {parse_role(key).role for key in assigned}
+    """Meaning of every heading of a row; roles assigned by the user replace those of headings."""
+    indices = {key: _find_column(texts, name) for key, name in assigned.items()}
+    by_index = {found[0]: parse_role(key) for key, found in indices.items() if len(found) == 1}
+    assigned_roles = {parse_role(key).role for key in assigned}
     headings: list[Heading | None] = []
     for index, text in enumerate(texts):
         heading = read_heading(text)
@@ -274,7 +274,7 @@ def _read_headings(
             unit = heading.unit if heading and heading.unit else _split_unit(_normalize(text))[1]
             heading = Heading(by_index[index].role, by_index[index].cycle, unit)
         elif heading is not None and (
-            heading.role in roles or (heading.role in (*POINT, *NOMINAL) and not points)
+            heading.role in assigned_roles or (heading.role in (*POINT, *NOMINAL) and not points)
         ):
             heading = None
         headings.append(heading)
@@ -285,7 +285,7 @@ def parse_role(key: str) -> Heading:
     """Parse the role of a --column option, such as `setup` or `reading 2`.
 
     Raises:
-        SessionError: If it is not a role.
+        SessionError: If the text is not a role.
     """
     match = re.fullmatch(r"((?:nominal )?[a-z]+)\s*([0-9]{1,4})?", key.strip().casefold())
     role = match[1] if match else ""
@@ -299,7 +299,7 @@ def parse_role(key: str) -> Heading:
 
 
 def _find_column(texts: Sequence[str], name: str) -> list[int]:
-    """Indices of the columns with a heading, or with a number such as `#4`."""
+    """Indices of the columns with a heading; `#4` is the fourth column."""
     numbered = re.fullmatch(r"#([0-9]{1,4})", name.strip())
     if numbered:
         index = int(numbered[1]) - 1
@@ -327,34 +327,35 @@ def choose_columns(
 
     Args:
         texts: Headings.
-        assigned: Role, or `reading 2`, to the heading of its column, or its number such as `#4`.
+        assigned: Heading of a column, or its number such as `#4`, by role or `reading 2`.
         where: File and line, for messages.
-        points: Whether the table may have points. Their posture may be a commanded point.
+        points: Whether the table may contain measured points. Commanded points may then name
+            their postures.
         one_setup: Whether the setup need not be stated.
 
     Raises:
-        SessionError: If a role has no column, or several.
+        SessionError: If a required role has no column, or a role has several columns.
     """
     for key, name in assigned.items():
-        places = _find_column(texts, name)
-        if len(places) != 1:
+        indices = _find_column(texts, name)
+        if len(indices) != 1:
             shown = shorten(", ".join(f"'{' '.join(t.split())}'" for t in texts))
             problem = (
-                f"appears twice; --column {key}=#{places[0] + 1} selects the first one"
-                if places
+                f"appears twice; --column {key}=#{indices[0] + 1} selects the first one"
+                if indices
                 else f"is not among the headings {shown}"
             )
             raise SessionError(f"column '{shorten(name)}' {problem}", where=f"{where}: {key}")
     headings = _read_headings(texts, assigned, points)
-    known = {h.role for h in headings if h is not None}
-    optional = {"setup": one_setup, "posture": known.issuperset(NOMINAL)}
+    roles = {h.role for h in headings if h is not None}
+    optional = {"setup": one_setup, "posture": roles.issuperset(NOMINAL)}
     single: dict[Role, int] = {}
     for role in SINGLE:
-        places = [i for i, h in enumerate(headings) if h is not None and h.role == role]
-        if len(places) > 1:
-            raise _several_columns(texts, places, role, where)
-        if places:
-            single[role] = places[0]
+        indices = [i for i, h in enumerate(headings) if h is not None and h.role == role]
+        if len(indices) > 1:
+            raise _several_columns(texts, indices, role, where)
+        if indices:
+            single[role] = indices[0]
         elif not optional.get(role, True):
             raise SessionError(
                 f"no column has the role {role}; assign one by --column {role}=HEADING",
@@ -362,10 +363,10 @@ def choose_columns(
             )
     lengths = LENGTHS if "posture" not in single else ("reading", *POINT)
     readings = {i: h for i, h in enumerate(headings) if h is not None and h.role in lengths}
-    of_readings = {i: h for i, h in readings.items() if h.role == "reading"}
+    reading_columns = {i: h for i, h in readings.items() if h.role == "reading"}
     has_points = _check_points(texts, readings, where)
-    if of_readings or not has_points:
-        _check_readings(texts, of_readings, single.get("cycle"), where)
+    if reading_columns or not has_points:
+        _check_readings(texts, reading_columns, single.get("cycle"), where)
     used = {*readings, *single.values()}
     return Columns(
         single=single,
@@ -376,12 +377,12 @@ def choose_columns(
 
 def _check_points(texts: Sequence[str], columns: Mapping[int, Heading], where: str) -> bool:
     """Refuse missing and ambiguous columns of points; True if a table has points."""
-    places = {role: [i for i, h in columns.items() if h.role == role] for role in LENGTHS[1:]}
-    has_points = any(places[role] for role in POINT)
-    for role, of_role in places.items():
-        if len(of_role) > 1:
-            raise _several_columns(texts, of_role, role, where)
-        if not of_role and has_points and role in POINT:
+    by_role = {role: [i for i, h in columns.items() if h.role == role] for role in LENGTHS[1:]}
+    has_points = any(by_role[role] for role in POINT)
+    for role, indices in by_role.items():
+        if len(indices) > 1:
+            raise _several_columns(texts, indices, role, where)
+        if not indices and has_points and role in POINT:
             raise SessionError(
                 f"no column has the role {role}; assign one by --column {role}=HEADING",
                 where=where,
@@ -401,8 +402,8 @@ def _check_readings(
     for index, heading in readings.items():
         if heading.cycle is None:
             if len(readings) > 1:
-                places = [i for i, h in readings.items() if h.cycle is None]
-                raise _several_columns(texts, places, "reading", where)
+                indices = [i for i, h in readings.items() if h.cycle is None]
+                raise _several_columns(texts, indices, "reading", where)
             continue
         if heading.cycle < 1:
             raise SessionError(
@@ -410,9 +411,9 @@ def _check_readings(
                 where=where,
             )
         by_cycle.setdefault(heading.cycle, []).append(index)
-    for places in by_cycle.values():
-        if len(places) > 1:
-            raise _several_columns(texts, places, "reading", where)
+    for indices in by_cycle.values():
+        if len(indices) > 1:
+            raise _several_columns(texts, indices, "reading", where)
     if by_cycle and cycle is not None:
         raise SessionError(
             f"has cycles side by side ('{shorten(texts[min(readings)])}' ...) and a column "
@@ -422,9 +423,10 @@ def _check_readings(
 
 
 def _several_columns(
-    texts: Sequence[str], places: Sequence[int], role: str, where: str
+    texts: Sequence[str], indices: Sequence[int], role: str, where: str
 ) -> SessionError:
-    names = " and ".join(f"'{' '.join(texts[i].split())}' (#{i + 1})" for i in places[:4])
+    """Error about several columns with one role."""
+    names = " and ".join(f"'{' '.join(texts[i].split())}' (#{i + 1})" for i in indices[:4])
     return SessionError(
         f"several columns have the role {role}: {names}; choose one by --column {role}=HEADING",
         where=where,

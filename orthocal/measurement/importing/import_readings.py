@@ -19,8 +19,8 @@ from orthocal.measurement.files.readings_checks import check_readings, parse_row
 from orthocal.measurement.files.readings_file import (
     CONDITIONS,
     COORDINATES,
-    OF_POINTS,
     REQUIRED,
+    REQUIRED_OF_POINTS,
     RawReading,
     format_readings,
     read_rows,
@@ -59,7 +59,7 @@ class TableOptions:
     encoding: str | None = None
     """Encoding of a text file; detected by default."""
     columns: Mapping[str, str] = field(default_factory=dict)
-    """Role, such as `reading` or `reading 2`, to the heading of its column, or its number (#4)."""
+    """Heading of a column, or its number (#4), by role, such as `reading` or `reading 2`."""
     fill: bool = False
     """True to copy an empty setup or posture from the row above."""
 
@@ -78,9 +78,9 @@ class TableImport:
     text: str
     """New content of the readings.csv."""
     filled: int
-    """Number of rows that get a reading, or conditions beside it."""
+    """Number of rows that receive a reading or further conditions."""
     replaced: int
-    """Number of readings that get another value."""
+    """Number of readings whose value or conditions change."""
     unchanged: int
     """Number of readings that the session already has."""
     added: int
@@ -108,12 +108,12 @@ def import_readings(
     Args:
         table: A CSV file of any spreadsheet program, or an .xlsx workbook.
         session: The session.yaml or its directory. Its readings.csv may be missing or incomplete.
-        options: Options for what the table leaves open.
-        overwrite: True to replace readings of the session that differ.
+        options: Options that resolve ambiguities of the table.
+        overwrite: Whether to replace readings of the session that differ.
 
     Raises:
-        SessionError: Naming file and row, what was found and what was expected, and the option
-            that decides where a cell is ambiguous.
+        SessionError: If a row is wrong or ambiguous; names file and row, the expected content, and
+            the option that resolves an ambiguity.
     """
     options = options or TableOptions()
     require_kind(options, TableOptions, expected="TableOptions")
@@ -131,7 +131,9 @@ def import_readings(
     merged, counts = _merge(existing, new, overwrite)
     readings, points = check_readings(merged, plan, file=readings_path)
     check_contacts(replace(plan, readings=readings, setups=points.setups, gauges=points.gauges))
-    required = {c for row in merged for c in (OF_POINTS if points.is_point(row) else REQUIRED)}
+    required = {
+        c for row in merged for c in (REQUIRED_OF_POINTS if points.is_point(row) else REQUIRED)
+    }
     return TableImport(
         options=options,
         table=content,
@@ -151,13 +153,13 @@ def import_readings(
 def _read_long_table(
     path: Path, plan: Session, options: TableOptions
 ) -> tuple[Table, Columns, LongTable]:
-    """Table of a file with the roles of its columns, and its long form."""
+    """Table of a file, the roles of its columns, and its long form."""
     points = PointRows(plan)
     content = read_table(
         path,
         read_file(path, error=SessionError),
-        lambda rows: find_header(rows, options.columns, points=points.any),
-        expected=EXPECTED_POINTS if points.any else EXPECTED,
+        lambda rows: find_header(rows, options.columns, points=points.has_points),
+        expected=EXPECTED_POINTS if points.has_points else EXPECTED,
         sheet=options.sheet,
         separator=options.separator,
         encoding=options.encoding,
@@ -166,8 +168,8 @@ def _read_long_table(
         content.header,
         options.columns,
         where=content.place(content.header_line),
-        points=points.any,
-        one_setup=points.any and len(points.names) == 1,
+        points=points.has_points,
+        one_setup=points.has_points and len(points.names) == 1,
     )
     if "time" not in options.columns:
         columns = _without_clock_times(content, columns)
@@ -185,7 +187,7 @@ def _read_long_table(
 
 
 def _commanded_points(plan: Session) -> dict[str, Array]:
-    """Commanded point of each posture that has one, from the mechanical zero, (3,), [m]."""
+    """Commanded points by posture, from the mechanical zero, shape (3,), [m]."""
     return {n: p.values for n, p in plan.postures.items() if p.form == "tcp" and p.values.size == 3}
 
 
@@ -193,7 +195,7 @@ def write_import(result: TableImport) -> None:
     """Write the readings.csv of a session atomically.
 
     Raises:
-        OrthocalError: If it cannot be written.
+        OrthocalError: If the file cannot be written.
     """
     write_file(result.readings_path, result.text)
 
@@ -212,28 +214,28 @@ def _check_options(options: TableOptions) -> None:
 
 
 def _without_clock_times(table: Table, columns: Columns) -> Columns:
-    """Columns without one of times that are not those of a session, such as a clock's."""
-    at = columns.single.get("time")
-    if at is None:
+    """Columns without a column of times that lack a date, such as those of a clock."""
+    time_column = columns.single.get("time")
+    if time_column is None:
         return columns
-    texts = (read_time(row.cell(at).text) for row in table.rows)
+    texts = (read_time(row.cell(time_column).text) for row in table.rows)
     try:
         for text in texts:
             if text:
                 parse_time(text, "")
     except SessionError:
-        single = {role: i for role, i in columns.single.items() if i != at}
-        return replace(columns, single=single, extra=tuple(sorted((*columns.extra, at))))
+        single = {role: i for role, i in columns.single.items() if i != time_column}
+        return replace(columns, single=single, extra=tuple(sorted((*columns.extra, time_column))))
     return columns
 
 
 def _read_existing(
     readings_path: Path, table: Path, long_table: LongTable, overwrite: bool
 ) -> list[RawReading]:
-    """Rows of the session's readings.csv; none if there is no such file.
+    """Rows of the session's readings.csv; empty if there is no such file.
 
     Raises:
-        SessionError: If the table itself is this file, and must not be overwritten.
+        SessionError: If the table itself is this file and must not be overwritten.
     """
     if not exists(readings_path):
         return []
@@ -251,10 +253,10 @@ def _read_existing(
 
 
 VALUES = ("reading_mm", *COORDINATES)
-"""Columns of what was measured."""
+"""Columns of measured values."""
 
 _Row = tuple[RawReading, Sequence[Reading]]
-"""A row as text, and its reading, or the three of a point."""
+"""Text of a row, and its reading or the three readings of a point."""
 
 
 def _is_filled(row: RawReading) -> bool:
@@ -273,21 +275,21 @@ def _merge(
     """Merge new readings into the existing rows; further readings follow at the end.
 
     Returns:
-        Rows, and numbers of rows that are filled, replaced, unchanged and added.
+        Rows, and the numbers of filled, replaced, unchanged and added rows.
 
     Raises:
-        SessionError: If a reading or a condition differs, unless it may be overwritten.
+        SessionError: If a reading or a condition differs and must not be overwritten.
     """
     pending: dict[Key, list[_Row]] = {}
     for row in new:
         pending.setdefault(_key(row), []).append(row)
-    places = Counter(map(_key, existing))
+    existing_counts = Counter(map(_key, existing))
     rows: list[RawReading] = []
     counts: Counter[str] = Counter()
     differing: list[_Row] = []
     for row in existing:
         key = _key(row)
-        match = _match(row[0], pending.get(key, []), places[key] == 1)
+        match = _match(row[0], pending.get(key, []), unique=existing_counts[key] == 1)
         if match is None:
             rows.append(row[0])
             continue
@@ -306,7 +308,7 @@ def _merge(
             "--replace overwrites existing readings",
             where=first.where,
         )
-    added = [row for of_place in pending.values() for row, _ in of_place]
+    added = [row for rows_of_key in pending.values() for row, _ in rows_of_key]
     _require_approaches(added, [row for row, _ in existing])
     counts["added"] = len(added)
     return [*rows, *added], counts
@@ -316,46 +318,52 @@ def _require_approaches(added: Sequence[RawReading], existing: Sequence[RawReadi
     """Refuse new rows without an approach in postures that the session reads from several sides.
 
     Raises:
-        SessionError: Naming the first one.
+        SessionError: If there is such a row; names the first one.
     """
     for row in added:
-        place = row.setup, row.posture, row.minus, row.cycle or "1"
+        key = row.setup, row.posture, row.minus, row.cycle or "1"
         sides = [
-            r.approach for r in existing if (r.setup, r.posture, r.minus, r.cycle or "1") == place
+            r.approach for r in existing if (r.setup, r.posture, r.minus, r.cycle or "1") == key
         ]
         if not row.approach and len(sides) > 1 and all(sides):
             raise SessionError(
-                f"{row.setup} {row.posture} of cycle {place[3]} is read from several sides "
+                f"{row.setup} {row.posture} of cycle {key[3]} is read from several sides "
                 f"({', '.join(sides)}); expected a column 'approach' that states which",
                 where=row.where,
             )
 
 
-def _match(row: RawReading, among: Sequence[_Row], alone: bool) -> _Row | None:
-    """The new reading of an existing row: that of its approach, or the only one without."""
-    for other in among:
-        if other[0].approach == row.approach:
-            return other
-    unstated = alone and len(among) == 1 and not (row.approach and among[0][0].approach)
-    return among[0] if unstated else None
+def _match(row: RawReading, candidates: Sequence[_Row], *, unique: bool) -> _Row | None:
+    """New reading of an existing row: the one with its approach, or a single one without approach.
+
+    Args:
+        row: The existing row.
+        candidates: New rows with its setup, postures and cycle.
+        unique: Whether no other existing row has this setup, these postures and this cycle.
+    """
+    for candidate in candidates:
+        if candidate[0].approach == row.approach:
+            return candidate
+    if unique and len(candidates) == 1 and not (row.approach and candidates[0][0].approach):
+        return candidates[0]
+    return None
 
 
 def _change(row: _Row, match: _Row) -> Literal["replaced", "filled", "unchanged"]:
     """Effect of a new reading on an existing row."""
     (text, old), (_, new) = row, match
     before, after = (astuple(r[0].conditions or Conditions()) for r in (old, new))
-    pairs = list(zip(before, after, strict=True))
+    conditions = [(b, a) for b, a in zip(before, after, strict=True) if a is not None]
     differs = [r.value for r in old] != [r.value for r in new]
-    if (_is_filled(text) and differs) or any(
-        one is not None and other is not None and one != other for one, other in pairs
-    ):
+    if (_is_filled(text) and differs) or any(b is not None and b != a for b, a in conditions):
         return "replaced"
-    filled = not _is_filled(text) or any(one is None and other is not None for one, other in pairs)
-    return "filled" if filled else "unchanged"
+    if not _is_filled(text) or any(b is None for b, _ in conditions):
+        return "filled"
+    return "unchanged"
 
 
 def _update(row: RawReading, other: RawReading) -> RawReading:
-    """An existing row with the reading and the stated conditions of another."""
+    """Existing row with the reading and the stated conditions of another row."""
     conditions = {name: getattr(other, name) or getattr(row, name) for name in CONDITIONS}
     return replace(row, **{name: getattr(other, name) for name in VALUES}, **conditions)
 

@@ -1,6 +1,6 @@
 """Long form of a table of readings: one row per reading, names of the session, values in mm.
 
-Cycles side by side become rows. Rows without a reading are skipped, each with its reason.
+Cycles side by side become rows. Rows without a reading are skipped, and the reason is listed.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from orthocal.io.tables.table import Table
 from orthocal.measurement.files.readings_file import (
     RawReading,
     decide_sign,
-    is_house,
+    has_standard_headings,
     mm_text,
-    require_whole_cells,
+    require_unsplit_numbers,
 )
 from orthocal.measurement.importing.headings import (
     NOMINAL,
@@ -52,22 +52,22 @@ from orthocal.units import MM
 
 NO_READING = "no reading"
 
-NAMED: tuple[Role, ...] = ("setup", "posture")
-"""Columns that no row of a reading leaves empty."""
+REQUIRED_NAMES: tuple[Role, ...] = ("setup", "posture")
+"""Columns of names that every row with a reading needs."""
 
 SkippedRows = list[tuple[int, str]]
 """Lines of the table that are not imported, with the reason."""
 
-CHOOSE_SIGN = "choose one by --decimal comma or --decimal point"
+SIGN_ADVICE = "choose one by --decimal comma or --decimal point"
 
 SAME_POINT_MM = 0.1
-"""Largest difference of each coordinate of a commanded point from that of its posture, [mm]."""
+"""Largest difference per coordinate between a commanded point and its posture, [mm]."""
 
 LONGEST_NAME = 200
 """Maximum length of a name in a session."""
 
 WARMEST = Decimal(45)
-"""Largest temperature of a workshop in °C; larger ones without a unit may be in °F."""
+"""Largest temperature without a unit that is certainly in °C; larger ones may be in °F."""
 
 _DAY_FIRST = re.compile(r"([0-9]{1,2})\.([0-9]{1,2})\.([0-9]{4}),? +([0-9]{1,2})(:[0-9]{2}.*)")
 _NUMBER_AND_WORD = re.compile(r"(.*[0-9.,])\s*([^0-9.,\s].*)", re.S)
@@ -75,22 +75,22 @@ _NUMBER_AND_WORD = re.compile(r"(.*[0-9.,])\s*([^0-9.,\s].*)", re.S)
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A cell of a column of readings."""
+    """Cell of a column of readings or coordinates."""
 
     row: RawReading
-    """The row with names as written, without its reading."""
+    """The row with names as in the table, without its reading."""
     column: int
     number: str | None
     """Text of the number without its unit; None if the cell has no reading."""
     value: Decimal | None = None
-    """Value of a workbook's number."""
+    """Value of the number in a workbook; None for text."""
     unit: UnitName | None = None
     role: Role = "reading"
 
 
 @dataclass(frozen=True, slots=True)
 class LongTable:
-    """Readings of a table in its order, and how they were interpreted."""
+    """Readings of a table in their order, and their interpretation."""
 
     rows: tuple[RawReading, ...]
     missing: tuple[RawReading, ...]
@@ -99,11 +99,11 @@ class LongTable:
     units: tuple[UnitName, ...]
     """Units of the readings."""
     unit_assumed: bool
-    """True if readings without a unit have the unit of the option."""
+    """True if the option --unit applies to some readings."""
     skipped: tuple[tuple[int, str], ...]
     """Lines that are not imported, with the reason."""
     renamed: tuple[tuple[str, str], ...]
-    """Names of the table with the names of the session that replace them."""
+    """Names in the table, each with the name in the session that replaces it."""
 
 
 def make_long_table(
@@ -122,24 +122,24 @@ def make_long_table(
     Args:
         table: The table.
         columns: Roles of its columns.
-        names: Names of the session for `setup` and `posture`; the first setup is that of all rows
-            without a column of setups. Upper case, and blanks in place of
-            underscores, make no difference.
+        names: Names in the session for `setup` and `posture`. Without a column of setups, all rows
+            belong to the first setup. Case is ignored; blanks and underscores are equal.
         decimal: Decimal sign; inferred by default.
         unit: Unit of readings without a unit.
-        separator_known: True if the user stated the separator.
-        fill: True to copy an empty setup or posture from the row above.
-        points: Posture to its commanded point, (3,), [m], for tables that state points instead.
+        separator_known: Whether the user stated the separator.
+        fill: Whether to copy an empty setup or posture from the row above.
+        points: Commanded points by posture, shape (3,), [m], for tables that state points instead
+            of postures.
 
     Raises:
-        SessionError: Naming the row, if a cell is not a number, has no unit, or is ambiguous.
+        SessionError: If a cell is not a number, has no unit, or is ambiguous; names the row.
     """
-    require_whole_cells(table, columns, sure=separator_known or decimal == "point")
+    require_unsplit_numbers(table, columns, separator_known=separator_known or decimal == "point")
     skipped: SkippedRows = []
     first_setup = next(iter(names["setup"]))
     entries = list(_read_entries(table, columns, skipped, fill, first_setup))
     sign = _decide_decimal_sign(table, entries, decimal)
-    setups, postures = (_folded_names(names[role]) for role in NAMED)
+    setups, postures = (_folded_names(names[role]) for role in REQUIRED_NAMES)
     rows = _Rows(setups, postures, skipped)
     for entry in entries:
         if entry.number is None:
@@ -160,22 +160,23 @@ def make_long_table(
 
 @dataclass
 class _Rows:
-    """Rows of a long table in the making: readings, and points of several cells."""
+    """Accumulator of the rows of a long table; a point has several cells."""
 
     setups: Mapping[str, str]
-    """Names of the session by their folded form."""
+    """Setups of the session by folded name."""
     postures: Mapping[str, str]
+    """Postures of the session by folded name."""
     skipped: SkippedRows
     read: dict[tuple[int, str], RawReading] = field(default_factory=dict)
-    """Line and cycle to the row."""
+    """Rows by line and cycle."""
     missing: list[RawReading] = field(default_factory=list)
     commanded: dict[int, dict[Role, Decimal]] = field(default_factory=dict)
-    """Line to the commanded point, [mm]."""
+    """Coordinates of the commanded points by line, [mm]."""
     units: dict[UnitName, None] = field(default_factory=dict)
     renamed: dict[str, str] = field(default_factory=dict)
 
     def skip(self, entry: Entry) -> None:
-        """Note an empty cell."""
+        """Record an empty cell."""
         row = _with_session_names(entry.row, self.setups, self.postures)
         if row.setup in self.setups and row.posture in self.postures:
             self.missing.append(row)
@@ -183,7 +184,7 @@ class _Rows:
             self.skipped.append((row.line, NO_READING))
 
     def add(self, entry: Entry, value: Decimal, unit: UnitName) -> None:
-        """Note a number."""
+        """Record a number."""
         row = _with_session_names(entry.row, self.setups, self.postures)
         names = zip(_names(entry.row), _names(row), strict=True)
         self.renamed |= {old: new for old, new in names if old != new}
@@ -198,10 +199,10 @@ class _Rows:
         self.read[key] = replace(self.read.get(key, row), **cell)
 
     def located(self, points: Mapping[str, Array]) -> tuple[RawReading, ...]:
-        """The rows, those with a commanded point with the posture of that point.
+        """Rows in which commanded points are replaced by their postures.
 
         Args:
-            points: Posture to its commanded point, shape (3,), [m].
+            points: Commanded points by posture, shape (3,), [m].
         """
         return tuple(
             replace(row, posture=_find_posture(self.commanded[row.line], points, row.where))
@@ -217,26 +218,26 @@ def _find_posture(
     """Posture of a commanded point.
 
     Args:
-        commanded: Role to coordinate, [mm]; without those that are empty.
-        points: Posture to its commanded point, shape (3,), [m].
+        commanded: Coordinates by role, [mm], without empty ones.
+        points: Commanded points by posture, shape (3,), [m].
         where: File and row, for messages.
 
     Raises:
-        SessionError: If the point is incomplete, or that of no posture, or of several ones.
+        SessionError: If the point is incomplete, or does not belong to exactly one posture.
     """
     missing = next((role for role in NOMINAL if role not in commanded), None)
     if missing is not None:
         raise SessionError(f"{missing} is empty; expected a commanded point", where=where)
     point = np.array([float(commanded[role]) for role in NOMINAL])
-    near = [n for n, p in points.items() if np.abs(p / MM - point).max() <= SAME_POINT_MM]
-    if len(near) != 1:
-        what = f"that of {' and '.join(near[:3])}" if near else "that of no posture"
+    postures = [n for n, p in points.items() if np.abs(p / MM - point).max() <= SAME_POINT_MM]
+    if len(postures) != 1:
+        owner = f"that of {' and '.join(postures[:3])}" if postures else "that of no posture"
         raise SessionError(
-            f"the commanded point ({', '.join(f'{v:g}' for v in point)}) mm is {what}; expected "
+            f"the commanded point ({', '.join(f'{v:g}' for v in point)}) mm is {owner}; expected "
             f"one of the session within {SAME_POINT_MM:g} mm, from the mechanical zero",
             where=where,
         )
-    return near[0]
+    return postures[0]
 
 
 def _names(row: RawReading) -> tuple[str, str, str]:
@@ -246,7 +247,7 @@ def _names(row: RawReading) -> tuple[str, str, str]:
 def _with_session_names(
     row: RawReading, setups: Mapping[str, str], postures: Mapping[str, str]
 ) -> RawReading:
-    """A row with the names of the session in place of those of the table."""
+    """Row with the names in the session instead of those in the table."""
     return replace(
         row,
         setup=_session_name(row.setup, setups),
@@ -263,9 +264,12 @@ def _read_entries(
     Args:
         table: The table.
         columns: Roles of its columns.
-        skipped: Receives the lines without a reading.
-        fill: As for `make_long_table`.
+        skipped: Lines without a reading are appended to it.
+        fill: Whether to copy an empty setup or posture from the row above.
         setup: Setup of all rows, if there is no column of setups.
+
+    Raises:
+        SessionError: If a cell of readings is merged, a name is missing, or units contradict.
     """
     for column, top, _ in table.merged:
         if column in columns.readings:
@@ -273,31 +277,31 @@ def _read_entries(
                 "is merged with cells below; expected one cell for each reading",
                 where=table.place(top, column),
             )
-    named = [role for role in NAMED if role in columns.single]
+    name_roles = [role for role in REQUIRED_NAMES if role in columns.single]
     measured = [i for i, h in columns.readings.items() if h.role not in NOMINAL]
-    above = dict.fromkeys(NAMED, "")
+    above = dict.fromkeys(REQUIRED_NAMES, "")
     rows, units_below = _without_units_row(table, columns, skipped)
     for row in rows:
-        names = {role: _name(row.cell(columns.single.get(role))) for role in NAMED}
-        if "setup" not in named:
+        names = {role: _name(row.cell(columns.single.get(role))) for role in REQUIRED_NAMES}
+        if "setup" not in name_roles:
             names["setup"] = setup
         filled_cells = [i for i in measured if not _is_missing(row.cell(i))]
-        beyond = sum(not c.is_blank for c in row.cells[len(table.header) :])
-        if beyond:
-            skipped.append((row.line, f"{beyond} cells without a heading"))
-        if not filled_cells and not all(names[role] for role in named):
+        unheaded = sum(not c.is_blank for c in row.cells[len(table.header) :])
+        if unheaded:
+            skipped.append((row.line, f"{unheaded} cells without a heading"))
+        if not filled_cells and not all(names[role] for role in name_roles):
             skipped.append((row.line, NO_READING))
             continue
         if fill:
             names = above = {role: name or above[role] for role, name in names.items()}
-        for role in named:
+        for role in name_roles:
             if not names[role]:
                 raise SessionError(
                     f"has a reading but no {role}; --fill copies the {role} from the row above",
                     where=table.place(row.line),
                 )
         cells = _read_optional_cells(table, row, columns) | names
-        for i, heading in _of_row(columns, filled_cells).items():
+        for i, heading in _length_columns(columns, filled_cells).items():
             where = table.place(row.line, i)
             numbered = cells if heading.cycle is None else {**cells, "cycle": str(heading.cycle)}
             entry = Entry(RawReading(where, row.line, **numbered), i, None, role=heading.role)
@@ -317,7 +321,7 @@ def _read_entries(
 def _without_units_row(
     table: Table, columns: Columns, skipped: SkippedRows
 ) -> tuple[Iterable[Row], dict[int, UnitName]]:
-    """Rows below the headings and a row of units, and these units by column."""
+    """Rows below the headings without a row of units, and these units by column."""
     rows = table.fill_merged(columns.keys)
     for first in rows:
         units = _read_units_row(first, columns)
@@ -328,33 +332,40 @@ def _without_units_row(
     return rows, {}
 
 
-def _of_row(columns: Columns, filled: Sequence[int]) -> dict[int, Heading]:
-    """Columns of lengths that belong to a row: those of its point, or of its readings."""
-    point = any(columns.readings[i].role in POINT for i in filled)
+def _length_columns(columns: Columns, filled: Sequence[int]) -> dict[int, Heading]:
+    """Columns of lengths that belong to a row: those of its point, or of its readings.
+
+    Args:
+        columns: Roles of the columns.
+        filled: Indices of the columns with a number in this row.
+    """
+    is_point = any(columns.readings[i].role in POINT for i in filled)
     if not filled:
-        point = not any(h.role == "reading" for h in columns.readings.values())
-    others: tuple[Role, ...] = ("reading",) if point else POINT
-    return {i: h for i, h in columns.readings.items() if h.role not in others}
+        is_point = not any(h.role == "reading" for h in columns.readings.values())
+    excluded: tuple[Role, ...] = ("reading",) if is_point else POINT
+    return {i: h for i, h in columns.readings.items() if h.role not in excluded}
 
 
 def _read_optional_cells(table: Table, row: Row, columns: Columns) -> dict[str, str]:
     """Cells of a row in the optional columns of a readings.csv."""
     cells = {role: row.cell(columns.single.get(role)) for role in SINGLE}
-    warm = columns.single.get("temperature")
+    temperature = columns.single.get("temperature")
     return {
         "minus": _name(cells["minus"]),
         "cycle": _name(cells["cycle"]),
         "approach": _name(cells["approach"]).casefold(),
-        "temperature_C": "" if warm is None else _read_temperature(table, row, warm),
+        "temperature_C": (
+            "" if temperature is None else _read_temperature(table, row, temperature)
+        ),
         "time": read_time(cells["time"].text),
     }
 
 
 def _read_temperature(table: Table, row: Row, column: int) -> str:
-    """Temperature of a row in °C; text that is no number as it is.
+    """Temperature of a row in °C; text that is not a number is returned unchanged.
 
     Raises:
-        SessionError: If it may be in °C or °F.
+        SessionError: If the temperature may be in °C or °F.
     """
     text = row.cell(column).text.strip()
     number, unit = split_degrees(text)
@@ -374,14 +385,17 @@ def _read_temperature(table: Table, row: Row, column: int) -> str:
 
 
 def read_time(text: str) -> str:
-    """Date and time of ISO 8601, of a day such as 14.03.2025; other text as it is."""
+    """Date and time in the form of ISO 8601, converted from a date such as 14.03.2025.
+
+    Other text is returned unchanged.
+    """
     text = text.strip()
     day = _DAY_FIRST.match(text)
     return text if day is None else f"{day[3]}-{day[2]:0>2}-{day[1]:0>2}T{day[4]:0>2}{day[5]}"
 
 
 def _read_units_row(row: Row, columns: Columns) -> dict[int, UnitName]:
-    """Units by column, if a row below the headings contains units only."""
+    """Units by column, if a row below the headings contains units only; empty otherwise."""
     if any(_name(row.cell(i)) for i in columns.keys):
         return {}
     units: dict[int, UnitName] = {}
@@ -397,7 +411,7 @@ def _read_units_row(row: Row, columns: Columns) -> dict[int, UnitName]:
 
 def _name(cell: Cell) -> str:
     """Name of a cell; empty for a dash."""
-    if len(cell.text) > 2 * LONGEST_NAME:  # normalising takes quadratic time
+    if len(cell.text) > 2 * LONGEST_NAME:  # normalising needs quadratic time
         return cell.text
     text = composed(" ".join(tidy_text(cell.text).split()))
     return "" if plain_minus(text) in ("-", "—") else text
@@ -419,10 +433,10 @@ _NOT_A_NUMBER = {
 
 
 def _read_number(cell: Cell, where: str) -> tuple[str, Decimal | None, UnitName | None]:
-    """Text, value and unit of the number of a cell.
+    """Text, value and unit of the number of a cell; value and unit are None if not known.
 
     Raises:
-        SessionError: If the cell is not a number, whatever the decimal sign.
+        SessionError: If the cell is a date, a Boolean, an unsaved formula or a percentage.
     """
     if cell.kind in _NOT_A_NUMBER:
         raise SessionError(
@@ -442,10 +456,16 @@ def _decide_decimal_sign(table: Table, entries: list[Entry], stated: Sign | None
     numerals = [
         Numeral(e.number, e.row.line) for e in entries if e.number is not None and e.value is None
     ]
-    return decide_sign(numerals, house=is_house(table.header), ask=CHOOSE_SIGN, place=table.place)
+    return decide_sign(
+        numerals,
+        standard=has_standard_headings(table.header),
+        advice=SIGN_ADVICE,
+        place=table.place,
+    )
 
 
 def _parse_value(entry: Entry, sign: Sign | None) -> Decimal:
+    """Number of a cell in the cell's unit."""
     if entry.value is not None:
         return entry.value
     number = entry.number or ""
@@ -461,6 +481,7 @@ def _parse_value(entry: Entry, sign: Sign | None) -> Decimal:
 
 
 def _choose_unit(entry: Entry, stated: UnitName | None, heading: str) -> UnitName:
+    """Unit of a cell or its heading, or the unit of the option `--unit`."""
     where = entry.row.where
     if stated and entry.unit and stated != entry.unit:
         raise SessionError(
@@ -477,20 +498,21 @@ def _choose_unit(entry: Entry, stated: UnitName | None, heading: str) -> UnitNam
 
 
 def _fold(name: str) -> str:
+    """Name in lower case with underscores instead of blanks."""
     if len(name) > 2 * LONGEST_NAME:
         return name
     return "_".join(plain_minus(composed(name)).casefold().split())
 
 
 def _folded_names(names: Iterable[str]) -> dict[str, str]:
-    """Names of the session by themselves and, where it is unique, by their folded form."""
+    """Names in the session by exact name and, if unique, by folded name."""
     by_fold: dict[str, list[str]] = {}
     for name in names:
         by_fold.setdefault(_fold(name), []).append(name)
-    unique = {fold: alike[0] for fold, alike in by_fold.items() if len(alike) == 1}
-    return unique | {name: name for alike in by_fold.values() for name in alike}
+    unique = {fold: same[0] for fold, same in by_fold.items() if len(same) == 1}
+    return unique | {name: name for same in by_fold.values() for name in same}
 
 
-def _session_name(written: str, known: Mapping[str, str]) -> str:
-    """The session's name for a name as written; the same text if the session has none."""
-    return known.get(written) or known.get(_fold(written)) or written
+def _session_name(written: str, folded_names: Mapping[str, str]) -> str:
+    """Name in the session for a name in the table; the name in the table if there is none."""
+    return folded_names.get(written) or folded_names.get(_fold(written)) or written

@@ -1,6 +1,6 @@
-"""Import of a printer's log: a robot of the firmware's dimensions, and a session of its bed.
+"""Import of a printer's log: a robot with the firmware's dimensions, and a session of its bed.
 
-Distances measured on a print are a setup of their own.
+Distances measured on a print form a second setup.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from orthocal.errors import SessionError
 from orthocal.io.documents import read_text
 from orthocal.io.fields import read_only
 from orthocal.io.files import exists
-from orthocal.measurement.files.schema import LARGEST_READING_MM
+from orthocal.measurement.files.session_keys import LARGEST_READING_MM
 from orthocal.measurement.files.write_session import write_session
 from orthocal.printers.firmwares import FIRMWARES, find_firmware, require_firmware
 from orthocal.printers.log import PrinterLog
@@ -32,29 +32,33 @@ from orthocal.units import MM
 
 ROBOT = "printer"
 
-NOISE = 0.02 * MM
-"""Standard deviation of a probing, [m], with the waviness of a bed between the points."""
+PROBE_STD = 0.02 * MM
+"""Standard deviation of a probed height, [m], including the waviness of a bed between the
+points."""
 
-TILT = 5e-3
-"""Prior standard deviation of the bed's tilt against the towers, [rad]."""
+TILT_STD = 5e-3
+"""Prior standard deviation of the bed's tilt relative to the towers, [rad]."""
 
-CALLIPER = 0.05 * MM
-"""Standard deviation of a distance less the width of its pillar, [m]: seams and blobs."""
+CALLIPER_STD = 0.05 * MM
+"""Standard deviation of a distance minus the width of its pillar, [m]: seams and blobs."""
 
-WIDTH = 0.025 * MM
-"""Standard deviation of the error that all widths of pillars have in common, [m]."""
+WIDTH_STD = 0.025 * MM
+"""Prior standard deviation of the common error of all widths of pillars, [m]."""
 
-CALLIPER_STEP = 0.01 * MM
+CALLIPER_RESOLUTION = 0.01 * MM
 """Resolution of a calliper, [m]."""
 
-PRINT_SCALE = 0.001
-"""Standard deviation of the scale of calliper and print, [1]: plastic shrinks by some 0.2 %."""
+PRINT_SCALE_STD = 0.001
+"""Prior standard deviation of the scale of calliper and print, [1]: plastic shrinks by 0.2 %."""
 
-PRINT = "print"
+PRINT_SETUP = "print"
 """Name of the setup of distances."""
 
-ROOM = 10 * MM
+TRAVEL_MARGIN = 10 * MM
 """Travel beyond the endstops and the lowest posture, [m]."""
+
+RANGE_MARGIN = 5 * MM
+"""Range of the probe beyond the largest height, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +76,7 @@ class PrinterImport:
 
 
 def recognise_log(path: Path) -> FirmwareName | None:
-    """Firmware of a log where its text is certain; None for any other file."""
+    """Firmware that wrote a log; None if the file is not clearly such a log."""
     try:
         return find_firmware(read_text(path, error=SessionError))
     except SessionError:
@@ -86,7 +90,7 @@ def import_printer_log(
     settings: Sequence[str | Path] = (),
     radius: float | None = None,
 ) -> PrinterImport:
-    """Read the log of a probed bed: triggers, and the settings with which they were taken.
+    """Read the log of a probed bed: heights at the triggers, and the settings of the firmware.
 
     Args:
         log: The log: console output, klippy.log, or a printer.cfg with saved heights.
@@ -95,7 +99,7 @@ def import_printer_log(
         radius: Largest distance from the middle that Marlin's G33 or G29 probed, [m].
 
     Raises:
-        SessionError: Naming the file and line or key, what was found and what was expected.
+        SessionError: If a file is wrong or incomplete; names file and line or key.
     """
     texts = [read_text(Path(p), error=SessionError) for p in (*settings, log)]
     text = "\n".join(texts)
@@ -112,13 +116,13 @@ def import_printer_log(
 
 
 def write_printer_import(result: PrinterImport, folder: str | Path) -> Path:
-    """Write the session and, in a directory within, its robot.
+    """Write the session and, in a subdirectory, its robot.
 
     Returns:
         Path of the session.yaml.
 
     Raises:
-        SessionError: If the directory has a session already.
+        SessionError: If the directory contains a session already.
     """
     folder = Path(folder)
     for name in ("session.yaml", "readings.csv", ROBOT):
@@ -130,39 +134,39 @@ def write_printer_import(result: PrinterImport, folder: str | Path) -> Path:
 def _session(log: PrinterLog, path: Path) -> Session:
     """Session of a probed bed.
 
-    The nozzle is at the commanded height above the bed where the probe triggers: a printer's owner
-    sets the height of the probe apart. So it has no tolerance, and heights of the bed are absolute.
+    When the probe triggers, the nozzle is at the commanded height above the bed. The owner of a
+    printer sets the trigger height of the probe separately. So this height has no tolerance, and
+    the heights of the bed are absolute.
     """
     robot = _robot(log)
     postures = {f"p{i + 1}": _posture(f"p{i + 1}", c) for i, c in enumerate(log.carriages)}
     x, y, z = log.settings.probe
-    surface = Artefact("plate", direction_std=TILT, form_degree=4)
+    surface = Artefact("plate", direction_std=TILT_STD, form_degree=4)
     setup = Setup("bed", Probe("-z", surface, (x, y, z), trigger_std=0.0), "", zero="known")
     readings = tuple(
         Reading("bed", name, None, 1, float(height), None, None)
         for name, height in zip(postures, log.heights, strict=True)
     )
-    limit = LARGEST_READING_MM * MM
-    if np.abs(log.heights).max() > limit:
+    largest = float(np.abs(log.heights).max())
+    if largest > LARGEST_READING_MM * MM:
         raise SessionError(
-            f"found a height of {np.abs(log.heights).max() / MM:g} mm; expected at most "
-            f"{LARGEST_READING_MM:g} mm",
+            f"found a height of {largest / MM:g} mm; expected at most {LARGEST_READING_MM:g} mm",
             where=str(path),
         )
-    half = max(5 * MM, float(np.abs(log.heights).max()) + 5 * MM)
-    probe = Gauge(NOISE, None, (-half, half))
+    half_range = largest + RANGE_MARGIN
+    probe = Gauge(PROBE_STD, None, (-half_range, half_range))
     setups, gauges = {"bed": setup}, {"": probe}
     if log.distances:
-        sensor = Distance(width_std=WIDTH, scale_std=PRINT_SCALE)
+        sensor = Distance(width_std=WIDTH_STD, scale_std=PRINT_SCALE_STD)
         setups = {
             "bed": replace(setup, gauge="probe"),
-            PRINT: Setup(PRINT, sensor, "calliper", zero="known"),
+            PRINT_SETUP: Setup(PRINT_SETUP, sensor, "calliper", zero="known"),
         }
-        gauges = {"probe": probe, "calliper": Gauge(CALLIPER, CALLIPER_STEP)}
-        for d in log.distances:
-            names = f"{d.name}_far", f"{d.name}_near"
-            postures |= {n: _posture(n, c) for n, c in zip(names, d.carriages, strict=True)}
-            readings += (Reading(PRINT, *names, 1, d.length),)
+        gauges = {"probe": probe, "calliper": Gauge(CALLIPER_STD, CALLIPER_RESOLUTION)}
+        for distance in log.distances:
+            names = f"{distance.name}_far", f"{distance.name}_near"
+            postures |= {n: _posture(n, c) for n, c in zip(names, distance.carriages, strict=True)}
+            readings += (Reading(PRINT_SETUP, *names, 1, distance.length),)
     title = FIRMWARES[log.settings.firmware].title
     return Session(
         robot=robot,
@@ -183,7 +187,7 @@ def _posture(name: str, carriages: Array) -> Posture:
 
 
 def _robot(log: PrinterLog) -> Robot:
-    """Robot as designed: equal rods, towers 120° apart, the firmware's radius."""
+    """Robot of nominal dimensions: equal rods, towers 120° apart, the firmware's radius."""
     carriages = np.concatenate([log.carriages, *(d.carriages for d in log.distances)])
     machine = _design(log.settings, carriages.min(), carriages.max())
     files = {f"{ROBOT}.urdf": machine.urdf(ROBOT), f"{ROBOT}.yaml": machine.yaml()}
@@ -191,8 +195,8 @@ def _robot(log: PrinterLog) -> Robot:
 
 
 def _design(settings: DeltaSettings, lowest: float, highest: float) -> LinearDelta:
-    """Dimensions by design, with the travel of the carriages."""
+    """Nominal dimensions, with a travel that contains all carriage coordinates, [m]."""
     machine = LinearDelta(rod=round(float(np.mean(settings.rods)), 6), radius=settings.radius)
-    low = max(min(machine.travel[0], lowest - ROOM), MM)
-    high = max(max(settings.homed), highest, machine.zero) + ROOM
+    low = max(min(machine.travel[0], lowest - TRAVEL_MARGIN), MM)
+    high = max(max(settings.homed), highest, machine.zero) + TRAVEL_MARGIN
     return replace(machine, travel=(round(low, 3), round(high, 3)))

@@ -1,10 +1,10 @@
-"""Traces: readings that a gauge takes many times a second while the tool moves along a path.
+"""Traces: readings of a gauge sampled at a high rate while the tool moves along a path.
 
-A trace is averaged into bins along the path. A polynomial of the path length describes the readings
-between two reversals roughly. In each bin, a line is fitted to their deviations from it. Line and
-polynomial at the middle sample are the reading there. The bins are so short that what the line
-omits, w² h''/24 for a bin of length w, stays below a tenth of the noise of a bin. So averaging
-loses nothing. Where the path reverses, a bin ends, because the approach changes.
+A trace is averaged in bins along the path. A polynomial of the path length describes the readings
+between two reversals approximately. In each bin, a line is fitted to the deviations from the
+polynomial. The sum of line and polynomial at the middle sample is the reading there. The averaging
+error w² h''/24 of a bin of length w, with h the deviations, stays below a tenth of the noise of a
+bin. A bin ends where the path reverses, because the approach changes.
 """
 
 from __future__ import annotations
@@ -32,32 +32,32 @@ from orthocal.session.session import Conditions, Posture, Reading, Session
 from orthocal.units import MM
 
 MOST_SAMPLES = 500_000
-"""Samples of one trace: eight minutes at 1 kHz."""
+"""Largest number of samples of a trace: eight minutes at 1 kHz."""
 
 LARGEST_TRACE = 64 * 2**20
-"""Largest file of a trace, [bytes]."""
+"""Largest size of a file, [bytes]."""
 
 FEWEST_SAMPLES = 8
-"""Samples of a bin: enough for a line and the noise about it."""
+"""Fewest samples of a bin, sufficient for a line and the noise about it."""
 
 MOST_BINS = 360
-"""Bins between two reversals."""
+"""Largest number of bins between two reversals."""
 
 LONGEST_BIN = 4 * MM
-"""Length of a bin at first: 5° of a circle of 100 mm, [m]."""
+"""Initial length of a bin, [m]: 5° of a circle with a diameter of 100 mm."""
 
 BATCHES = 4
-"""Parts of a bin whose means show its noise, correlation within a part included."""
+"""Batches per bin, whose means show its noise; samples may be correlated within a batch."""
 
-OMITTED = 0.1
-"""Largest error of averaging, in standard deviations of a bin's reading."""
+MAX_AVERAGING_ERROR = 0.1
+"""Largest averaging error, in standard deviations of a bin's reading."""
 
 DEGREE = 12
-"""Degree of the polynomial that describes readings between two reversals: two harmonics of a full
-circle to some nm."""
+"""Degree of the polynomial between two reversals: exact to some nm for two harmonics of a full
+circle."""
 
-TURN = 0.1 * MM
-"""Path length in which a reversal shows, [m]."""
+REVERSAL_LENGTH = 0.1 * MM
+"""Path length over which a reversal is detected, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,34 +83,32 @@ class BinnedTrace:
     std: float
     """Standard deviation of a reading, [m]."""
     samples: int
-    """Number of samples."""
+    """Number of samples of the trace."""
 
 
 def read_trace(path: str | Path, robot: Robot) -> Trace:
     """Read a trace from a CSV file.
 
     Args:
-        path: CSV with columns reading_mm and x_mm, y_mm, z_mm (those that the drives control): the
-            commanded position of the tool, relative to the mechanical zero. Other columns, such as
-            a time, are ignored.
+        path: CSV with the column reading_mm and the commanded coordinates of x_mm, y_mm, z_mm,
+            relative to the mechanical zero. Other columns, such as a time, are ignored.
         robot: The robot.
 
     Raises:
-        SessionError: Naming file and line.
+        SessionError: If the file is wrong; names file and line.
     """
     file = Path(path)
     content = read_file(file, error=SessionError, largest=LARGEST_TRACE)
     text = read_text(file, error=SessionError, content=content)
     rows = csv.reader(io.StringIO(text, newline=None), skipinitialspace=True)
     header = [cell.strip() for cell in next(rows, [])]
-    wanted = [*(COORDINATES[c] for c in require_tcp(robot).coordinates), "reading_mm"]
-    missing = next((name for name in wanted if header.count(name) != 1), None)
-    if missing is not None:
+    required = [*(COORDINATES[c] for c in require_tcp(robot).coordinates), "reading_mm"]
+    if any(header.count(name) != 1 for name in required):
         raise SessionError(
-            f"has the columns {', '.join(header)[:200]}; expected {', '.join(wanted)}, once each",
+            f"has the columns {', '.join(header)[:200]}; expected {', '.join(required)}, once each",
             where=f"{file}:1",
         )
-    columns = [header.index(name) for name in wanted]
+    columns = [header.index(name) for name in required]
     samples: list[list[float]] = []
     try:
         for row in rows:
@@ -140,6 +138,8 @@ def read_trace(path: str | Path, robot: Robot) -> Trace:
 def bin_trace(trace: Trace) -> BinnedTrace:
     """Average a trace in bins along its path.
 
+    Bins are shortened until the averaging error is small, or they have too few samples.
+
     Raises:
         SessionError: If the tool does not move.
     """
@@ -151,83 +151,111 @@ def bin_trace(trace: Trace) -> BinnedTrace:
     smooth = np.zeros(len(length))
     for run in runs:
         smooth[run] = Chebyshev.fit(length[run], trace.values[run], DEGREE)(length[run])
-    remainder = trace.values - smooth
+    deviations = trace.values - smooth
     count = 1
     while True:
-        by_run = [_split_bins(length, run, count) for run in runs]
-        bins = [b for of_run in by_run for b in of_run]
-        fits = [_fit_line(length[b], remainder[b]) for b in bins]
+        bins_by_run = [_split_bins(length, run, count) for run in runs]
+        bins = [b for run_bins in bins_by_run for b in run_bins]
+        fits = [_fit_line(length[b], deviations[b]) for b in bins]
         std = float(np.sqrt(np.mean([variance for _, _, variance in fits])))
         values = np.array([value for value, _, _ in fits])
-        sizes = [len(of_run) for of_run in by_run]
-        if _omitted(values, sizes, std) <= OMITTED * std or max(sizes) >= MOST_BINS:
+        counts = [len(run_bins) for run_bins in bins_by_run]
+        if _averaging_error(values, counts, std) <= MAX_AVERAGING_ERROR * std:
+            break
+        if max(counts) >= MOST_BINS:
             break
         if min(b.size for b in bins) < 2 * FEWEST_SAMPLES:
             break
         count += 1
-    middle = np.array([b[at] for b, (_, at, _) in zip(bins, fits, strict=True)])
+    middle = np.array([b[index] for b, (_, index, _) in zip(bins, fits, strict=True)])
     values += smooth[middle]
     motions = np.array([trace.points[b[-1]] - trace.points[b[0]] for b in bins])
     return BinnedTrace(trace.points[middle], values, motions, std, len(trace.values))
 
 
 def _split_runs(points: Array, length: Array) -> list[slice]:
-    """Parts of a path between reversals, without samples at rest at their ends."""
-    marks = np.searchsorted(length, np.arange(0.0, length[-1], TURN))
+    """Runs of a path between reversals; runs that hardly move are omitted.
+
+    Args:
+        points: Tool coordinates, shape (n, n_coordinates), [m].
+        length: Path length at the samples, shape (n,), [m].
+    """
+    marks = np.searchsorted(length, np.arange(0.0, length[-1], REVERSAL_LENGTH))
     marks = np.unique(np.append(marks, len(length) - 1))
     tangents = np.diff(points[marks], axis=0)
     if len(tangents) < 2:
         return []
     turns = np.flatnonzero((tangents[1:] * tangents[:-1]).sum(axis=1) < 0.0) + 1
     ends = [0, *marks[turns].tolist(), len(length) - 1]
-    moved = [(a, b) for a, b in pairwise(ends) if length[b] - length[a] > 2.0 * TURN]
-    return [slice(a, b + 1) for a, b in moved]
+    return [
+        slice(start, end + 1)
+        for start, end in pairwise(ends)
+        if length[end] - length[start] > 2.0 * REVERSAL_LENGTH
+    ]
 
 
 def _split_bins(length: Array, run: slice, count: int) -> list[Indices]:
-    """Samples of each bin of a run; `count` bins for each `LONGEST_BIN`."""
+    """Indices of the samples of each bin of a run, with `count` bins per `LONGEST_BIN`.
+
+    Samples at rest, which do not advance along the path, are omitted.
+    """
     along = length[run]
     number = max(int(np.ceil(count * (along[-1] - along[0]) / LONGEST_BIN)), 1)
     edges = along[0] + np.arange(1, number) / number * (along[-1] - along[0])
     moving = np.flatnonzero(np.diff(along, prepend=-1.0) > 0.0)
-    parts = np.split(moving, np.searchsorted(along[moving], edges))
-    return [run.start + part for part in parts if part.size >= FEWEST_SAMPLES]
+    bins = np.split(moving, np.searchsorted(along[moving], edges))
+    return [run.start + samples for samples in bins if samples.size >= FEWEST_SAMPLES]
 
 
 def _fit_line(along: Array, values: Array) -> tuple[float, int, float]:
-    """Value of a line at the middle sample, the sample's place, and the variance of the value."""
+    """Fit a line to the samples of a bin.
+
+    Args:
+        along: Path length, shape (n,), [m].
+        values: Deviations, shape (n,), [m].
+
+    Returns:
+        Value of the line at the middle sample, [m], the index of this sample, and the variance of
+        the value by batch means, [m²].
+    """
     middle = int(np.abs(along - 0.5 * (along[0] + along[-1])).argmin())
     s = along - along.mean()
     slope = (s @ values) / (s @ s)
     residuals = values - values.mean() - slope * s
-    means = np.array([part.mean() for part in np.array_split(residuals, BATCHES)])
+    means = np.array([batch.mean() for batch in np.array_split(residuals, BATCHES)])
     variance = float(means @ means) / (BATCHES - 2) / BATCHES
     return float(values.mean() + slope * s[middle]), middle, variance
 
 
-def _omitted(values: Array, sizes: list[int], std: float) -> float:
-    """RMS error of the bins' values by the curvature of the readings, noise taken out, [m]."""
-    runs = np.split(values, np.cumsum(sizes)[:-1])
+def _averaging_error(values: Array, counts: list[int], std: float) -> float:
+    """RMS error of the bins' values by the curvature of the readings, corrected for noise, [m].
+
+    Args:
+        values: Values of the bins, shape (n_bins,), [m].
+        counts: Number of bins of each run.
+        std: Standard deviation of a value, [m].
+    """
+    runs = np.split(values, np.cumsum(counts)[:-1])
     bends = np.concatenate([np.diff(run, 2) for run in runs])
     noise = 6.0 * std**2  # of v₁ − 2 v₂ + v₃
     return math.sqrt(max(float(bends @ bends) / max(bends.size, 1) - noise, 0.0)) / 24.0
 
 
 def with_traces(session: Session, traces: Mapping[str, Trace]) -> Session:
-    """Session whose setups have the binned readings of traces in place of their own.
+    """Session in which binned traces replace the readings of their setups.
 
     The standard deviation of their gauges becomes that of a bin.
 
     Args:
         session: A plan or a session.
-        traces: Setup to its trace.
+        traces: Traces by setup.
 
     Raises:
         SessionError: If a setup does not exist, or the machine does not reach a point.
     """
     readings = [r for r in session.readings if r.setup not in traces and r.is_read]
-    postures = {p for r in readings for p in (r.posture, r.minus)}
-    used = {n: p for n, p in session.postures.items() if n in postures}
+    read_postures = {p for r in readings for p in (r.posture, r.minus)}
+    postures = {n: p for n, p in session.postures.items() if n in read_postures}
     stds: dict[str, list[float]] = {}
     for name, trace in traces.items():
         if name not in session.setups:
@@ -239,26 +267,25 @@ def with_traces(session: Session, traces: Mapping[str, Trace]) -> Session:
         except SessionError as e:
             raise SessionError(e.problem, where=f"trace of {name}") from None
         stds.setdefault(session.setups[name].gauge, []).append(binned.std)
-        added = _place_bins(session, name, binned)
-        for posture, approach, value in added:
-            used[posture.name] = posture
+        for posture, approach, value in _place_bins(session, name, binned):
+            postures[posture.name] = posture
             conditions = Conditions(approach)
             readings.append(Reading(name, posture.name, value=value, conditions=conditions))
     gauges = dict(session.gauges)
-    for name, of_gauge in stds.items():
-        sigma = float(np.sqrt(np.mean(np.square(of_gauge))))
+    for name, bin_stds in stds.items():
+        sigma = float(np.sqrt(np.mean(np.square(bin_stds))))
         gauges[name] = replace(gauges[name], sigma=sigma, resolution=None)
-    read = {r.setup for r in readings}
+    read_setups = {r.setup for r in readings}
     setups = {
         n: replace(s, aligned_at=None) if n in traces else s
         for n, s in session.setups.items()
-        if n in read
+        if n in read_setups
     }
     return replace(
         session,
         gauges=gauges,
         setups=setups,
-        postures=used,
+        postures=postures,
         readings=tuple(readings),
         sha256="",
         readings_path=None,
@@ -268,18 +295,18 @@ def with_traces(session: Session, traces: Mapping[str, Trace]) -> Session:
 def _place_bins(
     session: Session, setup: str, binned: BinnedTrace
 ) -> list[tuple[Posture, str, float]]:
-    """Posture, approach and reading of each bin."""
+    """Posture, approach and reading, [m], of each bin."""
     closure = nominal_closure(session.robot)
     names = [f"{setup}-{i + 1:03d}" for i in range(len(binned.values))]
     try:
         drives = closure.inverse(binned.points, names=names)
-        before = closure.inverse(binned.points - 0.5 * binned.motions, names=names)
+        starts = closure.inverse(binned.points - 0.5 * binned.motions, names=names)
     except ClosureError as e:
         raise SessionError(e.reason, where=f"trace of {setup}: {e.posture}") from None
     bins = []
-    for name, point, at, start, value in zip(
-        names, binned.points, drives, before, binned.values.tolist(), strict=True
+    for name, point, end, start, value in zip(
+        names, binned.points, drives, starts, binned.values.tolist(), strict=True
     ):
-        posture = Posture(name, "tcp", point, at - session.active_offsets)
-        bins.append((posture, name_approach(at - start), value))
+        posture = Posture(name, "tcp", point, end - session.active_offsets)
+        bins.append((posture, name_approach(end - start), value))
     return bins

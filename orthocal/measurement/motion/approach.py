@@ -1,7 +1,7 @@
 """Approach of a posture: the last motion of each drive before a reading.
 
-An approach is written as in readings.csv: a letter for each drive, p if its coordinate grows, n if
-it falls, u if it does not matter.
+An approach is written as in readings.csv, with a letter for each drive: p if its coordinate grows,
+n if it falls, u if the direction is not stated.
 """
 
 from __future__ import annotations
@@ -21,42 +21,45 @@ from orthocal.session.session import Conditions, Session
 from orthocal.units import DEG, LIMIT, MM
 
 APPROACH = 2e-3
-"""Length of the approach of a sliding drive, [m]."""
+"""Usual length of the approach of a prismatic drive, [m]."""
 
 APPROACH_TURN = 0.5 * DEG
-"""Angle of the approach of a turning drive, [rad]."""
+"""Usual angle of the approach of a revolute drive, [rad]."""
 
-SHORTEST = 0.2e-3
-"""Least length of the approach of a sliding drive: five times a usual backlash, [m]."""
+SHORTEST_APPROACH = 0.2e-3
+"""Least length of the approach of a prismatic drive: five times a usual backlash, [m]."""
 
 STEP = 0.1e-3
-"""Shortened approaches are multiples of this, [m]."""
+"""Increment of the length of shortened approaches, [m]."""
 
-TURNING = 1e-6
+LEAST_MOTION = 1e-6
 """Motion of a drive in an approach below which it has no direction, [m, rad]."""
 
-TAKEN_UP = 2.0
-"""Least length of an approach, in the limit of the backlash."""
+APPROACH_PER_BACKLASH = 2.0
+"""Least length of an approach, as a multiple of the limit of the backlash."""
 
 ARROWS = {1.0: "↑", -1.0: "↓", 0.0: "·"}
-"""Sign of the change of a joint's number to its arrow."""
+"""Arrows by the sign of the change of a joint's displayed number."""
 
 
 def usual_approaches(robot: Robot) -> tuple[str, ...]:
-    """Approaches of planned readings: all drives one way, or all the other; none if no matter."""
+    """Approaches of planned readings: all drives outwards, or all inwards.
+
+    Empty if no effect of the robot depends on the approach.
+    """
     if not any("approach" in e.conditions for e in robot_effects(robot)):
         return ()
     return tuple(letter * len(robot.drives) for letter in "pn")
 
 
 def approach_share(session: Session) -> float:
-    """Length of the approaches of a session, as a share of the usual one.
+    """Length of the approaches of a session, as a share of the usual length.
 
-    At most half the range of its gauges, so that the tip stays in contact; the backlash is taken
-    up all the same.
+    The length is at most half the range of the gauges, so that the tip stays in contact. It is
+    never too short to take up the backlash.
     """
     ranges = [g.range for g in session.gauges.values() if g.range is not None]
-    room = min((0.5 * (high - low) for low, high in ranges), default=APPROACH)
+    half_range = min((0.5 * (high - low) for low, high in ranges), default=APPROACH)
     backlash = max(
         (
             LIMIT * session.robot.parameters[error.name].prior_std
@@ -67,12 +70,16 @@ def approach_share(session: Session) -> float:
         ),
         default=0.0,
     )
-    length = max(math.floor(room / STEP + 1e-6) * STEP, SHORTEST, TAKEN_UP * backlash)
+    length = max(
+        math.floor(half_range / STEP + 1e-6) * STEP,
+        SHORTEST_APPROACH,
+        APPROACH_PER_BACKLASH * backlash,
+    )
     return min(length / APPROACH, 1.0)
 
 
 def approach_length(session: Session) -> str:
-    """Length of the approaches of a session with its unit."""
+    """Length of the approaches of a session, as text with its unit."""
     share = approach_share(session)
     if any(d.unit == "m" for d in session.robot.drives):
         return f"{share * APPROACH / MM:.3g} mm"
@@ -80,9 +87,9 @@ def approach_length(session: Session) -> str:
 
 
 def describe_approach(robot: Robot, approach: str) -> str:
-    """Change of each joint's number in an approach: ↑ where it grows, ↓ where it falls.
+    """Arrows of an approach: ↑ if the displayed number of a joint grows, ↓ if it falls.
 
-    One arrow where all are alike; · where the direction does not matter.
+    The arrow is · if the direction is not stated. If all arrows are equal, one is returned.
     """
     arrows = [
         ARROWS[DIRECTIONS[letter] * d.direction]
@@ -92,8 +99,14 @@ def describe_approach(robot: Robot, approach: str) -> str:
 
 
 def name_approach(motion: Array) -> str:
-    """Approach by the last motion of each drive, shape (n_drives,); u for one that hardly moves."""
-    return "".join("u" if abs(v) < TURNING else "p" if v > 0.0 else "n" for v in motion.tolist())
+    """Letters of the approach of a last motion; u for a drive that moves less than LEAST_MOTION.
+
+    Args:
+        motion: Motion of the drives, shape (n_drives,), [m, rad].
+    """
+    return "".join(
+        "u" if abs(v) < LEAST_MOTION else "p" if v > 0.0 else "n" for v in motion.tolist()
+    )
 
 
 def approach_steps(robot: Robot, approach: str, other: str = "p", *, share: float = 1.0) -> Array:
@@ -102,27 +115,33 @@ def approach_steps(robot: Robot, approach: str, other: str = "p", *, share: floa
     Args:
         robot: The robot.
         approach: A letter for each drive.
-        other: Letter in place of u.
-        share: Length as a share of the usual one.
+        other: Letter that replaces u.
+        share: Length as a share of the usual length.
     """
     lengths = share * np.array([APPROACH if d.unit == "m" else APPROACH_TURN for d in robot.drives])
     return lengths * [DIRECTIONS[letter] or DIRECTIONS[other] for letter in approach]
 
 
 def common_approach(robot: Robot, drives: Array) -> str | None:
-    """First usual approach that serves all postures; None without one."""
+    """First usual approach that is possible in all postures; None if there is none.
+
+    Args:
+        robot: The robot.
+        drives: Nominal drive coordinates of the postures, shape (n, n_drives), [m, rad].
+    """
     return next((a for a in usual_approaches(robot) if can_approach(robot, drives, a).all()), None)
 
 
 def fill_approach(robot: Robot, stated: str | None, other: str) -> str:
-    """Approach with a letter in place of each u, and of one that is not stated."""
+    """Approach in which a letter replaces every u; all letters are u if it is not stated."""
     return (stated or "u" * len(robot.drives)).replace("u", other)
 
 
 def state_common_approach(session: Session) -> Session:
-    """Session whose readings without a stated approach come from one side, as programs do it.
+    """Session whose readings without a stated approach are approached from one side.
 
-    A session as it is if no effect depends on the approach, or no side serves all postures.
+    Programs move in this way. The session is unchanged if no effect depends on the approach, or if
+    no side is possible in all postures.
     """
     drives = np.array([p.drives for p in session.postures.values()]) + session.active_offsets
     common = common_approach(session.robot, drives)
@@ -138,7 +157,7 @@ def state_common_approach(session: Session) -> Session:
 
 
 def can_approach(robot: Robot, drives: Array, approach: str) -> Mask:
-    """Mask of the postures whose approach begins within the travel, shape (n,).
+    """Mask of the postures whose approach starts within reach of the machine, shape (n,).
 
     Args:
         robot: The robot.
@@ -147,9 +166,9 @@ def can_approach(robot: Robot, drives: Array, approach: str) -> Mask:
     """
     start = drives - approach_steps(robot, approach)
     names = [""] * len(drives)
-    beyond = find_beyond_travel(robot, start, names)
+    beyond_travel = find_beyond_travel(robot, start, names)
     possible = np.ones(len(drives), dtype=np.bool_)
-    possible[list(beyond)] = False
+    possible[list(beyond_travel)] = False
     failures = Failures()
     inside = np.flatnonzero(possible)
     nominal_closure(robot).close(start[inside], names=[""] * inside.size, failures=failures)

@@ -1,12 +1,11 @@
 """Path of the machine through the postures of a session.
 
-A setup begins in its alignment posture, where the operator mounts and aligns the gauge. Every
-posture is approached as its reading states, by the last motion of each drive. Where nothing is
-stated, all postures are approached from one side, so that backlash acts alike in all readings: the
-drives pass the posture and come back to it. A sensor may prescribe the path of the tool between its
-readings, such as a ball bar, which stays on a sphere: approaches then follow from it. Each segment
-of the path is sampled to check that the drives reach it, that the tip stays on the rod and that the
-dial stays in its range.
+A setup starts in its alignment posture, where the operator mounts and aligns the gauge. Every
+posture is approached as its reading states, by the last motion of each drive. If no reading states
+an approach, all postures are approached from one side. Then backlash has the same effect on all
+readings. Approaches follow from the path if the sensor prescribes it between its readings: the
+tool ball of a ball bar stays on a sphere. Each segment of the path is sampled to check three
+conditions: the drives reach it, the tip stays on the rod, and the dial stays in its range.
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ from orthocal.arrays import Array
 from orthocal.errors import ClosureError, SessionError
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.workspace import position_at_zero, tool_at_zero
+from orthocal.measurement.files.readings_file import FIRST_LINE
 from orthocal.measurement.motion.approach import (
     APPROACH,
     approach_length,
@@ -55,15 +55,15 @@ class Guidance:
     """Joints, tool and contacts of the nominal machine in the postures of a session."""
 
     joints: dict[str, Array]
-    """Posture to the joint coordinates that the controller displays, [m, rad]."""
+    """Joint coordinates that the controller displays, shape (n_drives,), [m, rad], by posture."""
     passive: dict[str, Array]
-    """Posture to the passive coordinates, [m, rad]."""
+    """Passive coordinates, shape (n_passive,), [m, rad], by posture."""
     tool: dict[str, Array]
-    """Posture to the tool centre point, shape (3,), [m]; empty for a robot without a tool."""
+    """Tool centre points, shape (3,), [m], by posture; empty for a robot without a tool."""
     contacts: dict[str, tuple[list[str], Contact]]
-    """Setup to the postures in which it is aligned or read, and its contact there."""
+    """Postures in which a gauge is aligned or read, and its contact there, by setup."""
     aligned_at: dict[str, str]
-    """Setup to the posture in which its gauge is aligned."""
+    """Alignment postures by setup."""
 
     def touched(self, setup: str, posture: str) -> Array:
         """Contact point of a setup's gauge in a posture, shape (3,), [m]."""
@@ -94,14 +94,14 @@ def guide(session: Session) -> Guidance:
 
 
 def with_alignment(session: Session) -> Session:
-    """A session whose setups also read the postures in which their gauges are aligned."""
+    """Session with an additional reading of each setup in its alignment posture."""
     extra = [Reading(s, p, None, 1, 0.0, None) for s, p in session.alignment_postures.items()]
     return replace(session, readings=(*session.readings, *extra))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stop:
-    """A posture in which the machine stops, and the path that leads to it."""
+    """Posture in which the machine stops, and the path that leads to it."""
 
     posture: str
     role: Role
@@ -119,22 +119,22 @@ class Stop:
     approach_drives: Array
     """Drive coordinates at the start of the approach, shape (n_drives,), [m, rad]."""
     point: Array | None
-    """Tool coordinates that the drives control, shape (n_coordinates,), [m]; None where the
-    drives do not command the tool."""
+    """Commanded tool coordinates, shape (n_coordinates,), [m]; None if the drives do not command
+    the tool."""
     approach_point: Array | None
-    """Tool coordinates at the start of the approach, [m]."""
+    """Tool coordinates at the start of the approach, shape (n_coordinates,), [m]."""
     via: tuple[Array, ...] = ()
-    """Tool coordinates on the way to the start of the approach, [m]: the mechanical zero if the
-    direct way is out of reach, or the corners of a path that the sensor prescribes."""
+    """Tool coordinates on the path to the start of the approach, [m]: the mechanical zero if the
+    direct path is out of reach, or the corners of a path that the sensor prescribes."""
     lift: str = ""
-    """Reason to hold the plunger up on this path; empty where it may stay on the rod."""
+    """Reason to hold the plunger up on this path; empty if it may stay on the rod."""
     expected: float = 0.0
-    """Reading of a machine without errors, relative to the first reading, [m]."""
+    """Reading of the nominal machine, relative to the first reading, [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetupMotion:
-    """Path through all postures of a setup, and back to the first."""
+    """Path through all postures of a setup, and back to the first posture."""
 
     setup: str
     number: int
@@ -144,10 +144,10 @@ class SetupMotion:
     alignment: Stop | None
     """Stop in the alignment posture; None if that is the first posture of `stops`."""
     stops: tuple[Stop, ...]
-    """Postures to read, and the first of them again."""
+    """Stops in the postures to read, and in the first of them again."""
 
     def closing(self, stop: Stop, sensor: Sensor) -> str:
-        """Reading to expect when the first posture is read again; empty for other stops."""
+        """Instruction for a stop that repeats the first posture; empty for other stops."""
         if stop.repeats is None:
             return ""
         if isinstance(sensor, Points):
@@ -157,11 +157,14 @@ class SetupMotion:
 
 
 class _Path(NamedTuple):
-    """Sampled tool coordinates, (n, n_coordinates), with their drive and passive coordinates."""
+    """Samples of a path."""
 
     points: Array
+    """Tool coordinates, shape (n, n_coordinates), [m]."""
     drives: Array
+    """Drive coordinates, shape (n, n_drives), [m, rad]."""
     passive: Array
+    """Passive coordinates, shape (n, n_passive), [m, rad]."""
 
 
 def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
@@ -175,47 +178,47 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
             f"plans {len(session.readings)} readings; a sheet holds at most {MOST_STOPS}",
             where=str(session.path or "session"),
         )
-    rows: dict[str, list[tuple[int, Reading]]] = {}
+    rows_by_setup: dict[str, list[tuple[int, Reading]]] = {}
     for i, reading in enumerate(session.readings):
-        line = i + 2 if reading.line is None else reading.line
-        rows.setdefault(reading.setup, []).append((line, reading))
+        line = i + FIRST_LINE if reading.line is None else reading.line
+        rows_by_setup.setdefault(reading.setup, []).append((line, reading))
     aligned_at = session.alignment_postures
-    first = {setup: of_setup[0][1] for setup, of_setup in rows.items()}
+    first = {setup: rows[0][1] for setup, rows in rows_by_setup.items()}
     guided = _guided_setups(session)
-    apart = {
+    additional_alignments = {
         aligned_at[s]
         for s, r in first.items()
         if s not in guided and aligned_at[s] != (r.minus or r.posture)
     }
-    free_rows = [r for r in session.readings if r.setup not in guided]
-    stop_at = _find_approaches(session, free_rows, apart) if free_rows else {}
+    unguided = [r for r in session.readings if r.setup not in guided]
+    stop_at = _find_approaches(session, unguided, additional_alignments) if unguided else {}
     motions = []
-    for number, (setup, rows_of_setup) in enumerate(rows.items(), 1):
+    for number, (setup, rows) in enumerate(rows_by_setup.items(), 1):
         if setup in guided:
             on_path = _stops_on_path(session, setup)
-            of_setup = _list_stops(rows_of_setup, aligned_at[setup], on_path, any_side=True)
-            stops = _follow_path(session, setup, of_setup, guided[setup])
+            listed = _list_stops(rows, aligned_at[setup], on_path, any_side=True)
+            stops = _follow_path(session, setup, listed, guided[setup])
         else:
-            stops = _list_stops(rows_of_setup, aligned_at[setup], stop_at)
+            stops = _list_stops(rows, aligned_at[setup], stop_at)
             if _commands_tool(session.robot):
                 stops = _follow_stops(session, setup, stops)
         alignment = stops.pop(0) if stops[0].role == "alignment" else None
-        motions.append(SetupMotion(setup, number, len(rows), alignment, tuple(stops)))
+        motions.append(SetupMotion(setup, number, len(rows_by_setup), alignment, tuple(stops)))
     return tuple(motions)
 
 
 def state_path_approaches(session: Session) -> Session:
     """Session whose readings state the approaches that follow from the paths of their sensors.
 
-    Only approaches that an effect of the machine distinguishes are stated.
+    The session is unchanged if no effect of the machine depends on the approach.
 
     Raises:
-        SessionError: As `plan_motion`.
+        SessionError: If there are too many readings, or a posture cannot be reached or approached.
     """
     guided = _guided_setups(session)
     if not guided or not usual_approaches(session.robot):
         return session
-    of_line = {
+    approaches = {
         (m.setup, stop.line): stop.approach
         for m in plan_motion(session)
         if m.setup in guided
@@ -223,8 +226,8 @@ def state_path_approaches(session: Session) -> Session:
         if stop.role == "reading"
     }
     readings = tuple(
-        replace(r, conditions=replace(r.conditions or Conditions(), approach=of_line[key]))
-        if (key := (r.setup, i + 2 if r.line is None else r.line)) in of_line
+        replace(r, conditions=replace(r.conditions or Conditions(), approach=approaches[key]))
+        if (key := (r.setup, i + FIRST_LINE if r.line is None else r.line)) in approaches
         else r
         for i, r in enumerate(session.readings)
     )
@@ -232,7 +235,7 @@ def state_path_approaches(session: Session) -> Session:
 
 
 def dial_zero(gauge: Gauge) -> str:
-    """Reading in the middle of a gauge's range, to which its dial is set, in mm."""
+    """Text of the reading in the middle of a gauge's range, to which its dial is set, in mm."""
     low, high = gauge.range or (0.0, 0.0)
     return f"{0.5 * (low + high) / MM + 0.0:g}"
 
@@ -252,13 +255,19 @@ def set_dial(session: Session, setup: str) -> str:
 
 
 def shown_joints(robot: Robot, drives: ArrayLike) -> Array:
-    """Joint coordinates that the controller displays at drive coordinates, (..., n_drives)."""
+    """Joint coordinates that the controller displays, shape (..., n_drives), [m, rad].
+
+    Args:
+        robot: The robot.
+        drives: Drive coordinates, shape (..., n_drives), [m, rad].
+    """
     values = np.asarray(drives, dtype=np.float64)
     columns = [d.to_joint(values[..., i]) for i, d in enumerate(robot.drives)]
     return np.stack(columns, axis=-1)
 
 
 def _commands_tool(robot: Robot) -> bool:
+    """True if the drives command as many tool coordinates as there are drives."""
     return robot.tcp is not None and len(robot.tcp.coordinates) == len(robot.drives)
 
 
@@ -266,11 +275,11 @@ Path = Callable[[Array, Array], Array]
 """Corners of the path of the tool between two coordinates, shape (n, n_coordinates), [m]."""
 
 Approaches = dict[tuple[str, str | None], Stop]
-"""Posture and its stated approach, or None where none is stated, to the stop that reads it."""
+"""Stops by posture and stated approach, which is None if not stated."""
 
 
 def _guided_setups(session: Session) -> dict[str, Path]:
-    """Setups whose sensor prescribes the path of the tool between its readings."""
+    """Prescribed paths of the tool between readings, by setup, for sensors that have one."""
     if not _commands_tool(session.robot):
         return {}
     paths = {name: tool_path(s.sensor) for name, s in session.setups.items()}
@@ -304,27 +313,28 @@ def _stops_on_path(session: Session, setup: str) -> Approaches:
     tool = nominal_closure(robot).forward(nominal, names=names)
     points = tool[:, list(require_tcp(robot).coordinates)]
     unknown = "u" * len(robot.drives)
-    of_setup = [r for r in session.readings if r.setup == setup]
-    read = {(r.posture, r.approach) for r in of_setup}
-    read |= {(r.minus, None) for r in of_setup if r.minus is not None}
-    read |= {(session.alignment_postures[setup], None)}
-    at = {name: i for i, name in enumerate(names)}
-    return {
-        (name, approach): Stop(
+    readings = [r for r in session.readings if r.setup == setup]
+    places = {(r.posture, r.approach) for r in readings}
+    places |= {(r.minus, None) for r in readings if r.minus is not None}
+    places |= {(session.alignment_postures[setup], None)}
+    index = {name: i for i, name in enumerate(names)}
+    stops = {}
+    for name, approach in places:
+        drives, point = nominal[index[name]], points[index[name]]
+        stops[name, approach] = Stop(
             *(name, "reading", None, None, 1, approach or unknown),
-            *(nominal[at[name]], nominal[at[name]], points[at[name]], points[at[name]]),
+            *(drives, drives, point, point),
         )
-        for name, approach in read
-    }
+    return stops
 
 
 def _find_approaches(
     session: Session, readings: Sequence[Reading], alignment: set[str]
 ) -> Approaches:
-    """Stops to read, or to align a gauge, each at the end of its approach.
+    """Stops to read or to align a gauge, each at the end of its approach.
 
-    Postures without a stated approach are all approached from one side; so are drives whose
-    direction is stated as unknown.
+    Postures without a stated approach are all approached from one side. The same side applies to
+    drives with the letter u.
 
     Args:
         session: The session.
@@ -332,7 +342,8 @@ def _find_approaches(
         alignment: Names of the alignment postures.
 
     Raises:
-        SessionError: If no side serves all these postures, or one cannot be approached as stated.
+        SessionError: If neither side is possible in all these postures, or a posture cannot be
+            approached as stated.
     """
     wanted: set[tuple[str, str | None]] = {(name, None) for name in alignment}
     wanted |= {(r.posture, r.approach) for r in readings}
@@ -363,12 +374,16 @@ def _find_approaches(
 def _begin_approaches(
     session: Session, places: Sequence[tuple[str, str | None]], letter: str
 ) -> tuple[Approaches, dict[tuple[str, str | None], ClosureError]]:
-    """Stops of postures with their approaches, and those whose approach is out of reach.
+    """Stops of postures with their approaches.
 
     Args:
         session: The session.
         places: Postures and stated approaches.
-        letter: Direction of drives for which none is stated.
+        letter: Direction of drives without a stated one.
+
+    Returns:
+        Stops by place, and no errors; or no stops, and errors by place whose approach is out of
+        reach.
     """
     robot, names = session.robot, [name for name, _ in places]
     closure, unknown = nominal_closure(robot), "u" * len(robot.drives)
@@ -407,7 +422,7 @@ def _list_stops(
         rows: Lines and readings of the setup.
         aligned_at: Alignment posture.
         stop_at: Stops by posture and stated approach.
-        any_side: Whether the first posture is reached again from whichever side the path has.
+        any_side: Whether the first posture may be reached again from any side.
     """
     first_line, row = rows[0]
     first = row.minus or row.posture
@@ -433,7 +448,13 @@ def _list_stops(
 
 
 def _follow_stops(session: Session, setup: str, stops: Sequence[Stop]) -> list[Stop]:
-    """Stops with the paths between them and the predicted readings."""
+    """Stops with the paths between them and the predicted readings.
+
+    A path leads through the mechanical zero if the direct path is out of reach.
+
+    Raises:
+        SessionError: If neither path is within reach.
+    """
     robot = session.robot
     zero = tool_at_zero(robot)
     checked, paths, position = [], [], zero
@@ -458,8 +479,8 @@ def _follow_stops(session: Session, setup: str, stops: Sequence[Stop]) -> list[S
 def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path) -> list[Stop]:
     """Stops on the path that a sensor prescribes, with their approaches and predicted readings.
 
-    A reading whose stated approach has the opposite direction is passed first, and approached on
-    the way back.
+    If the stated approach of a reading has the opposite direction, the tool passes the posture and
+    approaches it on the way back.
 
     Raises:
         SessionError: If the path leaves the workspace, or no direction has the stated approach.
@@ -473,7 +494,7 @@ def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path
     for stop in stops:
         point = np.asarray(stop.point)
         corners = np.vstack([begin, point]) if not checked else path(position, point)
-        if checked and np.allclose(position, point):  # out and back again
+        if checked and np.allclose(position, point):  # away from the posture and back
             corners = np.vstack([point, begin, point])
         arrival = _arrive(session, setup, stop, corners, length)
         checked.append(arrival)
@@ -490,7 +511,7 @@ def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path
 
 
 def _arrive(session: Session, setup: str, stop: Stop, corners: Array, length: float) -> Stop:
-    """Stop that is approached along a path, forwards, or backwards after passing it.
+    """Stop that is approached along a path: forwards, or backwards after passing the posture.
 
     Args:
         session: The session.
@@ -528,7 +549,12 @@ def _arrive(session: Session, setup: str, stop: Stop, corners: Array, length: fl
 
 
 def _walk(corners: Array, length: float) -> Array:
-    """Point of a polyline at a distance from its start, or its end if it is shorter."""
+    """Point of a polyline at a distance from its start; its end if the polyline is shorter.
+
+    Args:
+        corners: Shape (n, n_coordinates), [m].
+        length: Distance along the polyline, [m].
+    """
     for start, end in pairwise(corners):
         step = float(np.linalg.norm(end - start))
         if step >= length:
@@ -539,27 +565,27 @@ def _walk(corners: Array, length: float) -> Array:
 
 def _sample_path(robot: Robot, corners: Sequence[Array]) -> _Path | None:
     """Samples of a polyline of tool coordinates; None if the machine does not reach all of it."""
-    points = [corners[0][None]]
+    segments = [corners[0][None]]
     for start, end in pairwise(corners):
         count = max(2, int(np.ceil(np.linalg.norm(end - start) / STEP)))
-        points.append(start + np.arange(1, count + 1)[:, None] / count * (end - start))
-    sampled = np.concatenate(points)
+        segments.append(start + np.arange(1, count + 1)[:, None] / count * (end - start))
+    points = np.concatenate(segments)
     try:
-        drives, passive = nominal_closure(robot).reach(sampled)
+        drives, passive = nominal_closure(robot).reach(points)
     except ClosureError:
         return None
-    if find_beyond_travel(robot, drives, [""] * len(sampled)):
+    if find_beyond_travel(robot, drives, [""] * len(points)):
         return None
-    return _Path(sampled, drives, passive)
+    return _Path(points, drives, passive)
 
 
 def _predict(
     session: Session, setup: str, stops: Sequence[Stop], paths: Sequence[_Path]
 ) -> list[Stop]:
-    """Stops with predicted readings, and with the reason to lift the plunger where there is one."""
-    points, drives, passive = (np.concatenate(part) for part in zip(*paths, strict=True))
+    """Stops with predicted readings, and with reasons to lift the plunger on their paths."""
+    points, drives, passive = (np.concatenate(arrays) for arrays in zip(*paths, strict=True))
     aligned = session.postures[session.alignment_postures[setup]]
-    names = [f"{aligned.name} {i}" for i in range(len(points))]  # none is the posture's own
+    names = [f"{aligned.name} {i}" for i in range(len(points))]  # all differ from aligned.name
     at_alignment = nominal_closure(session.robot).close(aligned.drives + session.active_offsets)
     sampled = replace(
         session,
@@ -582,7 +608,7 @@ def _predict(
     first = next(i for i, stop in enumerate(stops) if stop.role != "alignment")
     relative = predicted - predicted[ends[first] - 1]
     limits = session.gauges[session.setups[setup].gauge].range
-    room = np.inf if limits is None else 0.5 * (limits[1] - limits[0])
+    half_range = np.inf if limits is None else 0.5 * (limits[1] - limits[0])
     finished = []
     for i, (stop, end) in enumerate(zip(stops, ends, strict=True)):
         lift = ""
@@ -592,7 +618,7 @@ def _predict(
             problems = [p for p in contact.problems[start:end] if p]
             if problems or not np.isfinite(on_path).all():
                 lift = "the tip would leave the rod" if not problems else problems[0]
-            elif np.abs(on_path).max() > room:
+            elif np.abs(on_path).max() > half_range:
                 largest = f"{on_path[np.abs(on_path).argmax()] / MM:+.1f}".replace("-", "−")
                 lift = f"the dial would go {largest} mm"
         finished.append(replace(stop, lift=lift, expected=float(relative[end - 1])))

@@ -1,10 +1,10 @@
 """G-code programs that move the machine through a setup and pause (M0) where the operator acts.
 
 A program starts at the mechanical zero, without a gauge. The first pause is in the alignment
-posture, where the gauge is mounted and aligned. Then there is one for each reading. For a logger,
-a program dwells and triggers it instead. It still pauses where the operator sets the dial or holds
-the plunger up. The fixed ball of a ball bar may stand on the way to the first posture: its program
-also pauses before its first motion, and starts in the first posture if the ball stays.
+posture, where the operator mounts and aligns the gauge. A pause for each reading follows. With a
+logger, a program dwells and triggers it instead. It still pauses where the operator sets the dial
+or holds the plunger up. The fixed ball of a ball bar may be in the way of the first motion. So its
+program also pauses before this motion, and starts in the first posture if the ball stays mounted.
 
 Every motion is in machine coordinates (G53), so that work offsets (G54 to G59.3), G92 and a
 coordinate rotation have no effect. Coordinates are those of nominal kinematics; comments list the
@@ -21,6 +21,7 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.errors import ParameterError
 from orthocal.kinematics.workspace import tool_at_zero
+from orthocal.measurement.motion.approach import describe_approach
 from orthocal.measurement.motion.motion import SetupMotion, Stop, dial_zero, shown_joints
 from orthocal.robot.model import Robot
 from orthocal.sensors.ball_bar import BallBar
@@ -38,23 +39,23 @@ DECIMALS = 4
 LONGEST_NAME = 40
 """Largest length of a name in a comment: controllers read lines of 80 to 256 characters."""
 
-FASTEST = 20_000.0
+LARGEST_FEED = 20_000.0
 """Largest feed, [mm/min]."""
 
 LONGEST_DWELL = 600.0
 """Longest dwell at a reading, [s]."""
 
-SETTLE = 1.0
-"""Dwell before a trigger, unless another one is stated, [s]."""
+SETTLING_TIME = 1.0
+"""Dwell before a trigger if none is stated, [s]."""
 
-PULSE = 0.1
-"""Length of a pulse of a digital output, [s]."""
+PULSE_TIME = 0.1
+"""Duration of a pulse of a digital output, [s]."""
 
 TRIGGER = re.compile(r"(?P<output>[0-9]|[1-5][0-9]|6[0-3])|M1[0-9][0-9]")
 """Digital output of LinuxCNC, or an M-code of the user."""
 
 LARGEST_SHIFT = 1e5
-"""Largest coordinate of the machine's origin, [mm]."""
+"""Largest machine coordinate of the world's origin, [mm]."""
 
 PREAMBLE = (
     "(Every motion is in machine coordinates: G53 G1 in G90)",
@@ -63,6 +64,11 @@ PREAMBLE = (
     "(Cancel scaling and mirroring first. Run once without gauge at low feed override)",
     "G21 G90 G94 G40 G49",
 )
+
+SIGNS = str.maketrans("↑↓·", "+-0")
+"""Arrows of an approach in ASCII."""
+
+SIGNS_NOTE = "(Approach: + the number of the joint grows at the end, - it falls, 0 either)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,16 +86,16 @@ class ProgramOptions:
     shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Machine coordinates (G53) of the world's origin, [mm]."""
     dwell: float | None = None
-    """Time at each reading in place of a pause, [s]; None for a pause."""
+    """Dwell at each reading instead of a pause, [s]; None for a pause."""
     trigger: str | None = None
-    """Trigger of a logger at the end of that time: an M-code from M100 to M199, or the number of a
-    digital output that gives a pulse."""
+    """Trigger of a logger at the end of the dwell: an M-code from M100 to M199, or the number of a
+    digital output for a pulse."""
 
     def __post_init__(self) -> None:
         for name, feed in (("--feed", self.feed), ("--approach-feed", self.approach_feed)):
-            if not 1.0 <= feed <= FASTEST:
+            if not 1.0 <= feed <= LARGEST_FEED:
                 raise ParameterError(
-                    f"found {feed:g}; expected 1 to {FASTEST:g} mm/min", where=name
+                    f"found {feed:g}; expected 1 to {LARGEST_FEED:g} mm/min", where=name
                 )
         if not all(abs(v) <= LARGEST_SHIFT for v in self.shift_mm):
             raise ParameterError(
@@ -108,18 +114,18 @@ class ProgramOptions:
 
     @property
     def automatic(self) -> bool:
-        """True if readings need no operator."""
+        """True if the program dwells or triggers a logger instead of a pause."""
         return self.dwell is not None or self.trigger is not None
 
     @property
     def reading_lines(self) -> list[str]:
-        """Lines at a reading without an operator."""
-        lines = [f"G4 P{SETTLE if self.dwell is None else self.dwell:g}"]
+        """Lines of G-code at a reading without an operator."""
+        lines = [f"G4 P{SETTLING_TIME if self.dwell is None else self.dwell:g}"]
         if self.trigger is None:
             return lines
         if TRIGGER.fullmatch(self.trigger)["output"] is None:  # type: ignore[index] # checked above
             return [*lines, self.trigger]
-        return [*lines, f"M64 P{self.trigger}", f"G4 P{PULSE:g}", f"M65 P{self.trigger}"]
+        return [*lines, f"M64 P{self.trigger}", f"G4 P{PULSE_TIME:g}", f"M65 P{self.trigger}"]
 
 
 def program_name(motion: SetupMotion) -> str:
@@ -133,8 +139,13 @@ def write_program(
 ) -> str:
     """Program of a setup.
 
+    Args:
+        session: The session.
+        motion: Path through the setup.
+        options: Options of the program.
+
     Raises:
-        ParameterError: If the drives command no tool.
+        ParameterError: If the drives do not command the tool.
     """
     options = options or ProgramOptions()
     robot = session.robot
@@ -147,12 +158,14 @@ def write_program(
     of_setup = session.setups[motion.setup]
     sensor, gauge = of_setup.sensor, session.gauges[of_setup.gauge]
     stops = motion.stops if motion.alignment is None else (motion.alignment, *motion.stops)
+    stated = any(r.approach for r in session.readings)
     lines = [
         f"(orthocal: {name}, setup {setup}, {motion.number} of {motion.count})",
         f"({comment_safe(sensor.describe(), 120)})",
         f"(Machine coordinates, mm; tool at the mechanical zero: "
         f"{_words(robot, tool_at_zero(robot), options)})",
         *_before_start(robot, sensor, stops[0], options),
+        *([SIGNS_NOTE] if stated else []),
         *PREAMBLE[:-1],
         *(["(Dwells at each reading: G4 P in seconds)"] if options.automatic else []),
         PREAMBLE[-1],
@@ -160,7 +173,6 @@ def write_program(
         *_before_motion(robot, sensor, stops[0], options),
     ]
     mount = _mount(sensor)
-    stated = any(r.approach for r in session.readings)
     for i, stop in enumerate(stops):
         zero = "0" if stop.role == "subtracted" else ""
         if stop is motion.stops[0] and stop.role == "reading" and of_setup.zero == "free":
@@ -171,10 +183,9 @@ def write_program(
             "read" if stop.role == "reading" else "",
         )
         instruction = ", then ".join(action for action in actions if action)
-        instruction = "; ".join(
-            text for text in (instruction, motion.closing(stop, sensor)) if text
-        )
-        side = f"; approach {stop.approach}" if stated else ""
+        instruction = "; ".join(filter(None, (instruction, motion.closing(stop, sensor))))
+        signs = describe_approach(robot, stop.approach).translate(SIGNS)
+        side = f"; approach {signs}" if stated else ""
         lines.append(f"({_label(stop)}{side}; joints {_joints(robot, stop)})")
         lines += _moves(robot, stop, options)
         lines.append(f"(MSG, {_label(stop)}: {instruction})")
@@ -187,7 +198,7 @@ def write_program(
 def _before_start(
     robot: Robot, sensor: Sensor, first: Stop, options: ProgramOptions
 ) -> tuple[str, ...]:
-    """Place of the machine before the program: comments of its header."""
+    """Comments of the header about the position of the machine before the start."""
     if not isinstance(sensor, BallBar):
         return ("(Before start: gauge removed, machine at its mechanical zero)",)
     return (
@@ -200,12 +211,13 @@ def _before_start(
 def _before_motion(
     robot: Robot, sensor: Sensor, first: Stop, options: ProgramOptions
 ) -> tuple[str, ...]:
-    """Pause before the first motion where a fixed ball may be in its way."""
+    """Pause before the first motion of a ball bar, whose fixed ball may be in the way."""
     if not isinstance(sensor, BallBar):
         return ()
-    at = _words(robot, first.point, options)
+    start = _words(robot, first.point, options)
     return (
-        f"(MSG, before the first motion: remove fixed ball and post, or jog around them to {at})",
+        "(MSG, before the first motion: remove fixed ball and post, or jog around them to "
+        f"{start})",
         "M0",
     )
 
@@ -216,8 +228,8 @@ def _mount(sensor: Sensor) -> str:
         return "place the fixed ball unless it is in place, then mount the bar as the sheet shows"
     if mounting_steps(sensor) is not None:
         return "mount the gauge as the sheet shows"
-    centre = isinstance(sensor, BallIndicator)
-    return f"mount the gauge, {'centre its ball on the rod' if centre else 'align it'}"
+    align = "align its ball as the sheet shows" if isinstance(sensor, BallIndicator) else "align it"
+    return f"mount the gauge, {align}"
 
 
 def _end(sensor: Sensor) -> str:
@@ -236,8 +248,8 @@ def _read(
     """Pause for the operator, or dwell and trigger of a logger.
 
     Args:
-        stop: The posture.
-        following: The next one.
+        stop: Stop in the posture to read.
+        following: The next stop; None after the last one.
         options: Options of the program.
         needs_hand: Whether the operator has to act before the reading.
     """
@@ -260,7 +272,7 @@ def _moves(robot: Robot, stop: Stop, options: ProgramOptions) -> list[str]:
 
 
 def _words(robot: Robot, point: Array | None, options: ProgramOptions) -> str:
-    """Coordinates of a point in machine coordinates."""
+    """G-code words of a point in machine coordinates, [mm]."""
     coordinates = () if robot.tcp is None else robot.tcp.coordinates
     return " ".join(
         f"{LETTERS[c]}{format_fixed(v + options.shift_mm[c], DECIMALS)}"

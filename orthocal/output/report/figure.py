@@ -1,7 +1,7 @@
 """Figures of all reports as inline `<svg>`, in one style.
 
-Text stays text and is never parsed, because names come from files. Markers make every plot readable
-in black and white. Every figure has its own ids, so that a page can hold several.
+Text is not converted to curves and never parsed, because names come from files. Markers make every
+plot readable in black and white. Ids are unique, so that a page can contain several figures.
 """
 
 from __future__ import annotations
@@ -32,13 +32,14 @@ WIDTH = 7.2
 ROW_HEIGHT = 0.17
 """Height of a row of a list, [inch]."""
 
-HEAD = 0.48
+HEAD_HEIGHT = 0.48
 """Height of title and legend together, [inch]."""
 
 PADDING = 0.1
 """Distance of text from the border, [inch]; browsers draw text wider than matplotlib expects."""
 
-BEFORE, AFTER, UNSEEN, BAND = "#E69F00", "#0072B2", "#009E73", "#DDDDDD"
+BEFORE, AFTER, PREDICTED, BAND = "#E69F00", "#0072B2", "#009E73", "#DDDDDD"
+"""Colours of deviations before, deviations after, predictions, and bands."""
 
 _STYLE: dict[Any, Any] = {
     "font.family": "sans-serif",
@@ -79,13 +80,13 @@ BEFORE_LOOK: Look = {
     "linestyle": "none",
 }
 AFTER_LOOK: Look = {"marker": "s", "color": AFTER, "markersize": 4.5, "linestyle": "none"}
-UNSEEN_LOOK: Look = {"marker": "^", "color": UNSEEN, "markersize": 6.0, "linestyle": "none"}
+PREDICTED_LOOK: Look = {"marker": "^", "color": PREDICTED, "markersize": 6.0, "linestyle": "none"}
 BOUND_LOOK: Look = {"marker": "X", "color": "black", "markersize": 7.0, "linestyle": "none"}
 
 
 @contextmanager
 def house_style() -> Iterator[None]:
-    """The style of all figures, whatever the user has configured in matplotlib."""
+    """Style of all figures, independent of the user's configuration of matplotlib."""
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_STYLE)
@@ -94,13 +95,15 @@ def house_style() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Plot(Generic[P]):
-    """A plot: called, it gives an inline `<svg>`, or "" if it has nothing to show."""
+    """Plot that returns an inline `<svg>` if it is called, or "" without content."""
 
     name: str
+    """Prefix of the ids."""
     draw: Callable[P, Figure | None]
+    """Function that draws the figure."""
 
     def figure(self, *args: P.args, **kwargs: P.kwargs) -> Figure | None:
-        """The figure in the style of all figures; None if it has nothing to show."""
+        """Figure in the style of all figures; None without content."""
         with house_style():
             return self.draw(*args, **kwargs)
 
@@ -108,7 +111,7 @@ class Plot(Generic[P]):
         """Draw the plot as an inline `<svg>` that scales with its page."""
         stream = io.BytesIO()
         with house_style(), warnings.catch_warnings():
-            # the text is drawn with the fonts of the reader
+            # browsers draw the text with the reader's fonts
             warnings.filterwarnings("ignore", message="Glyph .* missing from")
             figure = self.draw(*args, **kwargs)
             if figure is None:
@@ -117,17 +120,17 @@ class Plot(Generic[P]):
             if layout is not None:  # otherwise savefig would draw twice
                 layout.execute(figure)
                 figure.set_layout_engine(None)
-            nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
-            figure.savefig(stream, format="svg", metadata=nothing)
+            no_metadata = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+            figure.savefig(stream, format="svg", metadata=no_metadata)
         return _make_inline(stream.getvalue(), figure, self.name)
 
     def document(self, *args: P.args, **kwargs: P.kwargs) -> str:
-        """The plot as an SVG file."""
+        """Text of an SVG file with the plot."""
         return f'<?xml version="1.0" encoding="utf-8"?>\n{self(*args, **kwargs)}\n'
 
 
 def _make_inline(svg: bytes, figure: Figure, name: str) -> str:
-    """An SVG file of a figure as an element of a page, with ids of its own."""
+    """Element of a page, with unique ids, from an SVG file of a figure."""
     label = str(figure.get_label())
     root = etree.fromstring(svg, etree.XMLParser(resolve_entities=False, huge_tree=True))
     _name_ids(root, f"{name}-{hashlib.sha256(svg).hexdigest()[:8]}-")
@@ -146,28 +149,28 @@ def _make_inline(svg: bytes, figure: Figure, name: str) -> str:
 
 
 def plot(name: str) -> Callable[[Callable[P, Figure | None]], Plot[P]]:
-    """Decorator that makes a plot of a function that draws a figure.
+    """Decorator that turns a function that draws a figure into a plot.
 
     Args:
-        name: Name with which the ids of the plot begin.
+        name: Prefix of the ids of the plot.
     """
     return lambda draw: Plot(name, draw)
 
 
 def open_figure(height: float, title: str, *, legend: bool = True) -> Figure:
-    """An empty figure with its title, which also describes it to those who do not see it.
+    """Empty figure with a title, which is also the description for screen readers.
 
     Args:
         height: Height of the plot without title and legend, [inch].
         title: The title.
-        legend: Whether to leave room for a legend below the title.
+        legend: Whether there is space for a legend below the title.
     """
-    head = HEAD if legend else 0.7 * HEAD
+    head = HEAD_HEIGHT if legend else 0.7 * HEAD_HEIGHT
     height += head
-    below = (0.0, 0.0, 1.0, 1.0 - head / height)
+    plot_area = (0.0, 0.0, 1.0, 1.0 - head / height)
     figure = Figure(
         figsize=(WIDTH, height),
-        layout=ConstrainedLayoutEngine(rect=below, w_pad=PADDING, h_pad=PADDING),
+        layout=ConstrainedLayoutEngine(rect=plot_area, w_pad=PADDING, h_pad=PADDING),
     )
     bold = {"fontsize": 10.0, "fontweight": "bold", "verticalalignment": "top"}
     figure.text(0.01, 1.0 - 0.06 / height, title, bold)
@@ -178,7 +181,14 @@ def open_figure(height: float, title: str, *, legend: bool = True) -> Figure:
 def open_list(
     title: str, names: Sequence[str], *, height: float = ROW_HEIGHT, share: bool = False
 ) -> tuple[Figure, Axes]:
-    """A figure with a row for each name; `share` adds a narrow panel at the right."""
+    """Empty figure with a row for each name.
+
+    Args:
+        title: The title.
+        names: Names of the rows.
+        height: Height of a row, [inch].
+        share: Whether there is a narrow second panel at the right.
+    """
     figure = open_figure(0.6 + height * max(len(names), 2), title)
     if share:
         axes, _ = figure.subplots(1, 2, sharey=True, width_ratios=[4.0, 1.0])
@@ -193,7 +203,15 @@ def open_list(
 
 
 def shade(axes: Axes, y: NDArray[np.int64], low: Array, high: Array, label: str) -> None:
-    """Draw a band behind rows of a list."""
+    """Draw a band behind rows of a list.
+
+    Args:
+        axes: The axes.
+        y: Indices of the rows, shape (n,).
+        low: Lower ends of the band, shape (n,).
+        high: Upper ends of the band, shape (n,).
+        label: Text of the legend.
+    """
     look: Look = {"color": BAND, "edgecolor": BAND, "linewidth": 0.5}
     axes.barh(y, high - low, 1.0, low, zorder=0.5, label=label, **look)
 
@@ -201,34 +219,34 @@ def shade(axes: Axes, y: NDArray[np.int64], low: Array, high: Array, label: str)
 def draw_legend(figure: Figure, axes: Axes) -> None:
     """Draw the legend in a line below the title."""
     handles, labels = axes.get_legend_handles_labels()
-    place = (0.01, 1.0 - 0.27 / figure.get_figheight())
-    figure.legend(handles, labels, bbox_to_anchor=place, ncols=len(handles))
+    position = (0.01, 1.0 - 0.27 / figure.get_figheight())
+    figure.legend(handles, labels, bbox_to_anchor=position, ncols=len(handles))
 
 
 def scale_log(axes: Axes, side: Literal["x", "y"], values: Array) -> None:
     """Make an axis logarithmic, with ticks at 1, 2 and 5 or at decades around positive values."""
     low, high = (math.log10(float(v)) for v in (values.min(), values.max()))
-    room = 0.02 + 0.03 * (high - low)
-    decades = range(math.floor(low - room) - 1, math.ceil(high + room) + 2)
+    margin = 0.02 + 0.03 * (high - low)
+    decades = range(math.floor(low - margin) - 1, math.ceil(high + margin) + 2)
     steps = (1.0, 2.0, 5.0) if high - low < 2.0 else (1.0,)
     ticks = np.array([s * 10.0**d for d in decades for s in steps])
-    first = int(np.flatnonzero(ticks <= 10.0 ** (low - room))[-1])
-    last = int(np.flatnonzero(ticks >= 10.0 ** (high + room))[0])
+    first = int(np.flatnonzero(ticks <= 10.0 ** (low - margin))[-1])
+    last = int(np.flatnonzero(ticks >= 10.0 ** (high + margin))[0])
     axes.set(**{f"{side}scale": "log", f"{side}lim": (ticks[first], ticks[last])})
     axis = axes.xaxis if side == "x" else axes.yaxis
-    every = math.ceil((last + 1 - first) / 9)
-    axis.set_major_locator(FixedLocator(ticks[first : last + 1 : every].tolist()))
+    stride = math.ceil((last + 1 - first) / 9)
+    axis.set_major_locator(FixedLocator(ticks[first : last + 1 : stride].tolist()))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
 
 
 def count_of(shown: int, count: int) -> str:
-    """Number of shown items, and of all items if some are not shown."""
+    """Number of shown items, and number of all items if some are not shown."""
     return str(count) if shown == count else f"{shown} of {count}"
 
 
 def _name_ids(root: etree._Element, prefix: str) -> None:
-    """Put a prefix before all ids and all references to them."""
+    """Add a prefix to all ids and to all references to them."""
     for element in root.iter():
         for key, value in element.attrib.items():
             if key == "id":

@@ -1,4 +1,4 @@
-"""Report of a calibration: a page with the values to enter, their accuracy, and the reasons.
+"""Report of a calibration: a page with the values to enter, their accuracy, and the evidence.
 
 The page is self-contained and needs no network.
 """
@@ -54,27 +54,27 @@ from orthocal.output.text.tables import (
 from orthocal.units import MM, show_limit
 from orthocal.viewer.scene import frame_of
 
-FEW_ROWS = 40
-"""Largest number of readings for which their list is open."""
+MAX_OPEN_ROWS = 40
+"""Largest number of readings whose list is initially open."""
 
-ALL_ROWS = 300
+MAX_LISTED_ROWS = 300
 """Largest number of readings that are all listed."""
 
-MOST_NAMED = 9
+MAX_NAMED = 9
 """Largest number of parameters that the provenance lists."""
 
 GLOSSARY = (
-    "σ: standard deviation of one reading. It comes from repeated cycles, else from the residuals, "
-    "else from the gauge as stated.",
+    "σ: standard deviation of one reading, from repeated cycles if possible, otherwise from the "
+    "residuals, otherwise as stated for the gauge.",
     "tolerance: limit of an error before the calibration; 19 of 20 errors are within it. From the "
     "robot's YAML or --tolerance.",
     "resolved: how much the readings improved a value: 0 % not at all, 100 % completely.",
-    "before: measured less nominal with the active offsets. after: measured less calibrated. Both "
-    "use the best gauge zeros.",
+    "before: measured minus nominal reading with the active offsets. after: measured minus "
+    "calibrated reading. Both use fitted gauge zeros.",
     "predicted: readings of a setup, predicted from all other setups.",
     "studentised: deviation of a reading from its prediction by all other readings, divided by its "
-    "standard deviation. influence: largest change of a parameter without this reading, in the "
-    "standard deviation of the parameter.",
+    "standard deviation. influence: largest change of a parameter without this reading, in its "
+    "standard deviations.",
     "workpiece aligned on the machine: tool error after the best alignment, which removes one "
     "translation and one rotation of the workspace.",
     "uncertainty before calibration: RMS uncertainty of the tool position with every error within "
@@ -84,7 +84,7 @@ GLOSSARY = (
     "within its tolerance changes the readings by more than their noise. Condition number and "
     "observability indices O1 to O5 are measures of identifiability.",
 )
-"""Terms of the report."""
+"""Explanations of the report's terms."""
 
 
 def build_report(calibration: Calibration, *, saved: Path | None = None) -> str:
@@ -92,7 +92,7 @@ def build_report(calibration: Calibration, *, saved: Path | None = None) -> str:
 
     Args:
         calibration: The calibration.
-        saved: Directory of the calibration; by default the one that it was loaded from.
+        saved: Directory of the calibration; by default the directory that it was loaded from.
 
     Raises:
         OrthocalError: If the robot is missing or differs from the calibrated one.
@@ -140,6 +140,7 @@ def write_report(calibration: Calibration, path: str | Path) -> Path:
 
 
 def _verdict(calibration: Calibration, saved: Path | None, further: FurtherHour) -> str:
+    """Content of the section with the verdict, the values to enter and the findings."""
     before, after = calibration.rms_before, calibration.rms_after
     change = f" ({after / before - 1.0:+.0%})" if before > 1e-8 else ""
     fit = (
@@ -158,6 +159,7 @@ def _verdict(calibration: Calibration, saved: Path | None, further: FurtherHour)
 
 
 def _tool(calibration: Calibration, further: FurtherHour) -> str:
+    """Content of the section with the tool error."""
     try:
         accuracy = assess_tool(calibration)
     except (ClosureError, RobotError) as e:
@@ -167,7 +169,7 @@ def _tool(calibration: Calibration, further: FurtherHour) -> str:
 
 
 def _adjustments(calibration: Calibration, saved: Path | None) -> list[tuple[str, str, str]]:
-    """Section with the plan of adjustments; none for a robot that declares no adjustments."""
+    """Section with the plan of adjustments; empty for a robot without adjustments."""
     if not calibration.robot.declared.adjustments:
         return []
     content = to_markup(render_adjustments(calibration, saved=saved))
@@ -175,14 +177,15 @@ def _adjustments(calibration: Calibration, saved: Path | None) -> list[tuple[str
 
 
 def _maps(calibration: Calibration, accuracy: ToolAccuracy) -> str:
+    """Maps of the tool error with captions."""
     scale = calibration.tolerance_scale.factor
     times = f"{scale:.1f} times " if scale > 1.0 else ""
     captions: dict[Field, str] = {
-        "now": "Actual less commanded position of the tool, with the offsets that were active "
+        "now": "Actual minus commanded position of the tool, with the offsets that were active "
         "during the measurement. All maps are for a workpiece that is aligned on the machine: one "
         "translation and one rotation are removed.",
-        "entered": "Actual less commanded position of the tool with the offsets above, without any "
-        "other correction.",
+        "entered": "Actual minus commanded position of the tool with the offsets above, without "
+        "any other correction.",
         "uncertainty": "Uncertainty of the tool position after calibration: RMS in space, "
         f"with unidentified errors within {times}their tolerances.",
     }
@@ -193,11 +196,12 @@ def _maps(calibration: Calibration, accuracy: ToolAccuracy) -> str:
 
 
 def _fit(calibration: Calibration) -> str:
+    """Content of the section with the residuals."""
     parts = [to_markup(render_fit(calibration))]
     if any(r.unseen == r.unseen for r in calibration.residuals):
         text = (
-            "Predicted: the readings of each setup, from all other setups. A good model predicts "
-            "them nearly as well as it fits them."
+            "Predicted: readings of each setup, predicted from all other setups. A good model "
+            "predicts them nearly as well as it fits them."
         )
     else:
         text = "No setup can be predicted: the other setups do not determine the model."
@@ -213,15 +217,16 @@ def _fit(calibration: Calibration) -> str:
 
 
 def _readings(calibration: Calibration) -> str:
-    every = len(calibration.residuals) <= ALL_ROWS
-    listed = to_markup(render_readings(calibration, all_rows=every, worst_first=True))
-    words = "All readings" if every else "The largest"
-    few = len(calibration.residuals) <= FEW_ROWS
-    return _figure(plot_residuals(calibration), "") + _details(words, listed, shown=few)
+    """Content of the section with the readings."""
+    all_rows = len(calibration.residuals) <= MAX_LISTED_ROWS
+    listed = to_markup(render_readings(calibration, all_rows=all_rows, worst_first=True))
+    summary = "All readings" if all_rows else "The largest"
+    few = len(calibration.residuals) <= MAX_OPEN_ROWS
+    return _figure(plot_residuals(calibration), "") + _details(summary, listed, shown=few)
 
 
 def _circles(calibration: Calibration) -> list[tuple[str, str, str]]:
-    """Section with the circles of ball bars; none without any."""
+    """Section with the circles of ball bars; empty without circles."""
     figures = [
         _figure(
             plot_circle(circle),
@@ -234,6 +239,7 @@ def _circles(calibration: Calibration) -> list[tuple[str, str, str]]:
 
 
 def _parameters(calibration: Calibration) -> str:
+    """Content of the section with the parameters."""
     listed = to_markup(render_parameters(calibration, all_rows=True))
     few = len(calibration.free) <= 12
     return _figure(plot_parameters(calibration), "") + (
@@ -242,9 +248,10 @@ def _parameters(calibration: Calibration) -> str:
 
 
 def _research(calibration: Calibration) -> str:
+    """Content of the section for research: linearisation, correlations, identifiability."""
     linearised = _figure(
         plot_linearised(calibration),
-        "Exact solution less the solution of the linear equations, as in the paper.",
+        "Exact solution minus the solution of the linear equations, as in the paper.",
     )
     return (
         linearised
@@ -256,6 +263,7 @@ def _research(calibration: Calibration) -> str:
 
 
 def _correlations(calibration: Calibration) -> str:
+    """Plot and table of the correlations."""
     figure = plot_correlations(calibration)
     if not figure:
         return paragraph("A single parameter has no correlations.")
@@ -270,14 +278,16 @@ def _correlations(calibration: Calibration) -> str:
 
 
 def _identifiability(calibration: Calibration) -> str:
+    """Plot and tables of the identifiability."""
     few = len(calibration.free) <= 12
-    words = to_markup(render_identifiability(calibration, all_rows=True))
+    tables = to_markup(render_identifiability(calibration, all_rows=True))
     return _figure(plot_singular_values(calibration), "") + (
-        words if few else _details("Tables", words)
+        tables if few else _details("Tables", tables)
     )
 
 
 def _provenance(calibration: Calibration) -> str:
+    """Table of robot, sessions, assumptions and software."""
     robot, session, solver = calibration.robot_record, calibration.session, calibration.solver
     sigma = session.gauge_sigma
     active = "not stated"
@@ -321,14 +331,14 @@ def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
     """Tolerances, known values and bounds that the user stated."""
     defaults = calibration.robot.parameters.defaults
     factor = calibration.tolerance_scale.factor
-    tolerances, known, bounds = [], [], []
+    tolerances, known_values, bounds = [], [], []
     for p in calibration.parameters:
         f, unit = p.edge_factor, p.edge_unit
         if not p.free:
-            known.append(f"{p.name} {p.value * f:g} {unit}")
+            known_values.append(f"{p.name} {p.value * f:g} {unit}")
             continue
         if p.prior and (p.mean != 0.0 or not calibration.prior):
-            known.append(f"{p.name} {p.mean * f:g} ± {show_limit(p.prior_std) * f:g} {unit}")
+            known_values.append(f"{p.name} {p.mean * f:g} ± {show_limit(p.prior_std) * f:g} {unit}")
         elif p.prior_std not in (defaults[p.name].prior_std, factor * defaults[p.name].prior_std):
             limit, default = (show_limit(q.prior_std) * f for q in (p, defaults[p.name]))
             tolerances.append(f"{p.name} {limit:g} {unit} instead of {default:g}")
@@ -337,7 +347,11 @@ def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
             bounds.append(f"{p.name} {low} … {high} {unit}".replace(" ∞ …", " −∞ …"))
     rows = [
         (name, _abbreviate(texts))
-        for name, texts in (("Tolerances", tolerances), ("Known values", known), ("Bounds", bounds))
+        for name, texts in (
+            ("Tolerances", tolerances),
+            ("Known values", known_values),
+            ("Bounds", bounds),
+        )
         if texts
     ]
     if factor != 1.0:
@@ -346,12 +360,13 @@ def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
 
 
 def _abbreviate(texts: Sequence[str]) -> str:
-    """Texts as a list; of many only the first, with the number of the others."""
-    more = len(texts) - MOST_NAMED
-    return "; ".join(texts[:MOST_NAMED]) + (f"; and {more} more" if more > 0 else "")
+    """Texts as a list; of many, the first ones and the number of the others."""
+    more = len(texts) - MAX_NAMED
+    return "; ".join(texts[:MAX_NAMED]) + (f"; and {more} more" if more > 0 else "")
 
 
 def _scene(calibration: Calibration) -> str:
+    """3-D scene in a frame, or the reason why it cannot be drawn."""
     try:
         scene = draw_scene(calibration)
     except OrthocalError as e:  # the report is useful without the scene
@@ -364,12 +379,14 @@ def _scene(calibration: Calibration) -> str:
 
 
 def _figure(svg: str, caption: str) -> str:
+    """HTML of a figure with a caption; "" without a plot."""
     if not svg:
         return ""
-    words = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-    return f"<figure>{svg}{words}</figure>"
+    element = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
+    return f"<figure>{svg}{element}</figure>"
 
 
-def _details(words: str, content: str, *, shown: bool = False) -> str:
+def _details(summary: str, content: str, *, shown: bool = False) -> str:
+    """HTML of content that is shown and hidden by its summary."""
     opening = "<details open>" if shown else "<details>"
-    return f"{opening}<summary>{escape(words)}</summary>{content}</details>"
+    return f"{opening}<summary>{escape(summary)}</summary>{content}</details>"

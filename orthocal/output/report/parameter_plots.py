@@ -31,36 +31,36 @@ from orthocal.output.report.figure import (
 from orthocal.output.text.layout import short_name, typeset
 from orthocal.units import MM, show_limit
 
-FEW_PARAMETERS = 12
-"""Number of parameters up to which units and correlations are printed as numbers."""
+MAX_IN_DETAIL = 12
+"""Most parameters for which units and correlations are printed as numbers."""
 
 NEGLIGIBLE = 0.1
-"""Negligible error of the linearised solution, [σ]."""
+"""Largest negligible error of the linearised solution, [σ]."""
 
-MOST_ESTIMATES = 30
+MAX_ESTIMATES = 30
 """Largest number of parameters whose estimates are shown."""
 
-MOST_CORRELATED = 40
+MAX_CORRELATED = 40
 """Largest number of parameters in the correlation matrix."""
 
-MOST_SHIFTS = 20
+MAX_SHIFTS = 20
 """Largest number of parameters whose linearised solution is shown."""
 
-CLEAR, DARK = 0.1, 0.6
-"""Correlations above which the sign is marked, and above which the colour is dark."""
+SIGN_LIMIT, DARK_LIMIT = 0.1, 0.6
+"""Correlations above which the sign is marked, and correlations with dark colours."""
 
-STEPS = (-1.0, -0.9, -0.7, -0.5, -0.3, -CLEAR, CLEAR, 0.3, 0.5, 0.7, 0.9, 1.0)
-"""Limits of the colours of correlations."""
+COLOUR_LIMITS = (-1.0, -0.9, -0.7, -0.5, -0.3, -SIGN_LIMIT, SIGN_LIMIT, 0.3, 0.5, 0.7, 0.9, 1.0)
+"""Limits between the colours of correlations."""
 
-LONGEST_IN_MATRIX = 24
-"""Characters of a name in the correlation matrix."""
+MAX_NAME_IN_MATRIX = 24
+"""Most characters of a name in the correlation matrix."""
 
 _MIDDLE: Look = {"horizontalalignment": "center", "verticalalignment": "center"}
 
 
 @plot("linearised")
 def plot_linearised(calibration: Calibration) -> Figure | None:
-    """Exact less linearised estimates, in their standard deviations, the largest first."""
+    """Exact minus linearised estimates, in standard deviations, the largest first."""
     shifts = _linearisation_shifts(calibration)
     if not shifts:
         return None
@@ -83,17 +83,17 @@ def plot_linearised(calibration: Calibration) -> Figure | None:
 
 @plot("parameters")
 def plot_parameters(calibration: Calibration) -> Figure:
-    """Estimates with 95 % intervals, and the share of the prior that the readings removed.
+    """Estimates with 95 % intervals, and the share of the prior variance that the readings remove.
 
-    Of many parameters the offsets are shown, then those that the readings determine best.
+    Of many parameters the offsets are shown first, then the best determined ones.
     """
     free = calibration.free
-    rows = sorted(free, key=_importance)[:MOST_ESTIMATES]
+    rows = sorted(free, key=_importance)[:MAX_ESTIMATES]
     title = "Estimates with 95 % intervals"
     if len(rows) < len(free):
         title += f": {len(rows)} of {len(free)}, offsets, then the best determined"
     names = [f"{short_name(p.name)}{f' at {p.at_bound} bound' if p.at_bound else ''}" for p in rows]
-    in_unit = len(rows) <= FEW_PARAMETERS and len({p.unit for p in rows}) == 1
+    in_unit = len(rows) <= MAX_IN_DETAIL and len({p.unit for p in rows}) == 1
     figure, axes = open_list(title, names, share=calibration.prior)
     scale = np.array([p.edge_factor if in_unit else 1.0 / show_limit(p.prior_std) for p in rows])
     y, values = np.arange(len(rows)), np.array([p.value for p in rows]) * scale
@@ -123,7 +123,7 @@ def plot_parameters(calibration: Calibration) -> Figure:
 
 
 def _draw_shares(axes: Axes, rows: Sequence[ParameterEstimate]) -> None:
-    """Draw the share of the prior that the readings removed, beside the parameters."""
+    """Draw the share of the prior variance that the readings remove."""
     shares = np.nan_to_num([p.data_share for p in rows]).clip(0.0, 1.0)
     axes.barh(np.arange(len(rows)), 100.0 * shares, 0.6, color=AFTER)
     axes.set_xlim(0.0, 100.0)
@@ -135,21 +135,21 @@ def _draw_shares(axes: Axes, rows: Sequence[ParameterEstimate]) -> None:
 
 @plot("correlations")
 def plot_correlations(calibration: Calibration) -> Figure | None:
-    """Correlation matrix of the estimates; nothing for fewer than two parameters.
+    """Correlation matrix of the estimates; None for fewer than two parameters.
 
-    Of many parameters those with the strongest correlations are shown.
+    Of many parameters, the ones with the strongest correlations are shown.
     """
     matrix = calibration.correlation
     finite = np.flatnonzero(np.isfinite(np.diag(matrix)))
     if finite.size < 2:
         return None
     size = np.abs(matrix[np.ix_(finite, finite)] - np.eye(finite.size))
-    chosen = np.sort(finite[np.argsort(-size.max(axis=1), kind="stable")[:MOST_CORRELATED]])
-    names = [short_name(calibration.free[i].name, LONGEST_IN_MATRIX) for i in chosen]
+    chosen = np.sort(finite[np.argsort(-size.max(axis=1), kind="stable")[:MAX_CORRELATED]])
+    names = [short_name(calibration.free[i].name, MAX_NAME_IN_MATRIX) for i in chosen]
     title = "Correlations of the estimates"
     if chosen.size < finite.size:
         title += f": the {chosen.size} of {finite.size} parameters with the strongest"
-    few, count = chosen.size <= FEW_PARAMETERS, chosen.size - 1
+    few, count = chosen.size <= MAX_IN_DETAIL, chosen.size - 1
     side = (0.3 if few else 0.145) * max(count, 2)
     flat = count <= 2
     below = 0.3 if flat else 0.073 * max(len(n) for n in names)
@@ -159,7 +159,7 @@ def plot_correlations(calibration: Calibration) -> Figure | None:
     r = matrix[chosen[rows + 1], chosen[columns]]
     corners = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
     cells = corners + np.stack([columns, rows], axis=1)[:, None, :]
-    norm = BoundaryNorm(STEPS, 256)
+    norm = BoundaryNorm(COLOUR_LIMITS, 256)
     image = PolyCollection(list(cells), cmap="PuOr", norm=norm, edgecolors="white")
     image.set_array(r)
     axes.add_collection(image)
@@ -172,28 +172,28 @@ def plot_correlations(calibration: Calibration) -> Figure | None:
     if not few:
         label = "correlation (−: negative)"
         look: Look = {"aspect": side / 0.12, "spacing": "proportional"}
-        figure.colorbar(image, ax=axes, label=label, ticks=STEPS[1:-1], **look)
+        figure.colorbar(image, ax=axes, label=label, ticks=COLOUR_LIMITS[1:-1], **look)
     return figure
 
 
 def _mark_signs(
     axes: Axes, columns: NDArray[np.int64], rows: NDArray[np.int64], r: Array, *, numbers: bool
 ) -> None:
-    """Print the numbers of a matrix in its cells, or a minus in negative cells."""
-    x, y, inks = columns + 0.5, rows + 0.5, np.where(np.abs(r) > DARK, "white", "black")
+    """Print the values of a matrix in its cells, or a minus sign in negative cells."""
+    x, y, inks = columns + 0.5, rows + 0.5, np.where(np.abs(r) > DARK_LIMIT, "white", "black")
     if numbers:
         for i, value in enumerate(r):
             text = typeset(float(value), 2)
             axes.text(x[i], y[i], text, color=str(inks[i]), fontsize=7.5, **_MIDDLE)
         return
     for ink in ("black", "white"):
-        marked = (r < -CLEAR) & (inks == ink)
+        marked = (r < -SIGN_LIMIT) & (inks == ink)
         axes.plot(x[marked], y[marked], "_", color=ink, markersize=4.0)
 
 
 @plot("singular-values")
 def plot_singular_values(calibration: Calibration) -> Figure | None:
-    """Singular values of the readings beside their noise; nothing if all are zero."""
+    """Singular values of the readings and their noise; None if all are zero."""
     spectrum = calibration.identifiability
     if not spectrum.structural_rank:
         return None
@@ -229,15 +229,15 @@ def plot_singular_values(calibration: Calibration) -> Figure | None:
 
 
 def _linearisation_shifts(calibration: Calibration) -> list[tuple[float, ParameterEstimate]]:
-    """Exact less linearised estimates in σ, the largest first."""
-    if not calibration.solver.tells_linearisation:
+    """Exact minus linearised estimates in σ with their parameters, the largest first."""
+    if not calibration.solver.shows_linearisation_error:
         return []
     finite = [p for p in calibration.free if math.isfinite(p.std) and p.std > 0.0]
     shifts = [((p.value - p.linear) / p.std, p) for p in finite]
-    return sorted(shifts, key=lambda s: -abs(s[0]))[:MOST_SHIFTS]
+    return sorted(shifts, key=lambda s: -abs(s[0]))[:MAX_SHIFTS]
 
 
 def _importance(parameter: ParameterEstimate) -> tuple[bool, float]:
-    """Sort key: offsets first, then the parameters that the readings determine best."""
+    """Sort key: offsets first, then the best determined parameters."""
     share = parameter.data_share
     return not parameter.name.endswith(".offset"), math.inf if math.isnan(share) else -share

@@ -1,4 +1,4 @@
-"""Plots of the readings: deviations before and after, per setup, their distribution, circles."""
+"""Plots of the readings: deviations before and after, RMS per setup, distribution, circles."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from orthocal.output.report.figure import (
     AFTER_LOOK,
     BEFORE,
     BEFORE_LOOK,
+    PREDICTED_LOOK,
     ROW_HEIGHT,
-    UNSEEN_LOOK,
     count_of,
     draw_legend,
     open_figure,
@@ -38,23 +38,23 @@ from orthocal.output.report.figure import (
 from orthocal.output.text.layout import short_name
 from orthocal.units import MM, UM
 
-_deviation, _residual, _unseen = map(attrgetter, ("deviation", "residual", "unseen"))
+_deviation, _residual, _prediction_error = map(attrgetter, ("deviation", "residual", "unseen"))
 
 SMALLEST_LENGTH = 1e-9
 """Smallest length on a logarithmic axis, [m]."""
 
-MOST_ROWS = 40
+MAX_ROWS = 40
 """Largest number of readings or setups that are shown."""
 
-MOST_POINTS = 500
-"""Largest number of points in a quantile plot; the outermost points are always shown."""
+MAX_POINTS = 500
+"""Largest number of points in a quantile plot, which always include the outermost ones."""
 
 
 @plot("residuals")
 def plot_residuals(calibration: Calibration) -> Figure:
     """Deviations of the readings before and after calibration, the worst first."""
     residuals = calibration.residuals
-    rows = sorted(residuals, key=lambda r: -max(abs(r.deviation), abs(r.residual)))[:MOST_ROWS]
+    rows = sorted(residuals, key=lambda r: -max(abs(r.deviation), abs(r.residual)))[:MAX_ROWS]
     title = "Readings before and after calibration, the worst first"
     if len(rows) < len(residuals):
         title = f"Readings before and after calibration: the {len(rows)} worst of {len(residuals)}"
@@ -63,7 +63,7 @@ def plot_residuals(calibration: Calibration) -> Figure:
     before, after = (np.array([f(r) for r in rows]) / MM for f in (_deviation, _residual))
     sigma = np.array([_row_sigma(calibration, r) for r in rows]) / MM
     if np.isfinite(sigma).all():
-        kind = "row" if np.ptp(sigma) > 0.0 else _row_word(calibration)
+        kind = "row" if np.ptp(sigma) > 0.0 else _row_noun(calibration)
         shade(axes, y, -2.0 * sigma, 2.0 * sigma, f"±2 σ of a {kind}")
     axes.hlines(y, before, after, color="#888888", linewidth=0.8)
     axes.axvline(0.0, color="black", linewidth=0.8)
@@ -76,9 +76,9 @@ def plot_residuals(calibration: Calibration) -> Figure:
 
 @plot("setups")
 def plot_setups(calibration: Calibration) -> Figure:
-    """Root mean square of every setup before, after, and predicted from all other setups."""
+    """RMS of every setup before, after, and predicted from all other setups."""
     groups = rows_by_setup(calibration.residuals)
-    names = sorted(groups, key=lambda n: -root_mean_square(map(_residual, groups[n])))[:MOST_ROWS]
+    names = sorted(groups, key=lambda n: -root_mean_square(map(_residual, groups[n])))[:MAX_ROWS]
     title = "Residuals per setup, the worst first"
     if len(names) < len(groups):
         title = f"Residuals per setup: the {len(names)} worst of {len(groups)}"
@@ -88,7 +88,7 @@ def plot_setups(calibration: Calibration) -> Figure:
     for get, shift, label, look in (
         (_deviation, -0.2, "before", BEFORE_LOOK),
         (_residual, 0.0, "after", AFTER_LOOK),
-        (_unseen, 0.2, "predicted from all other setups", UNSEEN_LOOK),
+        (_prediction_error, 0.2, "predicted from all other setups", PREDICTED_LOOK),
     ):
         sizes = np.array([root_mean_square(map(get, groups[n])) for n in names])
         finite = np.isfinite(sizes)
@@ -98,7 +98,7 @@ def plot_setups(calibration: Calibration) -> Figure:
             shown.append(sizes)
     if math.isfinite(calibration.sigma) and calibration.sigma > SMALLEST_LENGTH:
         sigma = calibration.sigma / MM
-        axes.axvline(sigma, color="black", linestyle=":", label=f"σ of a {_row_word(calibration)}")
+        axes.axvline(sigma, color="black", linestyle=":", label=f"σ of a {_row_noun(calibration)}")
         shown.append(np.array([sigma]))
     scale_log(axes, "x", np.concatenate(shown))
     axes.set_xlabel("RMS of measured − model [mm], logarithmic")
@@ -109,9 +109,9 @@ def plot_setups(calibration: Calibration) -> Figure:
 @plot("spread")
 def plot_spread(calibration: Calibration) -> Figure:
     """Normal quantile plot of the residuals, with the noise as a line."""
-    word = _row_word(calibration)
-    single = np.array([_residual(r) / calibration.noise_factor(r) for r in calibration.residuals])
-    values = np.sort(single) * calibration.row_factor / MM
+    noun = _row_noun(calibration)
+    scaled = np.array([_residual(r) / calibration.noise_factor(r) for r in calibration.residuals])
+    values = np.sort(scaled) * calibration.row_factor / MM
     quantiles = special.ndtri((np.arange(values.size) + 0.5) / values.size)
     chosen = _thin(values.size)
     figure = open_figure(3.8, "Normal quantile plot of the residuals")
@@ -119,18 +119,20 @@ def plot_spread(calibration: Calibration) -> Figure:
     label = f"residuals after: {count_of(chosen.size, values.size)}"
     look = {**AFTER_LOOK, "markersize": 3.5}
     axes.plot(quantiles[chosen], values[chosen], label=label, **look)
-    # the residuals lack the degrees of freedom of parameters and gauge zeros
-    part = math.sqrt(min(calibration.noise.residual_dof / values.size, 1.0))
+    # parameters and gauge zeros reduce the residuals by their degrees of freedom
+    reduction = math.sqrt(min(calibration.noise.residual_dof / values.size, 1.0))
     gauge = calibration.session.gauge_sigma
     stated = math.nan if gauge is None else gauge * calibration.row_factor
-    reach = np.array([-1.0, 1.0]) * max(abs(float(quantiles[0])), 1.0)
+    ends = np.array([-1.0, 1.0]) * max(abs(float(quantiles[0])), 1.0)
     for sigma, name, line in (
-        (calibration.sigma, f"σ of a {word}", "-"),
+        (calibration.sigma, f"σ of a {noun}", "-"),
         (stated, "σ stated for the gauge", "--"),
     ):
         if math.isfinite(sigma):
             label = f"{name}: {sigma / MM:.2g} mm"
-            axes.plot(reach, reach * part * sigma / MM, color="black", linestyle=line, label=label)
+            axes.plot(
+                ends, ends * reduction * sigma / MM, color="black", linestyle=line, label=label
+            )
     axes.grid(True)
     axes.set_xlabel(
         "normal quantile, expected from noise alone [σ]\n"
@@ -142,25 +144,27 @@ def plot_spread(calibration: Calibration) -> Figure:
 
 
 def _row_sigma(calibration: Calibration, row: ResidualRow) -> float:
+    """Standard deviation of a row, [m]."""
     return calibration.sigma * calibration.noise_factor(row) / calibration.row_factor
 
 
-def _row_word(calibration: Calibration) -> str:
+def _row_noun(calibration: Calibration) -> str:
+    """Noun for a row: difference or reading."""
     return "difference" if calibration.rows_are_differences else "reading"
 
 
 def _row_names(calibration: Calibration, rows: Sequence[ResidualRow]) -> list[str]:
-    """Names of rows: setup, postures, and the cycle if there are several."""
+    """Names of rows: setup, postures, and the cycle if there are several cycles."""
     repeated = any(r.cycle != 1 for r in calibration.residuals)
     return [short_name(f"{r.label}, cycle {r.cycle}" if repeated else r.label) for r in rows]
 
 
 def _thin(count: int) -> NDArray[np.int64]:
-    """Indices of sorted points that are drawn: of many the outermost, and a selection between."""
-    if count <= MOST_POINTS:
+    """Indices of the drawn points among sorted ones; of many, the outermost and a selection."""
+    if count <= MAX_POINTS:
         return np.arange(count)
-    edge = MOST_POINTS // 4
-    between = np.linspace(edge, count - 1 - edge, MOST_POINTS - 2 * edge).round()
+    edge = MAX_POINTS // 4
+    between = np.linspace(edge, count - 1 - edge, MAX_POINTS - 2 * edge).round()
     return np.concatenate([np.arange(edge), between, np.arange(count - edge, count)]).astype(
         np.int64
     )
@@ -168,7 +172,7 @@ def _thin(count: int) -> NDArray[np.int64]:
 
 @plot("circle")
 def plot_circle(circle: Circle) -> Figure:
-    """Radial plot of a circle: deviations from the least-squares circle, magnified."""
+    """Polar plot of a circle's magnified deviations from the least-squares circle."""
     figure = open_figure(3.6, f"Circle of setup {circle.setup}, plane {circle.plane}")
     axes = cast(PolarAxes, figure.subplots(subplot_kw={"projection": "polar"}))
     closed = np.append(circle.angles, circle.angles[0] + 2.0 * np.pi)
@@ -183,8 +187,8 @@ def plot_circle(circle: Circle) -> Figure:
         axes.plot(
             closed, radii, mark if few else "-", color=colour, label=text, markersize=3.0, lw=1.0
         )
-    reach = max(float(np.abs([circle.before, circle.after]).max()) / UM, 1e-3)
-    step = _round_up(reach)
+    largest = max(float(np.abs([circle.before, circle.after]).max()) / UM, 1e-3)
+    step = _round_up(largest)
     axes.set_ylim(-2.0 * step, step)
     axes.set_yticks([-step, 0.0, step], [f"−{step:g} µm", "0", f"+{step:g} µm"])
     axes.set_rlabel_position(67.5)
@@ -196,7 +200,7 @@ def plot_circle(circle: Circle) -> Figure:
 
 
 def _round_up(value: float) -> float:
-    """Next larger number of 1, 2 or 5 times a power of ten."""
+    """Smallest number of the form 1, 2 or 5 times a power of ten that is not less."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(
         next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= value * (1.0 - 1e-9))

@@ -17,16 +17,17 @@ from orthocal.output.report.figure import (
     AFTER_LOOK,
     BAND,
     BEFORE,
-    UNSEEN,
+    PREDICTED,
     Look,
     Plot,
+    count_of,
     draw_legend,
     open_figure,
     open_list,
     plot,
     scale_log,
 )
-from orthocal.planning.cost_curve import ENOUGH, HOUR
+from orthocal.planning.cost_curve import HOUR, HOURLY_GAIN
 from orthocal.planning.plan import MeasuringPlan
 from orthocal.study.bootstrap import BootstrapSummary
 from orthocal.study.linearisation import LinearisationSummary
@@ -39,11 +40,11 @@ GREY = "#777777"
 SMALLEST_DRAWN_MM = 1e-4
 """Smallest error on a logarithmic axis, [mm]."""
 
-MOST_ERRORS = 40
+MAX_ERRORS = 40
 """Largest number of errors in a plot."""
 
 NORMAL_95 = 1.96
-"""Half width of the 95 % interval of a normal distribution, in standard deviations."""
+"""Half width of the 95 % interval of a normal distribution, [σ]."""
 
 
 @plot("study")
@@ -76,7 +77,7 @@ def plot_machines(table: StudyTable, predicted: float) -> Figure:
 
 @plot("study")
 def plot_linearisation(s: LinearisationSummary, names: Mapping[str, str]) -> Figure:
-    """Error of linearised identification by the size of the machine's errors.
+    """Error of linearised identification as a function of the machine's errors.
 
     Args:
         s: Summary of a linearisation study.
@@ -95,7 +96,7 @@ def plot_linearisation(s: LinearisationSummary, names: Mapping[str, str]) -> Fig
             axes.plot(s.sizes, m.errors, label=names[m.name], **looks[m.name])
     (noise,) = (m.standard_error for m in s.methods if m.name == "first_order")
     for label, size, colour in (
-        ("standard error", noise, UNSEEN),
+        ("standard error", noise, PREDICTED),
         ("resolution", s.resolution, GREY),
     ):
         if size > 0.0 or label != "resolution":
@@ -111,8 +112,8 @@ def plot_linearisation(s: LinearisationSummary, names: Mapping[str, str]) -> Fig
 
 @plot("study")
 def plot_bootstrap(s: BootstrapSummary) -> Figure:
-    """Intervals of 95 % of the draws around the estimates, in predicted standard deviations."""
-    shown = s.parameters[:MOST_ERRORS]
+    """Intervals with 95 % of the draws around the estimates, in predicted standard deviations."""
+    shown = s.parameters[:MAX_ERRORS]
     unit = np.array([p.predicted or math.nan for p in shown])
     low, high = (
         np.array([getattr(p, end) - p.estimate for p in shown]) / unit for end in ("low", "high")
@@ -129,11 +130,10 @@ def plot_bootstrap(s: BootstrapSummary) -> Figure:
 
 @plot("study")
 def plot_sensitivity(s: SensitivitySummary) -> Figure:
-    """Change of each reading and tool coordinate by each error, as a heat map."""
-    influence = np.argsort(-np.abs(s.per_prior_std).max(axis=0), kind="stable")
-    chosen = np.sort(influence[:MOST_ERRORS])
-    count = len(s.parameters)
-    number = f"{count}" if len(chosen) == count else f"{len(chosen)} of {count}"
+    """Heat map of the change of each reading and tool coordinate by each error."""
+    by_influence = np.argsort(-np.abs(s.per_prior_std).max(axis=0), kind="stable")
+    chosen = np.sort(by_influence[:MAX_ERRORS])
+    number = count_of(len(chosen), len(s.parameters))
     values = s.per_prior_std[:, chosen] / UM
     largest = max(float(np.abs(values).max()), 1e-9)
     decades = 10.0 ** np.arange(math.floor(math.log10(largest)) - 1, math.ceil(math.log10(largest)))
@@ -160,7 +160,7 @@ PLOTS: dict[str, Plot[...]] = {
     "sensitivity": plot_sensitivity,
     "bootstrap": plot_bootstrap,
 }
-"""Plots of studies by their kind."""
+"""Plots by kind of study."""
 
 
 @plot("plan")
@@ -169,7 +169,7 @@ def plot_plan(plan: MeasuringPlan, unit: float) -> Figure:
 
     Args:
         plan: The plan.
-        unit: Unit of its criterion: a micrometre or 1.
+        unit: Unit of its criterion, [m] for a tool error, otherwise 1.
     """
     figure = open_figure(3.2, "Expected error over measuring time")
     axes = figure.subplots()
@@ -179,13 +179,13 @@ def plot_plan(plan: MeasuringPlan, unit: float) -> Figure:
     errors.append(plan.stage.error / unit)
     axes.plot(plan.minutes / HOUR, errors[-1], "s", color=AFTER, label="this plan")
     if plan.criterion == "aligned":
-        for marker, colour, other in zip("o^", (BEFORE, UNSEEN), plan.compared, strict=False):
+        for marker, colour, other in zip("o^", (BEFORE, PREDICTED), plan.compared, strict=False):
             if other.expected is not None:
                 errors.append(other.expected.reported.rms / unit)
                 look: Look = {"color": colour, "label": other.name}
                 axes.plot(other.minutes / HOUR, errors[-1], marker, **look)
     if plan.enough is not None:
-        label = f"another hour gains < {ENOUGH:.0%}"
+        label = f"another hour gains < {HOURLY_GAIN:.0%}"
         axes.axvline(plan.enough.minutes / HOUR, color="#999999", linestyle=":", label=label)
     scale_log(axes, "y", np.array(errors))
     axes.set_xlim(left=0.0)
@@ -194,6 +194,7 @@ def plot_plan(plan: MeasuringPlan, unit: float) -> Figure:
 
 
 def _finish(figure: Figure, axes: Axes, x_label: str, y_label: str) -> None:
+    """Add grid, labels and legend."""
     axes.grid(True)
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)

@@ -32,35 +32,35 @@ TITLES: dict[Field, str] = {
 
 AVERAGED = ", mean over conditions"
 
-FINEST = 1e-3
-"""Errors and differences of errors below this are zero, [µm]."""
+NEGLIGIBLE = 1e-3
+"""Errors and differences of errors up to this count as zero, [µm]."""
 
-EVEN = 1e-4
-"""Relative variation over a plane below which an error counts as constant."""
+CONSTANT_VARIATION = 1e-4
+"""Relative variation over a plane up to which an error counts as constant."""
 
-LEVELS = 8
+MAX_LEVELS = 8
 """Largest number of contour levels."""
 
-FINE = 43
-"""Points per side of the drawn grid."""
+DRAWN_POINTS = 43
+"""Number of points per side of the drawn grid."""
 
-ARROWS = np.array([-2.0, 0.0, 2.0]) / 3.0
-"""Places of the arrows along a side, from -1 to 1."""
+ARROW_POSITIONS = np.array([-2.0, 0.0, 2.0]) / 3.0
+"""Positions of the arrows along a side, from -1 to 1."""
 
-HIGHEST_DEGREE = 4
-"""Degree of the splines; with five points per side they are polynomials through all points."""
+MAX_DEGREE = 4
+"""Largest degree of the splines, which are interpolating polynomials with five points per side."""
 
 COLOURS = "cividis"
 
-MARGIN = 0.09
-"""Distance from the border within which a label would be cut off, in sides."""
+LABEL_MARGIN = 0.09
+"""Smallest distance of a label from the border, relative to the side."""
 
-ARROW = 0.85
-"""Length of the longest arrow, in distances between arrows."""
+ARROW_LENGTH = 0.85
+"""Length of the longest arrow, relative to the distance between arrows."""
 
 
 def _find_grid(points: Array) -> list[Array] | None:
-    """Coordinates along the sides of a grid with a middle point; None for other points."""
+    """Coordinates along the sides of a grid with a middle point; None without such a grid."""
     lines = [np.unique(column) for column in points.T]
     if len(lines) < 2 or any(line.size < 3 or line.size % 2 == 0 for line in lines):
         return None
@@ -71,14 +71,14 @@ def _find_grid(points: Array) -> list[Array] | None:
 def _error_parts(accuracy: ToolAccuracy, which: Field) -> Array:
     """Tool errors after alignment, shape (K, 3), or their uncertainty, shape (K, 1), [µm].
 
-    Means over the conditions of use.
+    They are averaged over the conditions of use.
     """
     if which == "now":
         return accuracy.average(accuracy.align(accuracy.deviation)) / UM
-    remaining = accuracy.after
-    if which == "entered" or remaining is None:
-        return accuracy.average(accuracy.align(accuracy.error_after_offsets)) / UM
-    variance = accuracy.average(np.trace(remaining.aligned_covariance, axis1=1, axis2=2))
+    after = accuracy.after
+    if which == "entered" or after is None:
+        return accuracy.average(accuracy.align(accuracy.deviation_with_entries)) / UM
+    variance = accuracy.average(np.trace(after.aligned_covariance, axis1=1, axis2=2))
     return np.asarray(np.sqrt(np.maximum(variance, 0.0))[:, None] / UM)
 
 
@@ -91,13 +91,15 @@ def plot_tool_map(calibration: Calibration, accuracy: ToolAccuracy, *, which: Fi
         which: The present error, the error with the offsets entered, or the uncertainty.
 
     Returns:
-        "" if the points are not such a grid, if the uncertainty is unknown, and for the error with
-        the offsets entered if nothing but offsets was identified, because it is zero by definition.
+        The inline `<svg>`. It is "" in three cases: the points are not such a grid; the uncertainty
+        is unknown; or only offsets were identified, so that the error with the offsets entered is
+        zero by definition.
     """
     return Plot(f"tool-{which}", _draw_tool_map)(calibration, accuracy, which)
 
 
 def _draw_tool_map(calibration: Calibration, accuracy: ToolAccuracy, which: Field) -> Figure | None:
+    """Figure with one panel per plane; None without content."""
     lines = _find_grid(accuracy.points)
     shown = {
         "now": True,
@@ -113,21 +115,21 @@ def _draw_tool_map(calibration: Calibration, accuracy: ToolAccuracy, which: Fiel
     maps = []
     for plane in planes:
         sides = [lines[k] for k in plane]
-        between = _interpolate(sides, _cut(grid, plane))
-        maps.append((plane, sides, between, *_refine(sides, between)))
+        interpolate = _interpolate(sides, _cut(grid, plane))
+        maps.append((plane, sides, interpolate, *_refine(sides, interpolate)))
     levels = _choose_levels(np.concatenate([size.reshape(-1) for *_, size in maps]))
     title = TITLES[which] + (AVERAGED if accuracy.use.size > 1 else "")
     figure = open_figure(3.0 if len(planes) > 1 else 5.0, title, legend=False)
     panels = np.atleast_1d(figure.subplots(1, len(planes)))
-    for axes, (plane, sides, between, x, y, size) in zip(panels, maps, strict=True):
+    for axes, (plane, sides, interpolate, x, y, size) in zip(panels, maps, strict=True):
         axes.set(aspect="equal", title=_describe_cut(lines, plane, world))
         axes.set_xlabel(f"{'xyz'[world[plane[0]]]} [mm]")
         axes.set_ylabel(f"{'xyz'[world[plane[1]]]} [mm]", labelpad=0.0)
-        taken = np.zeros((0, 2))
+        covered = np.zeros((0, 2))
         if which != "uncertainty":
-            taken = _draw_arrows(axes, sides, between, [world[k] for k in plane], levels)
-        _draw_size(axes, x, y, size, levels, taken)
-    label = "size of the tool error [µm]; arrows: its part in the plane"
+            covered = _draw_arrows(axes, sides, interpolate, [world[k] for k in plane], levels)
+        _draw_size(axes, x, y, size, levels, covered)
+    label = "size of the tool error [µm]; arrows: component in the plane"
     if which == "uncertainty":
         label = "RMS uncertainty in space [µm]"
         scale = calibration.tolerance_scale.factor
@@ -146,7 +148,7 @@ def _draw_tool_map(calibration: Calibration, accuracy: ToolAccuracy, which: Fiel
 
 
 def _cut(grid: Array, plane: tuple[int, ...]) -> Array:
-    """Values in a plane through the middle of a grid, shape (n_x, n_y, parts)."""
+    """Values in a plane through the middle of a grid, shape (n_x, n_y, n_components)."""
     middle = tuple(
         slice(None) if k in plane else size // 2 for k, size in enumerate(grid.shape[:-1])
     )
@@ -154,20 +156,20 @@ def _cut(grid: Array, plane: tuple[int, ...]) -> Array:
 
 
 def _interpolate(lines: list[Array], parts: Array) -> Callable[[Array, Array], Array]:
-    """Spline interpolation of an error: (x, y) in m to values, shape (parts, n_x, n_y)."""
+    """Spline interpolation of an error: (x, y), [m], to values, shape (n_components, n_x, n_y)."""
     degree = {
-        k: min(HIGHEST_DEGREE, line.size - 1) for k, line in zip(("kx", "ky"), lines, strict=True)
+        k: min(MAX_DEGREE, line.size - 1) for k, line in zip(("kx", "ky"), lines, strict=True)
     }
     splines = [RectBivariateSpline(*lines, p, **degree) for p in np.moveaxis(parts, -1, 0)]
     return lambda x, y: np.array([spline(x, y) for spline in splines])
 
 
 def _refine(
-    lines: list[Array], between: Callable[[Array, Array], Array]
+    lines: list[Array], interpolate: Callable[[Array, Array], Array]
 ) -> tuple[Array, Array, Array]:
-    """Coordinates x and y of a fine grid, [mm], and the size of the error, shape (n_y, n_x)."""
-    x, y = (np.linspace(line[0], line[-1], FINE) for line in lines)
-    return x / MM, y / MM, np.linalg.norm(between(x, y), axis=0).T
+    """Coordinates x and y of a fine grid, [mm], and norm of the error, shape (n_y, n_x), [µm]."""
+    x, y = (np.linspace(line[0], line[-1], DRAWN_POINTS) for line in lines)
+    return x / MM, y / MM, np.linalg.norm(interpolate(x, y), axis=0).T
 
 
 def _describe_cut(lines: list[Array], plane: tuple[int, ...], world: tuple[int, ...]) -> str:
@@ -183,17 +185,17 @@ def _choose_levels(size: Array) -> Array:
     """Round contour levels, at least two, around all sizes, [µm]."""
     low, high = float(size.min()), float(size.max())
     if _is_constant(size):
-        around = max(0.01 * high, 0.5)
-        low, high = max(low - around, 0.0), high + around
-    return np.asarray(MaxNLocator(LEVELS, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))
+        margin = max(0.01 * high, 0.5)
+        low, high = max(low - margin, 0.0), high + margin
+    return np.asarray(MaxNLocator(MAX_LEVELS, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))
 
 
 def _is_constant(size: Array) -> bool:
     """True if an error is constant over a plane."""
-    return float(np.ptp(size)) < max(EVEN * float(size.max()), FINEST)
+    return float(np.ptp(size)) < max(CONSTANT_VARIATION * float(size.max()), NEGLIGIBLE)
 
 
-def _draw_size(axes: Axes, x: Array, y: Array, size: Array, levels: Array, taken: Array) -> None:
+def _draw_size(axes: Axes, x: Array, y: Array, size: Array, levels: Array, covered: Array) -> None:
     """Draw colours and labelled contour lines of a size, shape (n_y, n_x), [µm]."""
     axes.contourf(x, y, size, levels=levels, norm=BoundaryNorm(levels, 256), cmap=COLOURS)
     inside = levels[(levels > size.min()) & (levels < size.max())]
@@ -204,28 +206,28 @@ def _draw_size(axes: Axes, x: Array, y: Array, size: Array, levels: Array, taken
     elif inside.size:
         inks = [_ink(levels, value) for value in inside]
         contours = axes.contour(x, y, size, levels=inside, colors=inks, linewidths=0.8)
-        places = _place_labels([path.vertices for path in contours.get_paths()], x, y, taken)
+        places = _place_labels([path.vertices for path in contours.get_paths()], x, y, covered)
         axes.clabel(contours, fmt="%g", fontsize=7.0, inline_spacing=2, manual=places)
 
 
 def _place_labels(
-    contours: Sequence[ArrayLike], x: Array, y: Array, taken: Array
+    contours: Sequence[ArrayLike], x: Array, y: Array, covered: Array
 ) -> list[tuple[float, float]]:
-    """A point for a label on each contour that is away from border, arrows and other labels."""
+    """Label position on each contour, away from border, arrows and other labels."""
     side = float(x[-1] - x[0])
     places: list[tuple[float, float]] = []
     for vertices in map(np.asarray, contours):
         edges = [vertices[:, 0] - x[0], x[-1] - vertices[:, 0]]
         edges += [vertices[:, 1] - y[0], y[-1] - vertices[:, 1]]
-        room = np.minimum.reduce(edges)
-        others = np.concatenate([taken, np.reshape(places, (-1, 2))])
-        away = 2.0 * room
+        to_border = np.minimum.reduce(edges)
+        others = np.concatenate([covered, np.reshape(places, (-1, 2))])
+        clearance = 2.0 * to_border
         if len(others):
             nearest = np.linalg.norm(vertices[:, None] - others, axis=-1).min(axis=1)
-            away = np.minimum(away, nearest)
-        away[room < MARGIN * side] = -1.0
-        if away.size and away.max() > 0.0:
-            best = vertices[away.argmax()]
+            clearance = np.minimum(clearance, nearest)
+        clearance[to_border < LABEL_MARGIN * side] = -1.0
+        if clearance.size and clearance.max() > 0.0:
+            best = vertices[clearance.argmax()]
             places.append((float(best[0]), float(best[1])))
     return places
 
@@ -233,27 +235,34 @@ def _place_labels(
 def _draw_arrows(
     axes: Axes,
     lines: list[Array],
-    between: Callable[[Array, Array], Array],
+    interpolate: Callable[[Array, Array], Array],
     within: list[int],
     levels: Array,
 ) -> Array:
-    """Draw the part of an error in the plane as arrows.
+    """Draw the component of an error in the plane as arrows.
+
+    Args:
+        axes: The axes.
+        lines: Coordinates along both sides of the plane, [m].
+        interpolate: Function for the error at coordinates.
+        within: Components of the error in the plane.
+        levels: Contour levels, [µm].
 
     Returns:
         Points that the arrows cover, shape (n, 2), [mm].
     """
-    x, y = (0.5 * (v[0] + v[-1] + (v[-1] - v[0]) * ARROWS) for v in lines)
-    some = between(x, y).transpose(2, 1, 0).reshape(-1, 3)
-    parts = some[:, within]
-    longest = float(np.linalg.norm(parts, axis=1).max())
-    if longest < FINEST:
+    x, y = (0.5 * (v[0] + v[-1] + (v[-1] - v[0]) * ARROW_POSITIONS) for v in lines)
+    errors = interpolate(x, y).transpose(2, 1, 0).reshape(-1, 3)
+    in_plane = errors[:, within]
+    longest = float(np.linalg.norm(in_plane, axis=1).max())
+    if longest < NEGLIGIBLE:
         return np.zeros((0, 2))
-    drawn = parts * (ARROW * (x[1] - x[0]) / MM / longest)
+    drawn = in_plane * (ARROW_LENGTH * (x[1] - x[0]) / MM / longest)
     points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) / MM
     axes.quiver(
         *points.T,
         *drawn.T,
-        color=[_ink(levels, size) for size in np.linalg.norm(some, axis=1)],
+        color=[_ink(levels, size) for size in np.linalg.norm(errors, axis=1)],
         pivot="middle",
         angles="xy",
         scale_units="xy",
@@ -266,5 +275,5 @@ def _draw_arrows(
 
 
 def _ink(levels: Array, size: float) -> str:
-    """Colour of text that is readable on the colour of a size."""
+    """Readable text colour, white or black, on the colour of a size."""
     return "white" if size < 0.5 * (levels[0] + levels[-1]) else "black"

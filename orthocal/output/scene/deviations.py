@@ -1,4 +1,4 @@
-"""Deviations of the readings of a session or calibration, and the stops that show them."""
+"""Deviations of the readings of a session or calibration, and stops of their animation."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ from orthocal.statistics.zeros import project_out_zeros
 Place = tuple[str, str]
 """Kind and name of the part of the machine that a sensor measures, such as ("leg", "x")."""
 
-FEW_NAMES = 24
+MAX_LISTED = 24
 """Largest number of postures that a message lists."""
 
-MOST_STOPS = 150
-"""Largest number of stops of an animation; of more postures a selection is shown."""
+MAX_STOPS = 150
+"""Largest number of stops of an animation; with more postures, a selection is shown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Deviation:
-    """Deviation of a reading or a difference of readings, mean of its cycles."""
+    """Deviation of a reading or of a difference of readings, averaged over its cycles."""
 
     setup: str
     posture: str
     minus: str | None
-    """Posture whose reading was subtracted."""
+    """Posture whose reading was subtracted; None for a single reading."""
     before: float
-    """Measured − nominal, [m]."""
+    """Measured minus nominal reading, [m]."""
     after: float | None
-    """Measured − calibrated, [m]; None without a calibration."""
+    """Measured minus calibrated reading, [m]; None without a calibration."""
     cycles: int = 1
     """Number of cycles."""
 
     @property
     def where(self) -> str:
-        """The posture, or the difference of postures."""
+        """Name of the posture, or of the difference of postures."""
         return f"{self.posture} − {self.minus}" if self.minus else self.posture
 
 
@@ -59,37 +59,38 @@ class Measurement:
     offsets: Array
     """Offsets active in the controller, shape (n_drives,), [m, rad]."""
     rows: tuple[Deviation, ...]
+    """Deviations, averaged over the cycles."""
     count: int
-    """Number of readings with all cycles."""
+    """Number of readings in all cycles."""
     largest_after: float | None
     """Largest residual of a single reading, [m]; None without a calibration."""
     planned: bool
-    """Whether no reading has been taken: all values are 0."""
+    """Whether this is a plan, in which all readings are 0."""
 
     def place(self, row: Deviation) -> Place:
-        """The part of the machine that a row measures."""
+        """Part of the machine that a row measures."""
         return self.setups[row.setup].sensor.place
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stop:
-    """A posture at which the animation stops."""
+    """Posture at which the animation stops."""
 
     name: str
     drives: Array
     """Commanded drive coordinates, shape (n_drives,), [m, rad]."""
     rows: tuple[Deviation, ...] = ()
-    """Deviations that the gauges show here, at most one per setup."""
+    """Deviations of the gauges at this stop, at most one per setup."""
     place: Place | None = None
-    """The measured part of the machine; None for all."""
+    """Measured part of the machine; None for all parts."""
     subtracted_from: tuple[str, ...] = ()
-    """Postures from whose readings those of this stop are subtracted."""
+    """Postures from whose readings the readings of this stop are subtracted."""
 
 
 def measure_deviations(session: Session) -> tuple[Deviation, ...]:
-    """Readings less predictions of the machine with the active offsets, with the best gauge zeros.
+    """Readings minus predictions of the nominal machine with the active offsets.
 
-    All deviations of a plan without readings are zero.
+    Gauge zeros are fitted. All deviations of a plan without readings are zero.
 
     Raises:
         ClosureError: If the machine cannot reach a posture.
@@ -112,7 +113,7 @@ def measure_deviations(session: Session) -> tuple[Deviation, ...]:
 
 
 def _average(rows: Iterable[Deviation]) -> tuple[Deviation, ...]:
-    """One deviation for all cycles of a setup and posture."""
+    """Average deviations over the cycles of each setup and posture."""
     groups: dict[tuple[str, str, str | None], list[Deviation]] = {}
     for row in rows:
         groups.setdefault((row.setup, row.posture, row.minus), []).append(row)
@@ -125,7 +126,7 @@ def _average(rows: Iterable[Deviation]) -> tuple[Deviation, ...]:
 
 
 def measurement_of_session(session: Session) -> Measurement:
-    """Measurement of a session without a calibration."""
+    """Postures, setups and deviations of a session without a calibration."""
     return Measurement(
         robot=session.robot,
         setups=session.setups,
@@ -139,7 +140,7 @@ def measurement_of_session(session: Session) -> Measurement:
 
 
 def measurement_of_calibration(calibration: Calibration) -> Measurement:
-    """Measurement of a calibration, with deviations before and after."""
+    """Postures, setups and deviations of a calibration, before and after."""
     robot, offsets = calibration.robot, calibration.session.controller_offsets
     return Measurement(
         robot=robot,
@@ -157,7 +158,7 @@ def measurement_of_calibration(calibration: Calibration) -> Measurement:
 
 
 def worst_of_setups(rows: Iterable[Deviation]) -> tuple[Deviation, ...]:
-    """The row of every setup with the largest deviation."""
+    """Row with the largest deviation of every setup."""
     worst: dict[str, Deviation] = {}
     for row in rows:
         if row.setup not in worst or abs(row.before) > abs(worst[row.setup].before):
@@ -170,10 +171,10 @@ def plan_stops(measured: Measurement, posture: str | None) -> tuple[list[Stop], 
 
     Args:
         measured: The measurement.
-        posture: The only stop, instead.
+        posture: Name of a posture that replaces all stops.
 
     Returns:
-        The stops, and the number of postures that were left out.
+        The stops, and the number of omitted postures.
 
     Raises:
         ParameterError: If the posture does not exist.
@@ -196,22 +197,23 @@ def plan_stops(measured: Measurement, posture: str | None) -> tuple[list[Stop], 
         if not np.allclose(stops[0].drives, zero, rtol=0.0, atol=1e-9):
             path.append(Stop("zero", zero, place=place))
         path += stops
-    chosen = np.unique(np.linspace(0, len(path) - 1, min(MOST_STOPS, len(path))).round())
+    chosen = np.unique(np.linspace(0, len(path) - 1, min(MAX_STOPS, len(path))).round())
     return [overview, *(path[int(i)] for i in chosen), overview], len(path) - len(chosen)
 
 
 def _stop_at(
     measured: Measurement, name: str, rows: Sequence[Deviation], place: Place | None
 ) -> Stop:
-    here = worst_of_setups(r for r in rows if r.posture == name)
+    """Stop at a posture with the deviations of some rows."""
+    deviations = worst_of_setups(r for r in rows if r.posture == name)
     minuends = dict.fromkeys(r.posture for r in rows if r.minus == name)
-    return Stop(name, measured.drives[name], here, place, tuple(minuends))
+    return Stop(name, measured.drives[name], deviations, place, tuple(minuends))
 
 
 def _suggest(name: str, postures: Sequence[str]) -> str:
-    """All postures if they are few, else those with similar names."""
-    if len(postures) <= FEW_NAMES:
+    """Message with all postures if they are few, otherwise with similar names."""
+    if len(postures) <= MAX_LISTED:
         return f"postures: {', '.join(postures)}"
-    near = get_close_matches(name, postures, n=3, cutoff=0.4)
-    meant = f"; did you mean {', '.join(near)}?" if near else ""
-    return f"there are {len(postures)} in the session{meant}"
+    similar = get_close_matches(name, postures, n=3, cutoff=0.4)
+    suggestion = f"; did you mean {', '.join(similar)}?" if similar else ""
+    return f"there are {len(postures)} in the session{suggestion}"

@@ -1,9 +1,9 @@
 """Scenes of a robot, a session and a calibration.
 
-The scene of a calibration shows two machines: the calibrated one solid, and the nominal one, which
-the controller assumes, as a pale ghost. The deviation between them is enlarged
-by a factor that the scene states. Arrows at the gauges show the deviations of the readings before
-and after the calibration, enlarged by a factor of their own.
+The scene of a calibration shows the calibrated machine as a solid, and the nominal machine, which
+the controller assumes, as a pale ghost. The deviation between them is enlarged by a stated factor.
+Arrows at the gauges show the deviations of the readings before and after the calibration, enlarged
+by another factor.
 """
 
 from __future__ import annotations
@@ -47,23 +47,23 @@ from orthocal.viewer.scene import Scene, round_scale
 Poses = Mapping[str, Array]
 """Frame to poses, shape (F, 4, 4), [m]."""
 
-SHOWN = ("readings", "tool", "all")
-"""Choices of what the scene of a calibration shows at first."""
+SHOW_CHOICES = ("readings", "tool", "all")
+"""Initially visible content of a calibration's scene."""
 
-LARGEST_DEVIATION = 0.05
-"""Drawn size of the largest deviation, in sizes of the machine."""
+DEFAULT_DEVIATION = 0.05
+"""Default drawn size of the largest deviation, relative to the machine."""
 
-LARGEST_EXAGGERATION = 1.0
-"""Largest drawn size of the largest deviation that may be asked for, in sizes of the machine."""
+MAX_DEVIATION = 1.0
+"""Largest drawn size of the largest deviation, relative to the machine."""
 
-NOTHING = 1e-9
+NEGLIGIBLE = 1e-9
 """Deviations below this are zero, [m]."""
 
-FREE_REACH = 0.3
-"""Travel of a drive without limits, [rad] or characteristic lengths."""
+UNLIMITED_TRAVEL = 0.3
+"""Drawn travel of a drive without limits, [rad] or characteristic lengths."""
 
-LARGEST_REACH = 1.0
-"""Largest travel of a drive, [rad] or characteristic lengths."""
+MAX_TRAVEL = 1.0
+"""Largest drawn travel of a drive, [rad] or characteristic lengths."""
 
 MACHINE = "Machine"
 GHOST = "Machine, nominal (ghost)"
@@ -76,13 +76,15 @@ class _Machines:
 
     timeline: Timeline
     nominal: Poses
+    """Poses of the nominal machine."""
     drawn: Poses
     """Poses of the calibrated machine with enlarged deviation."""
     exaggeration: float
+    """Factor that enlarges the deviation."""
     largest: float
     """Largest deviation of a frame, [m]."""
     frame: str
-    """Name of that frame."""
+    """Name of the frame with the largest deviation."""
 
 
 def draw_scene(
@@ -96,12 +98,12 @@ def draw_scene(
 
     Args:
         subject: The calibration, session or robot.
-        posture: The posture to show; by default the mechanical zero and an animation of the
+        posture: Name of the posture to show; by default the mechanical zero and an animation of the
             measurement.
         exaggeration: Factor that enlarges the deviation of the calibrated machine; 1 for true
             scale. By default a factor that makes the deviation visible.
-        show: What the scene of a calibration shows at first: "readings", "tool" (its errors) or
-            "all".
+        show: Initially visible content of a calibration's scene: "readings", "tool" (tool errors)
+            or "all".
 
     Raises:
         ParameterError: If the posture does not exist, or an argument is out of range or does not
@@ -114,10 +116,10 @@ def draw_scene(
         raise ParameterError(
             f"is {exaggeration:g}; expected a positive number", where="exaggeration"
         )
-    if show is not None and show not in SHOWN:
-        raise ParameterError(f"'{show}' is none of {', '.join(SHOWN)}", where="show")
+    if show is not None and show not in SHOW_CHOICES:
+        raise ParameterError(f"'{show}' is none of {', '.join(SHOW_CHOICES)}", where="show")
     if isinstance(subject, Calibration):
-        return _draw_calibration(subject, posture, exaggeration, show or SHOWN[0])
+        return _draw_calibration(subject, posture, exaggeration, show or SHOW_CHOICES[0])
     if show is not None:
         raise ParameterError("applies to a calibration only", where="show")
     if exaggeration is not None:
@@ -133,6 +135,7 @@ def draw_scene(
 
 
 def _draw_robot(robot: Robot, posture: str | None) -> Scene:
+    """Scene of a robot that moves each drive."""
     if posture is not None:
         raise ParameterError("a robot has no postures; name a session", where="posture")
     drawing = MachineScene(robot, f"{robot.name}: the nominal machine")
@@ -152,7 +155,7 @@ def _draw_robot(robot: Robot, posture: str | None) -> Scene:
 
 
 def _state_zero(robot: Robot) -> list[str]:
-    """Facts about the mechanical zero, as the controller counts, and about free motions there."""
+    """Facts about the mechanical zero in joint coordinates, and about free motions."""
     drives = ", ".join(
         f"{d.name} {float(d.to_joint(d.zero)) / size + 0.0:.6g} {unit}"
         for d in robot.drives
@@ -165,32 +168,38 @@ def _state_zero(robot: Robot) -> list[str]:
     free = count_free_motions(robot)
     if free:
         motions = counted(free, "passive motion")
-        facts.append(f"The loops leave {motions} free. Their drawn position is arbitrary.")
+        facts.append(f"The loops do not constrain {motions}. Their drawn position is arbitrary.")
     return facts
 
 
 def _tour(robot: Robot) -> list[Stop]:
     """Stops at the mechanical zero and, for every drive, towards both ends of its travel."""
-    reaches = np.where(coordinate_units(robot) == 1.0, robot.characteristic_length, 1.0)
+    units = np.where(coordinate_units(robot) == 1.0, robot.characteristic_length, 1.0)
     stops = [Stop("mechanical zero", robot.drive_zero)]
     for i, drive in enumerate(robot.drives):
-        unit = float(reaches[robot.drive_index[i]])
-        for end, word in ((drive.lower, "down"), (drive.upper, "up")):
-            reach = end - drive.zero
-            if not math.isfinite(reach):
-                reach = math.copysign(FREE_REACH * unit, end)
-            reach = math.copysign(min(abs(reach), LARGEST_REACH * unit), reach)
-            target = _find_reachable(robot, i, 0.4 * reach)
+        unit = float(units[robot.drive_index[i]])
+        for end, direction in ((drive.lower, "down"), (drive.upper, "up")):
+            travel = end - drive.zero
+            if not math.isfinite(travel):
+                travel = math.copysign(UNLIMITED_TRAVEL * unit, end)
+            travel = math.copysign(min(abs(travel), MAX_TRAVEL * unit), travel)
+            target = _find_reachable(robot, i, 0.4 * travel)
             if target is not None:
-                stops += [Stop(f"{drive.name} {word}", target), stops[0]]
+                stops += [Stop(f"{drive.name} {direction}", target), stops[0]]
     return stops
 
 
 def _find_reachable(robot: Robot, drive: int, move: float) -> Array | None:
-    """Drive coordinates after a move, or a part of it, with loops that close on the way."""
+    """Drive coordinates after a move or a fraction of it; None if no loops close on the way.
+
+    Args:
+        robot: The robot.
+        drive: Index of the drive that moves.
+        move: Change of its coordinate, [m or rad].
+    """
     zero = robot.drive_zero
-    for part in (1.0, 0.5, 0.25):
-        target = zero + part * move * np.eye(len(zero))[drive]
+    for fraction in (1.0, 0.5, 0.25):
+        target = zero + fraction * move * np.eye(len(zero))[drive]
         timeline = plan_motion([zero, target, zero], count=1 + 4 * len(zero))
         try:
             nominal_closure(robot).close(timeline.drives, allow_free=True)
@@ -201,9 +210,10 @@ def _find_reachable(robot: Robot, drive: int, move: float) -> Array | None:
 
 
 def _draw_session(session: Session, posture: str | None) -> Scene:
+    """Scene of a session on the nominal machine."""
     robot, measured = session.robot, measurement_of_session(session)
     drawing = MachineScene(robot, session.title, sensor_frames=_sensor_frames(measured))
-    stops, left_out = plan_stops(measured, posture)
+    stops, omitted = plan_stops(measured, posture)
     timeline = plan_motion([s.drives + measured.offsets for s in stops])
     poses = _follow(nominal_closure(robot), robot, timeline, drawing.all_frames)
     drawing.draw_machine(MACHINE, "Machine, nominal", timeline, poses)
@@ -211,22 +221,23 @@ def _draw_session(session: Session, posture: str | None) -> Scene:
     drawing.look_at(poses)
     draw_readings(drawing, measured, stops, timeline, poses)
     drawing.scene.headline = write_headline(measured)
-    _finish(drawing.scene, session.source, stops, left_out)
+    _finish(drawing.scene, session.source, stops, omitted)
     return drawing.scene
 
 
 def _draw_calibration(
     calibration: Calibration, posture: str | None, exaggeration: float | None, show: str
 ) -> Scene:
+    """Scene of a calibration with both machines, deviations and tool errors."""
     measured = measurement_of_calibration(calibration)
     title = f"{calibration.session.title} · model '{calibration.model}'"
     drawing = MachineScene(measured.robot, title, sensor_frames=_sensor_frames(measured))
     scene = drawing.scene
-    stops, left_out = plan_stops(measured, posture)
+    stops, omitted = plan_stops(measured, posture)
     machines = _place_machines(calibration, measured, stops, drawing, exaggeration)
     timeline, real = machines.timeline, machines.drawn
     drawing.draw_machine(SOLID, "Calibrated machine", timeline, real)
-    if machines.largest > NOTHING:
+    if machines.largest > NEGLIGIBLE:
         text = "Nominal machine, as the controller assumes"
         drawing.draw_machine(GHOST, text, timeline, machines.nominal, ghost_of=real)
     drawing.draw_leg_lines(timeline, real)
@@ -245,7 +256,7 @@ def _draw_calibration(
         keep = assessment_of(calibration).keeps_offsets
         which = "Offsets that stay as they are" if keep else "Offsets to enter"
         scene.facts.insert(0, f"{which}: {entries}. Each leg leans by the offsets of all drives.")
-    _finish(scene, calibration.session.source, stops, left_out)
+    _finish(scene, calibration.session.source, stops, omitted)
     return scene
 
 
@@ -265,7 +276,7 @@ def _place_machines(
     assumed = Timeline(timeline.drives + measured.offsets, timeline.times, timeline.stops)
     nominal = _follow(nominal_loops, robot, assumed, frames)
     real = _follow(real_loops, machine, timeline, frames)
-    # the largest deviation in all postures, whichever are shown
+    # the largest deviation includes postures that are not shown
     drives = np.array([robot.drive_zero - measured.offsets, *measured.drives.values()])
     expected = drives + measured.offsets
     largest, frame = find_largest_shift(
@@ -273,8 +284,10 @@ def _place_machines(
         place_frames(machine, drives, real_loops.close(drives), drawing.frames),
     )
     if exaggeration is None:
-        exaggeration = round_scale(LARGEST_DEVIATION * size / largest if largest > NOTHING else 1.0)
-    if exaggeration * largest > LARGEST_EXAGGERATION * size:
+        exaggeration = round_scale(
+            DEFAULT_DEVIATION * size / largest if largest > NEGLIGIBLE else 1.0
+        )
+    if exaggeration * largest > MAX_DEVIATION * size:
         raise ParameterError(
             f"is {exaggeration:g}; the largest deviation of {largest / MM:.3g} mm would be drawn "
             f"larger than the machine: expected at most {size / largest:.0f}",
@@ -285,8 +298,8 @@ def _place_machines(
 
 
 def _state_deviation(machines: _Machines) -> str:
-    """Size and scale of the deviation of the machine."""
-    if machines.largest <= NOTHING:
+    """Sentence with the size and the scale of the machine's deviation."""
+    if machines.largest <= NEGLIGIBLE:
         return "The calibrated machine does not deviate from the nominal one."
     scale = "true scale"
     if machines.exaggeration != 1.0:
@@ -295,7 +308,7 @@ def _state_deviation(machines: _Machines) -> str:
 
 
 def _sensor_frames(measured: Measurement) -> list[str]:
-    """Frames that the sensors of all setups measure."""
+    """Names of the frames that the sensors of all setups measure."""
     sensors = (s.sensor for s in measured.setups.values())
     return [f for s in sensors for f in s.frames(measured.robot).in_posture]
 
@@ -308,17 +321,17 @@ def _follow(
     *,
     allow_free: bool = False,
 ) -> dict[str, Array]:
-    """Poses of frames in all frames of a motion, with closed loops."""
+    """Poses of robot frames at all times of a motion, with closed loops."""
     passive = closure.close(timeline.drives, allow_free=allow_free)
     return place_frames(robot, timeline.drives, passive, frames)
 
 
-def _finish(scene: Scene, source: str, stops: Sequence[Stop], left_out: int) -> None:
-    """Add the animation, and facts about it and the source of the readings."""
+def _finish(scene: Scene, source: str, stops: Sequence[Stop], omitted: int) -> None:
+    """Add the animation, and facts about omitted postures and the source of the readings."""
     if len(stops) > 1:
         scene.animate()
-    if left_out:
+    if omitted:
         shown = len(stops) - 2
-        scene.facts.append(f"The animation stops at {shown} of {shown + left_out} postures.")
+        scene.facts.append(f"The animation stops at {shown} of {shown + omitted} postures.")
     if source:
         scene.facts.append(f"Source: {source}")

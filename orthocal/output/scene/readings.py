@@ -40,33 +40,33 @@ BEFORE = "Readings before"
 AFTER = "Readings after"
 
 COLOURS: dict[str, Colour] = {BEFORE: (0.93, 0.62, 0.0), AFTER: (0.0, 0.40, 0.72)}
-"""Node of the arrows to their colour."""
+"""Colour of the arrows by their node."""
 
 GAUGE_COLOUR: Colour = (0.16, 0.17, 0.2)
 
 LONGEST_ARROW = 0.16
-"""Drawn length of the longest arrow at a gauge, in sizes of the machine."""
+"""Drawn length of the longest arrow at a gauge, relative to the machine."""
 
-DIAL = 0.034
-"""Radius of a dial, in sizes of the machine; smaller if there are many gauges."""
+DIAL_RADIUS = 0.034
+"""Radius of a dial, relative to the machine; smaller with many gauges."""
 
 FIRST_ARROW, NEXT_ARROW = 0.42, 0.6
-"""Distance from a contact to the first arrow beside it and between arrows, in radii of a dial."""
+"""Distances from a contact to the first arrow and between arrows, in radii of a dial."""
 
-MANY_GAUGES = 9
-"""Number of gauges above which they are drawn smaller."""
+MAX_FULL_SIZE = 9
+"""Most gauges that are drawn in full size."""
 
-MOST_LABELS = 8
-"""Number of gauges above which the overview labels only the worst of each leg and direction."""
+MAX_ALL_LABELLED = 8
+"""Most gauges that the overview labels; of more, it labels the worst of each leg and direction."""
 
-LONGEST_LABEL = 16
-"""Characters of the name of a setup in a label."""
+MAX_LABEL = 16
+"""Most characters of a setup's name in a label."""
 
-NOTHING = 1e-9
+NEGLIGIBLE = 1e-9
 """Deviations below this are zero, [m]."""
 
-SQUARE = 1e-6
-"""Cosine of directions that are square to each other."""
+PERPENDICULAR = 1e-6
+"""Largest cosine between directions that count as perpendicular."""
 
 
 def draw_readings(
@@ -85,16 +85,16 @@ def draw_readings(
         measured: The deviations.
         stops: The stops of the animation.
         timeline: The times of the stops.
-        poses: Frame to poses as drawn, shape (F, 4, 4), [m].
-        shown: Whether gauges and arrows are visible at first.
+        poses: Frame to drawn poses, shape (F, 4, 4), [m].
+        shown: Whether gauges and arrows are initially visible.
     """
     scene, nodes = drawing.scene, _arrow_nodes(measured)
     setups = [measured.setups[name] for name in dict.fromkeys(r.setup for r in measured.rows)]
     contacts = {s.name: _find_contact(drawing, s, poses) for s in setups}
     longest = max((abs(_deviation(r, node)) for node in nodes for r in measured.rows), default=0.0)
-    if longest > NOTHING:
+    if longest > NEGLIGIBLE:
         scene.arrow_scale = round_scale(LONGEST_ARROW * drawing.size / longest)
-    dial = DIAL * drawing.size * min(1.0, math.sqrt(MANY_GAUGES / max(len(setups), 1)))
+    dial = DIAL_RADIUS * drawing.size * min(1.0, math.sqrt(MAX_FULL_SIZE / max(len(setups), 1)))
     labelled = _labelled_setups(setups, measured, contacts)
     for i, setup in enumerate(setups):
         contact, point = contacts[setup.name], contacts[setup.name].points[0]
@@ -102,13 +102,13 @@ def draw_readings(
         gauge = _draw_gauge(drawing, setup, contact, dial)
         _move_gauge(drawing, gauge, _find_contact(drawing, setup, poses, moving=True), timeline)
         _hide_at_others(scene, gauge, setup, stops, timeline)
-        # arrows of gauges with the same contact are beside each other
+        # arrows of gauges with the same contact are drawn side by side
         others = (contacts[s.name].points[0] for s in setups[:i])
-        beside = sum(float(np.linalg.norm(point - other)) < dial for other in others)
-        aside = (FIRST_ARROW + NEXT_ARROW * beside) * dial * contact.along
+        count = sum(float(np.linalg.norm(point - other)) < dial for other in others)
+        shift = (FIRST_ARROW + NEXT_ARROW * count) * dial * contact.along
         tips = [point] * len(stops)
         for node in nodes:
-            foot = point + (aside if node == AFTER else -aside)
+            foot = point + (shift if node == AFTER else -shift)
             lengths = [_deviation(row, node) * scene.arrow_scale for row in rows]
             draw_arrow(
                 scene,
@@ -123,7 +123,7 @@ def draw_readings(
             drawing.lower_ground(min(float(end[2]) for end in ends))
             tips = ends if node == BEFORE else tips
         texts = ["" if row is None else _label(row, measured) for row in rows]
-        if len(stops) > 1 and setup.name not in labelled:  # the overview is the first and last stop
+        if len(stops) > 1 and setup.name not in labelled:  # the first and last stop is the overview
             texts = ["" if s is stops[0] else t for s, t in zip(stops, texts, strict=True)]
         rank = max(abs(r.before) for r in measured.rows if r.setup == setup.name)
         scene.labels.append(_label_gauge(gauge, contact, dial, texts, tips, rank))
@@ -132,21 +132,22 @@ def draw_readings(
 
 
 def _captions(measured: Measurement, stops: Sequence[Stop], shown: bool) -> list[str]:
+    """Captions of all stops."""
     overview = "Overview at the mechanical zero"
     if shown:
-        planned = "places of the gauges" if measured.planned else "largest deviation at each gauge"
-        overview = f"{overview}: {planned}"
-    # the last stop may be the first again
+        content = "places of the gauges" if measured.planned else "largest deviation at each gauge"
+        overview = f"{overview}: {content}"
+    # the last stop may be identical to the first one
     return [overview if len(stops) > 1 and s is stops[0] else _caption(s, measured) for s in stops]
 
 
 def arrow_width(dial: float) -> float:
-    """Width of the arrows at a gauge whose dial has a radius, [m]."""
+    """Width of the arrows at a gauge with a dial of a radius, [m]."""
     return 0.28 * dial
 
 
 def _arrow_nodes(measured: Measurement) -> tuple[str, ...]:
-    """Nodes of the arrows: before, and after if there is a calibration; none for a plan."""
+    """Nodes of the arrows: before, and with a calibration also after; none for a plan."""
     if measured.planned:
         return ()
     return (BEFORE, AFTER) if any(r.after is not None for r in measured.rows) else (BEFORE,)
@@ -160,7 +161,7 @@ def _deviation(row: Deviation | None, node: str) -> float:
 
 
 def _draw_gauge(drawing: MachineScene, setup: Setup, contact: Contact, dial: float) -> str:
-    """Draw the gauge of a setup; return its node."""
+    """Draw the gauge of a setup, and return its node."""
     node, tip = f"{GAUGES}/{node_name(setup.name)}", contact.tip
     if contact.fixed is not None:
         draw_bar(drawing.scene, node, contact.fixed, contact.points[0], 0.3 * dial)
@@ -180,20 +181,20 @@ def _draw_gauge(drawing: MachineScene, setup: Setup, contact: Contact, dial: flo
 
 
 def _move_gauge(drawing: MachineScene, node: str, contact: Contact, timeline: Timeline) -> None:
-    """Animate a gauge that moves with the tool, or a bar that turns about its fixed end.
+    """Animate a gauge that moves with the tool, or a bar that rotates about its fixed end.
 
     Args:
         drawing: The scene of the machine.
         node: Node of the gauge.
-        contact: Its contact in all frames of the animation.
+        contact: Contact of the gauge in all frames of the animation.
         timeline: Times of the frames.
     """
     scene, points = drawing.scene, contact.points
     if contact.fixed is not None:
         ends = points - contact.fixed
         lengths = np.linalg.norm(ends, axis=1)
-        turned = pose_along(np.tile(contact.fixed, (len(ends), 1)), ends / lengths[:, None])
-        scene.move(f"{node}/{BAR}", timeline.times, turned)
+        poses = pose_along(np.tile(contact.fixed, (len(ends), 1)), ends / lengths[:, None])
+        scene.move(f"{node}/{BAR}", timeline.times, poses)
     elif contact.at_tool:
         scene.track(node, "position", "vector3", timeline.times, points)
 
@@ -201,7 +202,7 @@ def _move_gauge(drawing: MachineScene, node: str, contact: Contact, timeline: Ti
 def _hide_at_others(
     scene: Scene, gauge: str, setup: Setup, stops: Sequence[Stop], timeline: Timeline
 ) -> None:
-    """Hide a gauge while another leg is measured: its contact moves sideways then."""
+    """Hide a gauge while another leg is measured, because its contact then moves sideways."""
     present = np.array([s.place is None or s.place == setup.sensor.place for s in stops])
     if not present.all():
         scene.track(gauge, "visible", "bool", timeline.times[timeline.stops], present)
@@ -215,7 +216,7 @@ def _label_gauge(
     tips: Sequence[Array],
     rank: float,
 ) -> Label:
-    """Label of a gauge that covers neither its dial nor its contact nor the tip of its arrow.
+    """Label of a gauge that does not cover dial, contact and tip of the arrow.
 
     Args:
         node: Node of the gauge.
@@ -234,8 +235,8 @@ def _label_gauge(
 def _labelled_setups(
     setups: Sequence[Setup], measured: Measurement, contacts: Mapping[str, Contact]
 ) -> set[str]:
-    """Setups that the overview labels: of many the worst of each place and direction."""
-    if len(setups) <= MOST_LABELS:
+    """Names of setups that the overview labels; of many, the worst of each leg and direction."""
+    if len(setups) <= MAX_ALL_LABELLED:
         return {s.name for s in setups}
     worst: dict[tuple[Place, int], Deviation] = {}
     for row in worst_of_setups(measured.rows):
@@ -257,25 +258,27 @@ def _find_contact(
 
 
 def _facing(direction: Array) -> Array:
-    """Direction across another one that faces the camera, along a world axis if possible."""
-    square = np.abs(direction) < SQUARE
-    if not square.any():
+    """Direction towards the camera, perpendicular to another one; a world axis if possible."""
+    perpendicular = np.abs(direction) < PERPENDICULAR
+    if not perpendicular.any():
         across = np.array(VIEW) - np.dot(VIEW, direction) * direction
         return np.asarray(across / np.linalg.norm(across))
-    view = np.where(square, VIEW, 0.0)
+    view = np.where(perpendicular, VIEW, 0.0)
     axis = int(np.abs(view).argmax())
     return np.asarray(np.eye(3)[axis] * np.sign(view[axis]))
 
 
 def _label(row: Deviation, measured: Measurement) -> str:
-    name = short_name(row.setup, LONGEST_LABEL)
+    """Label of a gauge at a stop."""
+    name = short_name(row.setup, MAX_LABEL)
     if measured.planned:
         return name
     after = "" if row.after is None else f" → {_mm(row.after)}"
-    return f"{name} {_mm(row.before)}{after} mm\n{short_name(row.where, 2 * LONGEST_LABEL)}"
+    return f"{name} {_mm(row.before)}{after} mm\n{short_name(row.where, 2 * MAX_LABEL)}"
 
 
 def _caption(stop: Stop, measured: Measurement) -> str:
+    """Caption of a stop with its readings."""
     if not stop.rows:
         place = "" if stop.place is None else f", {list_places([stop.place])}"
         minuends = ", ".join(stop.subtracted_from)
@@ -299,13 +302,13 @@ def _explain(scene: Scene, nodes: Sequence[str], shown: bool) -> None:
 
 
 def write_headline(measured: Measurement) -> str:
-    """The largest deviation before and after the calibration, and its place."""
+    """Sentence with the largest deviation before and after the calibration, and its place."""
     worst = max(measured.rows, key=lambda r: abs(r.before))
     if measured.planned:
         postures = len({r.posture for r in measured.rows})
         readings = counted(measured.count, "reading")
-        return f"A plan: {readings} in {counted(postures, 'posture')}, none taken yet."
-    if abs(worst.before) < NOTHING:
+        return f"A plan: {readings} in {counted(postures, 'posture')}, none measured yet."
+    if abs(worst.before) < NEGLIGIBLE:
         return "No gauge shows a deviation."
     place = list_places([measured.place(worst)])
     mean = f", mean of {worst.cycles} cycles" if worst.cycles > 1 else ""
@@ -331,4 +334,5 @@ def write_steps(
 
 
 def _mm(value: float) -> str:
+    """Length in mm with sign."""
     return typeset(value / MM)

@@ -24,12 +24,12 @@ ENTERED_COLOUR: Colour = (0.10, 0.58, 0.42)
 UNCERTAINTY_COLOUR: Colour = (0.45, 0.40, 0.65)
 
 LONGEST_ARROW = 0.08
-"""Drawn length of the largest tool error, in sizes of the machine."""
+"""Drawn length of the largest tool error, relative to the machine."""
 
 ARROW_WIDTH = 0.006
-"""Width of the arrows, in sizes of the machine."""
+"""Width of the arrows, relative to the machine."""
 
-VANISHING = 1e-7
+NEGLIGIBLE = 1e-7
 """Tool errors below this are not drawn, [m]."""
 
 
@@ -39,10 +39,10 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
     Args:
         drawing: The scene of the machine.
         calibration: The calibration.
-        shown: Whether they are visible at first.
+        shown: Whether they are initially visible.
 
     Returns:
-        The main result in a sentence; "" if nothing is drawn.
+        Main result in a sentence; "" if nothing is drawn.
     """
     scene = drawing.scene
     if calibration.robot.tcp is None:
@@ -55,14 +55,14 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
     region = accuracy.workspace.words.removeprefix("the workspace ")
     now, entered = (
         accuracy.average(accuracy.align(d))
-        for d in (accuracy.deviation, accuracy.error_after_offsets)
+        for d in (accuracy.deviation, accuracy.deviation_with_entries)
     )
     now_largest, entered_largest = (_largest(d) for d in (now, entered))
-    # RMS in space, as in all tables; axes of an ellipsoid are shorter
-    after, excess = accuracy.after, calibration.tolerance_scale.factor
-    spread = 0.0 if after is None else after.sizes.reported.largest
-    largest = max(now_largest, entered_largest, spread)
-    if largest < VANISHING:
+    # RMS in space, as in all tables; the axes of an ellipsoid are shorter
+    after, scale_factor = accuracy.after, calibration.tolerance_scale.factor
+    uncertainty = 0.0 if after is None else after.sizes.reported.largest
+    largest = max(now_largest, entered_largest, uncertainty)
+    if largest < NEGLIGIBLE:
         return ""
     chosen = _choose_points(accuracy)
     scene.tool_scale = round_scale(LONGEST_ARROW * drawing.size / largest)
@@ -72,15 +72,15 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
     _draw_deviations(scene, TOOL_ENTERED, targets, entered[chosen], ENTERED_COLOUR, width)
     text = f"Tool error now, {region}, aligned: up to {um(now_largest)} µm ({scale})"
     scene.explain(LegendEntry(text, (TOOL_NOW,), css(NOW_COLOUR), "arrow", shown))
-    if entered_largest > VANISHING:
+    if entered_largest > NEGLIGIBLE:
         text = f"Tool error, offsets entered: up to {um(entered_largest)} µm ({scale})"
         scene.explain(LegendEntry(text, (TOOL_ENTERED,), css(ENTERED_COLOUR), "arrow", shown))
     headline = f"Tool error now: up to {um(now_largest)} µm over {region}, workpiece aligned."
     if after is not None:
         _draw_ellipsoids(scene, targets, accuracy.average(after.aligned_covariance)[chosen])
-        wider = f", errors at {excess:.1f} × tolerances" if excess > 1.0 else ""
-        size = f"up to {um(spread)} µm RMS"
-        text = f"Tool uncertainty, all identified errors corrected: {size}{wider} ({scale})"
+        scaled = f", errors at {scale_factor:.1f} × tolerances" if scale_factor > 1.0 else ""
+        size = f"up to {um(uncertainty)} µm RMS"
+        text = f"Tool uncertainty, all identified errors corrected: {size}{scaled} ({scale})"
         colour = css(UNCERTAINTY_COLOUR)
         scene.explain(LegendEntry(text, (TOOL_UNCERTAINTY,), colour, "ball", shown))
         headline += f" With all identified errors corrected: {size}."
@@ -88,11 +88,12 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
 
 
 def _largest(deviations: Array) -> float:
+    """Largest length of deviations of shape (K, 3), [m]."""
     return float(np.linalg.norm(deviations, axis=1).max())
 
 
 def _choose_points(accuracy: ToolAccuracy) -> NDArray[np.int64]:
-    """Indices of the drawn grid points: middles and ends of the sides."""
+    """Indices of the drawn grid points, at middles and ends of the sides."""
     points = accuracy.points
     chosen = np.ones(len(points), dtype=bool)
     for column in points.T:
@@ -104,16 +105,17 @@ def _choose_points(accuracy: ToolAccuracy) -> NDArray[np.int64]:
 def _draw_deviations(
     scene: Scene, node: str, targets: Array, deviations: Array, colour: Colour, width: float
 ) -> None:
+    """Draw deviations of the tool as arrows at its targets."""
     for i, (target, deviation) in enumerate(zip(targets, deviations, strict=True)):
         length = float(np.linalg.norm(deviation))
-        if length > VANISHING:
+        if length > NEGLIGIBLE:
             pose = pose_along(target, deviation / length)
             lengths = [length * scene.tool_scale]
             draw_arrow(scene, f"{node}/point {i + 1}", pose, lengths, width=width, colour=colour)
 
 
 def _draw_ellipsoids(scene: Scene, targets: Array, covariances: Array) -> None:
-    """Draw one standard deviation of the tool's position around its targets."""
+    """Draw ellipsoids of one standard deviation of the tool's position at its targets."""
     for i, (target, covariance) in enumerate(zip(targets, covariances, strict=True)):
         values, vectors = np.linalg.eigh(covariance)
         if np.linalg.det(vectors) < 0.0:

@@ -33,7 +33,7 @@ from orthocal.output.sheet.gauge_position import (
 )
 from orthocal.output.sheet.pictures import draw_machine, draw_section, draw_tool
 from orthocal.output.text.layout import counted, true_minus
-from orthocal.robot.model import ALONG, Robot
+from orthocal.robot.model import PARALLEL_SINE, Robot
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.points import AXES, Points
 from orthocal.sensors.protocol import mounting_steps, tool_path
@@ -142,11 +142,12 @@ def _front(
     normal = "" if _is_corrected(session) else "A few mm are normal: the calibration finds them. "
     checks = [
         "Warm the machine up. Home it once. Do not home it again until all readings are taken.",
-        f"Move the machine to its mechanical zero: {_zero_by_eye(robot)}, by eye. The "
+        f"Move the machine to its mechanical zero by eye, once: {_zero_by_eye(robot)}. The "
         f"controller must show about {_joint_list(robot, robot.drive_zero)}. {normal}If a number "
         f"differs by more than {_largest_difference(robot)}, a dimension or the direction of "
         "counting is wrong: correct it in machine.yaml (`orthocal new DIRECTORY --again`) or in "
-        f"the robot's YAML. Travel of the joints: {'; '.join(_travel(session))}.",
+        "the robot's YAML. Later, move the machine to these numbers, not by eye. Travel of the "
+        f"joints: {'; '.join(_travel(session))}.",
         f"Jog each slide a little {_growing(robot)}. Its number must {_count_outwards(robot)}.",
         _active_offsets(session),
         *([text] if (text := _compensation(session)) else []),
@@ -157,8 +158,8 @@ def _front(
         _contact_rule(session, motions),
         "After you have set the gauge zero, do not touch the bezel, the stand or the arm of the "
         "gauge. If the gauge was bumped, start that setup again.",
-        "Write down what the dial shows, with its sign. Estimate the last digit. If you took no "
-        "reading, leave the box empty.",
+        "Write down what the dial shows, with its sign, to the nearest step of its scale. If you "
+        "could not take a reading, leave the box empty.",
     ]
     blanks = "".join(
         f"<p>{escape(text)}: <span class='fill'>&nbsp;</span></p>"
@@ -273,8 +274,8 @@ def _mount_on_base(gauge: GaugePosition) -> tuple[str, ...]:
         reach = gauge.hinge_distances / MM
         contact = (
             f"Its {name_tip(gauge.tip)} touches {_across(gauge)}, {reach[gauge.aligned]:.1f} mm "
-            f"from the hinge on the slide ({reach.min():.0f} to {reach.max():.0f} mm during the "
-            "setup). "
+            "from the hinge on the slide. During the setup this distance is "
+            f"{reach.min():.0f} to {reach.max():.0f} mm. "
         )
         if gauge.tip is not None and gauge.tip.edge is None:
             contact += "Align the ball by eye: half a millimetre is good enough. "
@@ -288,7 +289,7 @@ def _mount_on_base(gauge: GaugePosition) -> tuple[str, ...]:
         f"{opposite}. {contact}Contact point, from the tool centre point at the mechanical zero: "
         f"{place} mm.",
         f"Push the plunger in with a finger, towards {side}. The reading must grow. If it falls, "
-        "reverse the sign of every reading of this setup.",
+        "enter every reading of this setup with the opposite sign.",
     )
 
 
@@ -422,9 +423,8 @@ def _afterwards(session: Session, command: str) -> str:
     columns = ["reading_mm"] * (not all(points)) + ["x_mm, y_mm and z_mm"] * any(points)
     steps = [
         "Enter the readings with `orthocal record`, which checks each one at once. Or type them "
-        f"into readings.csv, column {' or '.join(columns)}, in the order of its lines, and delete "
-        "the lines without a reading: an empty field is refused. `orthocal import` reads a "
-        "spreadsheet.",
+        f"into readings.csv, column {' or '.join(columns)}, in the order of its lines. Delete the "
+        "line of a reading that you could not take. `orthocal import` reads a spreadsheet.",
         "Run:",
     ]
     return (
@@ -465,8 +465,9 @@ def _active_offsets(session: Session) -> str:
         for d, v in zip(drives, session.active_offsets, strict=True)
     )
     return (
-        "Check that these offsets of the slides are active in the controller, as session.yaml "
-        f"states: {active}. Do not change them until all readings are taken."
+        f"Check that the controller has the offsets that session.yaml states: {active}. They count "
+        "from the settings of the controller before its first calibration. Do not change them "
+        "until all readings are taken."
     )
 
 
@@ -482,8 +483,9 @@ def _compensation(session: Session) -> str:
         return ""
     return (
         "session.yaml states that the controller compensates no backlash. If it compensates "
-        "backlash (LinuxCNC: BACKLASH, COMP_FILE), state this in session.yaml: "
-        "controller: {backlash_mm: [...]}."
+        "backlash (LinuxCNC: BACKLASH, COMP_FILE), state this in session.yaml, in the order "
+        f"{', '.join(d.name for d in session.robot.drives)}: controller: {{backlash_mm: ["
+        f"{', '.join(['0.02'] * len(session.robot.drives))}]}}."
     )
 
 
@@ -499,7 +501,7 @@ def _zero_by_eye(robot: Robot) -> str:
 def _growing(robot: Robot) -> str:
     """Direction in which the slides move as the coordinates of the drives grow."""
     legs = robot.legs.values()
-    upwards = legs and all(leg.root_motion[2] > 1.0 - ALONG for leg in legs)
+    upwards = legs and all(leg.root_motion[2] > 1.0 - PARALLEL_SINE for leg in legs)
     return "upwards" if upwards else "outwards"
 
 
@@ -535,20 +537,19 @@ def _approach_rule(session: Session, motions: Sequence[SetupMotion]) -> str:
     if not motions:
         return arcs
     arrows = {describe_approach(robot, s.approach) for m in motions for s in m.stops}
-    jog = (
-        f"If you jog, go {length} past the posture with every joint first, and come back to it in "
-        "one motion of all joints"
-    )
     if len(arrows) > 1:
         return (
             f"Approach each posture as its arrows show: in the last {length} the displayed number "
             f"of the joint grows (↑) or falls (↓).{_order_of_arrows(robot, arrows)} The programs "
-            f"do this. {jog}. If a joint went too far, begin the approach again."
+            f"do this. If you jog, first move each joint to a number {length} smaller (↑) or "
+            "larger (↓) than that of the posture. Then move all joints to the posture in one "
+            "motion. If a joint went too far, begin the approach again."
         )
     (arrow,) = arrows
     return (
         f"Approach every posture from the same side: the last {length} go towards "
-        f"{_describe_arrow(robot, arrow)}. The programs do this. {jog}. {arcs}".rstrip()
+        f"{_describe_arrow(robot, arrow)}. The programs do this. If you jog, begin {length} "
+        f"before the posture with every joint and move to it in one motion. {arcs}".rstrip()
     )
 
 

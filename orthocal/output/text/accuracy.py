@@ -16,8 +16,8 @@ from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.effect_limits import DETERMINED
 from orthocal.assessment.remaining_errors import RemainingError, find_remaining_errors
 from orthocal.assessment.tool_error import (
-    ErrorSizes,
     ToolAccuracy,
+    ToolErrorStatistics,
     assess_tool,
     summarise_tool,
 )
@@ -58,8 +58,10 @@ COLUMNS_NOTE = (
 )
 
 UNCERTAINTY_NOTE = (
-    "Uncertainty: RMS in space. Errors that were not identified are included with their tolerances."
+    "Uncertainty: RMS in space. Errors that were not identified are included with their tolerances"
+    "{}."
 )
+"""Note about the uncertainties; {} is the tolerance scale in words, or empty."""
 
 HELPFUL = 0.1
 """Relative reduction of a tool error by which a sensor helps."""
@@ -106,13 +108,11 @@ def render_accuracy(
     rows = [("identified error, now", accuracy.measure(accuracy.deviation))]
     keep = assessment_of(calibration).keeps_offsets
     if not calibration.only_offsets and not keep:
-        entered = accuracy.measure(accuracy.error_after_offsets)
+        entered = accuracy.measure(accuracy.deviation_with_entries)
         rows.append(("identified error, offsets entered", entered))
     rows.append(("uncertainty before calibration", accuracy.before.sizes))
-    scale = calibration.tolerance_scale.factor
-    scaled = f" (tolerances × {scale:.1f})" if scale > 1.0 else ""
     if accuracy.after is not None:
-        rows.append((f"uncertainty after calibration{scaled}", accuracy.after.sizes))
+        rows.append(("uncertainty after calibration", accuracy.after.sizes))
     cells = []
     for name, sizes in rows:
         a = sizes.aligned
@@ -128,7 +128,9 @@ def render_accuracy(
             "The uncertainty after calibration is unknown, because the noise of the readings is."
         )
     else:
-        notes.append(UNCERTAINTY_NOTE)
+        scale = calibration.tolerance_scale.factor
+        scaled = f", after the calibration times {scale:.1f}" if scale > 1.0 else ""
+        notes.append(UNCERTAINTY_NOTE.format(scaled))
         summary = summarise_tool(calibration, accuracy)
         if summary is not None:
             notes.append(describe_tool_error(summary, keep=keep))
@@ -258,7 +260,7 @@ def format_points(rows: Array) -> str:
 def accuracy_json(calibration: Calibration, accuracy: ToolAccuracy) -> str:
     """Tool errors over a region as JSON, SI units."""
 
-    def sizes(field: ErrorSizes) -> dict[str, Any]:
+    def sizes(field: ToolErrorStatistics) -> dict[str, Any]:
         names = ("rms", "percentile_95", "largest")
         forms = {"aligned": field.aligned, "relative": field.relative, "absolute": field.absolute}
         return {
@@ -274,7 +276,7 @@ def accuracy_json(calibration: Calibration, accuracy: ToolAccuracy) -> str:
         "points": len(accuracy.points),
         "box": None if accuracy.workspace.box is None else accuracy.workspace.box.tolist(),
         "deviation": sizes(accuracy.measure(accuracy.deviation)),
-        "offsets_entered": sizes(accuracy.measure(accuracy.error_after_offsets)),
+        "offsets_entered": sizes(accuracy.measure(accuracy.deviation_with_entries)),
         "uncertainty_before": sizes(accuracy.before.sizes),
         "uncertainty_after": None if after is None else sizes(after.sizes),
     }

@@ -95,7 +95,7 @@ def _scores(comparison: Comparison) -> RenderableType:
     for result in comparison.results:
         after = None if result.tool is None else result.tool.after
         checked = result.spare > 0
-        evidence = comparison.recommendation.of(result.model)
+        evidence = comparison.recommendation.log_evidence_of(result.model)
         for score in (result.linearised, result.exact):
             first = score.method == "linearised"
             # without redundancy the residuals do not check the model
@@ -126,7 +126,7 @@ def _scores(comparison: Comparison) -> RenderableType:
         "effective: number of parameters that the readings determine",
         "AICc, BIC: lower is better; ln evidence (0: complete model): higher is better",
         "CV: cross-validation, RMS error of predicting each setup from all others",
-        "uncertainty: of the tool after calibration, RMS, workpiece aligned, stated tolerances",
+        "uncertainty: of the tool after calibration, RMS, workpiece aligned",
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from orthocal.assessment.wording import counted
 from orthocal.io.tables.cell import column_letters
 from orthocal.io.tables.table import Table
-from orthocal.measurement.files.readings_file import RawReading, is_house
+from orthocal.measurement.files.readings_file import RawReading, has_standard_headings
 from orthocal.measurement.files.write_session import firmware_document
 from orthocal.measurement.importing.import_readings import VALUES, TableImport
 from orthocal.measurement.importing.printer_log import PrinterImport
@@ -98,7 +98,7 @@ def _describe_decimal_sign(result: TableImport) -> str:
         return f"{decimal.sign} (from '{decimal.evidence.text}' in row {decimal.evidence.line})"
     if result.table.sheet is not None:
         return "not needed (numbers of the workbook)"
-    if is_house(result.table.header):
+    if has_standard_headings(result.table.header):
         return "point (format of readings.csv)"
     return "not needed (whole numbers only)"
 

@@ -16,7 +16,7 @@ from orthocal.assessment.effect_limits import DETERMINED, EffectLimits
 from orthocal.assessment.wording import tool_mm
 from orthocal.assessment.words.entries import describe_aligned
 from orthocal.kinematics.conditions import stated_use
-from orthocal.kinematics.workspace import find_workspace
+from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.measurement.motion.approach import approach_length, describe_approach
 from orthocal.output.text.accuracy import (
     NOTICEABLE,
@@ -25,7 +25,7 @@ from orthocal.output.text.accuracy import (
     describe_remedy,
 )
 from orthocal.output.text.layout import bullets, counted, plain, section, table_of
-from orthocal.planning.cost_curve import ENOUGH, HOUR, Stage
+from orthocal.planning.cost_curve import HOUR, HOURLY_GAIN, Stage
 from orthocal.planning.expected_error import Criterion, Expected
 from orthocal.planning.first_plan import FixedPlan
 from orthocal.planning.further_readings import FurtherReadings
@@ -322,12 +322,13 @@ def _when_enough(plan: MeasuringPlan) -> str:
     if enough is None:
         last = plan.curve[-1]
         return (
-            f"Another hour gains more than {ENOUGH:.0%}, up to {counted(last.setups, 'setup')} "
-            f"({show_duration(last.minutes)}, {tool_mm(last.error)})."
+            f"Another hour gains more than {HOURLY_GAIN:.0%}, up to "
+            f"{counted(last.setups, 'setup')} ({show_duration(last.minutes)}, "
+            f"{tool_mm(last.error)})."
         )
     return (
         f"Beyond {counted(enough.setups, 'setup')} ({show_duration(enough.minutes)}, "
-        f"{tool_mm(enough.error)}) another hour gains less than {ENOUGH:.0%}."
+        f"{tool_mm(enough.error)}) another hour gains less than {HOURLY_GAIN:.0%}."
     )
 
 

@@ -37,7 +37,7 @@ GLUE = "\u00a0"
 """Space at which no line ends."""
 
 COMMANDS = {
-    "back": "correct the line above; `back 7` line 7",
+    "back": "correct the reading before; `back 7` line 7",
     "again": "read the last line once more, as another cycle; `again 7` line 7",
     "skip": "leave this line empty for now",
     "drop": "delete this line from the session; `drop 7` line 7",
@@ -215,8 +215,8 @@ class RecordingText:
             from_hinge = f", {distances[aligned] / MM:.1f} mm from the hinge on the slide"
         return (
             f"Stand: on the {side} side, so that the tip touches at ({at}) mm in {aligned}"
-            f"{from_hinge}. Push the plunger in: the reading must grow. If it falls, reverse "
-            "the sign of every reading of this setup."
+            f"{from_hinge}. Push the plunger in: the reading must grow. If it falls, enter "
+            "every reading of this setup with the opposite sign."
         )
 
     def label(self, row: Reading) -> str:

@@ -11,7 +11,7 @@ from rich.text import Text
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.fit_findings import find_held, find_unresolved
 from orthocal.assessment.words.anomalies import describe_evidence
-from orthocal.assessment.words.fit import FEW_NAMES
+from orthocal.assessment.words.fit import MAX_LISTED
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
@@ -53,7 +53,7 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
     linear = c.solver.name == "linearised"
     profiled = any(p.interval for p in c.free)
     by_noise = all_rows and any(p.std_scatter < p.std for p in c.free)
-    in_std = c.solver.tells_linearisation and not profiled
+    in_std = c.solver.shows_linearisation_error and not profiled
     shifts = in_std and not prior
     headers = (
         "parameter",
@@ -167,7 +167,7 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
     for below in (f for f in hidden if f.kind == "below the noise"):
         names = [p.parameter or "" for p in below.places]
         lines.append(below.text)
-        if len(names) > FEW_NAMES:
+        if len(names) > MAX_LISTED:
             lines[-1] += f" They are {', '.join(names)}." if all_rows else " --all lists them."
     sums = [c for c in spectrum.base if len(c.terms) > 1]
     if base:

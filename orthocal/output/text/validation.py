@@ -44,7 +44,7 @@ def render_validation(
     validation: Validation, *, details: bool = False, all_rows: bool = False
 ) -> RenderableType:
     """A validation as rich renderables: the short answer, and on demand the details."""
-    answer, judged = validation.answer, validation.assessment
+    answer, judged = validation.final_calibration, validation.assessment
     complete = details or all_rows
     findings = [
         f.words
@@ -76,13 +76,13 @@ def render_validation(
 
 def _next_step(validation: Validation, *, further: bool) -> list[RenderableType]:
     """The command that calibrates from all readings, where they improve the machine further."""
-    paths = [part.path for part in validation.answer.session.parts]
+    paths = [part.path for part in validation.final_calibration.session.parts]
     if not paths or None in paths:
         return []
     joint = validation.joint is not None and validation.assessment.decision.verdict == "enter"
     if further:
         words = "to use the better offsets:"
-    elif joint and gains_from_correction(validation.answer):
+    elif joint and gains_from_correction(validation.final_calibration):
         words = "to correct the other identified errors, too, calibrate from all readings:"
     else:
         return []

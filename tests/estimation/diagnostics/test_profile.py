@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from orthocal import Choice, calibrate, load_session
 from orthocal.errors import NotIdentifiableError, ParameterError
-from orthocal.estimation.diagnostics.profile_likelihood import SETTLED, profile_interval
+from orthocal.estimation.diagnostics.profile_likelihood import END_TOLERANCE, profile_interval
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.problem import build_problem
 from orthocal.statistics.chance import confidence_factor
@@ -57,7 +57,7 @@ def test_where_the_problem_bends_it_is_not_symmetric(experiment_2):
     p = fit.solution.theta[0]
     low, high = profile_interval(fit, "x_slide.offset", level=0.999)
     skew = (high + low - 2 * p) / (high - low)
-    assert abs(skew) > 10.0 * SETTLED / confidence_factor(fit.noise.dof, 0.999)
+    assert abs(skew) > 10.0 * END_TOLERANCE / confidence_factor(fit.noise.dof, 0.999)
     half = confidence_factor(fit.noise.dof, 0.999) * np.sqrt(fit.covariance()[0, 0])
     assert (high - low) / 2 == pytest.approx(half, rel=1e-3)
 

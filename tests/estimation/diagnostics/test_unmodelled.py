@@ -8,7 +8,7 @@ from drawn_machines import DrawnMachines
 from models import JOINTS
 
 from orthocal import Choice, calibrate, simulate_session
-from orthocal.assessment.judgement import RARE
+from orthocal.assessment.judgement import FALSE_ALARM_RATE
 from orthocal.calibration import build_record as recording
 from orthocal.estimation.diagnostics.unmodelled import (
     find_unmodelled_errors,
@@ -75,7 +75,7 @@ def test_one_machine_in_a_hundred_leaves_as_much_as_is_called_worse(result, mach
     parts = result.unmodelled.residual_dof
     squares = np.mean(machines[1] ** 2, axis=1) / result.unmodelled.residual_rms**2
     assert 2.0 / squares.var() == pytest.approx(parts, rel=0.25)
-    beyond = np.mean([chi_square_tail(parts, parts * s) < RARE for s in squares])
+    beyond = np.mean([chi_square_tail(parts, parts * s) < FALSE_ALARM_RATE for s in squares])
     assert 0.0 < beyond < 0.025  # 10 of 1,000, and three standard deviations
 
 

@@ -240,5 +240,5 @@ def test_a_tip_that_passes_where_a_solver_begins_is_told(root):
     problem = build_problem(session, model="offsets")
     start = np.zeros(problem.n_free)
     start[problem.free.index("z_slide.offset")] = 25e-3
-    with pytest.raises(SolverError, match="cannot begin: on the machine that the readings lead to"):
+    with pytest.raises(SolverError, match="cannot start: with the start values of the errors"):
         VariableProjection(problem).solve(sigma=1e-5, start=start)

@@ -335,7 +335,7 @@ def test_setups_that_no_other_predicts_have_no_such_marker(table1, unknown):
 
 
 def test_the_worst_of_many_setups_are_shown(sweep, monkeypatch):
-    monkeypatch.setattr(reading_plots, "MOST_ROWS", 5)
+    monkeypatch.setattr(reading_plots, "MAX_ROWS", 5)
     figure = reading_plots.plot_setups.figure(sweep)
     assert title(figure).endswith("the 5 worst of 18")
     assert len(row_names(figure.axes[0])) == 5
@@ -411,7 +411,7 @@ def test_differences_count_as_readings_where_both_are(table1):
 
 def test_of_many_residuals_the_outermost_all_stay(many):
     x, y = line(reading_plots.plot_spread.figure(many).axes[0], "residuals after: 500 of 12150")
-    assert x.size == reading_plots.MOST_POINTS
+    assert x.size == reading_plots.MAX_POINTS
     values = np.sort([r.residual * 1e3 for r in many.residuals])
     np.testing.assert_allclose(y[:100], values[:100], atol=UNIT)
     np.testing.assert_allclose(y[-100:], values[-100:], atol=UNIT)
@@ -555,7 +555,7 @@ def test_numbers_have_the_signs_that_axes_have():
 
 
 def test_of_many_parameters_those_with_the_strongest_correlations_are_shown(sweep, monkeypatch):
-    monkeypatch.setattr(parameter_plots, "MOST_CORRELATED", 10)
+    monkeypatch.setattr(parameter_plots, "MAX_CORRELATED", 10)
     figure = parameter_plots.plot_correlations.figure(sweep)
     assert title(figure).endswith("the 10 of 129 parameters with the strongest")
     axes = figure.axes[0]
@@ -576,7 +576,7 @@ def test_negative_correlations_are_marked_without_colour(sweep):
     (cells,) = axes.collections
     assert len(cells.get_paths()) == 40 * 39 / 2
     centres = np.array([p.vertices[:4].mean(axis=0) for p in cells.get_paths()])
-    negative = np.asarray(cells.get_array()) < -parameter_plots.CLEAR
+    negative = np.asarray(cells.get_array()) < -parameter_plots.SIGN_LIMIT
     marked = np.concatenate([a.get_xydata() for a in axes.lines])
     assert {tuple(p) for p in marked} == {tuple(p) for p in centres[negative]}
     assert 0 < len(marked) < 100

@@ -256,7 +256,7 @@ def test_session_in_a_notebook(raw_cycles):
     assert len(read.rows) == 7
     values = [r.value * 1e3 for r in raw_cycles.readings if r.setup == "yx"]
     assert read.rows[1] == [
-        *("yx", "leg x, gauge in y, at 0.5 of its length", "9"),
+        *("yx", "leg x, gauge in y, at 0.5 of its length from the slide", "9"),
         *(f"{min(values):+.3f}", f"{max(values):+.3f}"),
     ]
 

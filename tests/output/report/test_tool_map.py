@@ -122,7 +122,7 @@ def test_sizes_are_those_of_the_error_in_question(table1, accuracy):
     def sizes(which):
         return np.linalg.norm(tool_map._error_parts(accuracy, which), axis=1)
 
-    found = (accuracy.deviation, accuracy.error_after_offsets)
+    found = (accuracy.deviation, accuracy.deviation_with_entries)
     deviation, left = (np.linalg.norm(accuracy.align(v), axis=1) for v in found)
     np.testing.assert_allclose(sizes("now"), deviation * 1e6, rtol=GRID)
     np.testing.assert_allclose(sizes("entered"), left * 1e6, rtol=GRID)
@@ -168,7 +168,7 @@ def test_the_map_between_its_points_is_that_of_the_machine(table1, accuracy):
     """Halfway between middle and end, by the machine itself."""
     robot, half = table1.robot, accuracy.workspace.half_side
     lines = tool_map._find_grid(accuracy.workspace.points)
-    fine = assess_tool(table1, cube(robot, half_side=half, points_a_side=9))
+    fine = assess_tool(table1, cube(robot, half_side=half, points_per_side=9))
     nine = tool_map._find_grid(fine.workspace.points)
     known = fine.deviation.reshape(9, 9, 9, 3)[:, :, 4] * 1e6
     cut = accuracy.deviation.reshape(5, 5, 5, 3)[:, :, 2] * 1e6
@@ -282,14 +282,14 @@ def test_no_map_without_uncertainty_or_further_errors(table1, accuracy):
     assert tool_map.plot_tool_map(offsets, accuracy, which="now")
 
 
-@pytest.mark.parametrize("points_a_side", [2, 4])
-def test_a_grid_without_a_middle_has_no_map(orthoglide, points_a_side):
-    points = cube(orthoglide, points_a_side=points_a_side).points
+@pytest.mark.parametrize("points_per_side", [2, 4])
+def test_a_grid_without_a_middle_has_no_map(orthoglide, points_per_side):
+    points = cube(orthoglide, points_per_side=points_per_side).points
     assert tool_map._find_grid(points) is None
 
 
 def test_points_that_are_no_grid_have_no_map(table1, accuracy, orthoglide):
-    points = cube(orthoglide, points_a_side=3).points
+    points = cube(orthoglide, points_per_side=3).points
     assert len(tool_map._find_grid(points)) == 3
     line = np.linspace(-0.06, 0.06, 5)[:, None]
     for other in (points[:-1], points[::-1], line, points + np.eye(27, 3) * 1e-3):

@@ -164,7 +164,7 @@ def test_alignment_posture_comes_before_the_first(small):
 def test_steps_say_how_to_mount_and_set_the_gauge(page):
     ball, blade, line, pin = (words(s) for s in sections(page))
     for text in (ball, blade, line, pin):
-        assert "The reading must grow. If it falls, reverse the sign of every reading" in text
+        assert "The reading must grow. If it falls, enter every reading of this setup" in text
         assert "half of its travel, about 5 mm. Then turn the bezel until the dial shows 0." in text
     assert "blade 20 mm wide" in blade
     assert "on the -x side of rod b of leg y. Point its plunger to +x." in blade

@@ -1,0 +1,166 @@
+"""Active offsets, compensation and firmware of a session, checked against its robot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from orthocal.arrays import Array
+from orthocal.effects.compensation import Compensation, JointTrim
+from orthocal.errors import SessionError
+from orthocal.io.fields import read_only
+from orthocal.measurement.files.linuxcnc_ini import read_comp_file
+from orthocal.measurement.files.session_keys import BACKLASH_KEYS, OFFSET_KEYS, ControllerKeys
+from orthocal.printers.settings import DeltaSettings
+from orthocal.robot.model import Drive, Robot
+from orthocal.units import Unit
+
+KINDS: dict[Unit, str] = {"m": "prismatic", "rad": "revolute"}
+"""Kind of a drive by the unit of its coordinate."""
+
+
+def require_count(
+    values: Sequence[object],
+    noun: str,
+    drives: Sequence[Drive],
+    *,
+    where: str,
+    each: str = "drive",
+    remark: str = "",
+) -> None:
+    """Refuse a list without exactly one item per drive.
+
+    Args:
+        values: The list.
+        noun: Name of its items in the plural.
+        drives: The drives.
+        where: File and key, for messages.
+        each: Kind of the drives.
+        remark: End of the message.
+
+    Raises:
+        SessionError: If the numbers of items and drives differ.
+    """
+    if len(values) != len(drives):
+        names = ", ".join(d.name for d in drives)
+        raise SessionError(
+            f"has {len(values)} {noun}; expected {len(drives)}, one per {each}: {names}{remark}",
+            where=where,
+        )
+
+
+def build_offsets(keys: ControllerKeys | None, robot: Robot, where: str) -> Array | None:
+    """Active offsets, shape (n_drives,), [m, rad]; None if not stated.
+
+    Args:
+        keys: Keys under `controller`; None if absent.
+        robot: The robot.
+        where: File and key, for messages.
+
+    Raises:
+        SessionError: If numbers and drives do not match.
+    """
+    return None if keys is None else _read_drive_values(keys, OFFSET_KEYS, "offset", robot, where)
+
+
+def build_compensation(
+    keys: ControllerKeys | None, robot: Robot, *, folder: Path, where: str
+) -> Compensation:
+    """Backlash and errors of screws that the controller compensates; empty if it does not.
+
+    Args:
+        keys: Keys under `controller`; None if absent.
+        robot: The robot.
+        folder: Directory of the session, to which names of tables are relative.
+        where: File and key, for messages.
+
+    Raises:
+        SessionError: If numbers or tables and drives do not match, or a table is wrong.
+    """
+    if keys is None:
+        return ()
+    backlash = _read_drive_values(keys, BACKLASH_KEYS, "backlash", robot, where)
+    if backlash is None and keys.comp_file is None:
+        return ()
+    names = keys.comp_file or [None] * len(robot.drives)
+    table_key = f"{where}.comp_file"
+    remark = "; null for a drive without a table"
+    require_count(names, "names", robot.drives, where=table_key, remark=remark)
+    values = np.zeros(len(names)) if backlash is None else backlash
+    tables = (
+        None if name is None else read_comp_file(folder, name, drive, table_key)
+        for name, drive in zip(names, robot.drives, strict=True)
+    )
+    return tuple(JointTrim(float(v), table) for v, table in zip(values, tables, strict=True))
+
+
+def build_firmware(keys: ControllerKeys | None, robot: Robot, where: str) -> DeltaSettings | None:
+    """Settings of the firmware of a delta printer; None if not stated.
+
+    Raises:
+        SessionError: If the robot does not have three prismatic drives.
+    """
+    if keys is None or keys.firmware is None:
+        return None
+    if [d.unit for d in robot.drives] != ["m"] * 3:
+        raise SessionError(
+            f"{robot.name} is not a delta printer; expected three prismatic drives",
+            where=f"{where}.firmware",
+        )
+    return keys.firmware.to_settings()
+
+
+def _read_drive_values(
+    keys: ControllerKeys,
+    key_units: Mapping[str, tuple[Unit, float]],
+    quantity: str,
+    robot: Robot,
+    where: str,
+) -> Array | None:
+    """Assemble one value per drive from the keys for prismatic and revolute drives.
+
+    Args:
+        keys: Keys under `controller`.
+        key_units: Keys of the quantity, with the SI unit of their drives and the factor to SI.
+        quantity: Name of the quantity, for messages.
+        robot: The robot.
+        where: File and key, for messages.
+
+    Returns:
+        Shape (n_drives,), [m, rad]; None if no key is stated.
+
+    Raises:
+        SessionError: If numbers and drives do not match.
+    """
+    stated = [key for key in key_units if getattr(keys, key) is not None]
+    if not stated:
+        return None
+    result = np.zeros(len(robot.drives))
+    units: set[str] = set()
+    for key in stated:
+        values, (unit, factor) = getattr(keys, key), key_units[key]
+        indices = [i for i, d in enumerate(robot.drives) if d.unit == unit]
+        if not indices:
+            expected = " or ".join(k for k, (u, _) in key_units.items() if u != unit)
+            raise SessionError(
+                f"{robot.name} has no {KINDS[unit]} drive; expected {expected}",
+                where=f"{where}.{key}",
+            )
+        require_count(
+            values,
+            "numbers",
+            [robot.drives[i] for i in indices],
+            where=f"{where}.{key}",
+            each="drive" if len(indices) == len(robot.drives) else f"{KINDS[unit]} drive",
+        )
+        result[indices] = np.array(values) * factor
+        units.add(unit)
+    for drive in robot.drives:
+        if drive.unit not in units:
+            expected = " or ".join(k for k, (unit, _) in key_units.items() if unit == drive.unit)
+            raise SessionError(
+                f"the {quantity} of drive {drive.name} is missing; add {expected}", where=where
+            )
+    return read_only(result)

@@ -1,0 +1,139 @@
+"""Postures of a session, checked against its robot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from orthocal.arrays import Array
+from orthocal.errors import ClosureError, SessionError
+from orthocal.io.fields import read_only
+from orthocal.kinematics.loop_closure import nominal_closure
+from orthocal.measurement.files.session_controller import KINDS, require_count
+from orthocal.measurement.files.session_keys import PostureKeys, SessionKeys
+from orthocal.robot.model import Drive, Robot
+from orthocal.session.session import Posture, PostureForm
+from orthocal.units import DRIVE_UNITS, MM
+
+ROUNDING = 1e-9
+"""Excess over a limit of travel that may be a rounding error, [m, rad]."""
+
+
+def require_mechanical_zero(robot: Robot, where: str) -> None:
+    """Refuse a robot whose mechanical zero was computed instead of stated.
+
+    Legs, sections and offsets refer to the mechanical zero.
+
+    Args:
+        robot: The robot.
+        where: File and key that name it, for messages.
+
+    Raises:
+        SessionError: If the zero is not stated; lists the computed zeros, ready to copy.
+    """
+    zeros = [_state_zero(drive) for drive in robot.drives if drive.zero_computed]
+    if zeros:
+        raise SessionError(
+            f"the mechanical zero of '{robot.name}' is not stated, and its loops do not close with "
+            f"the drives at 0; add to orthocal.drives in {robot.yaml}: {', '.join(zeros)}",
+            where=where,
+        )
+
+
+def _state_zero(drive: Drive) -> str:
+    """Key and value of the mechanical zero of a drive."""
+    unit, factor = DRIVE_UNITS[drive.unit]
+    return f"{drive.name}.zero_{unit}: {drive.zero / factor:.6g}"
+
+
+def build_postures(
+    keys: SessionKeys, robot: Robot, offsets: Array | None, file: Path
+) -> dict[str, Posture]:
+    """Postures with their drive coordinates, by the nominal inverse kinematics.
+
+    Args:
+        keys: Keys of the session.yaml.
+        robot: The robot.
+        offsets: Active offsets, shape (n_drives,), [m, rad]; None if not stated.
+        file: The session.yaml, for messages.
+
+    Raises:
+        SessionError: If a posture has the wrong coordinates, or the machine cannot reach it.
+    """
+    closure = nominal_closure(robot)
+    active = np.zeros(len(robot.drives)) if offsets is None else offsets
+    offset_keys = [] if keys.controller is None else keys.controller.offset_keys
+    stated = {n: _read_posture(p, robot, f"{file}: postures.{n}") for n, p in keys.postures.items()}
+    points = {name: values for name, (form, values) in stated.items() if form == "tcp"}
+    try:
+        commanded = {name: values for name, (_, values) in stated.items()}
+        if points:
+            joints = closure.inverse(np.array(list(points.values())), names=list(points))
+            commanded |= dict(zip(points, joints, strict=True))
+        for name, drives in commanded.items():
+            _check_travel(robot, drives, where=f"{file}: postures.{name}")
+            # the controller subtracts the active offsets: its encoders are at commanded − active
+            where = f"{file}: controller.{' and '.join(offset_keys)}"
+            _check_travel(robot, drives - active, where=where, posture=name)
+        closure.close(np.array(list(commanded.values())), names=list(commanded))
+    except ClosureError as e:
+        raise SessionError(e.reason, where=f"{file}: postures.{e.posture}") from None
+    return {
+        name: Posture(name, form, read_only(values), read_only(commanded[name] - active))
+        for name, (form, values) in stated.items()
+    }
+
+
+def _read_posture(keys: PostureKeys, robot: Robot, where: str) -> tuple[PostureForm, Array]:
+    """Form and coordinates of a posture, shape (n_drives,), [m, rad]."""
+    key, values = keys.coordinates
+    count = len(robot.drives)
+    if key == "tcp_mm":
+        if robot.tcp is None or len(robot.tcp.coordinates) != count:
+            raise SessionError(
+                f"{robot.name} has no tool coordinate for every drive; state joints_mm or "
+                "joints_deg",
+                where=where,
+            )
+        if len(values) != count:
+            raise SessionError(
+                f"has {len(values)} coordinates; expected {count}", where=f"{where}.{key}"
+            )
+        return "tcp", np.array(values) * MM
+    where = f"{where}.{key}"
+    require_count(values, "numbers", robot.drives, where=where)
+    unit = "m" if key == "joints_mm" else "rad"
+    for drive in robot.drives:
+        if drive.unit != unit:
+            mixed = len({d.unit for d in robot.drives}) > 1
+            expected = "tcp_mm" if mixed else f"joints_{DRIVE_UNITS[drive.unit][0]}"
+            raise SessionError(
+                f"drive {drive.name} is {KINDS[drive.unit]}; use {expected}", where=where
+            )
+    return "joints", np.array(values) * MM if unit == "m" else np.deg2rad(values)
+
+
+def _check_travel(robot: Robot, drives: Array, *, where: str, posture: str | None = None) -> None:
+    """Refuse drive coordinates beyond a drive's travel.
+
+    Args:
+        robot: The robot.
+        drives: Drive coordinates, shape (n_drives,), [m, rad].
+        where: File and key, for messages.
+        posture: Name of the posture, if the key does not contain it.
+
+    Raises:
+        SessionError: If a drive does not reach its coordinate; the message has the joint
+            coordinates of the controller.
+    """
+    prefix = "" if posture is None else f"in posture '{posture}' "
+    for drive, value in zip(robot.drives, drives, strict=True):
+        if not drive.lower - ROUNDING <= value <= drive.upper + ROUNDING:
+            unit, factor = DRIVE_UNITS[drive.unit]
+            number, low, high = (v / factor for v in (drive.to_joint(value), *drive.joint_limits))
+            raise SessionError(
+                f"{prefix}{drive.name} would be at {number:.3f} {unit}; it reaches from {low:g} to "
+                f"{high:g} {unit}",
+                where=where,
+            )
