@@ -107,7 +107,7 @@ def test_a_gauge_block_stands_on_the_table(tmp_path):
 gauge: {sigma_mm: 0.005, range_mm: [-5, 5]}
 postures:
   beside: {tcp_mm: [10, 0, -20]}
-  on: {tcp_mm: [10, 0, 30]}
+  above: {tcp_mm: [10, 0, 30]}
 setups:
   step: {sensor: tool_indicator, direction: -z, tool_mm: [0, 0, -40],
          artefact: {kind: gauge_block, height_mm: 50, table_mm: 20}}
