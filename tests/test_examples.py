@@ -228,8 +228,9 @@ def test_the_enlargement_and_the_residuals_on_the_pages_are_right(root):
     text = " ".join((ROOT / "README.md").read_text().split())
     said = " ".join((ROOT / "docs/results.md").read_text().split())
     calibration = calibrate(root / "examples/table1/experiment-2")
-    assert "enlarged twelve times" in text
-    assert draw_scene(calibration).exaggeration == 12.0
+    scene = draw_scene(calibration)
+    enlarged = f"enlarged {scene.exaggeration:g} times, arrows {scene.arrow_scale:g} times"
+    assert enlarged in text
     assert "the residuals are ten times the noise of the gauge" in said
     noise, gauge = calibration.noise, calibration.session.gauge_sigma
     assert noise.residual_sigma / gauge == pytest.approx(10.0, abs=0.5)

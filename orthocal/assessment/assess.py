@@ -151,7 +151,9 @@ def assess(
         *([_no_change_needed(calibration, entries, chosen.best)] if keep else []),
         *([] if firmware else _entry_findings(calibration, entries, tool, keep=keep)),
         *describe_recommendation(
-            recommendation or recommend_model(session_used), identified=calibration.model
+            recommendation or recommend_model(session_used),
+            judged_scale=judgement.tolerance_scale.factor,
+            identified=calibration.model,
         ),
         *chosen.unreached,
     ]

@@ -15,19 +15,15 @@ from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
 from orthocal.kinematics.conditions import APPROACH, UseConditions, UseSamples, sample_use
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
-from orthocal.kinematics.reachable_box import find_workspace
+from orthocal.kinematics.reachable_box import find_workspace, require_travel
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace
-from orthocal.robot.model import Robot
 
 TOOL_CACHE_SIZE = 4
 """Number of calibrations whose tools are cached."""
 
 DEVIATION_CACHE_SIZE = 8
 """Number of cached deviations of tools."""
-
-LIMIT_SLACK = 1e-9
-"""Rounding error by which a drive may exceed its travel, [m, rad]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,7 +150,7 @@ def find_tool(calibration: Calibration, use: UseSamples | None = None) -> Calibr
     def require_reach(points: Array) -> None:
         drives, passive = nominal_closure(robot).reach(points)
         for offsets in (calibration.active_offsets, identified_offsets):
-            _require_travel(robot, drives - offsets)
+            require_travel(robot, drives - offsets)
             sensitivities[0].closure.forward(drives - offsets, start=passive)
 
     try:
@@ -227,13 +223,6 @@ def _place(
         sensitivities=sensitivities,
         jacobian=read_only(np.concatenate(jacobians)),
     )
-
-
-def _require_travel(robot: Robot, drives: Array) -> None:
-    """Refuse drive coordinates beyond a drive's travel, shape (K, n_drives)."""
-    for drive, values in zip(robot.drives, drives.T, strict=True):
-        if values.min() < drive.lower - LIMIT_SLACK or values.max() > drive.upper + LIMIT_SLACK:
-            raise ClosureError(f"is beyond the travel of {drive.name}", posture="a corner")
 
 
 def error_covariance(calibration: Calibration) -> Array:

@@ -203,7 +203,9 @@ def _score_with_prior(
 def _assess(comparison: Comparison) -> Assessment:
     """Assessment of a comparison: judgement of the readings and findings about the models."""
     judgement, best = comparison.judgement, comparison.best
-    notes = words.describe_recommendation(comparison.recommendation)
+    notes = words.describe_recommendation(
+        comparison.recommendation, judged_scale=judgement.tolerance_scale.factor
+    )
     notes += [words.not_determined(u.model, u.reason) for u in comparison.undetermined]
     notes += words.describe_effects(comparison.effects, len(comparison.labels))
     tool = None

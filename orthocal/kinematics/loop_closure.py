@@ -522,7 +522,7 @@ def find_beyond_travel(robot: Robot, drives: Array, names: Sequence[str]) -> Fai
     failures: Failures = {}
     for drive, values in zip(robot.drives, drives.T, strict=True):
         factor, unit = drive.edge_factor, drive.edge_unit
-        for i in np.flatnonzero((values < drive.lower) | (values > drive.upper)).tolist():
+        for i in np.flatnonzero(drive.is_beyond(values)).tolist():
             reason = (
                 f"{drive.name}_{unit} is {values[i] * factor:g}; the drive reaches from "
                 f"{drive.lower * factor:g} to {drive.upper * factor:g}"

@@ -117,20 +117,28 @@ def _nominal_reach_check(robot: Robot) -> RequireReach:
 
     Positions must be within the travel of the drives and away from singularities.
     """
-    lower = np.array([d.lower for d in robot.drives])
-    upper = np.array([d.upper for d in robot.drives])
     coordinates = list(require_commanded_tool(robot))
     sensitivity = ToolSensitivity(robot, free=[f"{d.name}.offset" for d in robot.drives])
 
     def require_reach(points: Array) -> None:
         drives, passive = nominal_closure(robot).reach(points)
-        if (drives < lower).any() or (drives > upper).any():
-            raise ClosureError("is beyond the travel of a drive", posture="a corner")
+        require_travel(robot, drives)
         jacobians = sensitivity(drives, passive=passive)[:, coordinates]
         if (np.linalg.cond(jacobians) > MAX_CONDITION_NUMBER).any():
             raise ClosureError("is nearly singular", posture="a corner")
 
     return require_reach
+
+
+def require_travel(robot: Robot, drives: Array) -> None:
+    """Refuse drive coordinates beyond the travel of a drive, shape (K, n_drives), [m, rad].
+
+    Raises:
+        ClosureError: Naming the drive.
+    """
+    for drive, values in zip(robot.drives, drives.T, strict=True):
+        if drive.is_beyond(values).any():
+            raise ClosureError(f"is beyond the travel of {drive.name}", posture="a corner")
 
 
 def _largest_box(robot: Robot, box: Array, require_reach: RequireReach) -> Workspace:

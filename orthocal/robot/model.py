@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Mask
 from orthocal.errors import ClosureError, ParameterError, RobotError
 from orthocal.io.fields import read_only
 from orthocal.robot.closing import Closing, close_loops, describe_opening
@@ -20,6 +20,9 @@ from orthocal.units import DRIVE_UNITS, InUnit, Unit
 
 PARALLEL_SINE = 0.02
 """Sine of the largest angle between a slide and a leg that counts as parallel to it."""
+
+TRAVEL_SLACK = 1e-9
+"""Rounding error by which a coordinate may exceed the travel of a drive, [m, rad]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +67,13 @@ class Drive(InUnit):
         """Lower and upper limit of the controller's joint coordinate, [unit]."""
         ends = (float(self.to_joint(self.lower)), float(self.to_joint(self.upper)))
         return min(ends), max(ends)
+
+    def is_beyond(self, coordinate: ArrayLike) -> Mask:
+        """True where drive coordinates, any shape, [unit], exceed the travel."""
+        values = np.asarray(coordinate, dtype=np.float64)
+        return np.asarray(
+            (values < self.lower - TRAVEL_SLACK) | (values > self.upper + TRAVEL_SLACK)
+        )
 
     def describe_beyond(self, coordinate: float) -> str:
         """Description of a position, [unit], and of the limits, in joint coordinates."""

@@ -157,8 +157,8 @@ class BallBar(ToolSensor):
             f"the tool is in the alignment posture: at about X{x} Y{y} Z{z} mm from the tool "
             f"centre point at the mechanical zero, by eye.{stays}",
             f"Put the bar between the balls. Its dial shows 0 at a length of {length}. {known}.",
-            "Make the bar longer with your hand. The reading must grow. If it falls, reverse the "
-            "sign of every reading of this setup.",
+            "Make the bar longer with your hand. The reading must grow. If it falls, enter "
+            "every reading of this setup with the opposite sign.",
         )
 
     def path(self, start: Array, end: Array, normal: Array | None = None) -> Array:

@@ -49,8 +49,8 @@ ALIGNMENT_STD = 5.0 * MRAD
 LENGTH_MM = 200.0
 """Default of the used length of an artefact, [mm]."""
 
-BLADE, BLOCK = 20 * MM, (35 * MM, 9 * MM)
-"""Width of a blade, length and width of a gauge block in pictures, [m]."""
+BLADE, BLOCK = 20 * MM, 35 * MM
+"""Width of a blade and of a gauge block in pictures, [m]."""
 
 LARGEST_MM = 2000.0
 """Largest accepted length and coordinate, [mm]; a larger one has a wrong unit."""
@@ -284,8 +284,8 @@ class ToolIndicator(ToolSensor):
             place + over + " Clamp it. It must not move until all its readings are taken.",
             f"Mount the indicator at the tool. Its plunger points to {self.direction} and touches "
             f"the {words}.",
-            "Push the plunger in with a finger. The reading must grow. If it falls, reverse the "
-            "sign of every reading of this setup.",
+            "Push the plunger in with a finger. The reading must grow. If it falls, enter "
+            "every reading of this setup with the opposite sign.",
         )
 
     def frames(self, robot: Robot) -> Frames:
@@ -382,18 +382,21 @@ class ToolIndicator(ToolSensor):
         )
 
     def _surface(self, tips: Array) -> Array:
-        """Corners of the touched surface, centred at the tips, shape (4, 3), [m].
+        """Corners of the touched surface, shape (4, 3), [m]; of a gauge block, of its front.
+
+        A surface is centred at the tips. A block stands on the surface that the plunger touches in
+        its most advanced posture.
 
         Args:
             tips: Positions of the tip, shape (K, 3), [m].
         """
-        a = self.artefact
-        across = np.cross(self._along, direction_vector(self.direction))
-        length, width = {
-            "gauge_block": BLOCK,
-            "plate": (a.length, a.length),
-        }.get(a.kind, (a.length, BLADE))
+        a, plunger = self.artefact, direction_vector(self.direction)
+        across = np.cross(self._along, plunger)
         middle = 0.5 * (tips.min(axis=0) + tips.max(axis=0))
+        length, width = a.length, a.length if a.kind == "plate" else BLADE
+        if a.kind == "gauge_block":
+            across, length, width = plunger, BLOCK, a.height
+            middle = middle + ((tips @ plunger).max() - middle @ plunger - 0.5 * width) * plunger
         return np.array(
             [
                 middle + 0.5 * (u * length * self._along + v * width * across)

@@ -11,8 +11,9 @@ import pytest
 
 from orthocal import calibrate, load_session, summarize
 from orthocal.assessment.comparison import compare_models
-from orthocal.assessment.recommendation import STRONG
+from orthocal.assessment.recommendation import STRONG, ModelEvidence, Recommendation
 from orthocal.assessment.wording import tool_mm
+from orthocal.assessment.words.comparison import describe_recommendation
 from orthocal.errors import ParameterError
 from orthocal.estimation.fit import fit_problem
 from orthocal.estimation.options import SolverOptions
@@ -260,3 +261,13 @@ def test_readings_without_any_deviation_speak_for_offsets_and_small_tolerances(r
     assert found.recommendation.log_evidence_of("offsets") > STRONG
     assert found.recommendation.tolerance_scale < 0.2
     assert math.isfinite(found["lengths"].exact.aicc)
+
+
+def test_one_tolerance_scale_is_stated():
+    """That of the judgement, which the calibration applies; it scales other errors."""
+    recommendation = Recommendation("full", 2.2, (ModelEvidence("full", 0.0),), 9.0)
+    kinds = {
+        scale: [f.kind for f in describe_recommendation(recommendation, judged_scale=scale)]
+        for scale in (1.0, 3.0)
+    }
+    assert kinds == {1.0: ["recommended", "tolerances differ"], 3.0: ["recommended"]}

@@ -160,7 +160,7 @@ def test_again_states_the_backlash_of_the_file(folder, one, plain):
     entered = [trim.backlash for trim in second.compensation]
     identified = [result.errors[f"{d.name}.backlash"] for d in second.robot.drives]
     assert entered == pytest.approx(np.round(identified, 6), abs=1e-12)
-    assert "x_slide" in done.stdout.partition("compensate this backlash")[2]
+    assert "x_slide" in done.stdout.partition("compensates this backlash")[2]
 
 
 def test_again_states_the_tables_of_the_file(folder, one):
@@ -183,4 +183,4 @@ def test_again_without_the_file_states_the_backlash_of_the_answer(folder, one):
     assert any(e.change for e in entries)
     stated = [trim.backlash for trim in second.compensation]
     assert stated == pytest.approx([e.active + e.change for e in entries], abs=5e-7)
-    assert "x_slide" in done.stdout.partition("compensate this backlash")[2]
+    assert "x_slide" in done.stdout.partition("compensates this backlash")[2]

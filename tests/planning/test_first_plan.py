@@ -101,7 +101,7 @@ def test_the_bed_of_a_delta_is_read_on_a_grid_from_above(delta):
     heights = [float(z) for z in re.findall(r"(?m)^G53 .* Z(-?[\d.]+)", motion)]
     assert min(heights) == 0.0
     sheet = sheet_files(plan)["sheet.html"]
-    assert "the tool at x 0, y 0, z 0 mm, by eye" in sheet
+    assert "by eye, once: the tool at x 0, y 0, z 0 mm" in sheet
     assert "a little upwards" in sheet
 
 
@@ -137,4 +137,4 @@ def test_the_legs_of_an_inclined_machine_are_read_along_them(tmp_path):
             assert sign * (at @ leg.direction) > 0.03
     sheet = sheet_files(plan)["sheet.html"]
     assert "a little outwards" in sheet
-    assert "each leg parallel to its axis, by eye" in sheet
+    assert "by eye, once: each leg parallel to its axis" in sheet

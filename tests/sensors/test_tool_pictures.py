@@ -11,6 +11,7 @@ from lxml import etree
 from machines import place
 
 from orthocal import load_plan
+from orthocal.observation.contacts import locate_contacts
 from orthocal.output.scene.drawing import draw_scene
 from orthocal.output.sheet.page import sheet_files
 
@@ -97,3 +98,22 @@ def test_a_bar_turns_about_its_fixed_ball_with_the_tool(plan):
     np.testing.assert_allclose(pose[:3, 2], along / np.linalg.norm(along), atol=1e-6)
     (command,) = [c for c in scene.commands if c["type"] == "set_animation"]
     assert any(part["path"].endswith("bar/bar") for part in command["animations"])
+
+
+def test_a_gauge_block_stands_on_the_table(tmp_path):
+    """It is drawn from the tip on the table to the tip on the block."""
+    (tmp_path / "plan.yaml").write_text(
+        """robot: orthoglide
+gauge: {sigma_mm: 0.005, range_mm: [-5, 5]}
+postures:
+  beside: {tcp_mm: [10, 0, -20]}
+  above: {tcp_mm: [10, 0, 30]}
+setups:
+  step: {sensor: tool_indicator, direction: -z, tool_mm: [0, 0, -40],
+         artefact: {kind: gauge_block, height_mm: 50, table_mm: 20}}
+"""
+    )
+    _, contact = locate_contacts(load_plan(tmp_path / "plan.yaml"))["step"]
+    tips, corners = contact.points[:, 2], contact.surface[:, 2]
+    assert np.array([corners.min(), corners.max()]) == pytest.approx(np.sort(tips), abs=1e-9)
+    assert contact.surface[:, 0] == pytest.approx([0.01] * 4, abs=0.018)

@@ -15,12 +15,14 @@ from orthocal.units import MM, UM
 
 
 def describe_recommendation(
-    recommendation: Recommendation, *, identified: str | None = None
+    recommendation: Recommendation, *, judged_scale: float, identified: str | None = None
 ) -> list[Finding]:
     """Findings about the recommended model and the recommended tolerance scale.
 
     Args:
         recommendation: The recommendation.
+        judged_scale: Tolerance scale of the judgement. If it is not 1, it is stated already, and
+            the recommended one, which also scales mountings and offsets, is not.
         identified: The identified model, which may be another one.
     """
     evidence = recommendation.log_evidence_of(recommendation.model)
@@ -40,7 +42,7 @@ def describe_recommendation(
     findings = [
         note("recommended", f"Recommended model: {recommendation.model}. {reason}", **numbers)
     ]
-    if recommendation.tolerance_scale != 1.0:
+    if recommendation.tolerance_scale != 1.0 and judged_scale == 1.0:
         findings.append(
             note(
                 "tolerances differ",

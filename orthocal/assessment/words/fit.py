@@ -118,7 +118,7 @@ def no_redundancy(readings: int, parameters: int) -> Finding:
     """Finding that the fit has no redundant readings."""
     return note(
         "no redundancy",
-        f"With {readings} independent readings for {parameters} unknown errors the fit cannot be "
+        f"With {readings} independent readings for {parameters} possible errors the fit cannot be "
         "checked against the readings. It relies on the stated tolerances.",
         independent_readings=float(readings),
         parameters=float(parameters),

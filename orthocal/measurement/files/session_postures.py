@@ -16,9 +16,6 @@ from orthocal.robot.model import Drive, Robot
 from orthocal.session.session import Posture, PostureForm
 from orthocal.units import DRIVE_UNITS, MM
 
-ROUNDING = 1e-9
-"""Excess over a limit of travel that may be a rounding error, [m, rad]."""
-
 
 def require_mechanical_zero(robot: Robot, where: str) -> None:
     """Refuse a robot whose mechanical zero was computed instead of stated.
@@ -129,7 +126,7 @@ def _check_travel(robot: Robot, drives: Array, *, where: str, posture: str | Non
     """
     prefix = "" if posture is None else f"in posture '{posture}' "
     for drive, value in zip(robot.drives, drives, strict=True):
-        if not drive.lower - ROUNDING <= value <= drive.upper + ROUNDING:
+        if drive.is_beyond(value):
             unit, factor = DRIVE_UNITS[drive.unit]
             number, low, high = (v / factor for v in (drive.to_joint(value), *drive.joint_limits))
             raise SessionError(

@@ -530,7 +530,9 @@ def draw_tool(gauge: GaugePosition) -> str:
     parts += [] if contact.fixed is None else [contact.fixed[None]]
     size = max(float(np.ptp(np.concatenate(parts), axis=0).max()), 0.02)
     end = _gauge_end(gauge, 0.35 * size)
-    around = np.concatenate([*parts, end[None]])
+    # the arrow at a dial points beyond its foot
+    ahead = 2.0 * contact.points[gauge.aligned] - end if contact.fixed is None else end
+    around = np.concatenate([*parts, [end, ahead]])
     spread = np.linalg.svd(around - around.mean(axis=0))
     flat = len(around) > 2 and spread[1][-1] < 0.02 * spread[1][0]
     forward = -np.array(VIEW)
