@@ -33,7 +33,7 @@ from orthocal.sensors.direction import Direction
 from orthocal.sensors.leg_indicator import LegIndicator, Section
 from orthocal.sensors.mounting import USUAL, Mounting, MountingKeys
 from orthocal.sensors.tips import Tip
-from orthocal.session.points import names_in_files, one_row_a_point
+from orthocal.session.points import names_in_files, one_row_per_point
 from orthocal.session.session import Gauge, Posture, Session
 from orthocal.units import MM
 
@@ -130,7 +130,7 @@ class Equipment:
 
     def minutes_of(self, plan: Session) -> float:
         """Minutes of all setups and readings of a session."""
-        durations, plan = self.durations(plan), one_row_a_point(plan)
+        durations, plan = self.durations(plan), one_row_per_point(plan)
         of_setup = {n: durations[names_in_files(s)[1]] for n, s in plan.setups.items()}
         setups = sum(duration.setup for duration in of_setup.values())
         return setups + sum(of_setup[r.setup].reading for r in plan.readings)

@@ -17,7 +17,7 @@ from orthocal.effects.loading import measurable_effects, neutral_values
 from orthocal.effects.protocol import Condition
 from orthocal.planning.expected_error import noise_of
 from orthocal.planning.plan_comparison import Comparison
-from orthocal.session.points import one_row_a_point
+from orthocal.session.points import one_row_per_point
 from orthocal.session.session import Conditions, Reading, Session
 
 WAITING_TIMES = (10.0, 20.0, 30.0, 60.0, 120.0)
@@ -102,7 +102,7 @@ def _evaluate(
 def _extensions(comparison: Comparison, conditions: Sequence[Condition]) -> Iterator[_Extension]:
     """Plans with further readings for an effect, the shortest first."""
     plan = comparison.equipment.in_course(comparison.plan)
-    rows = one_row_a_point(plan)
+    rows = one_row_per_point(plan)
     setups, readings = len(rows.setups), len(rows.readings)
     if "temperature" in conditions:
         minutes = comparison.equipment.minutes_of(plan)

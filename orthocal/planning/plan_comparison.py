@@ -17,7 +17,7 @@ from orthocal.planning.planned_session import build_session
 from orthocal.planning.selection import PlannedSetup
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.tips import Tip
-from orthocal.session.points import one_row_a_point
+from orthocal.session.points import one_row_per_point
 from orthocal.session.session import Gauge, Session
 
 MIDDLE_SECTION = 0.5
@@ -133,7 +133,7 @@ class Comparison:
 
     def _assess(self, name: str, session: Session, *, in_range: bool = True) -> Alternative:
         """Alternative with its expected tool error."""
-        minutes, rows = self.equipment.minutes_of(session), one_row_a_point(session)
+        minutes, rows = self.equipment.minutes_of(session), one_row_per_point(session)
         expected = self._expect(session) if in_range else None
         return Alternative(name, len(rows.setups), len(rows.readings), minutes, expected)
 

@@ -59,7 +59,7 @@ def gather_points(readings: Sequence[Reading], setups: Mapping[str, Setup]) -> l
     return [[r for _, r in group] for _, group in groupby(enumerate(readings), line_key)]
 
 
-def one_row_a_point(session: Session) -> Session:
+def one_row_per_point(session: Session) -> Session:
     """Session in which a setup of points and each of its lines are one, as in its files.
 
     It says where the machine stops, not what the instrument shows: its points have no readings.

@@ -37,7 +37,7 @@ from orthocal.robot.model import PARALLEL_SINE, Robot
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.points import AXES, Points
 from orthocal.sensors.protocol import mounting_steps, tool_path
-from orthocal.session.points import one_row_a_point
+from orthocal.session.points import one_row_per_point
 from orthocal.session.session import Session, Setup
 from orthocal.units import DRIVE_UNITS, LIMIT, MM, format_fixed
 from orthocal.viewer.visuals import load_visuals
@@ -96,7 +96,7 @@ def sheet_files(
         ParameterError: If a feed or a shift is out of range.
         RobotError: If the visuals of the robot cannot be loaded.
     """
-    session = one_row_a_point(session)
+    session = one_row_per_point(session)
     motions = plan_motion(session)
     programs: dict[str, str] = {}
     if all(stop.point is not None for motion in motions for stop in motion.stops):

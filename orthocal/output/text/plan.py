@@ -39,7 +39,7 @@ from orthocal.sensors.points import Points
 from orthocal.sensors.probe import Probe
 from orthocal.sensors.protocol import tool_path
 from orthocal.sensors.tool_indicator import ToolIndicator
-from orthocal.session.points import one_row_a_point
+from orthocal.session.points import one_row_per_point
 from orthocal.session.session import Reading, Session
 from orthocal.units import EDGE_UNITS, MM, UM
 
@@ -115,7 +115,7 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
 
 def describe_size(session: Session) -> str:
     """Numbers of readings and setups of a plan; readings are counted as on its sheet."""
-    session = one_row_a_point(session)
+    session = one_row_per_point(session)
     closing = sum(r.cycle > 1 for r in session.readings)
     words = f" ({closing} closing)" if closing else ""
     readings, setups = len(session.readings), len(session.setups)
@@ -258,7 +258,7 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
         "criterion": plan.criterion,
         "travel_mm": basis["travel_mm"],
         "workspace_mm": None if box is None else np.round(box / MM, 6).tolist(),
-        "setups": len(one_row_a_point(plan.session).setups),
+        "setups": len(one_row_per_point(plan.session).setups),
         "readings": read,
         "closing_readings": closing,
         "minutes": plan.minutes,
@@ -309,7 +309,7 @@ def _unit(plan: MeasuringPlan) -> float:
 
 def _counts(plan: MeasuringPlan) -> tuple[int, int]:
     """Numbers of readings, and of those that close a setup."""
-    readings = one_row_a_point(plan.session).readings
+    readings = one_row_per_point(plan.session).readings
     closing = sum(r.cycle > 1 for r in readings)
     return len(readings) - closing, closing
 
@@ -333,7 +333,7 @@ def _when_enough(plan: MeasuringPlan) -> str:
 
 
 def _alternatives(plan: MeasuringPlan) -> RenderableType:
-    s = one_row_a_point(plan.session)
+    s = one_row_per_point(plan.session)
     this = Alternative("this plan", len(s.setups), len(s.readings), plan.minutes, plan.expected)
     rows = []
     for a in (this, *plan.compared):
@@ -363,7 +363,7 @@ def _posture(reading: Reading, robot: Robot) -> str:
 
 
 def _setups(plan: MeasuringPlan) -> RenderableType:
-    s = one_row_a_point(plan.session)
+    s = one_row_per_point(plan.session)
     rows = [
         (
             setup.name,
