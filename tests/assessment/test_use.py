@@ -33,6 +33,7 @@ from orthocal.assessment.recommendation import Recommendation
 from orthocal.assessment.tool_error import assess_placed, summarise_tool
 from orthocal.calibration.identify import identify
 from orthocal.errors import ParameterError, RobotError
+from orthocal.estimation.tolerance_scale import AS_STATED
 from orthocal.kinematics.conditions import sample_use
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.kinematics.workspace import box_workspace, cube_limits
@@ -278,7 +279,7 @@ def test_the_forecast_of_a_plan_is_over_the_same_conditions(calibration, workspa
 
 @pytest.fixture(scope="module")
 def assessed(calibration):
-    judged, recommended = Judgement((), 1.0), Recommendation("full", 1.0, (), 0.0)
+    judged, recommended = Judgement((), AS_STATED), Recommendation("full", 1.0, (), 0.0)
     return replace(
         calibration,
         assessment=assess(calibration, judgement=judged, recommendation=recommended),
