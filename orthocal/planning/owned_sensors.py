@@ -119,6 +119,7 @@ def load_owned_sensor(path: str | Path) -> OwnedSensor:
             f"expected the key sensor: {' or '.join(PLACEMENT_KEYS)}, and keys of this sensor",
             where=str(file),
         )
+    _suggest_keys(data, file)
     times = {k: data.pop(k) for k in DurationKeys.model_fields if k in data}
     duration = validate(DurationKeys, times, where=str(file), error=SessionError)
     gauge_keys = {k: v for k, v in data.items() if k in GaugeKeys.model_fields}
@@ -133,6 +134,19 @@ def load_owned_sensor(path: str | Path) -> OwnedSensor:
     name = "".join(c for c in file.stem if c.isalnum() or c in "_-") or "sensor"
     usual = DURATIONS[data["sensor"]]
     return OwnedSensor(name, gauge, keys, file, duration.to_duration(usual))
+
+
+def _suggest_keys(data: Mapping[str, Any], file: Path) -> None:
+    """Refuse a key that resembles one of the gauge or of the durations.
+
+    Raises:
+        SessionError: Naming file, key and the key that was probably meant.
+    """
+    known = [*GaugeKeys.model_fields, *DurationKeys.model_fields]
+    for key in data:
+        similar = [k for k in known if k.rpartition("_")[0] == key]
+        if similar:
+            raise SessionError(f"unknown key; expected {similar[0]}", where=f"{file}: {key}")
 
 
 def _require_keys(keys: Mapping[str, Any], file: Path) -> None:

@@ -132,6 +132,7 @@ def _readjusted(model: LinearModel, rows: Rows) -> Family | None:
                         tuple(concerned.tolist()),
                         setups,
                         (*dimension, later[0]),
+                        sessions=(later[0],),
                     )
                 )
                 shapes.append(change[concerned])

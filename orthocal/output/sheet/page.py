@@ -46,10 +46,19 @@ SHEET = "sheet.html"
 """Name of the sheet's file."""
 
 END = (
-    "Compare the readings of the first posture with each other. If they differ by more than two "
-    "steps of the dial, repeat this setup: the gauge or the machine was displaced. "
+    "Compare the readings of the first posture with each other. If they differ by more than {}, "
+    "repeat this setup: the gauge or the machine was displaced. "
 )
-"""Check after the readings of a setup."""
+"""Check after the readings of a setup; {} is the largest usual difference."""
+
+FROM_ANOTHER_SIDE = (
+    "The last reading repeats the first posture from another side: backlash may change it. "
+)
+"""The same where the closing reading has another approach than the first."""
+
+MAX_STEPS, MAX_STDS = 2.0, 4.0
+"""Largest usual difference of two readings: in steps of the dial, or in standard deviations of a
+reading if that is more."""
 
 END_OF_POINTS = (
     "Compare the points of the first posture with each other. If they differ by more than the "
@@ -232,7 +241,7 @@ def _setup(
     program = f" Program: {program_name(motion)}." if with_program else ""
     sensor = session.setups[motion.setup].sensor
     measured = sensor.describe()
-    end = END_OF_POINTS if isinstance(sensor, Points) else END
+    end = _compare_closing(session, motion)
     end += REMOVE_BAR if isinstance(sensor, BallBar) else REMOVE
     return (
         f'<section id="setup-{motion.number}">{heading(title)}'
@@ -241,6 +250,20 @@ def _setup(
         f"{_numbered(_steps(session, motion, gauge))}"
         f"{_warnings(session, motion, gauge)}{_boxes(session, motion)}{paragraph(end)}</section>"
     )
+
+
+def _compare_closing(session: Session, motion: SetupMotion) -> str:
+    """Check after the readings of a setup."""
+    setup = session.setups[motion.setup]
+    if isinstance(setup.sensor, Points):
+        return END_OF_POINTS
+    approach = {stop.line: stop.approach for stop in motion.stops}
+    closing = [stop for stop in motion.stops if stop.repeats is not None]
+    if any(stop.approach != approach[stop.repeats] for stop in closing):
+        return FROM_ANOTHER_SIDE
+    gauge = session.gauges[setup.gauge]
+    largest = max(MAX_STEPS * (gauge.resolution or 0.0), MAX_STDS * (gauge.sigma or 0.0))
+    return END.format(f"{_short(largest)} mm" if largest else "two steps of the dial")
 
 
 def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[str]:

@@ -199,8 +199,14 @@ def _how_to_measure(plan: MeasuringPlan) -> list[str]:
     sensors = [setup.sensor for setup in session.setups.values()]
     first = {sensor.kind: sensor for sensor in reversed(sensors)}
     words = [HOW_TO[kind] for kind in HOW_TO if kind in first]
-    if any(setup.zero == "free" for setup in session.setups.values()):
-        words.append("Go to the first posture and set the dial to the middle of its range there.")
+    zeros = {setup.zero for setup in session.setups.values()}
+    if "free" in zeros:
+        only = " of a setup" if zeros == {"free"} else " of a setup with an indicator"
+        words.append(
+            f"Go to the first posture{only} and set the dial to the middle of its range there."
+        )
+    if "known" in zeros:
+        words.append("Do not set the zero of other sensors on the machine: it is known.")
     length = approach_length(session)
     stated = any(r.approach for r in session.readings)
     if any(tool_path(sensor) is None for sensor in sensors) and not stated:
