@@ -66,6 +66,7 @@ def import_(
         settings = settings or []
         _import_printer(table, session, format, settings, radius_mm, dry_run=dry_run, json=json)
         return
+    _require_session(table, session)
     options = orthocal.TableOptions(
         sheet=sheet,
         separator=separator,
@@ -103,8 +104,28 @@ def _is_printer_log(table: Path, session: Path) -> bool:
     """True if there is no session to import into, and the file is clearly a printer's log."""
     from orthocal.measurement.importing.printer_log import recognise_log
 
-    file = session / "session.yaml" if session.suffix not in (".yaml", ".yml") else session
-    return not exists(file) and recognise_log(table) is not None
+    return not exists(_session_file(session)) and recognise_log(table) is not None
+
+
+def _session_file(session: Path) -> Path:
+    return session / "session.yaml" if session.suffix not in (".yaml", ".yml") else session
+
+
+def _require_session(table: Path, session: Path) -> None:
+    """Refuse a file that is missing, and a table without a session to import it into.
+
+    Raises:
+        SessionError: Naming what is missing.
+    """
+    if exists(_session_file(session)):
+        return
+    if not exists(table):
+        raise orthocal.SessionError("there is no such file", where=str(table))
+    raise orthocal.SessionError(
+        f"there is no session to import into, and {table} is not recognised as a printer's log; "
+        "--format names its firmware",
+        where=str(session),
+    )
 
 
 def _import_printer(

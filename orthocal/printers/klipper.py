@@ -92,13 +92,25 @@ def _read_heights(text: str, where: str) -> PrinterLog:
         settings = _settings(sections, probe, where)
         return _log_from_steps(*steps, settings, _step_lengths(sections, where), where)
     settings = _settings(sections, probe, where)
-    nozzle = [numbers(m.groups(), where=where, name="probe") for m in _OLD_PROBE.finditer(text)]
-    contacts = [numbers(m.groups(), where=where, name="probe") for m in _NEW_PROBE.finditer(text)]
+    nozzle = _probed(_OLD_PROBE, text, where)
+    contacts = _probed(_NEW_PROBE, text, where)
     points = np.array([*nozzle, *contacts]).reshape(-1, 3) * MM
     points[len(nozzle) :] -= settings.probe  # newer versions print the point of contact
     name, keys = _probe_section(sections)
     notes = [] if "z_offset" in keys else [unstated_trigger(f"z_offset in [{name}]")]
     return probed_log(settings, points, where=where, expected=EXPECTED, notes=notes)
+
+
+def _probed(pattern: re.Pattern[str], text: str, where: str) -> list[list[float]]:
+    """Coordinates of the lines of a probe, [mm]."""
+    matches = list(pattern.finditer(text))
+    for match in matches:
+        if re.match(r",\d", text[match.end() :]):
+            raise SessionError(
+                f"found '{match[0]}' with a decimal comma; expected a decimal point",
+                where=place_of(text, match.start(), where),
+            )
+    return [numbers(match.groups(), where=where, name="probe") for match in matches]
 
 
 def _read_run(run: re.Match[str], text: str, probe: Array, where: str) -> PrinterLog:
@@ -178,6 +190,12 @@ def _saved_heights(saved: Mapping[str, str], where: str) -> tuple[Pairs, Pairs, 
         while (key := f"{prefix}{len(pairs)}") in saved:
             a, b, c = _saved_steps(saved, f"{key}_pos", where)
             pairs.append((_number(saved, key, where, "delta_calibrate"), (a, b, c)))
+        if len(pairs) < sum(re.fullmatch(rf"{prefix}\d+", k) is not None for k in saved):
+            raise SessionError(
+                "is missing, but a later one is there; expected the complete list that SAVE_CONFIG "
+                "writes",
+                where=f"{where}: [delta_calibrate] {key}",
+            )
         pairs_by_kind.append(pairs)
     distances: Distances = []
     while (key := f"distance{len(distances)}") in saved:

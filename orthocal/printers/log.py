@@ -184,6 +184,32 @@ def unusual_settings(settings: DeltaSettings) -> Iterator[str]:
 def last_words(text: str, pattern: str) -> dict[str, str]:
     """Letters and values of a G-code command; later lines replace values of earlier ones."""
     words: dict[str, str] = {}
-    for match in re.finditer(rf"^[^;\n]*?\b{pattern}\b([^;\n]*)", text, re.MULTILINE):
-        words |= dict(re.findall(rf"\b([A-Z]) ?({NUMBER}(?::{NUMBER})*)", match[1]))
+    for _, of_line in command_words(text, pattern):
+        words |= of_line
     return words
+
+
+def command_words(text: str, pattern: str) -> Iterator[tuple[int, dict[str, str]]]:
+    """Position of each line with a G-code command, and its letters and values."""
+    for match in re.finditer(rf"^[^;\n]*?\b{pattern}\b([^;\n]*)", text, re.MULTILINE):
+        yield match.start(1), dict(re.findall(rf"\b([A-Z]) ?({NUMBER}(?::{NUMBER})*)", match[1]))
+
+
+def require_one_value(text: str, command: str, *, where: str) -> None:
+    """Refuse a setting that a log states twice with different values.
+
+    Raises:
+        SessionError: Naming the setting and the place of its second value.
+    """
+    values: dict[str, str] = {}
+    for position, words in command_words(text, command):
+        for letter, value in words.items():
+            first, second = numbers(
+                [values.setdefault(letter, value), value], where=where, name=command
+            )
+            if first != second:
+                raise SessionError(
+                    f"{command} {letter} is {second:g}, and {first:g} before; expected only the "
+                    "settings during the probing",
+                    where=place_of(text, position, where),
+                )

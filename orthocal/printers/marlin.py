@@ -19,6 +19,7 @@ from orthocal.printers.log import (
     numbers,
     place_of,
     probed_log,
+    require_one_value,
     require_points,
     unstated_trigger,
 )
@@ -71,6 +72,9 @@ def read_log(text: str, *, where: str, radius: float | None = None) -> PrinterLo
     x, y, z = numbers([m851.get(k, "0") for k in "XYZ"], where=where, name="M851")
     probe = np.array([x, y, z]) * MM
     g33 = _G33.search(text)
+    if g33 is None:  # G33 changes settings, and prints those of the probing
+        for command in ("M665", "M666", "M851"):
+            require_one_value(text, command, where=where)
     settings = _settings(text, g33, probe, where)
     points = np.array([numbers(m.groups(), where=where, name="Bed") for m in _BED.finditer(text)])
     if len(points):

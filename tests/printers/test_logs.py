@@ -222,6 +222,13 @@ RRF = write_log("reprapfirmware", nominal(), rings()[:4], np.zeros(4))
         (MARLIN.replace("R140.0", "R340.0"), "log.txt", "R 340"),
         (MARLIN.replace("Bed X: 0.0000", "Bed X: 990.0000"), "log.txt", "x 990"),
         (MARLIN.replace("Bed X: -", "Bed -"), "log.txt", "probed points"),
+        (MARLIN + "M665 L280.0 R141.5 H300.0\n", "log.txt:", "R is 141.5, and 140 before"),
+        (KLIPPER.replace("#*# height1 =", "#*# other ="), "height1", "missing"),
+        (
+            write_settings("klipper", nominal()) + "probe at 0.0,0.0 is z=0,634\n" * 7,
+            "log.txt:",
+            "decimal comma",
+        ),
         (RRF.replace("G30 P3", "G30 P2"), "log.txt:", "4 heights of 3 points"),
         (RRF.replace("heights: 0.0000", "heights: failed"), "log.txt:", "failed"),
     ],
@@ -231,6 +238,24 @@ def test_what_is_refused_is_named(probed, text, where, found):
         probed(text)
     assert where in str(raised.value.where)
     assert found in raised.value.problem
+
+
+def test_lines_that_a_host_received(probed):
+    """With and without a time, as terminal and log of a host show them."""
+    plain = probed(MARLIN)
+    for prefix in ("Recv: ", "2026-03-01 10:00:07,125 - Recv: "):
+        log = probed("".join(f"{prefix}{line}\n" for line in MARLIN.splitlines()))
+        assert np.array_equal(log.carriages, plain.carriages)
+
+
+def test_a_missing_log_is_named(tmp_path):
+    done = run_orthocal(tmp_path, "import", "none.cfg", "bed")
+    assert done.returncode == 2
+    assert "none.cfg: there is no such file" in done.stderr
+    (tmp_path / "notes.txt").write_text("hello\n")
+    done = run_orthocal(tmp_path, "import", "notes.txt", "bed")
+    assert done.returncode == 2
+    assert "notes.txt is not recognised as a printer's log" in " ".join(done.stderr.split())
 
 
 def test_the_command_writes_a_session_and_its_robot(tmp_path):

@@ -5,6 +5,7 @@ Distances measured on a print form a second setup.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -54,6 +55,9 @@ PRINT_SCALE_STD = 0.001
 PRINT_SETUP = "print"
 """Name of the setup of distances."""
 
+RECEIVED = re.compile(r"^(?:[-\d :,]+ - )?Recv: ", re.MULTILINE)
+"""Beginning of a line that a host such as OctoPrint received."""
+
 TRAVEL_MARGIN = 10 * MM
 """Travel beyond the endstops and the lowest posture, [m]."""
 
@@ -78,7 +82,7 @@ class PrinterImport:
 def recognise_log(path: Path) -> FirmwareName | None:
     """Firmware that wrote a log; None if the file is not clearly such a log."""
     try:
-        return find_firmware(read_text(path, error=SessionError))
+        return find_firmware(RECEIVED.sub("", read_text(path, error=SessionError)))
     except SessionError:
         return None
 
@@ -101,7 +105,7 @@ def import_printer_log(
     Raises:
         SessionError: If a file is wrong or incomplete; names file and line or key.
     """
-    texts = [read_text(Path(p), error=SessionError) for p in (*settings, log)]
+    texts = [RECEIVED.sub("", read_text(Path(p), error=SessionError)) for p in (*settings, log)]
     text = "\n".join(texts)
     name = None if firmware is None else require_firmware(firmware, option="--format")
     name = name or find_firmware(texts[-1]) or find_firmware(text)
