@@ -494,10 +494,11 @@ def find_mounting_covariance(
     sigma: float,
     at_bound: Mask | None = None,
 ) -> Array:
-    """Part of the covariance of the machine's parameters that is due to mounting errors.
+    """Part of the covariance of the machine's parameters that is due to nuisance parameters.
 
-    It is the covariance minus that for known nuisance parameters. Because setups have independent
-    mounting errors, this part is independent between sessions.
+    It is the covariance minus that for known nuisance parameters. Most of these are mounting
+    errors, which are independent between setups. So this part counts as independent between
+    sessions, although a gauge's scale may be common to them.
 
     Args:
         problem: The problem.

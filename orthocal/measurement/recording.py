@@ -1,6 +1,7 @@
 """Recording of readings: rows in the order of the sheet, each change on disk before it counts.
 
-No change renumbers a row: added rows come last, and a blank line remains where a row was deleted.
+A row keeps its line in the CSV: added rows come last, and a blank line remains where a row was
+deleted.
 
 A change is appended to a journal beside the readings.csv and synced; then the CSV is replaced. Each
 line of the journal holds the digests of the CSV before and after its change. If the process is

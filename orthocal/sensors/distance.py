@@ -103,8 +103,8 @@ class Distance(ToolSensor):
         """Instructions for the operator."""
         return (
             "Print or mark the object at the positions of both postures, and let it cool down.",
-            "Measure the distance of both places by a calliper. The reading is what the calliper "
-            "shows, with the pillar that it includes.",
+            "Measure the distance between both marks with a calliper. Enter the value that it "
+            "shows, the width of the pillar included.",
         )
 
     def frames(self, robot: Robot) -> Frames:
