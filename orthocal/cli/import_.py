@@ -63,7 +63,6 @@ def import_(
         radius_mm (MM): Marlin's log: largest distance from the middle that G33 or G29 probed.
     """
     if format or settings or radius_mm is not None or _is_printer_log(table, session):
-        settings = settings or []
         _import_printer(table, session, format, settings, radius_mm, dry_run=dry_run, json=json)
         return
     _require_session(table, session)
@@ -132,7 +131,7 @@ def _import_printer(
     log: Path,
     directory: Path,
     firmware: str | None,
-    settings: list[Path],
+    settings: list[Path] | None,
     radius_mm: float | None,
     *,
     dry_run: bool,
@@ -147,7 +146,7 @@ def _import_printer(
     )
 
     radius = None if radius_mm is None else radius_mm * MM
-    result = import_printer_log(log, firmware=firmware, settings=settings, radius=radius)
+    result = import_printer_log(log, firmware=firmware, settings=settings or (), radius=radius)
     written = None if dry_run else write_printer_import(result, directory)
     deliver(
         lambda: format_printer_json(result, log, written),
