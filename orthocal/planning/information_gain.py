@@ -300,7 +300,7 @@ class PointGain:
         return PointGain(setup, spread, setup.jacobian @ root, sigma**2)
 
     def begin_with(self, first: int) -> PointGain:
-        """The same gain: it does not depend on the first point."""
+        """Gain with a first point, on which it does not depend."""
         del first
         return self
 
