@@ -376,8 +376,7 @@ def _find_changes(
     findings = describe_anomalies(all_sessions, replace(anomalies, found=changes))
     if mistake is None:
         return None, findings, False
-    new_setups = list(all_sessions.setups)[len(all_sessions.parts[0].setups) :]
-    new = {name.partition("/")[0] for name in new_setups}
+    new = all_sessions.labels[len(all_sessions.parts[0].setups) :]
     e = mistake.explanation
     return mistake, findings, e.kind in WRONGLY_ENTERED and e.sessions[0] in new
 

@@ -31,7 +31,7 @@ from orthocal.hypotheses.hypothesis import (
 from orthocal.hypotheses.likelihood import Likelihood, Products, build_likelihood
 from orthocal.observation.model import predict_readings
 from orthocal.sensors.protocol import DIMENSION_STEP, stated_dimensions
-from orthocal.session.session import Session, Setup
+from orthocal.session.session import Session, Setup, split_label
 from orthocal.statistics.distributions import log_positive_share
 from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
@@ -239,7 +239,7 @@ class LinearModel:
         times: dict[str, list[datetime | None]] = {}
         for r in session.readings:
             time = None if r.conditions is None else r.conditions.time
-            times.setdefault(r.setup.partition("/")[0], []).append(time)
+            times.setdefault(split_label(r.setup, joined=session.joined)[0], []).append(time)
         if session.joined and not any(None in of_session for of_session in times.values()):
             start = {
                 k: min(t.replace(tzinfo=t.tzinfo or UTC) for t in v if t) for k, v in times.items()
@@ -751,7 +751,7 @@ def label_sessions(session: Session, setup: Indices) -> tuple[tuple[str, ...], I
     """
     if not session.joined:
         return ("",), np.zeros(setup.size, dtype=np.int64)
-    label_of_setup = [name.partition("/")[0] for name in session.setups]
+    label_of_setup = session.labels
     with_readings = {label_of_setup[i] for i in np.unique(setup)}
     labels = tuple(n for n in dict.fromkeys(label_of_setup) if n in with_readings)
     place = np.array([labels.index(n) if n in labels else -1 for n in label_of_setup])

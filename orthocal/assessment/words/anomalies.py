@@ -11,7 +11,7 @@ from orthocal.assessment.words.effects import identify_effects
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.effects.loading import errors_of_no_model, robot_effects, with_effects
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, Explanation
-from orthocal.session.session import Session
+from orthocal.session.session import Session, split_label
 from orthocal.text import printable, spans
 from orthocal.units import EDGE_UNITS, MM, UM, Unit
 
@@ -231,7 +231,7 @@ def place_of(session: Session, row: int) -> Place:
 
 def _file_of(session: Session, label: str) -> str | None:
     """Path to the session.yaml of a joined session; None if unknown."""
-    names = list(dict.fromkeys(name.partition("/")[0] for name in session.setups))
+    names = list(dict.fromkeys(session.labels))
     if len(session.parts) != len(names) or label not in names:
         return None
     path = session.parts[names.index(label)].path
@@ -299,7 +299,7 @@ def _text(session: Session, e: Explanation) -> str:
             f"the same {len(e.rows)} times"
         ),
         "displaced gauge": lambda: _displaced(session, e),
-        "displaced artefact": lambda: _displaced_artefact(e),
+        "displaced artefact": lambda: _displaced_artefact(session, e),
         "wrong dimension": lambda: _other_dimension(session, e),
         "readjusted dimension": lambda: _readjusted(e),
         "drift": lambda: _drifted(e),
@@ -391,17 +391,17 @@ def _reversed(session: Session, e: Explanation) -> str:
     return f"the signs of {subject} are reversed"
 
 
-def _displaced_artefact(e: Explanation) -> str:
+def _displaced_artefact(session: Session, e: Explanation) -> str:
     """Clause about a displaced artefact, such as a ball post, with its session."""
-    label, _, artefact = e.names[0].rpartition("/")
+    label, artefact = split_label(e.names[0], joined=session.joined)
     name = f"{artefact.replace('.', ' ')}{f' of session {label}' if label else ''}"
-    how = "displaced or turned over" if _can_turn(e) else "displaced"
+    how = "displaced or turned over" if _can_turn(session, e) else "displaced"
     return f"{name} was {how} before setup {e.setups[0]}"
 
 
-def _can_turn(e: Explanation) -> bool:
+def _can_turn(session: Session, e: Explanation) -> bool:
     """True if an artefact has two sides: a square or a straightedge."""
-    artefact = "".join(e.names[:1]).rpartition("/")[2]
+    _, artefact = split_label("".join(e.names[:1]), joined=session.joined)
     return artefact.startswith(("square.", "straightedge."))
 
 
@@ -496,7 +496,7 @@ def _remedy(session: Session, e: Explanation) -> str:
     if e.kind == "inconsistent posture" and e.scope == "postures":
         return "Check its coordinates, and read it again."
     remedies = {
-        "displaced artefact": ("Check `reversed` of its setups. " if _can_turn(e) else "")
+        "displaced artefact": ("Check `reversed` of its setups. " if _can_turn(session, e) else "")
         + "If it was displaced, give it another name in the later setups.",
         "wrong dimension": f"If so, measure it, and correct `{''.join(e.names[:1])}`.",
         "readjusted dimension": "If so, state the present "

@@ -16,7 +16,7 @@ from orthocal.arrays import Array, Indices
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.hypotheses.hypothesis import Family, Rows
 from orthocal.observation.sensor_groups import nuisance_parameters
-from orthocal.session.session import Session
+from orthocal.session.session import Session, split_label
 
 if TYPE_CHECKING:
     from orthocal.hypotheses.linear_model import LinearModel
@@ -51,7 +51,7 @@ def shared_placements(session: Session) -> dict[str, dict[str, Indices]]:
     shared: dict[str, dict[str, Indices]] = {}
     nuisance = nuisance_parameters(session)
     for setup, indices in zip(session.setups.values(), nuisance.of_setup, strict=True):
-        label = setup.name.rpartition("/")[0] if session.joined else ""
+        label, _ = split_label(setup.name, joined=session.joined)
         indices_by_artefact: dict[str, list[int]] = {}
         for u, i in zip(setup.sensor.nuisance_parameters, indices, strict=False):
             if u.shared_by is not None and not u.of_gauge:
@@ -110,17 +110,19 @@ def _other_dimensions(model: LinearModel, rows: Rows) -> Family | None:
 
 def _readjusted(model: LinearModel, rows: Rows) -> Family | None:
     """A dimension that differs in several setups of a gauge from one session on."""
+    session = rows.session
+    label = dict(zip(session.setups, session.labels, strict=True))
     explanations: list[Explanation] = []
     shapes: list[Array] = []
     for dimension, changes in model.dimension_changes().items():
         gauges: dict[str, list[str]] = {}
         for name in changes:
-            gauge = rows.session.setups[name].gauge.partition("/")[2]
+            _, gauge = split_label(session.setups[name].gauge, joined=session.joined)
             gauges.setdefault(gauge, []).append(name)
         for of_gauge in gauges.values():
             for k in range(1, len(model.order)):
                 later = [model.labels[i] for i in model.order[k:]]
-                setups = tuple(n for n in of_gauge if n.partition("/")[0] in later)
+                setups = tuple(n for n in of_gauge if label[n] in later)
                 if not 1 < len(setups) < len(of_gauge):  # one setup: `_other_dimensions`
                     continue
                 change = np.sum([changes[name] for name in setups], axis=0)

@@ -122,14 +122,11 @@ def _setups(rows: Rows) -> list[Explanation]:
     """Two setups of one session."""
     if len(rows.setups) ** 2 > 2 * MAX_PAIRS:
         return []
-
-    def session(setup: str) -> str:
-        return setup.partition("/")[0] if rows.session.joined else ""
-
+    label = dict(zip(rows.session.setups, rows.session.labels, strict=True))
     return [
         _pair("setups", rows.setups[a], rows.setups[b], (a, b))
         for a, b in combinations(rows.setups, 2)
-        if rows.setups[a].size == rows.setups[b].size and session(a) == session(b)
+        if rows.setups[a].size == rows.setups[b].size and label[a] == label[b]
     ]
 
 

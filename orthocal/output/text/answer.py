@@ -29,7 +29,6 @@ from orthocal.calibration.assessment_record import (
     Verdict,
 )
 from orthocal.calibration.calibration import Calibration
-from orthocal.measurement.joining import name_within
 from orthocal.output.text.accuracy import FurtherHour, describe_undetermined
 from orthocal.output.text.layout import (
     EXPANDED,
@@ -44,6 +43,7 @@ from orthocal.output.text.layout import (
     signed,
     table_of,
 )
+from orthocal.session.session import split_label
 from orthocal.text import printable
 from orthocal.units import DRIVE_UNITS
 
@@ -289,7 +289,7 @@ def _measured(calibration: Calibration) -> str:
     places = list_places(s.sensor.place for s in setups)
     sessions = len(calibration.session.parts)
     used = {
-        name_within(name, joined=sessions > 0)
+        split_label(name, joined=sessions > 0)[1]
         for r in calibration.residuals
         for name in (r.posture, r.minus)
         if name
