@@ -59,7 +59,8 @@ EXPLANATIONS: tuple[FindingKind, ...] = (
 KEEPING: dict[FindingKind, str] = {
     "no offset": words.NOTHING_HEADLINE,
     "no change needed": words.KEEP_HEADLINE,
-    "nothing moved": words.KEEP_HEADLINE,
+    "no sensitivity": words.KEEP_HEADLINE,
+    "no deviation": words.KEEP_HEADLINE,
 }
 """Kinds of notes without anything to enter, and the headlines of the decision."""
 

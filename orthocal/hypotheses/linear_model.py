@@ -50,7 +50,7 @@ SMALL_CHANGE = 0.2
 LARGEST_ERROR = 6.0
 """Largest error about which a hypothesis is relinearised, [prior std]."""
 
-MAX_ENTRIES = 1600
+MAX_LINEARISED_ENTRIES = 1600
 """Most entries of all points that are linearised at once, to limit the memory."""
 
 MAX_STEPS = 8
@@ -317,7 +317,7 @@ class LinearModel:
             The linearisations; None if a machine cannot reach a posture or a predicted reading is
             not finite.
         """
-        size = max(1, MAX_ENTRIES // self.problem.observations.size)
+        size = max(1, MAX_LINEARISED_ENTRIES // self.problem.observations.size)
         return [
             linearisation
             for first in range(0, len(points), size)

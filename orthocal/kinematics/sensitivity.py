@@ -19,7 +19,7 @@ from orthocal.arrays import Array
 from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import robot_functions
-from orthocal.robot.closing import RANK_TOLERANCE
+from orthocal.robot.closing import invert_closures
 from orthocal.robot.model import Robot, require_tcp
 
 POSTURE_BLOCK_SIZE = 64
@@ -128,12 +128,7 @@ class ToolSensitivity:
         arguments = self.closure.inputs(commands, passive)
         _, p_a, p_q, p_xi = self._functions.tool_jacobian(*arguments)
         _, g_a, g_q, g_xi = self._functions.closure_jacobian(*arguments)
-        if g_q.shape[1] == g_q.shape[2]:
-            multiplier = np.swapaxes(
-                np.linalg.solve(np.swapaxes(g_q, 1, 2), np.swapaxes(p_q, 1, 2)), 1, 2
-            )
-        else:
-            multiplier = p_q @ np.linalg.pinv(g_q, rcond=RANK_TOLERANCE)
+        multiplier = p_q @ invert_closures(g_q)
         by_twists = p_xi - self._multiply_closures(multiplier, g_xi)
         _, drive_jacobian = self.closure.geometry().drive_derivatives(commands)
         by_drive_errors = (p_a - multiplier @ g_a) @ drive_jacobian

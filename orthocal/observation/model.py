@@ -20,7 +20,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array, Indices
 from orthocal.effects.adjustment import find_adjustments
@@ -40,7 +39,7 @@ from orthocal.observation.sensor_groups import (
     group_sensors,
     nuisance_parameters,
 )
-from orthocal.robot.closing import RANK_TOLERANCE
+from orthocal.robot.closing import invert_closures
 from orthocal.session.session import Session
 
 MAX_POSTURES, MAX_READINGS = 64, 640
@@ -542,7 +541,9 @@ class ReadingLinearisation:
         )
         g, g_a, g_q, nonzeros = (v.reshape(n_sets, k, *v.shape[1:]) for v in outputs)
         by_drive_errors = g_a @ self._by_drive_errors[:, block.states]
-        return _Closures(g, _inverse(g_q), by_drive_errors, nonzeros[:, :, self._pattern.chosen])
+        return _Closures(
+            g, invert_closures(g_q), by_drive_errors, nonzeros[:, :, self._pattern.chosen]
+        )
 
     def _evaluate_readings(self, block: _Block, passive: Array, nuisance: Array) -> _Readings:
         """Readings of a block and their derivatives with constant passive coordinates."""
@@ -745,11 +746,3 @@ def nominal_sensitivity(session: Session) -> Array:
     passive = closure.close(model.states.commands, names=model.states.names)
     linear = model.linearise(closure.errors(), passive, free=free, aligned=False)
     return linear.jacobian[:, :n]
-
-
-def _inverse(matrices: ArrayLike) -> Array:
-    """Inverses of square matrices, shape (..., n, n); pseudo-inverses of others."""
-    m: Array = np.asarray(matrices)
-    if m.shape[-2] == m.shape[-1]:
-        return np.asarray(np.linalg.inv(m))
-    return np.asarray(np.linalg.pinv(m, rcond=RANK_TOLERANCE))

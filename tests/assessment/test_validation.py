@@ -71,7 +71,7 @@ def test_experiment_3_validates_experiment_2_as_in_the_paper(table1):
     (lead,) = result.assessment.of_kind("as predicted")
     assert lead.numbers["achieved_rms_mm"] == pytest.approx(0.213, abs=0.001)
     assert result.assessment.of_kind("residuals repeat")
-    assert result.assessment.of_kind("controller not stated")
+    assert result.assessment.of_kind("controller assumed")
     assert decision.headline in summarize(result)
     document = json.loads(result.to_json())
     assert document["schema"] == "orthocal/validation/4"

@@ -41,7 +41,7 @@ def points(model, rng, *, unreachable=()):
 
 @pytest.mark.parametrize(("unreachable", "most"), [((), 1600), ((), 100), ((1,), 1600)])
 def test_several_machines_are_linearised_as_each_alone(model, unreachable, most, monkeypatch):
-    monkeypatch.setattr(module, "MAX_ENTRIES", most)
+    monkeypatch.setattr(module, "MAX_LINEARISED_ENTRIES", most)
     chosen = points(model, np.random.default_rng(3), unreachable=unreachable)
     together = model.linearise_all(chosen, keep_jacobian=True)
     assert [i for i, one in enumerate(together) if one is None] == list(unreachable)

@@ -89,7 +89,7 @@ def three_stated_rows(session):
 
 
 EXPLAINED = {
-    "fits": (lambda c, e: calibrate(_silent(c)), {"scatter_mm": 0.0102}),
+    "fits": (lambda c, e: calibrate(_silent(c)), {"sigma_mm": 0.0102}),
     "model error": (lambda c, e: calibrated(EXPERIMENT_2), {"ratio": 9.8, "sigma_mm": 0.195}),
     "model error beside cycles": (lambda c, e: every_time(c), {}),
     "noise from residuals": (lambda c, e: once(c), {}),

@@ -134,7 +134,7 @@ def not_determined(model: str, reason: str) -> Finding:
 def linearisation_cost(rms: float) -> Finding:
     """Finding about the increase of the tool error by linearisation, RMS, [m]."""
     return note(
-        "linearisation error",
+        "linearisation cost",
         f"Linearisation costs {tool_mm(rms)} RMS at the tool.",
         cost_um=rms / UM,
     )

@@ -65,7 +65,7 @@ def no_anomaly(readings: int, *, within_tolerances: bool) -> Finding:
         text = f"The reading agrees {machine}."
     else:
         text = "There is no second reading to compare the reading with."
-    return note("fits", text, readings=float(readings))
+    return note("no anomaly", text, readings=float(readings))
 
 
 def readings_missing(session: Session) -> Finding:

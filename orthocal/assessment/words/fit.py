@@ -47,26 +47,20 @@ def noise_as_stated(sigma: float) -> Finding:
 def noise_from_cycles(scatter: float) -> Finding:
     """Finding that uncertainties depend on the scatter of repeated readings alone."""
     return note(
-        "noise as stated",
+        "noise from cycles",
         "The uncertainty rests on the scatter of repeated readings.",
         scatter_mm=scatter / MM,
     )
 
 
-def fits_stated_noise(sigma: float) -> Finding:
-    """Finding that the residuals agree with the stated noise."""
-    return note(
-        "fits", "The residuals agree with the stated noise of the gauge.", sigma_mm=sigma / MM
-    )
+def fits(sigma: float, source: str) -> Finding:
+    """Finding that the residuals agree with the noise.
 
-
-def fits_cycles(scatter: float) -> Finding:
-    """Finding that the residuals agree with the scatter of repeated readings."""
-    return note(
-        "fits",
-        "The residuals agree with the scatter of repeated readings: the model fits.",
-        scatter_mm=scatter / MM,
-    )
+    Args:
+        sigma: Standard deviation of a reading, [m].
+        source: Noun phrase for the source of the noise.
+    """
+    return note("fits", f"The residuals agree with {source}.", sigma_mm=sigma / MM)
 
 
 def model_error(
@@ -128,7 +122,7 @@ def no_redundancy(readings: int, parameters: int) -> Finding:
 def nothing_depends(names: Sequence[str]) -> Finding:
     """Finding that no reading depends on any free parameter."""
     return note(
-        "nothing moved",
+        "no sensitivity",
         "No reading depends on any free parameter, so all keep their start values.",
         "Read setups and postures that depend on the parameters.",
         named(*names),
@@ -138,7 +132,7 @@ def nothing_depends(names: Sequence[str]) -> Finding:
 def nothing_deviates(rms: float) -> Finding:
     """Finding that the readings show no deviation that the parameters explain."""
     return note(
-        "nothing moved",
+        "no deviation",
         f"The readings show no deviation that these parameters explain (RMS {mm(rms)} mm).",
         before_rms_mm=rms / MM,
     )

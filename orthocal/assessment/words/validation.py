@@ -133,7 +133,7 @@ def describe_repetition(
 def controller_assumed() -> Finding:
     """Finding that the active offsets are not stated, so that the calibrated ones are assumed."""
     return note(
-        "controller not stated",
+        "controller assumed",
         "The session does not state the active offsets. The offsets of the calibration are assumed "
         "to be active.",
     )

@@ -34,8 +34,8 @@ from orthocal.units import MM
 MORE = "--details prints scores, estimates and residuals of each model."
 
 RESEARCH: tuple[FindingKind, ...] = (
-    *("recommended", "not recommended", "tool error", "linearisation error"),
-    "noise as stated",
+    *("recommended", "not recommended", "tool error", "linearisation cost"),
+    *("noise as stated", "noise from cycles"),
 )
 """Kinds of findings that the short answer replaces, or that only the details list."""
 
