@@ -27,7 +27,8 @@ from orthocal.calibration.assessment_record import Finding, Severity, Verdict
 from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
 from orthocal.hypotheses.anomaly import Anomalies
 from orthocal.hypotheses.families.sessions import detectable_changes
-from orthocal.hypotheses.linear_model import LinearModel, ModelLinearisation, linear_model
+from orthocal.hypotheses.linear_model import LinearModel, linear_model
+from orthocal.hypotheses.linearisation import ModelLinearisation
 from orthocal.hypotheses.search import find_anomalies
 from orthocal.measurement.joining import split_sessions
 from orthocal.session.session import Session
@@ -185,7 +186,8 @@ def find_tolerance_scale(session: Session) -> ToleranceScale:
         model = linear_model(part)
         linearisation = model.most_likely(part.values)
         deviation = model.entries(part.values[None])[0] - linearisation.expected
-        scatter, _ = estimate_repeatability(model.problem.values, model.problem.observations)
+        values = model.problem.observations.values(part.values) / model.problem.noise_ratio
+        scatter, _ = estimate_repeatability(values, model.problem.observations)
         noise = max(linearisation.likelihood.sigma, scatter)
         contrasts, machine_variances, rest_square, dof = _independent_contrasts(
             model, linearisation, deviation, noise

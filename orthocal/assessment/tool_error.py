@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 
 import numpy as np
 
@@ -61,7 +61,7 @@ SAMPLES = 500
 """Monte Carlo samples per point for the 95 % quantile."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class ErrorStatistics:
     """Statistics of position errors over a workspace, [m]."""
 
@@ -72,7 +72,7 @@ class ErrorStatistics:
     find_percentile: Callable[[], float] = field(repr=False)
     """Function that computes `percentile_95`, which needs time."""
 
-    @cached_property
+    @property
     def percentile_95(self) -> float:
         """95 % quantile of the errors over all points."""
         return self.find_percentile()

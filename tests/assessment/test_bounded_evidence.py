@@ -14,7 +14,8 @@ from orthocal import load_plan, simulate_session
 from orthocal.assessment.recommendation import TOLERANCE_SCALES, compute_log_evidence
 from orthocal.estimation.selection import complete_model
 from orthocal.hypotheses.likelihood import build_likelihood
-from orthocal.hypotheses.linear_model import ModelLinearisation, linear_model
+from orthocal.hypotheses.linear_model import linear_model
+from orthocal.hypotheses.linearisation import ModelLinearisation
 from orthocal.statistics.distributions import LATTICE, log_positive_share
 
 DRAWS = 200_000

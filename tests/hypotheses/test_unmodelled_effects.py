@@ -33,6 +33,7 @@ from orthocal.hypotheses.likelihood import (
     log_of_sum,
 )
 from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.hypotheses.row_changes import linearise_effect
 from orthocal.hypotheses.search import CLEAR_EFFECT_LOG_BAYES, find_anomalies
 from orthocal.statistics.distributions import log_positive_share
 
@@ -216,7 +217,7 @@ def test_readings_without_conditions_show_no_backlash(root):
 def test_the_columns_are_those_of_the_effect(plan, effect):
     """Differences of exact readings of machines with and without it."""
     bare, machine = plan.with_effects([]), plan.with_effects([effect])
-    found = LinearModel(bare).linearise_effect(effect)
+    found = linearise_effect(LinearModel(bare), effect)
 
     def differ(one, other):
         """Of readings whose first of each setup is 0."""

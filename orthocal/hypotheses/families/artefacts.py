@@ -8,18 +8,16 @@ square that was turned over without a statement is such a case: its error change
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from orthocal.arrays import Array, Indices
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.hypotheses.hypothesis import Family, Rows
+from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.hypotheses.row_changes import dimension_changes, nuisance_columns
 from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.session.session import Session, split_label
-
-if TYPE_CHECKING:
-    from orthocal.hypotheses.linear_model import LinearModel
 
 MIN_RELATIVE_CHANGE = 0.5
 """Smallest change of the readings by one prior std of a considered parameter, relative to the
@@ -65,7 +63,7 @@ def shared_placements(session: Session) -> dict[str, dict[str, Indices]]:
 def _displaced(model: LinearModel, rows: Rows) -> Family | None:
     """An artefact displaced before a setup: all its parameters have new values from there on."""
     explanations, groups = [], []
-    columns = model.nuisance_columns()
+    columns = nuisance_columns(model)
     for artefact, placements in shared_placements(rows.session).items():
         names = sorted(placements, key=lambda name: rows.setups[name][0])
         for k in range(1, len(names)):
@@ -91,7 +89,7 @@ def _other_dimensions(model: LinearModel, rows: Rows) -> Family | None:
     """A wrong stated dimension in one setup, or in all setups that state it."""
     explanations: list[Explanation] = []
     shapes: list[Array] = []
-    for dimension, changes in model.dimension_changes().items():
+    for dimension, changes in dimension_changes(model).items():
         for setups in _each_and_all(changes):
             change = np.sum([changes[name] for name in setups], axis=0)
             concerned = np.flatnonzero(change)
@@ -114,7 +112,7 @@ def _readjusted(model: LinearModel, rows: Rows) -> Family | None:
     label = dict(zip(session.setups, session.labels, strict=True))
     explanations: list[Explanation] = []
     shapes: list[Array] = []
-    for dimension, changes in model.dimension_changes().items():
+    for dimension, changes in dimension_changes(model).items():
         gauges: dict[str, list[str]] = {}
         for name in changes:
             _, gauge = split_label(session.setups[name].gauge, joined=session.joined)
