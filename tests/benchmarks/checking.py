@@ -108,7 +108,7 @@ def reverse_two_signs(plan, pairs: int) -> Iterator[tuple[object, frozenset[int]
 class _Exhaustive(search._Search):
     """A search that linearises far more sets of at most two hypotheses anew."""
 
-    def sets(self, rows: frozenset[int]) -> tuple[float, float]:
+    def compare(self, rows: frozenset[int]) -> tuple[float, float]:
         """Log evidence of the true pair, and of the best other set of one or two hypotheses."""
         state, table = self.sound, Rows(self.session, self.session.values)
         families = family_scores.list_families(self.model, table, grouped=True)
@@ -138,7 +138,7 @@ def count_pairs(plan, pairs: int) -> dict[str, int]:
         found = search.find_anomalies(session)
         refitted = family_scores.MAX_REFITTED, family_scores.MAX_REFITTED_PAIRS
         family_scores.MAX_REFITTED, family_scores.MAX_REFITTED_PAIRS = 40, 100
-        own, other = _Exhaustive(session, LinearModel(session)).sets(rows)
+        own, other = _Exhaustive(session, LinearModel(session)).compare(rows)
         family_scores.MAX_REFITTED, family_scores.MAX_REFITTED_PAIRS = refitted
         can = own >= CLEAR_LOG_BAYES and own - other >= SIMILAR_LOG_BAYES
         kinds = {a.explanation.kind for a in found.found}
