@@ -24,7 +24,7 @@ from orthocal.assessment.plausibility import (
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import describe_anomalies, describe_no_change
 from orthocal.calibration.assessment_record import Finding, Severity, Verdict
-from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
+from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale, trial_scales
 from orthocal.hypotheses.anomaly import Anomalies
 from orthocal.hypotheses.families.sessions import detectable_changes
 from orthocal.hypotheses.linear_model import LinearModel, linear_model
@@ -45,7 +45,7 @@ RESOLVED = 1e-3
 """Effect of one prior standard deviation of an offset on the readings, relative to the noise, below
 which the offset is not resolved."""
 
-TRIAL_SCALES = np.geomspace(1.0, 30.0, 86)
+TRIAL_SCALES = trial_scales(1.0, 30.0)
 """Tolerance scales whose likelihoods are compared."""
 
 LARGEST_DEVIATION = 3.0

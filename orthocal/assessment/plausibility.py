@@ -182,7 +182,7 @@ def _by_model(
 def _dimensions(session: Session, problem: CalibrationProblem) -> Finding | None:
     """Finding about postures in which the nominal machine would have moved the gauge far more.
 
-    A sensor whose readings are stated does not move.
+    Prescribed readings, such as those of a probe, do not show how far the gauge moved.
     """
     if any(states_readings(s.sensor) for s in session.setups.values()):
         return None
