@@ -17,13 +17,13 @@ from orthocal.errors import OrthocalError
 from orthocal.estimation.fit import Fit, fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem, build_problem
+from orthocal.estimation.weighting import stated_sigma
 from orthocal.hypotheses.hypothesis import Rows
 from orthocal.measurement.joining import split_sessions
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import states_readings
 from orthocal.session.session import Gauge, Session
 from orthocal.statistics.chance import chance_of_excess
-from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 from orthocal.units import MM
 
@@ -275,7 +275,7 @@ def _check_repeats(session: Session, name: str) -> Finding | None:
     gauge = session.gauges[name]
     if gauge.sigma is None:
         return None
-    sigma = noise_floor(gauge.sigma, gauge.resolution)
+    sigma = stated_sigma(gauge)
     repeated = [
         rows
         for (setup, *_), rows in Rows(session).repeated.items()

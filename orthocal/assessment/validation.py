@@ -295,9 +295,8 @@ def _require_new(calibration: Calibration, sessions: Sequence[Session]) -> None:
         SessionError: If a session belongs to the calibration; it names the session.
     """
     record = calibration.session
-    used = {part.sha256 for part in (record, *record.parts)} - {""}
     for session in sessions:
-        if session.sha256 in used:
+        if any(session.was_read_from(part.sha256) for part in (record, *record.parts)):
             raise SessionError(
                 "belongs to the calibration itself; expected a session measured afterwards",
                 where=str(session.path or "session"),

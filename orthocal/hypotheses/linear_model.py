@@ -17,7 +17,7 @@ from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.linear import require_finite
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import select_parameters
-from orthocal.estimation.weighting import DEFAULT_SIGMA, initial_noise_ratio
+from orthocal.estimation.weighting import assumed_sigma, initial_noise_ratio
 from orthocal.hypotheses.hypothesis import (
     MAX_DENSE_COLUMNS,
     MachineShift,
@@ -28,7 +28,6 @@ from orthocal.hypotheses.hypothesis import (
 from orthocal.hypotheses.likelihood import Products, build_likelihood
 from orthocal.hypotheses.linearisation import LinearisationPoint, ModelLinearisation
 from orthocal.session.session import Session, split_label
-from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 
 CACHE_SIZE = 6
@@ -55,9 +54,6 @@ CONVERGED_CHANGE = 0.02
 HIDDEN = 0.1
 """Largest change of readings by one prior std that counts as no change, [σ]."""
 
-SMALLEST_SIGMA = 1e-9
-"""Smallest standard deviation of a reading, [m]."""
-
 
 class LinearModel:
     """Predictions and derivatives of a session for all errors of the machine and its sensors.
@@ -81,8 +77,7 @@ class LinearModel:
         self.problem = problem.with_noise_ratio(initial_noise_ratio(session, problem.observations))
         o = self.problem.observations
         self.stated = session.gauge.sigma is not None
-        floor = noise_floor(session.gauge.sigma or DEFAULT_SIGMA, session.gauge.resolution)
-        self.sigma = max(floor, SMALLEST_SIGMA)
+        self.sigma = assumed_sigma(session.gauge)
         """Standard deviation of a reading of the first gauge, [m]; all entries refer to it."""
         self.dof = o.size - o.n_zeros
         self.labels, self.session_of_entry = label_sessions(session, o.setup)

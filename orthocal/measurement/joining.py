@@ -58,12 +58,7 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
         return sessions[0]
     last = sessions[-1]
     for session in sessions:
-        if session.robot.sha256 != last.robot.sha256:
-            raise SessionError(
-                f"is of robot '{session.robot.name}'; another session is of '{last.robot.name}', "
-                "or of another version of it",
-                where=None if session.path is None else str(session.path),
-            )
+        require_same_robot(session, last)
         if session.robot.effect_names != last.robot.effect_names:
             names = (", ".join(s.robot.effect_names) or "none" for s in (session, last))
             raise SessionError(
@@ -98,6 +93,20 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
         joined=True,
         purpose=purposes.pop() if len(purposes) == 1 else None,
     )
+
+
+def require_same_robot(session: Session, other: Session) -> None:
+    """Refuse a session of another robot than that of another session.
+
+    Raises:
+        SessionError: If URDF or YAML of the robots differ; names both robots.
+    """
+    if session.robot.sha256 != other.robot.sha256:
+        raise SessionError(
+            f"is of robot '{session.robot.name}'; another session is of '{other.robot.name}', "
+            "or of another version of it",
+            where=None if session.path is None else str(session.path),
+        )
 
 
 def _join_tolerances(sessions: Sequence[Session]) -> dict[str, float]:

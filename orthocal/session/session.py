@@ -276,6 +276,10 @@ class Session:
         """Label of the session of each setup, shape (n_setups,); "" unless sessions were joined."""
         return tuple(split_label(name, joined=self.joined)[0] for name in self.setups)
 
+    def was_read_from(self, digest: str) -> bool:
+        """True if the session was read from the files of a digest; "" is the digest of none."""
+        return bool(digest) and self.sha256 == digest
+
     @property
     def gauge(self) -> Gauge:
         """The first gauge. The noise of other gauges is stated relative to it."""

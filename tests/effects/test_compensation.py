@@ -25,6 +25,7 @@ from orthocal import (
     write_calibration,
     write_session,
 )
+from orthocal.measurement.recording import _is_outdated
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import drive_table
 
@@ -148,6 +149,7 @@ def test_files_hold_what_is_compensated(compensated, tmp_path):
     session = simulate_session(plan, {"x_slide.offset": 0.2 * MM}, seed=1).session
     write_session(session, tmp_path / "written")
     again = load_session(tmp_path / "written")
+    assert not _is_outdated(again)  # a recording reads the files once
     result = calibrate(again, "offsets", solver="variable-projection")
     write_calibration(result, tmp_path / "calibration.json")
     restored = restore_session(load_calibration(tmp_path / "calibration.json"))
