@@ -411,7 +411,7 @@ class CalibrationProblem:
     def errors_per_theta(self) -> Array:
         """Elementary errors per unit of θ̂, shape (n_errors, n_machine), [SI]."""
         selection = self.machine_selection
-        return self.functions.errors.columns(selection.names) * selection.prior_stds
+        return self.functions.errors.unit_errors(selection.names) * selection.prior_stds
 
 
 def build_problem(

@@ -59,8 +59,8 @@ class ToolSensitivity:
         self.closure = LoopClosure(robot, fixed=values, conditions=conditions)
         self._functions = robot_functions(robot)
         errors = self._functions.errors
-        self._columns = errors.columns(self.free)
-        self._drive_errors = self._columns[errors.drive_errors]
+        self._unit_errors = errors.unit_errors(self.free)
+        self._drive_errors = self._unit_errors[errors.drive_errors]
 
     def __call__(
         self,
@@ -107,12 +107,14 @@ class ToolSensitivity:
     @cached_property
     def _placement_jacobian(self) -> Array:
         """∂ξ/∂θ of the placements under neutral conditions, shape (n_twists, n_free)."""
-        return self._functions.errors.jacobian(self.closure.errors(), self._columns)
+        return self._functions.errors.placement_jacobian(self.closure.errors(), self._unit_errors)
 
     def _placement_jacobians(self, commands: Array) -> Array:
         """∂ξ/∂θ of the placements under the conditions of commands, (K, n_twists, n_free)."""
         errors = np.tile(self.closure.errors(), (len(commands), 1))
-        return self._functions.errors.jacobian(errors, self._columns, command=commands)
+        return self._functions.errors.placement_jacobian(
+            errors, self._unit_errors, command=commands
+        )
 
     def _differentiate(self, commands: Array, passive: Array, placement_jacobian: Array) -> Array:
         """Equation of the module.

@@ -133,19 +133,19 @@ class ObservationModel:
             index = [a.parameter for a in alignments]
             virtual = virtual_session(self.session, alignments)
             by_errors = nominal_sensitivity(virtual)
-            offsets = errors.columns([f"{d.name}.offset" for d in self.session.robot.drives])
+            offsets = errors.unit_errors([f"{d.name}.offset" for d in self.session.robot.drives])
             active = np.array([a.active for a in alignments])
             sensitivity[index] = by_errors
             start[index] = -((by_errors @ offsets) * active).sum(axis=1)
             amounts = [a.parameter for a in find_adjustments(self.session.robot)]
-            changes = (by_errors @ errors.columns(amounts)) * adjustment_table(virtual)
+            changes = (by_errors @ errors.unit_errors(amounts)) * adjustment_table(virtual)
             start[index] += changes.sum(axis=1)
         return ManualAlignment(sensitivity, start)
 
-    def parametrise(self, columns: Array, nuisance_scale: Array) -> FreeParameters:
+    def parametrise(self, unit_errors: Array, nuisance_scale: Array) -> FreeParameters:
         """Free parameters for `linearise`; arguments are the fields of `FreeParameters`."""
-        pattern = ClosurePattern.of(self.functions, columns)
-        return FreeParameters(columns, nuisance_scale, pattern)
+        pattern = ClosurePattern.of(self.functions, unit_errors)
+        return FreeParameters(unit_errors, nuisance_scale, pattern)
 
     def predict(
         self,
@@ -389,7 +389,7 @@ class ReadingLinearisation:
         batch: bool,
     ) -> None:
         self._model, self._free, self._batch = model, free, batch
-        alignment_by_theta = alignment @ free.columns
+        alignment_by_theta = alignment @ free.unit_errors
         self._machines = _Machines(model, errors)
         geometry = self._machines.geometry
         _, self._by_drive_errors = geometry.drive_derivatives(model.states.commands)
@@ -399,8 +399,8 @@ class ReadingLinearisation:
         n = model.observations.size + model.paired.size
         sparse = n_sets == 1 and n >= MIN_SPARSE_ROWS
         self._twists = TwistChain(map_, errors, model.states, free, sparse=sparse)
-        self._by_machine = free.columns[map_.drive_errors]
-        n_machine, n_nuisance = free.columns.shape[1], free.nuisance_scale.size
+        self._by_machine = free.unit_errors[map_.drive_errors]
+        n_machine, n_nuisance = free.unit_errors.shape[1], free.nuisance_scale.size
         reading, opening = np.empty((n_sets, n)), np.empty((n_sets, n))
         correction = np.zeros_like(passive, dtype=np.float64)
         jacobian = np.empty((n_sets, n, n_machine + n_nuisance))
@@ -440,7 +440,7 @@ class ReadingLinearisation:
             Shape (S, n_states, n_passive), [m, rad], including `correction`.
         """
         changes = np.atleast_2d(change)
-        machine = changes[:, : self._free.columns.shape[1], None]
+        machine = changes[:, : self._free.unit_errors.shape[1], None]
         twists = self._twists.follow(machine)
         drive_errors = (self._by_machine @ machine)[:, None]
         correction = self.correction if self._batch else self.correction[None]

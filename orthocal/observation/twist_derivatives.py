@@ -24,7 +24,7 @@ from orthocal.observation.observations import States
 class FreeParameters:
     """Scaled free parameters θ̂: machine errors first, then nuisance parameters."""
 
-    columns: Array
+    unit_errors: Array
     """Elementary errors for one unit of each machine parameter, (n_errors, n_machine), [SI]."""
     nuisance_scale: Array
     """Values of one unit of each nuisance parameter, shape (n_nuisance,), [SI]."""
@@ -48,9 +48,9 @@ class ClosurePattern:
     """Twist of each chosen nonzero, shape (nnz,)."""
 
     @staticmethod
-    def of(functions: RobotFunctions, columns: Array) -> ClosurePattern:
-        """Pattern for parameters whose units are columns of elementary errors."""
-        moved = functions.errors.twists_moved_by(columns).reshape(-1, 6).any(axis=1)
+    def of(functions: RobotFunctions, unit_errors: Array) -> ClosurePattern:
+        """Pattern for parameters; one unit of each are elementary errors, (n_errors, n)."""
+        moved = functions.errors.twists_moved_by(unit_errors).reshape(-1, 6).any(axis=1)
         used = np.flatnonzero(np.repeat(moved, 6))
         position = np.full(functions.n_twists, -1)
         position[used] = np.arange(used.size)
@@ -109,16 +109,17 @@ class TwistChain:
         self, map_: ErrorMap, errors: Array, states: States, free: FreeParameters, *, sparse: bool
     ) -> None:
         pattern, commands = free.pattern, states.variant_commands
-        self._used, self._columns, self._variant = pattern.used, free.columns, states.variant
+        self._used, self._variant = pattern.used, states.variant
+        self._unit_errors = free.unit_errors
         self._map, self._errors, self._command = map_, errors, commands[0]
         self._sparse = sparse and self._used.size > 0
-        self._delta_jacobian = map_.twist_columns(errors, free.columns, self._command)
+        self._twist_jacobian = map_.twist_jacobian(errors, free.unit_errors, self._command)
         self._right = np.zeros((1, len(map_.moved), 6, 6))
         if self._used.size:
             self._right = map_.right_jacobians(errors, self._command)
         self._varying: VaryingDerivatives | None = None
         if len(commands) > 1 and self._used.size:
-            self._varying = map_.varying_derivatives(errors, free.columns, commands)
+            self._varying = map_.varying_derivatives(errors, free.unit_errors, commands)
             self._of_varying = (6 * map_.varying[:, None] + np.arange(6)).reshape(-1)
             self._positions = pattern.position[self._of_varying]
 
@@ -128,8 +129,8 @@ class TwistChain:
 
         Rows of twists that vary with the conditions are 0.
         """
-        jacobian = self._map.jacobian(
-            self._errors, self._columns, command=self._command, right=self._right
+        jacobian = self._map.placement_jacobian(
+            self._errors, self._unit_errors, command=self._command, right=self._right
         )
         if self._varying is not None:
             jacobian[:, self._of_varying] = 0.0
@@ -163,8 +164,8 @@ class TwistChain:
         by_xi = np.where(self._positions >= 0, rows[:, :, self._positions], 0.0)
         by_delta = by_xi.reshape(*rows.shape[:2], -1, 1, 6) @ varying.right[:, variant]
         by_delta = by_delta.reshape(*rows.shape[:2], -1)
-        by_errors = (by_delta[:, :, None, varying.rows] @ varying.jacobian[:, variant])[:, :, 0]
-        return np.asarray(by_delta @ varying.constant + by_errors @ varying.columns)
+        by_errors = (by_delta[:, :, None, varying.rows] @ varying.by_errors[:, variant])[:, :, 0]
+        return np.asarray(by_delta @ varying.constant + by_errors @ varying.unit_errors)
 
     def follow(self, change: Array) -> Array:
         """Twists ∂ξ for changes of machine parameters.
@@ -175,14 +176,14 @@ class TwistChain:
         Returns:
             Shape (D, 1, n_twists), or (D, V, n_twists) if placements vary under V conditions.
         """
-        delta = (self._delta_jacobian @ change).reshape(len(change), -1, 6, 1)
+        delta = (self._twist_jacobian @ change).reshape(len(change), -1, 6, 1)
         result = np.asarray((self._right @ delta).reshape(len(change), 1, -1))
         varying = self._varying
         if varying is None:
             return result
         result = np.repeat(result, varying.right.shape[1], axis=1)
         delta = np.repeat((varying.constant @ change)[:, None], result.shape[1], axis=1)
-        delta[:, :, varying.rows] += varying.jacobian @ (varying.columns @ change)[:, None]
+        delta[:, :, varying.rows] += varying.by_errors @ (varying.unit_errors @ change)[:, None]
         xi = varying.right @ delta.reshape(*delta.shape[:2], -1, 6, 1)
         result[:, :, self._of_varying] = xi.reshape(*delta.shape[:2], -1)
         return result

@@ -96,7 +96,7 @@ class MachineModel:
     @property
     def columns(self) -> Array:
         """Elementary errors per unit of each identified parameter, shape (n_errors, n_machine)."""
-        return self.problem.functions.errors.columns(self.problem.machine_selection.names)
+        return self.problem.functions.errors.unit_errors(self.problem.machine_selection.names)
 
     def errors(self, theta: Array) -> Array:
         """Elementary errors of estimates, shape (n_sets, n_errors), [SI].

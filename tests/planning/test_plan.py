@@ -125,7 +125,7 @@ def simulate_tool_error(plan, workspace, *, machines):
     assert reached.all()
     values = values + sigma * rng.normal(size=values.shape)
     found = BatchSolver(problem).solve(values, sigma=sigma).theta
-    closure, columns = LoopClosure(robot), problem.functions.errors.columns(names)
+    closure, columns = LoopClosure(robot), problem.functions.errors.unit_errors(names)
     drives = closure.inverse(workspace.points)
 
     def tools(values):

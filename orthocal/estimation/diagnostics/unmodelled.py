@@ -130,7 +130,7 @@ def error_jacobian(fit: Fit, names: Sequence[str]) -> Array:
     """
     problem, parameters = fit.problem, fit.problem.robot.parameters
     prior_stds = np.array([parameters[n].prior_std for n in names])
-    columns = problem.functions.errors.columns(names) * prior_stds
+    columns = problem.functions.errors.unit_errors(names) * prior_stds
     nuisance_scale = problem.theta_scale[problem.n_machine :]
     linear = problem.linearise(
         fit.solution.theta,
