@@ -27,7 +27,7 @@ POINTS_PER_SIDE = 7
 
 _YAML_HEAD = """\
 # Identified errors of the machine, relative to the nominal robot.
-# `enter` lists the offsets for a controller that corrects offsets of its drives only.
+# `offsets to enter` are those for a controller that corrects offsets of its drives only.
 """
 
 
@@ -43,7 +43,7 @@ def export_parameters(calibration: Calibration) -> dict[str, str]:
         f"#   {e.drive}_{e.edge_unit}: {tidy(e.enter * e.edge_factor)}"
         for e in find_entries(calibration)
     ]
-    comment = "\n".join(["# enter:", *enter, ""]) if enter else ""
+    comment = "\n".join(["# offsets to enter:", *enter, ""]) if enter else ""
     text = yaml.safe_dump({"errors": errors}, sort_keys=False, default_flow_style=False)
     return {"errors.yaml": f"{_YAML_HEAD}{comment}{text}"}
 

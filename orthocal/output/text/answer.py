@@ -69,6 +69,11 @@ STYLES: dict[Verdict, str] = {"enter": "bold green", "review": "bold yellow", "r
 LONGEST_LINE = 150
 """Characters of a line with names from files, in the short answer."""
 
+NEW_NOTE = (
+    "new: complete offset, in place of now. `orthocal export --offsets` converts it to HOME_OFFSET."
+)
+"""Meaning of the column `new` of offsets."""
+
 MORE = "--details prints all readings, residuals, parameters and tool errors."
 
 
@@ -145,12 +150,16 @@ def _entry_notes(calibration: Calibration, assessment: Assessment) -> list[Rende
     unstated = assessment.of_kind("controller not stated")
     if unstated:
         return [_indented(Text(unstated[0].words))]
-    down = [d.name for d in calibration.robot.drives if d.direction < 0]
-    if not down or assessment.keeps_offsets:
+    if assessment.keeps_offsets:
         return []
-    verb = "counts" if len(down) == 1 else "count"
-    text = f"joint: change of the controller's joint, with its sign; {joined(down)} {verb} down."
-    return [_indented(Text(text))]
+    notes = [NEW_NOTE]
+    down = [d.name for d in calibration.robot.drives if d.direction < 0]
+    if down:
+        verb = "counts" if len(down) == 1 else "count"
+        notes.append(
+            f"joint: change of the controller's joint, with its sign; {joined(down)} {verb} down."
+        )
+    return [_indented(Text(note)) for note in notes]
 
 
 def _tool(calibration: Calibration, assessment: Assessment) -> list[RenderableType]:
@@ -338,15 +347,14 @@ def render_values(calibration: Calibration) -> RenderableType:
     table = entry_table(calibration, identified=not calibration.only_offsets)
     keep, stated = assessment.keeps_offsets, assessment.entries[0].active is not None
     meaning = "Slide coordinate = encoder coordinate + offset."
-    replaced = "Enter the complete offset in place of the active one."
-    notes = [f"{meaning} {replaced}" if stated and not keep else meaning]
+    notes = [meaning, *([NEW_NOTE] if stated and not keep else [])]
     notes += [f.words for f in assessment.of_kind("controller not stated")]
     notes.append(EXPANDED)
     if not calibration.only_offsets:
         notes.append(
-            f"{'best' if keep else 'enter'}: best value for a controller that corrects nothing "
-            "else; it compensates a part of the other errors. identified: offset of the slide, for "
-            "a controller that corrects all identified errors."
+            "For a controller that corrects nothing else the best value is "
+            f"`{'best' if keep else 'new'}`; it compensates a part of the other errors. "
+            "identified: offset of the slide, for a controller that corrects all identified errors."
         )
     return noted(Group() if complete else table, *notes)
 
@@ -364,7 +372,7 @@ def render_backlash(calibration: Calibration) -> RenderableType:
         halves.append(f"±{half} {e.edge_unit}")
     if not any(e.change or e.active for e in entries):
         return Text(f"Backlash: not determined ({max(halves)}).")
-    return table_of(("backlash", "now", "enter", "±", "unit"), rows)
+    return table_of(("backlash", "now", "new", "±", "unit"), rows)
 
 
 def entry_table(calibration: Calibration, *, identified: bool = False) -> Table:
@@ -375,11 +383,11 @@ def entry_table(calibration: Calibration, *, identified: bool = False) -> Table:
         identified: Whether to list the identified offsets, too.
     """
     assessment = assessment_of(calibration)
-    enter = "best" if assessment.keeps_offsets else "enter"
+    keep = assessment.keeps_offsets
     stated = any(e.active is not None for e in assessment.entries)
-    columns = ["now", enter] if stated else ["add" if enter == "enter" else enter]
+    columns = ["now", "best" if keep else "new"] if stated else ["best" if keep else "add"]
     directions = {d.name: d.direction for d in calibration.robot.drives}
-    counts_down = enter == "enter" and any(directions[e.drive] < 0 for e in assessment.entries)
+    counts_down = not keep and any(directions[e.drive] < 0 for e in assessment.entries)
     rows = []
     for e in assessment.entries:
         factor = e.edge_factor

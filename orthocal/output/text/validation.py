@@ -60,7 +60,7 @@ def render_validation(
     ]
     if validation.mistake is not None and validation.enter:
         rows = [(e.drive, signed(e.enter * e.edge_factor), e.edge_unit) for e in validation.enter]
-        parts.append(section("Values to enter", table_of(("drive", "enter", "unit"), rows)))
+        parts.append(section("Values to enter", table_of(("drive", "new", "unit"), rows)))
     further = bool(judged.of_kind("further change"))
     if assessment_of(answer).entries and (further or complete):
         source = "the new readings" if validation.joint is None else "all readings"

@@ -161,7 +161,7 @@ def test_full_model_shows_the_error_with_offsets_entered():
         page = build_report(found)
     assert "without any other correction" in page
     read = Reader(page)
-    assert ["drive", "now", "enter", "±", "identified", "unit"] in read.rows
+    assert ["drive", "now", "new", "±", "identified", "unit"] in read.rows
     assert (
         len([r for r in read.rows if len(r) > 5 and r[0] in {s.name for s in found.setups}]) == 162
     )
@@ -228,7 +228,7 @@ def test_robot_without_a_tool_has_a_report(experiment_2):
 
 def test_calibration_in_a_notebook(calibration):
     read = Reader(calibration._repr_html_())
-    assert read.rows[0] == ["drive", "now", "enter", "±", "unit"]
+    assert read.rows[0] == ["drive", "now", "new", "±", "unit"]
     entry = calibration.assessment.entries[0]
     assert read.rows[1] == [
         "x_slide",
