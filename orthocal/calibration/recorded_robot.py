@@ -223,7 +223,7 @@ def require_consistent(record: CalibrationRecord, robot: Robot, *, file: str) ->
             where = f"{file}: residuals[{i}].conditions"
             with _errors_at(where):
                 check_conditions(
-                    row.conditions, robot, difference=row.minus is not None, where=where
+                    row.conditions, robot, two_postures=row.minus is not None, where=where
                 )
 
 

@@ -61,8 +61,8 @@ class PlanOptions:
             each; default: up to 100 mm from the mechanical zero.
         along (N): For research: number of positions along a leg's direction.
         across_mm (MM): Displacement across that direction, to either side.
-        minutes_a_setup (MINUTES): Duration of a setup.
-        minutes_a_reading (MINUTES): Duration of a reading.
+        minutes_per_setup (MINUTES): Duration of a setup.
+        minutes_per_reading (MINUTES): Duration of a reading.
         criterion (aligned|relative|absolute|worst|A|D|E): For research: figure to minimise.
             RMS tool error after aligning the workpiece, after shifting it, or absolute; worst tool
             error; or trace, determinant or largest eigenvalue of the covariance.
@@ -82,8 +82,8 @@ class PlanOptions:
     box: str | None = None
     along: Annotated[int, Option(min=2, max=50)] = 9
     across_mm: float = 20.0
-    minutes_a_setup: float = 10.0
-    minutes_a_reading: float = 0.5
+    minutes_per_setup: float = 10.0
+    minutes_per_reading: float = 0.5
     workspace_mm: WorkspaceMm = None
     criterion: str = "aligned"
     effects: Effects = None
@@ -218,8 +218,8 @@ def _read_equipment(
     box = options.box
     limits = None if box is None else read_box(box, coordinate_letters(robot), where="--box")
     temperatures = read_temperatures(options.temperature)
-    require_between(options.minutes_a_setup, 0.0, 1e4, "--minutes-a-setup")
-    require_between(options.minutes_a_reading, 0.0, 1e4, "--minutes-a-reading")
+    require_between(options.minutes_per_setup, 0.0, 1e4, "--minutes-per-setup")
+    require_between(options.minutes_per_reading, 0.0, 1e4, "--minutes-per-reading")
     if not 0.0 <= options.across_mm < 1000.0:
         raise ParameterError("expected 0 or more, and less than 1000 mm", where="--across-mm")
     sections = options.sections
@@ -235,8 +235,8 @@ def _read_equipment(
         box=limits,
         along=options.along,
         across=options.across_mm * MM,
-        minutes_a_setup=options.minutes_a_setup,
-        minutes_a_reading=options.minutes_a_reading,
+        minutes_per_setup=options.minutes_per_setup,
+        minutes_per_reading=options.minutes_per_reading,
         temperatures=temperatures,
         owned=tuple(load_owned_sensor(path) for path in options.with_ or ()),
     )

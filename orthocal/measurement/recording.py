@@ -260,7 +260,7 @@ class Recording:
                 check_conditions(
                     conditions,
                     self.session.robot,
-                    difference=row.minus is not None,
+                    two_postures=row.minus is not None,
                     where=row.label_with_cycle,
                 )
             readings_mm.append(round(reading, DECIMALS))
@@ -282,9 +282,10 @@ class Recording:
         if len(self.rows) >= MOST_READINGS:
             raise SessionError(f"there are {MOST_READINGS} rows already, the largest number")
         same_setup = [r for r in self.rows if r.setup == row.setup]
-        is_difference = row.minus is not None
-        cycle = 1 + max(r.cycle for r in same_setup if is_difference or r.place == row.place)
-        if any(r.cycle == cycle and (r.minus is not None) != is_difference for r in same_setup):
+        difference = self.session.is_difference(row)
+        cycle = 1 + max(r.cycle for r in same_setup if difference or r.place == row.place)
+        in_cycle = [r for r in same_setup if r.cycle == cycle]
+        if any(self.session.is_difference(r) != difference for r in in_cycle):
             cycle = 1 + max(r.cycle for r in same_setup)
         rows = [self.rows[i] for i in self.point(index)]
         added = [replace(_emptied(r), cycle=cycle).key for r in rows]

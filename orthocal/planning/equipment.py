@@ -86,8 +86,8 @@ class Equipment:
     """Largest displacement of the tool to either side across a leg's direction, [m]."""
     spare_range: float = SPARE_RANGE
     """Prior standard deviations of readings that must fit into the gauge's range."""
-    minutes_a_setup: float = MINUTES_PER_SETUP
-    minutes_a_reading: float = MINUTES_PER_READING
+    minutes_per_setup: float = MINUTES_PER_SETUP
+    minutes_per_reading: float = MINUTES_PER_READING
     temperatures: tuple[float, float] | None = None
     """Temperatures at the first and at the last reading, [°C]; by default the reference temperature
     of the nominal dimensions."""
@@ -114,11 +114,11 @@ class Equipment:
 
     def minutes(self, setups: int, readings: int) -> float:
         """Minutes of setups at legs and their readings."""
-        return setups * self.minutes_a_setup + readings * self.minutes_a_reading
+        return setups * self.minutes_per_setup + readings * self.minutes_per_reading
 
     def durations(self, session: Session) -> dict[str, Duration]:
         """Durations of a setup and a reading with each gauge of a session."""
-        at_legs = Duration(self.minutes_a_setup, self.minutes_a_reading)
+        at_legs = Duration(self.minutes_per_setup, self.minutes_per_reading)
         at_tool = {sensor.name: sensor.duration for sensor in self.owned}
         in_files = [names_in_files(setup)[1] for setup in session.setups.values()]
         return {name: at_tool.get(name, at_legs) for name in (*session.gauges, *in_files)}
@@ -135,7 +135,7 @@ class Equipment:
         setups = sum(duration.setup for duration in of_setup.values())
         return setups + sum(of_setup[r.setup].reading for r in plan.readings)
 
-    def in_course(self, plan: Session) -> Session:
+    def schedule(self, plan: Session) -> Session:
         """Planned readings with their expected times and temperatures."""
         return schedule_readings(
             plan, temperatures=self.temperatures, durations=self.durations(plan)

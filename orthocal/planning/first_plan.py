@@ -85,15 +85,15 @@ def expect_fixed(session: Session, choice: Choice, equipment: Equipment) -> Fixe
         ParameterError: If the model is unknown.
     """
     forecast = ToolForecast(session.robot, choice.select(session.robot.parameters))
-    course = equipment.in_course(session)
+    scheduled = equipment.schedule(session)
     return FixedPlan(
         session=session,
         forecast=forecast,
         minutes=equipment.minutes_of(session),
         known=forecast.before,
-        expected=forecast.after(course),
-        first_round=forecast.after(course, entered=False),
-        effects=find_limits(forecast.problem(course), stated_sigma(course.gauge)),
+        expected=forecast.after(scheduled),
+        first_round=forecast.after(scheduled, entered=False),
+        effects=find_limits(forecast.problem(scheduled), stated_sigma(scheduled.gauge)),
     )
 
 

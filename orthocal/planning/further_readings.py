@@ -83,7 +83,7 @@ def _evaluate(
     comparison: Comparison, extension: _Extension, limit: EffectLimits
 ) -> FurtherReadings:
     """Limit of an effect after further readings, and their gain at the tool."""
-    forecast, plan = comparison.forecast, comparison.equipment.in_course(comparison.plan)
+    forecast, plan = comparison.forecast, comparison.equipment.schedule(comparison.plan)
     session = comparison.join(extension.session)
     limits = find_limits(forecast.problem(session), stated_sigma(session.gauge))
     after = next(e for e in limits if (e.effect, e.unit) == (limit.effect, limit.unit))
@@ -101,7 +101,7 @@ def _evaluate(
 
 def _extensions(comparison: Comparison, conditions: Sequence[Condition]) -> Iterator[_Extension]:
     """Plans with further readings for an effect, the shortest first."""
-    plan = comparison.equipment.in_course(comparison.plan)
+    plan = comparison.equipment.schedule(comparison.plan)
     rows = one_row_per_point(plan)
     setups, readings = len(rows.setups), len(rows.readings)
     if "temperature" in conditions:

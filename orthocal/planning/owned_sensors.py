@@ -57,12 +57,12 @@ class DurationKeys(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
-    minutes_a_setup: Minutes | None = None
-    minutes_a_reading: Minutes | None = None
+    minutes_per_setup: Minutes | None = None
+    minutes_per_reading: Minutes | None = None
 
     def to_duration(self, usual: Duration) -> Duration:
         """Stated durations; the usual ones by default."""
-        setup, reading = self.minutes_a_setup, self.minutes_a_reading
+        setup, reading = self.minutes_per_setup, self.minutes_per_reading
         return Duration(
             usual.setup if setup is None else float(setup),
             usual.reading if reading is None else float(reading),
@@ -107,7 +107,7 @@ def load_owned_sensor(path: str | Path) -> OwnedSensor:
 
     Args:
         path: YAML with `sensor`, keys of a gauge such as `sigma_mm` and `range_mm`, keys of a
-            setup, and `minutes_a_setup` and `minutes_a_reading`.
+            setup, and `minutes_per_setup` and `minutes_per_reading`.
 
     Raises:
         SessionError: If the file is invalid; names file and key.

@@ -367,7 +367,7 @@ def _evaluate(
 ) -> MeasuringPlan:
     """Compute the expected errors of a plan and of its alternatives."""
     plan, measured, forecast = comparison.plan, comparison.measured, comparison.forecast
-    joined = comparison.join(comparison.equipment.in_course(plan))
+    joined = comparison.join(comparison.equipment.schedule(plan))
     setups, readings = len(planned.setups), sum(len(s.chosen) for s in planned.setups)
     minutes = comparison.equipment.minutes_of(plan)
     each = None if comparison.equipment.owned else round(readings / setups)

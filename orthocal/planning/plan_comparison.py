@@ -109,7 +109,7 @@ class Comparison:
 
     def _expect(self, session: Session) -> Expected:
         """Expected tool error after planned readings, joined with the existing ones."""
-        joined = self.join(self.equipment.in_course(session))
+        joined = self.join(self.equipment.schedule(session))
         return self.forecast.after(joined, entered=self.entered)
 
     def list_alternatives(self) -> tuple[Alternative, ...]:

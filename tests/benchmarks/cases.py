@@ -76,7 +76,7 @@ class Timing:
         return self.seconds_build + self.seconds_solve
 
     @property
-    def microseconds_a_reading(self) -> float:
+    def microseconds_per_reading(self) -> float:
         """From a session to its solution."""
         return 1e6 * self.seconds / self.readings
 

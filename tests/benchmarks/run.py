@@ -78,7 +78,7 @@ def format_row(timing: Timing, peer: float | None) -> list[str]:
         str(timing.iterations),
         f"{timing.seconds_again:.2f}",
         str(timing.iterations_again),
-        f"{timing.microseconds_a_reading:.0f}",
+        f"{timing.microseconds_per_reading:.0f}",
         f"{timing.peak_before:.0f}",
         f"{timing.peak:.0f}",
         *compared,

@@ -328,7 +328,7 @@ def test_usual_plans_that_the_dial_cannot_read_have_no_expected_error(orthoglide
 def test_enough_does_not_depend_on_the_number_of_setups_of_the_plan(orthoglide):
     """With `--setups 6` it was 9 setups, with `--setups 9` more."""
     equipment = Equipment(along=5, across=0.0, sections=(0.5,))
-    durations = {"": Duration(equipment.minutes_a_setup, equipment.minutes_a_reading)}
+    durations = {"": Duration(equipment.minutes_per_setup, equipment.minutes_per_reading)}
     search = TimedSearch(make_search(orthoglide, equipment), durations)
     curves = [compute_curve(search, 3, planned) for planned in (1, 9)]
     few, many = (find_enough(curve) for curve in curves)

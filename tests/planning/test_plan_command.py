@@ -237,8 +237,8 @@ def test_each_criterion_is_better_met_by_its_own_plan(orthoglide, for_the_headli
             "of the machine need",
         ),
         (
-            ["orthoglide", "--minutes-a-setup", 0],
-            "--minutes-a-setup: found 0; expected a number between 0 and",
+            ["orthoglide", "--minutes-per-setup", 0],
+            "--minutes-per-setup: found 0; expected a number between 0 and",
         ),
     ],
 )

@@ -21,12 +21,12 @@ from orthocal.assessment.effect_limits import find_limits
 from orthocal.effects.loading import with_effects
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.solvers.batch import BatchSolver
+from orthocal.estimation.weighting import stated_sigma
 from orthocal.measurement.motion.approach import can_approach, describe_approach
 from orthocal.observation.conditions import MORNING, schedule_readings
 from orthocal.observation.model import predict_readings
 from orthocal.planning.candidates import list_candidates
 from orthocal.planning.equipment import Equipment
-from orthocal.planning.expected_error import noise_of
 from orthocal.planning.first_plan import first_equipment, paper_plan
 from orthocal.planning.further_readings import WAITING_TIMES
 from orthocal.planning.plan import plan_readings
@@ -74,7 +74,7 @@ def test_a_plan_from_one_side_determines_no_backlash(planned):
         for i, r in enumerate(rows, 1)
     )
     one = replace(planned.session, readings=same)
-    (backlash,) = find_limits(planned.forecast.problem(one), noise_of(one))
+    (backlash,) = find_limits(planned.forecast.problem(one), stated_sigma(one.gauge))
     assert backlash.after > 0.9 * backlash.before
 
 
@@ -90,7 +90,7 @@ def test_calibrations_reach_the_promised_limits(planned):
         theta[seed, : len(names)] = [drawn[n] for n in names]
     values, _, reached = problem.simulate(theta)
     assert reached.all()
-    sigma = noise_of(problem.session)
+    sigma = stated_sigma(problem.session.gauge)
     found = BatchSolver(problem).solve(values + sigma * rng.normal(size=values.shape), sigma=sigma)
     own = [i for i, name in enumerate(names) if name.endswith(".backlash")]
     missed, true = (found.theta - theta)[:, own], theta[:, own]
@@ -146,7 +146,7 @@ def test_a_plan_determines_both_parts_of_a_periodic_error(orthoglide):
     fine = Gauge(sigma=0.5 * UM, resolution=1.0 * UM, range=(-5.0 * MM, 5.0 * MM))
     equipment = Equipment(gauge=fine, sections=(0.5,), across=0.0)
     plan = plan_readings(with_effects(robot, ["screw"]), "full", equipment=equipment, starts=1)
-    session, sigma = plan.session, noise_of(plan.session)
+    session, sigma = plan.session, stated_sigma(plan.session.gauge)
     rows = [r.posture for r in session.readings]
     setups = np.array([r.setup for r in session.readings])
     bounds = []
@@ -182,7 +182,7 @@ def test_temperature_and_drift_in_a_plan(orthoglide):
     robot = with_effects(orthoglide, ["thermal", "drift"])
     after = []
     for temperatures in (None, (20.0, 28.0)):
-        equipment = replace(FEW, temperatures=temperatures, minutes_a_reading=30.0)
+        equipment = replace(FEW, temperatures=temperatures, minutes_per_reading=30.0)
         plan = plan_readings(robot, "full", equipment=equipment, setups=2, starts=1)
         limits = {e.effect: e for e in plan.effects}
         assert limits["thermal"].before == pytest.approx(3.0 * PPM)
@@ -199,8 +199,8 @@ def test_further_readings_for_effects_that_a_plan_does_not_determine(orthoglide)
     assert not any(e.determined for e in plan.effects)
     further = {f.limit.effect: f for f in plan.further}
     readings = [r for r in plan.session.readings if r.setup == plan.session.readings[0].setup]
-    last = FEW.minutes_a_reading * (len(readings) - 1)
-    std, noise = 0.25, noise_of(plan.session) / UM
+    last = FEW.minutes_per_reading * (len(readings) - 1)
+    std, noise = 0.25, stated_sigma(plan.session.gauge) / UM
     for wait in (w for w in WAITING_TIMES if w <= further["drift"].wait):
         times = np.array([0.0, last, last + wait])
         slope = noise / np.sqrt(((times - times.mean()) ** 2).sum())

@@ -25,6 +25,7 @@ from orthocal.effects.loading import with_effects
 from orthocal.errors import ParameterError, SessionError
 from orthocal.estimation.choice import resolve_choice
 from orthocal.estimation.solvers.variable_projection import VariableProjection
+from orthocal.estimation.weighting import stated_sigma
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.measurement.motion.motion import plan_motion
 from orthocal.measurement.motion.motion_program import write_program
@@ -32,7 +33,7 @@ from orthocal.observation.simulate import draw_errors
 from orthocal.output.text.plan import plan_json
 from orthocal.planning.candidates import list_candidates, measure_candidates
 from orthocal.planning.equipment import Equipment, place_tool
-from orthocal.planning.expected_error import ToolForecast, noise_of
+from orthocal.planning.expected_error import ToolForecast
 from orthocal.planning.owned_sensors import load_owned_sensor
 from orthocal.planning.planned_session import _order_readings, build_session
 from orthocal.planning.selection import PlannedSetup, SetupSearch
@@ -186,7 +187,7 @@ def test_approaches_of_a_bar_follow_from_its_path(owned):
 @pytest.mark.parametrize(
     ("text", "place"),
     [
-        (BAR + "minutes_a_reading: -1\n", "minutes_a_reading"),
+        (BAR + "minutes_per_reading: -1\n", "minutes_per_reading"),
         (BAR.replace("length_mm: 50", "length_mm: long"), "length_mm"),
         (BAR.replace("length_mm: 50\n", ""), "length_mm"),
         (BAR.replace("length_mm: 50", "lenght_mm: 50"), "lenght_mm"),
@@ -283,7 +284,7 @@ def test_a_bed_is_probed_once_at_the_height_of_its_plane(owned):
 
 def test_the_minutes_of_a_sensor_are_those_of_its_file(owned):
     robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 1.0})
-    slow = BAR + "minutes_a_setup: 40\nminutes_a_reading: 2\n"
+    slow = BAR + "minutes_per_setup: 40\nminutes_per_reading: 2\n"
     equipment = Equipment(owned=owned(bar=slow), **QUICK)
     plan = plan_readings(robot, hours=2.0, equipment=equipment, starts=1)
     session, bars = plan.session, {n for n, s in plan.session.setups.items() if s.gauge == "bar"}
@@ -292,7 +293,7 @@ def test_the_minutes_of_a_sensor_are_those_of_its_file(owned):
     expected += 10.0 * (len(session.setups) - len(bars)) + 0.5 * (len(session.readings) - of_bar)
     assert plan.minutes == pytest.approx(expected)
     assert plan.minutes <= 120.0 + 1e-9
-    times = [r.conditions.time for r in equipment.in_course(session).readings]
+    times = [r.conditions.time for r in equipment.schedule(session).readings]
     assert (times[-1] - times[0]).total_seconds() / 60.0 > plan.minutes - 45.0
 
 
@@ -367,7 +368,7 @@ def test_a_plan_of_points_is_one_setup_within_its_time(tracked):
     assert postures[-1] == postures[0]
     document = json.loads(plan_json(tracked))
     assert [document[k] for k in ("setups", "readings", "closing_readings")] == [1, 19, 1]
-    times = [r.conditions.time for r in tracked.equipment.in_course(session).readings]
+    times = [r.conditions.time for r in tracked.equipment.schedule(session).readings]
     assert times[0::3] == times[1::3] == times[2::3]
     assert (times[-1] - times[0]).total_seconds() == pytest.approx(19 * 30.0)
 
@@ -545,7 +546,7 @@ def test_planar_machines_keep_the_promise_of_a_bar(planar):
         errors = draw_errors(session.robot, forecast.names, seed=seed)
         shown = simulate_session(session, errors, seed=seed).session
         values = problem.observations.values(shown.values) / problem.noise_ratio
-        found = program.solve(sigma=noise_of(session), values=values)
+        found = program.solve(sigma=stated_sigma(session.gauge), values=values)
         missed = found.theta[:n] - np.array([errors[name] for name in problem.free[:n]])
         field = forecast.align(forecast.jacobian @ missed)
         squares.append(forecast.workspace.weights @ (field**2).sum(axis=1))

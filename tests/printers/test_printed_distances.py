@@ -38,7 +38,9 @@ from orthocal.hypotheses.search import find_anomalies
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.measurement.importing.printer_log import import_printer_log, write_printer_import
+from orthocal.measurement.recording import open_recording
 from orthocal.observation.model import ObservationModel, predict_readings
+from orthocal.sensors.protocol import equal_readings, states_readings
 from orthocal.units import MM
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
@@ -384,6 +386,16 @@ def test_rows_and_plans_state_pairs(tmp_path, printer):
     planned = load_plan(file)
     assert [(r.posture, r.minus) for r in planned.readings] == [("a", "b"), ("c", "d")]
     assert predict_readings(planned) == pytest.approx([88 * MM, 98 * MM], abs=1e-9)
+    (sensor,) = (s.sensor for s in planned.setups.values())
+    assert (states_readings(sensor), equal_readings(sensor)) == (False, True)
+    # a repeated pair is a reading, not a difference of its cycle
+    file.write_text(f"{plan}readings: readings.csv\n")
+    rows = "setup,posture,minus,cycle,reading_mm\nsize,a,b,1,\nsize,c,d,2,\n"
+    (tmp_path / "readings.csv").write_text(rows)
+    with open_recording(file) as recording:
+        recording.repeat(0)
+        recording.repeat(1)
+    assert [r.cycle for r in load_plan(file).readings] == [1, 2, 2, 3]
     file.write_text(plan.replace("0.1}", "0.1, postures: [a, b, c]}"))
     with pytest.raises(SessionError, match="3 postures"):
         load_plan(file)

@@ -269,8 +269,8 @@ def parse_conditions(row: RawReading, robot: Robot) -> Conditions | None:
     if row.minus:
         column, text = next(iter(stated.items()))
         raise SessionError(
-            f"{column} is '{shorten(text)}'; expected an empty cell: the row is a difference, and "
-            "conditions belong to single readings",
+            f"{column} is '{shorten(text)}'; expected an empty cell: the row has two postures, and "
+            "conditions belong to readings in one posture",
             where=row.where,
         )
     if row.approach:
@@ -282,21 +282,23 @@ def parse_conditions(row: RawReading, robot: Robot) -> Conditions | None:
     )
 
 
-def check_conditions(conditions: Conditions, robot: Robot, *, difference: bool, where: str) -> None:
+def check_conditions(
+    conditions: Conditions, robot: Robot, *, two_postures: bool, where: str
+) -> None:
     """Refuse conditions that a reading cannot have.
 
     Args:
         conditions: The conditions.
         robot: The robot.
-        difference: Whether the reading is a difference of two postures.
+        two_postures: Whether the reading belongs to two postures.
         where: File and line, or name of the reading, for messages.
 
     Raises:
         SessionError: If the reading cannot have the conditions.
     """
-    if difference:
+    if two_postures:
         raise SessionError(
-            "is a difference of two postures; conditions belong to single readings", where=where
+            "has two postures; conditions belong to readings in one posture", where=where
         )
     if conditions.approach is not None:
         require_approach(conditions.approach, robot, where)
