@@ -19,8 +19,7 @@ from orthocal.cli.options import app
 from orthocal.cli.printing import put_note, put_out
 from orthocal.errors import OrthocalError
 from orthocal.runtime.interrupts import INTERRUPTED, ending_at_interrupt
-from orthocal.runtime.slow_commands import announced_if_slow
-from orthocal.runtime.streams import ReaderGoneError, guarded_streams
+from orthocal.runtime.streams import ReaderGoneError, announced_if_slow, guarded_streams
 from orthocal.text import printable
 
 PANELS = {

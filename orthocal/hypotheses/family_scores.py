@@ -10,11 +10,10 @@ import numpy as np
 from orthocal.arrays import Array, Indices
 from orthocal.hypotheses.families.artefacts import wrong_artefacts
 from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
-from orthocal.hypotheses.families.row_offset import row_offsets
+from orthocal.hypotheses.families.row_order import row_offsets, swapped_rows
 from orthocal.hypotheses.families.sessions import changes_between_sessions
-from orthocal.hypotheses.families.single_reading import wrong_readings
-from orthocal.hypotheses.families.swapped_rows import swapped_rows
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
+from orthocal.hypotheses.families.wrong_readings import wrong_readings
 from orthocal.hypotheses.hypothesis import Family, Rows, to_dense
 from orthocal.hypotheses.hypothesis_set import HypothesisSet, Term
 from orthocal.hypotheses.likelihood import Products, log_of_sum

@@ -19,8 +19,8 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, AnomalyKind
 from orthocal.hypotheses.families.effects import find_effects, unmodelled_effects
-from orthocal.hypotheses.families.inconsistent_group import inconsistent_groups
 from orthocal.hypotheses.families.sessions import MAX_DRIVES
+from orthocal.hypotheses.families.wrong_readings import inconsistent_groups
 from orthocal.hypotheses.family_scores import (
     CLEAR_LOG_BAYES,
     COARSE_MARGIN,

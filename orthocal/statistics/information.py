@@ -147,11 +147,7 @@ class Information:
     ) -> Array:
         """Part of `covariance` from noise, b A⁻¹ Jᵀ J A⁻¹/σ², shape (n_free, n_free).
 
-        Args:
-            sigma: Standard deviation of one reading, [m].
-            precision: Diagonal of P⁻¹: 1 or 0, shape (n_free,).
-            at_bound: Mask of the parameters at a bound, whose covariance is 0.
-            loss: Mean a of ρ'' and mean square b of ρ' over the residuals; (1, 1) for squares.
+        Arguments are those of `covariance`.
         """
         gain, noise = loss
         inverse = self.covariance(

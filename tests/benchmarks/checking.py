@@ -30,7 +30,7 @@ from unmodelled_machines import EffectSearch, plan_with_conditions, read_machine
 from orthocal import check_session, load_plan
 from orthocal.cli import make_program
 from orthocal.hypotheses import family_scores, search
-from orthocal.hypotheses.families.inconsistent_group import inconsistent_groups
+from orthocal.hypotheses.families.wrong_readings import inconsistent_groups
 from orthocal.hypotheses.family_scores import CLEAR_LOG_BAYES, SIMILAR_LOG_BAYES
 from orthocal.hypotheses.hypothesis import Rows
 from orthocal.hypotheses.linear_model import LinearModel

@@ -27,10 +27,9 @@ from orthocal.cli import make_program
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.hypotheses.anomaly import AnomalyKind
 from orthocal.hypotheses.families.displaced_gauge import displaced_gauges
-from orthocal.hypotheses.families.row_offset import row_offsets
-from orthocal.hypotheses.families.single_reading import wrong_readings
-from orthocal.hypotheses.families.swapped_rows import swapped_rows
+from orthocal.hypotheses.families.row_order import row_offsets, swapped_rows
 from orthocal.hypotheses.families.unit_and_sign import wrong_units_and_signs
+from orthocal.hypotheses.families.wrong_readings import wrong_readings
 from orthocal.hypotheses.hypothesis import MAX_DENSE_COLUMNS, Rows, to_dense
 from orthocal.hypotheses.linear_model import LARGEST_ERROR, LinearModel
 from orthocal.hypotheses.search import find_anomalies

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from orthocal.runtime.slow_commands import announced_if_slow
+from orthocal.runtime.streams import announced_if_slow
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import codecs
 import csv
 import itertools
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 from orthocal.errors import SessionError
@@ -117,16 +117,20 @@ def decode(content: bytes, *, where: str, encoding: str | None = None) -> Decode
     return DecodedText(text, name, reason)
 
 
+def _require_choice(requested: str, choices: Collection[str], noun: str) -> None:
+    """Refuse a requested encoding or separator that is none of the choices."""
+    if requested not in choices:
+        raise SessionError(
+            f"'{shorten(requested)}' is not {noun}; expected one of {', '.join(choices)}",
+            where=f"--{noun.split()[-1]}",
+        )
+
+
 def _find_encoding(content: bytes, requested: str | None, where: str) -> tuple[str, str]:
     """Name of the encoding and the evidence for it."""
     mark = next((name for mark, name in _BYTE_ORDER_MARKS if content.startswith(mark)), None)
     if requested is not None:
-        if requested not in ENCODINGS:
-            raise SessionError(
-                f"'{shorten(requested)}' is not an encoding; expected one of "
-                f"{', '.join(ENCODINGS)}",
-                where="--encoding",
-            )
+        _require_choice(requested, ENCODINGS, "an encoding")
         if mark is not None and requested not in (mark, mark[:6]):
             raise SessionError(
                 f"has the byte order mark of {mark}, which contradicts --encoding {requested}",
@@ -181,12 +185,7 @@ def find_separator(
         SessionError: If the headings appear with several separators.
     """
     if requested is not None:
-        if requested not in SEPARATORS:
-            raise SessionError(
-                f"'{shorten(requested)}' is not a separator; expected one of "
-                f"{', '.join(SEPARATORS)}",
-                where="--separator",
-            )
+        _require_choice(requested, SEPARATORS, "a separator")
         return requested, "requested"
     stated = stated_separator(text)
     if stated is not None:

@@ -1,4 +1,4 @@
-"""Mistakes in a single reading, or in one posture of a setup in all its cycles."""
+"""Wrong readings: one, those of a posture, or those of a setup."""
 
 from __future__ import annotations
 
@@ -17,6 +17,12 @@ MISREAD = (1e-3, 0.5e-3, 0.2e-3, 0.1e-3)
 
 MIN_POSTURES = 3
 """Fewest postures of a setup of which one may be wrong in all cycles."""
+
+MAX_AMOUNTS = 12
+"""Most independent amounts of a setup or posture that is considered."""
+
+MAX_GROUPS = 100
+"""Most setups or postures of a session in which these hypotheses are considered."""
 
 
 def wrong_readings(rows: Rows) -> Iterator[Family]:
@@ -69,3 +75,47 @@ def _misread(rows: Rows, groups: Sequence[Indices]) -> Family:
     amounts = [sign * size for size in MISREAD for sign in (-1.0, 1.0)]
     explanations = [_explain(rows, i, "misread dial", amount=a) for a in amounts for i in groups]
     return Family.edited(rows, explanations, [np.array([-(e.amount or 0.0)]) for e in explanations])
+
+
+def inconsistent_groups(rows: Rows) -> Iterator[Family]:
+    """Setups, and postures of several setups, whose readings carry no information.
+
+    These hypotheses have many free amounts. So any more specific hypothesis that fits has more
+    evidence.
+    """
+    for family in (_inconsistent_setups(rows), _inconsistent_postures(rows)):
+        if family is not None and 0 < family.count <= MAX_GROUPS:
+            yield family
+
+
+def _inconsistent_setups(rows: Rows) -> Family | None:
+    """Setups whose readings are wrong by independent amounts; None with fewer than 3 setups."""
+    if not 2 < len(rows.setups) <= MAX_GROUPS:
+        return None
+    explanations, groups = [], []
+    for name, indices in rows.setups.items():
+        amounts = [r for (setup, *_), r in rows.repeated.items() if setup == name]
+        if rows.single[indices].all():  # the gauge zero is free
+            amounts = amounts[1:]
+        if 1 < len(amounts) <= MAX_AMOUNTS:
+            concerned = tuple(indices.tolist())
+            explanations.append(Explanation("inconsistent setup", "setup", concerned, (name,)))
+            groups.append(amounts)
+    return Family.of(explanations, groups=groups)
+
+
+def _inconsistent_postures(rows: Rows) -> Family | None:
+    """Postures whose readings in all setups are wrong by independent amounts; None with few."""
+    by_label: dict[str, list[Indices]] = {}
+    for indices in rows.repeated.values():
+        by_label.setdefault(rows.posture(int(indices[0])), []).append(indices)
+    if len(by_label) < 3:
+        return None
+    groups = {k: v for k, v in by_label.items() if 1 < len(v) <= MAX_AMOUNTS}
+    explanations = [
+        Explanation(
+            "inconsistent posture", "postures", tuple(np.concatenate(g).tolist()), names=(label,)
+        )
+        for label, g in groups.items()
+    ]
+    return Family.of(explanations, groups=list(groups.values()))

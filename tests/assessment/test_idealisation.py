@@ -7,7 +7,7 @@ import pytest
 from machines import place, reading_by_pinocchio
 
 from orthocal import calibrate, load_plan, simulate_session
-from orthocal.estimation.diagnostics.idealisation import find_idealised
+from orthocal.assessment.fit_findings import find_idealised
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.units import MM
 
