@@ -24,7 +24,7 @@ from orthocal.arrays import Array
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.tool_error import assess_tool
-from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.calibration import Calibration, propagate_stds
 from orthocal.calibration.refit import restore_covariances
 from orthocal.errors import ClosureError, ExportError
 from orthocal.kinematics.sensitivity import ToolSensitivity
@@ -213,10 +213,7 @@ def _setting_rows(
     present = calibration.session.firmware or settings
     uncertainties = np.full(len(gain), np.nan)
     if not calibration.unmodelled.prior_stds.size:
-        stds = [
-            np.sqrt(np.einsum("ij,jk,ik->i", gain, c, gain))
-            for c in restore_covariances(calibration)
-        ]
+        stds = propagate_stds(gain, restore_covariances(calibration))
         uncertainties = calibration.expand(*stds)
     values = [("radius", present.radius / MM, settings.radius / MM, MM, "mm")]
     for field, label, size, unit in (

@@ -150,7 +150,7 @@ def test_uncertainty_of_the_settings(calibrated):
     """Errors beside the identified ones change the settings as the derivative says."""
     _, calibration = calibrated
     fit = fit_firmware(calibration, "klipper")
-    covariance, _ = restore_covariances(calibration)
+    covariance, _, _ = restore_covariances(calibration)
     n = len(calibration.free)
     assert covariance[:n, :n] == pytest.approx(calibration.model_covariance, rel=1e-6, abs=1e-18)
     of_sensors = [p.std for p in calibration.sensors]

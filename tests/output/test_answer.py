@@ -23,7 +23,7 @@ from orthocal import (
     simulate_session,
     summarize,
 )
-from orthocal.assessment.assess import expanded_uncertainty
+from orthocal.assessment.controller_entries import expanded_uncertainty
 from orthocal.assessment.words.entries import describe_tool_error
 from orthocal.output.report.page import build_report
 from orthocal.output.text.answer import LISTED, MORE, MOST_LISTED, render_answer
@@ -173,16 +173,15 @@ def test_values_to_enter_have_their_expanded_uncertainty(answers, name):
         assert row[-3:] == [f"{e.enter * 1e3:+.3f}", f"{half * 1e3:.3f}", "mm"]
 
 
-def test_few_contrasts_widen_all_but_the_noise(answers):
+def test_few_contrasts_widen_the_scaled_errors(answers):
     """Six differences and three offsets: Student's factor, 3.18 of three contrasts, for the scaled
     tolerances."""
     calibration = answers["table1/experiment-2"]
     factor = coverage_factor(calibration.tolerance_scale.contrasts)
     assert factor == pytest.approx(student.ppf(0.975, calibration.tolerance_scale.contrasts))
     for e in calibration.assessment.entries:
-        rest = e.std**2 - e.std_scatter**2
-        expected = np.sqrt(4.0 * e.std_scatter**2 + factor**2 * rest)
-        assert expanded_uncertainty(calibration, e) == pytest.approx(expected, rel=1e-3)
+        expected = np.sqrt(4.0 * (e.std**2 - e.std_scaled**2) + factor**2 * e.std_scaled**2)
+        assert expanded_uncertainty(calibration, e) == pytest.approx(expected, rel=1e-9)
 
 
 def test_a_rejected_session_offers_nothing_to_type(answers):

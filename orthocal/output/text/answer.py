@@ -11,8 +11,8 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from orthocal.assessment.assess import assessment_of, expanded_uncertainty
-from orthocal.assessment.controller_entries import lowers
+from orthocal.assessment.assess import assessment_of
+from orthocal.assessment.controller_entries import expanded_uncertainty, lowers
 from orthocal.assessment.plausibility import describe_legs
 from orthocal.assessment.wording import joined
 from orthocal.assessment.words.anomalies import describe_evidence

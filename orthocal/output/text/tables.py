@@ -72,7 +72,7 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
         if not (few or _is_listed(p)):
             continue
         f, shift = p.edge_factor, p.value - p.linear
-        noise = float(c.expand(p.std_scatter, p.std_scatter))
+        noise = min(half, float(c.expand(p.std_scatter, p.std_scatter, 0.0)))
         resolved = f"{p.data_share:.0%}" if math.isfinite(p.data_share) else ""
         row = (
             p.name,
@@ -263,7 +263,7 @@ def render_sensors(calibration: Calibration) -> RenderableType | None:
     if calibration.sensors:
         rows = []
         for p in calibration.sensors:
-            half = float(calibration.expand(p.std, p.std_scatter))
+            half = calibration.expand_estimate(p)
             f = p.edge_factor
             limits = (plain(half * f), plain(show_limit(p.prior_std) * f))
             rows.append((p.name, signed(p.value * f), *limits, p.edge_unit))
