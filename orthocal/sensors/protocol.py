@@ -160,8 +160,12 @@ class Sensor(Protocol):
     # mounting_steps: tuple[str, ...], optional: instructions for mounting the sensor in the
     # alignment posture (`mounting_steps`)
 
-    # states_readings: ClassVar[bool], optional: whether readings are prescribed, not measured. Then
-    # equal readings do not indicate a sticking dial (`states_readings`)
+    # states_readings: ClassVar[bool], optional: whether equal readings are expected. Then they do not
+    # indicate a sticking dial (`states_readings`)
+
+    # is_trigger: ClassVar[bool], optional: whether the posture is measured when a switch triggers,
+    # and its reading is prescribed. Then nobody misreads a number or writes it into a wrong row
+    # (`is_trigger`)
 
     # reads_pairs: ClassVar[bool], optional: whether a reading belongs to a pair of postures: the
     # posture of its row and the one in the column `minus`. It is a single reading (`reads_pairs`)
@@ -317,6 +321,12 @@ def is_difference(minus: str | None, sensor: Sensor) -> bool:
 
 
 def states_readings(sensor: Sensor) -> bool:
-    """True if readings are prescribed, not measured; then equal readings are no anomaly."""
+    """True if equal readings are expected and no anomaly."""
     stated: bool = getattr(sensor, "states_readings", False)
     return stated
+
+
+def is_trigger(sensor: Sensor) -> bool:
+    """True if the posture is measured when a switch triggers, and its reading is prescribed."""
+    trigger: bool = getattr(sensor, "is_trigger", False)
+    return trigger
