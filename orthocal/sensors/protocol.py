@@ -160,8 +160,8 @@ class Sensor(Protocol):
     # mounting_steps: tuple[str, ...], optional: instructions for mounting the sensor in the
     # alignment posture (`mounting_steps`)
 
-    # states_readings: ClassVar[bool], optional: whether equal readings are expected. Then they do not
-    # indicate a sticking dial (`states_readings`)
+    # states_readings: ClassVar[bool], optional: whether equal readings are expected. Then they are
+    # no sign of a sticking dial (`states_readings`)
 
     # is_trigger: ClassVar[bool], optional: whether the posture is measured when a switch triggers,
     # and its reading is prescribed. Then nobody misreads a number or writes it into a wrong row

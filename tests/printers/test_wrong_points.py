@@ -1,4 +1,4 @@
-"""Points of a probed bed that contradict the others: a bump, dirt, a wrong trigger, a loose probe."""
+"""Points of a bed that contradict the others: bump, dirt, wrong trigger, loose probe."""
 
 from __future__ import annotations
 
