@@ -11,6 +11,7 @@ from orthocal.assessment.words.effects import identify_effects
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.effects.loading import errors_of_no_model, robot_effects, with_effects
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, Explanation
+from orthocal.sensors.protocol import states_readings
 from orthocal.session.session import Session, split_label
 from orthocal.text import printable, spans
 from orthocal.units import EDGE_UNITS, MM, UM, Unit
@@ -52,10 +53,11 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
     if e.kind in ("wrong dimension", "readjusted dimension"):
         numbers["dimension_mm"], numbers["stated_mm"] = _dimensions_mm(e)
     if anomaly.expected is not None:
-        text += (
-            f" It reads {signed(first.value / MM)} mm; the other readings predict "
-            f"{signed(anomaly.expected / MM)} mm."
-        )
+        if not _is_trigger(session, e):
+            text += (
+                f" It reads {signed(first.value / MM)} mm; the other readings predict "
+                f"{signed(anomaly.expected / MM)} mm."
+            )
         numbers |= {
             "measured_mm": first.value / MM,
             "expected_mm": anomaly.expected / MM,
@@ -285,9 +287,9 @@ def _text(session: Session, e: Explanation) -> str:
             f"{_subject(session, e)} was read {abs(e.amount or 0.0) / MM:g} mm too "
             f"{'high' if (e.amount or 0.0) > 0 else 'low'}, by a turn or a mark of the dial"
         ),
-        "outlier": lambda: f"{_subject(session, e)} was misread or mistyped",
+        "outlier": lambda: _wrong_reading(session, e),
         "inconsistent posture": lambda: (
-            f"{_subject(session, e)} was misread or mistyped"
+            _wrong_reading(session, e)
             if e.scope == "posture"
             else f"the machine was not in posture {e.names[0]} when that was read"
         ),
@@ -334,6 +336,25 @@ def _text(session: Session, e: Explanation) -> str:
     return texts[e.kind]()
 
 
+def _wrong_reading(session: Session, e: Explanation) -> str:
+    """Clause about a reading that contradicts the others."""
+    subject = _subject(session, e)
+    if not _is_trigger(session, e):
+        return f"{subject} was misread or mistyped"
+    excess = e.amount or 0.0  # of the prescribed height over the height of the trigger
+    side, cause = (
+        ("above", "a bump, dirt or filament, or a trigger that came too early")
+        if excess < 0.0
+        else ("below", "a dent, or a trigger that came too late")
+    )
+    return f"{subject} triggered {mm(abs(excess))} mm {side} the surface of the others: {cause}"
+
+
+def _is_trigger(session: Session, e: Explanation) -> bool:
+    """True if an explanation concerns a reading that a switch triggered."""
+    return states_readings(session.setups[session.readings[e.rows[0]].setup].sensor)
+
+
 def _amounts(e: Explanation) -> str:
     """Significant parameters of an effect, such as "x_slide.backlash 0.045 ± 0.010 mm"."""
     texts = []
@@ -363,6 +384,11 @@ def _displaced(session: Session, e: Explanation) -> str:
     """Clause about a displaced gauge."""
     if e.scope == "cycle":
         return f"the gauge of setup {e.names[0]} was displaced before cycle {e.cycle}"
+    if _is_trigger(session, e):
+        return (
+            f"the probe or the bed moved before {_row(session, e.rows[0])}: all later points are "
+            "shifted"
+        )
     return (
         f"the gauge of setup {e.names[0]} was displaced before {_row(session, e.rows[0])}: all "
         "later readings of that setup are shifted"
@@ -493,6 +519,8 @@ def _remedy(session: Session, e: Explanation) -> str:
         if e.missing:
             return "If so, move them down by a line and read what is missing."
         return "If so, move them up by a line and read the last one again."
+    if e.kind == "displaced gauge" and session.firmware is not None:
+        return "If so, fasten the probe and the bed, probe again and import the new log."
     if e.kind == "inconsistent posture" and e.scope == "postures":
         return "Check its coordinates, and read it again."
     remedies = {
@@ -519,12 +547,14 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
     """Action to repeat or omit readings, with commands for the first one."""
     rows = [session.readings[i] for e in explanations for i in e.rows]
     if session.firmware is not None:
-        repeat = "Probe the bed again and import that log"
+        repeat = "Clean the bed and the nozzle, probe again and import the new log"
         if all(r.minus is not None for r in rows):
             repeat = (
                 "Measure again and correct the command DELTA_ANALYZE, then import the log again"
             )
-        return f"{repeat}, or leave out what is wrong."
+        lines = [r.line for r in rows if r.line is not None][:MAX_PLACES]
+        omitted = f"delete {spans(lines, 'line')} of readings.csv" if lines else "leave it out"
+        return f"{repeat}. Or {omitted}, and calibrate again."
     advice = "Read it again" if len(rows) == 1 else "Look at these readings. Read them again"
     file = rows[0].file or session.readings_path
     if file is None or rows[0].line is None:

@@ -30,7 +30,8 @@ def wrong_dimensions(legs: str, nominal: float, measured: float) -> Finding:
 def beyond_tolerances(scale: float, limit: float, *, firmware: bool) -> Finding:
     """Finding that only errors of many times the stated tolerances explain the readings."""
     check = (
-        "Check that the settings of the log are those with which it was probed, and its points."
+        "Check that the settings of the log are those with which it was probed. Then clean the bed "
+        "and the nozzle, and probe again."
         if firmware
         else "Check signs, lines and setups. If they are right, adjust the machine mechanically "
         "first."

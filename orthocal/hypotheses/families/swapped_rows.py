@@ -24,7 +24,7 @@ MAX_PAIRS = 60_000
 
 def swapped_rows(rows: Rows) -> Iterator[Family]:
     """Swapped rows, one family per scope."""
-    for pairs in (
+    for listed in (
         _of_setup(rows),
         _across_setups(rows),
         _postures_of_setup(rows),
@@ -33,6 +33,7 @@ def swapped_rows(rows: Rows) -> Iterator[Family]:
         _legs(rows),
         _backwards(rows),
     ):
+        pairs = [p for p in listed if rows.written[list(p.rows)].all()]
         if 0 < len(pairs) <= MAX_PAIRS:
             yield _swapped(rows, pairs)
 
