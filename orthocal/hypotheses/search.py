@@ -551,7 +551,11 @@ class _Search:
         )
 
     def _shortlist(self, scored: list[tuple[Family, Array]], rows: Rows) -> list[Term]:
-        """The most likely single hypotheses, and the most likely one of each kind."""
+        """The most likely single hypotheses, and the most likely one of each kind.
+
+        Reversed signs of absolute readings are always included, except of pairs of setups. They are
+        far from the linearisation: a fixed ball is on the opposite side of its nominal position.
+        """
         ranked = sorted(
             (
                 (float(evidence[h]), i, h)
@@ -569,7 +573,17 @@ class _Search:
             if evidence > 0.0 and key not in kinds:
                 kinds.add(key)
                 chosen.append(t)
-        return chosen[:MAX_REFITTED]
+        chosen = chosen[:MAX_REFITTED]
+        present = {t.explanation for t in chosen}
+        absolute = {s.name for s in self.session.setups.values() if s.zero == "known"}
+        return chosen + [
+            self._term(family, h, rows)
+            for family, _ in scored
+            if family.log_volume is not None and absolute
+            for h, e in enumerate(map(family.explain, range(family.count)))
+            if e.kind == "reversed sign" and e.scope != "setups" and absolute.intersection(e.setups)
+            if e not in present
+        ]
 
     def _pairs(
         self, state: HypothesisSet, scored: list[tuple[Family, Array]]
