@@ -41,7 +41,8 @@ def simulate(
     """Simulate the readings of a machine with known errors.
 
     The directory receives session.yaml, readings.csv and truth.yaml. Readings state the conditions
-    that effects of the machine need, and their time and temperature with --temperature.
+    that effects of the machine need, and their time and temperature with --temperature. With the
+    truth.yaml of an earlier session (--errors) machine and gauges are the same, mounted anew.
 
     Args:
         draw (MODEL|GLOBS): Draw normally distributed errors by their tolerances: of a model, or of

@@ -221,7 +221,8 @@ class Rows:
         sensors = {name: setup.sensor for name, setup in session.setups.items()}
         self.paired = np.array([reads_pairs(sensors[r.setup]) for r in session.readings], bool)
         """Mask of rows that are distances between two postures, not read on a dial, (n_rows,)."""
-        self.written = np.array([not states_readings(sensors[r.setup]) for r in session.readings], bool)
+        prescribed = [states_readings(sensors[r.setup]) for r in session.readings]
+        self.written = ~np.array(prescribed, bool)
         """Mask of rows whose number somebody read and wrote, unlike triggers, (n_rows,)."""
 
     @cached_property
