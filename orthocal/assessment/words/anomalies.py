@@ -11,6 +11,7 @@ from orthocal.assessment.words.effects import identify_effects
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.effects.loading import errors_of_no_model, robot_effects, with_effects
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, Explanation
+from orthocal.measurement.motion.approach import label_reading
 from orthocal.sensors.protocol import states_readings
 from orthocal.session.session import Session, split_label
 from orthocal.text import printable, spans
@@ -21,6 +22,9 @@ MAX_PLACES = 20
 
 LARGEST_ODDS = 1e6
 """Odds above which the number is not printed."""
+
+LEAST_CHANCE = 1e-4
+"""Probability by chance below which only this limit is printed."""
 
 UNITS = {25.4: "in inches", 1e3: "in m", 1e-3: "in µm"}
 """Unit of wrongly written readings by the factor that corrects them; others are mm as inches."""
@@ -43,8 +47,10 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
         return _ambiguous(session, result, anomaly)
     first = session.readings[e.rows[0]]
     descriptions = [_text(session, c) for c in anomaly.causes] or [_text(session, e)]
-    text = f"{_lines(session, e)}it looks as if {' or '.join(descriptions)}."
-    text = f"{text[0].upper()}{text[1:]}"
+    text = _capitalised(f"{_lines(session, e)}it looks as if {descriptions[0]}.")
+    if len(descriptions) > 1:
+        listed = ";\n  ".join(descriptions)
+        text = _capitalised(f"{_lines(session, e)}one of these may have happened:\n  {listed}.")
     numbers = _numbers(result, anomaly)
     if e.amounts:
         numbers["amount_um"] = (e.amount or 0.0) / UM
@@ -134,8 +140,7 @@ def _unexplained(session: Session, result: Anomalies) -> Finding:
 def _between_sessions(session: Session, anomaly: Anomaly) -> Finding:
     """Finding about a machine that changed, or offsets that were not entered as stated."""
     e = anomaly.explanation
-    text = _text(session, e)
-    text = f"{text[0].upper()}{text[1:]}."
+    text = _capitalised(f"{_text(session, e)}.")
     others = [_text(session, c) for c in (*anomaly.causes, *anomaly.alternatives) if c != e]
     if others:
         text += f" The readings do not distinguish this from: {'; '.join(others)}."
@@ -194,7 +199,11 @@ def _numbers(result: Anomalies, anomaly: Anomaly) -> dict[str, float]:
 
 
 def describe_evidence(finding: Finding) -> str:
-    """Residuals before and after the correction of an anomaly, and its odds; "" if unknown."""
+    """Numbers behind a finding about readings; "" without any.
+
+    Residuals before and after the correction of an anomaly, and its odds; correlation of the
+    residuals of two sessions.
+    """
     numbers = finding.numbers
     sentences = []
     before, after = (numbers.get(f"{n}_rms_um", math.nan) * UM for n in ("before", "after"))
@@ -206,6 +215,14 @@ def describe_evidence(finding: Finding) -> str:
         if odds > 0.999 * LARGEST_ODDS:
             number = f"more than {LARGEST_ODDS:,.0f}"
         sentences.append(f"Odds that something is wrong: {number} to 1.")
+    if "correlation" in numbers and math.isfinite(numbers["correlation"]):
+        probability = f"below {100.0 * LEAST_CHANCE:g} %"
+        if numbers["chance"] >= LEAST_CHANCE:
+            probability = f"{100.0 * numbers['chance']:.2g} %"
+        sentences.append(
+            f"Correlation {numbers['correlation']:.3f} over {numbers['rows']:.0f} lines; "
+            f"probability by chance {probability}."
+        )
     return " ".join(sentences)
 
 
@@ -251,11 +268,16 @@ def _lines(session: Session, e: Explanation) -> str:
     return f"{spans(lines, 'line')}{file}: "
 
 
+def _capitalised(text: str) -> str:
+    """A text with a capital first letter."""
+    return f"{text[0].upper()}{text[1:]}"
+
+
 def _row(session: Session, row: int) -> str:
     """Setup, postures and cycle of a reading; for a printer's log with the probed point."""
     reading = session.readings[row]
     if session.firmware is None or reading.minus is not None:
-        return reading.label_with_cycle
+        return label_reading(session.robot, reading)
     x, y = session.firmware.touched(session.postures[reading.posture].drives)[0, :2] / MM
     return f"{reading.label_with_cycle} (x {x:.1f}, y {y:.1f} mm)"
 
@@ -285,7 +307,7 @@ def _text(session: Session, e: Explanation) -> str:
         "reversed sign": lambda: _reversed(session, e),
         "misread dial": lambda: (
             f"{_subject(session, e)} was read {abs(e.amount or 0.0) / MM:g} mm too "
-            f"{'high' if (e.amount or 0.0) > 0 else 'low'}, by a turn or a mark of the dial"
+            f"{'high' if (e.amount or 0.0) > 0 else 'low'}, by one turn or one mark of the dial"
         ),
         "outlier": lambda: _wrong_reading(session, e),
         "inconsistent posture": lambda: (
@@ -293,7 +315,7 @@ def _text(session: Session, e: Explanation) -> str:
             if e.scope == "posture"
             else f"the machine was not in posture {e.names[0]} when that was read"
         ),
-        "inconsistent setup": lambda: f"setup {e.setups[0]} is not the one that is described",
+        "inconsistent setup": lambda: f"setup {e.setups[0]} was not mounted as session.yaml states",
         "swapped rows": lambda: _swapped(session, e),
         "row offset": lambda: _offset(session, e),
         "stuck dial": lambda: (
@@ -512,7 +534,7 @@ def _remedy(session: Session, e: Explanation) -> str:
             f"{reverse_direction}"
         )
     if e.factor is not None:
-        return f"If so, multiply these by {e.factor:.6g}."
+        return f"If so, multiply these readings by {e.factor:.6g}."
     if e.kind == "displaced gauge" and e.scope == "cycle":
         return f"If so, read cycle {e.cycle} again, or leave it out."
     if e.kind == "row offset":
@@ -555,16 +577,15 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
         lines = [r.line for r in rows if r.line is not None][:MAX_PLACES]
         omitted = f"delete {spans(lines, 'line')} of readings.csv" if lines else "leave it out"
         return f"{repeat}. Or {omitted}, and calibrate again."
-    advice = "Read it again" if len(rows) == 1 else "Look at these readings. Read them again"
+    what = "it" if len(rows) == 1 else "these"
     file = rows[0].file or session.readings_path
     if file is None or rows[0].line is None:
-        return f"{advice}, or leave out what is wrong."
+        return f"Read {what} again, or leave out what is wrong."
     line, path = rows[0].line, printable(shlex.quote(str(file.parent)))
-    others = "" if len(rows) == 1 else " Other lines likewise."
+    others = "" if len(rows) == 1 else ", and so on"
     return (
-        f"{advice}, or leave out what is wrong. In `orthocal record {path}` the command "
-        f"`again {line}` reads line {line} once more, `back {line}` corrects it, and "
-        f"`drop {line}` deletes it.{others}"
+        f"Read {what} again: in `orthocal record {path}` type `again {line}`{others}. "
+        f"`back {line}` corrects a mistyped reading, `drop {line}` deletes it."
     )
 
 

@@ -15,6 +15,7 @@ from orthocal.assessment.words.fit import MAX_LISTED
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
+from orthocal.output.text.answer import name_values
 from orthocal.output.text.layout import (
     NOISE_SOURCES,
     bullets,
@@ -95,7 +96,7 @@ def _parameter_notes(c: Calibration, *, omitted: int, by_noise: bool) -> list[st
     """Sentences under the table of the parameters."""
     notes = []
     if not c.only_offsets and assessment_of(c).entries:
-        notes.append("Offsets are those of the slides; the best ones to enter differ (see there).")
+        notes.append(f"Offsets of the slides. The best ones to enter differ: see {name_values(c)}.")
     if omitted:
         notes.append(f"{omitted} more are resolved by less than half; --all lists them.")
     held = [p for p in c.parameters if not p.free]
