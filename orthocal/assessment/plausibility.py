@@ -20,6 +20,7 @@ from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.estimation.weighting import stated_sigma
 from orthocal.hypotheses.hypothesis import Rows
 from orthocal.measurement.joining import split_sessions
+from orthocal.measurement.motion.approach import label_reading
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import states_readings
 from orthocal.session.session import Gauge, Session
@@ -294,12 +295,13 @@ def _check_repeats(session: Session, name: str) -> Finding | None:
         return None
     worst = max(repeated, key=sum_of_squares)
     shown = ", ".join(
-        f"{signed(values[i] / MM)} in {session.where(session.readings[i])}" for i in worst[:4]
+        f"{signed(values[i] / MM)} mm" + (f" in line {line}" if line is not None else "")
+        for i, line in ((i, session.readings[i].line) for i in worst[:4])
     )
     return words.scattered_repeats(
         math.sqrt(total / dof),
         sigma,
-        session.readings[worst[0]].label,
+        label_reading(session.robot, session.readings[worst[0]]),
         shown,
         [place_of(session, i) for i in worst[:MAX_PLACES]],
     )

@@ -17,13 +17,8 @@ from typing import Any
 import numpy as np
 
 from orthocal.arguments import require_kind
-from orthocal.assessment.assess import (
-    assess,
-    assessment_of,
-    expanded_uncertainty,
-    is_significant,
-)
-from orthocal.assessment.controller_entries import find_entries
+from orthocal.assessment.assess import assess, assessment_of, is_significant
+from orthocal.assessment.controller_entries import expanded_uncertainty, find_entries
 from orthocal.assessment.judgement import Judgement, judge_session, rank, verdict_of
 from orthocal.assessment.predictive import (
     DeviationTest,

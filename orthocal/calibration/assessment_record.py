@@ -191,6 +191,8 @@ class ControllerEntry(InUnit):
     """Standard deviation of `best` from noise, priors and unmodelled errors, [unit]."""
     std_scatter: SizeOrNaN
     """Part of `std` from the noise of the readings, [unit]."""
+    std_scaled: SizeOrNaN
+    """Part of `std` from errors whose tolerances the tolerance scale multiplies, [unit]."""
     held: Literal["known", "lower bound", "upper bound"] | None
     """Reason why the readings do not determine the offset; None if they do."""
 

@@ -14,6 +14,9 @@ from orthocal.sensors.compiled import CompiledReading, compile_reading
 from orthocal.sensors.protocol import NuisanceParameter
 from orthocal.session.session import Session, Setup, split_label
 
+OF_GAUGE = "gauge."
+"""Beginning of the names of parameters of a gauge, which all its setups and sessions share."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorGroup:

@@ -33,6 +33,7 @@ from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace
 from orthocal.observation.observations import build_observations
+from orthocal.observation.sensor_groups import OF_GAUGE
 from orthocal.robot.model import Robot
 from orthocal.runtime.worker_pool import call_in_parallel, current_worker_budget
 from orthocal.session.session import Session
@@ -46,9 +47,6 @@ worst point with translation and rotation removed. A, D, E: trace, determinant o
 of the covariance of the parameters, in prior std."""
 
 CRITERIA: tuple[Criterion, ...] = ("aligned", "relative", "absolute", "worst", "A", "D", "E")
-
-OF_GAUGE = "gauge."
-"""Beginning of the names of parameters that all sessions with a gauge share."""
 
 WORST_POWER = 8.0
 """Exponent of the power mean that approximates the largest variance of the points."""

@@ -26,7 +26,7 @@ from orthocal import (
     write_calibration,
 )
 from orthocal.assessment.assess import assess
-from orthocal.assessment.calibrated_tool import error_covariance, place_tool
+from orthocal.assessment.calibrated_tool import place_tool
 from orthocal.assessment.controller_entries import entered_offsets, find_backlash
 from orthocal.assessment.judgement import Judgement
 from orthocal.assessment.recommendation import Recommendation
@@ -164,7 +164,7 @@ def test_it_is_that_of_sampled_machines_under_sampled_conditions(calibration, wo
     accuracy = assess_tool(calibration, workspace)
     figures = summarise_tool(calibration, accuracy)
     robot, names = calibration.robot, accuracy.names
-    values, vectors = np.linalg.eigh(error_covariance(calibration))
+    values, vectors = np.linalg.eigh(calibration.error_covariances[0])
     draws = np.random.default_rng(7).normal(size=(MACHINES, values.size))
     errors = (draws * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     at = calibration.errors

@@ -23,6 +23,7 @@ from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import entered_offsets, find_entries
 from orthocal.assessment.judgement import judge_session
 from orthocal.assessment.predictive import Repetition, judge_deviations, measure_repetition
+from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.validation import describe_repetition
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.identify import identify
@@ -83,7 +84,9 @@ def test_experiment_3_validates_experiment_2_as_in_the_paper(table1):
     ("chance", "text"), [(0.22, "by chance 22 %"), (1e-9, "by chance below 0.01 %")]
 )
 def test_the_probability_of_a_repetition_is_printed(chance, text):
-    assert text in describe_repetition(Repetition(6, 0.5, chance)).text
+    found = describe_repetition(Repetition(6, 0.5, chance))
+    assert text not in found.text
+    assert text in describe_evidence(found)
 
 
 def test_offsets_that_were_entered_with_their_sign_turned_are_found_out(plan):

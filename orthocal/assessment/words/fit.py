@@ -84,9 +84,9 @@ def model_error(
     """
     return note(
         "model error",
-        f"After the fit, {row_noun} typically deviates by {mm(sigma * row_factor)} mm, "
+        f"After the calibration {row_noun} still deviates by about {mm(sigma * row_factor)} mm, "
         f"{times(sigma / reference)} {source} ({mm(reference * row_factor)} mm). Probable cause: "
-        "errors of legs, axes and mounting, not noise.",
+        "errors of legs, axes and mounting.",
         "`orthocal compare` shows whether the readings support a larger model."
         if may_enlarge_model
         else "",
@@ -112,8 +112,8 @@ def no_redundancy(readings: int, parameters: int) -> Finding:
     """Finding that the fit has no redundant readings."""
     return note(
         "no redundancy",
-        f"With {readings} independent readings for {parameters} possible errors the fit cannot be "
-        "checked against the readings. It relies on the stated tolerances.",
+        f"There are {readings} independent readings for {parameters} possible errors, so the "
+        "result relies on the stated tolerances. Only new readings can check it.",
         independent_readings=float(readings),
         parameters=float(parameters),
     )

@@ -31,7 +31,7 @@ MIN_ROWS = 3
 
 def swapped_rows(rows: Rows) -> Iterator[Family]:
     """Swapped rows, one family per scope."""
-    for pairs in (
+    for listed in (
         _of_setup(rows),
         _across_setups(rows),
         _postures_of_setup(rows),
@@ -40,6 +40,7 @@ def swapped_rows(rows: Rows) -> Iterator[Family]:
         _legs(rows),
         _backwards(rows),
     ):
+        pairs = [p for p in listed if rows.written[list(p.rows)].all()]
         if 0 < len(pairs) <= MAX_PAIRS:
             yield _swapped(rows, pairs)
 
@@ -185,7 +186,8 @@ def row_offsets(rows: Rows) -> Iterator[Family]:
     one. If a reading was written twice, the last one is lost. The lost reading has an unknown
     value.
     """
-    setups = {n: i for n, i in rows.setups.items() if not rows.paired[i].any()}
+    dials = rows.written & ~rows.paired
+    setups = {n: i for n, i in rows.setups.items() if dials[i].all()}
     segments = [indices for indices in setups.values() if indices.size >= MIN_ROWS]
     segments += [
         indices

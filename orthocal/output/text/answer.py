@@ -11,8 +11,8 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from orthocal.assessment.assess import assessment_of, expanded_uncertainty
-from orthocal.assessment.controller_entries import lowers
+from orthocal.assessment.assess import assessment_of
+from orthocal.assessment.controller_entries import expanded_uncertainty, lowers
 from orthocal.assessment.plausibility import describe_legs
 from orthocal.assessment.wording import joined
 from orthocal.assessment.words.anomalies import describe_evidence
@@ -94,19 +94,27 @@ def render_answer(
     """
     assessment = assessment_of(calibration)
     parts: list[RenderableType] = [render_subject(calibration), Text()] if heading else []
-    parts += [_decision(assessment.decision), Text()]
-    if assessment.entries and assessment.decision.verdict != "reject":
+    parts += [render_headline(assessment.decision), Text()]
+    notes = [f.words for f in _listed(calibration, assessment)]
+    if assessment.decision.verdict == "enter":
+        parts += _values(calibration, assessment) + _tool(calibration, assessment)
+        notes += describe_undetermined(calibration, further)
+    parts.append(bullets(notes))
+    return Group(*parts, render_next(*_next_step(calibration, assessment, saved)))
+
+
+def _values(calibration: Calibration, assessment: Assessment) -> list[RenderableType]:
+    """Values to enter, with notes."""
+    parts: list[RenderableType] = []
+    if assessment.entries:
         parts += [
             _indented(entry_table(calibration)),
-            *_entry_notes(calibration, assessment),
+            *(_indented(Text(text)) for text in _entry_notes(calibration, assessment)),
             Text(),
         ]
-    if assessment.backlash and assessment.decision.verdict != "reject":
+    if assessment.backlash:
         parts += [_indented(render_backlash(calibration)), Text()]
-    parts += _tool(calibration, assessment)
-    notes = [f.words for f in _listed(calibration, assessment)]
-    parts.append(bullets([*notes, *describe_undetermined(calibration, further)]))
-    return Group(*parts, render_next(*_next_step(calibration, assessment, saved)))
+    return parts
 
 
 def render_next(words: str, commands: Sequence[str] = ()) -> RenderableType:
@@ -123,7 +131,7 @@ def render_decision(assessment: Assessment, *, details: bool = False) -> Rendera
         details: Whether to list the evidence for each finding.
     """
     decision = assessment.decision
-    parts: list[RenderableType] = [_decision(decision)]
+    parts: list[RenderableType] = [render_headline(decision)]
     further = [f.words for f in assessment.findings if f.text != decision.reason]
     if further:
         parts += [Text(), bullets(further)]
@@ -140,26 +148,30 @@ def print_decision(assessment: Assessment, *, details: bool = False) -> None:
     print_rich(render_decision(assessment, details=details))
 
 
-def _decision(decision: Decision) -> Text:
+def render_headline(decision: Decision) -> Text:
+    """Headline of a decision, and its reason."""
     headline = (decision.headline, STYLES[decision.verdict])
     return Text.assemble(headline, f" {decision.reason}".rstrip())
 
 
-def _entry_notes(calibration: Calibration, assessment: Assessment) -> list[RenderableType]:
+def _entry_notes(calibration: Calibration, assessment: Assessment) -> list[str]:
     """Notes on entering the values."""
     unstated = assessment.of_kind("controller not stated")
-    if unstated:
-        return [_indented(Text(unstated[0].words))]
+    return [unstated[0].words] if unstated else describe_columns(calibration)
+
+
+def describe_columns(calibration: Calibration) -> list[str]:
+    """Meaning of the columns `new` and `joint`, in sentences; none without these columns."""
+    assessment = assessment_of(calibration)
     if assessment.keeps_offsets:
         return []
-    notes = [NEW_NOTE]
-    down = [d.name for d in calibration.robot.drives if d.direction < 0]
-    if down:
+    notes = [] if assessment.of_kind("controller not stated") else [NEW_NOTE]
+    if down := [d.name for d in calibration.robot.drives if d.direction < 0]:
         verb = "counts" if len(down) == 1 else "count"
         notes.append(
             f"joint: change of the controller's joint, with its sign; {joined(down)} {verb} down."
         )
-    return [_indented(Text(note)) for note in notes]
+    return notes
 
 
 def _tool(calibration: Calibration, assessment: Assessment) -> list[RenderableType]:
@@ -182,10 +194,11 @@ def describe_conditions(calibration: Calibration) -> list[str]:
 
 def _listed(calibration: Calibration, assessment: Assessment) -> Sequence[Finding]:
     """Further findings that matter before anything is entered, the gravest first."""
+    kinds = LISTED if assessment.decision.verdict == "enter" else ()
     listed = [
         f
         for f in assessment.findings
-        if (f.severity != "note" or f.kind in LISTED) and f.text != assessment.decision.reason
+        if (f.severity != "note" or f.kind in kinds) and f.text != assessment.decision.reason
     ]
     if assessment.keeps_offsets:
         listed = [f for f in listed if f.kind not in ("must change", "not significant")]
@@ -214,8 +227,8 @@ def _next_step(
         words = "correct the other errors, in LinuxCNC or in programs."
         if not unchanged:
             words = (
-                "if the controller corrects offsets only, enter them. Otherwise leave the offsets, "
-                "and correct all identified errors in LinuxCNC or in programs."
+                "enter these offsets only if the controller corrects nothing else. Otherwise leave "
+                "the offsets, and correct all identified errors in LinuxCNC or in programs."
             )
         active = "" if unchanged else " --offsets active"
         return words, (
@@ -343,7 +356,7 @@ def render_values(calibration: Calibration) -> RenderableType:
         return noted(Text(settings), EXPANDED)
     if not assessment.entries:
         return noted(Text("None: no offset was identified."), EXPANDED)
-    complete = assessment.decision.verdict != "reject" and calibration.only_offsets
+    complete = assessment.decision.verdict == "enter" and calibration.only_offsets
     table = entry_table(calibration, identified=not calibration.only_offsets)
     keep, stated = assessment.keeps_offsets, assessment.entries[0].active is not None
     meaning = "Slide coordinate = encoder coordinate + offset."
