@@ -16,6 +16,9 @@ from orthocal.robot.loading import packaged_robots
 EFFECTS = "backlash: {}, thermal: {}, screw: {lead_mm: 10}, drift: {}"
 """Keys of all effects that a session can identify."""
 
+ALL = ("backlash", "thermal", "screw", "drift")
+"""Names of these effects."""
+
 FEW = ("yx", "xy", "xz")
 """Setups that suffice to identify backlash."""
 

@@ -18,10 +18,10 @@ from unmodelled_machines import EffectSearch, plan_with_conditions, read_machine
 
 from orthocal import (
     Choice,
-    calibrate,
     check_session,
     simulate_session,
 )
+from orthocal.calibration.identify import identify
 from orthocal.effects import registry
 from orthocal.errors import RobotError
 from orthocal.hypotheses.families.effects import find_effects, missing_effects
@@ -166,7 +166,7 @@ def test_the_remedy_frees_parameters_that_the_complete_model_lacks(slack):
         r"--effects (\S+) --model (\S+) --free '(\S+)'`", finding.action
     ).groups()
     choice = Choice(model, free=free.split(","), effects=effects.split(","))
-    result = calibrate(session, choice, solver="variable-projection")
+    result, _ = identify(session, choice, solver="variable-projection")
     slack_of_x = next(p for p in result.free if p.name == "x_slide.slack")
     assert slack_of_x.value == pytest.approx(30e-6, abs=3.0 * slack_of_x.std)
 
