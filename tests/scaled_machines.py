@@ -20,6 +20,10 @@ class Outcome:
 
     covered: np.ndarray
     """Whether ± of each offset contains the best value to enter, shape (n_machines, n_drives)."""
+    mounted: np.ndarray
+    """Whether ± of each nuisance parameter contains its value, shape (n_machines, n_nuisance)."""
+    profiled: np.ndarray
+    """Whether profile intervals of offsets contain their values, shape (n_machines, n_profiled)."""
     found: np.ndarray
     """Whether the readings showed errors above their tolerances, shape (n_machines,)."""
     tool: np.ndarray
@@ -32,23 +36,31 @@ class Outcome:
         return true / predicted
 
 
-def calibrate_machines(session, model, *, factor, count, solver="linearised", seed=0):
+def calibrate_machines(session, model, *, factor, count, solver="linearised", seed=0, profile=()):
     """Calibrate machines with errors at a factor of their tolerances, offsets at theirs.
 
     The machines have the errors of `full` and random noise; gauges are mounted with errors.
+    Profile-likelihood intervals are computed of the offsets whose names are in `profile`.
     """
     parameters = session.robot.parameters
     names = parameters.select_model("full")
     session = session.with_gauge(replace(session.gauge, range=None))
-    rng, covered, found, tools = np.random.default_rng(seed), [], [], []
+    rng, covered, mounted, profiled = np.random.default_rng(seed), [], [], []
+    found, tools = [], []
     for number in range(count):
         sizes = [
             (factor if parameters.are_scaled(n) else 1.0) * parameters[n].prior_std for n in names
         ]
         errors = dict(zip(names, (rng.normal(size=len(names)) * sizes).tolist(), strict=True))
         errors |= {n: v / 5.0 for n, v in errors.items() if parameters.are_offsets(n)}
-        read = simulate_session(session, errors, seed=seed + number).session
-        calibration, _ = identify(read, model, solver=solver, find_scale=find_tolerance_scale)
+        simulated = simulate_session(session, errors, seed=seed + number)
+        calibration, _ = identify(
+            simulated.session,
+            model,
+            solver=solver,
+            find_scale=find_tolerance_scale,
+            profile=profile,
+        )
         tool = find_tool(calibration)
         entries = compute_entries(calibration, tool)
         accuracy = assess_placed(calibration, tool, entries)
@@ -57,9 +69,16 @@ def calibrate_machines(session, model, *, factor, count, solver="linearised", se
         left = Machine(session.robot, errors).forward(drives) - tool.targets
         promised = summarise_tool(calibration, accuracy).entered
         tools.append((accuracy.measure(left).reported.rms, promised))
+        errors |= simulated.nuisance
         offsets = [calibration[f"{d.name}.offset"] for d in session.robot.drives]
-        wrong = [abs(p.value - errors[p.name]) for p in offsets]
-        half = calibration.expand([p.std for p in offsets], [p.std_scatter for p in offsets])
-        covered.append(wrong <= half)
+        covered.append(_cover(calibration, offsets, errors))
+        mounted.append(_cover(calibration, calibration.sensors, errors))
+        intervals = [calibration[name].interval for name in profile]
+        profiled.append([a <= errors[n] <= b for n, (a, b) in zip(profile, intervals, strict=True)])
         found.append(calibration.tolerance_scale.factor > 1.0)
-    return Outcome(np.array(covered), np.array(found), np.array(tools))
+    return Outcome(*map(np.array, (covered, mounted, profiled, found, tools)))
+
+
+def _cover(calibration, estimates, truth):
+    """Whether ± of each estimate, of an offset or a nuisance parameter, contains the truth."""
+    return [abs(p.value - truth[p.name]) <= calibration.expand_estimate(p) for p in estimates]

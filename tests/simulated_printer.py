@@ -67,8 +67,9 @@ def read_settings(firmware, text, m851=0.0):
     angles = np.array(ANGLES) + [one(m665, k) for k in "XYZ"]
     stops = np.array([one(m666, k) for k in "XYZ"])
     height, radius = one(m665, "H"), one(m665, "R")
-    if firmware == "marlin":
+    if firmware in ("marlin", "marlin1"):
         assert (stops <= 0.0).all()
+        assert firmware == "marlin" or not set("ABC") & m665.keys()
         rods = one(m665, "L") + np.array([one(m665, k) for k in "ABC"])
         return Firmware(radius, rods, angles, height - m851 - stops)
     rods = np.array(m665["L"]) if len(m665["L"]) == 3 else np.full(3, m665["L"][0])
@@ -88,14 +89,18 @@ def write_settings(firmware, s, m851=0.0):
         return f"[printer]\nkinematics: delta\ndelta_radius: {s.radius:.6f}\n{towers}"
     rods = ":".join(f"{r:.4f}" for r in s.rods)
     height = s.endstops.mean()
-    if firmware == "marlin":
+    if firmware in ("marlin", "marlin1"):
         top = s.endstops.min()
         a, b, c = s.rods - s.rods[0]
+        trims = f"A{a:.4f} B{b:.4f} C{c:.4f}"
+        if firmware == "marlin1":  # B is the radius at which G33 probes
+            assert a == b == c
+            trims = "B80.0000"
         lowered = " ".join(f"{k}{top - e:.4f}" for k, e in zip("XYZ", s.endstops, strict=True))
         return (
             f"echo:; Delta settings: L<diagonal_rod> R<radius>\necho:  M665 L{s.rods[0]:.4f} "
             f"R{s.radius:.4f} H{top + m851:.4f} S200.00 X{x:.4f} Y{y:.4f} Z{z:.4f} "
-            f"A{a:.4f} B{b:.4f} C{c:.4f}\necho:; Endstop adjustment:\necho:  M666 {lowered}\n"
+            f"{trims}\necho:; Endstop adjustment:\necho:  M666 {lowered}\n"
             f"echo:  M851 X0.00 Y0.00 Z{m851:.2f}\n"
         )
     stops = " ".join(f"{k}{e - height:.4f}" for k, e in zip("XYZ", s.endstops, strict=True))
@@ -198,7 +203,7 @@ def write_log(firmware, settings, xy, z, m851=0.0):
             f"{head}\n[probe]\nz_offset: {-m851}\n\n#*# <---- SAVE_CONFIG ---->\n#*#\n"
             f"#*# [delta_calibrate]\n{saved}"
         )
-    if firmware == "marlin":
+    if firmware in ("marlin", "marlin1"):
         lines = [
             f"Bed X: {x:.4f} Y: {y:.4f} Z: {h:.4f}" for (x, y), h in zip(xy, z + m851, strict=True)
         ]

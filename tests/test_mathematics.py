@@ -72,10 +72,15 @@ def test_covariance_bias_and_expanded_uncertainty():
     bias = (scaled @ jacobian.T @ by_one_std / sigma**2 * problem.theta_scale[:, None])[:n]
     np.testing.assert_allclose(c + bias @ bias.T, calibration.total_covariance, rtol=SAME_NUMBER)
 
-    u, s = np.sqrt(np.diag(calibration.total_covariance)), np.sqrt(np.diag(noise)[:n])
+    total, scatter = np.diag(calibration.total_covariance), np.diag(noise)[:n]
+    # offsets have no prior here, and mountings none that is scaled
+    parameters = problem.robot.parameters
+    chosen = [parameters.are_scaled(name) for name in calibration.unmodelled.names]
+    from_scaled = (bias[:, chosen] ** 2).sum(axis=1)
+    np.testing.assert_allclose(from_scaled, [p.std_scaled**2 for p in calibration.free])
     t = t_quantile(eta.contrasts, 0.975)
     assert f"differences have {eta.contrasts:.2f} of them, so $k_\\eta = {t:.2f}$" in PAGE
-    expanded = np.sqrt(4.0 * s**2 + t**2 * (u**2 - s**2))
+    expanded = np.sqrt(4.0 * scatter + t**2 * from_scaled + 4.0 * (total - scatter - from_scaled))
     np.testing.assert_allclose(expanded, calibration.expanded_uncertainties, rtol=SAME_NUMBER)
     effective = problem.n_free - np.trace(prior @ scaled)
     dof = problem.observations.size - problem.observations.n_free_zeros - effective

@@ -253,7 +253,7 @@ def test_a_part_of_a_machine_with_effects_is_as_good_as_promised(warmed):
     assert "orthocal calibrate one two --out two-calibration" in said["validate"]
     for p in both.free:
         if p.name.endswith(".backlash"):  # three of them, to 99.7 %
-            half = 1.5 * float(both.expand(p.std, p.std_scatter))
+            half = 1.5 * both.expand_estimate(p)
             assert p.value == pytest.approx(backlash, abs=half)
     entered = [e.enter for e in first.assessment.backlash]
     assert both.compensated_backlash == pytest.approx(np.round(entered, 6), abs=1e-12)

@@ -90,8 +90,7 @@ class EffectSearch:
 
     def __init__(self, plan, effect):
         bare = plan.with_effects([])
-        self.search = search._Search(bare, LinearModel(bare))
-        self.start, self.rows = self.search.sound.about, bare
+        self.bare, self.model = bare, LinearModel(bare)
         self.true = LinearModel(plan.with_effects([effect] if effect else []))
         self.about = self.true.linearise(
             np.zeros(self.true.problem.n_free), (), None, keep_jacobian=False
@@ -99,19 +98,17 @@ class EffectSearch:
 
     def name(self, values):
         """Effects that are named in the readings of a machine, shape (n_rows,), [m]."""
-        found = self.search
-        found.values = values
-        found.sound = found.evaluate((), self.start)
-        families = unmodelled_effects(Rows(self.rows, values), found.effects)
+        found = search._Search(self.bare.with_values(values), self.model)
+        families = unmodelled_effects(Rows(self.bare, values), found.effects)
         scores = {
             f.systematic[0].name: float(evidence[0])
-            for f, evidence in found._score(found.sound, families)
+            for f, evidence in found.scorer.score(found.sound, families)
             if f.systematic
         }
         needed = search.CLEAR_EFFECT_LOG_BAYES - np.log(search.N_FAMILIES)
         clear = sorted((n for n in scores if scores[n] >= needed), key=lambda n: -scores[n])
         gain = self._evidence(self.true, self.about, values)
-        return Named(gain - self._evidence(found.model, self.start, values), tuple(clear))
+        return Named(gain - self._evidence(self.model, found.sound.about, values), tuple(clear))
 
     @staticmethod
     def _evidence(model, about, values):

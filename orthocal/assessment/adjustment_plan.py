@@ -28,7 +28,6 @@ from orthocal.arrays import Array
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.calibrated_tool import (
     CalibratedTool,
-    error_covariance,
     find_tool,
     place_tool,
 )
@@ -43,7 +42,7 @@ from orthocal.assessment.controller_entries import (
 from orthocal.assessment.tool_error import assess_placed, require_tool, summarise_tool
 from orthocal.calibration.adjusting import adjust_calibration
 from orthocal.calibration.assessment_record import ControllerEntry, ToolErrorSummary
-from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.calibration import Calibration, propagate_stds
 from orthocal.effects.adjustment import LEVER_SHARE, Adjustment, find_adjustments
 from orthocal.errors import ParameterError, RobotError
 from orthocal.kinematics.sensitivity import ToolSensitivity
@@ -325,20 +324,12 @@ class _Search:
         return np.asarray(-np.linalg.solve(normal, effects.T @ error_effects))
 
     def _covariance(self) -> Array:
-        return error_covariance(self.calibration)
+        return self.calibration.error_covariances[0]
 
     def uncertainties(self, chosen: Sequence[int]) -> Array:
         """Expanded uncertainties of the best amounts, shape (n_chosen,), [m]."""
-        gain = self._gain(chosen)
-        gain_of_free = gain[:, : len(self.calibration.free)]
-        std, std_scatter = (
-            np.sqrt(np.maximum(np.diag(g @ c @ g.T), 0.0))
-            for g, c in (
-                (gain, self._covariance()),
-                (gain_of_free, self.calibration.noise_covariance),
-            )
-        )
-        return self.calibration.expand(std, std_scatter)
+        stds = propagate_stds(self._gain(chosen), self.calibration.error_covariances)
+        return self.calibration.expand(*stds)
 
     def displacement_uncertainty(self, chosen: Sequence[int]) -> float:
         """Standard deviation of the displacement of the tool, RMS after alignment, [m]."""

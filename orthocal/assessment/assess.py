@@ -16,6 +16,7 @@ from orthocal.assessment.controller_entries import (
     backlash_changes,
     compute_backlash,
     compute_entries,
+    expanded_uncertainty,
     is_worth_changing,
     lowers,
 )
@@ -59,7 +60,8 @@ EXPLANATIONS: tuple[FindingKind, ...] = (
 KEEPING: dict[FindingKind, str] = {
     "no offset": words.NOTHING_HEADLINE,
     "no change needed": words.KEEP_HEADLINE,
-    "nothing moved": words.KEEP_HEADLINE,
+    "no sensitivity": words.KEEP_HEADLINE,
+    "no deviation": words.KEEP_HEADLINE,
 }
 """Kinds of notes without anything to enter, and the headlines of the decision."""
 
@@ -334,11 +336,6 @@ def _entry_findings(
 def is_significant(calibration: Calibration, entry: ControllerEntry) -> bool:
     """True if the best value differs from the active one by more than its uncertainty."""
     return not abs(entry.best_change) <= expanded_uncertainty(calibration, entry)
-
-
-def expanded_uncertainty(calibration: Calibration, entry: ControllerEntry | BacklashEntry) -> float:
-    """Expanded uncertainty of the best value to enter, [unit of the drive]."""
-    return float(calibration.expand(entry.std, entry.std_scatter))
 
 
 def _decide(findings: Sequence[Finding], *, firmware: bool, backlash: bool) -> Decision:

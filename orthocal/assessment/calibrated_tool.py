@@ -223,20 +223,3 @@ def _place(
         sensitivities=sensitivities,
         jacobian=read_only(np.concatenate(jacobians)),
     )
-
-
-def error_covariance(calibration: Calibration) -> Array:
-    """Covariance of the errors of the estimate, free parameters before unmodelled ones, [SI].
-
-    Unmodelled errors θᵤ ~ N(0, V) bias the estimate by L θᵤ (leakage L). With C the covariance of
-    the free parameters without unmodelled errors it is [[C + L V Lᵀ, −L V], [−V Lᵀ, V]].
-    """
-    unmodelled = calibration.unmodelled
-    variance = unmodelled.prior_stds**2
-    cross = unmodelled.leakage * variance
-    return np.block(
-        [
-            [calibration.model_covariance + cross @ unmodelled.leakage.T, -cross],
-            [-cross.T, np.diag(variance)],
-        ]
-    )

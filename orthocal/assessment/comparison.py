@@ -26,7 +26,7 @@ from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.io.fields import finite_or_none
-from orthocal.measurement.joining import Given, gather_sessions, join_sessions
+from orthocal.measurement.joining import Given, gather_sessions, join_sessions, require_same_robot
 from orthocal.session.session import Session
 from orthocal.statistics.noise import KnownNoise, estimate_repeatability
 
@@ -264,13 +264,8 @@ def _require_another(other: Session, sessions: Sequence[Session]) -> None:
     """Refuse a session of `repeat` that is of another robot, or is one of the compared sessions."""
     where = None if other.path is None else str(other.path)
     for session in sessions:
-        if other.robot.sha256 != session.robot.sha256:
-            raise SessionError(
-                f"is of robot '{other.robot.name}'; the other session is of "
-                f"'{session.robot.name}', or of another version of it",
-                where=where,
-            )
-        if other.sha256 and other.sha256 == session.sha256:
+        require_same_robot(other, session)
+        if other.was_read_from(session.sha256):
             raise SessionError(
                 "is the same session: its residuals repeat by definition", where=where
             )

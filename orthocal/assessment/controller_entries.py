@@ -17,9 +17,9 @@ from typing import Literal
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.assessment.calibrated_tool import CalibratedTool, error_covariance, find_tool
+from orthocal.assessment.calibrated_tool import CalibratedTool, find_tool
 from orthocal.calibration.assessment_record import BacklashEntry, ControllerEntry
-from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.calibration import Calibration, propagate_stds
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.effects.compensation import Compensation, JointTrim
 from orthocal.effects.loading import robot_effects
@@ -116,7 +116,7 @@ def compute_backlash(
         entry = BacklashEntry(
             drive.name, drive.unit, active_backlash, value, value, std, std_scatter
         )
-        uncertainty = float(calibration.expand(std, std_scatter))
+        uncertainty = expanded_uncertainty(calibration, entry)
         entries.append(entry)
         changes.append(_backlash_change(entry))
         determined.append(max(value, abs(value - active_backlash)) > uncertainty)
@@ -222,14 +222,12 @@ def _amplitude_uncertainty(
     length = float(np.linalg.norm(amplitude))
     if len(columns) < len(names) or not length:
         return 0.0
-    total, scatter = (
-        c[np.ix_(columns, columns)]
-        for c in (calibration.total_covariance, calibration.noise_covariance)
-    )
+    covariances = [c[np.ix_(columns, columns)] for c in calibration.error_covariances]
     direction = amplitude / length
-    std = 1.0 / math.sqrt(float(direction @ np.linalg.solve(total, direction)))
-    std_scatter = math.sqrt(max(float(direction @ scatter @ direction), 0.0))
-    return float(calibration.expand(std, min(std_scatter, std)))
+    stds = propagate_stds(direction[None], covariances)[:, 0]
+    # the ellipse is narrower than its projection
+    radius = 1.0 / math.sqrt(float(direction @ np.linalg.solve(covariances[0], direction)))
+    return float(calibration.expand(*(stds * radius / stds[0])))
 
 
 def _compensated_screws(calibration: Calibration, screw: Screw) -> Array:
@@ -246,6 +244,15 @@ def _compensated_screws(calibration: Calibration, screw: Screw) -> Array:
     return np.array(amplitudes)
 
 
+def expanded_uncertainty(calibration: Calibration, entry: ControllerEntry | BacklashEntry) -> float:
+    """Expanded uncertainty of the best value to enter, [unit of the drive]."""
+    if isinstance(entry, BacklashEntry):
+        names = [p.name for p in calibration.free]
+        halves = dict(zip(names, calibration.expanded_uncertainties.tolist(), strict=True))
+        return float(halves.get(f"{entry.drive}.backlash", 0.0))
+    return float(calibration.expand(entry.std, entry.std_scatter, entry.std_scaled))
+
+
 def is_worth_changing(
     calibration: Calibration, tool: CalibratedTool | None, entries: Sequence[BacklashEntry]
 ) -> bool:
@@ -254,7 +261,7 @@ def is_worth_changing(
     for e in entries:
         changes |= _backlash_change(e)
     return any(
-        abs(e.change) > float(calibration.expand(e.std, e.std_scatter)) for e in entries
+        abs(e.change) > expanded_uncertainty(calibration, e) for e in entries
     ) or _changes_tool(calibration, tool, changes)
 
 
@@ -276,7 +283,7 @@ def _changes_tool(
     if tool is None or not columns or not np.isfinite(calibration.model_covariance).all():
         return False
     change = np.array([nonzero[names[i]] for i in columns])
-    covariance = error_covariance(calibration)
+    covariance = calibration.error_covariances[0]
     aligned, _ = weighted_fields(tool, tool.jacobian[:, :, : len(covariance)])
     uncertainty = math.sqrt(max(float(np.sum((aligned @ covariance) * aligned)), 0.0))
     deviation = float(np.linalg.norm(aligned[:, columns] @ change))
@@ -316,22 +323,17 @@ def compute_entries(
     }
     if not any(p.free for parts in parameters_of_drive.values() for p in parts):
         return ()
-    names = [p.name for p in calibration.free]
     identified, enter = calibration.offsets, calibration.active_offsets
     enter[list(parameters_of_drive)] = identified[list(parameters_of_drive)]
     free_weights = weights[:, [j for j, p in enumerate(calibration.parameters) if p.free]]
-    std, std_scatter = (
-        np.array([_std_of_sum(row, covariance) for row in free_weights])
-        for covariance in (calibration.total_covariance, calibration.noise_covariance)
-    )
+    covariances = calibration.error_covariances
+    stds = propagate_stds(free_weights, covariances)
     if calibration.only_offsets:
         tool = None
     if tool is not None:
         chosen = choose_offsets(tool, enter, drives=list(parameters_of_drive))
-        covariance = error_covariance(calibration)
         enter = chosen.offsets
-        std = _row_stds(chosen.gain[:, : len(covariance)], covariance)
-        std_scatter = _row_stds(chosen.gain[:, : len(names)], calibration.noise_covariance)
+        stds = propagate_stds(chosen.gain[:, : len(covariances[0])], covariances)
     active = calibration.session.controller_offsets
     return tuple(
         ControllerEntry(
@@ -341,8 +343,9 @@ def compute_entries(
             identified=float(identified[i]),
             best=float(enter[i]),
             enter=float(enter[i]),
-            std=float(std[i]),
-            std_scatter=float(std_scatter[i]),
+            std=float(stds[0, i]),
+            std_scatter=float(stds[1, i]),
+            std_scaled=float(stds[2, i]),
             held=_reason_held(parts[0]) if tool is None and len(parts) == 1 else None,
         )
         for i, parts in parameters_of_drive.items()
@@ -356,19 +359,6 @@ def _reason_held(p: ParameterEstimate) -> Literal["known", "lower bound", "upper
     if p.at_bound is None:
         return None
     return "lower bound" if p.at_bound == "lower" else "upper bound"
-
-
-def _std_of_sum(weights: Array, covariance: Array) -> float:
-    """Standard deviation of a weighted sum; parameters with weight 0 may have NaN covariances."""
-    used = np.flatnonzero(weights)
-    if not used.size:
-        return 0.0
-    return math.sqrt(float(weights[used] @ covariance[np.ix_(used, used)] @ weights[used]))
-
-
-def _row_stds(gain: Array, covariance: Array) -> Array:
-    """Standard deviations of gain θ, shape (n_rows,), for the covariance of θ."""
-    return np.asarray(np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", gain, covariance, gain), 0.0)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

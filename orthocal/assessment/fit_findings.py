@@ -20,6 +20,9 @@ STANDSTILL = 1e-6
 NOTABLE_IDEALISATION = 1 / 3
 """Error by idealisation, in standard deviations of a reading, above which it is reported."""
 
+STATED, REPEATED = "the stated noise of the gauge", "the scatter of repeated readings"
+"""Sources of the noise, as noun phrases."""
+
 
 def find_fit_findings(calibration: Calibration) -> list[Finding]:
     """All findings about a fit."""
@@ -60,21 +63,21 @@ def _residuals(calibration: Calibration) -> list[Finding]:
         return [words.noise_unknown()]
     if noise.source == "gauge":
         if calibration.redundancy > 0:
-            return [words.fits_stated_noise(noise.sigma)]
+            return [words.fits(noise.sigma, STATED)]
         return [words.noise_as_stated(noise.sigma)]
     if noise.source == "cycles":
         if calibration.redundancy > 0:
-            return [words.fits_cycles(noise.cycles_sigma)]
+            return [words.fits(noise.cycles_sigma, REPEATED)]
         return [words.noise_from_cycles(noise.cycles_sigma)]
     if noise.cycles_dof > 0:
-        return [excess(noise.cycles_sigma, "the scatter of repeated readings")]
+        return [excess(noise.cycles_sigma, REPEATED)]
     if stated is None:
         return [words.noise_from_residuals(calibration.sigma)]
     if noise.exceeded_by_residuals(stated):
-        return [excess(stated, "its stated noise")]
+        return [excess(stated, "the stated scatter of the gauge")]
     if noise.exceeds_residuals(stated):
         return [words.gauge_overstated(noise.residual_sigma, stated)]
-    return [words.fits_stated_noise(noise.residual_sigma)]
+    return [words.fits(noise.residual_sigma, STATED)]
 
 
 def _standstill(calibration: Calibration) -> list[Finding]:

@@ -24,10 +24,11 @@ from orthocal.assessment.plausibility import (
 from orthocal.assessment.words import plausibility as words
 from orthocal.assessment.words.anomalies import describe_anomalies, describe_no_change
 from orthocal.calibration.assessment_record import Finding, Severity, Verdict
-from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale
+from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale, trial_scales
 from orthocal.hypotheses.anomaly import Anomalies
 from orthocal.hypotheses.families.sessions import detectable_changes
-from orthocal.hypotheses.linear_model import LinearModel, ModelLinearisation, linear_model
+from orthocal.hypotheses.linear_model import LinearModel, linear_model
+from orthocal.hypotheses.linearisation import ModelLinearisation
 from orthocal.hypotheses.search import find_anomalies
 from orthocal.measurement.joining import split_sessions
 from orthocal.session.session import Session
@@ -44,7 +45,7 @@ RESOLVED = 1e-3
 """Effect of one prior standard deviation of an offset on the readings, relative to the noise, below
 which the offset is not resolved."""
 
-TRIAL_SCALES = np.geomspace(1.0, 30.0, 86)
+TRIAL_SCALES = trial_scales(1.0, 30.0)
 """Tolerance scales whose likelihoods are compared."""
 
 LARGEST_DEVIATION = 3.0
@@ -185,7 +186,8 @@ def find_tolerance_scale(session: Session) -> ToleranceScale:
         model = linear_model(part)
         linearisation = model.most_likely(part.values)
         deviation = model.entries(part.values[None])[0] - linearisation.expected
-        scatter, _ = estimate_repeatability(model.problem.values, model.problem.observations)
+        values = model.problem.observations.values(part.values) / model.problem.noise_ratio
+        scatter, _ = estimate_repeatability(values, model.problem.observations)
         noise = max(linearisation.likelihood.sigma, scatter)
         contrasts, machine_variances, rest_square, dof = _independent_contrasts(
             model, linearisation, deviation, noise

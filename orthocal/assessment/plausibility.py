@@ -17,13 +17,14 @@ from orthocal.errors import OrthocalError
 from orthocal.estimation.fit import Fit, fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem, build_problem
+from orthocal.estimation.weighting import stated_sigma
 from orthocal.hypotheses.hypothesis import Rows
 from orthocal.measurement.joining import split_sessions
+from orthocal.measurement.motion.approach import label_reading
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import states_readings
 from orthocal.session.session import Gauge, Session
 from orthocal.statistics.chance import chance_of_excess
-from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 from orthocal.units import MM
 
@@ -182,7 +183,7 @@ def _by_model(
 def _dimensions(session: Session, problem: CalibrationProblem) -> Finding | None:
     """Finding about postures in which the nominal machine would have moved the gauge far more.
 
-    A sensor whose readings are stated does not move.
+    Prescribed readings, such as those of a probe, do not show how far the gauge moved.
     """
     if any(states_readings(s.sensor) for s in session.setups.values()):
         return None
@@ -275,7 +276,7 @@ def _check_repeats(session: Session, name: str) -> Finding | None:
     gauge = session.gauges[name]
     if gauge.sigma is None:
         return None
-    sigma = noise_floor(gauge.sigma, gauge.resolution)
+    sigma = stated_sigma(gauge)
     repeated = [
         rows
         for (setup, *_), rows in Rows(session).repeated.items()
@@ -294,12 +295,13 @@ def _check_repeats(session: Session, name: str) -> Finding | None:
         return None
     worst = max(repeated, key=sum_of_squares)
     shown = ", ".join(
-        f"{signed(values[i] / MM)} in {session.where(session.readings[i])}" for i in worst[:4]
+        f"{signed(values[i] / MM)} mm" + (f" in line {line}" if line is not None else "")
+        for i, line in ((i, session.readings[i].line) for i in worst[:4])
     )
     return words.scattered_repeats(
         math.sqrt(total / dof),
         sigma,
-        session.readings[worst[0]].label,
+        label_reading(session.robot, session.readings[worst[0]]),
         shown,
         [place_of(session, i) for i in worst[:MAX_PLACES]],
     )

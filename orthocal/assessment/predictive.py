@@ -22,8 +22,7 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.refit import restore_mounting_covariance
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.fit import Fit
-from orthocal.measurement.joining import name_within
-from orthocal.session.session import known_approach
+from orthocal.session.session import known_approach, split_label
 from orthocal.statistics.chance import BY_CHANCE
 from orthocal.statistics.distributions import (
     chi_square_tail,
@@ -169,8 +168,8 @@ def _keyed_rows(calibration: Calibration) -> Iterator[tuple[_Row, ResidualRow]]:
     """Rows of a calibration with keys that two sessions share."""
     joined = bool(calibration.session.parts)
     for r in calibration.residuals:
-        setup, posture = (name_within(n, joined=joined) for n in (r.setup, r.posture))
-        minus = None if r.minus is None else name_within(r.minus, joined=joined)
+        setup, posture = (split_label(n, joined=joined)[1] for n in (r.setup, r.posture))
+        minus = None if r.minus is None else split_label(r.minus, joined=joined)[1]
         yield (setup, posture, minus, known_approach(r.conditions)), r
 
 

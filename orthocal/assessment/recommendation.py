@@ -23,7 +23,8 @@ import numpy as np
 from orthocal.arrays import Array
 from orthocal.errors import OrthocalError
 from orthocal.estimation.selection import complete_model
-from orthocal.hypotheses.likelihood import NOISE_SCALES, log_of_sum, noise_weights
+from orthocal.estimation.tolerance_scale import trial_scales
+from orthocal.hypotheses.likelihood import NOISE_SCALES, log_normal, log_of_sum, noise_weights
 from orthocal.hypotheses.linear_model import linear_model
 from orthocal.measurement.joining import split_sessions
 from orthocal.session.session import Session
@@ -37,10 +38,10 @@ STRONG = 5.0
 NEARLY_EQUAL = 3.0
 """Difference of the log evidence below which models are nearly equally well supported."""
 
-TOLERANCE_SCALES = np.geomspace(0.1, 10.0, 41)
+TRIAL_SCALES = trial_scales(0.1, 10.0)[::3]
 """Tolerance scales whose evidence is computed."""
 
-LOG_SCALE_STD = 1.0
+TRIAL_SCALE_SPREAD = 1.0
 """Prior standard deviation of ln(tolerance scale)."""
 
 
@@ -97,8 +98,7 @@ def _recommend(session: Session, models: tuple[str, ...]) -> Recommendation:
             evidence.append(ModelEvidence(name, compute_log_evidence(session, name)[0] - reference))
         except OrthocalError:
             evidence.append(ModelEvidence(name, math.nan))
-    log_prior = -0.5 * (np.log(TOLERANCE_SCALES) / LOG_SCALE_STD) ** 2
-    best = int(np.argmax(by_scale + log_prior))
+    best = int(np.argmax(by_scale + log_normal(TRIAL_SCALES, TRIAL_SCALE_SPREAD)))
     gain = float(by_scale[best] - reference)  # without the prior, which only selects the scale
     best_smaller = max(
         (e for e in evidence[1:] if math.isfinite(e.log_evidence)),
@@ -110,20 +110,20 @@ def _recommend(session: Session, models: tuple[str, ...]) -> Recommendation:
         return Recommendation(best_smaller.model, 1.0, tuple(evidence), 0.0)
     if gain < STRONG:
         return Recommendation(complete, 1.0, tuple(evidence), 0.0)
-    return Recommendation(complete, float(TOLERANCE_SCALES[best]), tuple(evidence), gain)
+    return Recommendation(complete, float(TRIAL_SCALES[best]), tuple(evidence), gain)
 
 
 def compute_log_evidence(
     session: Session, model: str, *, free: tuple[str, ...] = ()
 ) -> tuple[float, Array]:
-    """Log evidence at the stated tolerances, and at all TOLERANCE_SCALES, shape (n_scales,).
+    """Log evidence at the stated tolerances, and at all TRIAL_SCALES, shape (n_scales,).
 
     Args:
         session: The session, or several that were joined.
         model: Name of the model.
         free: Names of errors that are free in addition to those of the model.
     """
-    total, by_scale = 0.0, np.zeros(TOLERANCE_SCALES.size)
+    total, by_scale = 0.0, np.zeros(TRIAL_SCALES.size)
     for part in split_sessions(session):
         if len(part.readings) < 2:  # one reading usually determines only a gauge zero
             continue
@@ -133,7 +133,7 @@ def compute_log_evidence(
         noises, log_weights = np.ones(1), np.zeros(1)
         if not linear.stated:
             noises, log_weights = NOISE_SCALES, noise_weights(stated=False)
-        scales = np.append(1.0, TOLERANCE_SCALES)
+        scales = np.append(1.0, TRIAL_SCALES)
         likelihood = linearisation.likelihood
         logs = likelihood.log_densities(likelihood.products(deviation[None]), scales, noises)
         logs = logs.reshape(scales.size, noises.size)

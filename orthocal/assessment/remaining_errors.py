@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.assessment.calibrated_tool import error_covariance
 from orthocal.assessment.tool_error import ToolAccuracy
 from orthocal.calibration.calibration import Calibration
 
@@ -41,7 +40,7 @@ def find_remaining_errors(
     prior_stds = np.r_[[p.prior_std for p in calibration.free], calibration.unmodelled.prior_stds]
     return rank_errors(
         accuracy.align(accuracy.jacobian),
-        error_covariance(calibration),
+        calibration.error_covariances[0],
         weights=accuracy.workspace.weights,
         prior_stds=prior_stds,
         names=accuracy.names,

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from orthocal.arguments import require_kind
 from orthocal.arrays import Array
 from orthocal.assessment.calibrated_tool import (
     CalibratedTool,
-    error_covariance,
     find_tool,
     place_tool,
 )
@@ -61,7 +60,7 @@ SAMPLES = 500
 """Monte Carlo samples per point for the 95 % quantile."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class ErrorStatistics:
     """Statistics of position errors over a workspace, [m]."""
 
@@ -72,7 +71,7 @@ class ErrorStatistics:
     find_percentile: Callable[[], float] = field(repr=False)
     """Function that computes `percentile_95`, which needs time."""
 
-    @cached_property
+    @property
     def percentile_95(self) -> float:
         """95 % quantile of the errors over all points."""
         return self.find_percentile()
@@ -292,14 +291,13 @@ def assess_placed(
     """
     unmodelled = calibration.unmodelled
     prior_stds = np.r_[[p.prior_std for p in calibration.free], unmodelled.prior_stds]
-    free = tuple(tool.free[: len(prior_stds)])
     # back to the stated tolerances
-    prior_stds /= calibration.tolerance_scale.factors(calibration.robot.parameters, free)
+    prior_stds[calibration.scaled] /= calibration.tolerance_scale.factor
     jacobian = tool.jacobian[:, :, : len(prior_stds)]
     workspace, targets = tool.workspace, tool.targets
     after = None
     if np.isfinite(calibration.model_covariance).all():
-        after = measure_uncertainty(jacobian, error_covariance(calibration), workspace, targets)
+        after = measure_uncertainty(jacobian, calibration.error_covariances[0], workspace, targets)
     offsets = entered_offsets(calibration, entries)
     backlash_entries = find_backlash(calibration) if backlash is None else backlash
     changes = backlash_changes(calibration, backlash_entries)
@@ -314,7 +312,7 @@ def assess_placed(
         workspace=workspace,
         use=tool.use,
         targets=targets,
-        names=free,
+        names=tuple(tool.free[: len(prior_stds)]),
         jacobian=jacobian,
         deviation=read_only(tool.deviation(calibration.active_offsets, names=names)),
         deviation_with_entries=read_only(deviation),
@@ -369,7 +367,7 @@ def _summarise_use(
     stated = stated_use(calibration.robot, use)
     if use is None or stated is None:
         return None
-    covariance = error_covariance(calibration)
+    covariance = calibration.error_covariances[0]
     weights = accuracy.workspace.once(accuracy.use.size).weights
     deviation_changes, jacobian_changes = (
         accuracy.use.changes(v) for v in (accuracy.deviation_with_entries, accuracy.jacobian)

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array
-from orthocal.assessment.calibrated_tool import error_covariance
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError
 from orthocal.io.fields import read_only
@@ -131,7 +130,7 @@ def accuracy_rows(
     active = calibration.session.controller_offsets
     offsets = np.zeros(len(robot.drives)) if active is None else np.array(active)
     noise_known = bool(np.isfinite(calibration.model_covariance).all())
-    covariance = error_covariance(calibration) if noise_known else None
+    covariance = calibration.error_covariances[0] if noise_known else None
 
     def evaluate(rows: Array, names: Sequence[str], failures: Failures) -> Array:
         drives = nominal.inverse(rows, names=names, failures=failures)

@@ -17,13 +17,8 @@ from typing import Any
 import numpy as np
 
 from orthocal.arguments import require_kind
-from orthocal.assessment.assess import (
-    assess,
-    assessment_of,
-    expanded_uncertainty,
-    is_significant,
-)
-from orthocal.assessment.controller_entries import find_entries
+from orthocal.assessment.assess import assess, assessment_of, is_significant
+from orthocal.assessment.controller_entries import expanded_uncertainty, find_entries
 from orthocal.assessment.judgement import Judgement, judge_session, rank, verdict_of
 from orthocal.assessment.predictive import (
     DeviationTest,
@@ -295,9 +290,8 @@ def _require_new(calibration: Calibration, sessions: Sequence[Session]) -> None:
         SessionError: If a session belongs to the calibration; it names the session.
     """
     record = calibration.session
-    used = {part.sha256 for part in (record, *record.parts)} - {""}
     for session in sessions:
-        if session.sha256 in used:
+        if any(session.was_read_from(part.sha256) for part in (record, *record.parts)):
             raise SessionError(
                 "belongs to the calibration itself; expected a session measured afterwards",
                 where=str(session.path or "session"),
@@ -376,8 +370,7 @@ def _find_changes(
     findings = describe_anomalies(all_sessions, replace(anomalies, found=changes))
     if mistake is None:
         return None, findings, False
-    new_setups = list(all_sessions.setups)[len(all_sessions.parts[0].setups) :]
-    new = {name.partition("/")[0] for name in new_setups}
+    new = all_sessions.labels[len(all_sessions.parts[0].setups) :]
     e = mistake.explanation
     return mistake, findings, e.kind in WRONGLY_ENTERED and e.sessions[0] in new
 

@@ -65,8 +65,8 @@ LEG = Dimension(
 )
 TRAVEL = Dimension(
     "travel",
-    "Lowest and highest coordinate of a slide, LEAST:LARGEST, mm. It is {zero} (the leg) where the "
-    "legs are parallel to their axes, and grows outwards",
+    "Lowest and highest coordinate of a slide, LEAST:LARGEST, mm. The coordinate is {zero} (the "
+    "leg length) where the legs are parallel to their axes, and grows outwards",
     "Coordinates of a slide: the leg length where the legs are parallel to their axes,\n"
     "more further out.",
     form="LEAST:LARGEST",

@@ -32,6 +32,7 @@ NoiseKind = Literal[
     "noise unknown",
     "noise from residuals",
     "noise as stated",
+    "noise from cycles",
     "model error",
     "gauge overstated",
     "fits",
@@ -48,6 +49,7 @@ FindingKind = Literal[
     "change unknown",
     "scattered repeats",
     "readings missing",
+    "no anomaly",
     # implausible readings and settings
     "wrong dimensions",
     "beyond tolerances",
@@ -61,7 +63,8 @@ FindingKind = Literal[
     # a fit
     "no convergence",
     NoiseKind,
-    "nothing moved",
+    "no sensitivity",
+    "no deviation",
     "held by a bound",
     "linearisation error",
     "inseparable",
@@ -79,6 +82,7 @@ FindingKind = Literal[
     "tool error",
     "out of reach",
     # a comparison of models
+    "linearisation cost",
     "recommended",
     "not recommended",
     "not determined",
@@ -89,6 +93,7 @@ FindingKind = Literal[
     "residuals differ",
     "repetition unknown",
     # a validation
+    "controller assumed",
     "as predicted",
     "larger than predicted",
     "nothing predicted",
@@ -186,6 +191,8 @@ class ControllerEntry(InUnit):
     """Standard deviation of `best` from noise, priors and unmodelled errors, [unit]."""
     std_scatter: SizeOrNaN
     """Part of `std` from the noise of the readings, [unit]."""
+    std_scaled: SizeOrNaN
+    """Part of `std` from errors whose tolerances the tolerance scale multiplies, [unit]."""
     held: Literal["known", "lower bound", "upper bound"] | None
     """Reason why the readings do not determine the offset; None if they do."""
 

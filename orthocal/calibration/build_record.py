@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
@@ -34,7 +33,6 @@ from orthocal.estimation.diagnostics.deletion import (
 )
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
 from orthocal.estimation.diagnostics.unmodelled import (
-    UnmodelledEffect,
     find_unmodelled_errors,
     propagate_unmodelled,
 )
@@ -46,7 +44,6 @@ from orthocal.io.documents import LARGEST_NUMBER
 from orthocal.io.fields import finite_or_none, read_only
 from orthocal.robot.model import Robot
 from orthocal.session.session import Session
-from orthocal.statistics.chance import confidence_factor
 from orthocal.statistics.identifiability import (
     Identifiability,
     analyse_identifiability,
@@ -56,18 +53,13 @@ from orthocal.statistics.zeros import project_out_zeros
 
 
 def assemble_calibration(
-    fit: Fit,
-    *,
-    full_problem: CalibrationProblem | None = None,
-    intervals: Mapping[str, tuple[float, float]] | None = None,
-    nominal: Array | None = None,
+    fit: Fit, *, full_problem: CalibrationProblem | None = None, nominal: Array | None = None
 ) -> Calibration:
     """Build the calibration of a solved problem.
 
     Args:
         fit: The solved problem.
         full_problem: The problem with all parameters, if base parameters were estimated.
-        intervals: Parameter to its profile-likelihood interval, [SI].
         nominal: Free parameters of the machine that predicts the nominal readings, shape
             (n_machine,), [SI]; by default the nominal machine with the active offsets.
 
@@ -81,14 +73,16 @@ def assemble_calibration(
     unmodelled_errors = find_unmodelled_errors(fit, represented=represented)
     unmodelled, bias_of_sensors = propagate_unmodelled(fit, unmodelled_errors)
     noise = _separate_noise(fit) if unmodelled_errors.names else None
-    covariance, noise_covariance = fit.covariance(noise=noise), fit.noise_covariance(noise=noise)
-    bias_std = np.append(np.sqrt(np.diag(unmodelled.bias_covariance)), bias_of_sensors)
-    estimates = _estimates(
-        fit,
-        std=np.hypot(np.sqrt(np.diag(covariance)), bias_std),
-        std_scatter=np.sqrt(np.diag(noise_covariance)),
-        intervals=_widen_intervals(fit, unmodelled, intervals or {}),
+    covariances = (
+        fit.covariance(noise=noise),
+        fit.noise_covariance(noise=noise),
+        fit.scaled_covariance(),
     )
+    bias = np.vstack([unmodelled.leakage * unmodelled.prior_stds, bias_of_sensors])
+    variances = np.array([np.diag(c) for c in covariances])
+    variances[0] += (bias**2).sum(axis=1)
+    variances[2] += (bias[:, unmodelled_errors.scaled] ** 2).sum(axis=1)
+    estimates = _estimates(fit, np.sqrt(variances))
     _require_possible(estimates, fit.iterations)
     diagnostics = diagnose_readings(fit)
     return Calibration(
@@ -99,8 +93,9 @@ def assemble_calibration(
         solver=_solver_record(fit),
         parameters=(*estimates[:n], *_held_parameters(problem)),
         sensors=estimates[n:],
-        model_covariance=read_only(covariance[:n, :n]),
-        noise_covariance=read_only(noise_covariance[:n, :n]),
+        model_covariance=read_only(covariances[0][:n, :n]),
+        noise_covariance=read_only(covariances[1][:n, :n]),
+        scaled_covariance=read_only(covariances[2][:n, :n]),
         unmodelled=unmodelled,
         identifiability=_identifiability(fit, full_problem),
         base=full_problem is not None,
@@ -193,45 +188,12 @@ def _identifiability(fit: Fit, full_problem: CalibrationProblem | None) -> Ident
     )
 
 
-def _widen_intervals(
-    fit: Fit, unmodelled: UnmodelledEffect, intervals: Mapping[str, tuple[float, float]]
-) -> dict[str, tuple[float, float]]:
-    """Profile-likelihood intervals, widened by the bias from unmodelled errors, within the bounds.
-
-    Args:
-        fit: The solved problem.
-        unmodelled: Effect of the unmodelled errors.
-        intervals: Parameter to its profile-likelihood interval, [SI].
-    """
-    contrasts = fit.problem.machine_selection.tolerance_scale.contrasts
-    bias_limits = confidence_factor(contrasts) * np.sqrt(np.diag(unmodelled.bias_covariance))
-    widened = {}
-    for name, ends in intervals.items():
-        i = fit.problem.free.index(name)
-        value, bias_limit = float(fit.solution.theta[i]), float(bias_limits[i])
-        low, high = (math.hypot(value - end, bias_limit) for end in ends)
-        selection = fit.problem.selection
-        widened[name] = (
-            max(value - low, float(selection.lower[i])),
-            min(value + high, float(selection.upper[i])),
-        )
-    return widened
-
-
-def _estimates(
-    fit: Fit,
-    *,
-    std: Array,
-    std_scatter: Array,
-    intervals: Mapping[str, tuple[float, float]],
-) -> tuple[ParameterEstimate, ...]:
+def _estimates(fit: Fit, stds: Array) -> tuple[ParameterEstimate, ...]:
     """Estimates of the free parameters: errors of the machine, then nuisance parameters.
 
     Args:
         fit: The solved problem.
-        std: Standard deviations, shape (n_free,), [SI].
-        std_scatter: Parts of them from the noise of the readings, shape (n_free,), [SI].
-        intervals: Parameter to its profile-likelihood interval, [SI].
+        stds: `std`, `std_scatter` and `std_scaled` of each parameter, shape (3, n_free), [SI].
     """
     problem, solution = fit.problem, fit.solution
     selection = problem.selection
@@ -244,9 +206,11 @@ def _estimates(
             unit=p.unit,
             value=float(solution.theta[i]),
             linear=float(fit.linearised_theta[i]),
-            std=float(std[i]),
-            std_scatter=float(std_scatter[i]),
+            std=float(stds[0, i]),
+            std_scatter=float(stds[1, i]),
+            std_scaled=float(stds[2, i]),
             prior_std=p.prior_std,
+            scaled=bool(selection.scaled[i]),
             free=True,
             identifiable=bool(determined[i]),
             start=float(problem.active_theta[i]),
@@ -255,7 +219,7 @@ def _estimates(
             lower=finite_or_none(selection.lower[i]),
             upper=finite_or_none(selection.upper[i]),
             at_bound=bounds[int(solution.at_bound[i] * fit.at_bound[i])],
-            interval=intervals.get(p.name),
+            interval=None,
         )
         for i, p in enumerate(problem.parameters)
     )
@@ -271,7 +235,9 @@ def hold_parameter(robot: Robot, name: str, value: float) -> ParameterEstimate:
         linear=value,
         std=0.0,
         std_scatter=0.0,
+        std_scaled=0.0,
         prior_std=p.prior_std,
+        scaled=False,
         free=False,
         identifiable=False,
         start=value,

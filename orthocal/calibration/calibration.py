@@ -6,13 +6,14 @@ It contains everything that reports, scenes and exports need. None of them reads
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Mask
 from orthocal.calibration.machine import Machine
 from orthocal.calibration.records import CalibrationRecord, ParameterEstimate
 from orthocal.effects.compensation import displace_drives
@@ -140,27 +141,92 @@ class Calibration(CalibrationRecord):
         return np.asarray(self.model_covariance + self.unmodelled.bias_covariance)
 
     @property
+    def error_covariances(self) -> tuple[Array, Array, Array]:
+        """Covariances of the errors of the estimate, `free` before unmodelled errors, [SI].
+
+        Unmodelled errors θᵤ ~ N(0, V) bias the estimate by L θᵤ (leakage L). With C the covariance
+        of `free` without unmodelled errors the total is [[C + L V Lᵀ, −L V], [−V Lᵀ, V]].
+
+        Returns:
+            The total, its part from the noise of the readings, and its part from errors that the
+            tolerance scale multiplies, shape (n, n) with n = n_machine + n_unmodelled.
+        """
+        n, unmodelled = len(self.free), self.unmodelled
+        leakage = np.vstack([unmodelled.leakage, -np.eye(len(unmodelled.names))])
+
+        def join(covariance: Array, stds: Array) -> Array:
+            joint = (leakage * stds**2) @ leakage.T
+            joint[:n, :n] += covariance
+            return np.asarray(joint)
+
+        stds = unmodelled.prior_stds
+        return (
+            join(self.model_covariance, stds),
+            join(self.noise_covariance, np.zeros_like(stds)),
+            join(self.scaled_covariance, stds * self.scaled[n:]),
+        )
+
+    @property
+    def scaled(self) -> Mask:
+        """Mask of the errors whose tolerances the tolerance scale multiplies.
+
+        `free`, then unmodelled errors, shape (n_machine + n_unmodelled,).
+        """
+        unmodelled = map(self.robot.parameters.are_scaled, self.unmodelled.names)
+        return np.array([*(p.scaled for p in self.free), *unmodelled], dtype=np.bool_)
+
+    @property
     def expanded_uncertainties(self) -> Array:
         """Expanded uncertainties of `free`, shape (n_machine,), [SI].
 
         The coverage factor is k = 2, or Student's 95 % factor if few degrees of freedom determine
         the noise or the tolerance scale; see `statistics.chance.expanded_uncertainty`.
         """
-        return self.expand(self.standard_deviations, [p.std_scatter for p in self.free])
+        biases = self.expanded_biases.tolist()
+        return np.array(
+            [self.expand_estimate(p, bias=b) for p, b in zip(self.free, biases, strict=True)]
+        )
 
-    def expand(self, std: ArrayLike, std_scatter: ArrayLike) -> Array:
+    @property
+    def expanded_biases(self) -> Array:
+        """Parts of `expanded_uncertainties` from unmodelled errors, shape (n_machine,), [SI]."""
+        biases = self.unmodelled.leakage * self.unmodelled.prior_stds
+        scaled = biases[:, self.scaled[len(self.free) :]]
+        return self.expand(*(np.linalg.norm(b, axis=1) for b in (biases, biases[:, :0], scaled)))
+
+    def expand_estimate(self, p: ParameterEstimate, *, bias: float = 0.0) -> float:
+        """Expanded uncertainty of an estimate with noise and priors, at most that of its prior.
+
+        Unmodelled errors may bias an estimate by more. For errors of the machine they are added,
+        because the estimate is used. A nuisance parameter is stated for information alone, and its
+        prior limits the sum.
+
+        Args:
+            p: The estimate.
+            bias: Part from unmodelled errors that the prior does not limit, [unit].
+        """
+        expanded = float(self.expand(p.std, p.std_scatter, p.std_scaled))
+        if not p.prior:
+            return expanded
+        of_prior = float(self.expand(p.prior_std, 0.0, p.prior_std * p.scaled))
+        return min(expanded, math.hypot(of_prior, bias))
+
+    def expand(self, std: ArrayLike, std_scatter: ArrayLike, std_scaled: ArrayLike) -> Array:
         """Expanded uncertainties of linear functions of `free`, of any shape.
 
         Args:
             std: Standard deviations.
             std_scatter: Parts of them from the noise of the readings.
+            std_scaled: Parts of them from errors that the tolerance scale multiplies.
         """
         scale, noise = self.tolerance_scale, self.noise
         dof = self.dof
         if scale.factor != 1.0 and self.unmodelled.names and noise.source == "residuals":
             session = self.session
             _, dof = noise.without_residuals(session.gauge_sigma, session.gauge_resolution)
-        return expanded_uncertainty(std, std_scatter, dof=dof, other_dof=scale.contrasts)
+        return expanded_uncertainty(
+            std, std_scatter, std_scaled, dof=dof, contrasts=scale.contrasts
+        )
 
     @property
     def intervals(self) -> tuple[tuple[float, float], ...]:
@@ -257,3 +323,21 @@ class Calibration(CalibrationRecord):
         import orthocal  # here, as the output depends on this module
 
         return orthocal.summarize(self, html=True)
+
+
+def propagate_stds(gain: Array, covariances: Sequence[Array]) -> Array:
+    """Standard deviations of linear functions of errors, shape (n_covariances, n_functions).
+
+    Args:
+        gain: Derivatives of the functions, shape (n_functions, m). Errors that no function depends
+            on may have unknown variances.
+        covariances: Covariances of the errors, shape (n, n) each with n >= m, such as
+            `error_covariances`.
+    """
+    stds = np.zeros((len(covariances), len(gain)))
+    for i, row in enumerate(gain):
+        used = np.flatnonzero(row)
+        for k, covariance in enumerate(covariances):
+            variance = row[used] @ covariance[np.ix_(used, used)] @ row[used]
+            stds[k, i] = np.sqrt(np.maximum(variance, 0.0))
+    return stds

@@ -25,7 +25,7 @@ from orthocal.io.files import exists, is_folder, write_file
 from orthocal.robot.model import Robot
 from orthocal.text import shorten
 
-SCHEMA = "orthocal/calibration/10"
+SCHEMA = "orthocal/calibration/11"
 
 DERIVED_TOLERANCE = 1e-9
 """Largest relative difference of a derived number from its recomputed value."""
@@ -136,7 +136,6 @@ def _read_document(
     record = validate(CalibrationRecord, plain, where=file, error=CalibrationFileError)
     for key, problem in _find_contradictions(record):
         raise CalibrationFileError(problem, where=f"{file}: {key}")
-    _check_estimates(record, file)
     if robot is None:
         robot = load_recorded_robot(record.robot_record, file=file)
     require_consistent(record, robot, file=file)
@@ -145,6 +144,7 @@ def _read_document(
         robot=robot,
         path=path,
     )
+    _check_estimates(calibration, file)
     _check_derived(data, _derive(calibration), file)
     return calibration
 
@@ -208,13 +208,13 @@ def _check_derived(
         )
 
 
-def _check_estimates(record: CalibrationRecord, file: str) -> None:
+def _check_estimates(calibration: Calibration, file: str) -> None:
     """Refuse standard deviations that contradict the covariances."""
-    variances = {
-        "std": np.diag(record.model_covariance + record.unmodelled.bias_covariance),
-        "std_scatter": np.diag(record.noise_covariance),
-    }
-    free = [(i, p) for i, p in enumerate(record.parameters) if p.free]
+    n = len(calibration.free)
+    keys = ("std", "std_scatter", "std_scaled")
+    covariances = zip(keys, calibration.error_covariances, strict=True)
+    variances = {key: np.diag(covariance)[:n] for key, covariance in covariances}
+    free = [(i, p) for i, p in enumerate(calibration.parameters) if p.free]
     for key, variance in variances.items():
         for (i, p), size in zip(free, np.sqrt(np.abs(variance)).tolist(), strict=True):
             if math.isfinite(size):
@@ -226,7 +226,7 @@ def _find_contradictions(record: CalibrationRecord) -> Iterator[tuple[str, str]]
     n_free = sum(p.free for p in record.parameters)
     if not n_free:
         yield "parameters", "contains no free parameter"
-    for key in ("model_covariance", "noise_covariance"):
+    for key in ("model_covariance", "noise_covariance", "scaled_covariance"):
         matrix = getattr(record, key)
         if matrix.shape != (n_free, n_free):
             yield key, f"expected {n_free} × {n_free} numbers, one row per free parameter"

@@ -90,8 +90,8 @@ def identify(
     solve = _fit_base if chosen.base else fit_problem
     fit = solve(problem, options=options, start=start_values)
     profiled = _match_profiled(fit.problem, profile)
-    intervals = {name: profile_interval(fit, name) for name in profiled}
-    return assemble_calibration(fit, full_problem=full_problem, intervals=intervals), session
+    calibration = assemble_calibration(fit, full_problem=full_problem)
+    return _with_intervals(calibration, fit, profiled), session
 
 
 def _read_start(start: ArrayLike, problem: CalibrationProblem) -> Array:
@@ -148,6 +148,18 @@ def _fit_base(
         fit = fit_problem(reduced, options=options, start=start)
         sigma = max(fit.sigma, sigma)  # no more parameters than before
     return fit
+
+
+def _with_intervals(calibration: Calibration, fit: Fit, names: Sequence[str]) -> Calibration:
+    """Calibration of a fit with profile-likelihood intervals of some parameters."""
+    estimates = list(calibration.parameters)
+    totals, biases = calibration.expanded_uncertainties, calibration.expanded_biases
+    parts = np.sqrt(np.maximum(totals**2 - biases**2, 0.0)).tolist()
+    for i, (part, bias) in enumerate(zip(parts, biases.tolist(), strict=True)):
+        if (p := estimates[i]).name in names:
+            interval = profile_interval(fit, p.name, uncertainty=part, bias=bias)
+            estimates[i] = replace(p, interval=interval)
+    return replace(calibration, parameters=tuple(estimates))
 
 
 def _match_profiled(problem: CalibrationProblem, patterns: Sequence[str]) -> list[str]:

@@ -172,8 +172,12 @@ class ParameterEstimate(InUnit):
     """Standard deviation from noise, priors and unmodelled errors, [unit]; NaN if unknown."""
     std_scatter: SizeOrNaN
     """Part of `std` from the noise of the readings, [unit]."""
+    std_scaled: SizeOrNaN
+    """Part of `std` from errors whose tolerances the tolerance scale multiplies, [unit]."""
     prior_std: PositiveInSI
     """Prior standard deviation, [unit]."""
+    scaled: bool
+    """True if the tolerance scale multiplies its prior standard deviation."""
     free: bool
     identifiable: bool
     """True if the readings alone determine it better than its prior."""
@@ -190,8 +194,7 @@ class ParameterEstimate(InUnit):
     at_bound: Literal["lower", "upper"] | None
     """Active bound, at which the parameter is fixed with the standard deviation 0; None without."""
     interval: tuple[Number, Number] | None
-    """95 % profile-likelihood interval, [unit], widened by unmodelled errors; None if not
-    requested."""
+    """Profile-likelihood interval with the coverage of ±, [unit]; None if not requested."""
 
     @property
     def data_share(self) -> float:
@@ -286,6 +289,9 @@ class CalibrationRecord:
     errors, shape (n_machine, n_machine), [SI]."""
     noise_covariance: Matrix
     """Part of it from the noise of the readings, shape (n_machine, n_machine), [SI]."""
+    scaled_covariance: Matrix
+    """Part of it from priors that the tolerance scale multiplies, shape (n_machine, n_machine),
+    [SI]."""
     unmodelled: UnmodelledEffect
     """Unmodelled errors and the bias that they cause."""
     identifiability: Identifiability

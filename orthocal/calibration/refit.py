@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -76,16 +77,18 @@ def restore_mounting_covariance(calibration: Calibration) -> Array:
     )
 
 
-def restore_covariances(calibration: Calibration) -> tuple[Array, Array]:
+def restore_covariances(calibration: Calibration) -> tuple[Array, Array, Array]:
     """Covariance of the free errors of the machine and the nuisance parameters, from the record.
 
     Returns:
-        The covariance and its part from noise, shape (n, n), [SI]; NaN if the noise is unknown.
+        The covariance, its part from noise and its part from priors that the tolerance scale
+        multiplies, shape (n, n), [SI]; NaN if the noise is unknown.
     """
     problem = _recorded_problem(calibration)
     scale = np.outer(problem.theta_scale, problem.theta_scale)
     if not math.isfinite(calibration.noise.sigma):
-        return np.full_like(scale, np.nan), np.full_like(scale, np.nan)
+        unknown = np.full_like(scale, np.nan)
+        return unknown, unknown, unknown
     information = _recorded_information(calibration, problem)
     covariances = (
         compute(
@@ -93,10 +96,14 @@ def restore_covariances(calibration: Calibration) -> tuple[Array, Array]:
             precision=problem.prior_precision,
             at_bound=_at_bound(calibration),
         )
-        for compute in (information.covariance, information.noise_covariance)
+        for compute in (
+            information.covariance,
+            information.noise_covariance,
+            partial(information.prior_covariance, priors=problem.selection.scaled),
+        )
     )
-    covariance, noise_covariance = (np.asarray(scale * c) for c in covariances)
-    return covariance, noise_covariance
+    covariance, noise_covariance, scaled_covariance = (np.asarray(scale * c) for c in covariances)
+    return covariance, noise_covariance, scaled_covariance
 
 
 def _recorded_problem(calibration: Calibration) -> CalibrationProblem:
@@ -130,10 +137,9 @@ def _repeat_problem(
     free = calibration.free
     parameters = session.robot.parameters
     names = tuple(p.name for p in free)
-    old_factors, new_factors = (
-        s.factors(parameters, names) for s in (calibration.tolerance_scale, scale)
-    )
-    stds = np.array([p.prior_std for p in free]) / old_factors * new_factors
+    scaled = np.array([p.scaled for p in free])
+    change = scale.factor / calibration.tolerance_scale.factor
+    stds = np.array([p.prior_std for p in free]) * np.where(scaled, change, 1.0)
     selection = Selection(
         label=calibration.model,
         parameters=tuple(
@@ -141,6 +147,7 @@ def _repeat_problem(
             for n, std in zip(names, stds.tolist(), strict=True)
         ),
         prior=np.array([p.prior for p in free]),
+        scaled=scaled,
         mean=read_only([p.mean for p in free]),
         lower=read_only([-np.inf if p.lower is None else p.lower for p in free]),
         upper=read_only([np.inf if p.upper is None else p.upper for p in free]),

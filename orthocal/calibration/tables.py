@@ -18,7 +18,8 @@ def parameter_table(calibration: Calibration) -> list[Record]:
     """Records of all parameters: free ones, known ones, then those of sensors.
 
     `value`, `linearised`, `std` (from noise, priors and unmodelled errors), `std_scatter` (its part
-    from noise), `low` and `high` (value ± expanded uncertainty), and `prior_std` are in `unit`.
+    from noise), `std_scaled` (its part from errors that the tolerance scale multiplies), `low` and
+    `high` (value ± expanded uncertainty), and `prior_std` are in `unit`.
     """
     intervals = dict(
         zip((p.name for p in calibration.free), calibration.intervals, strict=True),
@@ -36,6 +37,7 @@ def parameter_table(calibration: Calibration) -> list[Record]:
                     "linearised": p.linear,
                     "std": finite_or_none(p.std),
                     "std_scatter": finite_or_none(p.std_scatter),
+                    "std_scaled": finite_or_none(p.std_scaled),
                     "low": finite_or_none(low),
                     "high": finite_or_none(high),
                     "prior_std": p.prior_std,

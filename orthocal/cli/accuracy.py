@@ -45,8 +45,8 @@ def accuracy(
 
     With points it prints CSV: the absolute error of the tool at each, without alignment of the
     workpiece, and its standard deviation.
-    Without --approach, --temperature and --payload a tool error is that under the conditions of
-    use that the robot's YAML states.
+    --approach, --temperature and --payload replace the conditions of use that the robot's YAML
+    states.
 
     Exit code 3: some points cannot be reached; they are named, and their cells are empty.
 

@@ -98,21 +98,21 @@ def _describe_entries(new: orthocal.Session, *, changes: bool) -> str:
         f"{d.name} {v * d.edge_factor:+.3f} {d.edge_unit}"
         for d, v in zip(new.robot.drives, new.active_offsets.tolist(), strict=True)
     )
-    text = f"Enter these offsets of the slides, home, and measure again: {offsets}."
+    text = f"Enter these offsets of the slides, unless they are entered already: {offsets}."
     if changes:
         text = (
-            f"Add these to the active offsets of the slides, home, and measure again: {offsets}. "
-            "The new session.yaml states these changes, since the calibrated session states no "
-            "offsets (`controller`)."
+            f"Add these to the active offsets of the slides, unless they are added already: "
+            f"{offsets}. The new session.yaml states these changes, since the calibrated session "
+            "states no offsets (`controller`)."
         )
     if down := [d.name for d in new.robot.drives if d.direction < 0]:
-        text += f" The sign is reversed for joints that count down: {', '.join(down)}."
+        text += f" In the controller the sign is opposite for {', '.join(down)}: it counts down."
     if backlash := describe_trims(new.robot, new.compensation):
         text += (
             f"\nCheck that the controller compensates this backlash: {backlash}. If it does not, "
             "remove it from `controller` in session.yaml."
         )
-    return text
+    return f"{text}\nThen home, measure and compare:"
 
 
 def _require_offsets(calibration: orthocal.Calibration, path: Path) -> None:

@@ -37,7 +37,7 @@ class ChoiceOptions:
     """Options about the errors to identify and what is known of them.
 
     Args:
-        known (NAME=VALUE[±TOL]): Known error, fixed or with a tolerance as prior:
+        known (NAME=VALUE[±TOL]): Known error, fixed or with a tolerance:
             x_leg.length_mm=0.12±0.02 (or +-).
         prior: Use the tolerances in the fit; default: yes, except where only offsets are
             identified.

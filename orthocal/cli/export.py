@@ -62,8 +62,7 @@ def export(
             urdf: the calibrated machine as a robot directory; linuxcnc: HOME_OFFSET, or a
             kinematics module if the calibration identified more than offsets.
         module: linuxcnc: write a module, or HOME_OFFSET only; default: by what was identified.
-        within (UM): linuxcnc: largest error of a module itself at the tool, µm; default: 0.1. (In
-            `correct`: of the written path.)
+        within (UM): linuxcnc: largest error of the module itself at the tool, µm; default: 0.1.
         home_offset (VALUES): linuxcnc: HOME_OFFSET of each joint during the measurement, separated
             by commas, mm or degrees; without it the files contain changes only.
         latched (SIGNS): linuxcnc: sign of HOME_LATCH_VEL of each joint, such as +,+,-; it matters
@@ -92,6 +91,8 @@ def export(
         _note_payload(result, payload)
     if to == "linuxcnc":
         _note_latching(result, options)
+    if "README.md" in files:
+        put_out(f"Next: follow {out / 'README.md'}.")
 
 
 def _show_settings(calibration: orthocal.Calibration, firmware: str) -> None:

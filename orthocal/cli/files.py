@@ -35,7 +35,7 @@ def load_each_once(
     sessions: list[orthocal.Session] = []
     for path in paths:
         session = orthocal.load_session(path, partial=partial)
-        if any(session.sha256 == other.sha256 for other in sessions):
+        if any(session.was_read_from(other.sha256) for other in sessions):
             raise SessionError(
                 "is the same session as one before it; its readings would count twice",
                 where=str(path),

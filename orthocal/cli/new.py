@@ -143,8 +143,7 @@ class FirstPlanOptions:
     """Options about the first plan of a machine.
 
     Args:
-        effects (EFFECTS): Effects beside geometry that the machine has, such as
-            backlash,thermal, or none.
+        effects (EFFECTS): Effects that the machine has, such as backlash,thermal, or none.
         paper: Read each leg in the mechanical zero and at both ends of its axis, as in the paper;
             no search.
     """

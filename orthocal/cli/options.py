@@ -145,7 +145,7 @@ SessionPaths = Annotated[
     list[Path],
     Argument(
         metavar="SESSION...",
-        help="session.yaml, or the directory that contains it; several are fitted together.",
+        help="session.yaml, or the directory that contains it; several are calibrated together.",
     ),
 ]
 PlanPath = Annotated[
@@ -183,8 +183,8 @@ Effects = Annotated[
     str | None,
     Option(
         metavar="EFFECTS",
-        help="Effects beside geometry to identify, such as backlash,thermal, or none; default: "
-        "those that the session states, else those of the robot.",
+        help="Effects to identify, such as backlash,thermal, or none; default: those that the "
+        "session states, else those of the robot.",
     ),
 ]
 Day = Annotated[
@@ -259,7 +259,10 @@ Approach = Annotated[
 ]
 Temperature = Annotated[
     float | None,
-    Option(metavar="C", help="Temperature of the machine, °C; default: that of its dimensions."),
+    Option(
+        metavar="C",
+        help="Temperature of the machine, °C; default: the robot's reference temperature (20 °C).",
+    ),
 ]
 Payload = Annotated[float | None, Option(metavar="KG", help="Mass on the tool, kg; default: none.")]
 Positive = Annotated[int | None, Option(min=1)]

@@ -30,7 +30,8 @@ def sheet(
     Args:
         feed (MM/MIN): Feed between postures.
         approach_feed (MM/MIN): Feed over the last 2 mm to a posture.
-        shift_mm (X,Y,Z): Machine coordinates (G53) of the origin of the world, mm.
+        shift_mm (X,Y,Z): Machine coordinates (G53) of the tool centre point at the
+            mechanical zero, mm.
         dwell (SECONDS): Time at each reading instead of a pause (G4).
         trigger (OUTPUT): Trigger of a logger after the dwell (default: 1 s): digital output 0 to
             63 (M64, M65 of LinuxCNC), or an M-code from M100 to M199.

@@ -41,13 +41,14 @@ def simulate(
     """Simulate the readings of a machine with known errors.
 
     The directory receives session.yaml, readings.csv and truth.yaml. Readings state the conditions
-    that effects of the machine need, and their time and temperature with --temperature.
+    that effects of the machine need, and their time and temperature with --temperature. With the
+    truth.yaml of an earlier session (--errors) machine and gauges are the same, mounted anew.
 
     Args:
-        draw (MODEL|GLOBS): Draw normally distributed errors by their tolerances: of a model, or of
-            names and globs.
-        effects (EFFECTS): Effects of the machine beside geometry, such as backlash,thermal, or
-            none; default: those that the plan states, else those of the robot.
+        draw (MODEL|PATTERNS): Draw random errors by their tolerances: those of a model, or by name
+            or pattern ('*': all).
+        effects (EFFECTS): Effects of the machine, such as backlash,thermal, or none; default:
+            those that the plan states, else those of the robot.
         exact: Without noise, gauge zeros and rounding.
     """
     from orthocal.observation.sensor_groups import nuisance_parameters

@@ -114,9 +114,9 @@ def accuracy(
 
     Args:
         machines (N): Number of machines.
-        draw (MODEL|GLOBS): Errors that are random, within their tolerances; default: all.
-        effects (EFFECTS): Effects beside geometry that the machines have, such as backlash,thermal,
-            or none; default: those of the plan.
+        draw (MODEL|PATTERNS): Errors that are random, by their tolerances; default: all.
+        effects (EFFECTS): Effects that the machines have, such as backlash,thermal, or none;
+            default: those of the plan.
         ignore (EFFECTS): Those of them that the calibration ignores; the answer says what that
             costs.
     """

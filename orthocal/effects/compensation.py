@@ -50,6 +50,9 @@ class JointTrim:
         return np.stack(columns, axis=1)
 
 
+MAX_COMP_FILE_ENTRIES = 256
+"""Largest number of entries of a COMP_FILE of LinuxCNC."""
+
 Compensation = tuple[JointTrim, ...]
 """Trim of the joint of each drive, in the robot's order; empty without compensation."""
 

@@ -20,7 +20,7 @@ import pinocchio as pin
 from orthocal.arrays import Array
 from orthocal.effects.protocol import Placement
 from orthocal.effects.rods import stretch_rod
-from orthocal.robot.closing import RANK_TOLERANCE
+from orthocal.robot.closing import invert_closures
 from orthocal.robot.frames import carriers
 from orthocal.robot.model import Robot, require_tcp
 
@@ -82,12 +82,8 @@ class RodForces:
         states = [self._evaluate(q, data) for q in coordinates]
         by_joints, by_tool, axes, placements = (np.array(v) for v in zip(*states, strict=True))
         passive = self.robot.passive_index
-        g_q, p_q = (np.swapaxes(v[:, :, passive], 1, 2) for v in (by_joints, by_tool))
-        if g_q.shape[1] == g_q.shape[2]:
-            multipliers = np.linalg.solve(g_q, p_q)
-        else:
-            multipliers = np.linalg.pinv(g_q, rcond=RANK_TOLERANCE) @ p_q
-        closing_forces = self._closing_forces(multipliers, axes)
+        multipliers = by_tool[:, :, passive] @ invert_closures(by_joints[:, :, passive])
+        closing_forces = self._closing_forces(np.swapaxes(multipliers, 1, 2), axes)
         result = np.zeros((len(coordinates), len(self._rods), 3))
         for i, d in self._displacements:
             direction = placements[:, self._index[d.placement]] @ d.direction

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -133,6 +134,18 @@ class Fit:
     def noise_covariance(self, *, noise: float | None = None) -> Array:
         """Part of `covariance` that is due to noise, shape (n_free, n_free), [SI]."""
         return self._to_si(self.information.noise_covariance, noise)
+
+    def inverse_normal(self) -> Array:
+        """Inverse curvature of the objective, shape (n_free, n_free), [SI]."""
+        return self._to_si(self.information.inverse_normal, None)
+
+    def scaled_covariance(self) -> Array:
+        """Part of `covariance` that is due to priors which the tolerance scale multiplies.
+
+        Shape (n_free, n_free), [SI].
+        """
+        priors = self.problem.selection.scaled
+        return self._to_si(partial(self.information.prior_covariance, priors=priors), None)
 
     def _to_si(self, compute: Callable[..., Array], noise: float | None) -> Array:
         """Covariance of the free parameters, (n_free, n_free), [SI], from that of θ̂."""

@@ -25,9 +25,10 @@ from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.function_cache import cached_per_robot
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import RobotFunctions
-from orthocal.observation.model import FreeParameters, ObservationModel, ReadingLinearisation
+from orthocal.observation.model import ObservationModel, ReadingLinearisation
 from orthocal.observation.observations import Observations, build_observations
 from orthocal.observation.sensor_groups import nuisance_parameters
+from orthocal.observation.twist_derivatives import FreeParameters
 from orthocal.robot.model import Robot, closure_row_units, coordinate_units
 from orthocal.robot.parameters import AXES
 from orthocal.session.session import Session
@@ -410,7 +411,7 @@ class CalibrationProblem:
     def errors_per_theta(self) -> Array:
         """Elementary errors per unit of θ̂, shape (n_errors, n_machine), [SI]."""
         selection = self.machine_selection
-        return self.functions.errors.columns(selection.names) * selection.prior_stds
+        return self.functions.errors.unit_errors(selection.names) * selection.prior_stds
 
 
 def build_problem(

@@ -51,6 +51,8 @@ class Selection:
     """Free parameters, with the priors of this selection."""
     prior: Mask
     """Mask of the parameters with a prior, shape (n_free,)."""
+    scaled: Mask
+    """Mask of the parameters whose prior the tolerance scale multiplies, shape (n_free,)."""
     mean: Array
     """Mean of each prior, shape (n_free,), [SI]."""
     lower: Array
@@ -92,6 +94,7 @@ class Selection:
             self,
             parameters=(*self.parameters, *parameters),
             prior=np.append(self.prior, np.ones(n, dtype=bool)),
+            scaled=np.append(self.scaled, np.zeros(n, dtype=bool)),
             mean=read_only(np.append(self.mean, np.zeros(n))),
             lower=read_only(np.append(self.lower, [_lowest(p) for p in parameters])),
             upper=read_only(np.append(self.upper, np.full(n, np.inf))),
@@ -104,6 +107,7 @@ class Selection:
             self,
             parameters=tuple(self.parameters[i] for i in index),
             prior=np.zeros(len(index), dtype=bool),
+            scaled=self.scaled[index],
             mean=read_only(np.zeros(len(index))),
             lower=read_only(self.lower[index]),
             upper=read_only(self.upper[index]),
@@ -142,9 +146,7 @@ def select_parameters(
             parameters contain the same elementary error, or a number is invalid.
     """
     base = complete_model(parameters) if model is None and not free else model
-    patterns: list[str] = []
-    if base is not None:
-        patterns += parameters.patterns(base)
+    patterns = [] if base is None else parameters.patterns(base)
     with errors_at("free"):
         chosen = set(parameters.select([*patterns, *free]))
     fixed, priors = _split_known(parameters, known or {})
@@ -164,6 +166,7 @@ def select_parameters(
         label=label_choice(base, free),
         parameters=tuple(replace(parameters[n], prior_std=stds[n]) for n in names),
         prior=np.array([use_priors or n in always_prior for n in names]),
+        scaled=np.array([n not in priors and parameters.are_scaled(n) for n in names]),
         mean=read_only([priors.get(n, (0.0, 0.0))[0] for n in names]),
         lower=read_only(lower),
         upper=read_only(upper),

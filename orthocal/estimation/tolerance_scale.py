@@ -36,3 +36,12 @@ class ToleranceScale:
 
 AS_STATED = ToleranceScale()
 """Scale of unchanged tolerances."""
+
+SCALE_RATIO = 30.0 ** (1.0 / 85.0)
+"""Ratio of neighbouring trial scales: 4 %, far less than the uncertainty of an estimated scale."""
+
+
+def trial_scales(lowest: float, highest: float) -> Array:
+    """Tolerance scales that are compared: powers of SCALE_RATIO within limits, 1 among them."""
+    first, last = (round(math.log(v) / math.log(SCALE_RATIO), 9) for v in (lowest, highest))
+    return np.asarray(SCALE_RATIO ** np.arange(math.ceil(first), math.floor(last) + 1))

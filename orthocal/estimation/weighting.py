@@ -20,7 +20,7 @@ from orthocal.statistics.noise import estimate_noise, estimate_repeatability, no
 from orthocal.statistics.zeros import project_out_zeros
 
 DEFAULT_SIGMA = 10e-6
-"""Initial standard deviation of a reading if none is stated, [m]."""
+"""Assumed noise of a gauge that does not state it, [m]."""
 
 SMALLEST_SIGMA = 1e-9
 """Smallest standard deviation of a reading, [m]; below it readings count as perfect."""
@@ -52,6 +52,16 @@ def split_by_gauge(session: Session, observations: Observations) -> tuple[GaugeR
     )
 
 
+def stated_sigma(gauge: Gauge) -> float:
+    """Standard deviation of a reading from stated noise and resolution, [m]; 0 without both."""
+    return noise_floor(gauge.sigma, gauge.resolution)
+
+
+def assumed_sigma(gauge: Gauge) -> float:
+    """Standard deviation of a reading, [m], with DEFAULT_SIGMA for a gauge that states none."""
+    return max(noise_floor(gauge.sigma or DEFAULT_SIGMA, gauge.resolution), SMALLEST_SIGMA)
+
+
 def initial_sigma(gauge: Gauge, repeatability: tuple[float, int]) -> float:
     """Standard deviation of a reading before the first solution, [m].
 
@@ -60,10 +70,9 @@ def initial_sigma(gauge: Gauge, repeatability: tuple[float, int]) -> float:
         repeatability: Scatter of repeated cycles, [m], and its degrees of freedom.
     """
     cycles_sigma, cycles_dof = repeatability
-    floor = noise_floor(gauge.sigma, gauge.resolution)
     if cycles_dof > 0:
-        return max(cycles_sigma, floor, SMALLEST_SIGMA)
-    return max(gauge.sigma or DEFAULT_SIGMA, floor)
+        return max(cycles_sigma, stated_sigma(gauge), SMALLEST_SIGMA)
+    return assumed_sigma(gauge)
 
 
 def initial_noise_ratio(session: Session, observations: Observations) -> Array:

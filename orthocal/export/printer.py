@@ -14,17 +14,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
-from scipy.optimize import OptimizeResult, least_squares
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from orthocal.arrays import Array
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.tool_error import assess_tool
-from orthocal.calibration.calibration import Calibration
+from orthocal.calibration.calibration import Calibration, propagate_stds
 from orthocal.calibration.refit import restore_covariances
 from orthocal.errors import ClosureError, ExportError
 from orthocal.kinematics.sensitivity import ToolSensitivity
@@ -140,14 +139,17 @@ def fit_firmware(calibration: Calibration, firmware: FirmwareName) -> FirmwareFi
             "`orthocal import LOG DIRECTORY` makes a session with them"
         )
     targets, layer_unknown = _find_targets(calibration)
-    scales = UNKNOWN_SCALES if FIRMWARES[firmware].tilts else UNKNOWN_SCALES[:-2]
+    start, unknowns = _start(present, firmware), _unknowns(firmware)
     solution = least_squares(
-        partial(_residuals, targets, present), np.zeros(len(scales)), x_scale=scales, method="lm"
+        lambda y: _residuals(targets, start, unknowns @ y),
+        np.zeros(unknowns.shape[1]),
+        x_scale=(UNKNOWN_SCALES @ unknowns) / unknowns.sum(axis=0),
+        method="lm",
     )
-    settings = replace(_changed(present, solution.x), firmware=firmware)
+    settings = _changed(start, unknowns @ solution.x)
     tool = assessment_of(calibration).tool
     homed_change = np.array(settings.homed) - present.homed
-    gain = _setting_gain(targets, settings, solution, homed_change)
+    gain = _setting_gain(targets, settings, solution.jac, homed_change)
     return FirmwareFit(
         settings=settings,
         now=_measure(targets, present, np.zeros(3)),
@@ -159,6 +161,28 @@ def fit_firmware(calibration: Calibration, firmware: FirmwareName) -> FirmwareFi
     )
 
 
+def _start(present: DeltaSettings, firmware: FirmwareName) -> DeltaSettings:
+    """Present settings, as a firmware can have them."""
+    rod = float(np.mean(present.rods))
+    return replace(
+        present,
+        firmware=firmware,
+        rods=(rod, rod, rod) if FIRMWARES[firmware].equal_rods else present.rods,
+        tilts=present.tilts if FIRMWARES[firmware].tilts else (0.0, 0.0),
+    )
+
+
+def _unknowns(firmware: FirmwareName) -> Array:
+    """Settings that each unknown of the fit changes, as in `_changed`, shape (14, n), [1]."""
+    unknowns = np.eye(len(UNKNOWN_SCALES))
+    if not FIRMWARES[firmware].tilts:
+        unknowns = unknowns[:, :-2]
+    if FIRMWARES[firmware].equal_rods:
+        common = unknowns[:, 3:6].sum(axis=1, keepdims=True)
+        unknowns = np.concatenate([unknowns[:, :3], common, unknowns[:, 6:]], axis=1)
+    return unknowns
+
+
 def _differentiate(settings: DeltaSettings, carriages: Array) -> Array:
     """Derivative of the computed position with respect to the carriages, shape (K, 3, 3), [1]."""
     steps = DIFFERENCE_STEP * np.eye(3)
@@ -167,7 +191,7 @@ def _differentiate(settings: DeltaSettings, carriages: Array) -> Array:
 
 
 def _setting_gain(
-    targets: _Targets, settings: DeltaSettings, solution: OptimizeResult, homed_change: Array
+    targets: _Targets, settings: DeltaSettings, jacobian: Array, homed_change: Array
 ) -> Array:
     """Derivative of the settings with respect to the free errors, shape (n_settings, n), [SI].
 
@@ -179,13 +203,13 @@ def _setting_gain(
     Args:
         targets: The points.
         settings: The new settings.
-        solution: Solution of the least squares.
+        jacobian: Derivative of the residuals with respect to the unknowns, shape (m, k).
         homed_change: Change of the homed carriages, shape (3,), [m].
     """
     n = targets.jacobian.shape[-1]
     computed, layer = (
-        _differentiate(settings, carriages + homed_change) @ np.linalg.solve(by_drives, jacobian)
-        for carriages, by_drives, jacobian in (
+        _differentiate(settings, carriages + homed_change) @ np.linalg.solve(by_drives, errors)
+        for carriages, by_drives, errors in (
             (targets.carriages, targets.by_drives, targets.jacobian),
             (targets.layer_carriages, targets.layer_by_drives, targets.layer_jacobian),
         )
@@ -193,7 +217,7 @@ def _setting_gain(
     change = np.sqrt(targets.weights)[:, None, None] * computed
     layer = math.sqrt(FIRST_LAYER / len(targets.layer_points)) * layer[:, 2]
     change = np.concatenate([change.reshape(-1, n), layer])
-    gain = np.asarray(np.linalg.lstsq(solution.jac, change, rcond=None)[0])
+    gain = _unknowns(settings.firmware) @ np.linalg.lstsq(jacobian, change, rcond=None)[0]
     rods = np.array(settings.rods)[:, None] * gain[3:6] - settings.radius * gain[:1]
     endstops = gain[6:9] - rods / settings.middle[:, None]
     fixed = np.zeros((1, n))
@@ -213,10 +237,7 @@ def _setting_rows(
     present = calibration.session.firmware or settings
     uncertainties = np.full(len(gain), np.nan)
     if not calibration.unmodelled.prior_stds.size:
-        stds = [
-            np.sqrt(np.einsum("ij,jk,ik->i", gain, c, gain))
-            for c in restore_covariances(calibration)
-        ]
+        stds = propagate_stds(gain, restore_covariances(calibration))
         uncertainties = calibration.expand(*stds)
     values = [("radius", present.radius / MM, settings.radius / MM, MM, "mm")]
     for field, label, size, unit in (
@@ -319,14 +340,13 @@ def _changed(settings: DeltaSettings, x: Array) -> DeltaSettings:
     """
     rods, homed = np.array(settings.rods) + x[3:6], np.array(settings.homed) + x[6:9]
     a, b, c = settings.angles
-    tilts = (settings.tilts[0] + x[12], settings.tilts[1] + x[13]) if len(x) > 12 else (0.0, 0.0)
     return replace(
         settings,
         radius=settings.radius + x[0],
         angles=(a + x[1], b + x[2], c),
         rods=tuple(rods.tolist()),
         homed=tuple(homed.tolist()),
-        tilts=tilts,
+        tilts=(settings.tilts[0] + x[12], settings.tilts[1] + x[13]),
     )
 
 
@@ -378,6 +398,12 @@ def export_printer(calibration: Calibration, firmware: FirmwareName) -> dict[str
     return {target.file: target.config_lines(fit.settings), "README.md": _page(calibration, fit)}
 
 
+_SEND = (
+    "Send the lines of `marlin.gcode`. `M500` saves them. Without EEPROM, change the values of the "
+    "same names in `Configuration.h`."
+)
+_HOME = "Home (`G28`). An existing mesh of `G29` is no longer valid: `M420 S0`."
+
 STEPS: dict[FirmwareName, Sequence[str]] = {
     "klipper": (
         "Replace these lines in your `printer.cfg`. Values of a part `SAVE_CONFIG` at its end take "
@@ -385,10 +411,11 @@ STEPS: dict[FirmwareName, Sequence[str]] = {
         "`RESTART`, then home.",
     ),
     "marlin": (
-        "Send the lines of `marlin.gcode`. `M500` saves them. Without EEPROM, change the values "
-        "of the same names in `Configuration.h`.",
-        "Home (`G28`). An existing mesh of `G29` is no longer valid: `M420 S0`.",
+        f"{_SEND} If `M503` prints no A, B and C in `M665`, your Marlin has one length for all "
+        "rods: export with `--to marlin1`.",
+        _HOME,
     ),
+    "marlin1": (_SEND, _HOME),
     "reprapfirmware": (
         "Replace `M665` and `M666` in `config.g`. Delete these commands in `config-override.g`.",
         "Restart, then home (`G28`). An existing height map is no longer valid: `G29 S2`.",

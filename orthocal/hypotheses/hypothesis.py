@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from orthocal.arrays import Array, Indices, Mask
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.robot.parameters import Parameter
-from orthocal.sensors.protocol import reads_pairs
+from orthocal.sensors.protocol import reads_pairs, states_readings
 from orthocal.session.session import Gauge, Session
 
 Key = TypeVar("Key")
@@ -221,6 +221,9 @@ class Rows:
         sensors = {name: setup.sensor for name, setup in session.setups.items()}
         self.paired = np.array([reads_pairs(sensors[r.setup]) for r in session.readings], bool)
         """Mask of rows that are distances between two postures, not read on a dial, (n_rows,)."""
+        prescribed = [states_readings(sensors[r.setup]) for r in session.readings]
+        self.written = ~np.array(prescribed, bool)
+        """Mask of rows whose number somebody read and wrote, unlike triggers, (n_rows,)."""
 
     @cached_property
     def setups(self) -> dict[str, Indices]:

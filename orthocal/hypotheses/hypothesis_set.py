@@ -12,7 +12,7 @@ from orthocal.arrays import Array
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.hypotheses.hypothesis import MachineShift, SystematicEffect
 from orthocal.hypotheses.likelihood import Score
-from orthocal.hypotheses.linear_model import ModelLinearisation
+from orthocal.hypotheses.linearisation import ModelLinearisation
 from orthocal.session.session import Session
 
 MAX_ALTERNATIVES = 8

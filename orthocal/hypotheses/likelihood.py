@@ -22,8 +22,8 @@ import numpy as np
 
 from orthocal.arrays import Array, Mask
 
-TOLERANCE_SCALES = np.geomspace(0.1, 16.0, 9)
-"""Grid of the tolerance scale e."""
+SCALE_NODES = np.geomspace(0.1, 16.0, 9)
+"""Tolerance scales e over which the likelihood is summed."""
 
 TOLERANCE_SCALE_SPREAD = 0.5
 """Prior standard deviation of ln e."""
@@ -106,7 +106,7 @@ class Likelihood:
     """Logarithms of the prior weights of all pairs (e, s), shape (g,)."""
 
     def grid(
-        self, tolerance_scales: Array = TOLERANCE_SCALES, noise_scales: Array = NOISE_SCALES
+        self, tolerance_scales: Array = SCALE_NODES, noise_scales: Array = NOISE_SCALES
     ) -> tuple[Array, Array]:
         """Variances of all pairs (e, s), [m²]: of the noise, (g,), and along directions, (r, g)."""
         noise = np.tile((noise_scales * self.sigma) ** 2, tolerance_scales.size)
@@ -176,7 +176,7 @@ class Likelihood:
     def log_densities(
         self,
         deviations: Products,
-        tolerance_scales: Array = TOLERANCE_SCALES,
+        tolerance_scales: Array = SCALE_NODES,
         noise_scales: Array = NOISE_SCALES,
     ) -> Array:
         """Logarithms of the normal densities at all pairs (e, s), up to a constant, (h, g)."""
@@ -247,7 +247,7 @@ class Likelihood:
         e, s = divmod(best, NOISE_SCALES.size)
         return Score(
             float(log_of_sum(logs)),
-            float(TOLERANCE_SCALES[e]),
+            float(SCALE_NODES[e]),
             float(NOISE_SCALES[s]),
             amounts[best],
             np.sqrt(np.diag(np.linalg.inv(gram[best]))),
@@ -257,7 +257,7 @@ class Likelihood:
         self,
         deviation: Array,
         vectors: Array,
-        tolerance_scales: Array = TOLERANCE_SCALES,
+        tolerance_scales: Array = SCALE_NODES,
         noise_scales: Array = NOISE_SCALES,
     ) -> tuple[Array, Array]:
         """Information W V⁻¹ Wᵀ, shape (g, k, k), and slope W V⁻¹ d, shape (g, k), at all (e, s).
@@ -351,15 +351,15 @@ def build_likelihood(
     )
     vectors = vectors[:, significant]
     directions = (vectors if basis is None else basis @ vectors).T
-    scale = -0.5 * (np.log(TOLERANCE_SCALES) / TOLERANCE_SCALE_SPREAD) ** 2
+    scale = log_normal(SCALE_NODES, TOLERANCE_SCALE_SPREAD)
     noise = noise_weights(stated=stated)
-    weights = np.repeat(scale - log_of_sum(scale), NOISE_SCALES.size)
+    weights = np.repeat(scale, NOISE_SCALES.size)
     likelihood = Likelihood(
         np.ascontiguousarray(directions),
         singular_values[significant] ** 2,
         sigma,
         dof,
-        weights + np.tile(noise, TOLERANCE_SCALES.size),
+        weights + np.tile(noise, SCALE_NODES.size),
     )
     return likelihood, errors[significant].T, singular_values[significant]
 
@@ -370,16 +370,16 @@ def noise_weights(*, stated: bool) -> Array:
     Args:
         stated: Whether the standard deviation of a reading is stated.
     """
-    noise = _log_normal(NOISE_SCALES, UNSTATED_NOISE_SPREAD)
+    noise = log_normal(NOISE_SCALES, UNSTATED_NOISE_SPREAD)
     if not stated:
         return noise
-    stated_noise = np.log1p(-WRONG_NOISE_PROBABILITY) + _log_normal(
+    stated_noise = np.log1p(-WRONG_NOISE_PROBABILITY) + log_normal(
         NOISE_SCALES, STATED_NOISE_SPREAD
     )
     return np.asarray(np.logaddexp(stated_noise, np.log(WRONG_NOISE_PROBABILITY) + noise))
 
 
-def _log_normal(values: Array, spread: float) -> Array:
+def log_normal(values: Array, spread: float) -> Array:
     """Log weights of a grid under a normal prior of ln(value), normalised to a sum of 1."""
     logs = -0.5 * (np.log(values) / spread) ** 2
     return np.asarray(logs - log_of_sum(logs))

@@ -2,44 +2,36 @@
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cached_property, lru_cache
-from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from orthocal.arrays import Array, Indices, Mask
+from orthocal.arrays import Array, Indices
 from orthocal.errors import ClosureError, SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.linear import require_finite
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import select_parameters
-from orthocal.estimation.weighting import DEFAULT_SIGMA, initial_noise_ratio
+from orthocal.estimation.weighting import assumed_sigma, initial_noise_ratio
 from orthocal.hypotheses.hypothesis import (
     MAX_DENSE_COLUMNS,
     MachineShift,
     Patterns,
     Sparse,
-    SystematicEffect,
     row_products,
 )
-from orthocal.hypotheses.likelihood import Likelihood, Products, build_likelihood
-from orthocal.observation.model import predict_readings
-from orthocal.sensors.protocol import DIMENSION_STEP, stated_dimensions
-from orthocal.session.session import Session, Setup
-from orthocal.statistics.distributions import log_positive_share
-from orthocal.statistics.noise import noise_floor
+from orthocal.hypotheses.likelihood import Products, build_likelihood
+from orthocal.hypotheses.linearisation import LinearisationPoint, ModelLinearisation
+from orthocal.session.session import Session, split_label
 from orthocal.statistics.zeros import project_out_zeros
 
-Result = TypeVar("Result")
-
 CACHE_SIZE = 6
-"""Number of cached models."""
+"""Number of cached models, and of cached most likely machines."""
 
 MAX_RELINEARISATIONS = 2
 """Most relinearisations per hypothesis."""
@@ -50,7 +42,7 @@ SMALL_CHANGE = 0.2
 LARGEST_ERROR = 6.0
 """Largest error about which a hypothesis is relinearised, [prior std]."""
 
-MAX_ENTRIES = 1600
+MAX_LINEARISED_ENTRIES = 1600
 """Most entries of all points that are linearised at once, to limit the memory."""
 
 MAX_STEPS = 8
@@ -62,86 +54,12 @@ CONVERGED_CHANGE = 0.02
 HIDDEN = 0.1
 """Largest change of readings by one prior std that counts as no change, [σ]."""
 
-SMALLEST_SIGMA = 1e-9
-"""Smallest standard deviation of a reading, [m]."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ModelLinearisation:
-    """Linearised model about one machine, gauge zeros projected out.
-
-    The machine of each session may differ by known errors (`shifts`).
-    """
-
-    expected: Array
-    """Predictions for the reference machine, to first order, shape (n_entries,), [m]."""
-    jacobian: Array
-    """Jacobian ∂h per prior std of each error, shape (n_entries, n_free), [m]; shape (n_entries, 0)
-    if not requested."""
-    likelihood: Likelihood
-    error_directions: Array
-    """Errors per principal direction, shape (n_free, r), [prior std]."""
-    singular_values: Array
-    """Singular values, shape (r,), [m]."""
-    theta: Array
-    """Errors at the point of linearisation minus those of the reference, (n_free,), [prior std]."""
-    passive: Array
-    """Passive coordinates at that point, shape (n_states, n_passive), [m, rad]."""
-
-    def errors_for(
-        self, deviation: Array, *, tolerance_scale: float = 1.0, noise_scale: float = 1.0
-    ) -> Array:
-        """Most likely errors for a deviation, shape (n_free,), [prior std].
-
-        Args:
-            deviation: Readings minus predictions, shape (n_entries,), zeros projected out, [m].
-            tolerance_scale: Tolerance scale e.
-            noise_scale: Noise scale s.
-        """
-        e2 = tolerance_scale**2
-        variance = e2 * self.singular_values**2 + (noise_scale * self.likelihood.sigma) ** 2
-        along = self.likelihood.directions @ deviation
-        return np.asarray(self.error_directions @ (e2 * self.singular_values / variance * along))
-
-    def log_positive_share(
-        self, deviation: Array, positive: Mask, *, tolerance_scale: float, noise_scale: float
-    ) -> float:
-        """Gain of the log likelihood by half-normal instead of normal priors.
-
-        The gain is ln 2ᵏ P(θ₊ > 0 | y) for the k errors θ₊ that are never negative. Their prior
-        density is twice the normal density, and only the positive part of the posterior counts.
-
-        Args:
-            deviation: Readings minus predictions, shape (n_entries,), zeros projected out, [m].
-            positive: Mask of the errors that are never negative, shape (n_free,).
-            tolerance_scale: Tolerance scale e.
-            noise_scale: Noise scale s.
-        """
-        scales = {"tolerance_scale": tolerance_scale, "noise_scale": noise_scale}
-        mean = self.errors_for(deviation, **scales)[positive]
-        resolved = tolerance_scale**2 * self.singular_values**2
-        resolved /= resolved + (noise_scale * self.likelihood.sigma) ** 2
-        rows = self.error_directions[positive]
-        covariance = tolerance_scale**2 * (np.eye(len(rows)) - rows * resolved @ rows.T)
-        return len(rows) * math.log(2.0) + log_positive_share(mean, covariance)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LinearisationPoint:
-    """Machine about which the model is linearised."""
-
-    theta: Array
-    """Errors minus those of the reference, shape (n_free,), [prior std]."""
-    shifts: Sequence[MachineShift]
-    """Known differences of the machine in some of the sessions."""
-    start: Array
-    """Passive coordinates to start from, shape (n_states, n_passive), [m, rad]."""
-
 
 class LinearModel:
     """Predictions and derivatives of a session for all errors of the machine and its sensors.
 
-    The search for anomalies calls the calibration problem through this class only.
+    The search for anomalies calls the calibration problem through this class only. The values of
+    the session's readings are not used, unless noise ratios are estimated from them.
 
     Args:
         session: A session, or several joined ones.
@@ -159,46 +77,39 @@ class LinearModel:
         self.problem = problem.with_noise_ratio(initial_noise_ratio(session, problem.observations))
         o = self.problem.observations
         self.stated = session.gauge.sigma is not None
-        floor = noise_floor(session.gauge.sigma or DEFAULT_SIGMA, session.gauge.resolution)
-        self.sigma = max(floor, SMALLEST_SIGMA)
+        self.sigma = assumed_sigma(session.gauge)
         """Standard deviation of a reading of the first gauge, [m]; all entries refer to it."""
         self.dof = o.size - o.n_zeros
         self.labels, self.session_of_entry = label_sessions(session, o.setup)
         self._counts = np.bincount(o.zero, minlength=o.n_zeros).astype(np.float64)
         self._incidence = self.problem.zero_incidence
-        self._shared: dict[Hashable, object] = {}
-        self._cached_most_likely: list[tuple[bytes, ModelLinearisation]] = []
-
-    def with_values(self, values: Array) -> LinearModel:
-        """Model for other readings of the same rows, shape (n_rows,), [m]."""
-        other = copy.copy(self)
-        other.problem = self.problem.with_values(values)
-        return other
-
-    def share(self, name: Hashable, compute: Callable[[], Result]) -> Result:
-        """Cached result that does not depend on the values of the readings."""
-        if name not in self._shared:
-            self._shared[name] = compute()
-        return cast(Result, self._shared[name])
 
     def at_reference(self, *, keep_jacobian: bool) -> ModelLinearisation:
-        """Linearisation about the machine without errors, cached; raises as `linearise` does.
+        """Linearisation about the machine without errors; raises as `linearise` does.
 
         Some nuisance parameters change readings noticeably, but only to second order, such as the
         height of a fixed ball across the plane of motion. They are one standard deviation there.
         """
+        return self._reference_with_jacobian if keep_jacobian else self._reference
 
-        def linearise() -> ModelLinearisation:
-            theta = np.zeros(self.problem.n_free)
-            about = self.linearise(theta, (), None, keep_jacobian=True)
-            theta[self._find_hidden(about)] = 1.0
-            if theta.any():
-                return self.linearise(theta, (), about.passive, keep_jacobian=keep_jacobian)
-            if keep_jacobian:
-                return about
-            return replace(about, jacobian=np.empty((len(about.jacobian), 0)))
+    @cached_property
+    def _reference(self) -> ModelLinearisation:
+        return self._linearise_reference(keep_jacobian=False)
 
-        return self.share(("reference", keep_jacobian), linearise)
+    @cached_property
+    def _reference_with_jacobian(self) -> ModelLinearisation:
+        return self._linearise_reference(keep_jacobian=True)
+
+    def _linearise_reference(self, *, keep_jacobian: bool) -> ModelLinearisation:
+        """Linearisation about the machine without errors."""
+        theta = np.zeros(self.problem.n_free)
+        about = self.linearise(theta, (), None, keep_jacobian=True)
+        theta[self._find_hidden(about)] = 1.0
+        if theta.any():
+            return self.linearise(theta, (), about.passive, keep_jacobian=keep_jacobian)
+        if keep_jacobian:
+            return about
+        return replace(about, jacobian=np.empty((len(about.jacobian), 0)))
 
     def _find_hidden(self, about: ModelLinearisation) -> Indices:
         """Indices of nuisance parameters that change readings at one prior std, but not at 0."""
@@ -239,7 +150,7 @@ class LinearModel:
         times: dict[str, list[datetime | None]] = {}
         for r in session.readings:
             time = None if r.conditions is None else r.conditions.time
-            times.setdefault(r.setup.partition("/")[0], []).append(time)
+            times.setdefault(split_label(r.setup, joined=session.joined)[0], []).append(time)
         if session.joined and not any(None in of_session for of_session in times.values()):
             start = {
                 k: min(t.replace(tzinfo=t.tzinfo or UTC) for t in v if t) for k, v in times.items()
@@ -317,7 +228,7 @@ class LinearModel:
             The linearisations; None if a machine cannot reach a posture or a predicted reading is
             not finite.
         """
-        size = max(1, MAX_ENTRIES // self.problem.observations.size)
+        size = max(1, MAX_LINEARISED_ENTRIES // self.problem.observations.size)
         return [
             linearisation
             for first in range(0, len(points), size)
@@ -423,7 +334,7 @@ class LinearModel:
     def most_likely(self, rows: Array) -> ModelLinearisation:
         """Linearise about the most likely machine, with the tolerances as prior.
 
-        The result for the last readings is cached because a judgement and a recommendation need it.
+        The last results are cached because a judgement and a recommendation need the same.
 
         Args:
             rows: Readings, shape (n_rows,), [m].
@@ -431,11 +342,7 @@ class LinearModel:
         Raises:
             ClosureError: If the nominal machine cannot reach a posture.
         """
-        key, cache = rows.tobytes(), self._cached_most_likely
-        if not cache or cache[0][0] != key:
-            entries = self.entries(rows[None])[0]
-            cache[:] = [(key, self._approach(entries, np.zeros_like(entries)))]
-        return cache[0][1]
+        return _cached_most_likely(self, rows.astype(np.float64).tobytes())
 
     def predict_row(self, rows: Array, row: int) -> tuple[float, float]:
         """Predictive distribution of a reading, conditional on all other readings.
@@ -456,7 +363,7 @@ class LinearModel:
             ClosureError: If the nominal machine cannot reach a posture.
         """
         entries, effect = self.entries(np.array([rows, np.arange(rows.size) == row]))
-        about = self._approach(entries, effect)
+        about = self.approach(entries, effect)
         (amount,), (std,) = about.likelihood.estimate_amounts(
             entries - about.expected, effect[None]
         )
@@ -485,7 +392,7 @@ class LinearModel:
             errors[left_out] = deviation[left_out] - about.jacobian[left_out] @ theta
         return o.rows(errors * self.problem.noise_ratio)
 
-    def _approach(self, entries: Array, effect: Array) -> ModelLinearisation:
+    def approach(self, entries: Array, effect: Array) -> ModelLinearisation:
         """Linearise about the most likely machine, with a further effect of unknown amount.
 
         Gauss-Newton steps are needed because readings are not linear over offsets of some mm. They
@@ -508,87 +415,6 @@ class LinearModel:
             except (ClosureError, SessionError, np.linalg.LinAlgError):
                 break
         return about
-
-    def linearise_effect(self, name: str) -> SystematicEffect:
-        """Linearised change of the rows by an effect that the robot's model lacks.
-
-        The point of linearisation is the nominal machine.
-
-        Args:
-            name: Name of the effect.
-
-        Raises:
-            RobotError: If the effect needs keys that the robot's YAML lacks.
-        """
-        session, o = self.problem.session, self.problem.observations
-        robot = session.robot
-        other = session.with_effects((*robot.effect_names, name))
-        parameters = other.robot.parameters
-        errors = [n for n in parameters.names if n not in robot.parameters]
-        offsets = [self.problem.free[i] for i in self.offsets.values()]
-        selection = select_parameters(parameters, free=[*offsets, *errors], prior=True)
-        problem = CalibrationProblem(other, selection)
-        reading, jacobian = problem.predict_and_jacobian(problem.active_theta)
-        nominal = self.problem.predict(self.problem.active_theta) * self.problem.noise_ratio
-        present = set(self.problem.free) | set(offsets)
-        new = [i for i, n in enumerate(problem.free) if n not in present]
-        return SystematicEffect(
-            name,
-            tuple(problem.parameters[i] for i in new),
-            o.rows(reading - nominal),
-            o.rows(jacobian[:, new]).T,
-        )
-
-    def nuisance_columns(self) -> Array:
-        """Change of the rows by one prior std of each nuisance parameter, [m].
-
-        The shape is (n_nuisance, n_rows). The machine has no errors. Gauge zeros are not projected
-        out.
-        """
-
-        def compute() -> Array:
-            problem = self.problem
-            passive = self.at_reference(keep_jacobian=False).passive
-            _, jacobian = problem.predict_and_jacobian(problem.active_theta, passive)
-            columns = jacobian[:, problem.n_machine :] * problem.noise_ratio[:, None]
-            return problem.observations.rows(columns).T
-
-        return self.share("nuisance", compute)
-
-    def dimension_changes(self) -> dict[tuple[str, str], dict[str, Array]]:
-        """Derivative of the rows with respect to each dimension that setups state.
-
-        The machine has no errors.
-
-        Returns:
-            Key of the dimension and its stated value, to setup, to the derivative, shape (n_rows,).
-        """
-
-        def compute() -> dict[tuple[str, str], dict[str, Array]]:
-            session, o = self.problem.session, self.problem.observations
-            setups = {r.setup: session.setups[r.setup] for r in session.readings}
-            enlarged: dict[str, Setup] = {}
-            dimensions: dict[str, tuple[str, str]] = {}
-            for name, setup in setups.items():
-                for key, sensor in stated_dimensions(setup.sensor).items():
-                    enlarged[name] = replace(setup, sensor=sensor)
-                    dimensions[name] = key, _stated_value(setup.sensor.to_keys(), key)
-            if not enlarged:
-                return {}
-            other = replace(session, setups={**session.setups, **enlarged})
-            passive = self.at_reference(keep_jacobian=False).passive
-            stated, changed = (
-                o.rows(predict_readings(s, observations=o, passive=passive))
-                for s in (session, other)
-            )
-            change = (changed - stated) / DIMENSION_STEP
-            changes: dict[tuple[str, str], dict[str, Array]] = {}
-            for name, dimension in dimensions.items():
-                of_setup = [r.setup == name for r in session.readings]
-                changes.setdefault(dimension, {})[name] = np.where(of_setup, change, 0.0)
-            return changes
-
-        return self.share("dimensions", compute)
 
     def shift_entries(self, about: ModelLinearisation, shift: MachineShift) -> Array:
         """Effect of a machine shift on the entries, zeros projected out, (n_entries,), [m]."""
@@ -679,7 +505,7 @@ def linear_model(
     """
     robot = session.robot
     names = machine_errors(robot) if model is None else robot.parameters.select_model(model)
-    return _cached_model(_Rows(session, (*names, *free))).with_values(session.values)
+    return _cached_model(_Rows(session, (*names, *free)))
 
 
 class _Rows:
@@ -718,6 +544,12 @@ def _cached_model(rows: _Rows) -> LinearModel:
     return LinearModel(rows.session, rows.names)
 
 
+@lru_cache(maxsize=CACHE_SIZE)
+def _cached_most_likely(model: LinearModel, rows: bytes) -> ModelLinearisation:
+    entries = model.entries(np.frombuffer(rows)[None])[0]
+    return model.approach(entries, np.zeros_like(entries))
+
+
 def _refer_to_most_corrected(session: Session) -> Session:
     """Use the largest active offsets of joined sessions as the reference of the errors.
 
@@ -751,14 +583,8 @@ def label_sessions(session: Session, setup: Indices) -> tuple[tuple[str, ...], I
     """
     if not session.joined:
         return ("",), np.zeros(setup.size, dtype=np.int64)
-    label_of_setup = [name.partition("/")[0] for name in session.setups]
+    label_of_setup = session.labels
     with_readings = {label_of_setup[i] for i in np.unique(setup)}
     labels = tuple(n for n in dict.fromkeys(label_of_setup) if n in with_readings)
     place = np.array([labels.index(n) if n in labels else -1 for n in label_of_setup])
     return labels, place[setup]
-
-
-def _stated_value(keys: Mapping[str, Any], key: str) -> str:
-    """Value of a key of a setup such as artefact.height_mm, as text."""
-    first, _, others = key.partition(".")
-    return _stated_value(keys[first], others) if others else f"{keys[first]:g}"

@@ -9,6 +9,13 @@ A command consists of the commanded drive coordinates of a posture and the condi
 drives or placements depend (`ErrorMap.conditions`). Coordinates alone are a command under neutral
 conditions.
 
+Matrices for n parameters, one unit of each, have these names.
+
+- `unit_errors`: elementary errors, shape (n_errors, n).
+- `twist_jacobian`: ∂δ of the moved placements, shape (6 n_moved, n).
+- `right`: T of each placement, shape (n_moved, 6, 6).
+- `placement_jacobian`: ∂ξ = T ∂δ, shape (6 n_moved, n).
+
 Effects may make placements depend on the coordinates of the drives (`Effect.placements`), which
 are then conditions too. Because a gauge is mounted in the reference posture, such a placement
 exists twice: with the coordinates of the posture, and with those of the reference posture.
@@ -184,7 +191,7 @@ class ErrorMap:
             result[self._index[name]] = value
         return result
 
-    def columns(self, names: Sequence[str]) -> Array:
+    def unit_errors(self, names: Sequence[str]) -> Array:
         """Elementary errors for one unit of each named parameter, shape (n_errors, n)."""
         return self.robot.parameters.coefficients(self.names, names)
 
@@ -275,25 +282,25 @@ class ErrorMap:
         return self._shaped(twists)[:, :, self.varying]
 
     def varying_derivatives(
-        self, errors: Array, columns: Array, commands: Array
+        self, errors: Array, unit_errors: Array, commands: Array
     ) -> VaryingDerivatives:
         """Derivatives of the varying placements of S machines under V conditions.
 
         Args:
             errors: Shape (S, n_errors), [SI].
-            columns: Elementary errors for one unit of each parameter, shape (n_errors, n).
+            unit_errors: Elementary errors for one unit of each parameter, shape (n_errors, n).
             commands: Shape (V, n_command).
         """
         of_varying = (6 * self.varying[:, None] + np.arange(6)).reshape(-1)
-        constant, jacobian, some_columns = self._twists.split(
-            _repeat_for(errors, commands), columns, self._conditions(commands[None])
+        constant, by_errors, general_unit_errors = self._twists.split(
+            _repeat_for(errors, commands), unit_errors, self._conditions(commands[None])
         )
         return VaryingDerivatives(
             right_jacobian(self._varying_twists(errors, commands)),
             constant[of_varying],
             np.searchsorted(of_varying, self._twists.general),
-            jacobian,
-            some_columns,
+            by_errors,
+            general_unit_errors,
         )
 
     def actuate(self, commands: Array, drive_errors: Array) -> Array:
@@ -319,10 +326,10 @@ class ErrorMap:
         by_commands, by_errors = self._drive_derivatives(self.command(commands), drive_errors)
         return by_commands, by_errors
 
-    def jacobian(
+    def placement_jacobian(
         self,
         errors: ArrayLike,
-        columns: Array,
+        unit_errors: Array,
         *,
         command: Array | None = None,
         right: Array | None = None,
@@ -331,7 +338,7 @@ class ErrorMap:
 
         Args:
             errors: Point of differentiation, shape (..., n_errors), [SI].
-            columns: Elementary errors for one unit of each parameter, shape (n_errors, n).
+            unit_errors: Elementary errors for one unit of each parameter, shape (n_errors, n).
             command: Shape (n_command,) or (..., n_command); neutral conditions by default.
             right: `right_jacobians` of these errors; computed by default.
 
@@ -339,8 +346,8 @@ class ErrorMap:
             Twists in the frames of the placements, shape (..., 6 n_moved, n), [m, rad].
         """
         right = self.right_jacobians(errors, command) if right is None else right
-        n = columns.shape[1]
-        inner = self.twist_columns(errors, columns, command)
+        n = unit_errors.shape[1]
+        inner = self.twist_jacobian(errors, unit_errors, command)
         twists = right @ inner.reshape(*inner.shape[:-2], len(self.moved), 6, n)
         return twists.reshape(*twists.shape[:-3], 6 * len(self.moved), n)
 
@@ -363,29 +370,29 @@ class ErrorMap:
         """
         return self._twists(np.asarray(errors, dtype=np.float64), self._conditions(commands))
 
-    def twist_columns(
-        self, errors: ArrayLike, columns: Array, command: Array | None = None
+    def twist_jacobian(
+        self, errors: ArrayLike, unit_errors: Array, command: Array | None = None
     ) -> Array:
         """Derivatives of the twists δ of the moved placements with respect to parameters.
 
         Args:
             errors: Point of differentiation, shape (..., n_errors), [SI].
-            columns: Elementary errors for one unit of each parameter, shape (n_errors, n).
+            unit_errors: Elementary errors for one unit of each parameter, shape (n_errors, n).
             command: Shape (n_command,) or (..., n_command); neutral conditions by default.
 
         Returns:
             Shape (6 n_moved, n), [m, rad]; (..., 6 n_moved, n) if they depend on the errors.
         """
         values = np.asarray(errors, dtype=np.float64)
-        return self._twists.columns(values, columns, self._conditions(command))
+        return self._twists.jacobian(values, unit_errors, self._conditions(command))
 
-    def twists_moved_by(self, columns: Array) -> Mask:
+    def twists_moved_by(self, unit_errors: Array) -> Mask:
         """Mask of the twists that parameters change, shape (6 n_moved,).
 
         Args:
-            columns: Elementary errors for one unit of each parameter, shape (n_errors, n).
+            unit_errors: Elementary errors for one unit of each parameter, shape (n_errors, n).
         """
-        return self._twists.moved_by(np.asarray(columns.any(axis=1)))
+        return self._twists.moved_by(np.asarray(unit_errors.any(axis=1)))
 
     def _conditions(self, commands: Array | None) -> Array:
         """Conditions of commands, shape (..., n_conditions); neutral by default."""
@@ -398,7 +405,10 @@ class ErrorMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VaryingDerivatives:
-    """Derivatives ∂ξ = T ∂δ of the placements that vary, of S machines under V conditions."""
+    """Derivatives ∂ξ = T ∂δ of the placements that vary, of S machines under V conditions.
+
+    ∂δ is `constant`, plus `by_errors` @ `unit_errors` in some rows.
+    """
 
     right: Array
     """T, shape (S, V, n_varying, 6, 6)."""
@@ -406,9 +416,9 @@ class VaryingDerivatives:
     """Constant part of ∂δ with respect to the parameters, shape (6 n_varying, n)."""
     rows: Indices
     """Rows of ∂δ that have a varying part, shape (n_rows,)."""
-    jacobian: Array
-    """Varying part with respect to some of the errors, shape (S, V, n_rows, n_some)."""
-    columns: Array
+    by_errors: Array
+    """Derivatives of these rows with respect to some errors, shape (S, V, n_rows, n_some)."""
+    unit_errors: Array
     """Values of these errors for one unit of each parameter, shape (n_some, n)."""
 
 
@@ -426,16 +436,16 @@ class _Twists:
         conditions, errors = (function.sx_in(i) for i in range(2))
         twists, jacobian = function(conditions, errors)
         self._n = twists.numel()
-        rows, columns = (np.array(v, dtype=np.int64) for v in jacobian.sparsity().get_triplet())
-        self._rows, self._columns = rows, columns
-        nonzeros = [jacobian.nz[k] for k in range(rows.size)]
+        of_twist, of_error = (np.array(v, np.int64) for v in jacobian.sparsity().get_triplet())
+        self._of_twist, self._of_error = of_twist, of_error  # twist and error of each nonzero
+        nonzeros = [jacobian.nz[k] for k in range(of_twist.size)]
         constant = np.array([v.is_constant() for v in nonzeros], dtype=np.bool_)
-        first = np.isin(np.arange(rows.size), np.unique(rows, return_index=True)[1])
-        self._general_errors = np.unique(columns[~(constant & first)])
-        linear = ~np.isin(columns, self._general_errors)
-        self._linear = rows[linear], columns[linear]
+        first = np.isin(np.arange(of_twist.size), np.unique(of_twist, return_index=True)[1])
+        self._general_errors = np.unique(of_error[~(constant & first)])
+        linear = ~np.isin(of_error, self._general_errors)
+        self._linear_twists, self._linear_errors = of_twist[linear], of_error[linear]
         self._slopes = np.array([float(v) for v, ok in zip(nonzeros, linear, strict=True) if ok])
-        linear_errors = np.unique(self._linear[1]).tolist()
+        linear_errors = np.unique(self._linear_errors).tolist()
         general = ca.SX(twists)
         if linear_errors:
             zeros = ca.SX.zeros(len(linear_errors))
@@ -451,22 +461,23 @@ class _Twists:
 
     def __call__(self, errors: Array, conditions: Array) -> Array:
         result = np.zeros((*errors.shape[:-1], self._n))
-        rows, columns = self._linear
-        result[..., rows] = self._slopes * errors[..., columns]
+        result[..., self._linear_twists] = self._slopes * errors[..., self._linear_errors]
         if self.general.size:
             result[..., self.general] += self._evaluate(errors, conditions)[0]
         return result
 
-    def columns(self, errors: Array, columns: Array, conditions: Array) -> Array:
-        """Derivatives ∂δ with respect to parameters: `ErrorMap.twist_columns`."""
-        constant, jacobian, some_columns = self.split(errors, columns, conditions)
+    def jacobian(self, errors: Array, unit_errors: Array, conditions: Array) -> Array:
+        """Derivatives ∂δ with respect to parameters: `ErrorMap.twist_jacobian`."""
+        constant, by_errors, general_unit_errors = self.split(errors, unit_errors, conditions)
         if not self.general.size:
             return constant
         result = np.array(np.broadcast_to(constant, (*errors.shape[:-1], *constant.shape)))
-        result[..., self.general, :] += jacobian @ some_columns
+        result[..., self.general, :] += by_errors @ general_unit_errors
         return result
 
-    def split(self, errors: Array, columns: Array, conditions: Array) -> tuple[Array, Array, Array]:
+    def split(
+        self, errors: Array, unit_errors: Array, conditions: Array
+    ) -> tuple[Array, Array, Array]:
         """Constant part and general part of ∂δ with respect to parameters.
 
         Returns:
@@ -474,29 +485,28 @@ class _Twists:
             to some errors, shape (..., n_general, n_some); and the values of these errors for one
             unit of each parameter, shape (n_some, n).
         """
-        rows, linear_errors = self._linear
-        constant = np.zeros((self._n, columns.shape[1]))
-        constant[rows] = self._slopes[:, None] * columns[linear_errors]
-        some_columns = columns[self._general_errors]
+        constant = np.zeros((self._n, unit_errors.shape[1]))
+        constant[self._linear_twists] = self._slopes[:, None] * unit_errors[self._linear_errors]
+        general_unit_errors = unit_errors[self._general_errors]
         if not self.general.size:
-            empty = np.zeros((*errors.shape[:-1], 0, len(some_columns)))
-            return constant, empty, some_columns
-        return constant, self._evaluate(errors, conditions)[1], some_columns
+            empty = np.zeros((*errors.shape[:-1], 0, len(general_unit_errors)))
+            return constant, empty, general_unit_errors
+        return constant, self._evaluate(errors, conditions)[1], general_unit_errors
 
     def moved_by(self, errors: Mask) -> Mask:
         """Mask of the twists that masked errors change, shape (n_twists,)."""
         result = np.zeros(self._n, dtype=np.bool_)
-        result[self._rows[errors[self._columns]]] = True
+        result[self._of_twist[errors[self._of_error]]] = True
         return result
 
     def _evaluate(self, errors: Array, conditions: Array) -> tuple[Array, Array]:
         """General terms, shape (..., n_general), and their Jacobian with respect to the errors."""
         shape, values = errors.shape[:-1], errors.reshape(-1, errors.shape[-1])
         rows = np.broadcast_to(conditions, (*shape, conditions.shape[-1]))
-        twists, jacobian = self._general(
+        twists, by_errors = self._general(
             rows.reshape(len(values), -1), values[:, self._general_errors]
         )
-        return twists.reshape(*shape, -1), jacobian.reshape(*shape, *jacobian.shape[1:])
+        return twists.reshape(*shape, -1), by_errors.reshape(*shape, *by_errors.shape[1:])
 
 
 @cached_per_robot(maxsize=8)
@@ -537,27 +547,29 @@ class SymbolicErrorMap:
     ones for each.
 
     Args:
-        errors: The robot's error map.
+        map_: The robot's error map.
         fixed: Elementary errors at θ̂ = 0, shape (n_errors,), [SI].
-        columns: Elementary errors for one unit of each θ̂, shape (n_errors, n_free).
+        unit_errors: Elementary errors for one unit of each θ̂, shape (n_errors, n_free).
 
     Attributes:
         placements: The moved placements, shape (12 n_moved,).
         symbols: Inputs of posture and reading functions: θ̂, the constant placements, the nonzeros
             of their ∂ξ/∂θ̂, the varying placements, the nonzeros of their ∂ξ/∂θ̂.
-        digest: Digest of `fixed` and `columns`.
+        digest: Digest of `fixed` and `unit_errors`.
     """
 
-    def __init__(self, errors: ErrorMap, *, fixed: Array, columns: Array) -> None:
-        self.digest = hashlib.sha256(fixed.tobytes() + columns.tobytes()).hexdigest()
-        varying = errors.varying
-        constant = np.setdiff1d(np.arange(len(errors.moved)), varying)
-        theta = ca.SX.sym("theta", columns.shape[1])
+    def __init__(self, map_: ErrorMap, *, fixed: Array, unit_errors: Array) -> None:
+        self.digest = hashlib.sha256(fixed.tobytes() + unit_errors.tobytes()).hexdigest()
+        varying = map_.varying
+        constant = np.setdiff1d(np.arange(len(map_.moved)), varying)
+        theta = ca.SX.sym("theta", unit_errors.shape[1])
         symbols, jacobians = [theta], []
         self._functions = []
         for chosen in (constant, varying):
-            function, sparsity = _moved_placements(errors, chosen, fixed=fixed, columns=columns)
-            jacobians.append(ca.SX.sym("twist_jacobian", sparsity))
+            function, sparsity = _moved_placements(
+                map_, chosen, fixed=fixed, unit_errors=unit_errors
+            )
+            jacobians.append(ca.SX.sym("placement_jacobian", sparsity))
             symbols += [ca.SX.sym("placements", 12 * chosen.size), jacobians[-1].nz[:]]
             self._functions.append(function)
         self.symbols = tuple(symbols)
@@ -568,10 +580,10 @@ class SymbolicErrorMap:
             return ca.vertcat(*parts)[rows.tolist(), :]
 
         self.placements = ordered([symbols[1], symbols[3]], 12)
-        self._twist_jacobian = ordered(jacobians, 6)
-        chosen = errors.drive_errors
-        self._drives = errors.drives
-        self._drive_errors = ca.SX(fixed[chosen]) + ca.sparsify(ca.SX(columns[chosen])) @ theta
+        self._placement_jacobian = ordered(jacobians, 6)
+        chosen = map_.drive_errors
+        self._drives = map_.drives
+        self._drive_errors = ca.SX(fixed[chosen]) + ca.sparsify(ca.SX(unit_errors[chosen])) @ theta
 
     def values(self, theta: ca.MX, conditions: Array) -> list[ca.MX]:
         """Values of the symbols: one column, or one for each of V > 1 conditions if they vary.
@@ -602,34 +614,34 @@ class SymbolicErrorMap:
             command: The command, shape (n_command,).
         """
         by_theta = ca.jacobian(self.actuated(command), self.symbols[0])
-        return by_twists @ self._twist_jacobian + by_actuated @ by_theta
+        return by_twists @ self._placement_jacobian + by_actuated @ by_theta
 
 
 def _moved_placements(
-    errors: ErrorMap, chosen: Indices, *, fixed: Array, columns: Array
+    map_: ErrorMap, chosen: Indices, *, fixed: Array, unit_errors: Array
 ) -> tuple[ca.Function, ca.Sparsity]:
     """Function of θ̂ and conditions: some placements and the nonzeros of their ∂ξ/∂θ̂.
 
     Args:
-        errors: The robot's error map.
+        map_: The robot's error map.
         chosen: Indices of the moved placements, shape (n,).
         fixed: Elementary errors at θ̂ = 0, shape (n_errors,), [SI].
-        columns: Elementary errors for one unit of each θ̂, shape (n_errors, n_free).
+        unit_errors: Elementary errors for one unit of each θ̂, shape (n_errors, n_free).
 
     Returns:
         The function, and the sparsity of ∂ξ/∂θ̂, shape (6 n, n_free).
     """
-    theta, conditions = ca.MX.sym("theta", columns.shape[1]), ca.MX.sym("u", errors.n_conditions)
+    theta, conditions = ca.MX.sym("theta", unit_errors.shape[1]), ca.MX.sym("u", map_.n_conditions)
     rows = (6 * chosen[:, None] + np.arange(6)).reshape(-1).tolist()
-    symbols = errors.twists.sx_in()
-    outputs = [v[rows, :] for v in errors.twists(*symbols)]
+    symbols = map_.twists.sx_in()
+    outputs = [v[rows, :] for v in map_.twists(*symbols)]
     twists = ca.Function("twists", symbols, outputs)
-    by_theta = ca.MX(ca.sparsify(ca.DM(columns)))
+    by_theta = ca.MX(ca.sparsify(ca.DM(unit_errors)))
     delta, by_errors = twists(conditions, ca.DM(fixed) + by_theta @ theta)
     values, right = ca.MX(12, 0), ca.MX(27, 0)
     if chosen.size:
         mapped = _moved_placement().map(chosen.size)
-        values, right = mapped(ca.reshape(delta, 6, -1), ca.DM(errors.nominal[chosen].T))
+        values, right = mapped(ca.reshape(delta, 6, -1), ca.DM(map_.nominal[chosen].T))
     blocks = ca.diagcat(ca.Sparsity(0, 0), *[_right_jacobian_sparsity()] * chosen.size)
     by_twists = ca.MX(blocks, ca.vec(right)) @ (by_errors @ by_theta)
     function = ca.Function(

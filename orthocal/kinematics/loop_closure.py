@@ -65,7 +65,7 @@ class LoopClosure:
         self.free = tuple(free)
         self._conditions = conditions
         self._functions = robot_functions(robot)
-        self._columns = self._functions.errors.columns(self.free)
+        self._unit_errors = self._functions.errors.unit_errors(self.free)
         self.fixed = {k: v for k, v in (fixed or {}).items() if k not in self.free}
         """Values of the parameters that are not free."""
         self._fixed = self._functions.errors.expand(self.fixed)
@@ -295,7 +295,7 @@ class LoopClosure:
 
     def errors(self, theta: ArrayLike | None = None) -> Array:
         """All elementary errors for values of the free parameters, shape (..., n_errors), [SI]."""
-        return np.asarray(self._fixed + self._theta(theta) @ self._columns.T)
+        return np.asarray(self._fixed + self._theta(theta) @ self._unit_errors.T)
 
     def geometry(self, theta: ArrayLike | None = None) -> MachineGeometry:
         """Geometry of machines for values of the free parameters; 0 by default."""

@@ -19,7 +19,7 @@ from orthocal.arrays import Array
 from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import robot_functions
-from orthocal.robot.closing import RANK_TOLERANCE
+from orthocal.robot.closing import invert_closures
 from orthocal.robot.model import Robot, require_tcp
 
 POSTURE_BLOCK_SIZE = 64
@@ -59,8 +59,8 @@ class ToolSensitivity:
         self.closure = LoopClosure(robot, fixed=values, conditions=conditions)
         self._functions = robot_functions(robot)
         errors = self._functions.errors
-        self._columns = errors.columns(self.free)
-        self._drive_errors = self._columns[errors.drive_errors]
+        self._unit_errors = errors.unit_errors(self.free)
+        self._drive_errors = self._unit_errors[errors.drive_errors]
 
     def __call__(
         self,
@@ -107,12 +107,14 @@ class ToolSensitivity:
     @cached_property
     def _placement_jacobian(self) -> Array:
         """∂ξ/∂θ of the placements under neutral conditions, shape (n_twists, n_free)."""
-        return self._functions.errors.jacobian(self.closure.errors(), self._columns)
+        return self._functions.errors.placement_jacobian(self.closure.errors(), self._unit_errors)
 
     def _placement_jacobians(self, commands: Array) -> Array:
         """∂ξ/∂θ of the placements under the conditions of commands, (K, n_twists, n_free)."""
         errors = np.tile(self.closure.errors(), (len(commands), 1))
-        return self._functions.errors.jacobian(errors, self._columns, command=commands)
+        return self._functions.errors.placement_jacobian(
+            errors, self._unit_errors, command=commands
+        )
 
     def _differentiate(self, commands: Array, passive: Array, placement_jacobian: Array) -> Array:
         """Equation of the module.
@@ -128,12 +130,7 @@ class ToolSensitivity:
         arguments = self.closure.inputs(commands, passive)
         _, p_a, p_q, p_xi = self._functions.tool_jacobian(*arguments)
         _, g_a, g_q, g_xi = self._functions.closure_jacobian(*arguments)
-        if g_q.shape[1] == g_q.shape[2]:
-            multiplier = np.swapaxes(
-                np.linalg.solve(np.swapaxes(g_q, 1, 2), np.swapaxes(p_q, 1, 2)), 1, 2
-            )
-        else:
-            multiplier = p_q @ np.linalg.pinv(g_q, rcond=RANK_TOLERANCE)
+        multiplier = p_q @ invert_closures(g_q)
         by_twists = p_xi - self._multiply_closures(multiplier, g_xi)
         _, drive_jacobian = self.closure.geometry().drive_derivatives(commands)
         by_drive_errors = (p_a - multiplier @ g_a) @ drive_jacobian

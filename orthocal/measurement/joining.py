@@ -13,7 +13,7 @@ from orthocal.effects.adjustment import subtract_amounts
 from orthocal.effects.loading import with_adjustments
 from orthocal.errors import SessionError
 from orthocal.measurement.files.session_file import load_session
-from orthocal.session.session import Posture, Session, Setup
+from orthocal.session.session import Posture, Session, Setup, split_label
 from orthocal.text import composed
 
 CACHE_SIZE = 4
@@ -58,12 +58,7 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
         return sessions[0]
     last = sessions[-1]
     for session in sessions:
-        if session.robot.sha256 != last.robot.sha256:
-            raise SessionError(
-                f"is of robot '{session.robot.name}'; another session is of '{last.robot.name}', "
-                "or of another version of it",
-                where=None if session.path is None else str(session.path),
-            )
+        require_same_robot(session, last)
         if session.robot.effect_names != last.robot.effect_names:
             names = (", ".join(s.robot.effect_names) or "none" for s in (session, last))
             raise SessionError(
@@ -100,6 +95,20 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
     )
 
 
+def require_same_robot(session: Session, other: Session) -> None:
+    """Refuse a session of another robot than that of another session.
+
+    Raises:
+        SessionError: If URDF or YAML of the robots differ; names both robots.
+    """
+    if session.robot.sha256 != other.robot.sha256:
+        raise SessionError(
+            f"is of robot '{session.robot.name}'; another session is of '{other.robot.name}', "
+            "or of another version of it",
+            where=None if session.path is None else str(session.path),
+        )
+
+
 def _join_tolerances(sessions: Sequence[Session]) -> dict[str, float]:
     """Stated tolerances of all sessions on one machine.
 
@@ -132,25 +141,16 @@ def split_sessions(session: Session) -> tuple[Session, ...]:
     """
     if not session.joined:
         return (session,)
-    labels = dict.fromkeys(_label_of(r.setup) for r in session.readings)
+    label_of = dict(zip(session.setups, session.labels, strict=True))
+    labels = dict.fromkeys(label_of[r.setup] for r in session.readings)
     return tuple(
         replace(
             session,
-            setups={name: s for name, s in session.setups.items() if _label_of(name) == label},
-            readings=tuple(r for r in session.readings if _label_of(r.setup) == label),
+            setups={name: s for name, s in session.setups.items() if label_of[name] == label},
+            readings=tuple(r for r in session.readings if label_of[r.setup] == label),
         )
         for label in labels
     )
-
-
-def name_within(name: str, *, joined: bool) -> str:
-    """Name of a setup or posture in its session before sessions were joined."""
-    return name.partition("/")[2] or name if joined else name
-
-
-def _label_of(name: str) -> str:
-    """Label of a session, the first part of a name in a joined session."""
-    return name.partition("/")[0]
 
 
 def _merged(mappings: Iterable[Mapping[str, Value]]) -> dict[str, Value]:
@@ -167,7 +167,7 @@ def _labels(sessions: Sequence[Session]) -> list[dict[str, str]]:
     names: list[tuple[int, str, str]] = []
     for i, session in enumerate(sessions):
         if session.joined:
-            names += [(i, label, label) for label in dict.fromkeys(map(_label_of, session.setups))]
+            names += [(i, label, label) for label in dict.fromkeys(session.labels)]
             continue
         folder = "" if session.path is None else session.path.resolve().parent.name
         label = "".join("_" if c.isspace() or c in ',;"/' else c for c in composed(folder))
@@ -188,10 +188,9 @@ def _rename(session: Session, labels: Mapping[str, str]) -> Session:
     """
 
     def named(name: str) -> str:
-        if not session.joined:
-            return f"{labels['']}/{name}" if name else labels[""]
-        old, slash, within = name.partition("/")
-        return f"{labels.get(old, old)}{slash}{within}"
+        old, within = split_label(name, joined=session.joined)
+        label = labels.get(old, old)
+        return f"{label}/{within}" if within else label
 
     active, aligned_at = session.active_offsets, session.alignment_postures
 

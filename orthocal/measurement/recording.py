@@ -35,7 +35,7 @@ from orthocal.measurement.files.point_rows import (
 )
 from orthocal.measurement.files.readings_checks import check_conditions, check_range
 from orthocal.measurement.files.readings_file import FIRST_LINE
-from orthocal.measurement.files.session_file import load_rows
+from orthocal.measurement.files.session_file import load_rows, session_digest
 from orthocal.measurement.files.session_keys import LARGEST_READING_MM, MOST_READINGS
 from orthocal.measurement.files.write_session import readings_table
 from orthocal.runtime.interrupts import postponed_interrupt
@@ -422,8 +422,8 @@ def _is_outdated(session: Session) -> bool:
     """True if the files of a session changed since they were loaded."""
     if session.path is None or session.readings_path is None:
         return True
-    contents = (read_file(f, error=SessionError) for f in (session.path, session.readings_path))
-    return _digest(b"\0".join(contents)) != session.sha256
+    keys, table = (read_file(f, error=SessionError) for f in (session.path, session.readings_path))
+    return session_digest(keys, table, session.compensation) != session.sha256
 
 
 def _write(csv: Path, content: bytes) -> None:

@@ -13,24 +13,19 @@ distributions, plans and studies use this module.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array, Indices
 from orthocal.effects.adjustment import find_adjustments
-from orthocal.kinematics.error_map import ErrorMap, VaryingDerivatives
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.robot_functions import RobotFunctions, robot_functions
 from orthocal.observation.manual_alignment import ManualAlignment, list_alignments, virtual_session
 from orthocal.observation.observations import (
     Observations,
-    States,
     adjustment_table,
     build_observations,
 )
@@ -40,7 +35,8 @@ from orthocal.observation.sensor_groups import (
     group_sensors,
     nuisance_parameters,
 )
-from orthocal.robot.closing import RANK_TOLERANCE
+from orthocal.observation.twist_derivatives import ClosurePattern, FreeParameters, TwistChain
+from orthocal.robot.closing import invert_closures
 from orthocal.session.session import Session
 
 MAX_POSTURES, MAX_READINGS = 64, 640
@@ -51,18 +47,6 @@ MAX_PREDICTED = 4096
 
 MIN_SPARSE_ROWS = 400
 """Rows from which a product with a sparse matrix is faster than with a dense one."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FreeParameters:
-    """Scaled free parameters θ̂: machine errors first, then nuisance parameters."""
-
-    columns: Array
-    """Elementary errors for one unit of each machine parameter, (n_errors, n_machine), [SI]."""
-    nuisance_scale: Array
-    """Values of one unit of each nuisance parameter, shape (n_nuisance,), [SI]."""
-    pattern: _ClosurePattern
-    """Nonzeros of ∂g/∂ξ for the twists ξ that the machine parameters change."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,68 +93,6 @@ class _Readings:
     (nnz,), and the nonzeros, (S, n, nnz)."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _ClosurePattern:
-    """Nonzeros of ∂g/∂ξ for the twists that free parameters change, sorted by rows of g."""
-
-    used: Indices
-    """Indices of the twists that free parameters change, shape (n_used,)."""
-    position: Indices
-    """Position of each twist in `used`, -1 for other twists, shape (n_twists,)."""
-    chosen: Indices
-    """Positions of the chosen nonzeros among all nonzeros, shape (nnz,)."""
-    rows: Indices
-    """Row of each chosen nonzero, shape (nnz,)."""
-    columns: Indices
-    """Twist of each chosen nonzero, shape (nnz,)."""
-
-    @staticmethod
-    def of(functions: RobotFunctions, columns: Array) -> _ClosurePattern:
-        """Pattern for parameters whose units are columns of elementary errors."""
-        moved = functions.errors.twists_moved_by(columns).reshape(-1, 6).any(axis=1)
-        used = np.flatnonzero(np.repeat(moved, 6))
-        position = np.full(functions.n_twists, -1)
-        position[used] = np.arange(used.size)
-        rows, twists = functions.twist_pattern
-        chosen = np.flatnonzero(position[twists] >= 0)
-        chosen = chosen[np.argsort(rows[chosen], kind="stable")]
-        return _ClosurePattern(used, position, chosen, rows[chosen], twists[chosen])
-
-    def dense(self, nonzeros: Array, n_rows: int) -> Array:
-        """Dense ∂g/∂ξ, shape (S, k, n_rows, n_used), of nonzeros, shape (S, k, nnz)."""
-        result: Array = np.zeros((*nonzeros.shape[:2], n_rows * self.used.size))
-        result[:, :, self.rows * self.used.size + self.position[self.columns]] = nonzeros
-        return result.reshape(*nonzeros.shape[:2], n_rows, self.used.size)
-
-    def times(self, nonzeros: Array, twists: Array, n_rows: int) -> Array:
-        """Product ∂g/∂ξ · ξ.
-
-        Args:
-            nonzeros: Nonzeros of ∂g/∂ξ, shape (S, k, nnz).
-            twists: ξ, shape (S, k, n_twists) or (S, 1, n_twists).
-            n_rows: Number of rows of g.
-
-        Returns:
-            Shape (S, k, n_rows).
-        """
-        n_sets = max(len(twists), len(nonzeros))
-        result = np.zeros((n_sets, nonzeros.shape[1], n_rows))
-        for row, part in self._row_slices(n_rows):
-            factors = twists[:, :, self.columns[part]]
-            if twists.shape[1] == 1:
-                result[..., row] = (nonzeros[..., part] @ np.swapaxes(factors, 1, 2))[..., 0]
-            else:
-                result[..., row] = (nonzeros[..., part] * factors).sum(axis=-1)
-        return result
-
-    def _row_slices(self, n_rows: int) -> Iterator[tuple[int, slice]]:
-        """Rows with nonzeros, and the slice of the nonzeros of each."""
-        starts = np.searchsorted(self.rows, np.arange(n_rows + 1)).tolist()
-        for row, (first, end) in enumerate(itertools.pairwise(starts)):
-            if end > first:
-                yield row, slice(first, end)
-
-
 class ObservationModel:
     """Readings of a session's entries as functions of errors and nuisance parameters.
 
@@ -211,19 +133,19 @@ class ObservationModel:
             index = [a.parameter for a in alignments]
             virtual = virtual_session(self.session, alignments)
             by_errors = nominal_sensitivity(virtual)
-            offsets = errors.columns([f"{d.name}.offset" for d in self.session.robot.drives])
+            offsets = errors.unit_errors([f"{d.name}.offset" for d in self.session.robot.drives])
             active = np.array([a.active for a in alignments])
             sensitivity[index] = by_errors
             start[index] = -((by_errors @ offsets) * active).sum(axis=1)
             amounts = [a.parameter for a in find_adjustments(self.session.robot)]
-            changes = (by_errors @ errors.columns(amounts)) * adjustment_table(virtual)
+            changes = (by_errors @ errors.unit_errors(amounts)) * adjustment_table(virtual)
             start[index] += changes.sum(axis=1)
         return ManualAlignment(sensitivity, start)
 
-    def parametrise(self, columns: Array, nuisance_scale: Array) -> FreeParameters:
+    def parametrise(self, unit_errors: Array, nuisance_scale: Array) -> FreeParameters:
         """Free parameters for `linearise`; arguments are the fields of `FreeParameters`."""
-        pattern = _ClosurePattern.of(self.functions, columns)
-        return FreeParameters(columns, nuisance_scale, pattern)
+        pattern = ClosurePattern.of(self.functions, unit_errors)
+        return FreeParameters(unit_errors, nuisance_scale, pattern)
 
     def predict(
         self,
@@ -467,7 +389,7 @@ class ReadingLinearisation:
         batch: bool,
     ) -> None:
         self._model, self._free, self._batch = model, free, batch
-        alignment_by_theta = alignment @ free.columns
+        alignment_by_theta = alignment @ free.unit_errors
         self._machines = _Machines(model, errors)
         geometry = self._machines.geometry
         _, self._by_drive_errors = geometry.drive_derivatives(model.states.commands)
@@ -476,9 +398,9 @@ class ReadingLinearisation:
         map_, n_sets = model.functions.errors, len(errors)
         n = model.observations.size + model.paired.size
         sparse = n_sets == 1 and n >= MIN_SPARSE_ROWS
-        self._twists = _TwistChain(map_, errors, model.states, free, sparse=sparse)
-        self._by_machine = free.columns[map_.drive_errors]
-        n_machine, n_nuisance = free.columns.shape[1], free.nuisance_scale.size
+        self._twists = TwistChain(map_, errors, model.states, free, sparse=sparse)
+        self._by_machine = free.unit_errors[map_.drive_errors]
+        n_machine, n_nuisance = free.unit_errors.shape[1], free.nuisance_scale.size
         reading, opening = np.empty((n_sets, n)), np.empty((n_sets, n))
         correction = np.zeros_like(passive, dtype=np.float64)
         jacobian = np.empty((n_sets, n, n_machine + n_nuisance))
@@ -518,7 +440,7 @@ class ReadingLinearisation:
             Shape (S, n_states, n_passive), [m, rad], including `correction`.
         """
         changes = np.atleast_2d(change)
-        machine = changes[:, : self._free.columns.shape[1], None]
+        machine = changes[:, : self._free.unit_errors.shape[1], None]
         twists = self._twists.follow(machine)
         drive_errors = (self._by_machine @ machine)[:, None]
         correction = self.correction if self._batch else self.correction[None]
@@ -542,7 +464,9 @@ class ReadingLinearisation:
         )
         g, g_a, g_q, nonzeros = (v.reshape(n_sets, k, *v.shape[1:]) for v in outputs)
         by_drive_errors = g_a @ self._by_drive_errors[:, block.states]
-        return _Closures(g, _inverse(g_q), by_drive_errors, nonzeros[:, :, self._pattern.chosen])
+        return _Closures(
+            g, invert_closures(g_q), by_drive_errors, nonzeros[:, :, self._pattern.chosen]
+        )
 
     def _evaluate_readings(self, block: _Block, passive: Array, nuisance: Array) -> _Readings:
         """Readings of a block and their derivatives with constant passive coordinates."""
@@ -604,100 +528,6 @@ class ReadingLinearisation:
         return values if self._batch else values[0]
 
 
-class _TwistChain:
-    """Chain rule from the twists of placements to the machine parameters, for S machines.
-
-    Args:
-        map_: The error map.
-        errors: Elementary errors of the machines, shape (S, n_errors), [SI].
-        states: Loop closures, with the conditions of their placements.
-        free: The free parameters.
-        sparse: Use a sparse matrix, which is possible for one machine.
-    """
-
-    def __init__(
-        self, map_: ErrorMap, errors: Array, states: States, free: FreeParameters, *, sparse: bool
-    ) -> None:
-        pattern, commands = free.pattern, states.variant_commands
-        self._used, self._columns, self._variant = pattern.used, free.columns, states.variant
-        self._map, self._errors, self._command = map_, errors, commands[0]
-        self._sparse = sparse and self._used.size > 0
-        self._delta_jacobian = map_.twist_columns(errors, free.columns, self._command)
-        self._right = np.zeros((1, len(map_.moved), 6, 6))
-        if self._used.size:
-            self._right = map_.right_jacobians(errors, self._command)
-        self._varying: VaryingDerivatives | None = None
-        if len(commands) > 1 and self._used.size:
-            self._varying = map_.varying_derivatives(errors, free.columns, commands)
-            self._of_varying = (6 * map_.varying[:, None] + np.arange(6)).reshape(-1)
-            self._positions = pattern.position[self._of_varying]
-
-    @cached_property
-    def _matrix(self) -> Any:  # noqa: ANN401 - SciPy has no types
-        """∂ξ/∂θ̂ of the used twists, shape (S, n_used, n); or its transpose as a sparse matrix.
-
-        Rows of twists that vary with the conditions are 0.
-        """
-        jacobian = self._map.jacobian(
-            self._errors, self._columns, command=self._command, right=self._right
-        )
-        if self._varying is not None:
-            jacobian[:, self._of_varying] = 0.0
-        matrix = jacobian[:, self._used]
-        if not self._sparse:
-            return matrix
-        from scipy.sparse import csr_array
-
-        return csr_array(matrix[0].T)
-
-    def __call__(self, rows: Array, states: Indices) -> Array:
-        """Derivatives with respect to machine parameters.
-
-        Args:
-            rows: Derivatives with respect to the used twists, shape (S, n, n_used).
-            states: Loop closure of each row, shape (n,).
-
-        Returns:
-            Shape (S, n, n_machine).
-        """
-        if self._sparse:
-            result = np.asarray((self._matrix @ np.ascontiguousarray(rows[0].T)).T[None])
-        else:
-            result = np.asarray(rows @ self._matrix)
-        if self._varying is not None:
-            result += self._by_varying(self._varying, rows, self._variant[states])
-        return result
-
-    def _by_varying(self, varying: VaryingDerivatives, rows: Array, variant: Indices) -> Array:
-        """Contribution of the placements that vary to the result of a call."""
-        by_xi = np.where(self._positions >= 0, rows[:, :, self._positions], 0.0)
-        by_delta = by_xi.reshape(*rows.shape[:2], -1, 1, 6) @ varying.right[:, variant]
-        by_delta = by_delta.reshape(*rows.shape[:2], -1)
-        by_errors = (by_delta[:, :, None, varying.rows] @ varying.jacobian[:, variant])[:, :, 0]
-        return np.asarray(by_delta @ varying.constant + by_errors @ varying.columns)
-
-    def follow(self, change: Array) -> Array:
-        """Twists ∂ξ for changes of machine parameters.
-
-        Args:
-            change: Changes, shape (D, n_machine, 1).
-
-        Returns:
-            Shape (D, 1, n_twists), or (D, V, n_twists) if placements vary under V conditions.
-        """
-        delta = (self._delta_jacobian @ change).reshape(len(change), -1, 6, 1)
-        result = np.asarray((self._right @ delta).reshape(len(change), 1, -1))
-        varying = self._varying
-        if varying is None:
-            return result
-        result = np.repeat(result, varying.right.shape[1], axis=1)
-        delta = np.repeat((varying.constant @ change)[:, None], result.shape[1], axis=1)
-        delta[:, :, varying.rows] += varying.jacobian @ (varying.columns @ change)[:, None]
-        xi = varying.right @ delta.reshape(*delta.shape[:2], -1, 6, 1)
-        result[:, :, self._of_varying] = xi.reshape(*delta.shape[:2], -1)
-        return result
-
-
 def predict_readings(
     session: Session,
     errors: Mapping[str, float] | None = None,
@@ -745,11 +575,3 @@ def nominal_sensitivity(session: Session) -> Array:
     passive = closure.close(model.states.commands, names=model.states.names)
     linear = model.linearise(closure.errors(), passive, free=free, aligned=False)
     return linear.jacobian[:, :n]
-
-
-def _inverse(matrices: ArrayLike) -> Array:
-    """Inverses of square matrices, shape (..., n, n); pseudo-inverses of others."""
-    m: Array = np.asarray(matrices)
-    if m.shape[-2] == m.shape[-1]:
-        return np.asarray(np.linalg.inv(m))
-    return np.asarray(np.linalg.pinv(m, rcond=RANK_TOLERANCE))

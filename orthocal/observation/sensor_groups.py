@@ -12,7 +12,10 @@ from orthocal.observation.observations import Observations
 from orthocal.robot.parameters import Parameter
 from orthocal.sensors.compiled import CompiledReading, compile_reading
 from orthocal.sensors.protocol import NuisanceParameter
-from orthocal.session.session import Session, Setup
+from orthocal.session.session import Session, Setup, split_label
+
+OF_GAUGE = "gauge."
+"""Beginning of the names of parameters of a gauge, which all its setups and sessions share."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,12 +71,12 @@ def nuisance_parameters(session: Session) -> NuisanceParameters:
 
 def _owner(parameter: NuisanceParameter, setup: Setup, session: Session) -> str:
     """Owner of a nuisance parameter: a gauge, an object that setups share, or the setup."""
-    label, joined, _ = setup.name.partition("/") if session.joined else ("", "", "")
     if parameter.of_gauge:
-        gauge = setup.gauge if not label else setup.gauge.partition("/")[2]
+        _, gauge = split_label(setup.gauge, joined=session.joined)
         return f"gauge.{gauge}" if gauge else "gauge"
     if parameter.shared_by is not None:
-        return f"{label}{joined}{parameter.shared_by}"
+        label, _ = split_label(setup.name, joined=session.joined)
+        return f"{label}/{parameter.shared_by}" if label else parameter.shared_by
     return f"setup.{setup.name}"
 
 

@@ -18,7 +18,7 @@ from orthocal.errors import ParameterError, SessionError
 from orthocal.io.documents import Number, parse_number, read_yaml, validate
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import Observations, build_observations
-from orthocal.observation.sensor_groups import nuisance_parameters
+from orthocal.observation.sensor_groups import OF_GAUGE, nuisance_parameters
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import Parameter, ParameterSet, errors_at
 from orthocal.session.session import Reading, Session
@@ -252,8 +252,18 @@ class _TruthKeys(BaseModel):
     sensors: dict[str, Number] = {}
 
 
-def load_errors(path: str | Path, robot: Robot) -> dict[str, float]:
+def load_errors(
+    path: str | Path, robot: Robot, nuisance: Iterable[Parameter] = ()
+) -> dict[str, float]:
     """Load errors from a YAML file: `errors:` with keys such as x_slide.offset_mm.
+
+    A gauge keeps its errors: those that the file lists under `sensors`, such as the scale of a dial
+    or the length of a bar, are loaded too. Setups are mounted anew.
+
+    Args:
+        path: The file, such as a truth.yaml.
+        robot: The robot.
+        nuisance: Nuisance parameters of the plan to simulate.
 
     Returns:
         Names of parameters, mapped to values, [SI].
@@ -264,7 +274,10 @@ def load_errors(path: str | Path, robot: Robot) -> dict[str, float]:
     file = Path(path)
     data = read_yaml(file, error=ParameterError)
     keys = validate(_TruthKeys, data, where=str(file), error=ParameterError)
-    return read_errors(keys.errors, robot.parameters, where=f"{file}: errors")
+    errors = read_errors(keys.errors, robot.parameters, where=f"{file}: errors")
+    of_gauges = ParameterSet((), (p for p in nuisance if p.name.startswith(OF_GAUGE)))
+    known = {k: v for k, v in keys.sensors.items() if k.rpartition("_")[0] in of_gauges}
+    return errors | read_errors(known, of_gauges, where=f"{file}: sensors")
 
 
 def collect_errors(
@@ -283,7 +296,7 @@ def collect_errors(
         file: YAML file for `load_errors`.
         single: Texts such as x_slide.offset_mm=1.2.
         draw: Model of the robot, or names and globs separated by commas, to draw.
-        nuisance: Nuisance parameters of a plan, which texts may state in addition to errors.
+        nuisance: Nuisance parameters of a plan: texts may state any, a file those of gauges.
         seed: Seed of the random numbers.
 
     Returns:
@@ -292,7 +305,7 @@ def collect_errors(
     Raises:
         ParameterError: If a name, unit or number is not valid, or there are no errors.
     """
-    errors: dict[str, float] = {}
+    errors, nuisance = dict[str, float](), tuple(nuisance)
     if draw is not None:
         models = robot.parameters.models
         is_model = draw in models
@@ -312,7 +325,7 @@ def collect_errors(
                 where="--draw",
             ) from None
     if file is not None:
-        errors.update(load_errors(file, robot))
+        errors.update(load_errors(file, robot, nuisance))
     parameters = ParameterSet((), (*robot.parameters, *nuisance))
     for text in single:
         key, equals, number = text.partition("=")

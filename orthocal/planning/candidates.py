@@ -17,6 +17,7 @@ from orthocal.arrays import Array, Indices
 from orthocal.effects.loading import robot_effects
 from orthocal.errors import ParameterError
 from orthocal.estimation.problem import CalibrationProblem
+from orthocal.estimation.weighting import stated_sigma
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import can_approach, usual_approaches
 from orthocal.observation.contacts import locate_contacts
@@ -31,7 +32,6 @@ from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.tips import Tip
 from orthocal.session.points import names_in_files
 from orthocal.session.session import Conditions, Gauge, Posture, Reading, Session, Setup
-from orthocal.statistics.noise import noise_floor
 from orthocal.units import MM
 
 POSITIONS_ACROSS = 5
@@ -212,7 +212,7 @@ def measure_candidates(
         problem: Calibration problem of that session, with priors for all free parameters.
         spare_range: Prior standard deviations of readings that must fit into the gauge's range.
     """
-    sigma = noise_floor(session.gauge.sigma, session.gauge.resolution)
+    sigma = stated_sigma(session.gauge)
     h, jacobian = problem.predict_and_jacobian(problem.active_theta)
     n, o = problem.n_machine, problem.observations
     private = {f"setup.{name}" for name in session.setups}

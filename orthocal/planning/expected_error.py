@@ -26,18 +26,19 @@ from orthocal.errors import ClosureError, SessionError
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.estimation.selection import Selection
-from orthocal.estimation.weighting import split_by_gauge
+from orthocal.estimation.weighting import split_by_gauge, stated_sigma
 from orthocal.kinematics.conditions import UseSamples, effects_by_condition, sample_use
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace
 from orthocal.observation.observations import build_observations
+from orthocal.observation.sensor_groups import OF_GAUGE
 from orthocal.robot.model import Robot
 from orthocal.runtime.worker_pool import call_in_parallel, current_worker_budget
 from orthocal.session.session import Session
 from orthocal.statistics.information import VAGUE, Information
-from orthocal.statistics.noise import estimate_repeatability, noise_floor
+from orthocal.statistics.noise import estimate_repeatability
 from orthocal.statistics.zeros import project_out_zeros
 
 Criterion = Literal["aligned", "relative", "absolute", "worst", "A", "D", "E"]
@@ -46,9 +47,6 @@ worst point with translation and rotation removed. A, D, E: trace, determinant o
 of the covariance of the parameters, in prior std."""
 
 CRITERIA: tuple[Criterion, ...] = ("aligned", "relative", "absolute", "worst", "A", "D", "E")
-
-OF_GAUGE = "gauge."
-"""Beginning of the names of parameters that all sessions with a gauge share."""
 
 WORST_POWER = 8.0
 """Exponent of the power mean that approximates the largest variance of the points."""
@@ -204,7 +202,7 @@ class ToolForecast:
         """
         problem = self.problem(session)
         others = self._jacobian_of_others(session)
-        noise = noise_of(session)
+        noise = stated_sigma(session.gauge)
         drawn = list(self._draw(problem, entered=entered)) if machines is None else machines
         _, closed, reached = problem.simulate(np.array(drawn))
 
@@ -233,7 +231,7 @@ class ToolForecast:
         """Expected tool error to first order about the nominal machine, as in the search."""
         problem = self.problem(session)
         others = self._jacobian_of_others(session)
-        noise = noise_of(session)
+        noise = stated_sigma(session.gauge)
         covariance, _ = self._posterior(problem, others, problem.active_theta, noise)
         if covariance is None:
             raise ClosureError("cannot be read", posture="the planned ones")
@@ -405,7 +403,7 @@ def _information(problem: CalibrationProblem, state: Sequence[str], measured: Se
     """
     _, jacobian = problem.predict_and_jacobian(problem.active_theta)
     jacobian = project_out_zeros(jacobian, problem.observations)
-    information = jacobian.T @ jacobian / noise_of(measured) ** 2
+    information = jacobian.T @ jacobian / stated_sigma(measured.gauge) ** 2
     lasting = {
         name
         for i, name in enumerate(problem.free)
@@ -426,11 +424,6 @@ def _information(problem: CalibrationProblem, state: Sequence[str], measured: Se
     return of_state
 
 
-def noise_of(session: Session) -> float:
-    """Standard deviation of a reading of the first gauge, [m]."""
-    return noise_floor(session.gauge.sigma, session.gauge.resolution)
-
-
 def with_gauge_noise(problem: CalibrationProblem) -> CalibrationProblem:
     """Problem with noise ratios from the stated repeatability of the gauges."""
     session = problem.session
@@ -439,8 +432,7 @@ def with_gauge_noise(problem: CalibrationProblem) -> CalibrationProblem:
         return problem
     noise = np.ones(problem.observations.size)
     for group in groups:
-        floor = noise_floor(group.gauge.sigma, group.gauge.resolution)
-        noise[group.entries] = floor / noise_of(session)
+        noise[group.entries] = stated_sigma(group.gauge) / stated_sigma(session.gauge)
     return problem.with_noise_ratio(noise)
 
 

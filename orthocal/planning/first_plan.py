@@ -11,12 +11,13 @@ from orthocal.arrays import Array
 from orthocal.assessment.effect_limits import EffectLimits, find_limits
 from orthocal.errors import ParameterError, RobotError
 from orthocal.estimation.choice import Choice
+from orthocal.estimation.weighting import stated_sigma
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.workspace import tool_at_zero
 from orthocal.measurement.motion.approach import state_common_approach
 from orthocal.planning.candidates import ON_AXIS, directions_across
 from orthocal.planning.equipment import Equipment, choose_box, place_tool, posture_name
-from orthocal.planning.expected_error import Expected, ToolForecast, noise_of
+from orthocal.planning.expected_error import Expected, ToolForecast
 from orthocal.planning.further_readings import FurtherReadings
 from orthocal.planning.sensor_gains import SensorGain, find_sensor_gains
 from orthocal.robot.model import Leg, Robot
@@ -92,7 +93,7 @@ def expect_fixed(session: Session, choice: Choice, equipment: Equipment) -> Fixe
         known=forecast.before,
         expected=forecast.after(course),
         first_round=forecast.after(course, entered=False),
-        effects=find_limits(forecast.problem(course), noise_of(course)),
+        effects=find_limits(forecast.problem(course), stated_sigma(course.gauge)),
     )
 
 

@@ -32,16 +32,24 @@ class Pairs:
     """Second reading of each pair, shape (n_pairs,)."""
     flat: Indices
     """Index of each pair in a flattened matrix of shape (m, m), shape (n_pairs,)."""
+    within_range: Indices
+    """Number of readings within the gauge's range if it is aligned in each reading, shape (m,)."""
 
     @staticmethod
-    def of(setup: CandidateSetup, count: int) -> Pairs:
-        """Pairs whose first reading has at least `count` readings within the gauge's range."""
-        enough = setup.reachable.sum(axis=1) >= count
-        allowed = setup.reachable & enough[:, None]
+    def of(setup: CandidateSetup) -> Pairs:
+        """All pairs within the gauge's range."""
+        allowed = setup.reachable.copy()
         np.fill_diagonal(allowed, False)
         flat = np.flatnonzero(allowed)
         first, second = np.divmod(flat, len(allowed))
-        return Pairs(first, second, flat)
+        return Pairs(first, second, flat, setup.reachable.sum(axis=1))
+
+    def with_count(self, count: int) -> Pairs:
+        """Pairs whose first reading has at least `count` readings within the gauge's range."""
+        if (self.within_range >= count).all():
+            return self
+        kept = self.within_range[self.first] >= count
+        return Pairs(self.first[kept], self.second[kept], self.flat[kept], self.within_range)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,11 +10,11 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field
 
 from orthocal.errors import SessionError
+from orthocal.estimation.weighting import stated_sigma
 from orthocal.io.documents import Number, read_yaml, validate
 from orthocal.measurement.files.session_keys import GaugeKeys
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Gauge
-from orthocal.statistics.noise import noise_floor
 
 DIAL = "dial"
 """Name of the gauge for legs in plans with sensors at the tool."""
@@ -125,7 +125,7 @@ def load_owned_sensor(path: str | Path) -> OwnedSensor:
     gauge_keys = {k: v for k, v in data.items() if k in GaugeKeys.model_fields}
     shared = {"scale_tolerance", "tip"}
     gauge = validate(GaugeKeys, gauge_keys, where=str(file), error=SessionError).to_gauge()
-    if not noise_floor(gauge.sigma, gauge.resolution) > 0.0:
+    if not stated_sigma(gauge) > 0.0:
         raise SessionError(
             "is missing; a plan needs the repeatability of the readings", where=f"{file}: sigma_mm"
         )

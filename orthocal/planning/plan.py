@@ -15,6 +15,7 @@ from orthocal.assessment.remaining_errors import RemainingError, rank_errors
 from orthocal.effects.loading import robot_effects, with_effects
 from orthocal.errors import ParameterError
 from orthocal.estimation.choice import Choice, resolve_choice
+from orthocal.estimation.weighting import stated_sigma
 from orthocal.kinematics.workspace import Workspace
 from orthocal.measurement.motion.approach import usual_approaches
 from orthocal.planning.candidates import (
@@ -38,7 +39,6 @@ from orthocal.planning.expected_error import (
     Criterion,
     Expected,
     ToolForecast,
-    noise_of,
     state_noise,
 )
 from orthocal.planning.further_readings import FurtherReadings, find_further_readings
@@ -385,7 +385,7 @@ def _evaluate(
                     if measured is None
                     else forecast.after(measured, entered=comparison.entered)
                 ),
-                lambda: find_limits(forecast.problem(joined), noise_of(joined)),
+                lambda: find_limits(forecast.problem(joined), stated_sigma(joined.gauge)),
             ),
             killed=KILLED,
         )

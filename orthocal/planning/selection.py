@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import zip_longest
 from typing import cast
@@ -51,7 +51,7 @@ MIN_TOTAL_CANDIDATES = 20_000
 KILLED = "a process that chose readings was killed"
 
 ROUNDING_ERROR = 1e-6
-"""Relative rounding error of `Gains.rough_error`."""
+"""Relative rounding error of the errors of `Gains.refine`."""
 
 MAX_EXACTLY_RANKED = 2_000
 """Most candidate readings with which setups are ranked with the gauge aligned in each posture."""
@@ -102,8 +102,8 @@ class SetupSearch:
     """Orthonormal directions B of the state on which readings depend, (n_directions, n_state)."""
     reduced: tuple[CandidateSetup, ...]
     """Candidate setups with Jacobians A Bᵀ with respect to these directions."""
-    pairs: dict[tuple[int, int], Pairs] = field(default_factory=dict)
-    """Cached first pairs by candidate setup and number of readings."""
+    pairs: tuple[Pairs, ...]
+    """First pairs of readings of each candidate setup."""
 
     @staticmethod
     def of(candidates: Candidates, prior: Array, weight: WeightFunction) -> SetupSearch:
@@ -130,7 +130,9 @@ class SetupSearch:
             )
             for k in candidates.setups
         )
-        return SetupSearch(candidates.without_session, np.array(prior), weight, basis, reduced)
+        first_pairs = tuple(map(Pairs.of, reduced))
+        prior = np.array(prior)
+        return SetupSearch(candidates.without_session, prior, weight, basis, reduced, first_pairs)
 
     def choose(
         self,
@@ -280,10 +282,8 @@ class SetupSearch:
         others = plan.information - self.information_of(old)
         gains = Gains.of(self, others)
         ranked = gains.rank(len(old.chosen))[:MAX_REFINED]
-        restarted = (s for r in ranked for s in gains.restart(r))
-        for new in dict.fromkeys(gains.exchange_readings(s) for s in (old, *restarted)):
-            new = gains.exchange_first(new)
-            if gains.rough_error(new) > best.error * (1.0 + ROUNDING_ERROR):
+        for new, rough_error in gains.refine([old], restarted=ranked):
+            if rough_error > best.error * (1.0 + ROUNDING_ERROR):
                 continue
             information = others + self.information_of(new)
             error = self.error_of(information)
@@ -311,8 +311,6 @@ class Gains:
     """tr(T C); None if T depends on C."""
     averaged: bool
     """Whether setups are ranked with the alignment averaged over all postures."""
-    computed: dict[tuple[int, int | None, bool], Gain] = field(default_factory=dict)
-    """Cached gains by candidate setup, first reading, and whether the alignment is averaged."""
 
     @staticmethod
     def of(search: SetupSearch, information: Array) -> Gains:
@@ -325,60 +323,44 @@ class Gains:
         averaged = search.candidates.count > MAX_EXACTLY_RANKED
         return Gains(search, reduced @ search.basis.T, reduced @ root, total, averaged)
 
-    def setup(self, which: int, first: int | None = None) -> Gain:
-        """Gain by a candidate setup that begins with one of its readings."""
-        key = which, first if self.search.reduced[which].aligned else None, False
-        if key not in self.computed:
-            reduced = self.search.reduced[which]
-            self.computed[key] = (
-                self._compute(reduced) if key[1] is None else self.setup(which).begin_with(key[1])
-            )
-        return self.computed[key]
-
-    def _ranking_setup(self, which: int) -> Gain:
-        """Gain for ranking.
-
-        With many candidates the alignment is averaged over all postures, in half the time.
-        """
-        reduced = self.search.reduced[which]
-        if not (reduced.aligned and self.averaged):
-            return self.setup(which)
-        key = which, None, True
-        if key not in self.computed:
-            self.computed[key] = self._compute(replace(reduced, aligned=()))
-        return self.computed[key]
-
-    def _compute(self, setup: CandidateSetup) -> Gain:
+    def gain_of(self, setup: CandidateSetup) -> Gain:
         """Gain by a candidate setup."""
         kind = SetupGain if setup.width == 1 else PointGain
         return kind.of(setup, self.covariance, self.root, self.search.candidates.sigma)
 
-    def _pairs(self, which: int, count: int) -> Pairs:
-        """First pairs of a candidate setup with `count` readings, cached."""
-        key, pairs = (which, count), self.search.pairs
-        if key not in pairs:
-            pairs[key] = Pairs.of(self.search.reduced[which], count)
-        return pairs[key]
+    def refine(
+        self, setups: Sequence[PlannedSetup], *, restarted: Sequence[PlannedSetup] = ()
+    ) -> list[tuple[PlannedSetup, float]]:
+        """Setups with each reading exchanged for a better one, without repetition.
 
-    def rough_error(self, planned: PlannedSetup) -> float:
+        Args:
+            setups: The setups.
+            restarted: Setups that are first completed greedily from each of their best pairs.
+
+        Returns:
+            Setups, and the error with each from its gain; 0 if T depends on the covariance.
+        """
+        candidates = {s.candidate for s in (*setups, *restarted)}
+        gain_of = {which: self.gain_of(self.search.reduced[which]) for which in candidates}
+        starts = [*setups, *(s for r in restarted for s in self._restart(r, gain_of[r.candidate]))]
+        exchanged = dict.fromkeys(_exchange_readings(s, gain_of[s.candidate]) for s in starts)
+        refined = [_exchange_first(s, gain_of[s.candidate]) for s in exchanged]
+        return [(s, self.rough_error(s, gain_of[s.candidate])) for s in refined]
+
+    def rough_error(self, planned: PlannedSetup, gain: Gain) -> float:
         """Error with an additional setup, from its gain; 0 if T depends on the covariance."""
         if self.total is None:
             return 0.0
-        (gain,) = self.setup(planned.candidate).gains(np.array([planned.chosen]))
-        return math.sqrt(max(self.total - gain, 0.0))
+        return math.sqrt(max(self.total - float(gain.gains(np.array([planned.chosen]))[0]), 0.0))
 
-    def exchange_first(self, planned: PlannedSetup) -> PlannedSetup:
-        """Setup that begins with another reading, chosen or not, if this gains more."""
-        setup, chosen = self.search.reduced[planned.candidate], planned.chosen
-        if not setup.aligned:
-            return planned
-        reordered = [(first, *(i for i in chosen if i != first)) for first in chosen]
-        new_first = np.setdiff1d(np.arange(len(setup.rows)), chosen)
-        others = np.broadcast_to(chosen[1:], (len(new_first), len(chosen) - 1))
-        sets = np.vstack([reordered, np.column_stack([new_first, others])])
-        possible = sets[setup.reachable[sets[:, :1], sets].all(axis=1)]
-        best = first_largest(self.setup(planned.candidate).gains(possible))
-        return PlannedSetup(planned.candidate, tuple(possible[best].tolist()))
+    def _restart(self, planned: PlannedSetup, gain: Gain) -> list[PlannedSetup]:
+        """Setups completed greedily from each of the best pairs of readings."""
+        which, count = planned.candidate, len(planned.chosen)
+        pairs = gain.best_pairs(self.search.pairs[which].with_count(count), MAX_PAIRS)
+        return [
+            PlannedSetup(which, gain.begin_with(pair[0]).complete(pair, count)[1])
+            for _, pair in pairs
+        ]
 
     def rank(self, count: int) -> list[PlannedSetup]:
         """Best readings of candidate setups, completed greedily; largest gain first.
@@ -386,67 +368,80 @@ class Gains:
         Only the best setups of `begin` are completed.
         """
         completed = []
-        for which, pair in self.begin(count):
+        for which, pair, gain in self.begin(count):
             if count < self.search.reduced[which].min_readings:
                 continue
-            gain, chosen = self.setup(which, pair[0]).complete(pair, count)
-            completed.append((gain, PlannedSetup(which, chosen)))
+            total, chosen = gain.complete(pair, count)
+            completed.append((total, PlannedSetup(which, chosen)))
         return [planned for _, planned in sort_by(completed, lambda c: c[0])]
 
     def begin(
         self, count: int, gauges: Collection[str] | None = None
-    ) -> list[tuple[int, tuple[int, int]]]:
-        """Candidate setups and their best pairs of readings, the largest gain first.
+    ) -> list[tuple[int, tuple[int, int], Gain]]:
+        """Candidate setups that begin with their best pairs of readings, the largest gain first.
 
-        At most MAX_COMPLETED setups of each gauge are listed.
+        At most MAX_COMPLETED setups of each gauge are listed. With many candidates they are ranked
+        with the alignment averaged over all postures, in half the time.
 
         Args:
             count: Number of readings that the gauge's range must allow.
             gauges: Names of the gauges; by default all.
+
+        Returns:
+            The candidate setup, the pair, and the gain with the gauge aligned in its first reading.
         """
-        candidates = [
-            (gain, which, pair)
-            for which, setup in enumerate(self.search.reduced)
-            if (gauges is None or setup.gauge in gauges) and self._pairs(which, count).flat.size
-            for gain, pair in self._ranking_setup(which).best_pairs(self._pairs(which, count), 1)
-        ]
+        candidates = []
+        for which, setup in enumerate(self.search.reduced):
+            pairs = self.search.pairs[which].with_count(count)
+            if (gauges is None or setup.gauge in gauges) and pairs.flat.size:
+                ranked = replace(setup, aligned=()) if self.averaged else setup
+                gain = self.gain_of(ranked)
+                candidates += [(best, which, p, gain) for best, p in gain.best_pairs(pairs, 1)]
         listed: Counter[str] = Counter()
         best = []
-        for _, which, pair in sort_by(candidates, lambda c: c[0]):
-            gauge = self.search.reduced[which].gauge
-            listed[gauge] += 1
-            if listed[gauge] <= MAX_COMPLETED:
-                best.append((which, pair))
+        for _, which, pair, gain in sort_by(candidates, lambda c: c[0]):
+            setup = self.search.reduced[which]
+            listed[setup.gauge] += 1
+            if listed[setup.gauge] <= MAX_COMPLETED:
+                exact = self.gain_of(setup) if self.averaged and setup.aligned else gain
+                best.append((which, pair, exact.begin_with(pair[0])))
         return best
 
-    def restart(self, planned: PlannedSetup) -> list[PlannedSetup]:
-        """Setups completed greedily from each of the best pairs of readings."""
-        which, count = planned.candidate, len(planned.chosen)
-        return [
-            PlannedSetup(which, self.setup(which, pair[0]).complete(pair, count)[1])
-            for _, pair in self.setup(which).best_pairs(self._pairs(which, count), MAX_PAIRS)
-        ]
 
-    def exchange_readings(self, planned: PlannedSetup) -> PlannedSetup:
-        """Setup with each reading in turn exchanged for the best one in addition to the others."""
-        setup, chosen = self.search.reduced[planned.candidate], list(planned.chosen)
-        for _ in range(MAX_PASSES):
-            before = list(chosen)
-            gain = self.setup(planned.candidate, chosen[0])
-            gains = gain.exchange_gains(chosen)
-            for place, old in enumerate(before):
-                others = chosen[:place] + chosen[place + 1 :]
-                # the range about a new first reading must contain all others
-                allowed = np.array(
-                    setup.reachable[chosen[0]] if place else setup.reachable[:, others].all(axis=1)
-                )
-                allowed[others] = False
-                chosen[place] = first_largest(np.where(allowed, gains[place], -1.0))
-                if chosen[place] != old:
-                    gains = gain.exchange_gains(chosen)
-            if chosen == before:
-                break
-        return PlannedSetup(planned.candidate, tuple(chosen))
+def _exchange_first(planned: PlannedSetup, gain: Gain) -> PlannedSetup:
+    """Setup that begins with another reading, chosen or not, if this gains more."""
+    setup, chosen = gain.setup, planned.chosen
+    if not setup.aligned:
+        return planned
+    reordered = [(first, *(i for i in chosen if i != first)) for first in chosen]
+    new_first = np.setdiff1d(np.arange(len(setup.rows)), chosen)
+    others = np.broadcast_to(chosen[1:], (len(new_first), len(chosen) - 1))
+    sets = np.vstack([reordered, np.column_stack([new_first, others])])
+    possible = sets[setup.reachable[sets[:, :1], sets].all(axis=1)]
+    best = first_largest(gain.gains(possible))
+    return PlannedSetup(planned.candidate, tuple(possible[best].tolist()))
+
+
+def _exchange_readings(planned: PlannedSetup, gain: Gain) -> PlannedSetup:
+    """Setup with each reading in turn exchanged for the best one in addition to the others."""
+    setup, chosen = gain.setup, list(planned.chosen)
+    for _ in range(MAX_PASSES):
+        before = list(chosen)
+        begun = gain.begin_with(chosen[0])
+        gains = begun.exchange_gains(chosen)
+        for place, old in enumerate(before):
+            others = chosen[:place] + chosen[place + 1 :]
+            # the range about a new first reading must contain all others
+            allowed = np.array(
+                setup.reachable[chosen[0]] if place else setup.reachable[:, others].all(axis=1)
+            )
+            allowed[others] = False
+            chosen[place] = first_largest(np.where(allowed, gains[place], -1.0))
+            if chosen[place] != old:
+                gains = begun.exchange_gains(chosen)
+        if chosen == before:
+            break
+    return PlannedSetup(planned.candidate, tuple(chosen))
 
 
 def _inverse(information: Array) -> Array:

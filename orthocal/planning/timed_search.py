@@ -224,9 +224,9 @@ class TimedSearch:
         if not gauges:
             return []
         gains, options = Gains.of(self.search, plan.information), list[_Option]()
-        for which, pair in gains.begin(MIN_READINGS, gauges):
+        for which, pair, gain in gains.begin(MIN_READINGS, gauges):
             gauge = self.search.reduced[which].gauge
-            gain_after, chosen = gains.setup(which, pair[0]).grow(pair, max_counts[gauge])
+            gain_after, chosen = gain.grow(pair, max_counts[gauge])
             counts = {n for n in READINGS if n < len(chosen)} | {len(chosen)}
             for count in counts - set(range(self.search.reduced[which].min_readings)):
                 duration = self.durations[gauge].of(count)
@@ -262,9 +262,8 @@ class TimedSearch:
             by_candidate.setdefault(option.planned.candidate, option.planned)
         setups = [*([] if old is None else [old]), *list(by_candidate.values())[:MAX_REFINED]]
         best: PlannedSetups | None = None
-        for new in dict.fromkeys(gains.exchange_readings(s) for s in setups):
-            new = gains.exchange_first(new)
-            if best is None or gains.rough_error(new) <= best.error * (1.0 + ROUNDING_ERROR):
+        for new, rough_error in gains.refine(setups):
+            if best is None or rough_error <= best.error * (1.0 + ROUNDING_ERROR):
                 changed = self.search.extend(without, new)
                 best = changed if best is None else best_of([best, changed], _negative_error)
         return without if best is None else best

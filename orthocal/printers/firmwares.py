@@ -26,6 +26,8 @@ class Firmware:
     """Name of the file with new settings."""
     tilts: bool = False
     """Whether the tilt of the bed is a setting."""
+    equal_rods: bool = False
+    """Whether all rods have one length."""
 
 
 FIRMWARES: dict[FirmwareName, Firmware] = {
@@ -34,6 +36,14 @@ FIRMWARES: dict[FirmwareName, Firmware] = {
     ),
     "marlin": Firmware(
         "Marlin", marlin.recognise, marlin.read_log, marlin.config_lines, "marlin.gcode"
+    ),
+    "marlin1": Firmware(
+        "Marlin 1.1",
+        lambda _: False,  # its logs are those of Marlin; `marlin.read_log` knows it by its settings
+        marlin.read_log_1,
+        marlin.config_lines,
+        "marlin.gcode",
+        equal_rods=True,
     ),
     "reprapfirmware": Firmware(
         "RepRapFirmware",

@@ -20,13 +20,14 @@ from orthocal.io.documents import parse_number
 from orthocal.printers.klipper_print import Distances, read_analysis, saved_distances
 from orthocal.printers.log import (
     NUMBER,
+    LogText,
     PrinterLog,
+    last_probing,
     numbers,
-    place_of,
     probed_log,
     require_points,
     unstated_trigger,
-    unusual_settings,
+    unusual_content,
 )
 from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings
 from orthocal.units import DEG, MM
@@ -64,58 +65,63 @@ def recognise(text: str) -> bool:
     )
 
 
-def read_log(text: str, *, where: str, radius: float | None = None) -> PrinterLog:
+def read_log(source: LogText, *, radius: float | None = None) -> PrinterLog:
     """Read settings, triggers and printed distances.
 
     Args:
-        text: The log and files with settings.
-        where: Name of the log, for messages.
+        source: The log and files with settings.
         radius: Not used.
 
     Raises:
         SessionError: If the text is invalid; names the key or line.
     """
     del radius
-    log = _read_heights(text, where)
-    printed = read_analysis(text, log.settings, where=where)
+    log = _read_heights(source)
+    printed = read_analysis(source, log.settings)
     return replace(log, distances=printed) if printed else log
 
 
-def _read_heights(text: str, where: str) -> PrinterLog:
-    """Settings, triggers and saved distances."""
+def _read_heights(source: LogText) -> PrinterLog:
+    """Settings, triggers and saved distances.
+
+    Heights that a file with settings saved count only if the log has none: they are older.
+    """
+    text, where = source.text, source.name
     sections = _sections(text)
     probe = _probe_offset(sections, where)
     if runs := list(_RUN.finditer(text)):
-        return _read_run(runs[-1], text, probe, where)
-    steps = _saved_heights(sections.get("delta_calibrate", {}), where)
+        return _read_run(runs[-1], probe, source.place(runs[-1].start()))
+    matches = sorted(
+        [*_OLD_PROBE.finditer(text), *_NEW_PROBE.finditer(text)], key=lambda m: m.start()
+    )
+    saved = (_sections(text[source.begin :]) if matches else sections).get("delta_calibrate", {})
+    steps = _saved_heights(saved, where)
     if steps is not None:
         settings = _settings(sections, probe, where)
         return _log_from_steps(*steps, settings, _step_lengths(sections, where), where)
     settings = _settings(sections, probe, where)
-    nozzle = _probed(_OLD_PROBE, text, where)
-    contacts = _probed(_NEW_PROBE, text, where)
-    points = np.array([*nozzle, *contacts]).reshape(-1, 3) * MM
-    points[len(nozzle) :] -= settings.probe  # newer versions print the point of contact
+    points = np.array([_probed(m, source) for m in matches]).reshape(-1, 3) * MM
+    contacts = [m.re is _NEW_PROBE for m in matches]  # newer versions print the point of contact
+    points -= np.outer(contacts, settings.probe)
+    used, notes = last_probing(points, [m.start() for m in matches], source)
     name, keys = _probe_section(sections)
-    notes = [] if "z_offset" in keys else [unstated_trigger(f"z_offset in [{name}]")]
-    return probed_log(settings, points, where=where, expected=EXPECTED, notes=notes)
+    if "z_offset" not in keys:
+        notes.append(unstated_trigger(f"z_offset in [{name}]"))
+    return probed_log(settings, points[used], where=where, expected=EXPECTED, notes=notes)
 
 
-def _probed(pattern: re.Pattern[str], text: str, where: str) -> list[list[float]]:
-    """Coordinates of the lines of a probe, [mm]."""
-    matches = list(pattern.finditer(text))
-    for match in matches:
-        if re.match(r",\d", text[match.end() :]):
-            raise SessionError(
-                f"found '{match[0]}' with a decimal comma; expected a decimal point",
-                where=place_of(text, match.start(), where),
-            )
-    return [numbers(match.groups(), where=where, name="probe") for match in matches]
+def _probed(match: re.Match[str], source: LogText) -> list[float]:
+    """Coordinates of a line of the probe, [mm]."""
+    line = source.place(match.start())
+    if re.match(r",\d", match.string[match.end() :]):
+        raise SessionError(
+            f"found '{match[0]}' with a decimal comma; expected a decimal point", where=line
+        )
+    return numbers(match.groups(), where=line, name="probe")
 
 
-def _read_run(run: re.Match[str], text: str, probe: Array, where: str) -> PrinterLog:
-    """Settings and triggers of a calculation in klippy.log."""
-    line = place_of(text, run.start(), where)
+def _read_run(run: re.Match[str], probe: Array, line: str) -> PrinterLog:
+    """Settings and triggers of a calculation in klippy.log; `line` is its file and line."""
     try:
         heights, lengths, values = (ast.literal_eval(v) for v in run.groups())
         distances = [(float(d), [[*map(float, p)], [*map(float, q)]]) for d, p, q in lengths]
@@ -173,11 +179,12 @@ def _log_from_steps(
     if not settings.probe[2]:  # not stated: the height of the triggers replaces it
         settings = replace(settings, probe=(*settings.probe[:2], -pairs[-1][0] * MM))
     heights = np.array([h for h, _ in pairs]) * MM + settings.probe[2]
+    carriages = np.array(settings.homed) - stable * steps
     return PrinterLog(
         settings,
-        np.array(settings.homed) - stable * steps,
+        carriages,
         heights,
-        (*notes, *unusual_settings(settings)),
+        (*notes, *unusual_content(settings, carriages)),
         saved_distances(settings, steps, distances, where=where),
     )
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.errors import SessionError
-from orthocal.printers.log import PrintedDistance, numbers, place_of
+from orthocal.printers.log import LogText, PrintedDistance, numbers
 from orthocal.printers.settings import DeltaSettings
 from orthocal.units import DEG, MM
 
@@ -51,13 +51,12 @@ _COMMAND = re.compile(r"^[^\n;#]*\bDELTA_ANALYZE\b([^\n;#]*)", re.MULTILINE | re
 _WORD = re.compile(r"\b([A-Z_]+)\s*=\s*(\[[^\]]*\]|[^\s=]*)", re.IGNORECASE)
 
 
-def read_analysis(text: str, settings: DeltaSettings, *, where: str) -> tuple[PrintedDistance, ...]:
+def read_analysis(source: LogText, settings: DeltaSettings) -> tuple[PrintedDistance, ...]:
     """Distances of the commands `DELTA_ANALYZE` in a text; later values replace earlier ones.
 
     Args:
-        text: The log.
+        source: The log.
         settings: Settings with which the object was printed.
-        where: Name of the log, for messages.
 
     Returns:
         Twelve distances; empty if the text has no measurement.
@@ -66,8 +65,8 @@ def read_analysis(text: str, settings: DeltaSettings, *, where: str) -> tuple[Pr
         SessionError: If a measurement is invalid or missing; names the line or the measurement.
     """
     values: dict[str, list[float]] = {}
-    for command in _COMMAND.finditer(text):
-        line = place_of(text, command.start(1), where)
+    for command in _COMMAND.finditer(source.text):
+        line = source.place(command.start(1))
         for word in _WORD.finditer(command[1]):
             name = word[1].upper()
             if name in COUNTS or name == "SCALE":
@@ -79,7 +78,7 @@ def read_analysis(text: str, settings: DeltaSettings, *, where: str) -> tuple[Pr
         raise SessionError(
             f"DELTA_ANALYZE states {', '.join(measured)} but not {', '.join(missing)}; expected "
             "all four",
-            where=where,
+            where=source.name,
         )
     (scale,) = values.get("SCALE", [1.0])
     return _place(values, scale, settings)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
@@ -30,6 +32,10 @@ NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 LARGE_ROD_DIFFERENCE = 1.5 * MM
 """Difference of a rod from the mean that more likely absorbs another error, [m]."""
+
+SMALL_REACH = 1.0 / 3.0
+"""Distance of the outermost point from the middle, relative to the radius of the printer, below
+which points hardly determine radius, rods and towers."""
 
 LARGE_TOWER_ANGLE = 2.0 * DEG
 """Angular error of a tower that more likely absorbs another error, [rad]."""
@@ -64,6 +70,39 @@ class PrinterLog:
     """Distances measured on a print."""
 
 
+@dataclass(frozen=True, slots=True)
+class LogText:
+    """Text of a log, after the files with settings."""
+
+    files: tuple[tuple[str, str], ...]
+    """Name and text of each file; the log is the last one."""
+
+    @property
+    def text(self) -> str:
+        """Text of all files."""
+        return "\n".join(text for _, text in self.files)
+
+    @property
+    def name(self) -> str:
+        """Name of the log, for messages."""
+        return self.files[-1][0]
+
+    @property
+    def begin(self) -> int:
+        """Position in `text` at which the log begins."""
+        return len(self.text) - len(self.files[-1][1])
+
+    def place(self, position: int) -> str:
+        """File and line of a position in `text`, for messages."""
+        line = self.text.count("\n", 0, position)
+        for name, text in self.files[:-1]:
+            lines = text.count("\n") + 1
+            if line < lines:
+                return f"{name}:{line + 1}"
+            line -= lines
+        return f"{self.name}:{line + 1}"
+
+
 def numbers(texts: Sequence[str], *, where: str, name: str) -> list[float]:
     """Parse texts as finite numbers.
 
@@ -78,20 +117,73 @@ def numbers(texts: Sequence[str], *, where: str, name: str) -> list[float]:
     return [parse_number(t.strip(), where=where, name=name, error=SessionError) for t in texts]
 
 
-def place_of(text: str, position: int, name: str) -> str:
-    """File and line of a position in a text, for messages."""
-    return f"{name}:{text.count(chr(10), 0, position) + 1}"
-
-
 def average_samples(points: Array) -> Array:
     """Average successive samples of the same place, shape (K, 3), [m]."""
-    groups: list[list[Array]] = []
-    for point in points:
-        if groups and np.abs(point[:2] - groups[-1][0][:2]).max() < SAME_PLACE:
-            groups[-1].append(point)
-        else:
-            groups.append([point])
-    return np.array([np.mean(g, axis=0) for g in groups])
+    begins = _place_begins(points)
+    return np.array([np.mean(group, axis=0) for group in np.split(points, begins[1:])])
+
+
+def _place_begins(points: Array) -> list[int]:
+    """Indices at which successive samples of a place begin."""
+    begins = [0]
+    for k in range(1, len(points)):
+        if not _is_same_place(points[k], points[begins[-1]]):
+            begins.append(k)
+    return begins
+
+
+def _is_same_place(one: Array, other: Array) -> bool:
+    return bool(np.abs(one[:2] - other[:2]).max() < SAME_PLACE)
+
+
+def last_probing(
+    points: Array, positions: Sequence[int], source: LogText, *, headings: Sequence[int] = ()
+) -> tuple[slice, list[str]]:
+    """Last complete probing of a log.
+
+    A probing begins after a heading, or where the first two places are probed again in the same
+    order. It is incomplete if a probing before it has the same places and more of them.
+
+    Args:
+        points: All points of the log, shape (K, 3), [m].
+        positions: Position of each point in the text of the source.
+        source: The log.
+        headings: Positions of lines after which a probing begins.
+
+    Returns:
+        Indices of the points; and notes on the probings.
+    """
+    if len(points) < MIN_POINTS:
+        return slice(0, len(points)), []
+    begins = _place_begins(points)
+    places = points[begins]
+    starts = [0]
+    for k in range(1, len(places)):
+        before, at = positions[begins[k] - 1], positions[begins[k]]
+        first = starts[-1]
+        if any(before < h < at for h in headings) or (
+            k - first >= MIN_POINTS
+            and k + 1 < len(places)
+            and _is_same_place(places[k], places[first])
+            and _is_same_place(places[k + 1], places[first + 1])
+        ):
+            starts.append(k)
+    if len(starts) == 1:
+        return slice(0, len(points)), []
+    probings = [places[a:b] for a, b in pairwise([*starts, len(places)])]
+    chosen = max(i for i, p in enumerate(probings) if not any(map(partial(_extends, p), probings)))
+    ends = [*(begins[k] for k in starts[1:]), len(points)]
+    used = slice(begins[starts[chosen]], ends[chosen])
+    begin, end = (source.place(positions[i]) for i in (used.start, used.stop - 1))
+    return used, [
+        f"The log has {len(probings)} probings. The last complete one is used: "
+        f"{len(probings[chosen])} points, {begin} to line {end.rpartition(':')[2]}."
+    ]
+
+
+def _extends(probing: Array, other: Array) -> bool:
+    """True if another probing has the same places and more of them."""
+    return len(other) > len(probing) and all(map(_is_same_place, probing, other))
 
 
 def require_points(count: int, *, where: str, expected: str) -> None:
@@ -147,9 +239,8 @@ def probed_log(
         carriages = settings.inverse(points)
     except SessionError as e:
         raise SessionError(e.problem, where=where) from None
-    return PrinterLog(
-        settings, carriages, np.zeros(len(points)), (*notes, *unusual_settings(settings))
-    )
+    notes = (*notes, *unusual_content(settings, carriages))
+    return PrinterLog(settings, carriages, np.zeros(len(points)), notes)
 
 
 def unstated_trigger(key: str) -> str:
@@ -160,8 +251,21 @@ def unstated_trigger(key: str) -> str:
     )
 
 
-def unusual_settings(settings: DeltaSettings) -> Iterator[str]:
-    """Notes on settings that more likely absorb other errors than describe the printer."""
+def unusual_content(settings: DeltaSettings, carriages: Array) -> Iterator[str]:
+    """Notes on settings that more likely absorb other errors, and on points that show too little.
+
+    Args:
+        settings: Settings of the firmware.
+        carriages: Coordinates of the carriages at the triggers, shape (K, 3), [m].
+    """
+    with np.errstate(invalid="ignore"):  # of damaged steps; the calibration refuses them
+        reach = float(np.hypot(*settings.forward(carriages)[:, :2].T).max())
+    if reach < SMALL_REACH * settings.radius:
+        yield (
+            f"All points are within {reach / MM:.0f} mm of the middle. They hardly determine "
+            "radius, rods and towers, nor the height of the first layer farther out. Probe up to "
+            "the edge of the bed."
+        )
     mean = float(np.mean(settings.rods))
     differences = np.array(settings.rods) - mean
     if np.abs(differences).max() > LARGE_ROD_DIFFERENCE:
@@ -195,14 +299,23 @@ def command_words(text: str, pattern: str) -> Iterator[tuple[int, dict[str, str]
         yield match.start(1), dict(re.findall(rf"\b([A-Z]) ?({NUMBER}(?::{NUMBER})*)", match[1]))
 
 
-def require_one_value(text: str, command: str, *, where: str) -> None:
+def require_one_value(source: LogText, command: str, *, since: int = 0, until: int) -> None:
     """Refuse a setting that a log states twice with different values.
+
+    Args:
+        source: The log.
+        command: Command of the settings.
+        since: Position in the text at which the search begins.
+        until: Position in the text at which the search ends.
 
     Raises:
         SessionError: Naming the setting and the place of its second value.
     """
     values: dict[str, str] = {}
-    for position, words in command_words(text, command):
+    for position, words in command_words(source.text, command):
+        if not since <= position < until:
+            continue
+        where = source.place(position)
         for letter, value in words.items():
             first, second = numbers(
                 [values.setdefault(letter, value), value], where=where, name=command
@@ -211,5 +324,5 @@ def require_one_value(text: str, command: str, *, where: str) -> None:
                 raise SessionError(
                     f"{command} {letter} is {second:g}, and {first:g} before; expected only the "
                     "settings during the probing",
-                    where=place_of(text, position, where),
+                    where=where,
                 )

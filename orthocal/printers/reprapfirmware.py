@@ -7,6 +7,7 @@ src/Movement/Kinematics/LinearDeltaKinematics.cpp, src/Movement/BedProbing/Rando
 from __future__ import annotations
 
 import re
+from typing import NoReturn
 
 import numpy as np
 
@@ -14,12 +15,11 @@ from orthocal.arrays import Array
 from orthocal.errors import SessionError
 from orthocal.printers.log import (
     NUMBER,
+    LogText,
     PrinterLog,
     last_words,
     numbers,
-    place_of,
     probed_log,
-    require_points,
     unstated_trigger,
 )
 from orthocal.printers.settings import DESIGN_ANGLES, DeltaSettings
@@ -33,7 +33,9 @@ EXPECTED = (
     "bed.g and 'M665', 'M666' and 'G31' of config.g (--settings)"
 )
 
-_HEIGHTS = re.compile(r"bed probe heights:(?P<values>[^,\n]*)")
+_HEIGHTS = re.compile(r"[Bb]ed probe heights:(?P<values>[^,\n]*), mean")
+_CALIBRATED = re.compile(r"Calibrated (\d+) factors using \d+ points")
+_STOPPED = re.compile(rf"Stopped at height {NUMBER} mm")
 _POINT = re.compile(r"^[^;\n]*?\bG30\b(?P<words>[^;\n]*)", re.MULTILINE)
 _M665 = re.compile(
     rf"Diagonals? (?P<L>{NUMBER}(?::{NUMBER})*), delta radius (?P<R>{NUMBER}), homed height "
@@ -48,28 +50,28 @@ _M666 = re.compile(
 
 def recognise(text: str) -> bool:
     """True if a text is certainly from RepRapFirmware."""
-    return bool(_HEIGHTS.search(text) or _M665.search(text))
+    return any(p.search(text) for p in (_HEIGHTS, _M665, _CALIBRATED, _STOPPED))
 
 
-def read_log(text: str, *, where: str, radius: float | None = None) -> PrinterLog:
+def read_log(source: LogText, *, radius: float | None = None) -> PrinterLog:
     """Read settings and probed points.
 
     Args:
-        text: The log and files with settings and points.
-        where: Name of the log, for messages.
+        source: The log and files with settings and points.
         radius: Not used.
 
     Raises:
         SessionError: If the text is invalid; names the line or the missing setting.
     """
     del radius
+    text, where = source.text, source.name
     reports = list(_HEIGHTS.finditer(text))
     if not reports:
-        require_points(0, where=where, expected=EXPECTED)
+        _refuse_without_heights(source)
     report = reports[-1]
-    line = place_of(text, report.start(), where)
-    heights = numbers(report["values"].split(), where=line, name="a bed probe height")
-    points = _points(text, where)
+    line = source.place(report.start())
+    heights = _heights(report["values"], line)
+    points = _points(source, report.start())
     if len(points) != len(heights):
         raise SessionError(
             f"reports {len(heights)} heights of {len(points)} points; expected a line 'G30 P X Y' "
@@ -79,19 +81,98 @@ def read_log(text: str, *, where: str, radius: float | None = None) -> PrinterLo
     g31 = last_words(text, "G31")
     x, y, z = numbers([g31.get(k, "0") for k in "XYZ"], where=where, name="G31")
     nozzle = np.column_stack([points - [x, y], np.array(heights) + z]) * MM
+    _require_settings_of(source, report.start())
     settings = _settings(text, np.array([x, y, -z]) * MM, where)
     notes = [] if "Z" in g31 else [unstated_trigger("G31 Z")]
+    if len(reports) > 1:
+        notes.append(f"The log has {len(reports)} probings. The last one is used: {line}.")
     return probed_log(settings, nozzle, where=where, expected=EXPECTED, notes=notes)
 
 
-def _points(text: str, where: str) -> Array:
-    """Points of the commands G30 P in the order of their numbers, shape (K, 2), [mm]."""
-    places = {}
-    for match in _POINT.finditer(text):
+def _refuse_without_heights(source: LogText) -> NoReturn:
+    """Refuse a log without heights.
+
+    Raises:
+        SessionError: Naming the line of an answer that has none.
+    """
+    text = source.text
+    if calibrated := list(_CALIBRATED.finditer(text)):
+        factors = calibrated[-1][1]
+        raise SessionError(
+            f"G30 S{factors} calibrated {factors} factors and printed no heights; expected S-1 in "
+            f"place of S{factors} in the last G30 of bed.g. Restart, so that the settings of "
+            "config.g are active, and probe again by G32",
+            where=source.place(calibrated[-1].start()),
+        )
+    if stopped := _STOPPED.search(text):
+        raise SessionError(
+            f"found '{stopped[0]}' of a G30 without P, which states no place; expected {EXPECTED}",
+            where=source.place(stopped.start()),
+        )
+    raise SessionError(f"found no probed points; expected {EXPECTED}", where=source.name)
+
+
+def _heights(text: str, where: str) -> list[float]:
+    """Heights of a report, [mm].
+
+    Raises:
+        SessionError: If a point was not probed.
+    """
+    words = re.findall(r"not set|probing failed|\S+", text)
+    for number, word in enumerate(words):
+        if word in ("not set", "probing failed"):
+            raise SessionError(
+                f"point P{number} has '{word}' in place of a height; probe again", where=where
+            )
+    return numbers(words, where=where, name="a bed probe height")
+
+
+def _require_settings_of(source: LogText, report: int) -> None:
+    """Refuse settings that are not those of a report because a calibration changed them.
+
+    Args:
+        source: The log.
+        report: Position of the report in the text.
+
+    Raises:
+        SessionError: Naming the line of the calibration.
+    """
+    text = source.text
+    stated = [m.start() for pattern in (_M665, _M666) for m in pattern.finditer(text)]
+    for match in _CALIBRATED.finditer(text):
+        place, at = source.place(match.start()), match.start()
+        if at > report and any(p > at for p in stated):
+            raise SessionError(
+                "changed the settings after the heights, and M665 or M666 reported the new ones; "
+                "expected only the settings during the probing",
+                where=place,
+            )
+        reported = all(
+            any(at < m.start() < report for m in pattern.finditer(text))
+            for pattern in (_M665, _M666)
+        )
+        if at < report and not reported:
+            raise SessionError(
+                "changed the settings before the heights; expected the answers of M665 and M666 "
+                "without parameters between this line and the heights, or a log since the restart",
+                where=place,
+            )
+
+
+def _points(source: LogText, report: int) -> Array:
+    """Points of the commands G30 P in the order of their numbers, shape (K, 2), [mm].
+
+    The commands before the report count, all commands if there are none. P0 begins a new list.
+    """
+    places: dict[float, tuple[float, float]] = {}
+    matches = list(_POINT.finditer(source.text))
+    for match in [m for m in matches if m.start() < report] or matches:
         words = dict(re.findall(rf"\b([A-Z])({NUMBER})", match["words"]))
         if {"P", "X", "Y"} <= words.keys():
-            line = place_of(text, match.start(), where)
+            line = source.place(match.start())
             number, x, y = numbers([words[k] for k in "PXY"], where=line, name="G30")
+            if number == 0.0:
+                places = {}
             places[number] = (x, y)
     return np.array([places[k] for k in sorted(places)]).reshape(-1, 2)
 

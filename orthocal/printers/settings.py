@@ -26,7 +26,8 @@ from orthocal.io.documents import Number
 from orthocal.io.fields import CLOSED
 from orthocal.units import DEG, MM
 
-FirmwareName = Literal["klipper", "marlin", "reprapfirmware"]
+FirmwareName = Literal["klipper", "marlin", "marlin1", "reprapfirmware"]
+"""Name of a firmware; marlin1 is Marlin 1.1, which has one length for all rods."""
 
 Positive: TypeAlias = Annotated[Number, Field(gt=0.0)]
 Three: TypeAlias = tuple[Number, Number, Number]

@@ -120,6 +120,21 @@ def _decompose(residual: Array, jacobian: Array) -> Callable[[float], Array]:
     return damped_step
 
 
+def invert_closures(jacobians: ArrayLike) -> Array:
+    """Inverses of closure Jacobians ∂g/∂q, shape (..., n_passive, n_rows).
+
+    Implicit differentiation of g(q, θ) = 0 gives dq/dθ = −(∂g/∂q)⁻¹ ∂g/∂θ. A Jacobian of dependent
+    or too few rows is not square; its pseudo-inverse gives the change of minimum norm.
+
+    Args:
+        jacobians: Shape (..., n_rows, n_passive), [m, rad per m, rad]; regular if square.
+    """
+    g_q: Array = np.asarray(jacobians, dtype=np.float64)
+    if g_q.shape[-2] == g_q.shape[-1]:
+        return np.asarray(np.linalg.inv(g_q))
+    return np.asarray(np.linalg.pinv(g_q, rcond=RANK_TOLERANCE))
+
+
 def largest(values: Array) -> float:
     """Largest magnitude, 0 for an empty array."""
     return float(np.abs(values).max(initial=0.0))

@@ -70,7 +70,7 @@ class Distance(ToolSensor):
     ideal: ClassVar[str] = "its nominal length"
     zero: ClassVar[GaugeZero] = "known"
     reads_pairs: ClassVar[bool] = True
-    states_readings: ClassVar[bool] = True
+    equal_readings: ClassVar[bool] = True
     largest_reading: ClassVar[float] = LARGEST_MM * MM
 
     @classmethod

@@ -160,8 +160,12 @@ class Sensor(Protocol):
     # mounting_steps: tuple[str, ...], optional: instructions for mounting the sensor in the
     # alignment posture (`mounting_steps`)
 
-    # states_readings: ClassVar[bool], optional: whether readings are prescribed, not measured. Then
-    # equal readings do not indicate a sticking dial (`states_readings`)
+    # states_readings: ClassVar[bool], optional: whether readings are prescribed, not measured, such
+    # as the height of a bed (`states_readings`)
+
+    # equal_readings: ClassVar[bool], optional: whether different postures usually have equal
+    # readings, such as equal lengths of a print; by default if readings are prescribed. Then equal
+    # readings do not indicate a sticking dial (`equal_readings`)
 
     # reads_pairs: ClassVar[bool], optional: whether a reading belongs to a pair of postures: the
     # posture of its row and the one in the column `minus`. It is a single reading (`reads_pairs`)
@@ -317,6 +321,12 @@ def is_difference(minus: str | None, sensor: Sensor) -> bool:
 
 
 def states_readings(sensor: Sensor) -> bool:
-    """True if readings are prescribed, not measured; then equal readings are no anomaly."""
+    """True if readings are prescribed, not measured: the postures are."""
     stated: bool = getattr(sensor, "states_readings", False)
     return stated
+
+
+def equal_readings(sensor: Sensor) -> bool:
+    """True if equal readings of different postures are no anomaly."""
+    equal: bool = getattr(sensor, "equal_readings", states_readings(sensor))
+    return equal

@@ -220,6 +220,20 @@ def describe_postures(posture: str, minus: str | None, approach: str | None) -> 
     return posture if approach is None else f"{posture} (approach {approach})"
 
 
+def split_label(name: str, *, joined: bool) -> tuple[str, str]:
+    """Label of the session of a name, and the name within that session.
+
+    Args:
+        name: Name of a setup, a posture, a gauge or an artefact. In joined sessions it begins with
+            the label of its session and a slash; an unnamed gauge is the label alone.
+        joined: Whether the name is of joined sessions; otherwise the label is "".
+    """
+    if not joined:
+        return "", name
+    label, _, within = name.partition("/")
+    return label, within
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Session:
     """Session: postures, setups and readings of one robot."""
@@ -250,11 +264,21 @@ class Session:
     parts: tuple[Session, ...] = ()
     """Sessions that were joined into this one, if they are available."""
     joined: bool = False
-    """True if sessions were joined. Names then begin with the name of their session and a slash."""
+    """True if sessions were joined. Names then begin with the label of their session and a slash:
+    `split_label`."""
     purpose: Purpose | None = None
     """Model and free errors that the session states."""
     seed: int | None = None
     """Seed of simulated readings; None for measured readings."""
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Label of the session of each setup, shape (n_setups,); "" unless sessions were joined."""
+        return tuple(split_label(name, joined=self.joined)[0] for name in self.setups)
+
+    def was_read_from(self, digest: str) -> bool:
+        """True if the session was read from the files of a digest; "" is the digest of none."""
+        return bool(digest) and self.sha256 == digest
 
     @property
     def gauge(self) -> Gauge:

@@ -85,20 +85,35 @@ def bounded_interval(
 
 
 def expanded_uncertainty(
-    std: ArrayLike, std_scatter: ArrayLike, *, dof: float, other_dof: float = math.inf
+    std: ArrayLike,
+    std_scatter: ArrayLike,
+    std_scaled: ArrayLike,
+    *,
+    dof: float,
+    contrasts: float = math.inf,
 ) -> Array:
     """Expanded uncertainty U of estimates, of any shape, in their unit.
 
-    U² = (k_ν s)² + k_n² (u² − s²). k_ν is the coverage factor of the part s from noise, which was
-    estimated with ν degrees of freedom. k_n is 2, or Student's factor if the tolerance scale was
-    estimated from n contrasts.
+    U² = k_ν² s² + k_n² t² + 2² (u² − s² − t²). Noise estimated with ν degrees of freedom causes the
+    part s of u, and errors whose scale was estimated from n contrasts cause the part t. Each has
+    its coverage factor. The variance of the other part is known.
+
+    The parts are independent, and so are the estimates of their variances. Then U covers at least
+    what its factors cover, 95 % (Banerjee, Sankhya 22, 1960). Effective degrees of freedom (Welch
+    and Satterthwaite, GUM G.4) would cover 93 % if two contrasts caused three quarters of u².
 
     Args:
         std: Standard deviations u from all contributions.
         std_scatter: Parts s of them from the noise of the readings.
+        std_scaled: Parts t of them from errors that the tolerance scale multiplies.
         dof: Degrees of freedom ν of the noise.
-        other_dof: Number n of contrasts.
+        contrasts: Number n of contrasts that determine the tolerance scale; infinite if it was not
+            estimated.
     """
-    total, scatter = np.asarray(std, dtype=np.float64), np.asarray(std_scatter, dtype=np.float64)
-    other = np.sqrt(np.maximum(total**2 - scatter**2, 0.0))
-    return np.asarray(np.hypot(coverage_factor(dof) * scatter, coverage_factor(other_dof) * other))
+    total, scatter, scaled = (
+        np.square(np.asarray(part, dtype=np.float64)) for part in (std, std_scatter, std_scaled)
+    )
+    known = np.maximum(total - scatter - scaled, 0.0)
+    factors = (coverage_factor(dof), coverage_factor(contrasts), COVERAGE)
+    parts = (scatter, scaled, known)
+    return np.asarray(np.sqrt(sum(k**2 * v for k, v in zip(factors, parts, strict=True))))

@@ -137,6 +137,22 @@ class Information:
         covariance[np.ix_(free, free)] = 0.5 * (inverse + inverse.T)
         return covariance
 
+    def inverse_normal(
+        self,
+        *,
+        sigma: float,
+        precision: Array,
+        at_bound: Mask | None = None,
+        loss: tuple[float, float] = (1.0, 1.0),
+    ) -> Array:
+        """A⁻¹ of `covariance`, shape (n_free, n_free); arguments as there.
+
+        It is the inverse curvature of the objective. For squares it equals `covariance`.
+        """
+        return self.covariance(
+            sigma=sigma / np.sqrt(loss[0]), precision=precision, at_bound=at_bound
+        )
+
     def noise_covariance(
         self,
         *,
@@ -153,11 +169,37 @@ class Information:
             at_bound: Mask of the parameters at a bound, whose covariance is 0.
             loss: Mean a of ρ'' and mean square b of ρ' over the residuals; (1, 1) for squares.
         """
-        gain, noise = loss
-        inverse = self.covariance(
-            sigma=sigma / np.sqrt(gain), precision=precision, at_bound=at_bound
-        )  # A⁻¹
-        root = np.sqrt(noise) * inverse @ self.factor.T / sigma
+        inverse = self.inverse_normal(
+            sigma=sigma, precision=precision, at_bound=at_bound, loss=loss
+        )
+        root = np.sqrt(loss[1]) * inverse @ self.factor.T / sigma
+        return np.asarray(root @ root.T)
+
+    def prior_covariance(
+        self,
+        *,
+        sigma: float,
+        precision: Array,
+        priors: Mask,
+        at_bound: Mask | None = None,
+        loss: tuple[float, float] = (1.0, 1.0),
+    ) -> Array:
+        """Part of `covariance` from some of the priors, A⁻¹ P⁻¹ A⁻¹, shape (n_free, n_free).
+
+        The priors draw the estimate towards their means. This part grows with their variances. Over
+        all priors it is `covariance` less `noise_covariance`.
+
+        Args:
+            sigma: Standard deviation of one reading, [m].
+            precision: Diagonal of P⁻¹: 1 or 0, shape (n_free,).
+            priors: Mask of the parameters whose priors count, shape (n_free,).
+            at_bound: Mask of the parameters at a bound, whose covariance is 0.
+            loss: Mean a of ρ'' and mean square b of ρ' over the residuals; (1, 1) for squares.
+        """
+        inverse = self.inverse_normal(
+            sigma=sigma, precision=precision, at_bound=at_bound, loss=loss
+        )
+        root = inverse[:, priors] * np.sqrt(precision[priors])
         return np.asarray(root @ root.T)
 
 

@@ -265,6 +265,7 @@ def _true_selection(study: AccuracyStudy, robot: Robot) -> Selection:
         label="truth",
         parameters=parameters,
         prior=np.ones(n, dtype=np.bool_),
+        scaled=np.zeros(n, dtype=np.bool_),
         mean=np.zeros(n),
         lower=np.full(n, -np.inf),
         upper=np.full(n, np.inf),

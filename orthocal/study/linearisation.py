@@ -28,11 +28,11 @@ from orthocal.estimation.linear import (
 )
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.estimation.solvers.variable_projection import VariableProjection
+from orthocal.estimation.weighting import stated_sigma
 from orthocal.planning.first_plan import PAPER_GAUGE, Displacements, build_paper_plan
 from orthocal.robot.model import Robot
 from orthocal.sensors.mounting import EXACT
 from orthocal.session.session import Gauge, Session
-from orthocal.statistics.noise import noise_floor
 from orthocal.statistics.zeros import project_out_zeros
 from orthocal.study.runner import StudyTable
 from orthocal.study.study import Columns, Study, prepare_once
@@ -324,7 +324,7 @@ def build_linearisation_study(
         sizes=tuple(float(f"{v:.4g}") for v in sizes),
         directions=tuple(tuple(v.tolist()) for v in unit_vectors),
         displacements=paper_displacements,
-        sigma=noise_floor(gauge.sigma, gauge.resolution),
+        sigma=stated_sigma(gauge),
         resolution=gauge.resolution or 0.0,
     )
 

@@ -22,12 +22,13 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import Selection
 from orthocal.estimation.solvers.batch import BatchSolver
+from orthocal.estimation.weighting import stated_sigma
 from orthocal.kinematics.conditions import UseSamples, effects_by_condition, sample_use
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import Workspace, gauss_box
 from orthocal.observation.simulate import limits_of, show_readings
-from orthocal.planning.expected_error import noise_of, with_gauge_noise
+from orthocal.planning.expected_error import with_gauge_noise
 from orthocal.robot.model import Robot
 from orthocal.session.session import Session
 
@@ -95,7 +96,7 @@ class MachineModel:
     @property
     def columns(self) -> Array:
         """Elementary errors per unit of each identified parameter, shape (n_errors, n_machine)."""
-        return self.problem.functions.errors.columns(self.problem.machine_selection.names)
+        return self.problem.functions.errors.unit_errors(self.problem.machine_selection.names)
 
     def errors(self, theta: Array) -> Array:
         """Elementary errors of estimates, shape (n_sets, n_errors), [SI].
@@ -241,7 +242,7 @@ class RandomMachines:
             seed: Seed of errors, gauges and noise.
             count: Number of machines.
         """
-        sigma = noise_of(session)
+        sigma = stated_sigma(session.gauge)
         unweighted = [MachineModel.of(s, c, sigma=sigma) for s, c in models]
         limits = [limits_of(session, r) or (-np.inf, np.inf) for r in session.readings]
         machines = RandomMachines(

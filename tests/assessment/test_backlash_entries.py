@@ -12,12 +12,12 @@ import pytest
 from effect_plans import effect_plan
 
 from orthocal import ExportOptions, calibrate, export_calibration, simulate_session
-from orthocal.assessment.assess import expanded_uncertainty
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.controller_entries import (
     backlash_changes,
     compute_backlash,
     entered_offsets,
+    expanded_uncertainty,
     is_worth_changing,
 )
 from orthocal.cli.correct import _find_lags
@@ -59,7 +59,7 @@ def test_a_backlash_is_entered_where_it_is_determined(calibration):
     for drive, entered in zip("xyz", (True, True, False), strict=True):
         e, p = found[drive], calibration[f"{drive}_slide.backlash"]
         half = expanded_uncertainty(calibration, e)
-        assert half == pytest.approx(float(calibration.expand(p.std, p.std_scatter)))
+        assert half == pytest.approx(float(calibration.expand(p.std, p.std_scatter, p.std_scaled)))
         assert (e.identified > half) is entered
         assert e.enter == (max(p.value, 0.0) if entered else 0.0)
 
@@ -138,7 +138,7 @@ def test_an_undetermined_backlash_is_entered_if_that_lowers_the_tool_error(calib
     for scale, entered in ((1.0, True), (0.1, False)):
         covariance = np.array(calibration.model_covariance) * 1e-2
         value = p.value * scale
-        vague = replace(p, value=value, std=value)
+        vague = replace(p, value=value, std=value, prior_std=10.0 * value)
         vague_at = replace(
             calibration,
             assessment=None,
@@ -147,7 +147,7 @@ def test_an_undetermined_backlash_is_entered_if_that_lowers_the_tool_error(calib
         )
         assert [q.name for q in vague_at.free][free] == p.name
         (x, *_) = compute_backlash(vague_at, tool)
-        assert x.identified < float(vague_at.expand(value, 0.0))
+        assert x.identified < expanded_uncertainty(vague_at, x)
         assert (x.enter == value) is entered
 
 

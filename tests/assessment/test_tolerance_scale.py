@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from calibrated import calibrated, session_of
+from calibrated import session_of
+from intervals import coverage_band
+from linear_machines import LinearMachines
 from scaled_machines import calibrate_machines
 from scipy.stats import binom
 
 from orthocal import Choice, assess_tool, calibrate, compare_models
-from orthocal.assessment.assess import expanded_uncertainty
 from orthocal.assessment.calibrated_tool import find_tool
-from orthocal.assessment.controller_entries import compute_entries
+from orthocal.assessment.controller_entries import compute_entries, expanded_uncertainty
 from orthocal.calibration.file import load_calibration, write_calibration
 from orthocal.calibration.identify import identify
-from orthocal.calibration.refit import repeat_calibration, restore_session
+from orthocal.calibration.refit import repeat_calibration, repeat_fit, restore_session
+from orthocal.estimation.tolerance_scale import ToleranceScale
 from orthocal.statistics.chance import coverage_factor
 
+OFFSET = "x_slide.offset"
 WITHIN = 1.15
 """Largest ratio of the RMS tool error of machines to the predicted one."""
 
@@ -30,13 +35,13 @@ def session():
 
 
 @pytest.fixture(scope="module")
-def full():
-    return calibrated(EXAMPLE, "full")
+def full(session):
+    return calibrate(session, "full", solver="variable-projection", profile=[OFFSET])
 
 
 @pytest.fixture(scope="module")
-def offsets():
-    return calibrated(EXAMPLE, "offsets")
+def offsets(session):
+    return calibrate(session, "offsets", profile=[OFFSET])
 
 
 def test_priors_of_the_geometry_are_scaled_but_not_those_of_offsets(full):
@@ -49,10 +54,17 @@ def test_priors_of_the_geometry_are_scaled_but_not_those_of_offsets(full):
 
 
 def test_the_stated_uncertainty_of_a_known_value_is_not_scaled(session):
-    choice = Choice("full", known={"x_fork.rx_mrad": (0.05, 0.01)})
+    known = {"x_fork.rx": (0.05, 0.01)}
+    choice = Choice("full", known={f"{name}_mrad": value for name, value in known.items()})
     result = calibrate(session, choice, solver="linearised")
     assert result.tolerance_scale.factor > 2.0
     assert result["x_fork.rx"].prior_std == pytest.approx(0.005e-3)
+    assert result.expand_estimate(result["x_fork.rx"]) <= 0.01e-3
+    scale = ToleranceScale(2.0 * result.tolerance_scale.factor, 3.0)
+    selection = repeat_fit(result, session, tolerance_scale=scale).problem.machine_selection
+    for p, repeated in zip(result.free, selection.parameters, strict=True):
+        expected = 2.0 if p.name not in known and not p.name.endswith(".offset") else 1.0
+        assert repeated.prior_std == pytest.approx(expected * p.prior_std)
 
 
 def test_uncertainty_and_tool_error_are_those_of_scaled_tolerances(session, full):
@@ -82,6 +94,45 @@ def test_a_small_model_counts_unmodelled_errors_once(session, offsets):
     assert found.noise.source == "residuals"
 
 
+def test_a_profile_interval_counts_unmodelled_errors_once(full, offsets):
+    """The readings of Experiment 2 are nearly linear in the offsets."""
+    for found in (full, offsets):
+        p, half = found[OFFSET], found.expand_estimate(found[OFFSET])
+        assert p.interval == pytest.approx((p.value - half, p.value + half), abs=2e-3 * half)
+    assert full.unmodelled.names == ()
+    # the residuals of offsets contain unmodelled errors ten times larger than the stated noise
+    assert offsets.noise.sigma > 5.0 * offsets.session.gauge_sigma
+
+
+def test_uncertainties_of_mountings_are_within_their_tolerances(full, offsets):
+    """The factor of few contrasts is that of the geometry: 3.2 instead of 2."""
+    for found in (full, offsets):
+        limits = [found.expand_estimate(p) / (2.0 * p.prior_std) for p in found.sensors]
+        # the line model shows no mounting to first order
+        assert limits == pytest.approx(np.ones(len(limits)), abs=1e-3)
+        assert max(limits) <= 1.0
+    factor = coverage_factor(full.tolerance_scale.contrasts)
+    leg = full["x_coupler.x"]
+    assert full.expand_estimate(leg) == pytest.approx(factor * leg.std, rel=0.01)
+    assert full.expand_estimate(leg) <= factor * leg.prior_std
+
+
+def test_a_narrow_prior_limits_the_uncertainty(full):
+    """An offset with a narrow prior has a part from scaled errors, but no more than its prior."""
+    p = replace(full[OFFSET], prior_std=0.5 * full[OFFSET].std)
+    assert full.expand_estimate(p) == pytest.approx(2.0 * p.prior_std)
+    assert full.expand_estimate(replace(p, prior=False)) == full.expand_estimate(full[OFFSET])
+
+
+@pytest.mark.parametrize("name", [EXAMPLE, "workshop"])
+def test_intervals_cover_scaled_errors_and_mountings(name):
+    """Three and nine contrasts; `tests/benchmarks/few_contrasts.py` has more machines."""
+    machines, count = LinearMachines(session_of(name)), 1000
+    covered, (low, high) = machines.cover(2.83, count), coverage_band(count)
+    for kind in (machines.is_scaled, machines.is_offset, machines.is_mounting):
+        assert low <= count * covered[kind].mean() <= high
+
+
 def test_compare_refits_and_files_have_the_same_factor(session, full, offsets, tmp_path):
     compared = compare_models(session, models=["offsets"]).results[0].calibration
     again = repeat_calibration(offsets, restore_session(offsets))
@@ -97,10 +148,13 @@ def test_compare_refits_and_files_have_the_same_factor(session, full, offsets, t
 def test_intervals_contain_the_truth_at_any_factor(session, factor):
     """A sample; `tests/benchmarks/worse_machines.py` has more machines, and the full model."""
     count = 16
-    outcome = calibrate_machines(session, "offsets", factor=factor, count=count)
+    outcome = calibrate_machines(session, "offsets", factor=factor, count=count, profile=[OFFSET])
     # three offsets of a machine are wrong together
     judged = outcome.covered if factor == 1.0 else outcome.covered[outcome.found]
     assert judged.all(axis=1).sum() >= binom.ppf(0.001, len(judged), 0.9)
+    assert (outcome.profiled[:, 0] == outcome.covered[:, 0]).all()
+    low, high = coverage_band(outcome.mounted.size)
+    assert low <= outcome.mounted.sum() <= high
     if factor == 1.0:
         assert not outcome.found.any()
         true, predicted = np.sqrt(np.mean(outcome.tool**2, axis=0))

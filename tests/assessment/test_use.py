@@ -26,7 +26,7 @@ from orthocal import (
     write_calibration,
 )
 from orthocal.assessment.assess import assess
-from orthocal.assessment.calibrated_tool import error_covariance, place_tool
+from orthocal.assessment.calibrated_tool import place_tool
 from orthocal.assessment.controller_entries import entered_offsets, find_backlash
 from orthocal.assessment.judgement import Judgement
 from orthocal.assessment.recommendation import Recommendation
@@ -176,7 +176,7 @@ def test_tool_errors_are_those_of_sampled_machines_under_sampled_conditions(cali
     accuracy = assess_tool(calibration, workspace)
     figures = summarise_tool(calibration, accuracy)
     names, at = accuracy.names, calibration.errors
-    values, vectors = np.linalg.eigh(error_covariance(calibration))
+    values, vectors = np.linalg.eigh(calibration.error_covariances[0])
     draws = np.random.default_rng(7).normal(size=(MACHINES, values.size))
     errors = (draws * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     theta = np.array([at.get(n, 0.0) for n in names]) + errors

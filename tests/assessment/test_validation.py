@@ -25,6 +25,7 @@ from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import entered_offsets, find_entries
 from orthocal.assessment.judgement import judge_session
 from orthocal.assessment.predictive import Repetition, judge_deviations, measure_repetition
+from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.validation import describe_repetition
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.calibration.identify import identify
@@ -96,7 +97,7 @@ def test_experiment_3_validates_experiment_2_as_in_the_paper(paper, experiment_3
     (lead,) = result.assessment.of_kind("as predicted")
     assert lead.numbers["achieved_rms_mm"] == pytest.approx(0.213, abs=0.001)
     assert result.assessment.of_kind("residuals repeat")
-    assert result.assessment.of_kind("controller not stated")
+    assert result.assessment.of_kind("controller assumed")
     assert decision.headline in summarize(result)
     document = json.loads(result.to_json())
     assert document["schema"] == "orthocal/validation/4"
@@ -108,7 +109,9 @@ def test_experiment_3_validates_experiment_2_as_in_the_paper(paper, experiment_3
     ("chance", "text"), [(0.22, "by chance 22 %"), (1e-9, "by chance below 0.01 %")]
 )
 def test_the_probability_of_a_repetition_is_printed(chance, text):
-    assert text in describe_repetition(Repetition(6, 0.5, chance)).text
+    found = describe_repetition(Repetition(6, 0.5, chance))
+    assert text not in found.text
+    assert text in describe_evidence(found)
 
 
 def test_residuals_of_noise_repeat_as_seldom_as_stated(plan):

@@ -29,7 +29,10 @@ from unmodelled_machines import EffectSearch, plan_with_conditions, read_machine
 
 from orthocal import check_session, load_plan
 from orthocal.cli import make_program
-from orthocal.hypotheses import search
+from orthocal.hypotheses import family_scores, search
+from orthocal.hypotheses.families.inconsistent_group import inconsistent_groups
+from orthocal.hypotheses.family_scores import CLEAR_LOG_BAYES, SIMILAR_LOG_BAYES
+from orthocal.hypotheses.hypothesis import Rows
 from orthocal.hypotheses.linear_model import LinearModel
 
 EXAMPLES = ("raw-cycles", "sweep", "workshop")
@@ -74,7 +77,7 @@ def count_accused(example: str, sessions: int) -> int:
     return sum(check_session(session).decision.verdict != "enter" for session in made)
 
 
-def plan_with(readings: int):
+def new_plan():
     """The plan that `orthocal new` makes for a machine of the packaged dimensions."""
     machine = "--leg-mm 310.25 --travel-mm=190:390 --attachment-mm 40 --rods-apart-mm 80"
     more = "--rod-radius-mm 5 --counts up --at-zero-mm 310.25"
@@ -84,7 +87,6 @@ def plan_with(readings: int):
         )
         assert done.exit_code == 0, done.output
         plan = load_plan(f"{folder}/m/first/session.yaml")
-    assert len(plan.readings) == readings
     return plan
 
 
@@ -106,22 +108,23 @@ def reverse_two_signs(plan, pairs: int) -> Iterator[tuple[object, frozenset[int]
 class _Exhaustive(search._Search):
     """A search that linearises far more sets of at most two hypotheses anew."""
 
-    def sets(self, rows: frozenset[int]) -> tuple[float, float]:
+    def compare(self, rows: frozenset[int]) -> tuple[float, float]:
         """Log evidence of the true pair, and of the best other set of one or two hypotheses."""
-        state, table = self.sound, search.Rows(self.session, self.values)
-        scored = list(self._score(state, search._families(self.model, table)))
-        scored += list(self._score(state, search.inconsistent_groups(table)))
-        sets = [(t,) for t in self._shortlist(scored, table)]
-        sets += self._pairs(state, scored)[0]
+        state, table = self.sound, Rows(self.session, self.session.values)
+        families = family_scores.list_families(self.model, table, grouped=True)
+        scored = list(self.scorer.score(state, families))
+        scored += list(self.scorer.score(state, inconsistent_groups(table)))
+        sets = [(t,) for t in self.scorer.shortlist(scored)]
+        sets += self.scorer.pairs(state, scored)[0]
         family = next(
             f for f, _ in scored
             if (e := f.explain(0)).kind == "reversed sign" and e.scope == "reading"
         )  # fmt: skip
-        truth = tuple(self._term(family, i, table) for i in sorted(rows))
-        own = self.evaluate(truth, state.about).log_posterior
+        truth = tuple(self.scorer.term(family, i) for i in sorted(rows))
+        own = self.sets.evaluate(truth, state.about).log_posterior
         keys = frozenset(t.explanation for t in truth)
         others = [
-            self.evaluate(s, state.about).log_posterior
+            self.sets.evaluate(s, state.about).log_posterior
             for s in sets
             if frozenset(t.explanation for t in s) != keys
         ]
@@ -133,18 +136,18 @@ def count_pairs(plan, pairs: int) -> dict[str, int]:
     counts = dict.fromkeys(("made", "can be named", "named", "others beyond 7", "reported"), 0)
     for session, rows in reverse_two_signs(plan, pairs):
         found = search.find_anomalies(session)
-        refitted = search.MOST_REFITTED, search.MOST_PAIRS_REFITTED
-        search.MOST_REFITTED, search.MOST_PAIRS_REFITTED = 40, 100
-        own, other = _Exhaustive(session, LinearModel(session)).sets(rows)
-        search.MOST_REFITTED, search.MOST_PAIRS_REFITTED = refitted
-        can = own >= search.CLEAR_LOG_BAYES and own - other >= search.SIMILAR_LOG_BAYES
+        refitted = family_scores.MAX_REFITTED, family_scores.MAX_REFITTED_PAIRS
+        family_scores.MAX_REFITTED, family_scores.MAX_REFITTED_PAIRS = 40, 100
+        own, other = _Exhaustive(session, LinearModel(session)).compare(rows)
+        family_scores.MAX_REFITTED, family_scores.MAX_REFITTED_PAIRS = refitted
+        can = own >= CLEAR_LOG_BAYES and own - other >= SIMILAR_LOG_BAYES
         kinds = {a.explanation.kind for a in found.found}
         told = frozenset(i for a in found.found for i in a.explanation.rows)
         named = kinds == {"reversed sign"} and told == rows and not found.ambiguous
         counts["made"] += 1
         counts["can be named"] += can
         counts["named"] += can and named
-        beyond = not can and max(own, other) >= search.CLEAR_LOG_BAYES
+        beyond = not can and max(own, other) >= CLEAR_LOG_BAYES
         counts["others beyond 7"] += beyond
         counts["reported"] += beyond and bool(found.found)
     return counts
@@ -154,7 +157,7 @@ def print_pairs(console: Console, pairs: int) -> None:
     """Print how often two reversed signs in different setups are named."""
     plans = {name: load_plan(ROOT / "examples" / name / "plan.yaml") for name in EXAMPLES[::2]}
     table = Table("plan", "made", "can be named", "named", "others beyond 7", "reported")
-    for name, plan in {"new": plan_with(24), **plans}.items():
+    for name, plan in {"new": new_plan(), **plans}.items():
         table.add_row(name, *map(str, count_pairs(plan, pairs).values()))
     console.print(table)
 

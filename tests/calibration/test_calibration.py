@@ -54,7 +54,7 @@ def test_a_loaded_calibration_is_the_written_one(tmp_path, example, model):
 
 def test_the_file_has_the_documented_keys(result):
     document = json.loads(calibration_json(result))
-    assert document["schema"] == "orthocal/calibration/10"
+    assert document["schema"] == "orthocal/calibration/11"
     assert {
         "robot",
         "session",
@@ -63,6 +63,7 @@ def test_the_file_has_the_documented_keys(result):
         "parameters",
         "model_covariance",
         "noise_covariance",
+        "scaled_covariance",
         "sigma",
         "dof",
         "rms_before",
@@ -76,7 +77,9 @@ def test_the_file_has_the_documented_keys(result):
         "value",
         "std",
         "std_scatter",
+        "std_scaled",
         "prior_std",
+        "scaled",
         "free",
         "identifiable",
     } <= set(document["parameters"][0])
@@ -194,13 +197,15 @@ def test_all_outputs_state_the_same_standard_deviation():
     factor = confidence_factor(result.tolerance_scale.contrasts)
     for i, drive in enumerate(("x_slide", "y_slide", "z_slide")):
         found = table[f"{drive}.offset"]
-        std, scatter = found["std"], found["std_scatter"]
-        assert 0.0 < scatter < std
+        std, scatter, scaled = found["std"], found["std_scatter"], found["std_scaled"]
+        assert 0.0 < scatter < scaled < std
         assert std == pytest.approx(result.standard_deviations[i], rel=1e-12)
         for other in (in_file[f"{drive}.offset"], entries[drive]):
             assert other["std"] == pytest.approx(std, rel=1e-12)
             assert other["std_scatter"] == pytest.approx(scatter, rel=1e-12)
-        half = math.hypot(COVERAGE * scatter, factor * math.sqrt(std**2 - scatter**2))
+            assert other["std_scaled"] == pytest.approx(scaled, rel=1e-12)
+        rest = math.sqrt(std**2 - scatter**2 - scaled**2)
+        half = math.hypot(COVERAGE * scatter, factor * scaled, COVERAGE * rest)
         assert float(printed[drive][-2]) == pytest.approx(half * 1e3, abs=0.5e-3)
         assert (found["high"] - found["low"]) / 2 == pytest.approx(half, rel=1e-9)
 
@@ -221,15 +226,16 @@ def test_offsets_at_a_bound_or_with_a_known_value_are_not_significant(experiment
 
 
 def test_students_factor_applies_to_the_scaled_prior(experiment_2):
-    """Three contrasts determine its scale; the noise is as stated."""
+    """Three contrasts determine its scale; noise and the prior of offsets are as stated."""
     result = calibrate(experiment_2, "lengths", **QUICK)
     half = dict(zip([p.name for p in result.free], result.expanded_uncertainties, strict=True))
     factor = confidence_factor(result.tolerance_scale.contrasts)
     assert half["x_leg.length"] == pytest.approx(factor * result["x_leg.length"].std, rel=0.02)
     offset = result["x_slide.offset"]
-    rest = math.sqrt(offset.std**2 - offset.std_scatter**2)
+    rest = offset.std**2 - offset.std_scatter**2 - offset.std_scaled**2
     assert offset.std_scatter > 0.0
-    expected = math.hypot(2.0 * offset.std_scatter, factor * rest)
+    assert rest > 0.0
+    expected = math.hypot(2.0 * offset.std_scatter, factor * offset.std_scaled, 2.0 * rest**0.5)
     assert half["x_slide.offset"] == pytest.approx(expected, rel=1e-12)
 
 

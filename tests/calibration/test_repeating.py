@@ -85,8 +85,10 @@ EDITED = [
     ("residuals", 4, "predicted"),
     ("parameters", 1, "std"),
     ("parameters", 1, "std_scatter"),
+    ("parameters", 1, "std_scaled"),
     ("model_covariance", 1, 1),
     ("noise_covariance", 1, 1),
+    ("scaled_covariance", 1, 1),
     ("unmodelled", "leakage", 1, 1),
 ]
 

@@ -26,6 +26,7 @@ from orthocal import (
     write_session,
 )
 from orthocal.calibration.identify import identify
+from orthocal.measurement.recording import _is_outdated
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import drive_table
 
@@ -149,6 +150,7 @@ def test_files_keep_the_compensation(compensated, tmp_path):
     session = simulate_session(plan, {"x_slide.offset": 0.2 * MM}, seed=1).session
     write_session(session, tmp_path / "written")
     again = load_session(tmp_path / "written")
+    assert not _is_outdated(again)  # a recording reads the files once
     result, _ = identify(again, "offsets", **QUICK)
     write_calibration(result, tmp_path / "calibration.json")
     restored = restore_session(load_calibration(tmp_path / "calibration.json"))

@@ -281,7 +281,7 @@ def test_the_derivatives_of_the_error_map_are_exact(plan):
     rng = np.random.default_rng(1)
     errors = 1e-3 * rng.normal(size=len(map_.names))
     command = np.r_[plan.robot.drive_zero + 0.01, 1.0, -1.0, 1.0, 27.0]
-    twists = map_.twist_columns(errors, np.eye(errors.size), command)
+    twists = map_.twist_jacobian(errors, np.eye(errors.size), command)
     assert_derivative(twists, lambda e: map_.twists_of(e, command), errors)
     assert map_.twists_moved_by(np.eye(errors.size)[:, map_.names.index("rods.growth"), None]).sum()
     geometry = map_.geometry(errors, command)

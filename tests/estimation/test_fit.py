@@ -120,9 +120,9 @@ def test_the_robust_covariance_is_that_of_many_simulated_calibrations(exact_plan
 
 def test_nothing_moved_is_explained(exact_plan):
     still = calibrate(simulate_session(exact_plan, {}, exact=True).session)
-    (found,) = still.assessment.of_kind("nothing moved")
+    (found,) = still.assessment.of_kind("no deviation")
     assert found.numbers["before_rms_mm"] == pytest.approx(0.0, abs=1e-9)
-    assert not calibrate(plan_with_truth(exact_plan)).assessment.of_kind("nothing moved")
+    assert not calibrate(plan_with_truth(exact_plan)).assessment.of_kind("no deviation")
 
 
 def plan_with_truth(exact_plan):
@@ -132,7 +132,7 @@ def plan_with_truth(exact_plan):
 def test_nothing_to_move_is_explained(exact_plan):
     """The platform's own placement is seen by no reading of leg x alone."""
     result = calibrate(plan_with_truth(exact_plan), Choice(free=["frame.tcp.*"]))
-    (found,) = result.assessment.of_kind("nothing moved")
+    (found,) = result.assessment.of_kind("no sensitivity")
     assert {p.parameter for p in found.places} == {p.name for p in result.free}
     assert set(result.identifiability.unseen) == {p.name for p in result.free}
 

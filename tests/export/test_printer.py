@@ -69,7 +69,7 @@ def promised(page):
 
 
 @pytest.mark.usefixtures("short_reports")
-@pytest.mark.parametrize("firmware", FIRMWARES)
+@pytest.mark.parametrize("firmware", ["klipper", "marlin", "reprapfirmware"])
 def test_walk_of_the_owner_of_a_printer(tmp_path, firmware):
     """Paste a log, get an answer and lines; enter them; the bed is flat as promised."""
     rng = np.random.default_rng(1)
@@ -146,11 +146,26 @@ def test_no_nearby_settings_are_better(calibrated):
     assert cost(replace(s, radius=s.radius - 0.05 * MM))[0] > best
 
 
+def test_one_length_for_all_rods(calibrated):
+    """Marlin 1.1 has no trims of rods, and B is a radius there: the lines have neither."""
+    printer, calibration = calibrated
+    fit, free = (fit_firmware(calibration, name) for name in ("marlin1", "marlin"))
+    assert len(set(fit.settings.rods)) == 1
+    assert len(set(free.settings.rods)) == 3
+    assert fit.new.tool_rms > free.new.tool_rms
+    rods = np.array([r.uncertainty for r in fit.rows[1:4]])
+    assert rods == pytest.approx(np.full(3, rods[0]))
+    new = read_settings("marlin1", FIRMWARES["marlin1"].config_lines(fit.settings), -TRIGGER_MM)
+    flat = printer.probe(new, rings()) - TRIGGER_MM
+    expected = np.hypot(fit.new.layer_rms, fit.layer_unknown) / MM
+    assert np.sqrt(np.mean(flat**2)) < PROMISE * expected
+
+
 def test_uncertainty_of_the_settings(calibrated):
     """Errors beside the identified ones change the settings as the derivative says."""
     _, calibration = calibrated
     fit = fit_firmware(calibration, "klipper")
-    covariance, _ = restore_covariances(calibration)
+    covariance, _, _ = restore_covariances(calibration)
     n = len(calibration.free)
     assert covariance[:n, :n] == pytest.approx(calibration.model_covariance, rel=1e-6, abs=1e-18)
     of_sensors = [p.std for p in calibration.sensors]

@@ -18,7 +18,6 @@ from orthocal import (
     write_session,
 )
 from orthocal.hypotheses.families.sessions import changes_between_sessions, detectable_changes
-from orthocal.hypotheses.hypothesis import Rows
 from orthocal.hypotheses.hypothesis_set import explain_with_amounts
 from orthocal.hypotheses.linear_model import LinearModel
 from orthocal.hypotheses.search import _Search, find_anomalies
@@ -156,12 +155,12 @@ def test_without_a_stated_noise_no_change_is_found(experiment_2):
 
 def estimate_change(session, drive):
     """Change of a drive's offset between two sessions and its standard deviation, [m]."""
-    model, rows = LinearModel(session), Rows(session)
+    model = LinearModel(session)
     search = _Search(session, model)
     family = next(f for f in changes_between_sessions(model) if not f.known)
     (h,) = [h for h in range(family.count) if family.explain(h).drives == (drive,)]
-    term = search._term(family, h, rows)
-    (found,) = explain_with_amounts(search.evaluate([term], search.sound.about))
+    term = search.scorer.term(family, h)
+    (found,) = explain_with_amounts(search.sets.evaluate([term], search.sound.about))
     return found.amount, found.std
 
 

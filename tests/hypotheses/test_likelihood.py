@@ -10,7 +10,7 @@ from scipy.stats import Covariance, multivariate_normal
 from orthocal.hypotheses.likelihood import (
     AMOUNT_STDS,
     NOISE_SCALES,
-    TOLERANCE_SCALES,
+    SCALE_NODES,
     Products,
     build_likelihood,
     log_of_sum,
@@ -32,7 +32,7 @@ def case():
 def covariances(jacobian, n=N):
     return [
         e**2 * jacobian @ jacobian.T + (s * SIGMA) ** 2 * np.eye(n)
-        for e in TOLERANCE_SCALES
+        for e in SCALE_NODES
         for s in NOISE_SCALES
     ]
 

@@ -32,6 +32,7 @@ from orthocal.hypotheses.likelihood import (
     log_of_sum,
 )
 from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.hypotheses.row_changes import linearise_effect
 from orthocal.hypotheses.search import CLEAR_EFFECT_LOG_BAYES, find_anomalies
 from orthocal.statistics.distributions import log_positive_share
 
@@ -209,7 +210,7 @@ def test_readings_without_conditions_can_only_show_drift():
 @pytest.mark.parametrize("effect", ["backlash", "thermal"])
 def test_linearised_effects_are_differences_of_exact_readings(plan, effect):
     bare, machine = plan.with_effects([]), plan.with_effects([effect])
-    found = LinearModel(bare).linearise_effect(effect)
+    found = linearise_effect(LinearModel(bare), effect)
 
     def differ(one, other):
         """Difference of readings, and the first row of the setup of each."""

@@ -61,7 +61,7 @@ def test_derivatives_equal_those_of_the_expressions(request, name, size):
     expected = [np.asarray(v.full()) for v in theirs(at, d, q)]
 
     errors = functions.errors
-    slopes = errors.jacobian(at, np.eye(len(names)))
+    slopes = errors.placement_jacobian(at, np.eye(len(names)))
     geometry = errors.geometry(at)
     where = geometry.drives(d)[None], q[None], geometry.placements
     residual, g_a, g_q, g_t = _derivatives(functions, *where)
@@ -90,11 +90,12 @@ def test_a_choice_of_parameters_as_expressions_is_the_same_in_numbers(request, n
     functions, rng = robot_functions(robot), np.random.default_rng(3)
     errors = functions.errors
     free = robot.parameters.names[::2]
-    columns = errors.columns(free) * rng.uniform(0.5, 2.0, len(free))
+    columns = errors.unit_errors(free) * rng.uniform(0.5, 2.0, len(free))
     fixed = 1e-3 * rng.normal(size=len(errors.names))
-    chosen = SymbolicErrorMap(errors, fixed=fixed, columns=columns)
+    chosen = SymbolicErrorMap(errors, fixed=fixed, unit_errors=columns)
     theta = 1e-2 * rng.normal(size=len(free))
-    at, slopes = fixed + columns @ theta, errors.jacobian(fixed + columns @ theta, columns)
+    at = fixed + columns @ theta
+    slopes = errors.placement_jacobian(at, columns)
     _, d, q = _draw(robot, 0.0)
     neutral = errors.command(robot.drive_zero)[None, len(robot.drives) :]
     at_theta = ca.Function("values", [], chosen.values(ca.MX(ca.DM(theta)), neutral))

@@ -123,6 +123,25 @@ def test_a_setup_has_the_nuisance_parameter_that_is_stated(plan):
         collect_errors(plan.robot, single=single)
 
 
+def test_a_gauge_keeps_its_errors_between_sessions(plan, tmp_path):
+    """Its scale is that of truth.yaml; setups are mounted anew, and a text goes before the file."""
+    first, nuisance = simulate_session(plan, ERRORS, seed=1), nuisance_parameters(plan).parameters
+    file = tmp_path / "truth.yaml"
+    file.write_text(truth_document(first))
+    errors = collect_errors(plan.robot, file=file, nuisance=nuisance)
+    second = simulate_session(plan, errors, seed=2)
+    drawn = simulate_session(plan, ERRORS, seed=2)
+    scale = first.nuisance["gauge.scale"]
+    assert second.nuisance["gauge.scale"] == pytest.approx(scale, abs=1e-9)
+    others = {k: v for k, v in drawn.nuisance.items() if k != "gauge.scale"}
+    assert {k: v for k, v in second.nuisance.items() if k != "gauge.scale"} == others
+    single = ["gauge.scale_ppm=500"]
+    assert collect_errors(plan.robot, file=file, single=single, nuisance=nuisance)[
+        "gauge.scale"
+    ] == pytest.approx(500e-6)
+    assert "gauge.scale" not in collect_errors(plan.robot, file=file)  # a study has no gauge
+
+
 def test_readings_beyond_the_gauge_are_refused(plan):
     with pytest.raises(SessionError, match=r"the simulated reading .* the gauge's range ends at"):
         simulate_session(plan, {"x_slide.offset": 25e-3, "y_slide.offset": -25e-3})

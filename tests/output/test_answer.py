@@ -23,7 +23,7 @@ from orthocal import (
     simulate_session,
     summarize,
 )
-from orthocal.assessment.assess import expanded_uncertainty
+from orthocal.assessment.controller_entries import expanded_uncertainty
 from orthocal.assessment.words.entries import describe_tool_error
 from orthocal.output.report.page import build_report
 from orthocal.output.text.answer import LISTED, MORE, MOST_LISTED, render_answer
@@ -136,7 +136,7 @@ def test_the_subject_comes_first_then_the_decision_and_then_the_rest(answers, na
         f"Machine: legs of {'250' if name == '250 mm' else '310.25'} mm, travel",
         "Measured: ",
         f"{found.decision.headline} {found.decision.reason}",
-        *(f.text for f in found.of_kind("tool error")),
+        *(f.text for f in found.of_kind("tool error") if found.decision.verdict == "enter"),
         "Next: ",
         MORE,
     ]
@@ -173,23 +173,30 @@ def test_values_to_enter_have_their_expanded_uncertainty(answers, name):
         assert row[-3:] == [f"{e.enter * 1e3:+.3f}", f"{half * 1e3:.3f}", "mm"]
 
 
-def test_few_contrasts_widen_all_but_the_noise(answers):
+def test_few_contrasts_widen_the_scaled_errors(answers):
     """Six differences and three offsets: Student's factor, 3.18 of three contrasts, for the scaled
     tolerances."""
     calibration = answers["table1/experiment-2"]
     factor = coverage_factor(calibration.tolerance_scale.contrasts)
     assert factor == pytest.approx(student.ppf(0.975, calibration.tolerance_scale.contrasts))
     for e in calibration.assessment.entries:
-        rest = e.std**2 - e.std_scatter**2
-        expected = np.sqrt(4.0 * e.std_scatter**2 + factor**2 * rest)
-        assert expanded_uncertainty(calibration, e) == pytest.approx(expected, rel=1e-3)
+        expected = np.sqrt(4.0 * (e.std**2 - e.std_scaled**2) + factor**2 * e.std_scaled**2)
+        assert expanded_uncertainty(calibration, e) == pytest.approx(expected, rel=1e-9)
 
 
-def test_a_rejected_session_offers_nothing_to_type(answers):
-    calibration = answers["table1/experiment-1-printed"]
-    assert calibration.assessment.decision.verdict == "reject"
-    assert "x_slide" not in summarize(calibration).split()
-    assert "x_slide" in summarize(calibration, details=True).split()
+@pytest.mark.parametrize(
+    ("name", "verdict"), [("table1/experiment-1-printed", "reject"), ("turned", "review")]
+)
+def test_doubtful_readings_offer_nothing_to_enter(answers, name, verdict):
+    """Neither values nor the tool error with them; the details have both."""
+    calibration = answers[name]
+    assert calibration.assessment.decision.verdict == verdict
+    short, details = summarize(calibration), summarize(calibration, details=True)
+    assert "x_slide" not in short.split()
+    assert "x_slide" in details.partition("\nValues to enter\n")[2].split()
+    (tool,) = calibration.assessment.of_kind("tool error")
+    assert tool.text not in short
+    assert tool.text in details
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -203,11 +210,12 @@ def test_one_tool_error_in_one_sentence_everywhere(answers, name):
     (stated,) = found.of_kind("tool error")
     assert stated.text == sentence
     assert stated.numbers["entered_um"] == pytest.approx(found.tool.entered * 1e6)
-    assert words_of(calibration).count(sentence) == 1
-    # the answer, the section of the tool and the findings
-    assert answers.complete(name).count(sentence) == 3
+    shown = found.decision.verdict == "enter"
+    assert words_of(calibration).count(sentence) == shown
+    # the section of the tool and the findings
+    assert answers.complete(name).count(sentence) == 2 + shown
     assert ("With all identified errors corrected: " in words_of(calibration)) == (
-        not calibration.only_offsets
+        shown and not calibration.only_offsets
     )
 
 
@@ -272,7 +280,8 @@ def test_notebook_and_report_show_the_same_answer(answers):
         for page in (notebook, report) if name == "turned" else (notebook,):
             assert found.decision.headline in page
             for finding in found.findings:
-                if finding.severity != "note" or finding.kind == "tool error":
+                stated = found.decision.verdict == "enter" and finding.kind == "tool error"
+                if finding.severity != "note" or stated:
                     assert finding.text.replace("'", "&#x27;") in page
         assert "studentised" not in notebook
     headline = answers["turned"].assessment.decision.headline

@@ -44,7 +44,7 @@ def test_sigma_is_held_against_the_gauges_own(table1):
 
 def test_details_list_the_values_to_enter_and_significant_changes(table1):
     text = summarize(table1, details=True)
-    assert line(text, "z_slide").split() == [*("z_slide", "+0.000", "-1.761", "3.141", "mm")]
+    assert line(text, "z_slide").split() == [*("z_slide", "+0.000", "-1.761", "3.140", "mm")]
     (found,) = table1.assessment.of_kind("not significant")
     assert {p.parameter for p in found.places} == {"x_slide", "y_slide", "z_slide"}
     assert found.text in " ".join(text.split())
@@ -89,7 +89,7 @@ def three_stated_rows(session):
 
 
 EXPLAINED = {
-    "fits": (lambda c, e: calibrate(_silent(c)), {"scatter_mm": 0.0102}),
+    "fits": (lambda c, e: calibrate(_silent(c)), {"sigma_mm": 0.0102}),
     "model error": (lambda c, e: calibrated(EXPERIMENT_2), {"ratio": 9.8, "sigma_mm": 0.195}),
     "model error beside cycles": (lambda c, e: every_time(c), {}),
     "noise from residuals": (lambda c, e: once(c), {}),

@@ -68,7 +68,7 @@ def test_the_gain_of_a_reading_in_place_of_another(drawn):
 def test_the_best_pair_of_an_absolute_setup(drawn):
     kind, *_, taking = drawn
     taking = replace(taking, setup=replace(kind, absolute=True))
-    pairs = Pairs.of(taking.setup, 2)
+    pairs = Pairs.of(taking.setup).with_count(2)
     gains = taking.gains(np.column_stack([pairs.first, pairs.second]))
     (gain, pair), *_ = taking.best_pairs(pairs, 1)
     assert gain == pytest.approx(gains.max(), rel=1e-9)
@@ -78,7 +78,7 @@ def test_the_best_pair_of_an_absolute_setup(drawn):
 @pytest.mark.parametrize("count", [2, 3, 4])
 def test_readings_are_completed_greedily(drawn, count):
     kind, information, root, taking = drawn
-    for _, pair in taking.best_pairs(Pairs.of(kind, count), 3):
+    for _, pair in taking.best_pairs(Pairs.of(kind).with_count(count), 3):
         gain, chosen = taking.complete(pair, count)
         expected = list(pair)
         while len(expected) < count:
@@ -106,7 +106,7 @@ def test_best_pairs_have_the_largest_gains_and_share_no_reading(drawn, count):
         for p in permutations(range(READINGS), 2)
         if kind.reachable[p] and kind.reachable[p[0]].sum() >= count
     ]
-    found = taking.best_pairs(Pairs.of(kind, count), 3)
+    found = taking.best_pairs(Pairs.of(kind).with_count(count), 3)
     for gain, pair in found:
         assert gain == pytest.approx(max(map(worth, left)), rel=1e-12)
         assert pair in left
@@ -131,7 +131,7 @@ def test_gains_with_the_gauge_aligned_in_the_first_posture(seed):
     )
     kind, covariance = replace(kind, aligned=by_hand), np.linalg.inv(information)
     found = SetupGain.of(kind, covariance, covariance @ root, SIGMA).best_pairs(
-        Pairs.of(kind, 3), 3
+        Pairs.of(kind).with_count(3), 3
     )
     assert len({first for _, (first, _) in found}) == len(found) > 0
     for gain, (first, second) in found:
@@ -200,7 +200,7 @@ def test_the_gain_of_a_point_in_place_of_another(drawn_points):
 
 def test_points_are_completed_greedily_from_the_best_one(drawn_points):
     gain, reduction = drawn_points
-    pairs = gain.best_pairs(Pairs.of(gain.setup, 2), 2)
+    pairs = gain.best_pairs(Pairs.of(gain.setup).with_count(2), 2)
     (value, pair), (_, second) = pairs
     assert value == pytest.approx(reduction(pair), rel=1e-9)
     assert pair[0] == max(range(POINTS), key=lambda i: reduction([i]))

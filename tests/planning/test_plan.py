@@ -125,7 +125,7 @@ def simulate_tool_error(plan, workspace, *, machines):
     assert reached.all()
     values = values + sigma * rng.normal(size=values.shape)
     found = BatchSolver(problem).solve(values, sigma=sigma).theta
-    closure, columns = LoopClosure(robot), problem.functions.errors.columns(names)
+    closure, columns = LoopClosure(robot), problem.functions.errors.unit_errors(names)
     drives = closure.inverse(workspace.points)
 
     def tools(values):
@@ -307,7 +307,7 @@ def test_the_memory_of_a_plan_is_released_with_it(orthoglide):
     candidates = search.candidates
     plan = search.choose([3] * 3, starts=2)
     list(search.grow([3] * 3))
-    arrays = [s.reachable for s in candidates.setups] + [p.flat for p in search.pairs.values()]
+    arrays = [s.reachable for s in candidates.setups] + [p.flat for p in search.pairs]
     kept = [weakref.ref(array) for array in arrays]
     del arrays, candidates, search, plan
     gc.collect()

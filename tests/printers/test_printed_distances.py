@@ -143,7 +143,7 @@ def test_derivatives(session):
     model = ObservationModel(session)
     chosen = ["a_slide.offset", "b_slide.x", "c_coupler.x", "a_bar_b.rz", "b_slide.scale"]
     at, n = np.array([4e-4, -3e-4, 5e-4, 2e-3, 1e-3]), len(model.nuisance.parameters)
-    columns = model.functions.errors.columns(chosen)
+    columns = model.functions.errors.unit_errors(chosen)
     free = model.parametrise(columns, np.ones(n))
     errors = columns @ at
     fixed = LoopClosure(session.robot, fixed=dict(zip(chosen, at, strict=True)))

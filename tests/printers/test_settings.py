@@ -20,11 +20,12 @@ ROUNDING = 1e-6
 def odd(firmware="klipper"):
     """Settings with everything different."""
     turns = np.array([0.7, -0.4, 0.2]) * DEG
+    rods = (0.2801234567, 0.2812345678, 0.2793456789)
     tilts = (0.003, -0.002) if firmware == "reprapfirmware" else (0.0, 0.0)
     return DeltaSettings(
         firmware,
         0.1412345678,
-        (0.2801234567, 0.2812345678, 0.2793456789),
+        rods[:1] * 3 if FIRMWARES[firmware].equal_rods else rods,
         (0.5512345678, 0.5498765432, 0.5523456789),
         tuple((np.array(DESIGN_ANGLES) + turns).tolist()),
         tilts,

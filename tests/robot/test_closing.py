@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tolerances import CLOSED
+from tolerances import CLOSED, KINEMATICS
 
-from orthocal.robot.closing import close_loops, describe_opening
+from orthocal.robot.closing import RANK_TOLERANCE, close_loops, describe_opening, invert_closures
 
 
 def close(evaluate, start, **options):
@@ -77,3 +77,15 @@ def test_numbers_that_are_none_end_it():
 )
 def test_metres_and_radians_are_told_apart(residual, words):
     assert describe_opening(residual, [False, False, True]) == words
+
+
+@pytest.mark.parametrize("shape", [(2, 4, 5, 5), (3, 6, 5), (3, 4, 5)])
+def test_closure_jacobians_are_inverted_one_by_one(shape):
+    """More rows than coordinates, or fewer: the shortest least-squares change."""
+    jacobians = np.random.default_rng(1).normal(size=shape)
+    inverses = invert_closures(jacobians)
+    assert inverses.shape == (*shape[:-2], shape[-1], shape[-2])
+    for index in np.ndindex(shape[:-2]):
+        rows = np.eye(shape[-2])
+        change = np.linalg.lstsq(jacobians[index], rows, rcond=RANK_TOLERANCE)[0]
+        assert np.abs(inverses[index] - change).max() < KINEMATICS * np.abs(change).max()

@@ -79,6 +79,20 @@ def test_a_mistake_is_named_with_its_place(sound, mistake):
         assert {p.setup for p in found[0].places} == {place}
 
 
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_bar_with_all_signs_reversed_is_named(tmp_path, seed):
+    """Beside readings of the legs; the fixed ball seems to be on the opposite side of its place."""
+    plan = circles(tmp_path, legs=True)
+    plan = plan.select(
+        [r for r in plan.readings if not r.posture.endswith(("1", "3", "5", "7", "9"))]
+    )
+    session = simulate_session(plan, errors_of(plan, seed), seed=seed).session
+    of_bar = np.array([session.setups[r.setup].gauge == "bar" for r in session.readings])
+    (found,) = warnings_of(session.with_values(np.where(of_bar, -1.0, 1.0) * session.values))
+    assert found.kind == "reversed sign"
+    assert {p.setup for p in found.places} == {"xy", "yz", "zx"}
+
+
 @pytest.mark.parametrize("first", ["yz", "zx"])
 @pytest.mark.parametrize("size", [50e-6, 0.3e-3])
 def test_a_ball_displaced_between_setups_is_named(tmp_path, first, size):

@@ -11,6 +11,7 @@ from tolerances import CLOSED_FORM, KINEMATICS
 
 from orthocal import load_plan, load_session, write_session
 from orthocal.errors import SessionError
+from orthocal.session.session import split_label
 
 HEAD = """robot: orthoglide
 postures:
@@ -153,3 +154,16 @@ def test_a_session_written_elsewhere_has_its_robot(root, tmp_path):
     session = load_session(write(tmp_path / "s", head=head))
     again = load_session(write_session(session, tmp_path / "deep/er/copy"))
     assert again.robot.sha256 == session.robot.sha256
+
+
+@pytest.mark.parametrize(
+    ("name", "joined", "parts"),
+    [
+        ("monday/yx", True, ("monday", "yx")),
+        ("monday", True, ("monday", "")),  # an unnamed gauge
+        ("monday/a/b", True, ("monday", "a/b")),
+        ("a/b", False, ("", "a/b")),
+    ],
+)
+def test_names_of_joined_sessions_have_a_label(name, joined, parts):
+    assert split_label(name, joined=joined) == parts

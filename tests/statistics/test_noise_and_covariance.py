@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from calibrated import plan_of
 from gauges import exact
-from intervals import assert_coverage
+from intervals import assert_coverage, coverage_band
 from models import TRUTH
 from scipy import stats
 from tolerances import KINEMATICS
@@ -152,10 +152,58 @@ def test_expanded_uncertainty_is_twice_the_deviation_or_students_factor_of_the_n
     assert coverage_factor(np.inf) == 2.0
     assert coverage_factor(3.0) == confidence_factor(3.0)
     assert np.isnan(coverage_factor(0.0))
-    assert expanded_uncertainty(3.0, 3.0, dof=np.inf) == 6.0
-    assert expanded_uncertainty([5.0], [0.0], dof=2.0) == [10.0]
-    both = expanded_uncertainty(5.0, 3.0, dof=3.0)
+    assert expanded_uncertainty(3.0, 3.0, 0.0, dof=np.inf) == 6.0
+    assert expanded_uncertainty([5.0], [0.0], [0.0], dof=2.0, contrasts=2.0) == [10.0]
+    both = expanded_uncertainty(5.0, 3.0, 0.0, dof=3.0)
     assert both == pytest.approx(np.hypot(3.0 * confidence_factor(3.0), 8.0))
+    # 1² + 2² + 2² = 3²: noise, scaled errors, priors of known size
+    each = expanded_uncertainty(3.0, 1.0, 2.0, dof=3.0, contrasts=4.0)
+    factors = np.array([confidence_factor(3.0), confidence_factor(4.0), 2.0])
+    assert each == pytest.approx(np.linalg.norm(factors * [1.0, 2.0, 2.0]))
+
+
+@pytest.mark.parametrize("contrasts", [2, 3, 6])
+def test_expanded_uncertainty_covers_estimated_and_known_parts(contrasts):
+    """At least 95 % of sums, and of one estimated part alone; effective degrees of freedom do not.
+
+    The sum x has the known variance 1 and the variance v² of scaled errors, which is estimated.
+    """
+    count, rng = 20000, np.random.default_rng(1)
+    low, high = coverage_band(count)
+    normal, factor = rng.normal(size=count), rng.chisquare(contrasts, size=count) / contrasts
+    alone = expanded_uncertainty(factor**0.5, 0.0, factor**0.5, dof=np.inf, contrasts=contrasts)
+    assert low <= (np.abs(normal) <= alone).sum() <= high
+    for v2 in (0.1, 1.0, 3.0, 10.0):
+        scaled = v2 * factor
+        x = np.sqrt(1.0 + v2) * normal
+        half = expanded_uncertainty(
+            np.sqrt(1.0 + scaled), 0.0, np.sqrt(scaled), dof=np.inf, contrasts=contrasts
+        )
+        assert (np.abs(x) <= half).sum() >= low
+        if contrasts == 2 and v2 == 3.0:
+            effective = (1.0 + scaled) ** 2 / (scaled**2 / contrasts)
+            welch = stats.t.ppf(0.975, effective) * np.sqrt(1.0 + scaled)
+            assert np.mean(np.abs(x) <= welch) == pytest.approx(0.93, abs=0.005)
+
+
+def test_parts_of_a_covariance_are_those_of_the_errors_that_cause_them():
+    """Errors of the estimate are linear in the noise and in the parameters less their means."""
+    rng, sigma = np.random.default_rng(2), 0.3
+    jacobian, precision = rng.normal(size=(7, 5)), np.array([1.0, 0.0, 1.0, 1.0, 1.0])
+    scaled, held = np.array([0, 0, 1, 1, 0], dtype=bool), np.array([0, 0, 0, 1, 0], dtype=bool)
+    information, free = Information(jacobian), ~held
+    inverse = np.zeros((5, 5))
+    rows = jacobian[:, free] / sigma
+    normal = rows.T @ rows + np.diag(precision[free])
+    inverse[np.ix_(free, free)] = np.linalg.inv(normal)
+    known = {"sigma": sigma, "precision": precision, "at_bound": held}
+    found = information.prior_covariance(priors=scaled, **known)
+    assert found == pytest.approx(np.outer(inverse[:, 2], inverse[2]))
+    for loss in ((1.0, 1.0), (0.8, 0.6)):
+        parts = information.noise_covariance(loss=loss, **known)
+        for priors in (scaled, ~scaled):
+            parts = parts + information.prior_covariance(priors=priors, loss=loss, **known)
+        assert parts == pytest.approx(information.covariance(loss=loss, **known))
 
 
 def test_undetermined_offsets_are_named(raw_cycles):

@@ -11,7 +11,9 @@ from orthocal.assessment.words.effects import identify_effects
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.effects.loading import errors_of_no_model, robot_effects, with_effects
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, Explanation
-from orthocal.session.session import Session
+from orthocal.measurement.motion.approach import label_reading
+from orthocal.sensors.protocol import states_readings
+from orthocal.session.session import Session, split_label
 from orthocal.text import printable, spans
 from orthocal.units import EDGE_UNITS, MM, UM, Unit
 
@@ -20,6 +22,9 @@ MAX_PLACES = 20
 
 LARGEST_ODDS = 1e6
 """Odds above which the number is not printed."""
+
+LEAST_CHANCE = 1e-4
+"""Probability by chance below which only this limit is printed."""
 
 UNITS = {25.4: "in inches", 1e3: "in m", 1e-3: "in µm"}
 """Unit of wrongly written readings by the factor that corrects them; others are mm as inches."""
@@ -42,8 +47,10 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
         return _ambiguous(session, result, anomaly)
     first = session.readings[e.rows[0]]
     descriptions = [_text(session, c) for c in anomaly.causes] or [_text(session, e)]
-    text = f"{_lines(session, e)}it looks as if {' or '.join(descriptions)}."
-    text = f"{text[0].upper()}{text[1:]}"
+    text = _capitalised(f"{_lines(session, e)}it looks as if {descriptions[0]}.")
+    if len(descriptions) > 1:
+        listed = ";\n  ".join(descriptions)
+        text = _capitalised(f"{_lines(session, e)}one of these may have happened:\n  {listed}.")
     numbers = _numbers(result, anomaly)
     if e.amounts:
         numbers["amount_um"] = (e.amount or 0.0) / UM
@@ -52,10 +59,11 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
     if e.kind in ("wrong dimension", "readjusted dimension"):
         numbers["dimension_mm"], numbers["stated_mm"] = _dimensions_mm(e)
     if anomaly.expected is not None:
-        text += (
-            f" It reads {signed(first.value / MM)} mm; the other readings predict "
-            f"{signed(anomaly.expected / MM)} mm."
-        )
+        if not _is_trigger(session, e):
+            text += (
+                f" It reads {signed(first.value / MM)} mm; the other readings predict "
+                f"{signed(anomaly.expected / MM)} mm."
+            )
         numbers |= {
             "measured_mm": first.value / MM,
             "expected_mm": anomaly.expected / MM,
@@ -132,8 +140,7 @@ def _unexplained(session: Session, result: Anomalies) -> Finding:
 def _between_sessions(session: Session, anomaly: Anomaly) -> Finding:
     """Finding about a machine that changed, or offsets that were not entered as stated."""
     e = anomaly.explanation
-    text = _text(session, e)
-    text = f"{text[0].upper()}{text[1:]}."
+    text = _capitalised(f"{_text(session, e)}.")
     others = [_text(session, c) for c in (*anomaly.causes, *anomaly.alternatives) if c != e]
     if others:
         text += f" The readings do not distinguish this from: {'; '.join(others)}."
@@ -192,7 +199,11 @@ def _numbers(result: Anomalies, anomaly: Anomaly) -> dict[str, float]:
 
 
 def describe_evidence(finding: Finding) -> str:
-    """Residuals before and after the correction of an anomaly, and its odds; "" if unknown."""
+    """Numbers behind a finding about readings; "" without any.
+
+    Residuals before and after the correction of an anomaly, and its odds; correlation of the
+    residuals of two sessions.
+    """
     numbers = finding.numbers
     sentences = []
     before, after = (numbers.get(f"{n}_rms_um", math.nan) * UM for n in ("before", "after"))
@@ -204,6 +215,14 @@ def describe_evidence(finding: Finding) -> str:
         if odds > 0.999 * LARGEST_ODDS:
             number = f"more than {LARGEST_ODDS:,.0f}"
         sentences.append(f"Odds that something is wrong: {number} to 1.")
+    if "correlation" in numbers and math.isfinite(numbers["correlation"]):
+        probability = f"below {100.0 * LEAST_CHANCE:g} %"
+        if numbers["chance"] >= LEAST_CHANCE:
+            probability = f"{100.0 * numbers['chance']:.2g} %"
+        sentences.append(
+            f"Correlation {numbers['correlation']:.3f} over {numbers['rows']:.0f} lines; "
+            f"probability by chance {probability}."
+        )
     return " ".join(sentences)
 
 
@@ -231,7 +250,7 @@ def place_of(session: Session, row: int) -> Place:
 
 def _file_of(session: Session, label: str) -> str | None:
     """Path to the session.yaml of a joined session; None if unknown."""
-    names = list(dict.fromkeys(name.partition("/")[0] for name in session.setups))
+    names = list(dict.fromkeys(session.labels))
     if len(session.parts) != len(names) or label not in names:
         return None
     path = session.parts[names.index(label)].path
@@ -249,11 +268,16 @@ def _lines(session: Session, e: Explanation) -> str:
     return f"{spans(lines, 'line')}{file}: "
 
 
+def _capitalised(text: str) -> str:
+    """A text with a capital first letter."""
+    return f"{text[0].upper()}{text[1:]}"
+
+
 def _row(session: Session, row: int) -> str:
     """Setup, postures and cycle of a reading; for a printer's log with the probed point."""
     reading = session.readings[row]
     if session.firmware is None or reading.minus is not None:
-        return reading.label_with_cycle
+        return label_reading(session.robot, reading)
     x, y = session.firmware.touched(session.postures[reading.posture].drives)[0, :2] / MM
     return f"{reading.label_with_cycle} (x {x:.1f}, y {y:.1f} mm)"
 
@@ -283,15 +307,15 @@ def _text(session: Session, e: Explanation) -> str:
         "reversed sign": lambda: _reversed(session, e),
         "misread dial": lambda: (
             f"{_subject(session, e)} was read {abs(e.amount or 0.0) / MM:g} mm too "
-            f"{'high' if (e.amount or 0.0) > 0 else 'low'}, by a turn or a mark of the dial"
+            f"{'high' if (e.amount or 0.0) > 0 else 'low'}, by one turn or one mark of the dial"
         ),
-        "outlier": lambda: f"{_subject(session, e)} was misread or mistyped",
+        "outlier": lambda: _wrong_reading(session, e),
         "inconsistent posture": lambda: (
-            f"{_subject(session, e)} was misread or mistyped"
+            _wrong_reading(session, e)
             if e.scope == "posture"
             else f"the machine was not in posture {e.names[0]} when that was read"
         ),
-        "inconsistent setup": lambda: f"setup {e.setups[0]} is not the one that is described",
+        "inconsistent setup": lambda: f"setup {e.setups[0]} was not mounted as session.yaml states",
         "swapped rows": lambda: _swapped(session, e),
         "row offset": lambda: _offset(session, e),
         "stuck dial": lambda: (
@@ -299,7 +323,7 @@ def _text(session: Session, e: Explanation) -> str:
             f"the same {len(e.rows)} times"
         ),
         "displaced gauge": lambda: _displaced(session, e),
-        "displaced artefact": lambda: _displaced_artefact(e),
+        "displaced artefact": lambda: _displaced_artefact(session, e),
         "wrong dimension": lambda: _other_dimension(session, e),
         "readjusted dimension": lambda: _readjusted(e),
         "drift": lambda: _drifted(e),
@@ -334,6 +358,25 @@ def _text(session: Session, e: Explanation) -> str:
     return texts[e.kind]()
 
 
+def _wrong_reading(session: Session, e: Explanation) -> str:
+    """Clause about a reading that contradicts the others."""
+    subject = _subject(session, e)
+    if not _is_trigger(session, e):
+        return f"{subject} was misread or mistyped"
+    excess = e.amount or 0.0  # of the prescribed height over the height of the trigger
+    side, cause = (
+        ("above", "a bump, dirt or filament, or a trigger that came too early")
+        if excess < 0.0
+        else ("below", "a dent, or a trigger that came too late")
+    )
+    return f"{subject} triggered {mm(abs(excess))} mm {side} the surface of the others: {cause}"
+
+
+def _is_trigger(session: Session, e: Explanation) -> bool:
+    """True if an explanation concerns a reading that a switch triggered."""
+    return states_readings(session.setups[session.readings[e.rows[0]].setup].sensor)
+
+
 def _amounts(e: Explanation) -> str:
     """Significant parameters of an effect, such as "x_slide.backlash 0.045 ± 0.010 mm"."""
     texts = []
@@ -363,6 +406,11 @@ def _displaced(session: Session, e: Explanation) -> str:
     """Clause about a displaced gauge."""
     if e.scope == "cycle":
         return f"the gauge of setup {e.names[0]} was displaced before cycle {e.cycle}"
+    if _is_trigger(session, e):
+        return (
+            f"the probe or the bed moved before {_row(session, e.rows[0])}: all later points are "
+            "shifted"
+        )
     return (
         f"the gauge of setup {e.names[0]} was displaced before {_row(session, e.rows[0])}: all "
         "later readings of that setup are shifted"
@@ -391,17 +439,17 @@ def _reversed(session: Session, e: Explanation) -> str:
     return f"the signs of {subject} are reversed"
 
 
-def _displaced_artefact(e: Explanation) -> str:
+def _displaced_artefact(session: Session, e: Explanation) -> str:
     """Clause about a displaced artefact, such as a ball post, with its session."""
-    label, _, artefact = e.names[0].rpartition("/")
+    label, artefact = split_label(e.names[0], joined=session.joined)
     name = f"{artefact.replace('.', ' ')}{f' of session {label}' if label else ''}"
-    how = "displaced or turned over" if _can_turn(e) else "displaced"
+    how = "displaced or turned over" if _can_turn(session, e) else "displaced"
     return f"{name} was {how} before setup {e.setups[0]}"
 
 
-def _can_turn(e: Explanation) -> bool:
+def _can_turn(session: Session, e: Explanation) -> bool:
     """True if an artefact has two sides: a square or a straightedge."""
-    artefact = "".join(e.names[:1]).rpartition("/")[2]
+    _, artefact = split_label("".join(e.names[:1]), joined=session.joined)
     return artefact.startswith(("square.", "straightedge."))
 
 
@@ -486,17 +534,19 @@ def _remedy(session: Session, e: Explanation) -> str:
             f"{reverse_direction}"
         )
     if e.factor is not None:
-        return f"If so, multiply these by {e.factor:.6g}."
+        return f"If so, multiply these readings by {e.factor:.6g}."
     if e.kind == "displaced gauge" and e.scope == "cycle":
         return f"If so, read cycle {e.cycle} again, or leave it out."
     if e.kind == "row offset":
         if e.missing:
             return "If so, move them down by a line and read what is missing."
         return "If so, move them up by a line and read the last one again."
+    if e.kind == "displaced gauge" and session.firmware is not None:
+        return "If so, fasten the probe and the bed, probe again and import the new log."
     if e.kind == "inconsistent posture" and e.scope == "postures":
         return "Check its coordinates, and read it again."
     remedies = {
-        "displaced artefact": ("Check `reversed` of its setups. " if _can_turn(e) else "")
+        "displaced artefact": ("Check `reversed` of its setups. " if _can_turn(session, e) else "")
         + "If it was displaced, give it another name in the later setups.",
         "wrong dimension": f"If so, measure it, and correct `{''.join(e.names[:1])}`.",
         "readjusted dimension": "If so, state the present "
@@ -519,22 +569,23 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
     """Action to repeat or omit readings, with commands for the first one."""
     rows = [session.readings[i] for e in explanations for i in e.rows]
     if session.firmware is not None:
-        repeat = "Probe the bed again and import that log"
+        repeat = "Clean the bed and the nozzle, probe again and import the new log"
         if all(r.minus is not None for r in rows):
             repeat = (
                 "Measure again and correct the command DELTA_ANALYZE, then import the log again"
             )
-        return f"{repeat}, or leave out what is wrong."
-    advice = "Read it again" if len(rows) == 1 else "Look at these readings. Read them again"
+        lines = [r.line for r in rows if r.line is not None][:MAX_PLACES]
+        omitted = f"delete {spans(lines, 'line')} of readings.csv" if lines else "leave it out"
+        return f"{repeat}. Or {omitted}, and calibrate again."
+    what = "it" if len(rows) == 1 else "these"
     file = rows[0].file or session.readings_path
     if file is None or rows[0].line is None:
-        return f"{advice}, or leave out what is wrong."
+        return f"Read {what} again, or leave out what is wrong."
     line, path = rows[0].line, printable(shlex.quote(str(file.parent)))
-    others = "" if len(rows) == 1 else " Other lines likewise."
+    others = "" if len(rows) == 1 else ", and so on"
     return (
-        f"{advice}, or leave out what is wrong. In `orthocal record {path}` the command "
-        f"`again {line}` reads line {line} once more, `back {line}` corrects it, and "
-        f"`drop {line}` deletes it.{others}"
+        f"Read {what} again: in `orthocal record {path}` type `again {line}`{others}. "
+        f"`back {line}` corrects a mistyped reading, `drop {line}` deletes it."
     )
 
 

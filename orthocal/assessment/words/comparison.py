@@ -82,8 +82,8 @@ def describe_effects(comparison: EffectComparison | None, readings: int) -> list
         text, action = _describe_recommended_effects(comparison)
     else:
         single = [w.effects[0] for w in comparison.weighed if len(w.effects) == 1]
-        text = "Recommended effects: none. The readings do not support "
-        text, action = f"{text}{joined(single, 'or')} strongly.", ""
+        text, action = "Recommended effects: none. The readings do not clearly show ", ""
+        text += f"{joined(single, 'or')}; effects that the machine states may stay."
     numbers = {"log_evidence": best.log_evidence, "unseen_rms_mm": best.unseen_rms / MM}
     return [note("effects recommended", text, action, **numbers), *notes]
 
@@ -134,7 +134,7 @@ def not_determined(model: str, reason: str) -> Finding:
 def linearisation_cost(rms: float) -> Finding:
     """Finding about the increase of the tool error by linearisation, RMS, [m]."""
     return note(
-        "linearisation error",
+        "linearisation cost",
         f"Linearisation costs {tool_mm(rms)} RMS at the tool.",
         cost_um=rms / UM,
     )

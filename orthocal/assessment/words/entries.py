@@ -65,7 +65,7 @@ def no_anomaly(readings: int, *, within_tolerances: bool) -> Finding:
         text = f"The reading agrees {machine}."
     else:
         text = "There is no second reading to compare the reading with."
-    return note("fits", text, readings=float(readings))
+    return note("no anomaly", text, readings=float(readings))
 
 
 def readings_missing(session: Session) -> Finding:
@@ -74,7 +74,7 @@ def readings_missing(session: Session) -> Finding:
     return note(
         "readings missing",
         f"{describe_missing(session)}.",
-        "",
+        "Record them with `orthocal record`, or delete their lines there (`drop`).",
         [place_of(session, i) for i in missing[:MAX_PLACES]],
         readings=float(len(session.readings)),
         missing=float(len(missing)),
@@ -115,7 +115,10 @@ def must_change(drives: Sequence[str]) -> Finding:
 
 def not_significant(drives: Sequence[str]) -> Finding:
     """Finding about offsets that change by less than their uncertainty."""
-    text = f"{_describe_change(drives, 'less')} The tool error depends on all offsets together."
+    text = (
+        f"{_describe_change(drives, 'less')} Enter all offsets together or none: the tool error "
+        "depends on all of them."
+    )
     return note("not significant", text, "", named(*drives))
 
 
@@ -246,8 +249,8 @@ def describe_without_backlash(rms: float) -> str:
         rms: RMS of that tool error, [m].
     """
     return (
-        f"With the controller's present backlash: {tool_mm(rms)}. Approach from one side "
-        "avoids the difference."
+        f"With the controller's present backlash: {tool_mm(rms)}; approach from one side avoids "
+        "the difference."
     )
 
 

@@ -47,26 +47,20 @@ def noise_as_stated(sigma: float) -> Finding:
 def noise_from_cycles(scatter: float) -> Finding:
     """Finding that uncertainties depend on the scatter of repeated readings alone."""
     return note(
-        "noise as stated",
+        "noise from cycles",
         "The uncertainty rests on the scatter of repeated readings.",
         scatter_mm=scatter / MM,
     )
 
 
-def fits_stated_noise(sigma: float) -> Finding:
-    """Finding that the residuals agree with the stated noise."""
-    return note(
-        "fits", "The residuals agree with the stated noise of the gauge.", sigma_mm=sigma / MM
-    )
+def fits(sigma: float, source: str) -> Finding:
+    """Finding that the residuals agree with the noise.
 
-
-def fits_cycles(scatter: float) -> Finding:
-    """Finding that the residuals agree with the scatter of repeated readings."""
-    return note(
-        "fits",
-        "The residuals agree with the scatter of repeated readings: the model fits.",
-        scatter_mm=scatter / MM,
-    )
+    Args:
+        sigma: Standard deviation of a reading, [m].
+        source: Noun phrase for the source of the noise.
+    """
+    return note("fits", f"The residuals agree with {source}.", sigma_mm=sigma / MM)
 
 
 def model_error(
@@ -90,9 +84,9 @@ def model_error(
     """
     return note(
         "model error",
-        f"After the fit, {row_noun} typically deviates by {mm(sigma * row_factor)} mm, "
+        f"After the calibration {row_noun} still deviates by about {mm(sigma * row_factor)} mm, "
         f"{times(sigma / reference)} {source} ({mm(reference * row_factor)} mm). Probable cause: "
-        "errors of legs, axes and mounting, not noise.",
+        "errors of legs, axes and mounting.",
         "`orthocal compare` shows whether the readings support a larger model."
         if may_enlarge_model
         else "",
@@ -118,8 +112,8 @@ def no_redundancy(readings: int, parameters: int) -> Finding:
     """Finding that the fit has no redundant readings."""
     return note(
         "no redundancy",
-        f"With {readings} independent readings for {parameters} possible errors the fit cannot be "
-        "checked against the readings. It relies on the stated tolerances.",
+        f"There are {readings} independent readings for {parameters} possible errors, so the "
+        "result relies on the stated tolerances. Only new readings can check it.",
         independent_readings=float(readings),
         parameters=float(parameters),
     )
@@ -128,7 +122,7 @@ def no_redundancy(readings: int, parameters: int) -> Finding:
 def nothing_depends(names: Sequence[str]) -> Finding:
     """Finding that no reading depends on any free parameter."""
     return note(
-        "nothing moved",
+        "no sensitivity",
         "No reading depends on any free parameter, so all keep their start values.",
         "Read setups and postures that depend on the parameters.",
         named(*names),
@@ -138,7 +132,7 @@ def nothing_depends(names: Sequence[str]) -> Finding:
 def nothing_deviates(rms: float) -> Finding:
     """Finding that the readings show no deviation that the parameters explain."""
     return note(
-        "nothing moved",
+        "no deviation",
         f"The readings show no deviation that these parameters explain (RMS {mm(rms)} mm).",
         before_rms_mm=rms / MM,
     )

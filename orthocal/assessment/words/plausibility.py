@@ -30,15 +30,16 @@ def wrong_dimensions(legs: str, nominal: float, measured: float) -> Finding:
 def beyond_tolerances(scale: float, limit: float, *, firmware: bool) -> Finding:
     """Finding that only errors of many times the stated tolerances explain the readings."""
     check = (
-        "Check that the settings of the log are those with which it was probed, and its points."
+        "Check that the settings of the log are those with which it was probed. Then clean the bed "
+        "and the nozzle, and probe again."
         if firmware
         else "Check signs, lines and setups. If they are right, adjust the machine mechanically "
         "first."
     )
     return reject(
         "beyond tolerances",
-        f"These readings need errors {times(scale)} the stated tolerances. Above {limit:g} times, "
-        "the readings are wrong or the machine is out of adjustment.",
+        f"Only errors of {times(scale)} the stated tolerances explain these readings. Above "
+        f"{limit:g} times, the readings are wrong or the machine is out of adjustment.",
         check,
         tolerance_scale=scale,
     )
@@ -48,7 +49,8 @@ def above_tolerances(scale: float) -> Finding:
     """Finding that errors of the machine exceed their tolerances by a plausible factor."""
     return note(
         "above tolerances",
-        f"The errors of this machine are about {times(scale)} the stated tolerances.",
+        f"Errors of legs and axes are about {times(scale)} their tolerances; the calculation "
+        "allows for it.",
         tolerance_scale=scale,
     )
 
@@ -172,9 +174,9 @@ def scattered_repeats(
     """
     return review(
         "scattered repeats",
-        f"Repeated readings scatter by {mm(scatter)} mm. The gauge's noise explains {mm(gauge)} "
-        f"mm. They differ most at {label}: {shown} mm.",
-        "Check these for a wrong sign or row, and read them again.",
+        f"Repeated readings scatter by {mm(scatter)} mm; the gauge explains {mm(gauge)} mm. They "
+        f"differ most at {label}: {shown}.",
+        "Check these lines for a wrong sign or a wrong line, and read them again.",
         places,
         scatter_mm=scatter / MM,
         gauge_mm=gauge / MM,

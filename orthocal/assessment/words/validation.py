@@ -12,9 +12,6 @@ CONFIRMED = "The calibration is confirmed."
 NOT_CONFIRMED = "The calibration is not confirmed."
 INCONCLUSIVE = "The validation is inconclusive."
 
-MIN_PRINTED = 1e-4
-"""Probability by chance below which only this limit is printed."""
-
 RECALIBRATE = "Calibrate from this session and enter its offsets."
 
 CALIBRATE_JOINTLY = "Calibrate the sessions together and enter these offsets."
@@ -51,8 +48,8 @@ def larger_than_predicted(
         place: Reading with the largest deviation.
     """
     text = (
-        f"The new readings deviate from the predictions by {mm(achieved)} mm RMS, more than their "
-        f"uncertainty (for this pattern at most {mm(limit)} mm)."
+        f"The new readings deviate from the predictions by {mm(achieved)} mm RMS (limit "
+        f"{mm(limit)} mm)."
     )
     action = ""
     if refit is not None:
@@ -62,7 +59,7 @@ def larger_than_predicted(
         else:
             cause = "the readings scatter more than before, or something moved during the session"
             action = "Check the mounting of the gauge, then read again."
-        text += f" A fit of the new readings has residuals of {mm(refit)} mm RMS. Probably {cause}."
+        text += f" A new calibration leaves {mm(refit)} mm RMS of this. Probably {cause}."
     return review("larger than predicted", text, action, (place,), **numbers)
 
 
@@ -70,8 +67,8 @@ def as_predicted(achieved: float, limit: float, numbers: Mapping[str, float]) ->
     """Finding about deviations as predicted; arguments as for `larger_than_predicted`."""
     return note(
         "as predicted",
-        f"The new readings agree with the predictions: they deviate by {mm(achieved)} mm RMS, "
-        f"within their uncertainty (for this pattern at most {mm(limit)} mm).",
+        f"The new readings agree with the predictions: they deviate by {mm(achieved)} mm RMS "
+        f"(limit {mm(limit)} mm).",
         **numbers,
     )
 
@@ -108,32 +105,28 @@ def describe_repetition(
     """
     r, where = repetition, f" in '{title}'" if title else ""
     numbers = {"rows": float(r.matched), "correlation": r.correlation, "chance": r.p_value}
-    probability = f"below {100.0 * MIN_PRINTED:g} %"
-    if r.p_value >= MIN_PRINTED:
-        probability = f"{100.0 * r.p_value:.2g} %"
-    correlation = f"(correlation {r.correlation:.3f} over {r.matched} lines; probability by chance "
-    correlation += f"{probability})"
     if r.repeats is None:
-        reason = f"the fit absorbs nearly all of the {r.matched} shared lines"
+        reason = f"the calibration fits nearly all of the {r.matched} shared lines"
         if r.matched < MIN_ROWS:
             reason = "too few lines are shared"
         text = f"It is unknown whether the residuals repeat{where}: {reason}."
         return note("repetition unknown", text, **numbers)
     if r.repeats:
         text = (
-            f"The residuals repeat{where} {correlation}: they are unmodelled errors, which more "
-            "readings of the same kind do not reduce."
+            f"The same residuals remain as before{where}: they are errors that this model does not "
+            "contain, and more readings of the same kind do not reduce them."
         )
         return note("residuals repeat", text, **numbers)
     meaning = "they did not occur in the calibration" if exceeded else "they look like noise"
-    text = f"The residuals do not repeat{where} {correlation}: {meaning}."
+    text = f"The residuals do not repeat{where}: {meaning}."
     return note("residuals differ", text, **numbers)
 
 
 def controller_assumed() -> Finding:
     """Finding that the active offsets are not stated, so that the calibrated ones are assumed."""
     return note(
-        "controller not stated",
+        "controller assumed",
         "The session does not state the active offsets. The offsets of the calibration are assumed "
         "to be active.",
+        "State the active ones in its session.yaml (`controller`).",
     )

@@ -3,10 +3,14 @@
 One parameter is prescribed and all others are estimated again. The interval contains the values
 with
 
-    2 (F(θᵢ) − F(θ̂)) ≤ q²
+    2 (F(θᵢ) − F(θ̂)) ≤ q²,  q = U_F/s
 
-for the objective F and Student's factor q of a linear problem (Bates and Watts, Nonlinear
-Regression Analysis, 1988, section 6.1). The noise is fixed at its estimate.
+for the objective F (Bates and Watts, Nonlinear Regression Analysis, 1988, section 6.1). U_F is the
+expanded uncertainty from noise and priors, and s² = [A⁻¹]ᵢᵢ with the curvature A of F. In a linear
+problem the ends are the estimate ± U_F. For a stated noise q is the coverage factor. If the
+tolerance scale explains the residuals, F weighs them by more than their noise, and q is smaller: it
+is the correction of a likelihood with other variances than the true ones (Kent, Biometrika 69,
+1982). Unmodelled errors are not parameters of F. They widen each side in quadrature.
 """
 
 from __future__ import annotations
@@ -15,7 +19,7 @@ import math
 
 from orthocal.errors import ClosureError, NotIdentifiableError, SolverError
 from orthocal.estimation.fit import Fit
-from orthocal.statistics.chance import confidence_factor
+from orthocal.statistics.chance import coverage_factor
 
 END_TOLERANCE = 1e-3
 """Tolerance of the ends of an interval, [standard deviations]."""
@@ -24,13 +28,17 @@ MAX_TRIALS = 12
 """Largest number of trials for a value outside the interval."""
 
 
-def profile_interval(fit: Fit, name: str, *, level: float = 0.95) -> tuple[float, float]:
+def profile_interval(
+    fit: Fit, name: str, *, uncertainty: float, bias: float = 0.0
+) -> tuple[float, float]:
     """Profile-likelihood interval of a free parameter.
 
     Args:
         fit: The solved problem.
         name: Name of the parameter.
-        level: Probability that the interval contains the true value.
+        uncertainty: Expanded uncertainty U_F of the linearised problem from noise and priors, [SI].
+            At a bound it is 0, and the coverage factor of the noise replaces q.
+        bias: Expanded uncertainty from unmodelled errors, [SI].
 
     Returns:
         Lowest and highest value within the bounds of the parameter, [SI].
@@ -39,24 +47,30 @@ def profile_interval(fit: Fit, name: str, *, level: float = 0.95) -> tuple[float
         NotIdentifiableError: If the noise is unknown.
         SolverError: If a solution does not converge.
     """
-    index = fit.problem.free.index(name)
-    noise = fit.noise
-    factor = confidence_factor(noise.dof, level)
-    if not (math.isfinite(noise.sigma) and noise.sigma > 0.0 and math.isfinite(factor)):
+    index, noise = fit.problem.free.index(name), fit.noise
+    if not (0.0 < noise.sigma < math.inf and math.isfinite(uncertainty)):
         raise NotIdentifiableError(
             f"the noise is unknown, so {name} has no interval", parameters=(name,)
         )
-    low, high = (_find_end(fit, index, factor, side) for side in (-1.0, 1.0))
-    return low, high
+    std = math.sqrt(float(fit.inverse_normal()[index, index]))
+    factor = uncertainty / std if std > 0.0 else coverage_factor(noise.dof)
+    std = std or float(fit.problem.theta_scale[index])
+    low, high = (_find_end(fit, index, factor, std, side) for side in (-1.0, 1.0))
+    value, selection = float(fit.solution.theta[index]), fit.problem.selection
+    return (
+        max(value - math.hypot(value - low, bias), float(selection.lower[index])),
+        min(value + math.hypot(value - high, bias), float(selection.upper[index])),
+    )
 
 
-def _find_end(fit: Fit, index: int, factor: float, side: float) -> float:
+def _find_end(fit: Fit, index: int, factor: float, std: float, side: float) -> float:
     """End of the interval, where 2 (F − F̂) = factor², or the bound before it.
 
     Args:
         fit: The solved problem.
         index: Index of the parameter.
-        factor: Student's factor q.
+        factor: The factor q.
+        std: Standard deviation s, or at a bound the prior one, [SI].
         side: -1 for the lower end, 1 for the upper end.
     """
     problem, best, sigma = fit.problem, fit.solution, fit.sigma
@@ -64,9 +78,6 @@ def _find_end(fit: Fit, index: int, factor: float, side: float) -> float:
     centre = float(optimum.theta[index])
     bound = float((problem.selection.lower if side < 0.0 else problem.selection.upper)[index])
     to_bound = abs(bound - centre)
-    std = math.sqrt(float(fit.covariance()[index, index]))
-    if std == 0.0:  # at a bound
-        std = float(problem.theta_scale[index])
 
     def excess(distance: float) -> float:
         """√(2 (F − F̂)) − factor at a distance from the optimum, [SI]."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Mask
 from orthocal.estimation.fit import Fit
 from orthocal.io.documents import Number
 from orthocal.io.fields import CLOSED, Many, Matrix, Sizes, read_only
@@ -66,6 +66,8 @@ class UnmodelledErrors:
     prior_stds: Array
     """Prior standard deviation of each error with the tolerance scale, shape (n_unmodelled,),
     [SI]."""
+    scaled: Mask
+    """Mask of the errors whose tolerances the scale multiplies, shape (n_unmodelled,)."""
     jacobian: Array
     """∂h/∂θ̂ᵤ: change of the readings by one prior standard deviation of each error, zeros
     eliminated, shape (n_entries, n_unmodelled), [m of the first gauge]."""
@@ -108,11 +110,13 @@ def find_unmodelled_errors(fit: Fit, *, represented: Collection[str] = ()) -> Un
     ]
     o = problem.observations
     if not names:
-        return UnmodelledErrors((), read_only([]), read_only(np.zeros((o.size, 0))))
+        none = np.zeros(0, dtype=np.bool_)
+        return UnmodelledErrors((), read_only([]), none, read_only(np.zeros((o.size, 0))))
     factors = problem.machine_selection.tolerance_scale.factors(parameters, tuple(names))
     return UnmodelledErrors(
         tuple(names),
         read_only(factors * [parameters[n].prior_std for n in names]),
+        np.array([parameters.are_scaled(n) for n in names], dtype=np.bool_),
         read_only(error_jacobian(fit, names) * factors),
     )
 
@@ -130,7 +134,7 @@ def error_jacobian(fit: Fit, names: Sequence[str]) -> Array:
     """
     problem, parameters = fit.problem, fit.problem.robot.parameters
     prior_stds = np.array([parameters[n].prior_std for n in names])
-    columns = problem.functions.errors.columns(names) * prior_stds
+    columns = problem.functions.errors.unit_errors(names) * prior_stds
     nuisance_scale = problem.theta_scale[problem.n_machine :]
     linear = problem.linearise(
         fit.solution.theta,
@@ -144,14 +148,14 @@ def propagate_unmodelled(fit: Fit, errors: UnmodelledErrors) -> tuple[Unmodelled
     """Effect of unmodelled errors on an estimate.
 
     Returns:
-        Effect on the machine's parameters, and standard deviations of the effect on the nuisance
-        parameters, shape (n_nuisance,), [SI].
+        Effect on the machine's parameters, and bias of the nuisance parameters by one prior
+        standard deviation of each error, shape (n_nuisance, n_unmodelled), [SI].
     """
     problem = fit.problem
     n = problem.n_machine
     if not errors.names:
         no_effect = UnmodelledEffect((), read_only([]), read_only(np.zeros((n, 0))), 0.0, 0.0)
-        return no_effect, np.zeros(problem.n_free - n)
+        return no_effect, np.zeros((problem.n_free - n, 0))
     o, sigma = problem.observations, fit.sigma
     jacobian = project_out_zeros(fit.jacobian, o)
     inverse = fit.information.covariance(
@@ -167,7 +171,7 @@ def propagate_unmodelled(fit: Fit, errors: UnmodelledErrors) -> tuple[Unmodelled
         residual_rms=float(np.sqrt((residual**2).sum() / len(residual))),
         residual_dof=_effective_dof(residual),
     )
-    return effect, np.asarray(np.linalg.norm(bias[n:], axis=1))
+    return effect, np.asarray(bias[n:])
 
 
 def _effective_dof(matrix: Array) -> float:

@@ -67,7 +67,7 @@ class SymbolicProblem:
         self.error_map = SymbolicErrorMap(
             problem.functions.errors,
             fixed=problem.closure.errors(),
-            columns=problem.errors_per_theta,
+            unit_errors=problem.errors_per_theta,
         )
         n_command = problem.states.commands.shape[1]
         self.command = ca.SX.sym("command", n_command)

@@ -34,7 +34,7 @@ from orthocal.assessment.controller_entries import (
 )
 from orthocal.calibration.calibration import Calibration
 from orthocal.effects.backlash import Backlash
-from orthocal.effects.compensation import JointTrim, table_name
+from orthocal.effects.compensation import MAX_COMP_FILE_ENTRIES, JointTrim, table_name
 from orthocal.effects.loading import robot_effects
 from orthocal.effects.screw import SCREW_COMPONENTS, Screw
 from orthocal.errors import ExportError, ParameterError
@@ -44,9 +44,6 @@ from orthocal.units import UM
 
 NEGLIGIBLE = 0.1 * UM
 """Smallest backlash and amplitude that are compensated, [m or rad]."""
-
-MAX_ENTRIES = 256
-"""Largest number of entries of a COMP_FILE."""
 
 MAX_ITERATIONS = 20
 """Number of fixed-point iterations of `PeriodicErrors.invert`."""
@@ -332,8 +329,8 @@ class _Trims:
 def _tabulate_joint(joint: JointCompensation, trims: _Trims, travel: Array) -> JointCompensation:
     """Joint with a table of its trims over a range of positions, shape (2,), [m, rad]."""
     low, high = travel.tolist()
-    positions = np.linspace(low, high, MAX_ENTRIES)
-    checks = np.linspace(low, high, CHECKS_PER_INTERVAL * (MAX_ENTRIES - 1) + 1)
+    positions = np.linspace(low, high, MAX_COMP_FILE_ENTRIES)
+    checks = np.linspace(low, high, CHECKS_PER_INTERVAL * (MAX_COMP_FILE_ENTRIES - 1) + 1)
     table = np.column_stack([positions, trims(positions)])
     exact = trims(checks)
     linear = np.stack([np.interp(checks, positions, table[:, k]) for k in (1, 2)], axis=1)

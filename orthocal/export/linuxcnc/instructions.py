@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from orthocal.assessment.assess import assessment_of, expanded_uncertainty
+from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.controller_entries import (
     ENTERED_DECIMALS,
+    expanded_uncertainty,
     find_backlash,
     find_entries,
     find_screws,

@@ -8,18 +8,16 @@ square that was turned over without a statement is such a case: its error change
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from orthocal.arrays import Array, Indices
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.hypotheses.hypothesis import Family, Rows
+from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.hypotheses.row_changes import dimension_changes, nuisance_columns
 from orthocal.observation.sensor_groups import nuisance_parameters
-from orthocal.session.session import Session
-
-if TYPE_CHECKING:
-    from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.session.session import Session, split_label
 
 MIN_RELATIVE_CHANGE = 0.5
 """Smallest change of the readings by one prior std of a considered parameter, relative to the
@@ -51,7 +49,7 @@ def shared_placements(session: Session) -> dict[str, dict[str, Indices]]:
     shared: dict[str, dict[str, Indices]] = {}
     nuisance = nuisance_parameters(session)
     for setup, indices in zip(session.setups.values(), nuisance.of_setup, strict=True):
-        label = setup.name.rpartition("/")[0] if session.joined else ""
+        label, _ = split_label(setup.name, joined=session.joined)
         indices_by_artefact: dict[str, list[int]] = {}
         for u, i in zip(setup.sensor.nuisance_parameters, indices, strict=False):
             if u.shared_by is not None and not u.of_gauge:
@@ -65,7 +63,7 @@ def shared_placements(session: Session) -> dict[str, dict[str, Indices]]:
 def _displaced(model: LinearModel, rows: Rows) -> Family | None:
     """An artefact displaced before a setup: all its parameters have new values from there on."""
     explanations, groups = [], []
-    columns = model.nuisance_columns()
+    columns = nuisance_columns(model)
     for artefact, placements in shared_placements(rows.session).items():
         names = sorted(placements, key=lambda name: rows.setups[name][0])
         for k in range(1, len(names)):
@@ -91,7 +89,7 @@ def _other_dimensions(model: LinearModel, rows: Rows) -> Family | None:
     """A wrong stated dimension in one setup, or in all setups that state it."""
     explanations: list[Explanation] = []
     shapes: list[Array] = []
-    for dimension, changes in model.dimension_changes().items():
+    for dimension, changes in dimension_changes(model).items():
         for setups in _each_and_all(changes):
             change = np.sum([changes[name] for name in setups], axis=0)
             concerned = np.flatnonzero(change)
@@ -110,17 +108,19 @@ def _other_dimensions(model: LinearModel, rows: Rows) -> Family | None:
 
 def _readjusted(model: LinearModel, rows: Rows) -> Family | None:
     """A dimension that differs in several setups of a gauge from one session on."""
+    session = rows.session
+    label = dict(zip(session.setups, session.labels, strict=True))
     explanations: list[Explanation] = []
     shapes: list[Array] = []
-    for dimension, changes in model.dimension_changes().items():
+    for dimension, changes in dimension_changes(model).items():
         gauges: dict[str, list[str]] = {}
         for name in changes:
-            gauge = rows.session.setups[name].gauge.partition("/")[2]
+            _, gauge = split_label(session.setups[name].gauge, joined=session.joined)
             gauges.setdefault(gauge, []).append(name)
         for of_gauge in gauges.values():
             for k in range(1, len(model.order)):
                 later = [model.labels[i] for i in model.order[k:]]
-                setups = tuple(n for n in of_gauge if n.partition("/")[0] in later)
+                setups = tuple(n for n in of_gauge if label[n] in later)
                 if not 1 < len(setups) < len(of_gauge):  # one setup: `_other_dimensions`
                     continue
                 change = np.sum([changes[name] for name in setups], axis=0)

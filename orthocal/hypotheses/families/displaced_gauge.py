@@ -12,7 +12,7 @@ import numpy as np
 from orthocal.arrays import Indices
 from orthocal.hypotheses.anomaly import Explanation
 from orthocal.hypotheses.hypothesis import Family, Patterns, Rows, Tails, sparse_rows
-from orthocal.sensors.protocol import states_readings
+from orthocal.sensors.protocol import equal_readings
 
 MIN_READINGS = 4
 """Fewest readings of a setup in which a displacement differs from an outlier."""
@@ -79,7 +79,7 @@ def _stuck(rows: Rows, sigma: float) -> Family | None:
     runs: list[Indices] = []
     for indices in rows.setups.values():
         setup = rows.session.setups[rows.session.readings[indices[0]].setup]
-        if not rows.single[indices].all() or states_readings(setup.sensor):
+        if not rows.single[indices].all() or equal_readings(setup.sensor):
             continue
         ends = np.flatnonzero(np.append(np.diff(rows.values[indices]) != 0.0, True))
         begins = np.append(0, ends[:-1] + 1)

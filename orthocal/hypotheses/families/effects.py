@@ -1,12 +1,13 @@
 """Systematic effects that the readings show but the machine's model lacks.
 
-Each effect states its parameters and their priors (`LinearModel.linearise_effect`). So effects of
+Each effect states its parameters and their priors (`linearise_effect`). So effects of
 other packages are tested like those of orthocal. Effects of the model are not tested.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -16,7 +17,8 @@ from orthocal.effects.registry import effect_names, find_effect, order_effects
 from orthocal.errors import RobotError
 from orthocal.hypotheses.anomaly import EFFECT_KINDS, Explanation
 from orthocal.hypotheses.hypothesis import Family, Rows, SystematicEffect, group_rows
-from orthocal.hypotheses.linear_model import LinearModel
+from orthocal.hypotheses.linear_model import CACHE_SIZE, LinearModel
+from orthocal.hypotheses.row_changes import linearise_effect
 from orthocal.observation.observations import readings_without
 from orthocal.session.session import Session
 
@@ -50,26 +52,25 @@ def rows_without(session: Session, name: str) -> Indices:
     return np.flatnonzero([id(r) in lacking for r in session.readings])
 
 
-def find_effects(model: LinearModel) -> list[SystematicEffect]:
-    """Effects that the model lacks but the readings of a session could show."""
-    return model.share("effects", lambda: _find_effects(model))
+@lru_cache(maxsize=CACHE_SIZE)
+def find_effects(model: LinearModel) -> tuple[SystematicEffect, ...]:
+    """Effects that the model lacks but the readings of a session could show.
 
-
-def _find_effects(model: LinearModel) -> list[SystematicEffect]:
-    """Linearised effects with their visible parameters."""
+    They are linearised and have only their visible parameters.
+    """
     session, effects = model.problem.session, []
     for name in missing_effects(session):
         lacking = rows_without(session, name)
         if lacking.size == len(session.readings):
             continue
-        effect = model.linearise_effect(name)
+        effect = linearise_effect(model, name)
         visible = np.abs(effect.columns).max(axis=1) > MIN_RELATIVE_CHANGE * model.sigma
         if lacking.size:  # only parameters of setups whose rows all state the conditions
             visible &= ~effect.columns[:, lacking].any(axis=1)
             visible &= [p.name.startswith("setup.") for p in effect.parameters]
         if visible.any():
             effects.append(effect.select(visible))
-    return effects
+    return tuple(effects)
 
 
 def unmodelled_effects(rows: Rows, effects: Sequence[SystematicEffect]) -> Iterator[Family]:

@@ -41,7 +41,8 @@ def row_offsets(rows: Rows) -> Iterator[Family]:
     one. If a reading was written twice, the last one is lost. The lost reading has an unknown
     value.
     """
-    setups = {n: i for n, i in rows.setups.items() if not rows.paired[i].any()}
+    dials = rows.written & ~rows.paired
+    setups = {n: i for n, i in rows.setups.items() if dials[i].all()}
     segments = [indices for indices in setups.values() if indices.size >= MIN_ROWS]
     segments += [
         indices

@@ -21,11 +21,11 @@ MIN_POSTURES = 3
 
 def wrong_readings(rows: Rows) -> Iterator[Family]:
     """Mistakes in one reading, or in one posture of a setup in all cycles."""
-    single = [np.array([i]) for i in range(rows.count)]
-    yield _outliers(rows, single)
-    yield _multiplied(rows, single, (-1.0,), "reversed sign")
-    yield _multiplied(rows, single, DECIMAL_POINTS, "decimal point")
-    if dials := [np.array([i]) for i in np.flatnonzero(~rows.paired)]:
+    yield _outliers(rows, [np.array([i]) for i in range(rows.count)])
+    if written := [np.array([i]) for i in np.flatnonzero(rows.written)]:
+        yield _multiplied(rows, written, (-1.0,), "reversed sign")
+        yield _multiplied(rows, written, DECIMAL_POINTS, "decimal point")
+    if dials := [i for i in written if not rows.paired[i].any()]:
         yield _misread(rows, dials)
     in_all_cycles = [
         indices
@@ -34,8 +34,9 @@ def wrong_readings(rows: Rows) -> Iterator[Family]:
     ]
     if in_all_cycles:
         yield _outliers(rows, in_all_cycles)
-        yield _multiplied(rows, in_all_cycles, (-1.0,), "reversed sign")
-        yield _multiplied(rows, in_all_cycles, DECIMAL_POINTS, "decimal point")
+    if written := [i for i in in_all_cycles if rows.written[i].all()]:
+        yield _multiplied(rows, written, (-1.0,), "reversed sign")
+        yield _multiplied(rows, written, DECIMAL_POINTS, "decimal point")
 
 
 def _explain(

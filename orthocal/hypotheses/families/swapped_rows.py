@@ -24,7 +24,7 @@ MAX_PAIRS = 60_000
 
 def swapped_rows(rows: Rows) -> Iterator[Family]:
     """Swapped rows, one family per scope."""
-    for pairs in (
+    for listed in (
         _of_setup(rows),
         _across_setups(rows),
         _postures_of_setup(rows),
@@ -33,6 +33,7 @@ def swapped_rows(rows: Rows) -> Iterator[Family]:
         _legs(rows),
         _backwards(rows),
     ):
+        pairs = [p for p in listed if rows.written[list(p.rows)].all()]
         if 0 < len(pairs) <= MAX_PAIRS:
             yield _swapped(rows, pairs)
 
@@ -122,14 +123,11 @@ def _setups(rows: Rows) -> list[Explanation]:
     """Two setups of one session."""
     if len(rows.setups) ** 2 > 2 * MAX_PAIRS:
         return []
-
-    def session(setup: str) -> str:
-        return setup.partition("/")[0] if rows.session.joined else ""
-
+    label = dict(zip(rows.session.setups, rows.session.labels, strict=True))
     return [
         _pair("setups", rows.setups[a], rows.setups[b], (a, b))
         for a, b in combinations(rows.setups, 2)
-        if rows.setups[a].size == rows.setups[b].size and session(a) == session(b)
+        if rows.setups[a].size == rows.setups[b].size and label[a] == label[b]
     ]
 
 

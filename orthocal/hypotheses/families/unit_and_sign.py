@@ -43,16 +43,18 @@ def wrong_units_and_signs(rows: Rows, sigma: float) -> Iterator[Family]:
         rows: The rows.
         sigma: Standard deviation of a reading, [m].
     """
-    groups = _groups(rows)
+    groups = [g for g in _groups(rows) if rows.written[list(g.rows)].all()]
+    if not groups:
+        return
     yield multiplied(rows, groups)
-    names = list(rows.setups)
+    names = [name for name, indices in rows.setups.items() if rows.written[indices].all()]
     if 3 < len(names) <= MAX_PAIRED_SETUPS:
         pairs = combinations(names, 2)
         yield multiplied(rows, [_reversed("setups", rows.of_setups(p), p) for p in pairs])
     groups += [
         _reversed("cycle", indices, names=(name,), cycle=cycle)
         for (name, cycle), indices in rows.cycles.items()
-        if len(indices) < len(rows.setups[name])
+        if name in names and len(indices) < len(rows.setups[name])
     ]
     yield _scaled(rows, groups, "wrong unit", UNITS, sigma)
     yield _scaled(rows, groups, "decimal point", DECIMAL_POINTS, sigma)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.effects.compensation import Compensation, JointTrim
+from orthocal.effects.compensation import MAX_COMP_FILE_ENTRIES, Compensation, JointTrim
 from orthocal.errors import ParameterError, SessionError
 from orthocal.io.documents import parse_number, read_text
 from orthocal.io.fields import read_only
@@ -21,9 +21,6 @@ from orthocal.units import DRIVE_UNITS
 
 COMP_FILE_COLUMNS = ("position", "forward trim", "reverse trim")
 """Columns of a COMP_FILE of type 1."""
-
-MAX_COMP_FILE_ROWS = 256
-"""Largest number of entries of a COMP_FILE."""
 
 METRIC_UNITS = ("mm", "metric")
 """Values of LINEAR_UNITS with which lengths are in mm."""
@@ -176,8 +173,8 @@ def read_comp_file(folder: Path, name: str, drive: Drive, where: str) -> Array:
                     where=at,
                 )
             rows.append(row)
-        if not 1 < len(rows) <= MAX_COMP_FILE_ROWS:
+        if not 1 < len(rows) <= MAX_COMP_FILE_ENTRIES:
             raise SessionError(
-                f"has {len(rows)} entries; expected 2 to {MAX_COMP_FILE_ROWS}", where=str(file)
+                f"has {len(rows)} entries; expected 2 to {MAX_COMP_FILE_ENTRIES}", where=str(file)
             )
     return read_only(np.array(rows) * factor)

@@ -15,6 +15,7 @@ from itertools import islice
 from pathlib import Path
 
 from orthocal.effects.adjustment import require_adjustment
+from orthocal.effects.compensation import Compensation
 from orthocal.effects.loading import load_robot, with_effects
 from orthocal.errors import ParameterError, RobotError, SessionError
 from orthocal.io.documents import read_yaml, validate
@@ -90,19 +91,30 @@ def _load_session(file: Path, content: bytes, keys: SessionKeys) -> Session:
     with content_withheld_outside(file.parent, readings_path):
         rows = read_rows(readings_path, table)
         readings, points = check_readings(rows, plan, file=readings_path)
-    digest = hashlib.sha256(content + b"\0" + table)
-    for joint in plan.compensation:
-        digest.update(b"" if joint.table is None else joint.table.tobytes())
     session = replace(
         plan,
         setups=points.setups,
         gauges=points.gauges,
         readings=readings,
         readings_path=readings_path,
-        sha256=digest.hexdigest(),
+        sha256=session_digest(content, table, plan.compensation),
     )
     check_contacts(session)
     return session
+
+
+def session_digest(keys: bytes, table: bytes, compensation: Compensation) -> str:
+    """Digest of a session.
+
+    Args:
+        keys: Content of the session.yaml.
+        table: Content of the readings.csv.
+        compensation: Compensation of the controller, of which tables are in other files.
+    """
+    digest = hashlib.sha256(keys + b"\0" + table)
+    for joint in compensation:
+        digest.update(b"" if joint.table is None else joint.table.tobytes())
+    return digest.hexdigest()
 
 
 def load_unread(path: str | Path) -> tuple[Session, Path]:

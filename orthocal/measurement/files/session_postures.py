@@ -87,10 +87,9 @@ def _read_posture(keys: PostureKeys, robot: Robot, where: str) -> tuple[PostureF
     key, values = keys.coordinates
     count = len(robot.drives)
     if key == "tcp_mm":
-        if robot.tcp is None or len(robot.tcp.coordinates) != count:
+        if not _has_tool_coordinates(robot):
             raise SessionError(
-                f"{robot.name} has no tool coordinate for every drive; state joints_mm or "
-                "joints_deg",
+                f"{robot.name} has no tool coordinate for every drive; use {_usable_key(robot)}",
                 where=where,
             )
         if len(values) != count:
@@ -103,12 +102,28 @@ def _read_posture(keys: PostureKeys, robot: Robot, where: str) -> tuple[PostureF
     unit = "m" if key == "joints_mm" else "rad"
     for drive in robot.drives:
         if drive.unit != unit:
-            mixed = len({d.unit for d in robot.drives}) > 1
-            expected = "tcp_mm" if mixed else f"joints_{DRIVE_UNITS[drive.unit][0]}"
             raise SessionError(
-                f"drive {drive.name} is {KINDS[drive.unit]}; use {expected}", where=where
+                f"drive {drive.name} is {KINDS[drive.unit]}; use {_usable_key(robot)}", where=where
             )
     return "joints", np.array(values) * MM if unit == "m" else np.deg2rad(values)
+
+
+def _has_tool_coordinates(robot: Robot) -> bool:
+    """True if the tool centre point has one commanded coordinate for each drive."""
+    return robot.tcp is not None and len(robot.tcp.coordinates) == len(robot.drives)
+
+
+def _usable_key(robot: Robot) -> str:
+    """Key with which a posture of a robot can be stated, and what the robot's YAML lacks for it."""
+    units = {d.unit for d in robot.drives}
+    if len(units) == 1:
+        return f"joints_{DRIVE_UNITS[units.pop()][0]}"
+    if _has_tool_coordinates(robot):
+        return "tcp_mm"
+    return (
+        "tcp_mm, because the drives are of both kinds, and state one tool coordinate for each "
+        f"drive in {robot.yaml}: orthocal.tcp.coordinates"
+    )
 
 
 def _check_travel(robot: Robot, drives: Array, *, where: str, posture: str | None = None) -> None:

@@ -22,7 +22,7 @@ from orthocal.io.files import exists
 from orthocal.measurement.files.session_keys import LARGEST_READING_MM
 from orthocal.measurement.files.write_session import write_session
 from orthocal.printers.firmwares import FIRMWARES, find_firmware, require_firmware
-from orthocal.printers.log import PrinterLog
+from orthocal.printers.log import LogText, PrinterLog
 from orthocal.printers.settings import DeltaSettings, FirmwareName
 from orthocal.robot.model import Robot
 from orthocal.sensors.distance import Distance
@@ -69,9 +69,13 @@ RANGE_MARGIN = 5 * MM
 class PrinterImport:
     """A printer's log as a session with its robot; nothing is written."""
 
-    firmware: FirmwareName
     log: PrinterLog
     session: Session
+
+    @property
+    def firmware(self) -> FirmwareName:
+        """Firmware of the settings."""
+        return self.log.settings.firmware
 
     @property
     def title(self) -> str:
@@ -105,18 +109,22 @@ def import_printer_log(
     Raises:
         SessionError: If a file is wrong or incomplete; names file and line or key.
     """
-    texts = [RECEIVED.sub("", read_text(Path(p), error=SessionError)) for p in (*settings, log)]
-    text = "\n".join(texts)
+    source = LogText(
+        tuple(
+            (str(p), RECEIVED.sub("", read_text(Path(p), error=SessionError)))
+            for p in (*settings, log)
+        )
+    )
     name = None if firmware is None else require_firmware(firmware, option="--format")
-    name = name or find_firmware(texts[-1]) or find_firmware(text)
+    name = name or find_firmware(source.text[source.begin :]) or find_firmware(source.text)
     if name is None:
         raise SessionError(
             "is a log of no known firmware, or of several; expected --format "
             f"{', '.join(FIRMWARES)}",
             where=str(log),
         )
-    content = FIRMWARES[name].read_log(text, where=str(log), radius=radius)
-    return PrinterImport(name, content, _session(content, Path(log)))
+    content = FIRMWARES[name].read_log(source, radius=radius)
+    return PrinterImport(content, _session(content, Path(log)))
 
 
 def write_printer_import(result: PrinterImport, folder: str | Path) -> Path:

@@ -17,7 +17,7 @@ from orthocal.kinematics.conditions import APPROACH as DIRECTIONS
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.robot.model import Robot
-from orthocal.session.session import Conditions, Session
+from orthocal.session.session import Conditions, Reading, Session
 from orthocal.units import DEG, LIMIT, MM
 
 APPROACH = 2e-3
@@ -96,6 +96,15 @@ def describe_approach(robot: Robot, approach: str) -> str:
         for letter, d in zip(approach, robot.drives, strict=True)
     ]
     return arrows[0] if len(set(arrows)) == 1 else "".join(arrows)
+
+
+def label_reading(robot: Robot, reading: Reading) -> str:
+    """Setup, posture with the arrows of its approach, and the cycle from the second on."""
+    if reading.approach is None:
+        return reading.label_with_cycle
+    arrows = describe_approach(robot, reading.approach)
+    cycle = f", cycle {reading.cycle}" if reading.cycle > 1 else ""
+    return f"{reading.setup} {reading.posture} {arrows}{cycle}"
 
 
 def name_approach(motion: Array) -> str:

@@ -249,8 +249,8 @@ def set_dial(session: Session, setup: str) -> str:
     if gauge.range is not None:
         travel = f", about {0.5 * (gauge.range[1] - gauge.range[0]) / MM:g} mm"
     return (
-        f"Press the plunger in to half of its travel{travel}. Then turn the bezel until the dial "
-        f"shows {dial_zero(gauge)}."
+        f"Set the gauge so that its plunger is pressed in by half of its travel{travel}. Then turn "
+        f"the bezel until the dial shows {dial_zero(gauge)}."
     )
 
 

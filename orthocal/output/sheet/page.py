@@ -155,8 +155,8 @@ def _front(
         f"controller must show about {_joint_list(robot, robot.drive_zero)}. {normal}If a number "
         f"differs by more than {_largest_difference(robot)}, a dimension or the direction of "
         "counting is wrong: correct it in machine.yaml (`orthocal new DIRECTORY --again`) or in "
-        "the robot's YAML. Later, move the machine to these numbers, not by eye. Travel of the "
-        f"joints: {'; '.join(_travel(session))}.",
+        "the robot's YAML. From now on, drive to the numbers printed here, not by eye. Travel of "
+        f"the joints: {'; '.join(_travel(session))}.",
         f"Jog each slide a little {_growing(robot)}. Its number must {_count_outwards(robot)}.",
         _active_offsets(session),
         *([text] if (text := _compensation(session)) else []),
@@ -241,11 +241,12 @@ def _setup(
     program = f" Program: {program_name(motion)}." if with_program else ""
     sensor = session.setups[motion.setup].sensor
     measured = sensor.describe()
+    at_zero = "" if gauge.leg is None else "At the mechanical zero: "
     end = _compare_closing(session, motion)
     end += REMOVE_BAR if isinstance(sensor, BallBar) else REMOVE
     return (
         f'<section id="setup-{motion.number}">{heading(title)}'
-        f"{paragraph(f'{measured}.{program}', kind='lead')}"
+        f"{paragraph(f'{at_zero}{measured}.{program}', kind='lead')}"
         f'<div class="pictures">{pictures}</div>'
         f"{_numbered(_steps(session, motion, gauge))}"
         f"{_warnings(session, motion, gauge)}{_boxes(session, motion)}{paragraph(end)}</section>"
@@ -297,20 +298,23 @@ def _mount_on_base(gauge: GaugePosition) -> tuple[str, ...]:
         reach = gauge.hinge_distances / MM
         contact = (
             f"Its {name_tip(gauge.tip)} touches {_across(gauge)}, {reach[gauge.aligned]:.1f} mm "
-            "from the hinge on the slide. During the setup this distance is "
-            f"{reach.min():.0f} to {reach.max():.0f} mm. "
+            "from the hinge on the slide. The rod then moves along the tip: in the other postures "
+            f"this distance is {reach.min():.0f} to {reach.max():.0f} mm. "
         )
         if gauge.tip is not None and gauge.tip.edge is None:
             contact += "Align the ball by eye: half a millimetre is good enough. "
     elif gauge.leg is not None:
         target = f"leg {gauge.leg.name}"
-        contact = "Its tip touches the line between the rods. "
+        contact = (
+            "The calculation assumes that it reads the line between the rods. If its tip touches a "
+            "rod, state `touches` and `tip` in session.yaml. "
+        )
     else:
         target = " ".join(gauge.setup.sensor.place).strip()
     return (
         f"Mount the gauge on the base, on the {side} side of {target}. Point its plunger to "
-        f"{opposite}. {contact}Contact point, from the tool centre point at the mechanical zero: "
-        f"{place} mm.",
+        f"{opposite}. {contact}To check with a ruler: the contact point is at {place} mm from the "
+        "tool centre point of the machine at its mechanical zero.",
         f"Push the plunger in with a finger, towards {side}. The reading must grow. If it falls, "
         "enter every reading of this setup with the opposite sign.",
     )
@@ -480,17 +484,23 @@ def _active_offsets(session: Session) -> str:
     if session.controller_offsets is None:
         key = "offsets_mm" if all(d.unit == "m" for d in drives) else "offsets_deg"
         return (
-            "session.yaml does not state the offsets of the controller. Write the present ones "
-            f"into it: controller: {{{key}: [{', '.join('0' for _ in drives)}]}}."
+            "session.yaml does not state the offsets of the controller. Before the first "
+            f"calibration write `controller: {{{key}: [{', '.join('0' for _ in drives)}]}}` into "
+            "it, afterwards the offsets that you entered. They are not HOME_OFFSET."
+        )
+    if not _is_corrected(session):
+        return (
+            "session.yaml states that the controller has no offsets of a calibration yet. If it "
+            "has, state them there (`controller`). Do not change the controller's zeros until all "
+            "readings are taken."
         )
     active = ", ".join(
         f"{d.name} {_number(v / DRIVE_UNITS[d.unit][1], 3)} {DRIVE_UNITS[d.unit][0]}"
         for d, v in zip(drives, session.active_offsets, strict=True)
     )
     return (
-        f"Check that the controller has the offsets that session.yaml states: {active}. They count "
-        "from the settings of the controller before its first calibration. Do not change them "
-        "until all readings are taken."
+        f"Check that these offsets of a calibration are entered, as session.yaml states: {active}. "
+        "Do not change them until all readings are taken."
     )
 
 
@@ -506,9 +516,9 @@ def _compensation(session: Session) -> str:
         return ""
     return (
         "session.yaml states that the controller compensates no backlash. If it compensates "
-        "backlash (LinuxCNC: BACKLASH, COMP_FILE), state this in session.yaml, in the order "
-        f"{', '.join(d.name for d in session.robot.drives)}: controller: {{backlash_mm: ["
-        f"{', '.join(['0.02'] * len(session.robot.drives))}]}}."
+        "backlash (LinuxCNC: BACKLASH, COMP_FILE), add it to `controller` in session.yaml: "
+        f"`backlash_mm: [{', '.join(['0.02'] * len(session.robot.drives))}]` for "
+        f"{', '.join(d.name for d in session.robot.drives)}."
     )
 
 
@@ -570,7 +580,7 @@ def _approach_rule(session: Session, motions: Sequence[SetupMotion]) -> str:
         )
     (arrow,) = arrows
     return (
-        f"Approach every posture from the same side: the last {length} go towards "
+        f"Approach every posture from the same side: in the last {length} "
         f"{_describe_arrow(robot, arrow)}. The programs do this. If you jog, begin {length} "
         f"before the posture with every joint and move to it in one motion. {arcs}".rstrip()
     )
@@ -585,11 +595,11 @@ def _order_of_arrows(robot: Robot, arrows: Collection[str]) -> str:
 
 def _describe_arrow(robot: Robot, arrow: str) -> str:
     """Direction of an approach in words."""
-    words = {"↑": "larger", "↓": "smaller"}
+    verbs = {"↑": "grow", "↓": "fall"}
     if len(arrow) == 1:
-        return f"{words[arrow]} numbers of all joints"
+        return f"the numbers of all joints {verbs[arrow]}"
     ways = zip(arrow, robot.drives, strict=True)
-    return ", ".join(f"{words[a]} numbers of {d.name}" for a, d in ways)
+    return ", ".join(f"the number of {d.name} {verbs[a]}s" for a, d in ways)
 
 
 def _is_corrected(session: Session) -> bool:

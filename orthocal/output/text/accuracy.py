@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rich.console import RenderableType
+from rich.console import Group, RenderableType
 from rich.text import Text
 
 from orthocal.arrays import Array
@@ -120,7 +120,7 @@ def render_accuracy(
         values = (*aligned, sizes.relative.rms, sizes.absolute.rms)
         cells.append((name, *("" if v is None else um(v) for v in values)))
     headers = ("[µm]", "RMS", "95 %", "worst point", "translation removed", "absolute")
-    notes = [f"Over {accuracy.workspace.words}. {COLUMNS_NOTE}"]
+    first, notes = [], [f"Over {accuracy.workspace.words}. {COLUMNS_NOTE}"]
     if accuracy.use.declared is None:
         notes.append(describe_conditions_of(calibration, accuracy.use.conditions[0]))
     if accuracy.after is None:
@@ -128,22 +128,27 @@ def render_accuracy(
             "The uncertainty after calibration is unknown, because the noise of the readings is."
         )
     else:
+        first = _describe_expected(calibration, accuracy)
         scale = calibration.tolerance_scale.factor
         scaled = f", after the calibration times {scale:.1f}" if scale > 1.0 else ""
         notes.append(UNCERTAINTY_NOTE.format(scaled))
-        summary = summarise_tool(calibration, accuracy)
-        if summary is not None:
-            notes.append(describe_tool_error(summary, keep=keep))
-            if not calibration.only_offsets:
-                notes.append(describe_compensated(summary.compensated))
-            if summary.use is not None:
-                notes.append(
-                    f"Averaged over the conditions of use: {describe_use(summary.use.stated)}."
-                )
-                notes += describe_use_parts(summary)
         notes += describe_remaining(find_remaining_errors(calibration, accuracy, count=2))
         notes += describe_gains(further.gains, further.rms, now=False)
-    return noted(table_of(headers, cells), *notes)
+    return Group(*map(Text, first), noted(table_of(headers, cells), *notes))
+
+
+def _describe_expected(calibration: Calibration, accuracy: ToolAccuracy) -> list[str]:
+    """Expected tool errors over a region and their conditions of use, as sentences."""
+    summary = summarise_tool(calibration, accuracy)
+    if summary is None:
+        return []
+    texts = [describe_tool_error(summary, keep=assessment_of(calibration).keeps_offsets)]
+    if not calibration.only_offsets:
+        texts.append(describe_compensated(summary.compensated))
+    if summary.use is not None:
+        texts.append(f"Averaged over the conditions of use: {describe_use(summary.use.stated)}.")
+        texts += describe_use_parts(summary)
+    return texts
 
 
 def describe_undetermined(
@@ -237,8 +242,8 @@ def describe_remaining(errors: Iterable[RemainingError]) -> list[str]:
             f"{name} {read_limit(size):+.2f}" for name, size in error.parts[:MOST_PARTS]
         )
         if error.rms > UM:
-            which = f" from these errors together, in tolerances: {parts}" if parts else ""
-            lines.append(f"Remaining uncertainty of {um(error.rms)} µm RMS{which}.")
+            which = f" by these errors together, in tolerances: {parts}" if parts else ""
+            lines.append(f"The tool may still be off by {um(error.rms)} µm RMS{which}.")
     return lines
 
 

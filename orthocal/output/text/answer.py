@@ -11,8 +11,8 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from orthocal.assessment.assess import assessment_of, expanded_uncertainty
-from orthocal.assessment.controller_entries import lowers
+from orthocal.assessment.assess import assessment_of
+from orthocal.assessment.controller_entries import expanded_uncertainty, lowers
 from orthocal.assessment.plausibility import describe_legs
 from orthocal.assessment.wording import joined
 from orthocal.assessment.words.anomalies import describe_evidence
@@ -29,7 +29,6 @@ from orthocal.calibration.assessment_record import (
     Verdict,
 )
 from orthocal.calibration.calibration import Calibration
-from orthocal.measurement.joining import name_within
 from orthocal.output.text.accuracy import FurtherHour, describe_undetermined
 from orthocal.output.text.layout import (
     EXPANDED,
@@ -44,6 +43,7 @@ from orthocal.output.text.layout import (
     signed,
     table_of,
 )
+from orthocal.session.session import split_label
 from orthocal.text import printable
 from orthocal.units import DRIVE_UNITS
 
@@ -89,19 +89,27 @@ def render_answer(
     """
     assessment = assessment_of(calibration)
     parts: list[RenderableType] = [render_subject(calibration), Text()] if heading else []
-    parts += [_decision(assessment.decision), Text()]
-    if assessment.entries and assessment.decision.verdict != "reject":
+    parts += [render_headline(assessment.decision), Text()]
+    notes = [f.words for f in _listed(calibration, assessment)]
+    if assessment.decision.verdict == "enter":
+        parts += _values(calibration, assessment) + _tool(calibration, assessment)
+        notes += describe_undetermined(calibration, further)
+    parts.append(bullets(notes))
+    return Group(*parts, render_next(*_next_step(calibration, assessment, saved)))
+
+
+def _values(calibration: Calibration, assessment: Assessment) -> list[RenderableType]:
+    """Values to enter, with notes."""
+    parts: list[RenderableType] = []
+    if assessment.entries:
         parts += [
             _indented(entry_table(calibration)),
-            *_entry_notes(calibration, assessment),
+            *(_indented(Text(text)) for text in _entry_notes(calibration, assessment)),
             Text(),
         ]
-    if assessment.backlash and assessment.decision.verdict != "reject":
+    if assessment.backlash:
         parts += [_indented(render_backlash(calibration)), Text()]
-    parts += _tool(calibration, assessment)
-    notes = [f.words for f in _listed(calibration, assessment)]
-    parts.append(bullets([*notes, *describe_undetermined(calibration, further)]))
-    return Group(*parts, render_next(*_next_step(calibration, assessment, saved)))
+    return parts
 
 
 def render_next(words: str, commands: Sequence[str] = ()) -> RenderableType:
@@ -118,7 +126,7 @@ def render_decision(assessment: Assessment, *, details: bool = False) -> Rendera
         details: Whether to list the evidence for each finding.
     """
     decision = assessment.decision
-    parts: list[RenderableType] = [_decision(decision)]
+    parts: list[RenderableType] = [render_headline(decision)]
     further = [f.words for f in assessment.findings if f.text != decision.reason]
     if further:
         parts += [Text(), bullets(further)]
@@ -135,22 +143,25 @@ def print_decision(assessment: Assessment, *, details: bool = False) -> None:
     print_rich(render_decision(assessment, details=details))
 
 
-def _decision(decision: Decision) -> Text:
+def render_headline(decision: Decision) -> Text:
+    """Headline of a decision, and its reason."""
     headline = (decision.headline, STYLES[decision.verdict])
     return Text.assemble(headline, f" {decision.reason}".rstrip())
 
 
-def _entry_notes(calibration: Calibration, assessment: Assessment) -> list[RenderableType]:
+def _entry_notes(calibration: Calibration, assessment: Assessment) -> list[str]:
     """Notes on entering the values."""
     unstated = assessment.of_kind("controller not stated")
-    if unstated:
-        return [_indented(Text(unstated[0].words))]
+    return [unstated[0].words] if unstated else describe_joints(calibration)
+
+
+def describe_joints(calibration: Calibration) -> list[str]:
+    """Meaning of the column `joint`, in a sentence; none without this column."""
     down = [d.name for d in calibration.robot.drives if d.direction < 0]
-    if not down or assessment.keeps_offsets:
+    if not down or assessment_of(calibration).keeps_offsets:
         return []
     verb = "counts" if len(down) == 1 else "count"
-    text = f"joint: change of the controller's joint, with its sign; {joined(down)} {verb} down."
-    return [_indented(Text(text))]
+    return [f"joint: change of the controller's joint, with its sign; {joined(down)} {verb} down."]
 
 
 def _tool(calibration: Calibration, assessment: Assessment) -> list[RenderableType]:
@@ -173,10 +184,11 @@ def describe_conditions(calibration: Calibration) -> list[str]:
 
 def _listed(calibration: Calibration, assessment: Assessment) -> Sequence[Finding]:
     """Further findings that matter before anything is entered, the gravest first."""
+    kinds = LISTED if assessment.decision.verdict == "enter" else ()
     listed = [
         f
         for f in assessment.findings
-        if (f.severity != "note" or f.kind in LISTED) and f.text != assessment.decision.reason
+        if (f.severity != "note" or f.kind in kinds) and f.text != assessment.decision.reason
     ]
     if assessment.keeps_offsets:
         listed = [f for f in listed if f.kind not in ("must change", "not significant")]
@@ -205,8 +217,8 @@ def _next_step(
         words = "correct the other errors, in LinuxCNC or in programs."
         if not unchanged:
             words = (
-                "if the controller corrects offsets only, enter them. Otherwise leave the offsets, "
-                "and correct all identified errors in LinuxCNC or in programs."
+                "enter these offsets only if the controller corrects nothing else. Otherwise leave "
+                "the offsets, and correct all identified errors in LinuxCNC or in programs."
             )
         active = "" if unchanged else " --offsets active"
         return words, (
@@ -289,7 +301,7 @@ def _measured(calibration: Calibration) -> str:
     places = list_places(s.sensor.place for s in setups)
     sessions = len(calibration.session.parts)
     used = {
-        name_within(name, joined=sessions > 0)
+        split_label(name, joined=sessions > 0)[1]
         for r in calibration.residuals
         for name in (r.posture, r.minus)
         if name
@@ -334,7 +346,7 @@ def render_values(calibration: Calibration) -> RenderableType:
         return noted(Text(settings), EXPANDED)
     if not assessment.entries:
         return noted(Text("None: no offset was identified."), EXPANDED)
-    complete = assessment.decision.verdict != "reject" and calibration.only_offsets
+    complete = assessment.decision.verdict == "enter" and calibration.only_offsets
     table = entry_table(calibration, identified=not calibration.only_offsets)
     keep, stated = assessment.keeps_offsets, assessment.entries[0].active is not None
     meaning = "Slide coordinate = encoder coordinate + offset."

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from orthocal.assessment.comparison import Comparison
 from orthocal.assessment.wording import tool_mm
+from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.entries import describe_region
 from orthocal.calibration.assessment_record import FindingKind
 from orthocal.output.text.answer import STYLES
@@ -34,8 +35,8 @@ from orthocal.units import MM
 MORE = "--details prints scores, estimates and residuals of each model."
 
 RESEARCH: tuple[FindingKind, ...] = (
-    *("recommended", "not recommended", "tool error", "linearisation error"),
-    "noise as stated",
+    *("recommended", "not recommended", "tool error", "linearisation cost"),
+    *("noise as stated", "noise from cycles"),
 )
 """Kinds of findings that the short answer replaces, or that only the details list."""
 
@@ -60,6 +61,7 @@ def render_comparison(
     if not (details or all_rows):
         return Group(*answer, Text(MORE))
     further = [f.words for f in assessed.findings if f.kind in RESEARCH and f != recommended]
+    further += [e for f in assessed.findings if (e := describe_evidence(f))]
     noise = (
         f"{counted(c.independent, 'independent reading')}; σ of a reading: "
         f"{mm(c.noise.sigma)} mm, {NOISE_SOURCES[c.noise.source]}"

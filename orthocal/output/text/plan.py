@@ -66,7 +66,10 @@ MOST_LISTED = 24
 EVENLY = "evenly spaced"
 
 HOW_TO = {
-    LegIndicator.kind: ("In each setup at a leg mount the gauge so that it touches at `section`."),
+    LegIndicator.kind: (
+        "Dial at a leg: mount it so that it touches at the stated part of the length from the "
+        "slide, with the machine at its mechanical zero."
+    ),
     BallBar.kind: (
         "Ball bar: fix one ball on the table at the stated place and clamp the other to the tool. "
         "Put the bar between them. The programs move along arcs around the fixed ball."
@@ -126,11 +129,11 @@ def describe_expected(plan: MeasuringPlan | FixedPlan) -> list[str]:
     """Expected tool error with its conditions, and the readings that are impossible at first."""
     first, workspace = plan.first_round, plan.forecast.workspace
     expected, before, now = (tool_mm(e.reported.rms) for e in (plan.expected, first, plan.known))
-    condition = f"after the second measurement (first: {before}; now {now})"
+    figures = f"now {now}, {before} after this measurement, {expected} after a second one"
     if plan.complements:
-        condition = f"with these readings added ({now} with those of the session alone)"
+        figures = f"{expected} with these readings added, {now} with those of the session alone"
     lines = [
-        f"Expected tool error with all identified errors corrected: {expected} {condition}.",
+        f"Expected tool error with all identified errors corrected: {figures}.",
         describe_aligned(workspace.words, stated_use(plan.forecast.robot)),
     ]
     if first.lost > SOME_LOST:
@@ -328,13 +331,12 @@ def _when_enough(plan: MeasuringPlan) -> str:
     if enough is None:
         last = plan.curve[-1]
         return (
-            f"Another hour gains more than {HOURLY_GAIN:.0%}, up to "
-            f"{counted(last.setups, 'setup')} ({show_duration(last.minutes)}, "
-            f"{tool_mm(last.error)})."
+            f"More setups gain more than {HOURLY_GAIN:.0%} an hour: expect {tool_mm(last.error)} "
+            f"with {counted(last.setups, 'setup')} ({show_duration(last.minutes)})."
         )
     return (
-        f"Beyond {counted(enough.setups, 'setup')} ({show_duration(enough.minutes)}, "
-        f"{tool_mm(enough.error)}) another hour gains less than {HOURLY_GAIN:.0%}."
+        f"With {counted(enough.setups, 'setup')} ({show_duration(enough.minutes)}) expect "
+        f"{tool_mm(enough.error)}. More setups gain less than {HOURLY_GAIN:.0%} an hour."
     )
 
 

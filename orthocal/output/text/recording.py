@@ -18,6 +18,7 @@ from orthocal.measurement.motion.approach import (
     common_approach,
     describe_approach,
     fill_approach,
+    label_reading,
 )
 from orthocal.measurement.motion.motion import guide, set_dial
 from orthocal.measurement.recording import Recording
@@ -177,7 +178,7 @@ class RecordingText:
             f"{counted(len(of_setup), 'reading')}"
         )
         sensor = setup.sensor.in_file if isinstance(setup.sensor, Points) else setup.sensor
-        parts = [f"Read: {sensor.describe()}", self._stand(name), _gauge(session, setup)]
+        parts = [f"Gauge: {sensor.describe()}", self._stand(name), _gauge(session, setup)]
         if any(r.is_read for r in of_setup) and any(r.minus is None for r in of_setup):
             parts.append(
                 "This setup has readings. If the stand or the dial has moved since, `restart` the "
@@ -207,25 +208,22 @@ class RecordingText:
             return " ".join(steps)
         guidance = self._guidance
         aligned = guidance.aligned_at[setup]
-        at = ", ".join(f"{format_fixed(v / MM, 1)}" for v in guidance.touched(setup, aligned))
         side = name_direction(guidance.contacts[setup][1].direction)
         distances = hinge_distances(self._session, setup, guidance)
-        from_hinge = ""
         if distances:
-            from_hinge = f", {distances[aligned] / MM:.1f} mm from the hinge on the slide"
+            at = f"{distances[aligned] / MM:.1f} mm from the hinge on the slide"
+        else:
+            point = ", ".join(format_fixed(v / MM, 1) for v in guidance.touched(setup, aligned))
+            at = f"at ({point}) mm from the tool centre point at the mechanical zero"
         return (
-            f"Stand: on the {side} side, so that the tip touches at ({at}) mm in {aligned}"
-            f"{from_hinge}. Push the plunger in: the reading must grow. If it falls, enter "
-            "every reading of this setup with the opposite sign."
+            f"Stand: on the {side} side, so that the tip in posture {aligned} touches {at}. Push "
+            "the plunger in: the reading must grow. If it falls, enter every reading of this setup "
+            "with the opposite sign."
         )
 
     def label(self, row: Reading) -> str:
         """Setup, posture with the arrows of its approach, and the cycle from the second on."""
-        row = replace(row, setup=self.name(row))
-        if row.approach is None:
-            return row.label_with_cycle
-        arrows = describe_approach(self._session.robot, row.approach)
-        return f"{row.setup} {row.posture} {arrows}{f', cycle {row.cycle}' * (row.cycle > 1)}"
+        return label_reading(self._session.robot, replace(row, setup=self.name(row)))
 
     def name(self, row: Reading) -> str:
         """Name of the setup of a row, as in the files."""
@@ -315,8 +313,8 @@ class RecordingText:
             where = f" ({spans(parts[0], 'line')}; or {spans(parts[1], 'line')})"
         else:
             where = f" ({spans(parts[-1], 'line')})" if parts else ""
-        kind = finding.kind.capitalize()
-        head, *others = f"{kind}{where}: {finding.words}".split("\n")
+        where = "" if finding.words.startswith(("Line ", "Lines ")) else where
+        head, *others = f"{finding.kind.capitalize()}{where}: {finding.words}".split("\n")
         lines = [self.wrap(head, indent="  ", first="! ")]
         for other in others:  # causes, and what to do
             margin = "    " if other.startswith(" ") else ""

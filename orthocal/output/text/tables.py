@@ -15,6 +15,7 @@ from orthocal.assessment.words.fit import MAX_LISTED
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
+from orthocal.output.text.answer import name_values
 from orthocal.output.text.layout import (
     NOISE_SOURCES,
     bullets,
@@ -72,7 +73,7 @@ def render_parameters(calibration: Calibration, *, all_rows: bool = False) -> Re
         if not (few or _is_listed(p)):
             continue
         f, shift = p.edge_factor, p.value - p.linear
-        noise = float(c.expand(p.std_scatter, p.std_scatter))
+        noise = min(half, float(c.expand(p.std_scatter, p.std_scatter, 0.0)))
         resolved = f"{p.data_share:.0%}" if math.isfinite(p.data_share) else ""
         row = (
             p.name,
@@ -95,7 +96,7 @@ def _parameter_notes(c: Calibration, *, omitted: int, by_noise: bool) -> list[st
     """Sentences under the table of the parameters."""
     notes = []
     if not c.only_offsets and assessment_of(c).entries:
-        notes.append("Offsets are those of the slides; the best ones to enter differ (see there).")
+        notes.append(f"Offsets of the slides. The best ones to enter differ: see {name_values(c)}.")
     if omitted:
         notes.append(f"{omitted} more are resolved by less than half; --all lists them.")
     held = [p for p in c.parameters if not p.free]
@@ -263,7 +264,7 @@ def render_sensors(calibration: Calibration) -> RenderableType | None:
     if calibration.sensors:
         rows = []
         for p in calibration.sensors:
-            half = float(calibration.expand(p.std, p.std_scatter))
+            half = calibration.expand_estimate(p)
             f = p.edge_factor
             limits = (plain(half * f), plain(show_limit(p.prior_std) * f))
             rows.append((p.name, signed(p.value * f), *limits, p.edge_unit))

@@ -9,13 +9,16 @@ from rich.text import Text
 
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.validation import Validation
+from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.calibration.assessment_record import FindingKind
 from orthocal.output.text.answer import (
     describe_conditions,
+    describe_joints,
     entry_table,
     gains_from_correction,
     quote_path,
     render_backlash,
+    render_headline,
     render_next,
 )
 from orthocal.output.text.layout import (
@@ -46,17 +49,23 @@ def render_validation(
     """A validation as rich renderables: the short answer, and on demand the details."""
     answer, judged = validation.final_calibration, validation.assessment
     complete = details or all_rows
+    hidden = ("tool error",) if all_rows else ("tool error", *DETAILS)
     findings = [
         f.words
         for f in judged.findings
-        if f.text not in judged.decision.reason and (all_rows or f.kind not in DETAILS)
+        if f.text not in judged.decision.reason and f.kind not in hidden
     ]
-    if judged.tool is not None and judged.of_kind("tool error"):
-        findings += describe_conditions(answer)
-    parts = [
+    tool = [f.text for f in judged.of_kind("tool error")]
+    if judged.tool is not None and tool:
+        tool += describe_conditions(answer)
+    parts: list[RenderableType] = [
         Text("Validation of a calibration", style="bold"),
         Text(validation.refit.session.title),
-        section("Interpretation", bullets([judged.decision.words, *findings])),
+        Text(),
+        render_headline(judged.decision),
+        Text(),
+        *map(Text, tool),
+        bullets(findings),
     ]
     if validation.mistake is not None and validation.enter:
         rows = [(e.drive, signed(e.enter * e.edge_factor), e.edge_unit) for e in validation.enter]
@@ -65,7 +74,8 @@ def render_validation(
     if assessment_of(answer).entries and (further or complete):
         source = "the new readings" if validation.joint is None else "all readings"
         backlash = [Text(), render_backlash(answer)] if assessment_of(answer).backlash else []
-        parts.append(section(f"Offsets from {source}", Group(entry_table(answer), *backlash)))
+        values = Group(entry_table(answer), *map(Text, describe_joints(answer)), *backlash)
+        parts.append(section(f"Offsets from {source}", values))
     if complete:
         parts += _details(validation, all_rows=all_rows)
     parts += _next_step(validation, further=further)
@@ -75,7 +85,10 @@ def render_validation(
 
 
 def _next_step(validation: Validation, *, further: bool) -> list[RenderableType]:
-    """The command that calibrates from all readings, where they improve the machine further."""
+    """The next action: that of the decision, or the command that calibrates from all readings."""
+    action = validation.assessment.decision.action
+    if action:
+        return [Text(), render_next(action)]
     paths = [part.path for part in validation.final_calibration.session.parts]
     if not paths or None in paths:
         return []
@@ -94,6 +107,7 @@ def _next_step(validation: Validation, *, further: bool) -> list[RenderableType]
 def _details(validation: Validation, *, all_rows: bool) -> list[RenderableType]:
     """Deviations from the predictions: their size, and those of the readings."""
     refit = validation.refit
+    evidence = [e for f in validation.assessment.findings if (e := describe_evidence(f))]
     rms = (validation.expected_rms, refit.rms_before, refit.rms_after)
     largest = (validation.expected_largest, refit.largest_before, refit.largest_after)
     deviations = table_of(
@@ -112,4 +126,5 @@ def _details(validation: Validation, *, all_rows: bool) -> list[RenderableType]:
     return [
         section("Measured less predicted", deviations),
         section("Readings of the new session", readings),
+        *([section("Evidence", bullets(evidence))] if evidence else []),
     ]

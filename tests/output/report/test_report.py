@@ -15,7 +15,7 @@ from rich.panel import Panel
 from rich.text import Text
 
 from orthocal import Choice, calibrate, load_calibration
-from orthocal.assessment.assess import expanded_uncertainty
+from orthocal.assessment.controller_entries import expanded_uncertainty
 from orthocal.assessment.words.entries import describe_compensated, describe_tool_error
 from orthocal.calibration.file import write_calibration
 from orthocal.io.html import items, paragraph, table

@@ -116,7 +116,7 @@ def test_stated_contact_is_on_the_rod(small, page):
     robot, drives = small.robot, small.robot.drive_zero
     root, tip = (place(robot, drives, f) for f in ("x_bar_a", "x_coupler"))
     expected = 0.5 * (root + tip) + np.array([0.0, 0.004, 0.0])
-    found = re.search(r"mechanical zero: X([-\d.]+) Y([-\d.]+) Z([-\d.]+) mm", text)
+    found = re.search(r"contact point is at X([-\d.]+) Y([-\d.]+) Z([-\d.]+) mm", text)
     assert [float(v) for v in found.groups()] == pytest.approx(expected / MM, abs=ROUNDED_PLACE)
     assert "on the +y side of rod a of leg x. Point its plunger to -y." in text
     assert "ball of 3 mm diameter touches the rod on its centre line, 125.0 mm from" in text
@@ -168,7 +168,7 @@ def test_steps_say_how_to_mount_and_set_the_gauge(page):
         assert "half of its travel, about 5 mm. Then turn the bezel until the dial shows 0." in text
     assert "blade 20 mm wide" in blade
     assert "on the -x side of rod b of leg y. Point its plunger to +x." in blade
-    assert "Its tip touches the line between the rods. Contact point" in line
+    assert "assumes that it reads the line between the rods" in line
     assert "pin of 4 mm diameter, 60 mm wide" in pin
     # the leg moves sideways by more than the range of this dial
     assert "Even a perfect machine shows -32.7 mm in line 6" in blade
@@ -183,10 +183,10 @@ def test_front_page_states_zero_travel_and_approach(page):
     assert "x_slide -150.0 to 70.0 mm; y_slide -65.0 to 155.0 mm; z_slide 180.0 to 400.0 mm" in text
     assert "Its number must grow for x_slide, fall for y_slide, fall for z_slide" in text
     assert (
-        "towards larger numbers of x_slide, smaller numbers of y_slide, smaller numbers of z_slide"
+        "the number of x_slide grows, the number of y_slide falls, the number of z_slide falls"
     ) in text
     assert "After you have set the gauge zero, do not touch the bezel" in text
-    assert "into it: controller: {offsets_mm: [0, 0, 0]}." in text
+    assert "controller: {offsets_mm: [0, 0, 0]}" in text
     assert words(page.findall(".//code")[-1]) == "orthocal calibrate ."
     assert "`" not in text
 

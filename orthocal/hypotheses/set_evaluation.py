@@ -1,0 +1,225 @@
+"""Evaluation of sets of hypotheses: relinearised at the errors that each set implies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthocal.arrays import Array
+from orthocal.hypotheses.hypothesis import (
+    MachineShift,
+    SystematicEffect,
+    sparse_rows,
+    to_dense,
+)
+from orthocal.hypotheses.hypothesis_set import (
+    HypothesisSet,
+    Term,
+    correct_rows,
+    split_amounts,
+)
+from orthocal.hypotheses.likelihood import AmountPrior
+from orthocal.hypotheses.linear_model import (
+    LARGEST_ERROR,
+    MAX_RELINEARISATIONS,
+    SMALL_CHANGE,
+    LinearModel,
+)
+from orthocal.hypotheses.linearisation import LinearisationPoint, ModelLinearisation
+
+EFFECT_SCALES = np.array([1.0, 4.0])
+"""Grid of amplitudes of the parameters of an effect, [prior std]."""
+
+LARGEST_CHANGE = 100.0
+"""Largest plausible change of an error of the machine between two sessions, [prior std]."""
+
+LARGEST_FIRST_STEP = 50.0
+"""Largest error after the first relinearisation, [prior std]; beyond it, loops rarely close."""
+
+
+class SetEvaluator:
+    """Evaluation of sets of hypotheses about the readings of one session.
+
+    Args:
+        model: The linearised model.
+        values: The readings, shape (n_rows,), [m].
+
+    Attributes:
+        sound: The set without hypotheses.
+    """
+
+    def __init__(self, model: LinearModel, values: Array) -> None:
+        self.model, self.values = model, values
+        self._keep_jacobian = len(model.labels) > 1
+        start = model.at_reference(keep_jacobian=self._keep_jacobian)
+        self.sound = self.evaluate((), start)
+
+    def evaluate(self, terms: Sequence[Term], start: ModelLinearisation) -> HypothesisSet:
+        """Score a set of hypotheses, relinearised as in `evaluate_all`."""
+        (state,) = self.evaluate_all([terms], start)
+        return state
+
+    def evaluate_all(
+        self, term_sets: Iterable[Sequence[Term]], start: ModelLinearisation
+    ) -> list[HypothesisSet]:
+        """Score sets of hypotheses, each relinearised at the errors that it implies.
+
+        The first step may exceed LARGEST_ERROR. Readings are not linear over offsets of some mm,
+        and the nonlinear part looks like errors far beyond their tolerances. Such a step does not
+        count unless the next one returns within LARGEST_ERROR. No step exceeds LARGEST_FIRST_STEP.
+        """
+        tracks = [[state] for state in self._begin(list(term_sets), start)]
+        unfinished = tracks
+        for k in range(MAX_RELINEARISATIONS):
+            points = [self._next_point(states[-1], first=k == 0) for states in unfinished]
+            steps = [(t, p) for t, p in zip(unfinished, points, strict=True) if p is not None]
+            abouts = self.model.linearise_all(
+                [p for _, p in steps], keep_jacobian=self._keep_jacobian
+            )
+            unfinished = []
+            for (states, _), about in zip(steps, abouts, strict=True):
+                if about is not None:
+                    before = states[-1]
+                    states.append(self._evaluate_about(before.terms, about, _applied(before)))
+                    unfinished.append(states)
+        return [
+            next((s for s in reversed(states[1:]) if _are_small(s.about.theta)), states[0])
+            for states in tracks
+        ]
+
+    def _begin(
+        self, term_sets: Sequence[Sequence[Term]], start: ModelLinearisation
+    ) -> list[HypothesisSet]:
+        """Score sets of hypotheses about a start.
+
+        Sets with machine shifts start from the linearisation without anomalies.
+        """
+        model, shifts = self.model, [_known_shifts(terms) for terms in term_sets]
+        if any(t.shift is not None for terms in term_sets for t in terms):
+            sound = self.sound.about
+            points = [LinearisationPoint(sound.theta, s, sound.passive) for s in shifts if s]
+            shifted = iter(model.linearise_all(points, keep_jacobian=True))
+        states = []
+        for terms, known in zip(term_sets, shifts, strict=True):
+            about = start
+            if known:
+                about = next(shifted) or model.linearise(
+                    sound.theta, known, sound.passive, keep_jacobian=True
+                )
+            elif any(map(_is_unknown_shift, terms)):
+                about = sound
+            states.append(
+                self._evaluate_about(terms, about, np.zeros(sum(map(_is_unknown_shift, terms))))
+            )
+        return states
+
+    def _next_point(self, state: HypothesisSet, *, first: bool) -> LinearisationPoint | None:
+        """Errors that a set implies, to linearise about; None if they are too near or too far."""
+        errors = state.about.errors_for(
+            state.remaining,
+            noise_scale=state.score.noise_scale,
+            tolerance_scale=state.score.tolerance_scale,
+        )
+        if np.abs(errors - state.about.theta).max(initial=0.0) < SMALL_CHANGE:
+            return None
+        if not _are_small(errors) and (not first or np.abs(errors).max() > LARGEST_FIRST_STEP):
+            return None
+        unknown = [t.shift for t in state.terms if t.shift is not None and not t.known]
+        shifts = [
+            replace(s, direction=s.direction * a)
+            for s, a in zip(unknown, _applied(state), strict=True)
+        ]
+        return LinearisationPoint(
+            errors, [*_known_shifts(state.terms), *shifts], state.about.passive
+        )
+
+    def _evaluate_about(
+        self, terms: Sequence[Term], about: ModelLinearisation, applied: Array
+    ) -> HypothesisSet:
+        """Score a set of hypotheses about one linearisation.
+
+        Args:
+            terms: The hypotheses.
+            about: The linearisation.
+            applied: Amounts of the unknown machine shifts that the linearisation contains, (n,).
+        """
+        rows = self.values + sum((t.change for t in terms if t.change is not None), 0.0)
+        groups, silent, steps = self._vectors(terms, about)
+        priors = [
+            None if t.systematic is None else prior_of(t.systematic)
+            for t in terms
+            if t.effects is not None or (t.shift is not None and not t.known)
+        ]
+        deviation = self.model.entries(rows[None])[0] - about.expected + applied @ steps
+        score = about.likelihood.score_set(deviation, groups, silent, priors=priors)
+        effects = [*groups, *([] if silent is None else [silent])]
+        remaining = deviation - (score.amounts @ np.concatenate(effects) if effects else 0.0)
+        amounts, stds = (split_amounts(terms, a) for a in (score.amounts, score.stds))
+        changes = [
+            abs(a[0]) * np.abs(t.shift.direction).max()
+            for t, a in zip(terms, amounts, strict=True)
+            if t.shift is not None and not t.known
+        ]
+        if max(changes, default=0.0) > LARGEST_CHANGE:
+            score = replace(score, log_likelihood=-np.inf)
+        return HypothesisSet(
+            tuple(terms), score, about, remaining, correct_rows(rows, terms, amounts), amounts, stds
+        )
+
+    def _vectors(
+        self, terms: Sequence[Term], about: ModelLinearisation
+    ) -> tuple[list[Array], Array | None, Array]:
+        """Effects of the terms on the entries, zeros projected out.
+
+        Returns:
+            Effects of each term, (k, n_entries) each; indicators of silent rows, (m, n_entries), or
+            None; and effects of unknown shifts, (n, n_entries).
+        """
+        model, groups, silent, steps = self.model, [], [], []
+        for t in terms:
+            if t.effects is not None:
+                groups.append(model.entries(t.effects))
+            elif t.shift is not None and not t.known:
+                groups.append(model.shift_entries(about, t.shift)[None])
+                steps.append(groups[-1][0])
+            elif t.silent is not None:
+                silent.append(model.entries(marks(list(t.silent[:, None]), self.values.size)))
+        return (
+            groups,
+            np.concatenate(silent) if silent else None,
+            np.array(steps).reshape(len(steps), -1 if steps else about.expected.size),
+        )
+
+
+def _is_unknown_shift(term: Term) -> bool:
+    """True if a hypothesis is a machine shift of unknown amount."""
+    return term.shift is not None and not term.known
+
+
+def _known_shifts(terms: Sequence[Term]) -> list[MachineShift]:
+    """Machine shifts of known amounts."""
+    return [t.shift for t in terms if t.shift is not None and t.known]
+
+
+def _applied(state: HypothesisSet) -> Array:
+    """Estimated amounts of the unknown machine shifts, shape (n,)."""
+    pairs = zip(state.terms, state.amounts, strict=True)
+    return np.array([a[0] for t, a in pairs if _is_unknown_shift(t)])
+
+
+def _are_small(errors: Array) -> bool:
+    """True if no error exceeds LARGEST_ERROR, [prior std]."""
+    return bool(np.abs(errors).max(initial=0.0) < LARGEST_ERROR)
+
+
+def prior_of(effect: SystematicEffect) -> AmountPrior:
+    """Prior of the parameters of an effect, in prior std."""
+    return AmountPrior(EFFECT_SCALES, effect.positive)
+
+
+def marks(groups: Sequence[NDArray[np.int64]], count: int) -> Array:
+    """Indicator vectors of groups of rows, shape (len(groups), count)."""
+    return to_dense(sparse_rows(groups, [np.ones(len(g)) for g in groups], count))
