@@ -1,4 +1,4 @@
-"""Sessions, calibrations, scenes and reports of the examples, each made once in a process."""
+"""Plans, sessions, calibrations, scenes and reports of the examples, cached in a process."""
 
 from __future__ import annotations
 
@@ -8,22 +8,28 @@ from functools import cache
 from conftest import ROOT
 from folders import session_folder
 
-from orthocal import calibrate, draw_scene, load_session
+from orthocal import calibrate, draw_scene, load_plan, load_session
 from orthocal.output.report.page import build_report
 
 EXPERIMENT_2 = "table1/experiment-2"
 
 
 @cache
+def plan_of(name):
+    """Plan of an example, or of a directory in tests/sessions."""
+    return load_plan(session_folder(ROOT, name) / "plan.yaml")
+
+
+@cache
 def session_of(name):
-    """The session of an example, or of a directory in tests/sessions."""
+    """Session of an example, or of a directory in tests/sessions."""
     return load_session(session_folder(ROOT, name))
 
 
 @cache
-def calibrated(name, model=None):
+def calibrated(name, model=None, **options):
     """Calibration of an example with a model; by default the model of its session."""
-    return calibrate(session_of(name), model)
+    return calibrate(session_of(name), model, **options)
 
 
 @cache

@@ -2,17 +2,32 @@
 
 from __future__ import annotations
 
+import atexit
+import os
 import shutil
+import tempfile
 from datetime import datetime, timedelta
+from functools import cache
+from pathlib import Path
 
+from orthocal import load_plan
 from orthocal.robot.loading import packaged_robots
+
+EFFECTS = "backlash: {}, thermal: {}, screw: {lead_mm: 10}, drift: {}"
+"""Keys of all effects that a session can identify."""
+
+ALL = ("backlash", "thermal", "screw", "drift")
+"""Names of these effects."""
+
+FEW = ("yx", "xy", "xz")
+"""Setups that suffice to identify backlash."""
 
 PLAN = """robot: machine
 gauge: {sigma_mm: 0.001, range_mm: [-20, 20]}
 postures:
   zero: {tcp_mm: [0, 0, 0]}
 """
-"""Postures and setups follow."""
+"""Beginning of session.yaml, before further postures and the setups."""
 
 FIRST = datetime(2025, 3, 14, 9, 26)
 ALONG = (-100, -47, 23, 60)
@@ -64,3 +79,26 @@ def write_plan(folder, *, effects, joints=None, conditions=True):
     (folder / "session.yaml").write_text(f"{postures}{setups}readings: readings.csv\n")
     (folder / "readings.csv").write_text("\n".join(rows) + "\n")
     return folder
+
+
+@cache
+def effect_folder(keys=EFFECTS):
+    """Directory of a plan (`write_plan`), written once in a process."""
+    parent = tempfile.mkdtemp(prefix="plans-", dir=os.environ.get("ORTHOCAL_CACHE"))
+    atexit.register(shutil.rmtree, parent, ignore_errors=True)
+    return write_plan(Path(parent) / "plan", effects=keys)
+
+
+@cache
+def effect_plan(*chosen, keys=EFFECTS, setups=None):
+    """Plan of a machine with chosen effects.
+
+    Args:
+        chosen: Names of the effects.
+        keys: Keys of the effects in the robot's YAML.
+        setups: Names of the setups; all six by default.
+    """
+    plan = load_plan(effect_folder(keys)).with_effects(list(chosen))
+    if setups is None:
+        return plan
+    return plan.select([r for r in plan.readings if r.setup in setups])

@@ -1,7 +1,7 @@
-"""An effect of the tests' own that acts in every way an effect can.
+"""An effect for tests that acts in all possible ways.
 
-A drive stops short by half its slack in the direction of its last motion, and its screw has a
-periodic error. Rods grow with the temperature, and what a gauge shows creeps with the time.
+A drive lags by half its slack in the direction of its last motion, and its screw has a periodic
+error. Rods grow with the temperature, and readings change linearly with time.
 """
 
 from __future__ import annotations

@@ -1,19 +1,16 @@
-"""Machines with an effect that the model lacks: how much the readings say of it, and what is named.
+"""Machines with an effect that the model lacks, and the effects that a search names.
 
-The gain is that of the true effect with its tolerances, in ln evidence over no effect.
+The gain is the ln evidence of the true effect with its tolerances over no effect.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from datetime import timedelta
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
-from effect_plans import FIRST, write_plan
+from effect_plans import FIRST, effect_plan
 
-from orthocal import load_plan
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import build_problem
 from orthocal.hypotheses import search
@@ -21,10 +18,9 @@ from orthocal.hypotheses.families.effects import unmodelled_effects
 from orthocal.hypotheses.hypothesis import Rows
 from orthocal.hypotheses.linear_model import LinearModel
 
-EFFECTS = "backlash: {}, thermal: {}, drift: {}, screw: {lead_mm: 10}"
 SIGMA, STEP = 5e-6, 10e-6
 ENTERED = 0.02
-"""Part of their tolerances that offsets have left once they were entered."""
+"""Errors of offsets after they were entered, relative to their tolerances."""
 
 
 def plan_with_conditions(setups=None, *, pace=1.0):
@@ -36,11 +32,8 @@ def plan_with_conditions(setups=None, *, pace=1.0):
         setups: Names of its setups; all six by default.
         pace: Minutes between the readings.
     """
-    with TemporaryDirectory() as folder:
-        plan = load_plan(write_plan(Path(folder) / "plan", effects=EFFECTS))
+    plan = effect_plan(setups=setups)
     plan = plan.with_gauge(replace(plan.gauge, sigma=SIGMA, resolution=STEP))
-    if setups is not None:
-        plan = plan.select([r for r in plan.readings if r.setup in setups])
     return plan.select([_slower(r, pace) for name in plan.setups for r in _closed(plan, name)])
 
 
@@ -85,7 +78,7 @@ def read_machines(plan, effect, count, *, level=1.0, seed=0):
 
 @dataclass
 class Named:
-    """What the first step of the search says of one machine."""
+    """Result of the first step of the search for one machine."""
 
     gain: float
     effects: tuple[str, ...]
@@ -104,7 +97,7 @@ class EffectSearch:
         )
 
     def name(self, values):
-        """What is named in the readings of a machine, shape (n_rows,), [m]."""
+        """Effects that are named in the readings of a machine, shape (n_rows,), [m]."""
         found = search._Search(self.bare.with_values(values), self.model)
         families = unmodelled_effects(Rows(self.bare, values), found.effects)
         scores = {

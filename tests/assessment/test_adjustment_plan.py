@@ -1,4 +1,4 @@
-"""Plans of mechanical adjustments: adjusted machines reach what was promised."""
+"""Plans of mechanical adjustments, and tool errors of adjusted machines."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from adjusting import reached, shimmed_plan
+from calibrated import calibrated
+from commands import orthocal as run
 
 from orthocal import (
     calibrate,
@@ -25,6 +27,7 @@ from orthocal.assessment.words.adjustment import HEADLINES
 from orthocal.calibration.adjusting import adjust_calibration
 from orthocal.effects.adjustment import find_adjustments
 from orthocal.errors import RobotError
+from orthocal.output.report.page import build_report
 from orthocal.output.text.adjustment import render_plan
 from orthocal.output.text.layout import to_text
 
@@ -54,22 +57,22 @@ def plans(machines):
     return {seed: plan_adjustments(calibration) for seed, (_, calibration) in machines.items()}
 
 
-def test_adjusted_machines_reach_what_was_promised(machines, plans):
+def test_adjusted_machines_have_the_predicted_tool_error(machines, plans):
     """A sample; tests/benchmarks/adjusting.py has more machines, whose mean is within 1.15."""
-    ratios, wrong = [], []
+    ratios, of_reversed = [], []
     for seed, (errors, calibration) in machines.items():
         planned = plans[seed]
         adjusted = adjust_calibration(calibration, planned.amounts)
-        found = reached(errors, adjusted, planned.amounts, seed=seed)
-        ratios.append((found / planned.after.entered) ** 2)
-        turned = {n: -v for n, v in planned.amounts.items()}
-        wrong.append((reached(errors, adjusted, turned, seed=seed) / planned.after.entered) ** 2)
+        reversed_ = {n: -v for n, v in planned.amounts.items()}
+        for amounts, squares in ((planned.amounts, ratios), (reversed_, of_reversed)):
+            error = reached(errors, adjusted, amounts, seed=seed)
+            squares.append((error / planned.after.entered) ** 2)
     # few directions carry the uncertainty: the square of one ratio scatters by about 0.8
     assert np.mean(ratios) < 1.0 + 2.0 * 0.8 / np.sqrt(len(ratios))
-    assert np.mean(wrong) > 2.0 * (1.0 + 2.0 * 0.8 / np.sqrt(len(ratios)))
+    assert np.mean(of_reversed) > 2.0 * (1.0 + 2.0 * 0.8 / np.sqrt(len(ratios)))
 
 
-def test_amounts_can_be_set(plans):
+def test_amounts_are_multiples_of_the_step_within_the_limits(plans):
     for planned in plans.values():
         assert planned.judgement == "worthwhile"
         errors = [planned.before.entered, *(p.tool_error for p in planned.adjustments)]
@@ -83,13 +86,14 @@ def test_amounts_can_be_set(plans):
 
 
 def search_of(calibration):
+    """Search for adjustments, with all feet as candidates."""
     tool = find_tool(calibration)
     candidates = find_adjustments(calibration.robot)
     return _Search(calibration, tool, candidates, calibration.assessment.tool.compensated)
 
 
-def test_no_other_choice_of_as_many_is_much_better(machines, plans):
-    """All triples: forward selection with exchange may miss the best one by little."""
+def test_no_other_triple_is_much_better(machines, plans):
+    """Forward selection with exchange may miss the best one by LEAST_GAIN."""
     search = search_of(machines[4][1])
     chosen = search.choose()
     assert len(chosen) == len(plans[4].adjustments) == 3
@@ -111,8 +115,8 @@ def test_best_amounts_are_a_minimum(machines):
             assert search.error(trial) > own or abs(trial[i]) > search.max_amounts[i]
 
 
-def test_the_effects_are_those_of_the_adjusted_machine(machines):
-    """First order, with offsets entered again, against loops closed with the amounts."""
+def test_first_order_effects_are_those_of_the_adjusted_machine(machines):
+    """With offsets entered again, against loops closed with the amounts."""
     calibration = machines[4][1]
     search = search_of(calibration)
     plain = search_of(calibration)
@@ -125,8 +129,7 @@ def test_the_effects_are_those_of_the_adjusted_machine(machines):
         assert abs(change.error(0.0 * amounts) - plain.error(amounts)) < 0.02 * moved
 
 
-def test_uncertainties_of_amounts_by_sampling(machines):
-    """Best amounts of machines as uncertain as the calibration says."""
+def test_uncertainties_of_amounts_are_those_of_sampled_machines(machines):
     calibration = machines[4][1]
     search = search_of(calibration)
     search.max_amounts = np.full(15, 1.0)
@@ -158,7 +161,7 @@ def test_an_adjusted_calibration_is_the_machine_with_its_amounts(machines):
     assert adjust_calibration(calibration, {}) is calibration
 
 
-def test_a_machine_of_right_angles_is_left_alone(plan):
+def test_a_machine_of_right_angles_needs_no_adjustment(plan):
     errors = {"x_slide.offset": 0.4e-3, "y_slide.offset": -0.6e-3}
     session = simulate_session(plan, errors, seed=1, sigma=3e-6, exact=True).session
     planned = plan_adjustments(calibrate(session, **QUICK))
@@ -166,10 +169,7 @@ def test_a_machine_of_right_angles_is_left_alone(plan):
     assert planned.gain < 0.05
 
 
-def test_a_second_session_is_refused_as_the_adjustment_is(plan, tmp_path):
-    """Nothing is written for a machine that `adjust` leaves as it is."""
-    from test_cli import orthocal as run
-
+def test_a_plan_after_an_adjustment_with_small_gain_is_refused(plan, tmp_path):
     errors = {"x_slide.offset": 0.4e-3, "y_slide.rz": 1.4e-3}
     session = simulate_session(plan, errors, seed=1, sigma=3e-6).session
     write_calibration(calibrate(session, **QUICK), tmp_path / "calibration.json")
@@ -190,7 +190,7 @@ def test_a_second_session_is_refused_as_the_adjustment_is(plan, tmp_path):
     assert all(name in (new / "session.yaml").read_text() for name in amounts)
 
 
-def test_adjustments_that_are_not_worth_doing_are_details(machines, plans):
+def test_adjustments_with_uncertain_gain_are_details(machines, plans):
     _, calibration = machines[4]
     assert plans[4].judgement == "worthwhile"
     uncertain = replace(plans[4], displacement_uncertainty=1.0)
@@ -206,32 +206,25 @@ def test_adjustments_that_are_not_worth_doing_are_details(machines, plans):
     assert all(name in show(uncertain, details=True) for name in names)
 
 
-def test_a_robot_without_adjustments_is_refused(orthoglide, root):
+def test_a_robot_without_adjustments_is_refused():
     with pytest.raises(RobotError, match=r"orthocal\.adjustments"):
-        plan_adjustments(calibrate(root / "examples/table1/experiment-2", "offsets"))
+        plan_adjustments(calibrated("table1/experiment-2", "offsets"))
 
 
-def test_validation_expects_the_adjusted_machine(plan, machines, plans):
+@pytest.mark.parametrize(("sign", "confirmed"), [(1.0, True), (-1.0, False)])
+def test_validation_expects_the_adjusted_machine(plan, machines, plans, sign, confirmed):
     errors, calibration = machines[4]
     amounts = plans[4].amounts
     adjusted = adjust_calibration(calibration, amounts)
     entered = plan.with_controller(offsets_to_enter(adjusted))
-    now = {**errors, **{f"{n}.adjustment": v for n, v in amounts.items()}}
+    now = {**errors, **{f"{n}.adjustment": sign * v for n, v in amounts.items()}}
     after = simulate_session(entered, now, seed=12, sigma=3e-6).session
-    confirmed = validate_calibration(calibration, replace(after, adjusted=amounts))
-    assert confirmed.confirmed is True
-    reversed_ = {n: -v for n, v in amounts.items()}
-    wrong = {**errors, **{f"{n}.adjustment": v for n, v in reversed_.items()}}
-    after = simulate_session(entered, wrong, seed=12, sigma=3e-6).session
-    assert validate_calibration(calibration, replace(after, adjusted=amounts)).confirmed is not True
+    validation = validate_calibration(calibration, replace(after, adjusted=amounts))
+    assert (validation.confirmed is True) is confirmed
 
 
 @pytest.mark.usefixtures("short_reports", "without_sensor_gains")
-def test_the_command_and_the_report(machines, tmp_path):
-    from test_cli import orthocal as run
-
-    from orthocal.output.report.page import build_report
-
+def test_command_and_report_list_the_planned_adjustments(machines, tmp_path):
     _, calibration = machines[4]
     write_calibration(calibration, tmp_path / "calibration.json")
     code, out, _ = run("adjust", tmp_path)
@@ -248,17 +241,12 @@ def test_the_command_and_the_report(machines, tmp_path):
     code, _, err = run("adjust", tmp_path, "--among", "w_foot")
     assert code == 2
     assert "--among" in err
-    for text in (
-        "x_side_foot_z",
-        "w_foot=1",
-        "x_side_foot_z=99",
-        "x_side_foot_z=.1,x_side_foot_z=.1",
-    ):
-        code, _, err = run("again", tmp_path, "--adjusted", text, "--out", tmp_path / "new")
+    new = tmp_path / "new"
+    foot = "x_side_foot_z"
+    for amounts in (foot, "w_foot=1", f"{foot}=99", f"{foot}=.1,{foot}=.1"):
+        code, _, err = run("again", tmp_path, "--adjusted", amounts, "--out", new)
         assert code == 2
         assert "--adjusted" in err
-    code, out, _ = run(
-        "again", tmp_path, "--adjusted", f"{names[0]}=0.12", "--out", tmp_path / "new"
-    )
+    code, _, _ = run("again", tmp_path, "--adjusted", f"{names[0]}=0.12", "--out", new)
     assert code == 0
-    assert f"adjusted_mm: {{{names[0]}: 0.12}}" in (tmp_path / "new/session.yaml").read_text()
+    assert f"adjusted_mm: {{{names[0]}: 0.12}}" in (new / "session.yaml").read_text()

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from effect_plans import write_plan
+from effect_plans import effect_plan
 
-from orthocal import ExportOptions, calibrate, export_calibration, load_plan, simulate_session
-from orthocal.assessment.assess import assess
+from orthocal import ExportOptions, calibrate, export_calibration, simulate_session
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.controller_entries import (
     backlash_changes,
@@ -35,18 +34,15 @@ TRUTH = {
     "x_slide.backlash": 40e-6,
     "y_slide.backlash": 60e-6,
 }
-"""The z drive has no backlash."""
+"""Drive z has no backlash."""
 
 NOISE = 6e-6
 
 
 @pytest.fixture(scope="module")
-def plan(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("entered") / "plan"
-    effects = "backlash: {}, screw: {lead_mm: 10, periodic_tolerance_mm: 0.02}"
-    plan = load_plan(write_plan(folder, effects=effects)).with_effects(["backlash"])
-    gauge = replace(plan.gauge, sigma=NOISE)
-    return plan.with_gauge(gauge).with_controller(np.zeros(3))
+def plan():
+    plan = effect_plan("backlash")
+    return plan.with_gauge(replace(plan.gauge, sigma=NOISE)).with_controller(np.zeros(3))
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +86,7 @@ def test_every_output_has_the_same_decision(calibration, plan):
     assert "and this backlash" in text
 
 
-def test_a_table_has_the_same_decision(plan):
+def test_a_compensation_table_has_the_same_decision(plan):
     both = plan.with_effects(["backlash", "screw"])
     truth = {**TRUTH, "x_slide.screw_sin": 15e-6, "z_slide.screw_sin": 15e-6}
     session = simulate_session(both, truth, seed=3, sigma=NOISE).session
@@ -106,14 +102,14 @@ def test_a_table_has_the_same_decision(plan):
         assert apart == pytest.approx(found[drive].enter, rel=0.05, abs=1e-9)
 
 
-def test_the_tool_error_is_that_of_what_is_entered(calibration):
-    """Of the closed loops under every combination of sides, with the motors moved by hand."""
+def test_the_tool_error_is_that_with_the_entered_backlash(calibration):
+    """Loops are closed under every combination of sides with compensated drives."""
     tool, placed = calibration.assessment.tool, find_tool(calibration)
     points = placed.workspace.points[: len(placed.drives)]
     nominal = nominal_closure(calibration.robot)
     drives = nominal.inverse(points) - entered_offsets(calibration)
     half = 0.5 * np.array([e.enter for e in calibration.assessment.backlash])
-    for expected, taken_up in ((tool.entered, half), (tool.without_backlash, 0.0 * half)):
+    for expected, compensation in ((tool.entered, half), (tool.without_backlash, 0.0 * half)):
         fields = []
         for sides in itertools.product((1.0, -1.0), repeat=3):
             letters = "".join("p" if s > 0.0 else "n" for s in sides)
@@ -122,7 +118,7 @@ def test_the_tool_error_is_that_of_what_is_entered(calibration):
                 fixed=calibration.errors,
                 conditions=UseConditions(approach=letters),
             )
-            reached = closure.forward(drives + np.array(sides) * taken_up)
+            reached = closure.forward(drives + np.array(sides) * compensation)
             fields.append(reached - placed.targets[: len(points)])
         field = np.concatenate(fields)
         space = placed.workspace.once(placed.use.size).repeat(8)
@@ -134,7 +130,7 @@ def test_the_tool_error_is_that_of_what_is_entered(calibration):
 
 
 def test_an_undetermined_backlash_is_entered_if_that_lowers_the_tool_error(calibration):
-    """As uncertain as it is large: entered only if it moves the tool by a third of what is left."""
+    """Its uncertainty is its value; it must change the tool by a third of the remaining error."""
     tool = find_tool(calibration)
     index = next(i for i, p in enumerate(calibration.parameters) if p.name == "x_slide.backlash")
     p = calibration.parameters[index]
@@ -155,7 +151,7 @@ def test_an_undetermined_backlash_is_entered_if_that_lowers_the_tool_error(calib
         assert (x.enter == value) is entered
 
 
-def test_backlash_that_the_controller_takes_up_stays(plan, calibration):
+def test_backlash_that_the_controller_compensates_stays(plan, calibration):
     trims = tuple(JointTrim(e.enter) for e in calibration.assessment.backlash)
     again = replace(plan.with_controller(entered_offsets(calibration).round(6)), compensation=trims)
     second = calibrate(
@@ -173,10 +169,10 @@ def test_backlash_that_the_controller_takes_up_stays(plan, calibration):
 
 
 def test_backlash_alone_is_entered_where_the_offsets_stay(plan):
-    right = plan.with_controller(np.array([0.8e-3, -0.5e-3, 0.0]))
-    session = simulate_session(right, TRUTH, seed=5, sigma=NOISE).session
+    entered = plan.with_controller(np.array([0.8e-3, -0.5e-3, 0.0]))
+    session = simulate_session(entered, TRUTH, seed=5, sigma=NOISE).session
     found = calibrate(session, "offsets", **QUICK)
-    judged = assess(found)
+    judged = found.assessment
     assert judged.keeps_offsets
     assert any(e.change for e in judged.backlash)
     assert "Enter the backlash." in judged.decision.headline

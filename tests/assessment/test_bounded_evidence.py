@@ -1,4 +1,4 @@
-"""Evidence of a model with errors that are never negative, against integration and sampling."""
+"""Evidence of a model with errors that are never negative, by integration and by sampling."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from effect_plans import write_plan
+from effect_plans import effect_plan
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal, norm
 
-from orthocal import load_plan, simulate_session
+from orthocal import simulate_session
 from orthocal.assessment.recommendation import TRIAL_SCALES, compute_log_evidence
 from orthocal.estimation.selection import complete_model
 from orthocal.hypotheses.likelihood import build_likelihood
@@ -29,8 +29,8 @@ def test_the_share_of_one_variable_is_that_of_its_distribution():
 
 
 @pytest.mark.parametrize("size", [2, 3, 6])
-def test_the_share_of_several_is_that_of_draws(size):
-    """Also of correlated ones; independent ones multiply."""
+def test_the_share_of_several_variables_is_that_of_draws(size):
+    """Shares of independent variables are multiplied."""
     rng = np.random.default_rng(size)
     root = rng.normal(size=(size, size + 1))
     covariance, mean = root @ root.T, rng.normal(size=size) + 0.5
@@ -68,11 +68,10 @@ def test_the_evidence_of_one_parameter_is_its_integral(true, scale):
 
 
 @pytest.fixture(scope="module")
-def backlash(tmp_path_factory):
+def backlash():
     """Readings from both sides on a machine with backlash of two drives."""
-    plan = load_plan(write_plan(tmp_path_factory.mktemp("plan"), effects="backlash: {}"))
     errors = {"y_slide.backlash": 30e-6, "x_slide.backlash": 10e-6, "x_slide.offset": 0.1e-3}
-    return simulate_session(plan, errors, seed=4).session
+    return simulate_session(effect_plan("backlash"), errors, seed=4).session
 
 
 @pytest.mark.parametrize("scale", [1.0, float(TRIAL_SCALES[28])])
@@ -87,7 +86,7 @@ def test_the_evidence_of_a_session_is_that_of_drawn_backlash(backlash, scale):
     one, by_scale = compute_log_evidence(backlash, complete_model(backlash.robot.parameters))
     found = one if scale == 1.0 else float(by_scale[28])
 
-    # zeros are projected out: coordinates within what is left
+    # coordinates in the space without gauge zeros
     values, vectors = np.linalg.eigh(np.eye(deviation.size) - _zero_means(model))
     within = vectors[:, values > 0.5]
     others = scale * within.T @ about.jacobian[:, ~positive]
@@ -109,7 +108,7 @@ def test_the_evidence_of_a_session_is_that_of_drawn_backlash(backlash, scale):
 
 
 def _zero_means(model):
-    """Projection on the gauge zeros, of which each is the mean of its entries."""
+    """Projection on the gauge zeros; each is the mean of its entries."""
     incidence = model.problem.zero_incidence
     dense = incidence.toarray() if hasattr(incidence, "toarray") else np.asarray(incidence)
     return dense / dense.sum(axis=0) @ dense.T

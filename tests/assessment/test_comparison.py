@@ -1,4 +1,4 @@
-"""Models side by side: scores, predictions of setups left out, and one recommendation."""
+"""Comparison of models: scores, predictions of omitted setups, and one recommendation."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibrated import calibrated, session_of
 
-from orthocal import calibrate, load_session, summarize
+from orthocal import summarize
 from orthocal.assessment.comparison import compare_models
 from orthocal.assessment.recommendation import STRONG, ModelEvidence, Recommendation
 from orthocal.assessment.wording import tool_mm
@@ -22,35 +23,34 @@ from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.output.text.comparison import MORE
 from orthocal.statistics.zeros import project_out_zeros
 
-OFFSETS = {"*.offset_mm": 4.0}
+QUICK = SolverOptions("variable-projection")
+EXAMPLES = {"table1": "table1/experiment-2", "cycles": "raw-cycles", "workshop": "workshop"}
 
 
 @pytest.fixture(scope="module")
-def table1(root, experiment_2):
-    again = load_session(root / "examples/table1/experiment-3")
-    return compare_models(experiment_2, repeat=again)
+def table1():
+    session, again = (session_of(f"table1/experiment-{n}") for n in (2, 3))
+    return compare_models(session, repeat=again, options=QUICK)
 
 
 @pytest.fixture(scope="module")
-def cycles(raw_cycles):
-    return compare_models(raw_cycles)
+def cycles():
+    return compare_models(session_of("raw-cycles"), options=QUICK)
 
 
 @pytest.fixture(scope="module")
-def workshop(root):
-    return compare_models(root / "examples/workshop", models=["offsets", "full"])
+def workshop():
+    return compare_models(session_of("workshop"), models=["offsets", "full"], options=QUICK)
 
 
 @pytest.fixture(scope="module")
-def lines(root):
-    session = load_session(root / "tests/sessions/lines")
-    # the same optima as Ipopt's (`test_solvers`), in less time
-    quick = SolverOptions("variable-projection")
-    return compare_models(session, models=["offsets", "full"], tolerances=OFFSETS, options=quick)
+def lines():
+    session, models = session_of("lines"), ["offsets", "full"]
+    return compare_models(session, models=models, tolerances={"*.offset_mm": 4.0}, options=QUICK)
 
 
 def test_the_complete_model_is_recommended_for_table_1(table1):
-    """Its residuals exceed the noise of the dial ten times, which no model of offsets explains."""
+    """Residuals of offsets are ten times the noise of the dial."""
     assert table1.recommendation.model == "full"
     assert table1.best is table1["full"]
     assert (table1["offsets"].spare, table1["full"].spare) == (3, 0)
@@ -65,7 +65,7 @@ def test_the_complete_model_is_recommended_for_table_1(table1):
     assert others["offsets"]["unseen_rms_mm"] == pytest.approx(expected, rel=1e-12)
     (scale,) = found.of_kind("above tolerances")
     assert scale.numbers["tolerance_scale"] == table1.judgement.tolerance_scale.factor > 1.0
-    assert found.of_kind("repetition unknown")  # no reading is left to check it
+    assert found.of_kind("repetition unknown")  # no reading is redundant
 
 
 RECOMMENDED = {
@@ -77,24 +77,22 @@ RECOMMENDED = {
 
 
 @pytest.mark.parametrize("name", RECOMMENDED)
-def test_one_recommendation_for_calibrate_and_compare(name, request, root):
-    examples = {"table1": "table1/experiment-2", "cycles": "raw-cycles"}
+def test_compare_and_calibrate_recommend_the_same_model(name, request):
     compared = request.getfixturevalue(name)
     model, evidence = RECOMMENDED[name]
     assert compared.recommendation.model == model
     assert compared.recommendation.log_evidence_of("offsets") == pytest.approx(evidence, abs=0.5)
-    session = load_session(root / "examples" / examples.get(name, name))
-    calibration = calibrate(session, solver="variable-projection")
+    calibration = calibrated(EXAMPLES[name])
     (first,) = compared.assessment.of_kind("recommended")
     (second,) = calibration.assessment.of_kind("recommended")
     assert model in first.text
     assert model in second.text
 
 
-def test_residuals_of_offsets_repeat(root, experiment_2):
-    again = load_session(root / "examples/table1/experiment-3")
-    found = compare_models(experiment_2, models=["offsets"], repeat=again)
-    assert found.best is found["offsets"]  # the largest that is compared
+def test_residuals_of_offsets_repeat(experiment_2):
+    again = session_of("table1/experiment-3")
+    found = compare_models(experiment_2, models=["offsets"], repeat=again, options=QUICK)
+    assert found.best is found["offsets"]  # the largest compared model
     assert found.repetition.repeats
     assert found.repetition.correlation == pytest.approx(0.9937, abs=5e-5)
     (repeat,) = found.assessment.of_kind("residuals repeat")
@@ -103,8 +101,8 @@ def test_residuals_of_offsets_repeat(root, experiment_2):
     assert excess.numbers["ratio"] == pytest.approx(9.8, abs=0.05)
 
 
-def test_the_tool_error_is_that_of_calibrate(raw_cycles, cycles):
-    compared, calibration = cycles, calibrate(raw_cycles, cycles.best.model)
+def test_the_tool_error_is_that_of_calibrate(cycles):
+    compared, calibration = cycles, calibrated("raw-cycles", cycles.best.model)
     (first,) = compared.assessment.of_kind("tool error")
     (second,) = calibration.assessment.of_kind("tool error")
     assert first.text == second.text
@@ -123,38 +121,37 @@ def test_the_scores_of_table_1_solved_by_hand(table1):
     square = float(np.sum(score.residuals**2))
     assert score.rms == pytest.approx(np.sqrt(square / 6))
     assert score.chi_square == pytest.approx(square / (2 * 0.02e-3**2), rel=1e-9)
-    assert 2.998 < score.dof < 3.0  # what is not known of gauges takes the rest
+    assert 2.998 < score.dof < 3.0  # nuisance parameters reduce it a little
     k = 7.0 - score.dof
-    # six independent differences are six readings of variance one with their zeros taken out
+    # six independent differences are six readings of variance one without their zeros
     term = 6 * math.log(square / 2 / 6)
     assert score.aicc == pytest.approx(term + 2 * k + 2 * k * (k + 1) / (6 - k - 1))
     assert score.bic == pytest.approx(term + k * math.log(6))
     assert math.isinf(table1["full"].exact.aicc)
 
 
-def with_gauges_of(problem, fit):
-    """Parameters of a fit to fewer setups, the gauges of the others as they are said to stand."""
+def extend_to(problem, fit):
+    """Parameters of a fit to fewer setups, 0 for the nuisance parameters of the others."""
     found = dict(zip(fit.problem.free, fit.solution.theta, strict=True))
     return np.array([found.get(name, 0.0) for name in problem.free])
 
 
-def test_leaving_a_setup_out_is_really_leaving_it_out(experiment_2, table1):
-    """Against sessions without the setup's rows, each calibrated and asked for the missing row."""
-    for i, row in enumerate(experiment_2.readings):
+def test_omitted_setups_are_predicted_by_fits_without_their_rows(experiment_2, table1):
+    for i, row in list(enumerate(experiment_2.readings))[::2]:
         rest = replace(
             experiment_2, readings=tuple(r for r in experiment_2.readings if r.setup != row.setup)
         )
         problem = build_problem(experiment_2, model="offsets")
         fit = fit_problem(build_problem(rest, model="offsets"))
-        sigma = table1["offsets"].calibration.noise.sigma  # as gauges' tolerances weigh beside it
+        sigma = table1["offsets"].calibration.noise.sigma  # the weight beside the priors
         solution = NonlinearProgram(fit.problem).solve(sigma=sigma)
-        theta = with_gauges_of(problem, replace(fit, solution=solution))
+        theta = extend_to(problem, replace(fit, solution=solution))
         o = problem.observations
         error = o.rows(project_out_zeros(problem.values - problem.predict(theta), o))[i]
         assert table1["offsets"].exact.unseen[i] == pytest.approx(error, abs=1e-9)
 
 
-def test_leaving_a_setup_out_beside_a_prior(raw_cycles, cycles):
+def test_an_omitted_setup_is_predicted_with_priors(raw_cycles, cycles):
     setup = "xz"
     rest = replace(raw_cycles, readings=tuple(r for r in raw_cycles.readings if r.setup != setup))
     result = cycles["lengths"]
@@ -162,7 +159,7 @@ def test_leaving_a_setup_out_beside_a_prior(raw_cycles, cycles):
     problem = build_problem(raw_cycles, model="lengths")
     fit = fit_problem(build_problem(rest, model="lengths"))
     solution = NonlinearProgram(fit.problem).solve(sigma=sigma)
-    theta = with_gauges_of(problem, replace(fit, solution=solution))
+    theta = extend_to(problem, replace(fit, solution=solution))
     o = problem.observations
     errors = o.rows(project_out_zeros(problem.values - problem.predict(theta), o))
     for i, row in enumerate(raw_cycles.readings):
@@ -170,7 +167,7 @@ def test_leaving_a_setup_out_beside_a_prior(raw_cycles, cycles):
             assert result.exact.unseen[i] == pytest.approx(errors[i], abs=2e-8)
 
 
-def test_linearised_and_exact_predict_alike_but_not_the_same(cycles):
+def test_linearised_and_exact_predictions_nearly_agree(cycles):
     offsets = cycles["offsets"]
     gap = np.abs(offsets.linearised.unseen - offsets.exact.unseen)
     assert 0.0 < gap.max() < 0.01e-3
@@ -192,31 +189,30 @@ def test_displaced_lines_support_the_full_model(lines):
     assert lines.assessment.decision.verdict == "enter"
     full, offsets = lines["full"], lines["offsets"]
     assert full.exact.unseen_rms < 0.8 * offsets.exact.unseen_rms
-    # errors that no reading of a leg tells are in both, those of drives and rods' ends too
     assert full.tool.after.sizes.aligned.rms < 0.25 * offsets.tool.after.sizes.aligned.rms
     assert lines.independent == 264
 
 
-def test_readings_that_leave_an_offset_open_are_held_by_the_tolerances(raw_cycles):
+def test_undetermined_offsets_have_their_tolerances_as_prior(raw_cycles):
     rows = tuple(r for r in raw_cycles.readings if r.setup == "yx")
-    found = compare_models(replace(raw_cycles, readings=rows), models=["offsets"])
-    (result,) = found.results  # held as larger models are
+    found = compare_models(replace(raw_cycles, readings=rows), models=["offsets"], options=QUICK)
+    (result,) = found.results
     assert (result.prior, result.by_choice, result.spare) == (True, False, 0)
     json.loads(found.to_json())
 
 
 def test_an_unstated_noise_is_unknown(experiment_2):
     session = experiment_2.with_gauge(replace(experiment_2.gauge, sigma=None))
-    found = compare_models(session, models=["offsets"])
+    found = compare_models(session, models=["offsets"], options=QUICK)
     assert found.assessment.of_kind("noise from residuals")
     assert found.assessment.decision.exit_code == 0
     assert json.loads(found.to_json())["noise"] is None
 
 
 def test_a_setup_that_the_others_do_not_determine_has_no_prediction(raw_cycles):
-    """Two setups of leg x tell two offsets: without either one is lost."""
+    """Each setup of leg x is needed for one offset."""
     rows = tuple(r for r in raw_cycles.readings if r.setup in ("yx", "zx", "xz"))
-    found = compare_models(replace(raw_cycles, readings=rows), models=["offsets"])
+    found = compare_models(replace(raw_cycles, readings=rows), models=["offsets"], options=QUICK)
     assert np.isnan(found["offsets"].exact.unseen).any()
 
 
@@ -225,15 +221,16 @@ def test_an_unknown_model_is_refused(experiment_2):
         compare_models(experiment_2, models=["all"])
 
 
-def test_a_small_model_is_not_worse_off_for_having_no_prior(raw_cycles):
-    """Without leg z its offset is open; what holds it in larger models holds it in this one."""
+def test_an_undetermined_offset_has_a_prior_in_all_models(raw_cycles):
+    """Without leg z its offset is undetermined."""
     rows = tuple(r for r in raw_cycles.readings if r.setup in ("yx", "xy"))
-    found = compare_models(replace(raw_cycles, readings=rows), models=["offsets", "lengths"])
+    session, models = replace(raw_cycles, readings=rows), ["offsets", "lengths"]
+    found = compare_models(session, models=models, options=QUICK)
     assert found.undetermined == ()
     assert {r.model: r.by_choice for r in found.results} == {"offsets": False, "lengths": True}
 
 
-def test_the_recommendation_stands_first_and_unchecked_models_have_no_criteria(table1):
+def test_the_recommendation_is_first_and_models_without_redundancy_have_no_criteria(table1):
     text = summarize(table1, details=True)
     assert text.index("Recommended model") < text.index("Scores")
     rows = text[text.index("Scores") : text.index("Estimates")].splitlines()
@@ -242,7 +239,7 @@ def test_the_recommendation_stands_first_and_unchecked_models_have_no_criteria(t
     assert rows[full + 1].split()[1:6] == ["–"] * 5
 
 
-def test_the_summary_shows_all_that_was_promised(table1):
+def test_the_summary_has_all_scores(table1):
     text = summarize(table1, details=True)
     assert text.startswith(summarize(table1).removesuffix(f"{MORE}\n"))
     for words in ("linear", "exact", "χ²", "AICc", "BIC", "CV", "tool", "ln evidence"):
@@ -255,16 +252,16 @@ def test_the_summary_shows_all_that_was_promised(table1):
     assert document["models"][0]["exact"]["rms"] == pytest.approx(0.195e-3, abs=5e-7)
 
 
-def test_readings_without_any_deviation_speak_for_offsets_and_small_tolerances(raw_cycles):
+def test_readings_without_deviation_support_offsets_and_small_tolerances(raw_cycles):
     still = raw_cycles.with_values(np.zeros(len(raw_cycles.readings)))
-    found = compare_models(still, models=["offsets", "lengths"])
+    found = compare_models(still, models=["offsets", "lengths"], options=QUICK)
     assert found.recommendation.log_evidence_of("offsets") > STRONG
     assert found.recommendation.tolerance_scale < 0.2
     assert math.isfinite(found["lengths"].exact.aicc)
 
 
 def test_one_tolerance_scale_is_stated():
-    """That of the judgement, which the calibration applies; it scales other errors."""
+    """The calibration applies that of the judgement."""
     recommendation = Recommendation("full", 2.2, (ModelEvidence("full", 0.0),), 9.0)
     kinds = {
         scale: [f.kind for f in describe_recommendation(recommendation, judged_scale=scale)]

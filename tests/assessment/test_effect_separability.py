@@ -1,4 +1,4 @@
-"""What readings cannot show of the effects in the model, and which of them they do not separate."""
+"""Effects in the model that the readings do not show or do not separate."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from datetime import timedelta
 
 import numpy as np
 import pytest
-from effect_plans import FIRST, write_plan
+from effect_plans import FIRST, effect_plan
 
-from orthocal import check_session, load_plan, simulate_session
+from orthocal import check_session, simulate_session
 from orthocal.assessment.effect_limits import DETERMINED
 from orthocal.assessment.effect_separability import MAX_R_SQUARED, WARMER, find_unshown_effects
 from orthocal.estimation.problem import CalibrationProblem
@@ -18,13 +18,12 @@ from orthocal.statistics.zeros import project_out_zeros
 
 
 @pytest.fixture(scope="module")
-def plan(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("separable") / "plan"
-    return load_plan(write_plan(folder, effects="screw: {lead_mm: 10}")).with_effects([])
+def plan():
+    return effect_plan()
 
 
 def under(session, change):
-    """Session with other conditions: a function of the row and its present ones."""
+    """Session with other conditions, by a function of the row and its present ones."""
     readings = [
         replace(r, conditions=change(i, r.conditions)) for i, r in enumerate(session.readings)
     ]
@@ -35,13 +34,13 @@ def find(session, effects):
     return find_unshown_effects(session.with_effects(effects))
 
 
-def test_nothing_is_said_without_effects_or_where_readings_show_them(plan):
+def test_effects_that_the_readings_show_have_no_finding(plan):
     assert find(plan, []) == []
     assert find(plan, ["backlash"]) == []
     assert find(plan, ["backlash", "drift"]) == []
 
 
-def test_an_approach_from_one_side_is_said_once_and_accuses_nobody(plan):
+def test_an_approach_from_one_side_is_one_note(plan):
     one = under(plan, lambda _, c: replace(c, approach=f"p{c.approach[1:]}"))
     (found,) = find(one, ["backlash"])
     assert (found.kind, found.severity) == ("effect not shown", "note")
@@ -52,15 +51,15 @@ def test_an_approach_from_one_side_is_said_once_and_accuses_nobody(plan):
     assert assessment.decision.verdict == "enter"
 
 
-def test_conditions_that_nobody_stated_are_named(plan):
+def test_readings_without_conditions_show_no_effect(plan):
     bare = replace(plan, readings=tuple(replace(r, conditions=None) for r in plan.readings[::2]))
     kinds = [f.kind for f in find(bare, ["backlash", "thermal"])]
     assert kinds[:2] == ["effect not shown"] * 2
 
 
 @pytest.mark.parametrize(("sigma", "helps"), [(20e-6, False), (1e-6, True)])
-def test_another_temperature_is_asked_for_only_where_it_shows_more(plan, sigma, helps):
-    """Decided by the posterior limit of the coefficients over their tolerance, as in a plan."""
+def test_another_temperature_is_recommended_only_where_it_determines_more(plan, sigma, helps):
+    """By the posterior limit of the coefficients relative to their tolerance, as in a plan."""
     session = under(plan, lambda _, c: replace(c, temperature=22.0)).with_gauge(
         replace(plan.gauge, sigma=sigma)
     )
@@ -83,7 +82,7 @@ def test_another_temperature_is_asked_for_only_where_it_shows_more(plan, sigma, 
 
 
 def test_temperature_and_drift_that_grow_together_are_not_separated(plan):
-    """One posture of each setup, read again and again while it gets warmer."""
+    """One posture of each setup, read repeatedly while it gets warmer."""
     kept = plan.select([r for r in plan.readings if r.posture == f"{r.setup[1]}_60"])
     rows = [replace(r, cycle=r.cycle + 2 * k) for k in range(3) for r in kept.readings]
     rows.sort(key=lambda r: r.setup)
@@ -101,8 +100,8 @@ def test_temperature_and_drift_that_grow_together_are_not_separated(plan):
     assert not any("setup.yx.drift" in {p.parameter for p in f.places} for f in found)
 
 
-def test_growth_of_legs_and_screws_is_alike(plan):
-    """By the correlation of the two columns under all other errors, from the covariance itself."""
+def test_expansions_of_legs_and_screws_are_inseparable(plan):
+    """By the correlation of both columns under all other errors, from the covariance itself."""
     (found,) = find(plan, ["thermal"])
     assert {p.parameter for p in found.places} == {"legs.expansion", "screws.expansion"}
     session = plan.with_effects(["thermal"])

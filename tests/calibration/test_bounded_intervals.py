@@ -1,4 +1,4 @@
-"""Intervals of parameters that are bounded or never negative, against sampling."""
+"""Intervals of parameters that are bounded or never negative, by sampling."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import math
 
 import numpy as np
 import pytest
-from effect_plans import write_plan
+from calibrated import calibrated, session_of
+from effect_plans import effect_plan
 from scipy.stats import norm
 
-from orthocal import Choice, calibrate, load_plan, load_session, simulate_session
+from orthocal import Choice, simulate_session
+from orthocal.calibration.identify import identify
 from orthocal.calibration.tables import parameter_table
 from orthocal.estimation.problem import build_problem
 from orthocal.statistics.chance import bounded_interval
@@ -35,7 +37,7 @@ def test_an_interval_covers_its_share_of_the_truncated_distribution(value, lower
     assert lower <= low <= value <= high <= upper
     assert (cdf(high) - cdf(low)) / (cdf(upper) - cdf(lower)) == pytest.approx(COVERED, rel=1e-9)
     for inside, end in ((low > lower, low), (high < upper, high)):
-        if inside:  # the shortest: both ends are as far, or one is a bound
+        if inside:  # the shortest interval has equally distant ends, or one end is a bound
             other = low + high - end
             assert abs(end - value) >= abs(other - value) - 1e-9
 
@@ -47,26 +49,25 @@ def test_without_bounds_the_interval_is_the_value_and_its_uncertainty():
     assert np.isnan(bounded_interval(1.0, np.nan, 0.0, np.inf)).all()
 
 
-def test_a_bound_of_the_user_ends_an_interval(root):
-    session = load_session(root / "examples/raw-cycles")
-    free = calibrate(session, Choice("offsets"), solver="variable-projection")
+def test_a_bound_of_the_user_ends_an_interval():
+    free = calibrated("raw-cycles", "offsets")
     value = free["x_slide.offset"].value
     low, high = free.intervals[0]
     bounds = {"x_slide.offset_m": (value - 0.5 * (value - low), 1.0)}
-    held = calibrate(session, Choice("offsets", bounds=bounds), solver="variable-projection")
+    choice = Choice("offsets", bounds=bounds)
+    held, _ = identify(session_of("raw-cycles"), choice, solver="variable-projection")
     assert held["x_slide.offset"].at_bound is None
     assert held.intervals[0][0] == pytest.approx(bounds["x_slide.offset_m"][0])
     assert held.intervals[0][1] < high
 
 
 @pytest.mark.parametrize("sizes", [(8e-6, 0.0, 30e-6), (0.0, 0.0, 0.0), (3e-6, 60e-6, 5e-6)])
-@pytest.mark.parametrize("seed", range(2))
-def test_intervals_of_backlash_contain_its_posterior(tmp_path, sizes, seed):
-    """Posterior of the drives from the normal equations, drawn, its negative part rejected."""
-    plan = load_plan(write_plan(tmp_path, effects="backlash: {}"))
+def test_intervals_of_backlash_contain_its_posterior(sizes):
+    """Draws from the posterior by the normal equations, without negative ones."""
+    plan = effect_plan("backlash")
     errors = {f"{a}_slide.backlash": size for a, size in zip("xyz", sizes, strict=True)}
-    session = simulate_session(plan, {**errors, "x_slide.offset": 0.1e-3}, seed=seed).session
-    found = calibrate(session, "full", solver="variable-projection")
+    session = simulate_session(plan, {**errors, "x_slide.offset": 0.1e-3}, seed=1).session
+    found, _ = identify(session, "full", solver="variable-projection")
 
     problem = build_problem(session, model="full", prior=True)
     theta = np.array([p.value for p in (*found.free, *found.sensors)])
@@ -79,7 +80,7 @@ def test_intervals_of_backlash_contain_its_posterior(tmp_path, sizes, seed):
     index = [i for i, p in enumerate(problem.parameters) if p.positive]
     assert len(index) == 3
     rng = np.random.default_rng(1)
-    drawn = rng.multivariate_normal(mean[index], covariance[np.ix_(index, index)], size=400_000)
+    drawn = rng.multivariate_normal(mean[index], covariance[np.ix_(index, index)], size=200_000)
     drawn = drawn[(drawn >= 0.0).all(axis=1)] * problem.theta_scale[index]
     assert len(drawn) > 1000
     table = {row["name"]: row for row in parameter_table(found)}

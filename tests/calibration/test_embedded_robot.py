@@ -1,4 +1,4 @@
-"""calibration.json embeds its robot: it needs no other file, and a changed directory is named."""
+"""Robots embedded in calibration.json; changed directories are named."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ import json
 import logging
 import platform
 import shutil
-import subprocess
-import sys
 
 import numpy as np
 import pytest
+from commands import run_orthocal
 from tolerances import KINEMATICS
 
 import orthocal
@@ -19,12 +18,14 @@ from orthocal import (
     calibrate,
     draw_scene,
     load_calibration,
+    load_plan,
     load_session,
     simulate_session,
     validate_calibration,
     write_calibration,
 )
 from orthocal.calibration.file import calibration_document
+from orthocal.calibration.identify import identify
 from orthocal.errors import CalibrationFileError, SessionError
 from orthocal.measurement.files.write_session import write_session
 from orthocal.robot.files import LARGEST_MESHES, is_inner_path
@@ -37,7 +38,7 @@ STL = b"\0" * 80 + (1).to_bytes(4, "little") + np.eye(4, 3, -1, dtype="<f4").tob
 
 @pytest.fixture(scope="module")
 def made(root, tmp_path_factory):
-    """Directory with a machine that has a mesh, a session on it, and its calibration."""
+    """Directory with a machine that has a mesh, a session, and its calibration."""
     above = tmp_path_factory.mktemp("made")
     folder = above / "mill"
     shutil.copytree(root / "robots/orthoglide", folder)
@@ -64,50 +65,43 @@ def mill(made, tmp_path):
 
 
 COMMANDS = """
-import sys
-from orthocal.cli import main
-from orthocal import load_calibration, load_plan, simulate_session
-from orthocal.measurement.files.write_session import write_session
-
-def run(line):
-    sys.argv = ["orthocal", *line.split()]
-    try:
-        main()
-    except SystemExit as e:
-        if e.code:
-            sys.exit(f"{line}: {e.code}")
-
-open("joints.csv", "w").write("x_slide_mm,y_slide_mm,z_slide_mm\\n310,310,310\\n")
-open("points.csv", "w").write("x_mm,y_mm,z_mm\\n0,0,0\\n")
-open("part.ngc", "w").write("G21 G90 G54\\nG0 X0 Y0 Z0\\nG1 X10 F1000\\nM2\\n")
-for format in ("yaml", "table", "urdf", "linuxcnc"):
-    run(f"export calibration.json --to {format} --out {format}")
-run("correct calibration.json part.ngc --work-offset-mm 0,0,0 --out corrected.ngc")
-run("forward calibration.json joints.csv")
-run("inverse calibration.json points.csv")
-run("accuracy calibration.json points.csv")
-run("view calibration.json --html scene.html")
-run("report calibration.json")
-run("again calibration.json --out second")
-run("view second --html second.html")
-calibration = load_calibration("calibration.json")
-measured = simulate_session(load_plan("second"), calibration.errors, seed=3).session
-write_session(measured, "third")
-run("validate calibration.json third")
+export calibration.json --to yaml --out yaml
+export calibration.json --to table --out table
+export calibration.json --to urdf --out urdf
+export calibration.json --to linuxcnc --out linuxcnc
+correct calibration.json part.ngc --work-offset-mm 0,0,0 --out corrected.ngc
+forward calibration.json joints.csv
+inverse calibration.json points.csv
+accuracy calibration.json points.csv
+view calibration.json --html scene.html
+report calibration.json
+again calibration.json --out second
+view second --html second.html
 """
+FILES = {
+    "joints.csv": "x_slide_mm,y_slide_mm,z_slide_mm\n310,310,310\n",
+    "points.csv": "x_mm,y_mm,z_mm\n0,0,0\n",
+    "part.ngc": "G21 G90 G54\nG0 X0 Y0 Z0\nG1 X10 F1000\nM2\n",
+}
 
 
+@pytest.mark.usefixtures("short_reports", "without_sensor_gains")
 def test_every_command_works_without_the_robot_directory(mill, tmp_path_factory):
-    empty = tmp_path_factory.mktemp("elsewhere")
-    shutil.move(mill / "calibration.json", empty)
+    folder = tmp_path_factory.mktemp("elsewhere")
+    shutil.move(mill / "calibration.json", folder)
     shutil.rmtree(mill)
-    done = subprocess.run(
-        [sys.executable, "-c", COMMANDS], cwd=empty, capture_output=True, text=True, timeout=240
-    )
+    for name, text in FILES.items():
+        (folder / name).write_text(text)
+    for line in COMMANDS.split("\n")[1:-1]:
+        done = run_orthocal(folder, *line.split())
+        assert done.returncode == 0, (line, done.stderr)
+    assert (folder / "second/mill/parts/rail.stl").read_bytes() == STL
+    assert (folder / "corrected.ngc").exists()
+    errors = load_calibration(folder / "calibration.json").errors
+    measured = simulate_session(load_plan(folder / "second"), errors, seed=3).session
+    write_session(measured, folder / "third")
+    done = run_orthocal(folder, "validate", "calibration.json", "third")
     assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr
-    assert (empty / "second/mill/parts/rail.stl").read_bytes() == STL
-    assert (empty / "corrected.ngc").exists()
 
 
 def test_an_embedded_robot_is_the_robot_of_its_directory(mill):
@@ -136,10 +130,11 @@ def test_files_versions_and_seed_are_in_the_file(mill):
     assert versions["python"] == platform.python_version()
     assert versions["orthocal"] == orthocal.__version__
     assert document["session"]["seed"] is None
-    plan = orthocal.load_plan(mill / "first")
+    plan = load_plan(mill / "first")
     session = simulate_session(plan, {"x_slide.offset": 1e-3}, seed=7).session
     loaded = load_session(write_session(session, mill / "simulated"))
-    assert calibration_document(calibrate(loaded))["session"]["seed"] == 7
+    calibration, _ = identify(loaded, solver="variable-projection")
+    assert calibration_document(calibration)["session"]["seed"] == 7
 
 
 def test_a_changed_directory_is_named_and_the_embedded_robot_is_used(mill, caplog):
@@ -157,9 +152,10 @@ def test_a_changed_directory_is_named_and_the_embedded_robot_is_used(mill, caplo
         validate_calibration(after, load_session(mill / "first"))
 
 
-def test_large_meshes_are_left_out_and_not_drawn(mill):
+def test_large_meshes_are_omitted_and_not_drawn(mill):
     (mill / "mill/parts/rail.stl").write_bytes(STL + b"\0" * LARGEST_MESHES)
-    path = write_calibration(calibrate(mill / "first"), mill / "large.json")
+    calibration, _ = identify(mill / "first", solver="variable-projection")
+    path = write_calibration(calibration, mill / "large.json")
     shutil.rmtree(mill / "mill")
     loaded = load_calibration(path)
     assert len(loaded.robot_record.files) == 2
@@ -167,6 +163,7 @@ def test_large_meshes_are_left_out_and_not_drawn(mill):
 
 
 def set_file(index, **values):
+    """Change of one of the embedded files."""
     return lambda files: files[index].update(values)
 
 
@@ -194,7 +191,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("case", HOSTILE)
-def test_files_of_a_stranger(mill, case):
+def test_hostile_files_are_refused(mill, case):
     change, key = HOSTILE[case]
     path = mill / "calibration.json"
     document = json.loads(path.read_text())
@@ -230,5 +227,5 @@ def test_the_robot_checksum_belongs_to_the_files(mill):
 
 
 @pytest.mark.parametrize("name", ["a.stl", "parts/a.stl", "my robot.urdf", "é.yaml", "...stl"])
-def test_inner_paths(name):
+def test_paths_inside_a_directory_are_accepted(name):
     assert is_inner_path(name)

@@ -1,4 +1,4 @@
-"""A calibration made again from what its file keeps, and its numbers as tables."""
+"""Calibrations repeated from their files, checks of the files, and tables."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ import io
 import json
 
 import pytest
+from calibrated import calibrated, session_of
 
 from orthocal import (
     Choice,
-    calibrate,
     load_calibration,
-    load_session,
     parameter_table,
     reading_table,
     repeat_calibration,
@@ -20,22 +19,20 @@ from orthocal import (
     write_calibration,
 )
 from orthocal.calibration.file import calibration_document
+from orthocal.calibration.identify import identify
 from orthocal.errors import CalibrationFileError
 
 CASES = [
-    ("table1/experiment-2", "offsets", "squares", "ipopt"),
-    ("raw-cycles", "offsets", "huber", "ipopt"),
-    ("raw-cycles", "lengths", "squares", "variable-projection"),
-    ("sweep", "full", "squares", "ipopt"),
+    (["raw-cycles"], "offsets", "huber", "ipopt"),
+    (["raw-cycles"], "lengths", "squares", "variable-projection"),
     (["table1/experiment-2", "table1/experiment-3"], "offsets", "squares", "variable-projection"),
 ]
 
 
-@pytest.mark.parametrize(("name", "model", "loss", "solver"), CASES)
-def test_a_file_makes_its_calibration_again(root, tmp_path, name, model, loss, solver):
-    names = [name] if isinstance(name, str) else name
+@pytest.mark.parametrize(("names", "model", "loss", "solver"), CASES)
+def test_a_calibration_is_repeated_from_its_file(tmp_path, names, model, loss, solver):
     choice = Choice(model, bounds={"x_slide.offset_mm": (-0.5, 4.0)}, known={})
-    made = calibrate([root / "examples" / n for n in names], choice, loss=loss, solver=solver)
+    made, _ = identify([session_of(n) for n in names], choice, loss=loss, solver=solver)
     loaded = load_calibration(write_calibration(made, tmp_path / "calibration.json"))
     again = repeat_calibration(loaded, restore_session(loaded))
     for p, q in zip(made.parameters, again.parameters, strict=True):
@@ -52,12 +49,27 @@ def test_a_file_makes_its_calibration_again(root, tmp_path, name, model, loss, s
 
 
 @pytest.fixture(scope="module")
-def document(experiment_2):
-    return calibration_document(calibrate(experiment_2))
+def document():
+    return calibration_document(calibrated("table1/experiment-2"))
 
 
-def shifted(number):
-    return number * (1.0 + 1e-6) + 1e-9
+def edit(document, place, change, path):
+    """Write a document with one changed number, at a place given by its keys."""
+    edited = json.loads(json.dumps(document))
+    part = edited
+    for key in place[:-1]:
+        part = part[key]
+    change(part, place[-1])
+    path.write_text(json.dumps(edited))
+    return path
+
+
+def shift(part, key):
+    part[key] = part[key] * (1.0 + 1e-6) + 1e-9
+
+
+def remove(part, key):
+    del part[key]
 
 
 EDITED = [
@@ -83,32 +95,19 @@ EDITED = [
 
 @pytest.mark.parametrize("place", EDITED, ids=lambda p: ".".join(map(str, p)))
 def test_a_number_that_does_not_follow_from_the_others_is_refused(document, tmp_path, place):
-    """Whoever edits one number of a file has made another calibration, and is told so."""
-    edited = json.loads(json.dumps(document))
-    part = edited
-    for key in place[:-1]:
-        part = part[key]
-    part[place[-1]] = shifted(part[place[-1]])
-    path = tmp_path / "calibration.json"
-    path.write_text(json.dumps(edited))
+    path = edit(document, place, shift, tmp_path / "calibration.json")
     with pytest.raises(CalibrationFileError, match="the other numbers of the file give"):
         load_calibration(path)
 
 
 @pytest.mark.parametrize("place", [p for p in EDITED if "residual" in p[-1:] or len(p) == 1])
-def test_a_number_that_follows_may_be_left_out(document, tmp_path, place):
-    edited = json.loads(json.dumps(document))
-    part = edited
-    for key in place[:-1]:
-        part = part[key]
-    del part[place[-1]]
-    path = tmp_path / "calibration.json"
-    path.write_text(json.dumps(edited))
+def test_a_number_that_follows_from_the_others_may_be_omitted(document, tmp_path, place):
+    path = edit(document, place, remove, tmp_path / "calibration.json")
     assert calibration_document(load_calibration(path)) == document
 
 
-def test_tables_are_plain_records(root):
-    made = calibrate(load_session(root / "examples/raw-cycles"), "lengths")
+def test_tables_are_plain_records():
+    made = calibrated("raw-cycles", "lengths")
     parameters, readings = parameter_table(made), reading_table(made)
     assert [p["name"] for p in parameters if p["of"] == "machine"] == [
         p.name for p in made.parameters

@@ -1,4 +1,4 @@
-"""Guides that are not straight: an effect of the tests' own, and a simulator of such machines.
+"""Guides that are not straight: an effect for tests, and a simulator of such machines.
 
 A guide is bent to a parabola. A slide leaves its line by b u², with u the distance from the middle
 of the travel over half of it, and turns with the guide.

@@ -1,4 +1,4 @@
-"""Mechanical adjustments: what a foot or a thread moves, and sessions before and after."""
+"""Mechanical adjustments: displacements by feet and threads, sessions before and after."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from tolerances import CLOSED, DERIVATIVE, KINEMATICS
 
 from orthocal import (
     Choice,
-    calibrate,
     join_sessions,
     load_calibration,
     load_robot,
@@ -25,6 +24,7 @@ from orthocal import (
     write_calibration,
     write_session,
 )
+from orthocal.calibration.identify import identify
 from orthocal.effects.adjustment import find_adjustments
 from orthocal.errors import RobotError, SessionError
 from orthocal.estimation.problem import build_problem
@@ -60,12 +60,12 @@ def plan(tmp_path_factory):
     return shimmed_plan(tmp_path_factory.mktemp("shimmed") / "mill")
 
 
-# ---- what an adjustment moves
+# ---- displacements by an adjustment
 
 
 @pytest.mark.parametrize("name", ["far", "along", "tilted"])
 def test_a_foot_moves_the_slide_as_a_rigid_body(robot, name):
-    """Place of the leg's root on the slide, with the slide where it is."""
+    """Position of the leg's root at a fixed drive coordinate."""
     leg, drives = keys_of(robot, name)["moves"][0], robot.drive_zero + 0.03
     frame = robot.frame_id(f"{leg}_leg_root")
     q = robot.configuration(robot.joint_coordinates(drives, robot.reference_passive))
@@ -84,7 +84,7 @@ def test_a_foot_moves_the_slide_as_a_rigid_body(robot, name):
     slope = (by_errors(np.array([1e-3])) - by_errors(np.array([-1e-3])))[:, None] / 2e-3
     assert_derivative(slope, by_shims, np.zeros(1))
     assert np.abs(slope).max() > 1e-4
-    # at 1 mm the rail has turned by 3 mrad, and their difference is of second order
+    # at 1 mm the rail turns by 3 mrad; the difference is of second order
     assert np.abs(by_errors([1.0]) - by_shims(np.ones(1))).max() < 3e-5
 
 
@@ -92,7 +92,7 @@ def keys_of(robot, name):
     return robot.declared.adjustments[name]
 
 
-def test_the_foot_moves_by_its_amount_and_the_pivot_stays(robot):
+def test_the_foot_moves_by_its_amount_and_the_pivot_is_fixed(robot):
     keys, amount = keys_of(robot, "far"), 1e-6
     rotation, shift = turned(keys, amount)
     direction = np.array(keys["direction"]) / np.linalg.norm(keys["direction"])
@@ -108,7 +108,7 @@ def test_the_foot_moves_by_its_amount_and_the_pivot_stays(robot):
     assert direction @ (v + np.cross(w, at)) == pytest.approx(1.0, abs=KINEMATICS)
 
 
-def test_along_the_axis_of_its_drive_it_is_an_offset(robot):
+def test_an_adjustment_along_the_axis_of_the_drive_is_an_offset(robot):
     assert robot.parameters["along.adjustment"].terms == (("y_slide.offset", pytest.approx(1.0)),)
 
 
@@ -125,8 +125,7 @@ def test_a_thread_lengthens_its_rod(robot):
         assert distance == pytest.approx(length, abs=CLOSED * 10)
 
 
-def test_the_machine_after_both_ways_is_the_same(robot):
-    """Loops closed by orthocal and by Pinocchio alone."""
+def test_the_tool_after_an_adjustment_is_that_by_pinocchio(robot):
     amounts = {"far": 0.3e-3, "tilted": -0.2e-3}
     values = {f"{n}.adjustment": v for n, v in amounts.items()}
     drives = robot.drive_zero + np.array([0.02, -0.03, 0.01])
@@ -139,7 +138,7 @@ def test_the_machine_after_both_ways_is_the_same(robot):
     assert np.linalg.norm(tool - unmoved) > 2e-5
 
 
-def test_it_is_in_no_model(robot):
+def test_adjustments_belong_to_no_model(robot):
     for model in robot.parameters.models:
         assert not [n for n in robot.parameters.select_model(model) if n.endswith("adjustment")]
     assert not [n for n in robot.parameters.elementary if n.endswith(("adjustment", "setting"))]
@@ -169,7 +168,7 @@ def test_it_is_in_no_model(robot):
         ("3", ""),
     ],
 )
-def test_a_bad_key_is_named(tmp_path, text, key):
+def test_an_invalid_key_is_named(tmp_path, text, key):
     folder = write_robot(tmp_path / "machine", f"\n  adjustments:\n    foot: {text}\n")
     with pytest.raises(RobotError) as caught:
         load_robot(folder)
@@ -201,7 +200,7 @@ TRUTH = {
 
 
 def sessions_of(plan, *, stated=AMOUNTS, exact=True):
-    """Sessions before and after adjustments, those that the second one states or others."""
+    """Sessions before and after adjustments; the second one states some."""
     before = {f"{n}.adjustment": -v for n, v in AMOUNTS.items()}
     return [
         replace(
@@ -221,25 +220,25 @@ def test_sessions_before_and_after_are_one_machine(plan):
     residual = problem.values - problem.predict(theta)
     zeros = problem.zero_incidence
     assert np.abs(residual - zeros @ np.linalg.lstsq(zeros, residual)[0]).max() < 2e-6
-    # without the statement the second session contradicts the first
+    # without stated adjustments the second session contradicts the first
     other = build_problem(join_sessions(sessions_of(plan, stated={})), model="full", prior=True)
     theta = np.array([TRUTH.get(n, 0.0) for n in other.free])
     residual = other.values - other.predict(theta)
     assert np.abs(residual - zeros @ np.linalg.lstsq(zeros, residual)[0]).max() > 2e-5
 
 
-def test_the_order_of_the_sessions_decides_which_machine_is_meant(plan):
+def test_errors_are_those_of_the_last_session(plan):
     first, last = sessions_of(plan)
     moved = [dict(plan.robot.parameters[f"{n}.adjustment"].terms) for n in AMOUNTS]
     choice = Choice(free=sorted({*TRUTH, *moved[0], *moved[1]}))
     change = AMOUNTS["x_outer_foot_z"] * moved[0]["x_slide.ry"]
-    found = calibrate([first, last], choice, **QUICK).errors["x_slide.ry"]
+    found = identify([first, last], choice, **QUICK)[0].errors["x_slide.ry"]
     assert found == pytest.approx(TRUTH["x_slide.ry"], abs=0.05 * abs(change))
-    found = calibrate([last, first], choice, **QUICK).errors["x_slide.ry"]
+    found = identify([last, first], choice, **QUICK)[0].errors["x_slide.ry"]
     assert found == pytest.approx(TRUTH["x_slide.ry"] - change, abs=0.05 * abs(change))
 
 
-def test_sessions_that_agree_need_no_further_parameters(plan):
+def test_sessions_with_equal_adjustments_need_no_further_parameters(plan):
     first, last = sessions_of(plan)
     same = join_sessions([replace(first, adjusted=AMOUNTS), last])
     assert not same.robot.adjusted
@@ -247,7 +246,7 @@ def test_sessions_that_agree_need_no_further_parameters(plan):
 
 
 def test_the_jacobian_under_adjustments_is_exact(plan):
-    """By the errors of the setting among others, at random errors."""
+    """Also with respect to the errors of the setting, at random errors."""
     problem = build_problem(join_sessions(sessions_of(plan)), model="full", prior=True)
     rng = np.random.default_rng(2)
     scale = problem.theta_scale
@@ -267,8 +266,8 @@ def test_the_jacobian_under_adjustments_is_exact(plan):
     assert not jacobian[:, still].any()
 
 
-def test_a_calibration_keeps_them(plan, tmp_path):
-    result = calibrate(sessions_of(plan, exact=False), **QUICK)
+def test_a_calibration_file_keeps_the_adjustments(plan, tmp_path):
+    result, _ = identify(sessions_of(plan, exact=False), **QUICK)
     write_calibration(result, tmp_path / "calibration.json")
     again = load_calibration(tmp_path / "calibration.json")
     assert dict(again.session.adjusted) == pytest.approx(AMOUNTS)
@@ -280,7 +279,7 @@ def test_a_calibration_keeps_them(plan, tmp_path):
     assert sorted(map(len, stated.values())) == [0] * 6 + [2] * 6
 
 
-def test_a_session_file_states_them(plan, tmp_path):
+def test_a_session_file_states_the_adjustments(plan, tmp_path):
     _, after = sessions_of(plan)
     write_session(after, tmp_path / "after")
     text = (tmp_path / "after/session.yaml").read_text()
@@ -296,7 +295,7 @@ def test_a_session_file_states_them(plan, tmp_path):
 
 
 def test_feet_follow_the_dimensions(plan):
-    """Ends of the rails as drawn: 90 mm longer than the travel."""
+    """Drawn rails are 90 mm longer than the travel."""
     keys = plan.robot.declared.adjustments
     assert len(keys) == 15
     inner, outer = (keys[f"y_{end}_foot_x"]["at_mm"][1] for end in ("inner", "outer"))

@@ -1,4 +1,4 @@
-"""Derivatives of the effects of orthocal, and their identification by all solvers."""
+"""Derivatives of the effects of orthocal, and their identification with all solvers."""
 
 from __future__ import annotations
 
@@ -7,32 +7,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from derivatives import central_differences
-from effect_plans import write_plan
+from effect_plans import ALL, effect_plan
 from tolerances import DERIVATIVE, SAME_OPTIMUM
 
-from orthocal import load_plan, simulate_session
+from orthocal import simulate_session
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 from orthocal.measurement.joining import join_sessions
 
-KEYS = {
-    "backlash": "backlash: {}",
-    "thermal": "thermal: {}",
-    "screw": "screw: {lead_mm: 7}",
-    "drift": "drift: {}",
-}
 SIGMA = 1e-6
 SOME = ("*.offset", "*.scale", "x_coupler.*", "y_leg.length")
-"""Errors of geometry beside those of the effect."""
+"""Errors of geometry beside those of the effects."""
 
 
 @pytest.fixture(scope="module")
-def plans(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("built-in")
-    keys = {**KEYS, "all": ", ".join(KEYS.values())}
-    return {n: load_plan(write_plan(folder / n, effects=text)) for n, text in keys.items()}
+def plan():
+    return effect_plan(*ALL)
 
 
 def errors_of(plan):
@@ -61,29 +53,21 @@ def require_derivatives(problem, theta, jacobian):
     assert (np.abs(jacobian - numeric) / size).max() < 10 * DERIVATIVE
 
 
-@pytest.mark.parametrize("name", KEYS)
-def test_derivatives_are_those_of_the_readings(plans, name):
-    problem = build(plans[name])
-    theta = point(problem)
-    _, jacobian = problem.predict_and_jacobian(theta)
-    require_derivatives(problem, theta, jacobian)
-    names = [*errors_of(plans[name]), *(n for n in problem.free if n.endswith(".drift"))]
-    at = [problem.free.index(n) for n in names]
-    assert at
-    assert (np.abs(jacobian[:, at]).max(axis=0) > 0.0).all()
-
-
-def test_derivatives_of_all_effects_together(plans):
+def test_derivatives_are_those_of_the_readings(plan):
     """Two machines at once, under many conditions."""
-    problem = build(plans["all"])
+    problem = build(plan)
     thetas = np.array([point(problem, seed) for seed in (3, 4)])
     _, jacobians = problem.predict_and_jacobian(thetas)
     for theta, jacobian in zip(thetas, jacobians, strict=True):
         require_derivatives(problem, theta, jacobian)
+    names = [*errors_of(plan), *(n for n in problem.free if n.endswith(".drift"))]
+    at = [problem.free.index(n) for n in names]
+    assert len(at) == 3 + 2 + 6 + 6
+    assert (np.abs(jacobians[:, :, at]).max(axis=1) > 0.0).all()
 
 
 def require_same(problem, sigma=SIGMA):
-    """Refuse solvers that differ; return the solution of variable projection."""
+    """Refuse solvers with different solutions; return that of variable projection."""
     projected = VariableProjection(problem).solve(sigma=sigma)
     for solution in (
         NonlinearProgram(problem).solve(sigma=sigma).theta,
@@ -98,21 +82,18 @@ def simulate(plan, errors, seed=5):
     return simulate_session(plan, errors, seed=seed, sigma=SIGMA).session
 
 
-@pytest.mark.parametrize("name", [*KEYS, "all"])
-def test_all_solvers_identify_them_alike(plans, name):
-    plan = plans[name]
+def test_all_solvers_identify_the_same_errors(plan):
     problem = build(plan)
     truth = dict(zip(problem.free, point(problem), strict=True))
     errors = {n: truth[n] for n in problem.machine_selection.names}
     found = require_same(build(simulate(plan, errors)))
-    names = list(problem.free)
     for n in errors_of(plan):
-        i = names.index(n)
+        i = problem.free.index(n)
         assert abs(found.theta[i] - truth[n]) < 3.0 * problem.theta_scale[i]
 
 
 def difference_of_expansions(problem, theta):
-    """Legs less screws, value and std, [prior std]; together they change the scale alone."""
+    """Expansion of legs minus screws, value and std, [prior std]; their sum is a scale."""
     _, jacobian = problem.predict_and_jacobian(theta)
     zeros = problem.zero_incidence
     centred = jacobian - zeros @ (np.linalg.pinv(zeros) @ jacobian)
@@ -122,9 +103,9 @@ def difference_of_expansions(problem, theta):
     return along @ (theta / problem.theta_scale), np.sqrt(along @ covariance @ along)
 
 
-def test_two_days_at_16_and_27_degrees(plans):
-    """One day alone cannot distinguish growth from errors of geometry."""
-    plan = plans["thermal"].with_effects(["thermal"])
+def test_two_temperatures_determine_the_expansions(plan):
+    """At one temperature they cannot be distinguished from errors of geometry."""
+    plan = plan.with_effects(["thermal"])
 
     def at(temperature):
         readings = tuple(

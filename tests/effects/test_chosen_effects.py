@@ -1,4 +1,4 @@
-"""Effects chosen by name: by the robot, by a session, by a command."""
+"""Effects chosen by name: by the robot, a session or a calibration."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from effect_plans import write_plan
 
 from orthocal import (
     Choice,
-    calibrate,
     load_calibration,
     load_plan,
     load_session,
@@ -17,6 +16,7 @@ from orthocal import (
     write_calibration,
     write_session,
 )
+from orthocal.calibration.identify import identify
 from orthocal.effects.loading import robot_effects, with_effects
 from orthocal.errors import ParameterError, RobotError, SessionError
 from orthocal.measurement.joining import join_sessions
@@ -77,11 +77,11 @@ def test_an_unknown_effect_and_a_missing_key_are_refused(orthoglide):
     assert caught.value.where.endswith("orthocal.effects.screw.lead_mm")
 
 
-def test_what_is_chosen_is_kept_in_files(session, tmp_path):
+def test_files_keep_the_chosen_effects(session, tmp_path):
     chosen = session.with_effects(["backlash"])
     write_session(chosen, tmp_path / "session")
     assert names_of(load_session(tmp_path / "session").robot) == ["backlash"]
-    result = calibrate(session, Choice("offsets", effects=["backlash"]), **QUICK)
+    result, _ = identify(session, Choice("offsets", effects=["backlash"]), **QUICK)
     assert result["x_slide.backlash"].value == pytest.approx(40e-6, abs=6e-6)
     write_calibration(result, tmp_path / "calibration.json")
     again = restore_session(load_calibration(tmp_path / "calibration.json"))
@@ -103,6 +103,6 @@ def test_joined_sessions_need_the_same_effects(session):
     assert caught.value.where.endswith("calibration.effects")
     plain = [s.with_effects([]) for s in (other, session)]
     assert names_of(join_sessions(plain).robot) == []
-    result = calibrate([other, session], Choice("offsets", effects=["backlash"]), **QUICK)
+    result, _ = identify([other, session], Choice("offsets", effects=["backlash"]), **QUICK)
     stds = [p.std for p in result.free if p.name.endswith(".backlash")]
     assert (np.array(stds) < 12e-6).all()

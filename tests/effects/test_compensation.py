@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from effect_plans import write_plan
+from effect_plans import FEW, write_plan
 from gauges import exact
 from independent import States
 from test_independent import Measured, draw
@@ -25,11 +25,13 @@ from orthocal import (
     write_calibration,
     write_session,
 )
+from orthocal.calibration.identify import identify
 from orthocal.measurement.recording import _is_outdated
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import drive_table
 
 MM = 1e-3
+QUICK = {"solver": "variable-projection"}
 EFFECTS = "backlash: {}, thermal: {}, screw: {lead_mm: 5}"
 JOINTS = {"y_slide": "{counts: down}", "z_slide": "{counts: down, at_zero_mm: 0}"}
 ACTIVE = [0.4, -0.1, 0.2]
@@ -39,7 +41,7 @@ SHOWN_AT_ZERO = [310.25, 310.25, 0.0]
 
 
 def trims_of(number, count=200):
-    """Lines of the table of one joint, mm."""
+    """Lines of the table of a joint, [mm]."""
     wave = np.random.default_rng(number)
     places = np.linspace(-200.0, 560.0, count)
     both = wave.normal(scale=0.01, size=(count, 2)) + np.array([0.01, -0.01])
@@ -59,7 +61,7 @@ def state_controller(folder, controller):
 
 @pytest.fixture(scope="module")
 def compensated(tmp_path_factory):
-    """Backlash of all joints, and tables of the first and the last, in place of it."""
+    """Plan under a controller that compensates backlash of y, and x and z by tables."""
     folder = write_plan(tmp_path_factory.mktemp("c") / "plan", effects=EFFECTS, joints=JOINTS)
     write_tables(folder, [0, 2])
     state_controller(
@@ -71,10 +73,9 @@ def compensated(tmp_path_factory):
 
 
 def displaced(session, approach):
-    """Drives that LinuxCNC moves in place of the commanded ones, shape (n, 3), [m]."""
-    o_drives = drive_table(session)
+    """Drive coordinates to which LinuxCNC moves, shape (n, 3), [m]."""
     result = []
-    for drives, sides in zip(o_drives, approach, strict=True):
+    for drives, sides in zip(drive_table(session), approach, strict=True):
         row = []
         for i, (drive, side) in enumerate(zip(drives / MM, sides, strict=True)):
             way = -1.0 if DOWN[i] else 1.0
@@ -97,7 +98,7 @@ def displaced(session, approach):
 def read_independently(folder, session, errors):
     measured = Measured(folder, session)
     o = measured.observations
-    at = replace_table(session, o)
+    at = split_postures(session, o)
     states = States(
         displaced(at, o.conditions["approach"]),
         o.conditions["approach"],
@@ -106,8 +107,8 @@ def read_independently(folder, session, errors):
     return measured.read(errors, states=states)[0]
 
 
-def replace_table(session, observations):
-    """Session with one posture for each entry."""
+def split_postures(session, observations):
+    """Session with a separate posture for each entry."""
     postures = list(session.postures.values())
     rows = {str(i): postures[k] for i, k in enumerate(observations.posture)}
     return replace(session, postures=rows)
@@ -115,42 +116,42 @@ def replace_table(session, observations):
 
 def test_readings_are_those_of_the_independent_machine(compensated):
     plan = exact(load_plan(compensated))
-    for seed in range(3):
-        errors = draw(plan, "all", seed)
+    for seed in range(2):
+        errors = draw(plan, seed)
         shown = read_independently(compensated, plan, errors)
         assert np.abs(shown - predict_readings(plan, errors)).max() < 2e-9  # files have 1e-6 mm
     without = predict_readings(replace(plan, compensation=()), errors)
     assert np.abs(shown - without).max() > 3e-6
 
 
-def test_each_session_has_its_controller(compensated, tmp_path):
+def test_joined_sessions_keep_their_controllers(compensated):
     plan = exact(load_plan(compensated))
     before = replace(plan, compensation=())
-    errors = draw(plan, "all", 5)
+    errors = draw(plan, 5)
     both = predict_readings(join_sessions([before, plan]), errors)
     apart = [predict_readings(s, errors) for s in (before, plan)]
     assert np.abs(both - np.concatenate(apart)).max() < KINEMATICS
     assert np.abs(both - predict_readings(join_sessions([plan, plan]), errors)).max() > 1e-6
 
 
-def test_the_whole_backlash_is_identified_under_a_controller_that_takes_it_up(compensated):
+def test_the_total_backlash_is_identified_under_a_controller_that_compensates(compensated):
     plan = load_plan(compensated)
     truth = {f"{d}_slide.backlash": b * MM for d, b in zip("xyz", (0.05, 0.04, 0.03), strict=True)}
     session = simulate_session(plan, truth, seed=2, sigma=0.3e-6).session
-    result = calibrate(session, solver="variable-projection")
+    result, _ = identify(session, **QUICK)
     for p in result.free:
         if p.name in truth:
             assert abs(p.value - truth[p.name]) < 3.0 * p.std
             assert p.std < 4e-6
 
 
-def test_files_hold_what_is_compensated(compensated, tmp_path):
+def test_files_keep_the_compensation(compensated, tmp_path):
     plan = load_plan(compensated)
     session = simulate_session(plan, {"x_slide.offset": 0.2 * MM}, seed=1).session
     write_session(session, tmp_path / "written")
     again = load_session(tmp_path / "written")
     assert not _is_outdated(again)  # a recording reads the files once
-    result = calibrate(again, "offsets", solver="variable-projection")
+    result, _ = identify(again, "offsets", **QUICK)
     write_calibration(result, tmp_path / "calibration.json")
     restored = restore_session(load_calibration(tmp_path / "calibration.json"))
     for other in (again, restored):
@@ -163,8 +164,7 @@ def test_files_hold_what_is_compensated(compensated, tmp_path):
     assert read.max() < KINEMATICS
 
 
-def test_what_the_model_lacks_counts_as_corrected(compensated):
-    """Without effects a controller that corrects them is one without errors."""
+def test_compensation_of_effects_that_the_model_lacks_is_ignored(compensated):
     plan = exact(load_plan(compensated)).with_effects(())
     plain = predict_readings(replace(plan, compensation=()), {})
     assert np.array_equal(predict_readings(plan, {}), plain)
@@ -187,13 +187,13 @@ def test_what_the_model_lacks_counts_as_corrected(compensated):
     assert np.abs(moved + turned).max() < 0.05 * np.abs(moved).max()
 
 
-def test_validation_expects_a_controller_that_takes_up_backlash(compensated, tmp_path):
-    """As well as one that does not, if the session says which."""
-    first = replace(load_plan(compensated), compensation=())
+def test_validation_expects_the_stated_compensation(compensated):
+    plan = load_plan(compensated)
+    plan = plan.select([r for r in plan.readings if r.setup in FEW])
+    first = replace(plan, compensation=())
     truth = {f"{d}_slide.backlash": 0.04 * MM for d in "xyz"}
-    result = calibrate(simulate_session(first, truth, seed=3).session, solver="variable-projection")
-    second = simulate_session(load_plan(compensated), truth, seed=4).session
-    entered = second.with_controller(np.array([e.enter for e in result.assessment.entries]))
+    result = calibrate(simulate_session(first, truth, seed=3).session, "offsets", **QUICK)
+    entered = plan.with_controller([e.enter for e in result.assessment.entries])
     measured = simulate_session(entered, truth, seed=4).session
     assert validate_calibration(result, measured).confirmed
     unstated = replace(measured, compensation=())

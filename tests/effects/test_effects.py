@@ -1,4 +1,4 @@
-"""Effects beyond offsets and placements: their parameters, how they act, their identification."""
+"""Effects beyond offsets and placements: parameters, derivatives, identification."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from tolerances import CLOSED, DERIVATIVE, KINEMATICS, SAME_OPTIMUM
 
 from orthocal import (
     Choice,
-    calibrate,
     load_calibration,
     load_plan,
     load_robot,
@@ -26,6 +25,7 @@ from orthocal import (
     write_calibration,
     write_session,
 )
+from orthocal.calibration.identify import identify
 from orthocal.effects import registry
 from orthocal.effects.loading import robot_effects
 from orthocal.effects.rods import stretch_rod
@@ -59,10 +59,11 @@ TRUTH = {
     "rods.growth": 9e-6,
 }
 FREE = ("*.offset", "*.slack", "*.wave", "rods.growth")
+QUICK = {"solver": "variable-projection"}
 
 
 @pytest.fixture(autouse=True)
-def known():
+def registered():
     registry.register_effect(Slack)
     yield
     registry.unregister_effect("slack")
@@ -95,7 +96,7 @@ def point(problem, size=0.7):
 # ---- parameters and keys
 
 
-def test_its_parameters_are_those_of_the_robot(plan):
+def test_its_parameters_belong_to_the_robot(plan):
     parameters = plan.robot.parameters
     assert parameters["x_slide.slack"].prior_std == 0.04e-3
     assert parameters["rods.growth"].unit == "1/K"
@@ -105,7 +106,7 @@ def test_its_parameters_are_those_of_the_robot(plan):
     assert all(effect.describe() for effect in robot_effects(plan.robot))
 
 
-def test_a_machine_without_further_effects_has_the_parameters_as_before(orthoglide):
+def test_a_machine_without_declared_effects_has_drive_and_geometry(orthoglide):
     assert [e.name for e in robot_effects(orthoglide)] == ["drive", "geometry"]
     assert error_map(orthoglide).conditions == ()
 
@@ -120,7 +121,7 @@ def test_a_machine_without_further_effects_has_the_parameters_as_before(orthogli
         ("slag: {}", "orthocal.effects.slag"),
     ],
 )
-def test_keys_that_do_not_fit_are_refused(tmp_path, effects, key):
+def test_invalid_keys_are_refused(tmp_path, effects, key):
     folder = write_robot(tmp_path / "machine", effects)
     with pytest.raises(RobotError) as caught:
         load_robot(folder)
@@ -156,7 +157,7 @@ def test_effects_of_installed_packages_are_found(tmp_path, monkeypatch, root):
         load_robot(write_robot(tmp_path / "other", "broken: {}"))
 
 
-def test_placements_cannot_express_it(plan):
+def test_placements_cannot_express_a_slack(plan):
     with pytest.raises(ParameterError, match=r"x_slide\.slack"):
         plan.robot.with_errors({"x_slide.slack": 1e-5})
     assert not plan.robot.parameters.are_rigid("x_slide.slack")
@@ -198,7 +199,7 @@ def test_each_posture_under_other_conditions_is_another_loop_closure(plan, folde
     assert np.array_equal(plain.conditions["approach"], approach)
 
 
-def test_conditions_that_are_not_stated_are_neutral(tmp_path):
+def test_unstated_conditions_are_neutral(tmp_path):
     session = load_plan(write_plan(tmp_path / "plan", effects=KEYS, conditions=False))
     o = build_observations(session)
     assert o.states.posture.size == len(session.postures)
@@ -214,8 +215,8 @@ def test_time_counts_from_the_first_reading_of_the_setup(plan):
         assert np.array_equal(seconds, 60.0 * np.arange(seconds.size))
 
 
-def test_a_rod_that_grows_is_a_longer_leg(plan):
-    """All rods of the legs by the same length, as the errors of geometry have it."""
+def test_longer_rods_are_a_longer_leg(plan):
+    """Errors of geometry change all rods of a leg by the same length."""
     longer = 10.0 * 20e-6  # [m/m], at 30 °C
     lengths = {f"{k}_leg.length": longer * plan.robot.legs[k].rods["a"].length for k in "xyz"}
     drives = plan.robot.drive_zero + 0.02
@@ -226,7 +227,7 @@ def test_a_rod_that_grows_is_a_longer_leg(plan):
     assert np.abs(cold - LoopClosure(plan.robot).forward(drives)).max() < CLOSED
 
 
-def test_the_placements_on_a_rod_are_those_that_it_carries(orthoglide):
+def test_a_longer_rod_moves_the_placement_at_its_end(orthoglide):
     model, rods = orthoglide.model, orthoglide.legs["x"].rods
     change = ca.SX.sym("change")
     (inner,) = stretch_rod(orthoglide, rods["a"], change)
@@ -236,7 +237,7 @@ def test_the_placements_on_a_rod_are_those_that_it_carries(orthoglide):
     assert "x_rod_b_tip" in model.frames[outer.index].name
 
 
-def test_a_gauge_shows_conditions_that_an_effect_adds(plan):
+def test_readings_depend_on_the_conditions_of_an_effect(plan):
     (sensor, *_) = (s.sensor for s in plan.setups.values())
     assert reading_conditions(plan.robot, sensor) == ("approach", "temperature", "time")
 
@@ -258,7 +259,7 @@ def test_the_jacobian_is_that_of_the_readings(problem):
     assert (np.abs(jacobian).max(axis=0) > 0.0).all()
 
 
-def test_batches_and_first_order_agree_with_the_jacobian(problem):
+def test_batches_have_the_same_jacobians(problem):
     thetas = np.array([point(problem, size) for size in (0.2, 0.6)])
     passive = problem.close(thetas)
     readings, jacobians = problem.predict_and_jacobian(thetas, passive)
@@ -293,7 +294,7 @@ def test_the_derivatives_of_the_error_map_are_exact(plan):
     assert_derivative(exact_by, drives, np.r_[command[:3], geometry.drive_errors])
 
 
-def test_the_tool_follows_its_derivatives_and_comes_back(plan):
+def test_the_tool_sensitivity_and_the_inverse_are_exact(plan):
     free = ("x_slide.slack", "y_slide.wave", "z_slide.scale", "x_coupler.rx")
     at = {"x_slide.wave": 2e-3, "y_slide.wave": 1e-3, "x_coupler.rx": 1e-3}
     drives = np.array([[0.011, -0.02, 0.007]]) + plan.robot.drive_zero
@@ -307,9 +308,8 @@ def test_the_tool_follows_its_derivatives_and_comes_back(plan):
     assert np.abs(closure.inverse(closure.forward(drives)) - drives).max() < CLOSED
 
 
-@pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
-def test_the_program_has_exact_derivatives(problem, hessian):
-    program = NonlinearProgram(problem, options=SolverOptions(hessian=hessian))
+def test_the_program_has_exact_derivatives(problem):
+    program = NonlinearProgram(problem, options=SolverOptions(hessian="exact"))
     f, theta = program.functions(), point(problem)
     x, p = program.initial_variables(theta, sigma=1e-4), program.parameter_values(sigma=1e-4)
     rng = np.random.default_rng(4)
@@ -327,17 +327,16 @@ def test_the_program_has_exact_derivatives(problem, hessian):
     found = np.vstack([gradient @ along, jacobian @ along])
     scale = np.maximum(1.0, np.abs(numeric).max(axis=1, keepdims=True))
     assert (np.abs(found - numeric) / scale).max() < DERIVATIVE
-    if hessian == "exact":
 
-        def slope(t):
-            gradient = np.asarray(f["grad_f"](x + along @ t, p)[1]).ravel()
-            return gradient + np.asarray(ca.mtimes(f["jac_g"](x + along @ t, p)[1].T, lam)).ravel()
+    def slope(t):
+        gradient = np.asarray(f["grad_f"](x + along @ t, p)[1]).ravel()
+        return gradient + np.asarray(ca.mtimes(f["jac_g"](x + along @ t, p)[1].T, lam)).ravel()
 
-        upper = np.asarray(f["hess_lag"](x, p, 1.0, lam).full())
-        hessian = upper + np.triu(upper, 1).T
-        numeric = central_differences(slope, np.zeros(6), step=1e-4)
-        size = max(1.0, np.abs(numeric).max())
-        assert np.abs(hessian @ along - numeric).max() / size < DERIVATIVE
+    upper = np.asarray(f["hess_lag"](x, p, 1.0, lam).full())
+    hessian = upper + np.triu(upper, 1).T
+    numeric = central_differences(slope, np.zeros(6), step=1e-4)
+    size = max(1.0, np.abs(numeric).max())
+    assert np.abs(hessian @ along - numeric).max() / size < DERIVATIVE
 
 
 # ---- identification
@@ -349,35 +348,29 @@ def simulated(plan):
 
 
 def solutions(problem, sigma):
-    options = SolverOptions(hessian="exact")
-    programs = (
-        VariableProjection(problem),
-        NonlinearProgram(problem),
-        NonlinearProgram(problem, options=options),
-    )
-    return [program.solve(sigma=sigma) for program in programs]
+    """Solutions with variable projection and with Ipopt."""
+    return [P(problem).solve(sigma=sigma) for P in (VariableProjection, NonlinearProgram)]
 
 
-def test_all_solvers_identify_it_alike(simulated):
+def test_both_solvers_identify_the_same_errors(simulated):
     problem = build_problem(simulated.session, free=FREE, prior=True)
-    found = solutions(problem, 0.2e-6)
-    for other in found[1:]:
-        off = np.abs(other.theta - found[0].theta) / problem.theta_scale
-        assert off.max() < SAME_OPTIMUM / 1e-4
-        assert other.objective == pytest.approx(found[0].objective, rel=1e-9)
+    found, other = solutions(problem, 0.2e-6)
+    off = np.abs(other.theta - found.theta) / problem.theta_scale
+    assert off.max() < SAME_OPTIMUM / 1e-4
+    assert other.objective == pytest.approx(found.objective, rel=1e-9)
     truth = {**TRUTH, **simulated.nuisance}
     expected = np.array([truth.get(n, 0.0) for n in problem.free])
-    _, jacobian = problem.predict_and_jacobian(found[0].theta)
+    _, jacobian = problem.predict_and_jacobian(found.theta)
     zeros = problem.zero_incidence
     centred = jacobian - zeros @ (np.linalg.pinv(zeros) @ jacobian)
     std = np.sqrt(np.diag(np.linalg.inv(centred.T @ centred / 0.2e-6**2 + np.eye(problem.n_free))))
-    off = (found[0].theta - expected) / problem.theta_scale / std
+    off = (found.theta - expected) / problem.theta_scale / std
     assert np.abs(off).max() < 4.0
-    told = [problem.free.index(n) for n in TRUTH if n.endswith(("slack", "growth"))]
-    assert (std[told] < 0.2).all()
+    determined = [problem.free.index(n) for n in TRUTH if n.endswith(("slack", "growth"))]
+    assert (std[determined] < 0.2).all()
 
 
-def test_a_batch_is_solved_as_each_of_its_sets(simulated):
+def test_a_batch_is_solved_like_single_sets(simulated):
     problem = build_problem(simulated.session, free=FREE, prior=True)
     rng = np.random.default_rng(8)
     values = problem.values + 1e-6 * rng.normal(size=(3, problem.observations.size))
@@ -387,21 +380,21 @@ def test_a_batch_is_solved_as_each_of_its_sets(simulated):
         assert (np.abs(theta - alone.theta) / problem.theta_scale).max() < 1e-6
 
 
-def test_at_its_bound_it_stays(plan):
-    """Without slack half of the estimates would be negative."""
+def test_estimates_of_slack_are_never_negative(plan):
+    """Without slack half of the unbounded estimates would be negative."""
     exact_plan = exact(plan)
     without = {n: v for n, v in TRUTH.items() if not n.endswith("slack")}
     session = simulate_session(exact_plan, without, seed=3, sigma=1e-6).session
     problem = build_problem(session, free=FREE, prior=True)
-    projected, program, _ = solutions(problem, 1e-6)
+    projected, program = solutions(problem, 1e-6)
     of_slack = [i for i, n in enumerate(problem.free) if n.endswith("slack")]
     assert (projected.theta[of_slack] >= 0.0).all()
     assert (projected.at_bound[of_slack] == program.at_bound[of_slack]).all()
     assert (projected.at_bound[of_slack] == -1).any()
 
 
-def test_a_calibration_holds_it_and_its_conditions(simulated, tmp_path):
-    result = calibrate(simulated.session, Choice(free=FREE), solver="variable-projection")
+def test_a_calibration_file_keeps_the_effect_and_its_conditions(simulated, tmp_path):
+    result, _ = identify(simulated.session, Choice(free=FREE), **QUICK)
     assert result["x_slide.slack"].value == pytest.approx(
         30e-6, abs=4 * result["x_slide.slack"].std
     )
@@ -413,12 +406,12 @@ def test_a_calibration_holds_it_and_its_conditions(simulated, tmp_path):
     assert again["rods.growth"].unit == "1/K"
 
 
-def test_joined_sessions_share_the_machine_and_not_the_gauge(simulated):
+def test_joined_sessions_share_the_machine_but_not_the_gauges(simulated):
     joined = join_sessions([simulated.session, simulated.session])
     problem = build_problem(joined, free=FREE, prior=True)
     assert sum(n.endswith(".creep") for n in problem.free) == 12
     assert sum(n == "rods.growth" for n in problem.free) == 1
-    found = solutions(problem, 0.2e-6)[:2]
+    found = solutions(problem, 0.2e-6)
     objective = found[0].objective
     assert found[1].objective == pytest.approx(objective, rel=SAME_OPTIMUM)
     # in prior std the objective grows at least by half the square of a distance from its minimum
@@ -430,21 +423,20 @@ def test_readings_without_the_condition_are_refused(tmp_path):
     folder = write_plan(tmp_path / "plan", effects=KEYS, conditions=False)
     session = simulate_session(load_plan(folder), {"x_slide.offset": 1e-4}, seed=1).session
     with pytest.raises(SessionError, match="needs the approach"):
-        calibrate(session, Choice(free=FREE, effects=["slack"]))
-    # where only the robot has the effect, its errors keep their tolerances
-    quick = {"solver": "variable-projection"}
-    kept = calibrate(session, Choice(free=FREE), **quick)["x_slide.slack"]
+        identify(session, Choice(free=FREE, effects=["slack"]))
+    # errors of an effect that only the robot has keep their tolerances
+    kept = identify(session, Choice(free=FREE), **QUICK)[0]["x_slide.slack"]
     assert (kept.value, kept.std) == pytest.approx((0.0, 40e-6), rel=1e-6)
-    assert calibrate(session, "offsets", **quick).free
-    # not where some of the readings state the condition
+    assert identify(session, "offsets", **QUICK)[0].free
+    # unless some of the readings state the condition
     first, *others = simulate_session(load_plan(folder), {}, seed=1).session.readings
     stated = replace(first, conditions=Conditions(approach="ppn", temperature=21.0))
     some = replace(session, readings=(stated, *others))
     with pytest.raises(SessionError, match=f"{len(others)} of {len(others) + 1}"):
-        calibrate(some, Choice(free=FREE), **quick)
+        identify(some, Choice(free=FREE), **QUICK)
 
 
-def test_a_session_from_files_is_the_same(simulated, folder, tmp_path):
+def test_a_session_file_keeps_the_conditions(simulated, tmp_path):
     write_session(simulated.session, tmp_path / "out", decimals=12)
     again = load_session(tmp_path / "out")
     one, other = (build_problem(s, free=FREE, prior=True) for s in (simulated.session, again))

@@ -1,4 +1,4 @@
-"""Placements that change along the travel of a drive, shown by guides that are not straight."""
+"""Placements that change along the travel of a drive: guides that are not straight."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ BOWS = {"x_slide.bow": 40e-6, "y_slide.bow": -25e-6, "z_slide.bow": 60e-6}
 
 
 @pytest.fixture(scope="module", autouse=True)
-def known():
+def registered():
     registry.register_effect(Straightness)
     yield
     registry.unregister_effect("straightness")
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, known):
+def folder(tmp_path_factory, registered):
     return write_plan(tmp_path_factory.mktemp("bent") / "plan", effects="straightness: {}")
 
 
@@ -68,7 +68,7 @@ def points(closure):
 
 
 def test_readings_are_those_of_the_independent_machine(folder, plan, errors):
-    """Gauges stay where they were mounted, in the reference posture of the setup."""
+    """Gauges are mounted in the reference posture of the setup."""
     o = build_observations(plan)
     assert o.states.posture.size == len(o.states.variant_commands) == len(plan.postures)
     drives = drive_table(plan)[o.posture]
@@ -85,7 +85,7 @@ def test_readings_are_those_of_the_independent_machine(folder, plan, errors):
     assert np.ptp(predicted - straight) > 10e-6
 
 
-def test_the_tool_is_that_of_the_independent_machine_and_is_inverted(folder, closure, errors):
+def test_the_tool_is_that_of_the_independent_machine(folder, closure, errors):
     drives, tools = points(closure)
     states = States(drives, np.zeros_like(drives), np.full(len(drives), 20.0))
     (found,) = BentMachine(folder / "machine", errors).tool(states)
@@ -138,7 +138,7 @@ def test_solvers_find_bows_from_exact_readings(plan, touching):
     assert np.abs(batch.theta - expected).max() < SAME_OPTIMUM
 
 
-def test_other_machines_have_no_second_placements(orthoglide):
+def test_other_machines_have_no_reference_placements(orthoglide):
     map_ = error_map(orthoglide)
     assert map_.in_reference == {}
     assert len(map_.moved) == len(set(map_.moved))

@@ -1,4 +1,4 @@
-"""Study of accuracy with effects that the calibration identifies or ignores."""
+"""Accuracy study with effects that the calibration identifies or ignores."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LETTERS = {"p": 1.0, "n": -1.0}
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Plan of 60 readings on a machine that is used from both sides, at 24 to 30 °C."""
+    """Plan of 60 readings of a machine that is used from both sides, at 24 to 30 °C."""
     directory = write_plan(tmp_path_factory.mktemp("study") / "plan")
     file = directory / "machine" / "machine.yaml"
     file.write_text(file.read_text().replace("\n  tcp: ", f"\n  use: {USED}\n  tcp: "))
@@ -42,7 +42,7 @@ def study_of(folder, effects, identified, *, machines=3, seed=0):
 
 
 def test_the_tool_of_a_machine_agrees_with_the_independent_one(folder):
-    """The tool before a calibration, from both sides of each drive and at two temperatures."""
+    """Before a calibration, from both sides of each drive and at two temperatures."""
     study = study_of(folder, ("backlash", "thermal"), ("thermal",))
     rows, p = run_task(study, 0), study.prepare()
     drawn, _ = p.draw(1)
@@ -71,19 +71,17 @@ def test_the_tool_of_a_machine_agrees_with_the_independent_one(folder):
 
 
 def test_ignored_backlash_costs_what_the_covariance_predicts(folder):
-    study = study_of(folder, ("backlash",), (), machines=60)
+    study = study_of(folder, ("backlash",), (), machines=24)
     assert study.ignored == ("backlash",)
     table = run_study(study, workers=1)
     s = summarise_accuracy(study, table)
-    assert s.machines == 60
+    assert s.machines == 24
     assert abs(s.after - s.predicted.reported.rms) < 3.0 * s.standard_error
-    # half the backlash of three drives remains, beside what all errors leave
+    # half the backlash of three drives remains
     remaining = np.sqrt(3.0) * 0.5 * 0.02e-3
     assert s.after > np.hypot(0.95 * s.all_effects, 0.8 * remaining)
-    known = summarise_accuracy(
-        (told := study_of(folder, ("backlash",), ("backlash",), machines=60)),
-        run_study(told, workers=1),
-    )
+    identified = study_of(folder, ("backlash",), ("backlash",), machines=24)
+    known = summarise_accuracy(identified, run_study(identified, workers=1))
     assert known.all_effects is None
     assert known.after == pytest.approx(s.all_effects, rel=1e-9)
     document = report_study(table).document
@@ -119,7 +117,7 @@ def test_effects_are_part_of_the_record(folder):
     assert len({study.digest for study in (one, *others)}) == 3
 
 
-def test_bad_effects(folder):
+def test_unknown_effects_and_missing_conditions_are_refused(folder):
     with pytest.raises(ParameterError, match="'wear' is not an effect"):
         study_of(folder, ("wear",), ())
     plan = load_plan(folder)
@@ -130,8 +128,8 @@ def test_bad_effects(folder):
         build_accuracy_study(bare, Choice("full", effects=()), effects=("backlash",), machines=2)
 
 
-def test_cost_of_ignoring_in_one_command(folder, root):
-    words = ["study", "accuracy", folder, "--effects", "backlash", "--machines", 20]
+def test_the_command_prints_the_cost_of_ignoring_an_effect(folder, root):
+    words = ["study", "accuracy", folder, "--effects", "backlash", "--machines", 12]
     code, out, _ = run_orthocal(root, *words, "--ignore", "backlash", "--workers", 1)
     assert code == 0
     answer = " ".join(out.split())

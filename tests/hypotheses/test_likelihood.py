@@ -18,7 +18,7 @@ from orthocal.hypotheses.likelihood import (
 
 N, ERRORS, SIGMA = 7, 3, 0.8
 CONSTANT = N / 2.0 * np.log(2.0 * np.pi)
-"""Left out of all densities alike."""
+"""Omitted in all densities."""
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +61,7 @@ def test_prior_weights_add_up_to_one(case):
 
 @pytest.mark.parametrize("rows", [N, 3 * N])
 def test_principal_directions_reproduce_the_covariance(rows):
-    """Of wide and of tall Jacobians, which are decomposed by different ways."""
+    """Wide and tall Jacobians are decomposed differently."""
     jacobian = np.random.default_rng(1).normal(size=(rows, ERRORS))
     likelihood, errors, sizes = build_likelihood(jacobian, sigma=SIGMA, dof=rows, stated=True)
     r = likelihood.directions
@@ -70,7 +70,7 @@ def test_principal_directions_reproduce_the_covariance(rows):
     assert (r.T * likelihood.variances) @ r == pytest.approx(jacobian @ jacobian.T)
 
 
-def test_many_deviations_equal_dense_densities(case):
+def test_deviations_have_dense_normal_densities(case):
     jacobian, likelihood, deviations, _ = case
     found = likelihood.score(likelihood.products(deviations))
     assert found == pytest.approx([dense(jacobian, likelihood, d) for d in deviations])
@@ -117,8 +117,8 @@ def test_a_group_of_effects_shares_one_prior(case):
     assert found.amounts.shape == (2,)
 
 
-def test_an_effect_that_no_entry_shows_has_no_amount(case):
-    """Such as that of a gauge that was displaced before its first reading."""
+def test_an_invisible_effect_has_no_amount(case):
+    """Such as a displacement of the gauge before its first reading."""
     _, likelihood, deviations, effects = case
     nothing = np.zeros((1, N))
     alone = likelihood.score_set(deviations[0], [nothing])
@@ -130,7 +130,7 @@ def test_an_effect_that_no_entry_shows_has_no_amount(case):
     assert beside.amounts[1] == pytest.approx(one.amounts[0], rel=1e-9)
 
 
-def test_separate_effects_average_over_their_own_priors(case):
+def test_separate_effects_have_separate_priors(case):
     jacobian, likelihood, deviations, effects = case
     logs = []
     for weight, covariance in zip(likelihood.weights, covariances(jacobian), strict=True):
@@ -144,7 +144,7 @@ def test_separate_effects_average_over_their_own_priors(case):
     assert found.log_likelihood == pytest.approx(float(log_of_sum(np.array(logs))) + CONSTANT)
 
 
-def test_silent_rows_leave_the_density_of_the_others(case):
+def test_silent_rows_have_the_marginal_density_of_the_others(case):
     jacobian, likelihood, deviations, _ = case
     kept, silent = [0, 2, 3, 5, 6], [1, 4]
     found = likelihood.score_set(deviations[0], (), np.eye(N)[silent])

@@ -1,11 +1,12 @@
-"""The linearised model about several machines at once, and what is kept of it."""
+"""Linearised model about several machines at once, and its caches."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from calibrated import session_of
 
-from orthocal import join_sessions, load_session
+from orthocal import join_sessions
 from orthocal.hypotheses import linear_model as module
 from orthocal.hypotheses.hypothesis import MachineShift
 from orthocal.hypotheses.linear_model import LinearModel, linear_model
@@ -14,8 +15,8 @@ from orthocal.measurement.joining import split_sessions
 
 
 @pytest.fixture(scope="module")
-def joined(root):
-    return join_sessions([load_session(root / f"examples/{n}") for n in ("raw-cycles", "workshop")])
+def joined():
+    return join_sessions([session_of(name) for name in ("raw-cycles", "workshop")])
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +25,7 @@ def model(joined):
 
 
 def points(model, rng, *, unreachable=()):
-    """Machines with errors of half their tolerances, the last of them with changes."""
+    """Machines with errors of half their tolerances; the last two have machine shifts."""
     start, n = model.problem.active_passive, model.problem.n_free
     changes = [
         MachineShift(np.array([False, True]), rng.normal(size=n)),
@@ -41,7 +42,7 @@ def points(model, rng, *, unreachable=()):
 
 
 @pytest.mark.parametrize(("unreachable", "most"), [((), 1600), ((), 100), ((1,), 1600)])
-def test_several_machines_are_linearised_as_each_alone(model, unreachable, most, monkeypatch):
+def test_several_machines_are_linearised_like_single_ones(model, unreachable, most, monkeypatch):
     monkeypatch.setattr(module, "MAX_LINEARISED_ENTRIES", most)
     chosen = points(model, np.random.default_rng(3), unreachable=unreachable)
     together = model.linearise_all(chosen, keep_jacobian=True)
@@ -57,7 +58,7 @@ def test_several_machines_are_linearised_as_each_alone(model, unreachable, most,
         assert np.array_equal(found.theta, point.theta)
 
 
-def test_a_change_concerns_the_readings_of_its_sessions(model):
+def test_a_machine_shift_changes_the_readings_of_its_sessions(model):
     plain, _, changed, _ = points(model, np.random.default_rng(3))
     later = model.session_of_entry == 1
     given = LinearisationPoint(plain.theta, changed.shifts, plain.start)
@@ -70,12 +71,12 @@ def test_the_model_of_the_same_rows_is_built_once(joined):
     assert linear_model(joined).problem.model is linear_model(joined).problem.model
     for one, other in zip(split_sessions(joined), split_sessions(joined), strict=True):
         assert one is other
-        # the complete model by its name, and with other readings
+        # the complete model by its name, with other readings
         named = linear_model(one.with_values(one.values + 1e-5), "full")
         assert named.problem.model is linear_model(one).problem.model
     values = joined.values + 1e-5 * (np.arange(joined.values.size) % 3)
     changed = linear_model(joined.with_values(values))
-    # their gauges' noise may come from the readings
+    # the noise of several gauges depends on the readings
     assert changed.problem.model is not linear_model(joined).problem.model
 
 

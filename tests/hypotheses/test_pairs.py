@@ -51,7 +51,7 @@ def test_all_pairs_have_the_evidence_of_brute_force(case):
     assert (np.diff(found.log_posterior) <= 0.0).all()
 
 
-def test_a_bound_leaves_out_only_unlikely_pairs(case):
+def test_a_bound_omits_only_unlikely_pairs(case):
     every = find_pairs(*case)
     least = float(every.log_posterior[20])
     some = find_pairs(*case, min_log=least)

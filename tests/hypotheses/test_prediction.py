@@ -1,4 +1,4 @@
-"""Prediction of a reading by the others: against dense conditioning, and drawn machines."""
+"""Prediction of a reading by the others, by dense conditioning and for drawn machines."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibrated import plan_of, session_of
 
-from orthocal import load_plan, load_session
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import build_problem
 from orthocal.hypotheses.linear_model import CONVERGED_CHANGE, MAX_STEPS, LinearModel
@@ -24,7 +24,7 @@ ROUNDING = 1e-5
 """Relative error of conditioning with variances of ZERO² and of the noise side by side."""
 
 CHANCE = (0.7, 1.3)
-"""Range of the standard deviation of 60 scores: three standard errors of it."""
+"""Range of the standard deviation of 60 scores: ± three standard errors."""
 
 
 def part(session, count):
@@ -78,22 +78,19 @@ def condition(session, row):
 
 
 CASES = {
-    "next of a few": (lambda root: part(load_session(root / "examples/workshop"), 11), 10),
-    "one before": (lambda root: part(load_session(root / "examples/workshop"), 11), 4),
-    "repeated": (lambda root: part(load_session(root / "examples/raw-cycles"), 23), 22),
-    "differences": (lambda root: load_session(root / "examples/table1/experiment-2"), 3),
-    "two gauges": (lambda root: with_two_gauges(load_session(root / "examples/workshop")), 16),
-    "known zero": (
-        lambda root: with_known_zero(part(load_session(root / "examples/workshop"), 7), "xy"),
-        6,
-    ),
+    "last reading": (lambda: part(session_of("workshop"), 11), 10),
+    "earlier reading": (lambda: part(session_of("workshop"), 11), 4),
+    "repeated": (lambda: part(session_of("raw-cycles"), 23), 22),
+    "differences": (lambda: session_of("table1/experiment-2"), 3),
+    "two gauges": (lambda: with_two_gauges(session_of("workshop")), 16),
+    "known zero": (lambda: with_known_zero(part(session_of("workshop"), 7), "xy"), 6),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_prediction_equals_dense_conditioning(root, case):
+def test_a_prediction_equals_dense_conditioning(case):
     make, row = CASES[case]
-    session = make(root)
+    session = make()
     if session.gauge.sigma is None:
         session = session.with_gauge(replace(session.gauge, sigma=5e-6))
     mean, std = LinearModel(session).predict_row(session.values, row)
@@ -106,9 +103,9 @@ def test_a_prediction_equals_dense_conditioning(root, case):
     assert again == pytest.approx((mean, std), rel=1e-9)
 
 
-def test_repeated_readings_predict_their_mean(root):
-    """Hand-solved: with a free zero the mean of the others, to σ √(1 + 1/n)."""
-    plan = load_plan(root / "examples/raw-cycles")
+def test_repeated_readings_predict_their_mean():
+    """Solved by hand: with a free zero the mean of the others, to σ √(1 + 1/n)."""
+    plan = plan_of("raw-cycles")
     rows = [r for r in plan.readings if (r.setup, r.posture) == ("yx", "x_max")]
     session = plan.select(rows).with_values(np.array([0.1, 0.12, 0.7]) * MM)
     mean, std = LinearModel(session).predict_row(session.values, 2)
@@ -116,20 +113,21 @@ def test_repeated_readings_predict_their_mean(root):
     assert std == pytest.approx(np.hypot(0.01, 0.01 / np.sqrt(12.0)) * MM * np.sqrt(1.5))
 
 
-def test_the_first_reading_of_a_setup_has_no_prediction(root):
-    session = part(load_session(root / "examples/workshop"), 7)
+def test_the_first_reading_of_a_setup_has_no_prediction():
+    session = part(session_of("workshop"), 7)
     for only in (session, part(session, 1)):
         mean, std = LinearModel(only).predict_row(only.values, len(only.readings) - 1)
         assert math.isnan(mean)
         assert math.isinf(std)
 
 
-def test_a_difference_is_predicted_without_any_other(root):
-    plan = load_plan(root / "examples/raw-cycles")
-    session = replace(plan, readings=(Reading("yx", "x_max", "x_min", 1, 0.0, None),))
+def test_a_difference_is_predicted_without_other_readings():
+    session = replace(
+        plan_of("raw-cycles"), readings=(Reading("yx", "x_max", "x_min", 1, 0.0, None),)
+    )
     mean, std = LinearModel(session).predict_row(session.values, 0)
     assert mean == pytest.approx(0.0, abs=1e-9)
-    assert 0.5 * MM < std < 5.0 * MM  # the offsets' 2 mm, a part of which the gauge sees
+    assert 0.5 * MM < std < 5.0 * MM  # from offsets of 2 mm
 
 
 def draw_sessions(plan, count, seed):
@@ -146,24 +144,23 @@ def draw_sessions(plan, count, seed):
             yield plan.with_values(values)
 
 
-def test_readings_scatter_about_their_predictions_as_stated(root):
-    plan = load_plan(root / "examples/workshop")
-    scores = []
+def test_readings_scatter_about_their_predictions_as_stated():
+    plan, scores = plan_of("workshop"), []
+    models = {count: LinearModel(part(plan, count)) for count in (6, 12, 18)}
     for session in draw_sessions(plan, 30, 5):
-        for count in (6, 12, 18):
-            read = part(session, count)
-            mean, std = LinearModel(read).predict_row(read.values, count - 1)
-            scores.append((read.values[-1] - mean) / std)
+        for count, model in models.items():
+            values = session.values[:count]
+            mean, std = model.predict_row(values, count - 1)
+            scores.append((values[-1] - mean) / std)
     assert len(scores) >= 60
     assert CHANCE[0] < np.std(scores) < CHANCE[1]
     assert abs(np.mean(scores)) < 0.3
 
 
-def test_an_outlier_is_accused_by_the_prediction_that_a_recording_prints(root):
-    session = load_session(root / "examples/raw-cycles")
-    values = session.values.copy()
+def test_the_expected_value_of_an_outlier_is_its_prediction(raw_cycles):
+    values = raw_cycles.values.copy()
     values[9] += 0.13 * MM
-    wrong = session.with_values(values)
+    wrong = raw_cycles.with_values(values)
     (anomaly,) = find_anomalies(wrong).found
     mean, _ = LinearModel(wrong).predict_row(values, 9)
     assert (anomaly.explanation.kind, anomaly.explanation.rows) == ("outlier", (9,))

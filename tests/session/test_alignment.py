@@ -1,4 +1,4 @@
-"""The posture in which a gauge was aligned: stated or by rule, whatever the order of the rows."""
+"""Alignment posture of a gauge: stated or by rule, independent of the order of the rows."""
 
 from __future__ import annotations
 
@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from calibrated import calibrated, session_of
 
 from orthocal import (
-    Choice,
     SessionError,
     assess_tool,
-    calibrate,
     join_sessions,
     load_calibration,
     load_session,
@@ -20,28 +19,36 @@ from orthocal import (
     write_calibration,
     write_session,
 )
+from orthocal.calibration.identify import identify
 
+QUICK = {"solver": "variable-projection"}
 ORDER = {"reversed": lambda n: np.arange(n)[::-1], "shuffled": np.random.default_rng(5).permutation}
 
 
 @pytest.fixture(scope="module")
-def workshop(root):
-    return load_session(root / "examples/workshop")
+def workshop():
+    return session_of("workshop")
 
 
-def ordered(session, how):
-    rows = [session.readings[i] for i in ORDER[how](len(session.readings))]
+def ordered(session, order):
+    """The session with its rows in another order."""
+    rows = [session.readings[i] for i in ORDER[order](len(session.readings))]
     return replace(session, readings=tuple(rows))
 
 
 @pytest.fixture(scope="module")
-def calibration(workshop):
-    return calibrate(workshop, Choice("full"), solver="variable-projection")
+def calibration():
+    return calibrated("workshop", "full", **QUICK)
 
 
-@pytest.mark.parametrize("how", ORDER)
-def test_the_order_of_rows_changes_no_estimate(how, workshop, calibration):
-    other = calibrate(ordered(workshop, how), Choice("full"), solver="variable-projection")
+@pytest.mark.parametrize("order", ORDER)
+def test_the_order_of_rows_changes_no_estimate(order, workshop, calibration):
+    other, _ = identify(
+        ordered(workshop, order),
+        "full",
+        find_scale=lambda _: calibration.tolerance_scale,
+        **QUICK,
+    )
     scale = np.array([p.prior_std for p in calibration.free])
     expected, found = (np.array([p.value for p in c.free]) for c in (calibration, other))
     np.testing.assert_allclose(found / scale, expected / scale, atol=1e-9)
@@ -63,7 +70,7 @@ def test_the_mechanical_zero_is_the_default_where_it_is_read(workshop):
     assert set(ordered(workshop, "reversed").alignment_postures.values()) == {"zero"}
 
 
-def test_otherwise_it_is_the_posture_nearest_to_the_zero(workshop):
+def test_otherwise_the_default_is_the_posture_nearest_to_the_zero(workshop):
     rows = tuple(r for r in workshop.readings if r.posture != "zero")
     session = replace(workshop, readings=rows)
     nearest = {"x": "x_max", "y": "y_max", "z": "z_max"}  # +60 mm against -100 mm
@@ -72,11 +79,11 @@ def test_otherwise_it_is_the_posture_nearest_to_the_zero(workshop):
     }
 
 
-def test_among_equals_the_first_of_the_postures_counts(workshop):
+def test_among_equally_near_postures_the_first_is_the_default(workshop):
     leg = next(iter(workshop.setups.values())).sensor.leg
     setups = {n: s for n, s in workshop.setups.items() if s.sensor.leg == leg}
     postures = dict(reversed(list(workshop.postures.items())))
-    for name in ("x_max", "x_min"):  # as far from the zero, to either side
+    for name in ("x_max", "x_min"):  # equally far from the zero
         sign = 1.0 if name == "x_max" else -1.0
         drives = workshop.robot.drive_zero + sign * np.array([0.05, 0.0, 0.0])
         postures[name] = replace(postures[name], drives=drives)
@@ -88,16 +95,14 @@ def test_among_equals_the_first_of_the_postures_counts(workshop):
     assert set(session.alignment_postures.values()) == {first}
 
 
-def test_a_stated_posture_matters(workshop, calibration):
+def test_a_stated_posture_changes_estimates(workshop, calibration):
     setups = {n: replace(s, aligned_at=f"{s.sensor.leg}_min") for n, s in workshop.setups.items()}
-    other = calibrate(
-        replace(workshop, setups=setups), Choice("full"), solver="variable-projection"
-    )
+    other, _ = identify(replace(workshop, setups=setups), "full", **QUICK)
     change = [abs(a.value - b.value) for a, b in zip(other.free, calibration.free, strict=True)]
     assert max(change) > 1e-6
 
 
-def test_files_state_it(workshop, calibration, tmp_path):
+def test_files_state_the_posture(workshop, calibration, tmp_path):
     setups = {n: replace(s, aligned_at=f"{s.sensor.leg}_max") for n, s in workshop.setups.items()}
     write_session(replace(workshop, setups=setups), tmp_path / "stated")
     write_session(workshop, tmp_path / "default")
@@ -112,14 +117,14 @@ def test_files_state_it(workshop, calibration, tmp_path):
     assert restore_session(loaded).alignment_postures == workshop.alignment_postures
 
 
-def test_joined_sessions_keep_theirs(workshop):
+def test_joined_sessions_keep_their_postures(workshop):
     setups = {n: replace(s, aligned_at=f"{s.sensor.leg}_max") for n, s in workshop.setups.items()}
     joined = join_sessions([workshop, replace(workshop, setups=setups)])
     own = [name.partition("/")[2] for name in joined.alignment_postures.values()]
     assert own == ["zero"] * len(setups) + [s.aligned_at for s in setups.values()]
 
 
-def test_a_posture_that_is_none_is_refused(workshop, tmp_path):
+def test_an_unknown_posture_is_refused(workshop, tmp_path):
     file = write_session(workshop, tmp_path / "session")
     document = yaml.safe_load(file.read_text("utf-8"))
     name = next(iter(document["setups"]))

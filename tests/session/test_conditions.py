@@ -12,7 +12,6 @@ from commands import run_orthocal
 
 from orthocal import (
     Choice,
-    calibrate,
     import_readings,
     load_calibration,
     load_plan,
@@ -24,6 +23,7 @@ from orthocal import (
     write_session,
 )
 from orthocal.assessment.plausibility import find_scattered
+from orthocal.calibration.identify import identify
 from orthocal.errors import CalibrationFileError, SessionError
 from orthocal.measurement.importing.import_readings import TableOptions
 from orthocal.measurement.joining import join_sessions, split_sessions
@@ -75,7 +75,7 @@ def session(tmp_path):
 # ---- files
 
 
-def test_each_reading_has_its_own(session):
+def test_each_reading_has_its_conditions(session):
     stated = [r.conditions for r in session.readings]
     time = datetime(2025, 3, 14, 9, 26, 53, tzinfo=BERLIN)
     assert stated[0] == Conditions("ppp", 21.5, time)
@@ -85,7 +85,7 @@ def test_each_reading_has_its_own(session):
     assert [r.approach for r in session.readings] == ["ppp", "npp", "puu", None, None, None, None]
 
 
-def test_they_are_written_as_they_were_read(session, tmp_path):
+def test_conditions_are_written_as_they_were_read(session, tmp_path):
     write_session(session, tmp_path / "second")
     assert (tmp_path / "second/readings.csv").read_text() == TABLE.replace(
         ",0.2,", ",0.20,"
@@ -94,7 +94,7 @@ def test_they_are_written_as_they_were_read(session, tmp_path):
     assert [r.conditions for r in again.readings] == [r.conditions for r in session.readings]
 
 
-def test_columns_that_no_row_needs_are_not_written(session, tmp_path):
+def test_empty_columns_are_not_written(session, tmp_path):
     plain = replace(
         session, readings=tuple(replace(r, conditions=None) for r in session.readings[1:])
     )
@@ -103,7 +103,7 @@ def test_columns_that_no_row_needs_are_not_written(session, tmp_path):
     assert header == "setup,posture,cycle,reading_mm"
 
 
-def test_a_spreadsheet_may_have_saved_them(tmp_path):
+def test_the_formats_of_a_spreadsheet_are_read(tmp_path):
     table = (
         "setup;posture;reading_mm;approach;temperature_C;time\n"
         "yx;zero;0,01;ppp;21,5;2025-03-14 09:26\nyx;zero;0,02;npp;;\n"
@@ -113,7 +113,7 @@ def test_a_spreadsheet_may_have_saved_them(tmp_path):
     assert found[1].value == pytest.approx(0.02e-3)
 
 
-def test_times_without_zone_stay_so(tmp_path):
+def test_times_without_zone_are_kept(tmp_path):
     table = "setup,posture,reading_mm,time\nyx,zero,0.01,2025-03-14T09:26:53.5\n"
     found = load_session(write(tmp_path / "first", table))
     assert found.readings[0].conditions.time == datetime(2025, 3, 14, 9, 26, 53, 500_000)
@@ -121,7 +121,7 @@ def test_times_without_zone_stay_so(tmp_path):
     assert "2025-03-14T09:26:53.500000" in (tmp_path / "second/readings.csv").read_text()
 
 
-def test_times_with_and_without_zone_do_not_mix(tmp_path):
+def test_times_with_and_without_zone_are_refused(tmp_path):
     table = TABLE.replace("2025-03-14T11:00:00+01:00", "2025-03-14T11:00:00")
     with pytest.raises(SessionError) as caught:
         load_session(write(tmp_path / "first", table))
@@ -131,7 +131,7 @@ def test_times_with_and_without_zone_do_not_mix(tmp_path):
 # ---- repeats
 
 
-def test_readings_with_another_approach_are_no_repeats(session, tmp_path):
+def test_readings_with_different_approaches_are_no_repeats(session, tmp_path):
     o = build_observations(session)
     assert o.place[0] != o.place[1]
     assert o.place[3] == o.place[4]
@@ -143,7 +143,7 @@ def test_readings_with_another_approach_are_no_repeats(session, tmp_path):
         load_session(write(tmp_path / "other", TABLE.replace("npp", "ppp")))
 
 
-def test_slack_of_the_drives_is_no_scatter_of_the_gauge(tmp_path):
+def test_backlash_is_no_scatter_of_the_gauge(tmp_path):
     """Two approaches 60 µm apart, each read twice within 2 µm, by a dial of 5 µm."""
     rows = ["setup,posture,cycle,reading_mm,approach"]
     for cycle, off in enumerate((0.0, 0.002), start=1):
@@ -152,14 +152,14 @@ def test_slack_of_the_drives_is_no_scatter_of_the_gauge(tmp_path):
                 rows.append(f"yx,{posture},{cycle},{0.1 + off + step},{approach}")
     session = load_session(write(tmp_path / "first", "\n".join(rows) + "\n"))
     assert not find_scattered(session)
-    blind = replace(session, readings=tuple(replace(r, conditions=None) for r in session.readings))
-    assert find_scattered(blind)
+    unstated = [replace(r, conditions=None) for r in session.readings]
+    assert find_scattered(session.select(unstated))
 
 
-# ---- joined sessions and those that are read again
+# ---- joined and repeated sessions
 
 
-def test_joined_sessions_keep_them(session, tmp_path):
+def test_joined_sessions_keep_conditions(session, tmp_path):
     other = load_session(write(tmp_path / "second", TABLE.replace("+01:00", "")))
     joined = join_sessions([session, other])
     stated = [r.conditions for r in (*session.readings, *other.readings)]
@@ -171,12 +171,12 @@ def test_joined_sessions_keep_them(session, tmp_path):
     assert session.select(session.readings[2:4]).readings[0].conditions == stated[2]
 
 
-def test_a_session_read_again_has_its_approaches_planned(tmp_path, root):
-    first = load_session(root / "examples/raw-cycles")
+def test_a_repeated_session_plans_the_approaches(tmp_path, raw_cycles):
+    first = raw_cycles
     stated = Conditions("ppp", 21.0, datetime(2025, 3, 14, tzinfo=UTC))
     readings = tuple(replace(r, conditions=stated) for r in first.readings)
     write_session(replace(first, readings=readings), tmp_path / "first")
-    result = calibrate(load_session(tmp_path / "first"), "offsets", solver="variable-projection")
+    result, _ = identify(load_session(tmp_path / "first"), "offsets", solver="variable-projection")
     write_calibration(result, tmp_path / "calibration.json")
     words = ["again", "calibration.json", "--out", "second", "--anyway"]
     done = run_orthocal(tmp_path, *words)
@@ -201,7 +201,7 @@ def rows_of(folder):
     return (folder / "readings.csv").read_text().splitlines()[1:]
 
 
-def test_a_recording_keeps_what_is_planned_and_takes_what_is_stated(tmp_path):
+def test_a_recording_keeps_planned_and_adds_stated_conditions(tmp_path):
     folder = write(tmp_path / "first", PLANNED)
     time = datetime(2025, 3, 14, 9, 30)
     with open_recording(folder) as recording:
@@ -219,13 +219,13 @@ def test_a_recording_keeps_what_is_planned_and_takes_what_is_stated(tmp_path):
         "yx,zero,2,,nnn,,",
     ]
     with open_recording(folder) as recording:
-        recording.empty(0)  # what was measured goes, what is planned stays
+        recording.empty(0)  # planned conditions are kept
     assert rows_of(folder) == [
         *("yx,zero,1,,ppp", "yx,zero,1,,nnn", "yx,x_max,1,,pnu", "yx,zero,2,,nnn")
     ]
 
 
-def test_a_killed_recording_is_done_again_with_its_conditions(tmp_path):
+def test_the_journal_restores_conditions(tmp_path):
     folder = write(tmp_path / "first", PLANNED)
     with open_recording(folder) as recording:
         before = (folder / "readings.csv").read_bytes()
@@ -240,7 +240,7 @@ def test_a_killed_recording_is_done_again_with_its_conditions(tmp_path):
     assert (folder / "readings.csv").read_bytes() == after
 
 
-def test_a_recording_refuses_conditions_that_a_reading_cannot_have(tmp_path):
+def test_a_recording_refuses_impossible_conditions(tmp_path):
     folder = write(tmp_path / "first", PLANNED)
     with open_recording(folder) as recording:
         for wrong in (Conditions("pp"), Conditions(temperature=300.0)):
@@ -285,7 +285,7 @@ def test_an_import_fills_the_rows_of_the_same_approach(tmp_path):
     assert load_session(folder).readings[1].conditions.temperature == 21.5
 
 
-def test_an_import_matches_rows_whose_approach_one_side_does_not_state(tmp_path):
+def test_an_import_matches_rows_with_one_stated_approach(tmp_path):
     folder = write(tmp_path / "first", "setup,posture,reading_mm\nyx,zero,0.01\nyx,x_max,\n")
     result = imported(folder, "setup,posture,reading_mm,approach\nyx,zero,0.01,ppp\n")
     assert (result.filled, result.added) == (1, 0)
@@ -294,7 +294,7 @@ def test_an_import_matches_rows_whose_approach_one_side_does_not_state(tmp_path)
     assert (result.filled, result.added) == (0, 1)
 
 
-def test_an_import_refuses_to_change_conditions_unasked(tmp_path):
+def test_an_import_changes_conditions_only_with_overwrite(tmp_path):
     folder = write(tmp_path / "first", "setup,posture,reading_mm,temperature_C\nyx,zero,0.01,20\n")
     table = "setup,posture,reading_mm,temperature_C\nyx,zero,0.01,21.0\n"
     with pytest.raises(SessionError, match=r"20 °C, but 0\.01 mm, 21\.0 °C"):
@@ -316,8 +316,8 @@ def test_the_times_of_a_clock_are_left_out_unless_they_are_asked_for(tmp_path):
 # ---- records
 
 
-def test_a_calibration_keeps_them(session, tmp_path):
-    result = calibrate(session, Choice("offsets", prior=True), solver="variable-projection")
+def test_a_calibration_file_keeps_conditions(session, tmp_path):
+    result, _ = identify(session, Choice("offsets", prior=True), solver="variable-projection")
     write_calibration(result, tmp_path / "calibration.json")
     again = load_calibration(tmp_path / "calibration.json")
     stated = [r.conditions for r in session.readings]

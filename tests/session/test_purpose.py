@@ -1,4 +1,4 @@
-"""What a session says of its calibration: a model and tolerances, where nothing else is said."""
+"""Model and tolerances that a session states for its calibration."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthocal import Choice, ParameterError, SessionError, calibrate, load_calibration
+from orthocal import Choice, ParameterError, SessionError, load_calibration
 from orthocal.calibration.file import write_calibration
+from orthocal.calibration.identify import identify
 from orthocal.calibration.refit import repeat_calibration, restore_session
 from orthocal.cli.options import state_tolerances
 from orthocal.estimation.choice import resolve_choice
@@ -23,41 +24,41 @@ TOLERANCES = {"*_fork.rx_mrad": 6.0, "*_swivel.rx_mrad": 4.0, "*.offset_mm": 0.8
 FORK = "x_fork.rx"
 
 
-def say(session, folder, **said):
-    """The session from a folder where its file says this of its calibration."""
-    told = replace(session, purpose=Purpose(said.get("model"), tuple(said.get("free", ()))))
-    return load_session(write_session(told.with_tolerances(said.get("tolerances", {})), folder))
+def state(session, folder, *, model=None, free=(), tolerances=None):
+    """The session from a file that states its calibration."""
+    stated = replace(session, purpose=Purpose(model, tuple(free)))
+    return load_session(write_session(stated.with_tolerances(tolerances or {}), folder))
+
+
+def fit(session, choice=None):
+    """Calibration of a session without its assessment."""
+    return identify(session, choice, solver="variable-projection")[0]
 
 
 @pytest.fixture(scope="module")
 def stated(raw_cycles, tmp_path_factory):
-    return say(raw_cycles, tmp_path_factory.mktemp("full"), model="full", tolerances=TOLERANCES)
+    return state(raw_cycles, tmp_path_factory.mktemp("full"), model="full", tolerances=TOLERANCES)
 
 
-def test_what_a_session_says_is_what_options_would(raw_cycles, stated):
+def test_a_statement_has_the_effect_of_options(raw_cycles, stated):
     assert stated.purpose == Purpose("full")
-    found, expected = (
-        calibrate(stated, solver="variable-projection"),
-        calibrate(raw_cycles, Choice("full", tolerances=TOLERANCES), solver="variable-projection"),
-    )
+    found, expected = fit(stated), fit(raw_cycles, Choice("full", tolerances=TOLERANCES))
     assert found.model == expected.model == "full"
     assert [p.prior_std for p in found.free] == [p.prior_std for p in expected.free]
     assert [(p.value, p.std) for p in found.free] == [(p.value, p.std) for p in expected.free]
 
 
-def test_tolerances_hold_for_what_is_left_out(raw_cycles, stated):
-    own, told = (
-        calibrate(s, "offsets", solver="variable-projection") for s in (raw_cycles, stated)
-    )
-    np.testing.assert_allclose(*([p.value for p in c.free] for c in (own, told)), atol=1e-12)
-    index = own.unmodelled.names.index(FORK)
-    assert own.unmodelled.prior_stds[index] == 1e-3
-    assert told.unmodelled.prior_stds[index] == pytest.approx(3e-3)
-    assert told.unmodelled.residual_rms > own.unmodelled.residual_rms
+def test_tolerances_apply_to_unmodelled_errors(raw_cycles, stated):
+    default, wide = (fit(s, "offsets") for s in (raw_cycles, stated))
+    np.testing.assert_allclose(*([p.value for p in c.free] for c in (default, wide)), atol=1e-12)
+    index = default.unmodelled.names.index(FORK)
+    assert default.unmodelled.prior_stds[index] == 1e-3
+    assert wide.unmodelled.prior_stds[index] == pytest.approx(3e-3)
+    assert wide.unmodelled.residual_rms > default.unmodelled.residual_rms
 
 
-def test_a_calibration_keeps_them(stated, tmp_path):
-    first = calibrate(stated, solver="variable-projection")
+def test_a_calibration_file_keeps_tolerances(stated, tmp_path):
+    first = fit(stated)
     again = load_calibration(write_calibration(first, tmp_path / "calibration.json"))
     assert again.robot.parameters[FORK].prior_std == pytest.approx(3e-3)
     repeated = repeat_calibration(again, restore_session(again))
@@ -66,7 +67,7 @@ def test_a_calibration_keeps_them(stated, tmp_path):
     )
 
 
-def test_options_come_before_what_a_session_says(stated):
+def test_options_take_precedence_over_a_statement(stated):
     parameters = stated.robot.parameters
     assert resolve_choice("offsets", stated).model == "offsets"
     assert resolve_choice(Choice(free=["*.offset"]), stated).model is None
@@ -78,29 +79,26 @@ def test_options_come_before_what_a_session_says(stated):
     assert sizes["y_fork.rx"] == pytest.approx(3e-3)
 
 
-def test_where_nothing_is_said(raw_cycles, stated):
+def test_the_default_model_without_a_statement(raw_cycles, stated):
     silent = replace(raw_cycles, purpose=None)
-    assert resolve_choice(None, raw_cycles).model == "offsets"  # as it states
+    assert resolve_choice(None, raw_cycles).model == "offsets"  # as stated
     assert resolve_choice(None, silent).model == "full"
     assert resolve_choice(None, silent, default_model="lengths").model == "lengths"
     assert resolve_choice(None, None, default_model="full").model == "full"
     assert resolve_choice(None, stated, default_model="lengths").model == "full"
 
 
-def test_globs_instead_of_a_model(raw_cycles, tmp_path):
-    session = say(raw_cycles, tmp_path, free=["*.offset", "!x_slide.offset"])
-    assert [p.name for p in calibrate(session, solver="variable-projection").free] == [
-        "y_slide.offset",
-        "z_slide.offset",
-    ]
+def test_a_session_may_state_globs_instead_of_a_model(raw_cycles, tmp_path):
+    session = state(raw_cycles, tmp_path, free=["*.offset", "!x_slide.offset"])
+    assert [p.name for p in fit(session).free] == ["y_slide.offset", "z_slide.offset"]
 
 
-def test_sessions_agree_or_are_asked(raw_cycles, stated, tmp_path):
-    also = say(raw_cycles, tmp_path / "also", model="full", tolerances={"*.scale_ppm": 100.0})
+def test_joined_sessions_must_state_one_model(raw_cycles, stated, tmp_path):
+    also = state(raw_cycles, tmp_path / "also", model="full", tolerances={"*.scale_ppm": 100.0})
     joined = join_sessions([stated, also])
     assert joined.purpose == Purpose("full")
     assert joined.robot.parameters.stated == {**TOLERANCES, "*.scale_ppm": 100.0}
-    offsets = say(raw_cycles, tmp_path / "offsets", model="offsets")
+    offsets = state(raw_cycles, tmp_path / "offsets", model="offsets")
     joined = join_sessions([stated, offsets])
     with pytest.raises(ParameterError) as e:
         resolve_choice(None, joined)
@@ -113,8 +111,8 @@ def test_sessions_agree_or_are_asked(raw_cycles, stated, tmp_path):
     assert resolve_choice(None, join_sessions([stated, silent])).model == "full"
 
 
-def test_one_machine_has_one_tolerance(raw_cycles, stated, tmp_path):
-    other = say(raw_cycles, tmp_path, model="full", tolerances={"*.offset_mm": 4.0})
+def test_joined_sessions_must_state_equal_tolerances(raw_cycles, stated, tmp_path):
+    other = state(raw_cycles, tmp_path, model="full", tolerances={"*.offset_mm": 4.0})
     with pytest.raises(SessionError) as e:
         join_sessions([stated, other])
     assert str(e.value) == (
@@ -126,13 +124,13 @@ def test_one_machine_has_one_tolerance(raw_cycles, stated, tmp_path):
     assert join_sessions(agreed).robot.parameters.stated == TOLERANCES
 
 
-def test_a_worker_gets_them(stated):
+def test_a_worker_has_the_stated_tolerances(stated):
     there = pickle.loads(pickle.dumps(build_sensitivity_study(stated))).session
     assert there.purpose == stated.purpose
     assert there.robot.parameters[FORK].prior_std == pytest.approx(3e-3)
 
 
-def test_later_ones_come_on_top(orthoglide):
+def test_later_tolerances_replace_earlier_ones(orthoglide):
     parameters = orthoglide.parameters.with_tolerances({"*.offset_mm": 4.0})
     parameters = parameters.with_tolerances({"x_slide.offset_mm": 2.0})
     assert [parameters[f"{a}_slide.offset"].prior_std for a in "xyz"] == [1e-3, 2e-3, 2e-3]

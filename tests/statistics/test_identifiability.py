@@ -1,4 +1,4 @@
-"""What readings tell and what they cannot tell apart: hand-made Jacobians, then real plans."""
+"""Identifiability: hand-made Jacobians, then real plans."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from folders import session_folder
+from calibrated import plan_of, session_of
 from gauges import exact
 from models import JOINTS
 
-from orthocal import Choice, calibrate, load_plan, load_session, simulate_session
-from orthocal.errors import ParameterError
+from orthocal import Choice, calibrate, simulate_session
+from orthocal.calibration.identify import identify
+from orthocal.errors import NotIdentifiableError, ParameterError
 from orthocal.estimation.problem import build_problem
 from orthocal.robot.parameters import Parameter
 from orthocal.statistics.identifiability import (
@@ -20,6 +21,8 @@ from orthocal.statistics.identifiability import (
     find_base_parameters,
 )
 from orthocal.statistics.information import Information, decompose
+
+QUICK = {"solver": "variable-projection"}
 
 
 def parameters(*names, prior_stds=None):
@@ -42,26 +45,26 @@ def analyse(columns, names, *, sigma=0.1, prior_stds=None):
     )
 
 
-def test_two_that_act_alike_are_told_as_a_sum():
+def test_of_two_equal_columns_the_sum_is_identifiable():
     found = analyse([A, B, A], ["x_leg.length", "y.z", "x_slide.offset"])
     assert [c.words for c in found.alike] == ["x_leg.length and x_slide.offset: only their sum"]
     assert found.resolvable == ("y.z",)
     assert found.rank == 2
 
 
-def test_two_that_act_oppositely_are_told_as_a_difference():
+def test_of_two_opposite_columns_the_difference_is_identifiable():
     found = analyse([A, -A], ["a", "b"])
     assert found.alike[0].words == "a and b: only their difference"
 
 
-def test_coefficients_count_in_units_not_in_tolerances():
-    """One tolerance of b, 0.5, moves as far as one of a, 2: in units b moves four times as far."""
+def test_coefficients_are_per_unit_not_per_tolerance():
+    """One tolerance of b, 0.5, moves the readings as far as one of a, 2."""
     found = analyse([A, A, B], ["a", "b", "c"], prior_stds=[2.0, 0.5, 1.0])
     assert found.alike[0].terms == (("a", 1.0), ("b", pytest.approx(4.0)))
     assert found.alike[0].words == "a and b: only a + 4 b"
 
 
-def test_what_moves_nothing_by_more_than_the_noise_is_not_seen():
+def test_parameters_with_effects_below_the_noise_are_unseen():
     found = analyse([A, 0.01 * B, C], ["a", "b", "c"])
     assert found.unseen == ("b",)
     assert found.rank == 2
@@ -71,14 +74,14 @@ def test_what_moves_nothing_by_more_than_the_noise_is_not_seen():
     assert perfect.rank == 3
 
 
-def test_base_parameters_regroup_what_depends_on_others():
+def test_base_parameters_regroup_dependent_columns():
     """The third column is the first plus half of the second."""
     found = find_base_parameters(
         np.column_stack([A, B, A + 0.5 * B]), parameters("a", "b", "c"), threshold=0.1
     )
     sums = {c.terms[0][0]: dict(c.terms) for c in found}
     assert len(sums) == 2
-    # what the base parameters predict is what all parameters predict
+    # base parameters predict the readings of all parameters
     theta = {"a": 0.3, "b": -1.2, "c": 0.7}
     columns = {"a": A, "b": B, "c": A + 0.5 * B}
     whole = sum(columns[n] * v for n, v in theta.items())
@@ -99,7 +102,7 @@ def test_observability_indices_solved_by_hand():
     assert analyse([A, B, C], ["a", "b", "c"]).condition == pytest.approx(6.0)
 
 
-def test_nothing_seen_has_no_indices():
+def test_without_identifiable_parameters_indices_are_zero():
     found = analyse([0.01 * A], ["a"])
     assert found.rank == 0
     assert set(found.observability.values()) == {0.0}
@@ -107,18 +110,18 @@ def test_nothing_seen_has_no_indices():
     assert np.isinf(found.condition)
 
 
-def test_words_for_three():
+def test_combinations_are_described_in_words():
     c = Combination((("a", 1.0), ("b", -1.0), ("c", 0.31)))
     assert c.words == "a, b and c: only a − b + 0.31 c"
     assert Combination((("a", 1.0),)).words == "a: by itself"
 
 
 @pytest.fixture(scope="module")
-def jacobians(root):
-    """Identification Jacobians of the full model at nominal, of sweep and lines."""
+def jacobians():
+    """Identification Jacobians of all errors about the nominal machine, of sweep and lines."""
     found = {}
     for name in ("sweep", "lines"):
-        plan = exact(load_plan(session_folder(root, name) / "plan.yaml"))
+        plan = exact(plan_of(name))
         problem = build_problem(plan, free=JOINTS, prior=True)
         _, jacobian = problem.predict_and_jacobian(np.zeros(problem.n_free))
         found[name] = problem, jacobian
@@ -127,7 +130,7 @@ def jacobians(root):
 
 @pytest.mark.parametrize(("plan", "rank"), [("sweep", 30), ("lines", 42)])
 def test_the_base_parameters_of_a_plan_predict_every_reading(jacobians, plan, rank):
-    """The base parameters are as many as the rank, and say all that the readings say."""
+    """Their number is the rank."""
     problem, jacobian = jacobians[plan]
     found = decompose(jacobian, problem.observations)
     assert found.rank == rank
@@ -141,12 +144,11 @@ def test_the_base_parameters_of_a_plan_predict_every_reading(jacobians, plan, ra
         lead = combination.terms[0][0]
         reduced[index[lead]] = sum(k * theta[index[n]] for n, k in combination.terms)
     seen, kept = (found.factor @ (t / problem.theta_scale) for t in (theta, reduced))
-    # coefficients below a thousandth of a tolerance are left out of the sums
+    # sums omit coefficients below a thousandth of a tolerance
     assert np.abs(kept - seen).max() < 2e-3 * np.abs(found.factor).max()
 
 
-def test_what_the_sweep_takes_for_one_the_lines_tell_apart(jacobians):
-    """The length of a leg's bars against the tilt of the axis that carries it, and more."""
+def test_lines_resolve_more_combinations_than_the_sweep(jacobians):
     alike = {}
     for name, (problem, jacobian) in jacobians.items():
         found = analyse_identifiability(
@@ -160,24 +162,23 @@ def test_what_the_sweep_takes_for_one_the_lines_tell_apart(jacobians):
     assert alike["lines"].rank > 1.5 * alike["sweep"].rank
     groups = {c.names for c in alike["sweep"].alike}
     assert ("x_slide.offset", "x_swivel.x", "x_wrist.x", "x_fork.x") in groups
-    # on displaced lines the wrist's place is no longer the same as an offset
+    # displaced lines distinguish the position of the wrist from an offset
     assert ("x_slide.offset", "x_swivel.x", "x_fork.x") in {c.names for c in alike["lines"].alike}
 
 
-def test_a_leg_length_that_only_the_zero_posture_would_show_is_one_with_the_offset(root):
-    """Known in words from a session: the swivel's place along the slide is an offset."""
-    session = load_session(root / "examples/raw-cycles")
-    result = calibrate(session, Choice(free=["*.offset", "x_swivel.x"], prior=True))
+def test_the_position_of_the_swivel_along_its_slide_is_an_offset(raw_cycles):
+    choice = Choice(free=["*.offset", "x_swivel.x"], prior=True)
+    result, _ = identify(raw_cycles, choice, **QUICK)
     words = [c.words for c in result.identifiability.alike]
     assert words == ["x_slide.offset and x_swivel.x: only their difference"]
 
 
-def test_base_parameters_without_prior_are_the_sums_of_the_truth(root):
-    """Perfect readings: each base parameter is its whole combination, to first order."""
-    plan = load_plan(root / "examples/raw-cycles/plan.yaml")
+def test_base_parameters_without_prior_are_the_sums_of_the_truth():
+    """Exact readings, to first order."""
     truth = {"x_slide.offset": 0.4e-3, "y_slide.offset": -0.3e-3, "x_swivel.x": 0.1e-3}
-    session = simulate_session(plan, truth, exact=True).session
-    result = calibrate(session, Choice(free=["*.offset", "x_swivel.x"], base=True))
+    session = simulate_session(plan_of("raw-cycles"), truth, exact=True).session
+    choice = Choice(free=["*.offset", "x_swivel.x"], base=True)
+    result, _ = identify(session, choice, **QUICK)
     assert result.base
     assert not result.prior
     assert len(result.free) == 3
@@ -189,43 +190,43 @@ def test_base_parameters_without_prior_are_the_sums_of_the_truth(root):
     assert result["y_slide.offset"].value == pytest.approx(-0.3e-3, abs=1e-8)
 
 
-def test_base_and_prior_based_solutions_predict_the_same(root):
-    """Where the prior is weak beside the readings, both describe the readings alike."""
-    session = load_session(root / "examples/sweep")
-    base = calibrate(session, Choice(model="full", base=True))
-    prior = calibrate(session, Choice(model="full", tolerances={"*.offset_m": 4e-3}))
+def test_base_parameters_and_a_weak_prior_predict_the_same_readings():
+    session = session_of("sweep")
+    base, _ = identify(session, Choice("full", base=True), **QUICK)
+    prior, _ = identify(session, Choice("full", tolerances={"*.offset_m": 4e-3}), **QUICK)
     gap = [a.predicted - b.predicted for a, b in zip(base.residuals, prior.residuals, strict=True)]
     assert np.sqrt(np.mean(np.square(gap))) < 0.4 * prior.sigma
     assert len(base.free) < 30
     assert base.noise.sigma == pytest.approx(5e-6, rel=0.15)
 
 
-def test_base_parameters_have_no_prior(root):
-    session = load_session(root / "examples/raw-cycles")
+def test_base_parameters_have_no_prior(raw_cycles):
     with pytest.raises(ParameterError, match="without any prior"):
-        calibrate(session, Choice(model="full", base=True, prior=True))
+        calibrate(raw_cycles, Choice(model="full", base=True, prior=True))
     with pytest.raises(ParameterError, match=r"state x_leg\.length_m as known without ±"):
-        calibrate(session, Choice(known={"x_leg.length_m": (1e-4, 1e-5)}, base=True))
+        calibrate(raw_cycles, Choice(known={"x_leg.length_m": (1e-4, 1e-5)}, base=True))
 
 
-def test_readings_that_tell_nothing_leave_no_base(raw_cycles):
+def test_readings_without_information_have_no_base_parameters(raw_cycles):
     rows = tuple(r for r in raw_cycles.readings if r.posture == "zero")
-    from orthocal.errors import NotIdentifiableError
-
     with pytest.raises(NotIdentifiableError, match="determine none of the free parameters"):
         calibrate(replace(raw_cycles, readings=rows), Choice(base=True))
 
 
 def test_the_base_parameters_of_table_1_are_the_three_offsets(experiment_2):
-    """What six readings with that scatter tell of 126 errors is what the paper identifies."""
-    base = calibrate(experiment_2, Choice(model="full", base=True))
-    offsets = calibrate(experiment_2, Choice("offsets", base=True))
+    """Of 129 errors its six readings resolve those that the paper identifies."""
+    base, offsets, paper, full = (
+        identify(experiment_2, choice, **QUICK)[0]
+        for choice in (
+            *(Choice(model, base=True) for model in ("full", "offsets")),
+            *(Choice(model) for model in ("offsets", "full")),
+        )
+    )
     assert [p.name for p in base.free] == [p.name for p in offsets.free]
     for a, b in zip(base.free, offsets.free, strict=True):
         assert a.value == pytest.approx(b.value, abs=1e-9)
     known = [np.diag(c.model_covariance) for c in (base, offsets)]
     assert known[0] == pytest.approx(known[1], rel=1e-6)
-    paper = calibrate(experiment_2, "offsets")
     assert [p.value for p in base.free] == pytest.approx([p.value for p in paper.free], abs=1e-9)
     assert base.redundancy == 3
-    assert calibrate(experiment_2, "full").redundancy == 0
+    assert full.redundancy == 0
