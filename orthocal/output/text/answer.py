@@ -69,7 +69,7 @@ STYLES: dict[Verdict, str] = {"enter": "bold green", "review": "bold yellow", "r
 LONGEST_LINE = 150
 """Characters of a line with names from files, in the short answer."""
 
-MORE = "--details prints all readings, residuals, parameters and tool errors."
+MORE = "--details prints all readings, all errors of the machine and the tool error."
 
 
 def render_answer(
