@@ -123,8 +123,8 @@ def correct(
     """Correct a G-code program for the errors of the machine.
 
     The program is for a controller without the kinematics module of `export`. Lines and arcs are
-    divided into chords that stay near the corrected path. The feed along the path and all other
-    words are preserved.
+    divided into short lines that stay near the corrected path. The feed along the path and all
+    other words are preserved.
     Comments at the top mark the program as corrected; such a program is refused.
     With --tool the program may use one tool only. If a line cannot be corrected, its number and
     the reason are reported, and nothing is written. A note names the first line that leaves the

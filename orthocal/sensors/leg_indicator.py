@@ -284,7 +284,7 @@ class LegIndicator:
             offset = " ".join(
                 f"{axis} {v / MM:+g}" for axis, v in zip("xyz", self.beside, strict=True) if v
             )
-            words += f", at the mechanical zero {offset} mm off its centre line"
+            words += f", {offset} mm off its centre line"
         return words
 
     def frames(self, robot: Robot) -> Frames:

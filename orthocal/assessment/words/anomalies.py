@@ -47,11 +47,8 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
         return _ambiguous(session, result, anomaly)
     first = session.readings[e.rows[0]]
     descriptions = [_text(session, c) for c in anomaly.causes] or [_text(session, e)]
-    text = _capitalised(f"{_lines(session, e)}it looks as if {descriptions[0]}.")
-    if len(descriptions) > 1:
-        listed = ";\n  ".join(descriptions)
-        text = _capitalised(f"{_lines(session, e)}one of these may have happened:\n  {listed}.")
     numbers = _numbers(result, anomaly)
+    text = _looks_as_if(session, anomaly, descriptions)
     if e.amounts:
         numbers["amount_um"] = (e.amount or 0.0) / UM
         action = _effect_remedy(session, result)
@@ -59,11 +56,6 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
     if e.kind in ("wrong dimension", "readjusted dimension"):
         numbers["dimension_mm"], numbers["stated_mm"] = _dimensions_mm(e)
     if anomaly.expected is not None:
-        if not _is_trigger(session, e):
-            text += (
-                f" It reads {signed(first.value / MM)} mm; the other readings predict "
-                f"{signed(anomaly.expected / MM)} mm."
-            )
         numbers |= {
             "measured_mm": first.value / MM,
             "expected_mm": anomaly.expected / MM,
@@ -71,6 +63,23 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
         }
     action = _repeat(session, e) if anomaly.causes else _remedy(session, e)
     return review(e.kind, text, action, _places(session, e), **numbers)
+
+
+def _looks_as_if(session: Session, anomaly: Anomaly, descriptions: Sequence[str]) -> str:
+    """Sentences about one anomaly: its causes, and the reading that the others predict."""
+    e, predicted = anomaly.explanation, ""
+    if anomaly.expected is not None and not _is_trigger(session, e):
+        value = session.readings[e.rows[0]].value
+        predicted = (
+            f"it reads {signed(value / MM)} mm; the other readings predict "
+            f"{signed(anomaly.expected / MM)} mm."
+        )
+    listed = ";\n  ".join(descriptions)
+    sentences = [predicted, f"one of these may have happened:\n  {listed}."]
+    if len(descriptions) == 1:
+        sentences = [f"it looks as if {listed}.", predicted]
+    first, *others = [s for s in sentences if s]
+    return " ".join(map(_capitalised, [f"{_lines(session, e)}{first}", *others]))
 
 
 def _effect_places(session: Session, e: Explanation) -> tuple[Place, ...]:
@@ -270,7 +279,7 @@ def _lines(session: Session, e: Explanation) -> str:
 
 def _capitalised(text: str) -> str:
     """A text with a capital first letter."""
-    return f"{text[0].upper()}{text[1:]}"
+    return f"{text[:1].upper()}{text[1:]}"
 
 
 def _row(session: Session, row: int) -> str:
@@ -582,7 +591,7 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
     if file is None or rows[0].line is None:
         return f"Read {what} again, or leave out what is wrong."
     line, path = rows[0].line, printable(shlex.quote(str(file.parent)))
-    others = "" if len(rows) == 1 else ", and so on"
+    others = "" if len(rows) == 1 else ", likewise the other lines"
     return (
         f"Read {what} again: in `orthocal record {path}` type `again {line}`{others}. "
         f"`back {line}` corrects a mistyped reading, `drop {line}` deletes it."

@@ -16,7 +16,7 @@ from orthocal.units import UM
 HEADLINES: dict[Verdict, str] = {
     "enter": "Enter these offsets, then measure again.",
     "review": "Check these readings before you enter anything.",
-    "reject": "Do not enter these offsets.",
+    "reject": "Do not enter offsets from these readings.",
 }
 """Headlines of the verdicts on a calibration."""
 

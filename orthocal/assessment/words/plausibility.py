@@ -174,7 +174,7 @@ def scattered_repeats(
     """
     return review(
         "scattered repeats",
-        f"Repeated readings scatter by {mm(scatter)} mm; the gauge explains {mm(gauge)} mm. They "
+        f"Repeated readings scatter by {mm(scatter)} mm; the gauge alone by {mm(gauge)} mm. They "
         f"differ most at {label}: {shown}.",
         "Check these lines for a wrong sign or a wrong line, and read them again.",
         places,

@@ -106,19 +106,19 @@ def describe_repetition(
     r, where = repetition, f" in '{title}'" if title else ""
     numbers = {"rows": float(r.matched), "correlation": r.correlation, "chance": r.p_value}
     if r.repeats is None:
-        reason = f"the calibration fits nearly all of the {r.matched} shared lines"
+        reason = f"the calibration leaves none in nearly all of the {r.matched} shared lines"
         if r.matched < MIN_ROWS:
             reason = "too few lines are shared"
-        text = f"It is unknown whether the residuals repeat{where}: {reason}."
+        text = f"It is unknown whether the same deviations remain{where}: {reason}."
         return note("repetition unknown", text, **numbers)
     if r.repeats:
         text = (
-            f"The same residuals remain as before{where}: they are errors that this model does not "
-            "contain, and more readings of the same kind do not reduce them."
+            f"The same deviations remain as before{where}: they are errors that this model does "
+            "not contain, and more readings of the same kind do not reduce them."
         )
         return note("residuals repeat", text, **numbers)
     meaning = "they did not occur in the calibration" if exceeded else "they look like noise"
-    text = f"The residuals do not repeat{where}: {meaning}."
+    text = f"The remaining deviations do not repeat{where}: {meaning}."
     return note("residuals differ", text, **numbers)
 
 

@@ -152,5 +152,5 @@ def scaled_bounds(
 def advise(options: SolverOptions) -> str:
     """Advice if a solver does not converge, or converges to an impossible machine."""
     return "Look for a reading with a wrong sign or in a wrong row" + (
-        "" if options.loss.robust else "; the robust loss ('huber') may show which one"
+        "" if options.loss.robust else "; the loss 'huber' (option --loss) may show which one"
     )

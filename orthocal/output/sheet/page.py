@@ -298,8 +298,8 @@ def _mount_on_base(gauge: GaugePosition) -> tuple[str, ...]:
         reach = gauge.hinge_distances / MM
         contact = (
             f"Its {name_tip(gauge.tip)} touches {_across(gauge)}, {reach[gauge.aligned]:.1f} mm "
-            "from the hinge on the slide. The rod then moves along the tip: in the other postures "
-            f"this distance is {reach.min():.0f} to {reach.max():.0f} mm. "
+            "from the hinge on the slide. Then the rod slides past the tip: during the setup the "
+            f"distance becomes {reach.min():.0f} to {reach.max():.0f} mm. "
         )
         if gauge.tip is not None and gauge.tip.edge is None:
             contact += "Align the ball by eye: half a millimetre is good enough. "

@@ -242,8 +242,9 @@ def describe_remaining(errors: Iterable[RemainingError]) -> list[str]:
             f"{name} {read_limit(size):+.2f}" for name, size in error.parts[:MOST_PARTS]
         )
         if error.rms > UM:
-            which = f" by these errors together, in tolerances: {parts}" if parts else ""
-            lines.append(f"The tool may still be off by {um(error.rms)} µm RMS{which}.")
+            size = f"may still move the tool by {um(error.rms)} µm RMS"
+            which = f"These errors together {size}; in tolerances: {parts}."
+            lines.append(which if parts else f"Errors that were not determined {size}.")
     return lines
 
 

@@ -74,7 +74,7 @@ NEW_NOTE = (
 )
 """Meaning of the column `new` of offsets."""
 
-MORE = "--details prints all readings, residuals, parameters and tool errors."
+MORE = "--details prints all readings, all errors of the machine and the tool error."
 
 
 def render_answer(
@@ -235,12 +235,14 @@ def _next_step(
             f"orthocal export {directory} --to linuxcnc --out {module}",
             f"orthocal correct {directory} PROGRAM.ngc{active} --out CORRECTED.ngc",
         )
-    words = "enter the offsets, home the machine and measure again."
-    if any(e.change for e in assessment.backlash):
-        what = "backlash" if unchanged else "offsets and the backlash"
-        words = f"enter the {what}, home the machine and measure again."
-    elif unchanged:
-        words = "nothing to enter. After a crash or a change of the machine measure again."
+    changes = [] if unchanged else ["the offsets"]
+    changes += ["the backlash"] * any(e.change for e in assessment.backlash)
+    words = "nothing to enter. After a crash or a change of the machine measure again."
+    if changes:
+        words = (
+            f"enter {joined(changes)} (for LinuxCNC: `orthocal export`), home the machine and "
+            "measure again."
+        )
     return words, (
         f"orthocal again {directory} --out {new}",
         f"orthocal record {new}",

@@ -178,7 +178,7 @@ class RecordingText:
             f"{counted(len(of_setup), 'reading')}"
         )
         sensor = setup.sensor.in_file if isinstance(setup.sensor, Points) else setup.sensor
-        parts = [f"Gauge: {sensor.describe()}", self._stand(name), _gauge(session, setup)]
+        parts = [f"Place: {sensor.describe()}", self._stand(name), _gauge(session, setup)]
         if any(r.is_read for r in of_setup) and any(r.minus is None for r in of_setup):
             parts.append(
                 "This setup has readings. If the stand or the dial has moved since, `restart` the "
