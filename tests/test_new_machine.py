@@ -457,7 +457,7 @@ def test_the_first_plan_of_a_delta_is_its_bed_and_names_what_helps(tmp_path):
 def test_sensors_that_one_has_are_planned(tmp_path):
     bar = "sensor: ball_bar\nsigma_mm: 0.002\nrange_mm: [-5, 5]\nlength_mm: 50\n"
     (tmp_path / "bar.yaml").write_text(bar)
-    words = ["--with", tmp_path / "bar.yaml", "--hours", "0.5"]
+    words = ["--with", tmp_path / "bar.yaml", "--hours", "0.5", "--tolerance", "*.offset_mm=1"]
     code, said, err = orthocal("new", tmp_path / "delta", *DELTA, *words)
     assert code == 0, err
     session = load_plan(tmp_path / "delta/first")
