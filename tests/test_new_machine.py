@@ -106,17 +106,26 @@ def test_effects_without_usual_keys_are_refused(tmp_path, effects, message):
     assert not (tmp_path / "mill").exists()
 
 
+def offset_limits(machine):
+    """Tolerances of the zeros, [mm]: those of the machine, which its session does not repeat."""
+    robot, session = load_robot(machine), load_plan(machine / "first")
+    assert session.robot.parameters.stated == {}
+    names = [f"{drive.name}.offset" for drive in robot.drives]
+    limits = [robot.parameters.limit_of(name) for name in names]
+    assert [session.robot.parameters.limit_of(name) for name in names] == limits
+    return limits
+
+
 def test_zeros_have_one_usual_tolerance(made, tmp_path):
     """4 mm, with all dimensions as options as in the dialogue; the sheet's limit follows it."""
-    assert load_plan(made / "first").robot.parameters.stated == {"*.offset_mm": 4.0}
+    assert offset_limits(made) == [4.0, 4.0, 4.0]
     assert load_robot(made).parameters["z_slide.offset"].prior_std == 2e-3
     sheet = (made / "first/sheet.html").read_text()
     assert "differs by more than 7 mm" in sheet  # 4 mm, and half a degree of legs of 250 mm
     words = [*options(), "--paper", "--tolerance", "x_slide.offset_mm=12"]
     code, _, err = orthocal("new", tmp_path / "mill", *words)
     assert (code, err.splitlines()) == (0, ["orthocal: drawing the measuring sheet"])
-    tolerances = {"*.offset_mm": 4.0, "x_slide.offset_mm": 12.0}
-    assert load_plan(tmp_path / "mill/first").robot.parameters.stated == tolerances
+    assert offset_limits(tmp_path / "mill") == [12.0, 4.0, 4.0]
     assert "differs by more than 15 mm" in (tmp_path / "mill/first/sheet.html").read_text()
 
 
@@ -216,7 +225,7 @@ def test_without_paper_a_plan_is_chosen(planned):
     assert len(list(first.glob("*.ngc"))) == len(session.setups)
     assert {s.sensor.tip.form for s in session.setups.values()} == {"ball"}
     assert session.purpose == Purpose("full")
-    assert session.robot.parameters.stated == {"*.offset_mm": 4.0}
+    assert session.robot.parameters.stated == {}
     assert session.robot.parameters["y_slide.offset"].prior_std == 2e-3
     machine = load_robot(mill)  # later plans for the machine use these tolerances, too
     assert machine.parameters["y_slide.offset"].prior_std == 2e-3
@@ -375,7 +384,7 @@ def test_invalid_answers_are_asked_for_again(root, tmp_path):
     assert [d.direction for d in robot.drives] == [1, -1, 1]
     assert robot.legs["x"].rods["a"].radius == pytest.approx(0.004)
     session = load_plan(tmp_path / "mill/first")
-    assert session.robot.parameters.stated == {"*.offset_mm": 3.0}
+    assert offset_limits(tmp_path / "mill") == [3.0, 3.0, 3.0]
 
 
 def test_nothing_is_written_when_the_input_ends(root, tmp_path):

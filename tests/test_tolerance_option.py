@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shlex
+from pathlib import Path
 
 import pytest
 import yaml
@@ -14,9 +16,11 @@ from orthocal import (
     check_session,
     compare_models,
     load_calibration,
+    load_plan,
     load_session,
     write_session,
 )
+from orthocal.output.text.answer import calibrate_command
 
 OF_JOINTS = {"*.[xyz]_mm": 0.02, "*.r?_mrad": 0.2}
 STATED = OF_JOINTS | {"x_slide.offset_mm": 8.0}
@@ -65,7 +69,11 @@ def test_the_option_is_the_key(folder, words):
     )
     assert plain.returncode == stated.returncode
     assert compared(plain.stdout) == compared(stated.stdout)
-    assert compared(plain.stdout) != compared(unlike.stdout)
+    if words[0] == "validate":  # the calibration has other tolerances than the session
+        assert unlike.returncode == 2
+        assert "3/session.yaml: calibration.tolerances" in unlike.stderr
+    else:
+        assert compared(plain.stdout) != compared(unlike.stdout)
 
 
 def test_a_calibration_keeps_the_option(folder):
@@ -113,6 +121,21 @@ def test_sessions_that_state_different_tolerances_join_by_the_option(folder):
     words = ["check", "stated/2", "stated/other"]
     assert run_orthocal(folder, *words).returncode == 2
     assert run_orthocal(folder, *words, "--tolerance", "*.offset_mm=8").returncode != 2
+
+
+def test_a_session_made_again_states_the_option(folder):
+    """The sessions of a joined calibration do not; nor does their robot."""
+    joined = ["2", "3", *OPTION, "--solver", "linearised"]
+    assert run_orthocal(folder / "plain", "calibrate", *joined, "--out", "both").returncode == 3
+    done = run_orthocal(folder / "plain", "again", "both", "--anyway", "--out", "next")
+    assert done.returncode == 0, done.stderr
+    assert load_plan(folder / "plain/next").robot.parameters.stated == STATED
+    assert load_plan(folder / "plain/3").robot.parameters.stated == {}
+
+
+def test_the_printed_calibration_of_all_sessions_repeats_the_option():
+    words = shlex.split(calibrate_command([Path("one day"), Path("two")], STATED))
+    assert words == ["orthocal", "calibrate", "one day", "two", *OPTION, "--out", "two-calibration"]
 
 
 def test_in_python_the_argument_is_the_key(folder):

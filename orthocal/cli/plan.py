@@ -134,6 +134,7 @@ def plan(
     if out is not None:
         with worker_budget(workers):
             _write(chosen, out)
+        put_note(_describe_next(subject, chosen, out, stated=bool(options.tolerance)))
     elif not json:
         put_note("Nothing was written; --out DIRECTORY writes session, sheet and programs.")
 
@@ -177,6 +178,24 @@ def _choose(subject: str, options: PlanOptions, *, workers: int) -> orthocal.Mea
         reference=subject if measured is None else measured.robot_reference,
         workers=workers,
         report=lambda text: put_note(f"orthocal: {text}"),
+    )
+
+
+def _describe_next(subject: str, plan: orthocal.MeasuringPlan, out: Path, *, stated: bool) -> str:
+    """Next commands: record the readings, and calibrate with those that they complement.
+
+    Args:
+        subject: Robot, or session that the plan complements.
+        plan: The plan.
+        out: Directory of the plan.
+        stated: True if the tolerances are those of an option.
+    """
+    from orthocal.output.text.answer import calibrate_command, quote_path
+
+    sessions = [Path(subject), out] if plan.complements else [out]
+    tolerances = plan.session.robot.parameters.stated if stated and plan.complements else {}
+    return (
+        f"Next:\n  orthocal record {quote_path(out)}\n  {calibrate_command(sessions, tolerances)}"
     )
 
 

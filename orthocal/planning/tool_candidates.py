@@ -85,16 +85,10 @@ def list_tool_candidates(
     """
     if not owned:
         return {}, {}, {}, []
-    _require_coordinates(robot, owned)
+    _require_usable(robot, owned)
     stated = robot.workspace if box is None else box
     limits, middle = choose_box(robot, stated), tool_at_zero(robot)
     gauges = {sensor.name: sensor.gauge for sensor in owned}
-    names = [DIAL, *(sensor.name for sensor in owned)]
-    for sensor in owned:
-        if names.count(sensor.name) > 1:
-            raise SessionError(
-                f"two gauges are named '{sensor.name}'; rename the file", where=str(sensor.file)
-            )
     places = [
         (sensor, *place) for sensor in owned for place in _places(sensor, robot, middle, limits)
     ]
@@ -126,16 +120,24 @@ def list_tool_candidates(
     placed = {names_in_files(setup)[1] for setup in setups.values()}
     for sensor in owned:
         if sensor.name not in placed:
-            raise ParameterError("the machine reaches no place for it", where=str(sensor.file))
+            problem = "the machine reaches no place for it that is clear of its rods"
+            raise ParameterError(problem, where=str(sensor.file))
     return gauges, postures, setups, readings
 
 
-def _require_coordinates(robot: Robot, owned: Sequence[OwnedSensor]) -> None:
-    """Refuse sensors that need a tool that moves in space.
+def _require_usable(robot: Robot, owned: Sequence[OwnedSensor]) -> None:
+    """Refuse sensors of the same name, and those that need a tool that moves in space.
 
     Raises:
-        ParameterError: Naming the file of the sensor.
+        SessionError: If two gauges have one name; names the file of the sensor.
+        ParameterError: If the tool does not move in space; names the file of the sensor.
     """
+    names = [DIAL, *(sensor.name for sensor in owned)]
+    for sensor in owned:
+        if names.count(sensor.name) > 1:
+            raise SessionError(
+                f"two gauges are named '{sensor.name}'; rename the file", where=str(sensor.file)
+            )
     count = 0 if robot.tcp is None else len(robot.tcp.coordinates)
     for sensor in owned:
         if count < (2 if sensor.keys["sensor"] in IN_PLANE else 3):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -57,6 +58,8 @@ def test_a_plan_is_written_ready_to_measure(tmp_path):
     assert all(row.endswith(",") for row in rows[1:])
     assert len(rows) == 1 + 24
     assert "an empty readings.csv" in err
+    next_commands = [f"orthocal record {out}", f"orthocal calibrate {out} --out {out}-calibration"]
+    assert [line.strip() for line in err.splitlines()[-2:]] == next_commands
     document = json.loads((out / "plan.json").read_text())
     assert document["readings"] + document["closing_readings"] == 24
     assert (out / "plan.svg").read_text().startswith('<?xml version="1.0"')
@@ -129,14 +132,17 @@ def test_offsets_that_too_few_readings_leave_are_named():
     assert err.endswith("--out DIRECTORY writes session, sheet and programs.\n")
 
 
-def test_further_setups_of_a_session_are_planned(root):
+def test_further_setups_of_a_session_are_planned(root, tmp_path):
     session = root / "examples/workshop"
     code, text, _ = run_orthocal(".", "plan", session, "--add", 2, "--json", *QUICK)
     assert code == 0
     found = json.loads(text)
     assert found["setups"] == 2
     assert found["expected"]["aligned_um"] < found["before"]["aligned_um"]
-    code, text, _ = run_orthocal(".", "plan", session, "--add", 2, *QUICK)
+    option, out = ["--tolerance", "*.offset_mm=8"], tmp_path / "out"
+    code, text, err = run_orthocal(".", "plan", session, "--add", 2, *QUICK, *option, "--out", out)
+    calibrating = ["orthocal", "calibrate", str(session), str(out), *option]
+    assert shlex.split(err.splitlines()[-1]) == [*calibrating, "--out", f"{out}-calibration"]
     said = " ".join(text.split())
     words = r"([\d.]+) mm with these readings added \(([\d.]+) mm with those of the session alone\)"
     after, before = map(float, re.search(words, said).groups())
