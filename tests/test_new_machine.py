@@ -383,7 +383,6 @@ def test_invalid_answers_are_asked_for_again(root, tmp_path):
     assert robot.workspace.tolist() == [[-0.05, 0.06], [-0.05, 0.06], [-0.04, 0.04]]
     assert [d.direction for d in robot.drives] == [1, -1, 1]
     assert robot.legs["x"].rods["a"].radius == pytest.approx(0.004)
-    session = load_plan(tmp_path / "mill/first")
     assert offset_limits(tmp_path / "mill") == [3.0, 3.0, 3.0]
 
 
