@@ -12,6 +12,7 @@ import sys
 
 import numpy as np
 import pytest
+import yaml
 from commands import orthocal
 from folders import files_of
 from lxml import etree
@@ -122,11 +123,16 @@ def test_zeros_have_one_usual_tolerance(made, tmp_path):
     assert load_robot(made).parameters["z_slide.offset"].prior_std == 2e-3
     sheet = (made / "first/sheet.html").read_text()
     assert "differs by more than 7 mm" in sheet  # 4 mm, and half a degree of legs of 250 mm
-    words = [*options(), "--paper", "--tolerance", "x_slide.offset_mm=12"]
+    words = [*options(), "--paper", "--tolerance", "x_slide.offset_mm=12", "--backlash", "0"]
     code, _, err = orthocal("new", tmp_path / "mill", *words)
     assert (code, err.splitlines()) == (0, ["orthocal: drawing the measuring sheet"])
     assert offset_limits(tmp_path / "mill") == [12.0, 4.0, 4.0]
-    assert "differs by more than 15 mm" in (tmp_path / "mill/first/sheet.html").read_text()
+    sheet = (tmp_path / "mill/first/sheet.html").read_text()
+    assert "differs by more than 15 mm" in sheet
+    assert "compensates no backlash, as session.yaml states" in sheet
+    first = tmp_path / "mill/first/session.yaml"
+    assert yaml.safe_load(first.read_text())["controller"]["backlash_mm"] == [0.0, 0.0, 0.0]
+    assert "compensates no backlash" not in (made / "first/sheet.html").read_text()
 
 
 def test_numbers_of_drives_are_those_of_the_controller(made):

@@ -51,7 +51,7 @@ class JointTrim:
 
 
 Compensation = tuple[JointTrim, ...]
-"""Trim of the joint of each drive, in the robot's order; empty without compensation."""
+"""Trim of the joint of each drive, in the robot's order; empty if not stated."""
 
 SAME_TRIM = 1e-9
 """Largest difference between equal trims, [m, rad]: tables are written to 1e-6 mm."""

@@ -33,6 +33,7 @@ from orthocal.assessment import assess, comparison
 from orthocal.assessment.judgement import judge_session
 from orthocal.calibration.assessment_record import EXIT_CODES, Finding, FindingKind, Severity
 from orthocal.output.text.summary import result_json
+from orthocal.session.session import Conditions
 
 UNITS = ("_mm", "_um", "_mrad", "_deg")
 
@@ -293,6 +294,12 @@ NOTES = {
     "no offset": lambda c, t: calibrate(c, Choice(free=["x_leg.length"])),
     "no change needed": lambda c, t: calibrate(t["3"]),
     "fits": lambda c, t: calibrate(c),
+    "backlash not stated": lambda c, t: calibrate(
+        replace(
+            c.with_effects(["backlash"]),
+            readings=tuple(replace(r, conditions=Conditions("ppp")) for r in c.readings),
+        )
+    ),
     "earlier readings": lambda c, t: calibrate(c.with_controller(np.full(3, 1e-3))),
 }
 

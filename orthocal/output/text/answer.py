@@ -56,6 +56,7 @@ LISTED: tuple[FindingKind, ...] = (
     "above tolerances",
     "no redundancy",
     "earlier readings",
+    "backlash not stated",
     "held by a bound",
     "not significant",
     "line assumed",
