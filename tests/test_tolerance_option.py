@@ -69,11 +69,19 @@ def test_the_option_is_the_key(folder, words):
     )
     assert plain.returncode == stated.returncode
     assert compared(plain.stdout) == compared(stated.stdout)
-    if words[0] == "validate":  # the calibration has other tolerances than the session
-        assert unlike.returncode == 2
-        assert "3/session.yaml: calibration.tolerances" in unlike.stderr
-    else:
-        assert compared(plain.stdout) != compared(unlike.stdout)
+    of_calibration = words[0] == "validate"  # its tolerances are those of silent sessions
+    assert (compared(plain.stdout) == compared(unlike.stdout)) == of_calibration
+
+
+def test_a_session_of_other_tolerances_than_the_calibration_is_not_validated(folder):
+    other = ["--tolerance", "*.offset_mm=1"]
+    session = load_session(folder / "stated/3").with_tolerances({"*.offset_mm": 1.0})
+    write_session(session, folder / "stated/narrow")
+    done = run_orthocal(folder / "stated", "validate", "calibration", "narrow")
+    assert done.returncode == 2
+    assert "narrow/session.yaml: calibration.tolerances" in done.stderr
+    done = run_orthocal(folder / "stated", "validate", "calibration", "narrow", *other)
+    assert done.returncode != 2, done.stderr
 
 
 def test_a_calibration_keeps_the_option(folder):

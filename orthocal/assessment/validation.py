@@ -254,12 +254,19 @@ def _apply_stated(
 ) -> tuple[Calibration, list[Session]]:
     """Calibration and new sessions with the stated tolerances and mechanical adjustments.
 
+    A session that states no tolerances has those of the calibration.
+
     Raises:
         SessionError: If a session belongs to the calibration, an adjustment does not fit, or
             tolerances differ from those of the calibration.
     """
-    restated = [session.with_tolerances(tolerances) for session in sessions]
     robot = calibration.robot.with_tolerances(tolerances)
+    restated = [
+        session.with_tolerances(
+            tolerances if session.robot.parameters.stated else robot.parameters.stated
+        )
+        for session in sessions
+    ]
     for session in restated:
         require_same_tolerances(robot, session, source="the calibration")
     calibration = _adjust_to_sessions(replace(calibration, robot=robot), restated)
