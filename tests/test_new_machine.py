@@ -12,6 +12,7 @@ import sys
 
 import numpy as np
 import pytest
+import yaml
 from commands import orthocal
 from folders import files_of
 from lxml import etree
@@ -106,18 +107,32 @@ def test_effects_without_usual_keys_are_refused(tmp_path, effects, message):
     assert not (tmp_path / "mill").exists()
 
 
+def offset_limits(machine):
+    """Tolerances of the zeros, [mm]: those of the machine, which its session does not repeat."""
+    robot, session = load_robot(machine), load_plan(machine / "first")
+    assert session.robot.parameters.stated == {}
+    names = [f"{drive.name}.offset" for drive in robot.drives]
+    limits = [robot.parameters.limit_of(name) for name in names]
+    assert [session.robot.parameters.limit_of(name) for name in names] == limits
+    return limits
+
+
 def test_zeros_have_one_usual_tolerance(made, tmp_path):
     """4 mm, with all dimensions as options as in the dialogue; the sheet's limit follows it."""
-    assert load_plan(made / "first").robot.parameters.stated == {"*.offset_mm": 4.0}
+    assert offset_limits(made) == [4.0, 4.0, 4.0]
     assert load_robot(made).parameters["z_slide.offset"].prior_std == 2e-3
     sheet = (made / "first/sheet.html").read_text()
     assert "differs by more than 7 mm" in sheet  # 4 mm, and half a degree of legs of 250 mm
-    words = [*options(), "--paper", "--tolerance", "x_slide.offset_mm=12"]
+    words = [*options(), "--paper", "--tolerance", "x_slide.offset_mm=12", "--backlash", "0"]
     code, _, err = orthocal("new", tmp_path / "mill", *words)
     assert (code, err.splitlines()) == (0, ["orthocal: drawing the measuring sheet"])
-    tolerances = {"*.offset_mm": 4.0, "x_slide.offset_mm": 12.0}
-    assert load_plan(tmp_path / "mill/first").robot.parameters.stated == tolerances
-    assert "differs by more than 15 mm" in (tmp_path / "mill/first/sheet.html").read_text()
+    assert offset_limits(tmp_path / "mill") == [12.0, 4.0, 4.0]
+    sheet = (tmp_path / "mill/first/sheet.html").read_text()
+    assert "differs by more than 15 mm" in sheet
+    assert "compensates no backlash, as session.yaml states" in sheet
+    first = tmp_path / "mill/first/session.yaml"
+    assert yaml.safe_load(first.read_text())["controller"]["backlash_mm"] == [0.0, 0.0, 0.0]
+    assert "compensates no backlash" not in (made / "first/sheet.html").read_text()
 
 
 def test_numbers_of_drives_are_those_of_the_controller(made):
@@ -216,7 +231,7 @@ def test_without_paper_a_plan_is_chosen(planned):
     assert len(list(first.glob("*.ngc"))) == len(session.setups)
     assert {s.sensor.tip.form for s in session.setups.values()} == {"ball"}
     assert session.purpose == Purpose("full")
-    assert session.robot.parameters.stated == {"*.offset_mm": 4.0}
+    assert session.robot.parameters.stated == {}
     assert session.robot.parameters["y_slide.offset"].prior_std == 2e-3
     machine = load_robot(mill)  # later plans for the machine use these tolerances, too
     assert machine.parameters["y_slide.offset"].prior_std == 2e-3
@@ -374,8 +389,7 @@ def test_invalid_answers_are_asked_for_again(root, tmp_path):
     assert robot.workspace.tolist() == [[-0.05, 0.06], [-0.05, 0.06], [-0.04, 0.04]]
     assert [d.direction for d in robot.drives] == [1, -1, 1]
     assert robot.legs["x"].rods["a"].radius == pytest.approx(0.004)
-    session = load_plan(tmp_path / "mill/first")
-    assert session.robot.parameters.stated == {"*.offset_mm": 3.0}
+    assert offset_limits(tmp_path / "mill") == [3.0, 3.0, 3.0]
 
 
 def test_nothing_is_written_when_the_input_ends(root, tmp_path):
@@ -457,7 +471,7 @@ def test_the_first_plan_of_a_delta_is_its_bed_and_names_what_helps(tmp_path):
 def test_sensors_that_one_has_are_planned(tmp_path):
     bar = "sensor: ball_bar\nsigma_mm: 0.002\nrange_mm: [-5, 5]\nlength_mm: 50\n"
     (tmp_path / "bar.yaml").write_text(bar)
-    words = ["--with", tmp_path / "bar.yaml", "--hours", "0.5"]
+    words = ["--with", tmp_path / "bar.yaml", "--hours", "0.5", "--tolerance", "*.offset_mm=1"]
     code, said, err = orthocal("new", tmp_path / "delta", *DELTA, *words)
     assert code == 0, err
     session = load_plan(tmp_path / "delta/first")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shlex
+from pathlib import Path
 
 import pytest
 import yaml
@@ -14,9 +16,11 @@ from orthocal import (
     check_session,
     compare_models,
     load_calibration,
+    load_plan,
     load_session,
     write_session,
 )
+from orthocal.output.text.answer import calibrate_command
 
 OF_JOINTS = {"*.[xyz]_mm": 0.02, "*.r?_mrad": 0.2}
 STATED = OF_JOINTS | {"x_slide.offset_mm": 8.0}
@@ -65,7 +69,19 @@ def test_the_option_is_the_key(folder, words):
     )
     assert plain.returncode == stated.returncode
     assert compared(plain.stdout) == compared(stated.stdout)
-    assert compared(plain.stdout) != compared(unlike.stdout)
+    of_calibration = words[0] == "validate"  # its tolerances are those of silent sessions
+    assert (compared(plain.stdout) == compared(unlike.stdout)) == of_calibration
+
+
+def test_a_session_of_other_tolerances_than_the_calibration_is_not_validated(folder):
+    other = ["--tolerance", "*.offset_mm=1"]
+    session = load_session(folder / "stated/3").with_tolerances({"*.offset_mm": 1.0})
+    write_session(session, folder / "stated/narrow")
+    done = run_orthocal(folder / "stated", "validate", "calibration", "narrow")
+    assert done.returncode == 2
+    assert "narrow/session.yaml: calibration.tolerances" in done.stderr
+    done = run_orthocal(folder / "stated", "validate", "calibration", "narrow", *other)
+    assert done.returncode != 2, done.stderr
 
 
 def test_a_calibration_keeps_the_option(folder):
@@ -113,6 +129,21 @@ def test_sessions_that_state_different_tolerances_join_by_the_option(folder):
     words = ["check", "stated/2", "stated/other"]
     assert run_orthocal(folder, *words).returncode == 2
     assert run_orthocal(folder, *words, "--tolerance", "*.offset_mm=8").returncode != 2
+
+
+def test_a_session_made_again_states_the_option(folder):
+    """The sessions of a joined calibration do not; nor does their robot."""
+    joined = ["2", "3", *OPTION, "--solver", "linearised"]
+    assert run_orthocal(folder / "plain", "calibrate", *joined, "--out", "both").returncode == 3
+    done = run_orthocal(folder / "plain", "again", "both", "--anyway", "--out", "next")
+    assert done.returncode == 0, done.stderr
+    assert load_plan(folder / "plain/next").robot.parameters.stated == STATED
+    assert load_plan(folder / "plain/3").robot.parameters.stated == {}
+
+
+def test_the_printed_calibration_of_all_sessions_repeats_the_option():
+    words = shlex.split(calibrate_command([Path("one day"), Path("two")], STATED))
+    assert words == ["orthocal", "calibrate", "one day", "two", *OPTION, "--out", "two-calibration"]
 
 
 def test_in_python_the_argument_is_the_key(folder):

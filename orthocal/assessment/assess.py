@@ -152,6 +152,7 @@ def assess(
         *find_fit_findings(calibration),
         *([_no_change_needed(calibration, entries, chosen.best)] if keep else []),
         *([] if firmware else _entry_findings(calibration, entries, tool, keep=keep)),
+        *(_backlash_findings(calibration) if chosen.backlash and not firmware else []),
         *describe_recommendation(
             recommendation or recommend_model(session_used),
             judged_scale=judgement.tolerance_scale.factor,
@@ -331,6 +332,16 @@ def _entry_findings(
     if insignificant:
         findings.append(words.not_significant(insignificant))
     return findings
+
+
+def _backlash_findings(calibration: Calibration) -> list[Finding]:
+    """Finding that a session does not state the backlash that its controller compensates."""
+    session = calibration.session
+    stated = [
+        session.compensation if s.compensation is None else s.compensation
+        for s in calibration.setups
+    ]
+    return [] if all(stated) else [words.backlash_not_stated(len(calibration.robot.drives))]
 
 
 def is_significant(calibration: Calibration, entry: ControllerEntry) -> bool:

@@ -48,7 +48,12 @@ from orthocal.estimation.fit import Fit
 from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomalies, Anomaly
 from orthocal.hypotheses.search import find_anomalies
 from orthocal.io.fields import finite_or_none
-from orthocal.measurement.joining import Given, gather_sessions, join_sessions
+from orthocal.measurement.joining import (
+    Given,
+    gather_sessions,
+    join_sessions,
+    require_same_tolerances,
+)
 from orthocal.session.session import Session
 from orthocal.statistics.chance import BY_CHANCE
 from orthocal.units import MM
@@ -244,11 +249,21 @@ def _apply_stated(
 ) -> tuple[Calibration, list[Session]]:
     """Calibration and new sessions with the stated tolerances and mechanical adjustments.
 
+    A session that states no tolerances has those of the calibration.
+
     Raises:
-        SessionError: If a session belongs to the calibration, or an adjustment does not fit.
+        SessionError: If a session belongs to the calibration, an adjustment does not fit, or
+            tolerances differ from those of the calibration.
     """
-    restated = [session.with_tolerances(tolerances) for session in sessions]
     robot = calibration.robot.with_tolerances(tolerances)
+    restated = [
+        session.with_tolerances(
+            tolerances if session.robot.parameters.stated else robot.parameters.stated
+        )
+        for session in sessions
+    ]
+    for session in restated:
+        require_same_tolerances(robot, session, source="the calibration")
     calibration = _adjust_to_sessions(replace(calibration, robot=robot), restated)
     _require_new(calibration, restated)
     return calibration, restated

@@ -78,6 +78,7 @@ FindingKind = Literal[
     "must change",
     "not significant",
     "controller not stated",
+    "backlash not stated",
     "earlier readings",
     "tool error",
     "out of reach",

@@ -187,6 +187,7 @@ def _plan_again(
     if path is not None:
         planned = orthocal.load_plan(path)
         require_calibrated_robot(calibration, planned)
+        planned = replace(planned, robot=calibration.robot)  # its tolerances and effects
     else:
         planned = orthocal.restore_session(calibration)
     title = planned.title.removeprefix("Simulated: ")

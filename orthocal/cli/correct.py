@@ -496,13 +496,15 @@ def _describe_backlash(result: orthocal.Calibration, lags: Array, *, by_program:
         lags: Half of the backlash to be compensated, shape (n_drives,), [m, rad].
         by_program: Whether the program compensates it, not the controller.
     """
+    from orthocal.effects.compensation import describe_trims
+
     if not lags.any():
         return ""
     listed = []
     for drive, lag in zip(result.robot.drives, lags.tolist(), strict=True):
         unit, factor = DRIVE_UNITS[drive.unit]
         listed.append(f"{drive.name} {format_fixed(2.0 * lag / factor, 3)} {unit}")
-    if by_program and result.session.compensation:
+    if by_program and describe_trims(result.robot, result.session.compensation):
         text = (
             "Where drives reverse, the program takes up the backlash that the controller does not"
         )

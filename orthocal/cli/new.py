@@ -13,6 +13,7 @@ import typer
 
 import orthocal
 from orthocal.cli.options import (
+    ControllerOptions,
     Day,
     Force,
     Gauge,
@@ -59,7 +60,8 @@ COMMENT = (
     "A plan. Print sheet.html and measure: run `orthocal record .` in this directory, or fill\n"
     "in readings.csv in its order. Then\n"
     "orthocal calibrate .\n"
-    "offsets_mm: those that are active in the controller during the measurement."
+    "offsets_mm: those that are active in the controller during the measurement.\n"
+    "backlash_mm: the backlash that it compensates, 0 for none."
 )
 """Comment at the top of the first session's session.yaml."""
 
@@ -165,6 +167,7 @@ def new(
     *,
     dimensions: DimensionOptions,
     options: FirstPlanOptions,
+    controller: ControllerOptions,
     again: bool = False,
     force: Force = False,
 ) -> None:
@@ -180,14 +183,15 @@ def new(
         again: Make URDF, YAML and sheets again from DIRECTORY/machine.yaml.
     """
     if again:
-        stated = {option: text for option, text in dimensions.by_key().values()}
-        _require_none({"--kind": dimensions.kind, **stated, "--workspace-mm": options.workspace_mm})
+        stated: dict[str, object] = {o: text for o, text in dimensions.by_key().values()}
+        stated |= {"--kind": dimensions.kind, "--workspace-mm": options.workspace_mm}
+        _require_none(stated | {"--backlash": controller.backlash, "--ini": controller.ini})
         _make_again(folder)
         return
     if options.paper and options.hours is not None:
         raise ParameterError("found with --paper, whose setups are fixed", where="--hours")
     name = _require_new(folder, force=force)
-    design = _design(name, dimensions, options)
+    design = _design(name, dimensions, options, controller)
     _write(folder, name, design)
     _report(folder, design)
     if not design.tolerance_stated:
@@ -213,7 +217,12 @@ class _Design:
     """Text of the files beside session.yaml and readings.csv, by name."""
 
 
-def _design(name: str, dimensions: DimensionOptions, options: FirstPlanOptions) -> _Design:
+def _design(
+    name: str,
+    dimensions: DimensionOptions,
+    options: FirstPlanOptions,
+    controller: ControllerOptions,
+) -> _Design:
     """Design a machine from options and answers, with its first plan.
 
     Raises:
@@ -244,9 +253,11 @@ def _design(name: str, dimensions: DimensionOptions, options: FirstPlanOptions) 
         if robot.workspace is not None:
             box = tuple((low, high) for low, high in robot.workspace.tolist())
             machine = replace(machine, workspace=box)
+        compensation = controller.read(robot)
         tolerances = {"*.offset_mm": USUAL_OFFSET} | read_tolerances(tolerance, robot)
         make_plan = _plan if reads_legs else _plan_bed
         plan, session = make_plan(robot, equipment, tolerances, options)
+        session = session if compensation is None else replace(session, compensation=compensation)
         put_note("orthocal: drawing the measuring sheet")
         return _Design(
             machine=machine,
@@ -297,7 +308,7 @@ def _make_trial(
         raise ParameterError(problem, where="--effects") from None
 
 
-def _require_none(options: Mapping[str, str | None]) -> None:
+def _require_none(options: Mapping[str, object]) -> None:
     """Refuse options that --again reads from machine.yaml."""
     for option, value in options.items():
         if value is not None:

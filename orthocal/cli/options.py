@@ -6,7 +6,7 @@ import inspect
 import re
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, get_args, get_type_hints
 
@@ -21,6 +21,8 @@ from orthocal.units import MM
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+    from orthocal.effects.compensation import Compensation
 
     Array = NDArray[np.float64]
 
@@ -283,6 +285,51 @@ Force = Annotated[bool, Option("--force", help="Overwrite existing files.")]
 Anyway = Annotated[
     bool, Option("--anyway", help="Continue against the verdict of the calibration.")
 ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControllerOptions:
+    """Options about what the controller corrects during the measurement.
+
+    Args:
+        backlash (B[,B,...]): Backlash that the controller compensates, mm or degrees: one number
+            for all drives or one for each; 0 for none.
+        ini (FILE): INI file of LinuxCNC with BACKLASH and COMP_FILE, instead of --backlash.
+    """
+
+    backlash: str | None = None
+    ini: Path | None = None
+
+    def read(self, robot: orthocal.Robot) -> Compensation | None:
+        """Compensation of the controller; None without an option.
+
+        Raises:
+            ParameterError: If an option is malformed, or does not fit the robot.
+            SessionError: If a COMP_FILE is wrong.
+        """
+        from orthocal.effects.compensation import JointTrim
+        from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
+        from orthocal.measurement.files.session_keys import LARGEST_TRIM
+        from orthocal.units import DRIVE_UNITS
+
+        where, drives = "--backlash", robot.drives
+        if self.ini is not None:
+            if self.backlash is not None:
+                raise ParameterError("found with --ini; expected one", where=where)
+            return read_controller_joints(self.ini, robot).compensation
+        if self.backlash is None:
+            return None
+        values = read_numbers(self.backlash, where)
+        values = values * len(drives) if len(values) == 1 else values
+        if len(values) != len(drives) or not all(0.0 <= v <= LARGEST_TRIM for v in values):
+            names = ", ".join(d.name for d in drives)
+            raise ParameterError(
+                f"found '{self.backlash}'; expected one number of 0 to {LARGEST_TRIM:g} for all "
+                f"drives, or one for each of {names}",
+                where=where,
+            )
+        sizes = [DRIVE_UNITS[d.unit][1] for d in drives]
+        return tuple(JointTrim(v * size) for v, size in zip(values, sizes, strict=True))
 
 
 def split_globs(texts: Sequence[str] | None) -> list[str]:

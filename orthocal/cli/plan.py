@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -10,6 +10,7 @@ from typer import Option
 
 import orthocal
 from orthocal.cli.options import (
+    ControllerOptions,
     Day,
     Details,
     Effects,
@@ -99,6 +100,7 @@ def plan(
     subject: str,
     *,
     options: PlanOptions,
+    controller: ControllerOptions,
     out: OptionalOutDirectory = None,
     json: Json = False,
     details: Details = False,
@@ -124,7 +126,7 @@ def plan(
     if out is not None:
         require_new_session(out, FILES, force=force)
     workers = options.workers or available_cores()
-    chosen = _choose(subject, options, workers=workers)
+    chosen = _choose(subject, options, controller, workers=workers)
     deliver(lambda: plan_json(chosen), lambda: print_summary(chosen, details=details), json=json)
     if options.gauge is not None and chosen.equipment.tip is None:
         put_note(
@@ -134,11 +136,14 @@ def plan(
     if out is not None:
         with worker_budget(workers):
             _write(chosen, out)
+        put_note(_describe_next(subject, chosen, out, stated=bool(options.tolerance)))
     elif not json:
         put_note("Nothing was written; --out DIRECTORY writes session, sheet and programs.")
 
 
-def _choose(subject: str, options: PlanOptions, *, workers: int) -> orthocal.MeasuringPlan:
+def _choose(
+    subject: str, options: PlanOptions, controller: ControllerOptions, *, workers: int
+) -> orthocal.MeasuringPlan:
     """Plan readings for a robot, or further readings for a session.
 
     Raises:
@@ -154,7 +159,7 @@ def _choose(subject: str, options: PlanOptions, *, workers: int) -> orthocal.Mea
         raise ParameterError("needs a session; found a robot", where="--add")
     if options.add is not None and options.setups is not None:
         raise ParameterError("found with --setups; expected one", where="--add")
-    equipment = _read_equipment(options, robot, measured)
+    equipment, compensation = _read_equipment(options, robot, measured), controller.read(robot)
     workspace = None
     if options.workspace_mm is not None:
         workspace = box_workspace(robot, read_workspace(options.workspace_mm, robot))
@@ -162,7 +167,7 @@ def _choose(subject: str, options: PlanOptions, *, workers: int) -> orthocal.Mea
     with errors_at("--effects"):
         robot = robot if names is None else with_effects(robot, names)
     tolerances = read_tolerances(options.tolerance, robot)
-    return orthocal.plan_readings(
+    plan = orthocal.plan_readings(
         robot,
         orthocal.Choice(options.model, tolerances=tolerances, effects=names),
         setups=options.setups if options.add is None else options.add,
@@ -178,6 +183,27 @@ def _choose(subject: str, options: PlanOptions, *, workers: int) -> orthocal.Mea
         workers=workers,
         report=lambda text: put_note(f"orthocal: {text}"),
     )
+    if compensation is None:
+        return plan
+    return replace(plan, session=replace(plan.session, compensation=compensation))
+
+
+def _describe_next(subject: str, plan: orthocal.MeasuringPlan, out: Path, *, stated: bool) -> str:
+    """Next commands: record the readings, and calibrate with those that they complement.
+
+    Args:
+        subject: Robot, or session that the plan complements.
+        plan: The plan.
+        out: Directory of the plan.
+        stated: True if the tolerances are those of an option.
+    """
+    from orthocal.output.text.answer import calibrate_command, quote_path
+
+    sessions = [Path(subject), out] if plan.complements else [out]
+    tolerances = plan.session.robot.parameters.stated if stated and plan.complements else {}
+    return (
+        f"Next:\n  orthocal record {quote_path(out)}\n  {calibrate_command(sessions, tolerances)}"
+    )
 
 
 def _write(plan: orthocal.MeasuringPlan, directory: Path) -> None:
@@ -190,8 +216,8 @@ def _write(plan: orthocal.MeasuringPlan, directory: Path) -> None:
     comment = (
         "A plan: run `orthocal record .` in this directory, or fill in readings.csv; then\n"
         "orthocal calibrate .\n"
-        "State the offsets that are active in the controller during the measurement, such as\n"
-        "controller: {offsets_mm: [0, 0, 0]}, one number for each drive.\n"
+        "State what the controller corrects during the measurement, one number for each drive:\n"
+        "controller: {offsets_mm: [0, 0, 0], backlash_mm: [0, 0, 0]}\n"
         f"Approach every posture {side}. The last reading of a setup is its first\n"
         "posture again."
     )

@@ -54,7 +54,7 @@ MAX_COMP_FILE_ENTRIES = 256
 """Largest number of entries of a COMP_FILE of LinuxCNC."""
 
 Compensation = tuple[JointTrim, ...]
-"""Trim of the joint of each drive, in the robot's order; empty without compensation."""
+"""Trim of the joint of each drive, in the robot's order; empty if not stated."""
 
 SAME_TRIM = 1e-9
 """Largest difference between equal trims, [m, rad]: tables are written to 1e-6 mm."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -13,6 +14,7 @@ from orthocal.effects.adjustment import subtract_amounts
 from orthocal.effects.loading import with_adjustments
 from orthocal.errors import SessionError
 from orthocal.measurement.files.session_file import load_session
+from orthocal.robot.model import Robot
 from orthocal.session.session import Posture, Session, Setup, split_label
 from orthocal.text import composed
 
@@ -57,28 +59,14 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
     if len(sessions) == 1:
         return sessions[0]
     last = sessions[-1]
-    for session in sessions:
-        require_same_robot(session, last)
-        if session.robot.effect_names != last.robot.effect_names:
-            names = (", ".join(s.robot.effect_names) or "none" for s in (session, last))
-            raise SessionError(
-                "states the effects {}; another session has {}: choose them".format(*names),
-                where=f"{session.path or 'session'}: calibration.effects",
-            )
-        if session.firmware != last.firmware:
-            raise SessionError(
-                "states other settings of the firmware than another session; expected readings "
-                "with the same settings",
-                where=f"{session.path or 'session'}: controller.firmware",
-            )
-    tolerances = _join_tolerances(sessions)
+    _require_same_machine(sessions)
     purposes = {s.purpose for s in sessions} - {None}
     parts = [_rename(s, labels) for s, labels in zip(sessions, _labels(sessions), strict=True)]
     setups = _merged(p.setups for p in parts)
     if any(subtract_amounts(s.adjusted or {}, last.adjusted) for s in setups.values()):
         last = replace(last, robot=with_adjustments(last.robot))
     return replace(
-        last.with_tolerances(tolerances),
+        last,
         title=" + ".join(dict.fromkeys(s.title for s in sessions if s.title)),
         source="; ".join(dict.fromkeys(s.source for s in sessions if s.source)),
         gauges=_merged(p.gauges for p in parts),
@@ -95,6 +83,31 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
     )
 
 
+def _require_same_machine(sessions: Sequence[Session]) -> None:
+    """Refuse sessions of different robots, effects, firmware or tolerances.
+
+    Raises:
+        SessionError: If they differ; names the session and the key.
+    """
+    first, last = sessions[0], sessions[-1]
+    for session in sessions:
+        require_same_robot(session, last)
+        if session.robot.effect_names != last.robot.effect_names:
+            names = (", ".join(s.robot.effect_names) or "none" for s in (session, last))
+            raise SessionError(
+                "states the effects {}; another session has {}: choose them".format(*names),
+                where=f"{session.path or 'session'}: calibration.effects",
+            )
+        if session.firmware != last.firmware:
+            raise SessionError(
+                "states other settings of the firmware than another session; expected readings "
+                "with the same settings",
+                where=f"{session.path or 'session'}: controller.firmware",
+            )
+        source = str(first.path or first.title or "another session")
+        require_same_tolerances(first.robot, session, source=source)
+
+
 def require_same_robot(session: Session, other: Session) -> None:
     """Refuse a session of another robot than that of another session.
 
@@ -109,27 +122,38 @@ def require_same_robot(session: Session, other: Session) -> None:
         )
 
 
-def _join_tolerances(sessions: Sequence[Session]) -> dict[str, float]:
-    """Stated tolerances of all sessions on one machine.
+def require_same_tolerances(robot: Robot, session: Session, *, source: str) -> None:
+    """Refuse a session with other tolerances of the same machine.
+
+    A session that states no tolerance of an error has that of the robot's YAML.
+
+    Args:
+        robot: The robot with its tolerances.
+        session: The session.
+        source: Name of the session or calibration with the first tolerances, for messages.
 
     Raises:
-        SessionError: If two sessions state different tolerances for one key.
+        SessionError: Naming both and an error whose tolerances differ.
     """
-    tolerances: dict[str, float] = {}
-    first_session: dict[str, Session] = {}
-    for session in sessions:
-        for key, value in session.robot.parameters.stated.items():
-            if tolerances.setdefault(key, value) != value:
-                other = tolerances[key]
-                raise SessionError(
-                    f"is {value:g}; it is {other:g} in "
-                    f"{first_session[key].path or 'another session'}, and "
-                    "the machine is the same; expected one value. "
-                    f"--tolerance '{key}={other:g}' states it for all sessions",
-                    where=f"{session.path or 'session'}: calibration.tolerances.{key}",
-                )
-            first_session.setdefault(key, session)
-    return tolerances
+    one, other = robot.parameters, session.robot.parameters
+    differing = (
+        p for p in one if p.name in other and not math.isclose(p.prior_std, other[p.name].prior_std)
+    )
+    p = next(differing, None)
+    if p is None:
+        return
+    here, there = (f"{q.limit_of(p.name):g}" for q in (other, one))
+    options = {}
+    for glob in (other.read_glob(key)[0] for key in other.stated):
+        name = other.select([glob])[0]
+        options[f"{glob}_{other[name].edge_unit}"] = one.limit_of(name)
+    words = " ".join(f"--tolerance '{k}={v:g}'" for k, v in {**options, **one.stated}.items())
+    raise SessionError(
+        f"'{p.name}' is within ±{here} {p.edge_unit}, but within ±{there} {p.edge_unit} in "
+        f"{source}; expected one value, because the machine is the same. A session without "
+        f"`tolerances` has those of the robot's YAML. For all: {words}",
+        where=f"{session.path or session.title or 'session'}: calibration.tolerances",
+    )
 
 
 @lru_cache(maxsize=CACHE_SIZE)

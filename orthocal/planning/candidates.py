@@ -6,8 +6,8 @@ come from the usual functions.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import nominal_sensitivity
 from orthocal.observation.observations import build_observations
 from orthocal.planning.equipment import Equipment, choose_box, place_tool, posture_name, reachable
+from orthocal.planning.expected_error import ENTERED_OFFSET_STD, is_offset
 from orthocal.planning.owned_sensors import DIAL
 from orthocal.planning.tool_candidates import list_tool_candidates
 from orthocal.robot.model import Leg, Robot
@@ -31,7 +32,7 @@ from orthocal.sensors.direction import Direction
 from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.tips import Tip
 from orthocal.session.points import names_in_files
-from orthocal.session.session import Conditions, Gauge, Posture, Reading, Session, Setup
+from orthocal.session.session import Conditions, Posture, Reading, Session, Setup
 from orthocal.units import MM
 
 POSITIONS_ACROSS = 5
@@ -140,11 +141,19 @@ class Candidates:
     """Names of the parameters on which more than one setup may depend."""
     spare_range: float
     """Range of the gauge to either side that errors within the tolerances need, [m]; median."""
+    needed: Mapping[str, float] = field(default_factory=dict)
+    """Range to either side that readings of a gauge need, by gauge, [m]; median."""
 
     @property
     def count(self) -> int:
         """Number of candidate readings."""
         return sum(len(s.rows) for s in self.setups)
+
+    @property
+    def unusable(self) -> dict[str, float]:
+        """Gauges whose range is too small for any setup, with `needed`, [m]."""
+        usable = {s.gauge for s in self.setups if s.reachable.sum(axis=1).max() >= MIN_READINGS}
+        return {gauge: v for gauge, v in self.needed.items() if gauge not in usable}
 
     @property
     def without_session(self) -> Candidates:
@@ -203,7 +212,7 @@ def list_candidates(robot: Robot, equipment: Equipment, *, reference: str = "") 
 
 
 def measure_candidates(
-    session: Session, problem: CalibrationProblem, *, spare_range: float
+    session: Session, problem: CalibrationProblem, *, spare_range: float, entered: bool = False
 ) -> Candidates:
     """Compute Jacobians, covariances and gauge ranges of candidate readings.
 
@@ -211,17 +220,20 @@ def measure_candidates(
         session: Session of the candidates.
         problem: Calibration problem of that session, with priors for all free parameters.
         spare_range: Prior standard deviations of readings that must fit into the gauge's range.
+        entered: True if offsets of a calibration are active, so that the remaining ones are small.
     """
     sigma = stated_sigma(session.gauge)
     h, jacobian = problem.predict_and_jacobian(problem.active_theta)
     n, o = problem.n_machine, problem.observations
-    private = {f"setup.{name}" for name in session.setups}
     owners = [name.rpartition(".")[0] for name in problem.free]
-    common = [i for i, owner in enumerate(owners) if i < n or owner not in private]
+    common = _find_state(session, owners, n)
+    state = tuple(problem.free[i] for i in common)
+    stds = np.array([ENTERED_OFFSET_STD if entered and is_offset(s) else 1.0 for s in state])
     setups, margins, aligned_of = [], [], _list_aligned(session, problem)
+    spans: dict[str, list[float]] = {}
     aligned_at, order = session.alignment_postures, list(session.setups)
     for parts in _find_parts(session):
-        width, name = len(parts), parts[0].name
+        width, name, (_, base) = len(parts), parts[0].name, names_in_files(parts[0])
         rows = np.flatnonzero(np.isin(o.setup, [order.index(p.name) for p in parts]))
         if rows.size < MIN_READINGS * width:
             continue
@@ -231,31 +243,46 @@ def measure_candidates(
         aligned = []
         for index, alignment in aligned_of.get(name, ()):
             sensitivity = jacobian[rows, index] / problem.theta_scale[index]
-            deviation = np.zeros_like(by_state)
-            deviation[:, :n] = alignment - alignment.mean(axis=0)
+            a = AlignedParameter(sensitivity, _about_mean(alignment, len(common)))
             first = [session.readings[i].posture for i in rows].index(aligned_at[name])
-            by_state -= np.outer(sensitivity, deviation[first])  # the session aligns the gauge here
-            aligned.append(AlignedParameter(sensitivity, deviation))
+            by_state -= np.outer(a.sensitivity, a.jacobian[first])  # the session aligns it here
+            aligned.append(a)
         covariance, absolute = by_nuisance @ by_nuisance.T, parts[0].zero == "known"
         reachable = np.ones((rows.size // width, rows.size // width), dtype=np.bool_)
         for c, part in enumerate(parts):
             of_part, ratio = slice(c, None, width), float(problem.noise_ratio[rows[c]])
-            nuisance = covariance[of_part, of_part]
-            # the operator places a fixed ball so that its first reading is in the middle of the
-            # range
-            margin = spare_range * ratio * _difference_std(by_state[of_part], nuisance)
+            prior = by_state[of_part] * stds
+            prior = prior @ prior.T + covariance[of_part, of_part]
+            margin = spare_range * ratio * _prior_std(prior, absolute=absolute)
             margins.append(float(margin.max()))
-            gauge = session.gauges[part.gauge]
-            reachable &= _find_reachable(gauge, ratio * h[rows[of_part]], margin)
+            limits, predicted = session.gauges[part.gauge].range, ratio * h[rows[of_part]]
+            if limits is not None:
+                middle = 0.5 * sum(limits) if absolute else None
+                span = margin + _distances(predicted, middle)
+                reachable &= span <= 0.5 * (limits[1] - limits[0])
+                each = np.diag(span) if absolute else span
+                spans.setdefault(base, []).append(float(np.median(each)))
             covariance[of_part, of_part] += 0.0 if absolute else (ZERO_PRIOR / ratio) ** 2
         candidate = CandidateSetup(
             *(name, rows[::width], by_state, covariance, reachable, tuple(aligned), absolute),
-            *(names_in_files(parts[0])[1], width),
+            *(base, width),
         )
         setups.append(candidate)
-    state = tuple(problem.free[i] for i in common)
     median = float(np.median(margins)) if margins else 0.0
-    return Candidates(session, problem, tuple(setups), sigma, state, median)
+    needed = {gauge: float(np.median(v)) for gauge, v in spans.items()}
+    return Candidates(session, problem, tuple(setups), sigma, state, median, needed)
+
+
+def _find_state(session: Session, owners: Sequence[str], n_machine: int) -> list[int]:
+    """Indices of the free parameters on which more than one setup may depend.
+
+    Args:
+        session: Session of the candidates.
+        owners: Owner of each free parameter.
+        n_machine: Number of parameters of the machine, which are the first.
+    """
+    private = {f"setup.{name}" for name in session.setups}
+    return [i for i, owner in enumerate(owners) if i < n_machine or owner not in private]
 
 
 def _find_parts(session: Session) -> list[list[Setup]]:
@@ -293,31 +320,42 @@ def _list_aligned(
     return aligned
 
 
-def _difference_std(jacobian: Array, nuisance: Array) -> Array:
-    """Prior standard deviations of differences of readings, shape (m, m), [m].
+def _about_mean(alignment: Array, n_state: int) -> Array:
+    """Sensitivities minus their mean over the postures, padded with 0, shape (m, n_state)."""
+    padded = np.zeros((len(alignment), n_state))
+    padded[:, : alignment.shape[1]] = alignment - alignment.mean(axis=0)
+    return padded
+
+
+def _prior_std(covariance: Array, *, absolute: bool) -> Array:
+    """Prior standard deviations that the range of a gauge must contain, shape (m, m), [m].
+
+    They are those of the differences of two readings. If the gauge zero is known, they are the
+    larger ones of both readings: the operator cannot set the dial to the middle of its range.
 
     Args:
-        jacobian: Sensitivity to the state, shape (m, n_state), [m per prior std].
-        nuisance: Covariance from nuisance parameters, shape (m, m), [m²].
+        covariance: Prior covariance of the readings, shape (m, m), [m²].
+        absolute: Whether the gauge zero is known.
     """
-    covariance = jacobian @ jacobian.T + nuisance
     variance = np.diag(covariance)
+    if absolute:
+        return np.asarray(np.sqrt(np.maximum(variance[:, None], variance)))
     square = variance[:, None] + variance[None] - 2.0 * covariance
     return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
 
-def _find_reachable(gauge: Gauge, h: Array, margin: Array) -> NDArray[np.bool_]:
-    """Mask of readings within the range of a gauge that is centred on another reading, (m, m).
+def _distances(h: Array, middle: float | None) -> Array:
+    """Distances of readings from the middle of the dial, shape (m, m), [m].
 
     Args:
-        gauge: The gauge.
         h: Predicted readings, shape (m,), [m].
-        margin: Part of the range that errors within the tolerances need, shape (m, m), [m].
+        middle: Middle of the range, [m]; None for a dial that is set to it in the first reading
+            (rows).
     """
-    if gauge.range is None:
-        return np.ones((h.size, h.size), dtype=np.bool_)
-    half = 0.5 * (gauge.range[1] - gauge.range[0])
-    return np.asarray(np.abs(h[:, None] - h[None]) <= half - margin)
+    if middle is None:
+        return np.asarray(np.abs(h[:, None] - h))
+    distances = np.abs(h - middle)
+    return np.asarray(np.maximum(distances[:, None], distances))
 
 
 def _add_postures(

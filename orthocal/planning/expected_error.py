@@ -258,7 +258,7 @@ class ToolForecast:
         Yields:
             Free parameters, shape (n_free,), [SI].
         """
-        offsets = [i for i, name in enumerate(problem.free) if name.endswith(".offset")]
+        offsets = [i for i, name in enumerate(problem.free) if is_offset(name)]
         for seed in range(N_MACHINES):
             drawn = np.random.default_rng(seed).normal(size=problem.n_free) * problem.theta_scale
             if entered:
@@ -422,6 +422,11 @@ def _information(problem: CalibrationProblem, state: Sequence[str], measured: Se
     of_state = np.zeros((len(state), len(state)))
     of_state[np.ix_(places, places)] = marginal
     return of_state
+
+
+def is_offset(name: str) -> bool:
+    """True for the name of a drive's offset, which the controller corrects."""
+    return name.endswith(".offset")
 
 
 def with_gauge_noise(problem: CalibrationProblem) -> CalibrationProblem:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from orthocal.errors import SessionError
 from orthocal.estimation.weighting import stated_sigma
@@ -15,6 +16,7 @@ from orthocal.io.documents import Number, read_yaml, validate
 from orthocal.measurement.files.session_keys import GaugeKeys
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Gauge
+from orthocal.units import DEG, MM
 
 DIAL = "dial"
 """Name of the gauge for legs in plans with sensors at the tool."""
@@ -50,15 +52,34 @@ DURATIONS = {
 """Usual durations by kind of sensor. A probe is read automatically."""
 
 Minutes = Annotated[Number, Field(ge=0.0, le=1e4)]
+Angle = Annotated[Number, Field(ge=-90.0, le=90.0)]
+
+BAR_RADIUS = 10 * MM
+"""Default radius of a ball bar with its sleeve and cups, [m]."""
+
+OF_BARS = ("radius_mm", "elevation_deg")
+"""Keys of a plan that only ball bars have."""
 
 
-class DurationKeys(BaseModel):
-    """Keys of durations in a sensor's file."""
+class PlanKeys(BaseModel):
+    """Keys of a sensor's file that only a plan uses."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     minutes_per_setup: Minutes | None = None
     minutes_per_reading: Minutes | None = None
+    radius_mm: Annotated[Number, Field(ge=0.0, le=1000.0)] = BAR_RADIUS / MM
+    """Radius about the axis of a ball bar in which no rod may be."""
+    elevation_deg: tuple[Angle, Angle] = (-90.0, 90.0)
+    """Lowest and highest angle of a ball bar above the plane of x and y, from the tool's ball."""
+
+    @model_validator(mode="after")
+    def _require_order(self) -> PlanKeys:
+        """Refuse an empty range of elevations."""
+        low, high = self.elevation_deg
+        if not low < high:
+            raise ValueError(f"elevation_deg|found [{low:g}, {high:g}]; expected [LOW, HIGH]")
+        return self
 
     def to_duration(self, usual: Duration) -> Duration:
         """Stated durations; the usual ones by default."""
@@ -100,6 +121,10 @@ class OwnedSensor:
     """Keys of a setup in a session.yaml, without the keys that the plan chooses."""
     file: Path
     duration: Duration
+    radius: float = BAR_RADIUS
+    """Radius about the axis of a ball bar in which no rod may be, [m]."""
+    elevation: tuple[float, float] = (-0.5 * math.pi, 0.5 * math.pi)
+    """Lowest and highest angle of a ball bar above the plane of x and y, [rad]."""
 
 
 def load_owned_sensor(path: str | Path) -> OwnedSensor:
@@ -107,7 +132,7 @@ def load_owned_sensor(path: str | Path) -> OwnedSensor:
 
     Args:
         path: YAML with `sensor`, keys of a gauge such as `sigma_mm` and `range_mm`, keys of a
-            setup, and `minutes_per_setup` and `minutes_per_reading`.
+            setup, and those of `PlanKeys`.
 
     Raises:
         SessionError: If the file is invalid; names file and key.
@@ -120,8 +145,11 @@ def load_owned_sensor(path: str | Path) -> OwnedSensor:
             where=str(file),
         )
     _suggest_keys(data, file)
-    times = {k: data.pop(k) for k in DurationKeys.model_fields if k in data}
-    duration = validate(DurationKeys, times, where=str(file), error=SessionError)
+    for key in OF_BARS:
+        if key in data and data["sensor"] != "ball_bar":
+            raise SessionError("only a ball bar has it; delete this key", where=f"{file}: {key}")
+    of_plan = {k: data.pop(k) for k in PlanKeys.model_fields if k in data}
+    planned = validate(PlanKeys, of_plan, where=str(file), error=SessionError)
     gauge_keys = {k: v for k, v in data.items() if k in GaugeKeys.model_fields}
     shared = {"scale_tolerance", "tip"}
     gauge = validate(GaugeKeys, gauge_keys, where=str(file), error=SessionError).to_gauge()
@@ -132,17 +160,18 @@ def load_owned_sensor(path: str | Path) -> OwnedSensor:
     keys = {k: v for k, v in data.items() if k not in gauge_keys or k in shared}
     _require_keys(keys, file)
     name = "".join(c for c in file.stem if c.isalnum() or c in "_-") or "sensor"
-    usual = DURATIONS[data["sensor"]]
-    return OwnedSensor(name, gauge, keys, file, duration.to_duration(usual))
+    low, high = (angle * DEG for angle in planned.elevation_deg)
+    duration, radius = planned.to_duration(DURATIONS[data["sensor"]]), planned.radius_mm * MM
+    return OwnedSensor(name, gauge, keys, file, duration, radius, (low, high))
 
 
 def _suggest_keys(data: Mapping[str, Any], file: Path) -> None:
-    """Refuse a key that resembles one of the gauge or of the durations.
+    """Refuse a key that resembles one of the gauge or of the plan.
 
     Raises:
         SessionError: Naming file, key and the key that was probably meant.
     """
-    known = [*GaugeKeys.model_fields, *DurationKeys.model_fields]
+    known = [*GaugeKeys.model_fields, *PlanKeys.model_fields]
     for key in data:
         similar = [k for k in known if k.rpartition("_")[0] == key]
         if similar:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -111,6 +111,8 @@ class MeasuringPlan:
     """Further readings for the effects that this plan does not determine."""
     complete: Session | None = None
     """Planned readings with expected times and temperatures, joined with the existing readings."""
+    unusable: Mapping[str, float] = field(default_factory=dict)
+    """Gauges that the plan cannot use, with the range to either side that they would need, [m]."""
 
     def find_sensor_gains(self) -> tuple[SensorGain, ...]:
         """Gains of an hour with each usual sensor after these readings, the largest first."""
@@ -241,7 +243,10 @@ def _plan(
     """
     work.report(f"computing {len(session.readings)} candidate readings")
     candidates = measure_candidates(
-        session, forecast.problem(session), spare_range=equipment.spare_range
+        session,
+        forecast.problem(session),
+        spare_range=equipment.spare_range,
+        entered=measured is not None and bool(np.any(measured.active_offsets)),
     )
     search = SetupSearch.of(
         candidates,
@@ -409,6 +414,7 @@ def _evaluate(
         effects=limits,
         further=find_further_readings(comparison, limits),
         complete=joined,
+        unusable=comparison.candidates.unusable,
     )
 
 

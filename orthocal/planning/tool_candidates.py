@@ -9,13 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Mask
 from orthocal.errors import ParameterError, SessionError
+from orthocal.kinematics.loop_closure import nominal_closure
+from orthocal.kinematics.robot_functions import robot_functions
 from orthocal.kinematics.workspace import position_at_zero, tool_at_zero
 from orthocal.measurement.motion.approach import can_approach, usual_approaches
 from orthocal.planning.equipment import choose_box, place_tool, posture_name, reachable
 from orthocal.planning.owned_sensors import DIAL, OwnedSensor
 from orthocal.robot.model import Robot, require_tcp
+from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.points import Points
 from orthocal.sensors.protocol import Sensor, default_zero, tool_path
 from orthocal.sensors.registry import read_setup
@@ -53,6 +56,12 @@ BALLS = (
 )
 """Positions of a fixed ball, relative to the box: middle 0, faces ±1."""
 
+PARALLEL = 1e-12
+"""Largest squared sine of the angle between segments that count as parallel."""
+
+SAME_ANGLE = 1e-6
+"""Rounding error of an angle that is accepted, [rad]."""
+
 STEP = 5 * MM
 """Step of the positions, [m]."""
 
@@ -76,16 +85,10 @@ def list_tool_candidates(
     """
     if not owned:
         return {}, {}, {}, []
-    _require_coordinates(robot, owned)
+    _require_usable(robot, owned)
     stated = robot.workspace if box is None else box
     limits, middle = choose_box(robot, stated), tool_at_zero(robot)
     gauges = {sensor.name: sensor.gauge for sensor in owned}
-    names = [DIAL, *(sensor.name for sensor in owned)]
-    for sensor in owned:
-        if names.count(sensor.name) > 1:
-            raise SessionError(
-                f"two gauges are named '{sensor.name}'; rename the file", where=str(sensor.file)
-            )
     places = [
         (sensor, *place) for sensor in owned for place in _places(sensor, robot, middle, limits)
     ]
@@ -95,11 +98,13 @@ def list_tool_candidates(
     readings: list[Reading] = []
     for sensor, name, keys, points in places:
         reached = positions.names(points)
-        if len(reached) < 2:
-            continue
         checked, built = read_setup(
             {**sensor.keys, **keys}, where=str(sensor.file), under="", error=SessionError
         )
+        if isinstance(built, BallBar):
+            reached = positions.select_clear(reached, built, sensor.radius)
+        if len(reached) < 2:
+            continue
         postures.update((n, positions.postures[n]) for n in reached)
         setup = Setup(name, built, sensor.name, zero=checked.zero or default_zero(built))
         parts = {name: setup}
@@ -115,16 +120,24 @@ def list_tool_candidates(
     placed = {names_in_files(setup)[1] for setup in setups.values()}
     for sensor in owned:
         if sensor.name not in placed:
-            raise ParameterError("the machine reaches no place for it", where=str(sensor.file))
+            problem = "the machine reaches no place for it that is clear of its rods"
+            raise ParameterError(problem, where=str(sensor.file))
     return gauges, postures, setups, readings
 
 
-def _require_coordinates(robot: Robot, owned: Sequence[OwnedSensor]) -> None:
-    """Refuse sensors that need a tool that moves in space.
+def _require_usable(robot: Robot, owned: Sequence[OwnedSensor]) -> None:
+    """Refuse sensors of the same name, and those that need a tool that moves in space.
 
     Raises:
-        ParameterError: Naming the file of the sensor.
+        SessionError: If two gauges have one name; names the file of the sensor.
+        ParameterError: If the tool does not move in space; names the file of the sensor.
     """
+    names = [DIAL, *(sensor.name for sensor in owned)]
+    for sensor in owned:
+        if names.count(sensor.name) > 1:
+            raise SessionError(
+                f"two gauges are named '{sensor.name}'; rename the file", where=str(sensor.file)
+            )
     count = 0 if robot.tcp is None else len(robot.tcp.coordinates)
     for sensor in owned:
         if count < (2 if sensor.keys["sensor"] in IN_PLANE else 3):
@@ -163,6 +176,32 @@ class _Positions:
         names = dict.fromkeys(posture_name(self.robot, p, self.middle) for p in points)
         return [name for name in names if name in self.postures]
 
+    def select_clear(self, names: Sequence[str], bar: BallBar, radius: float) -> list[str]:
+        """Postures of the nominal machine in which a ball bar is clear of all rods.
+
+        Args:
+            names: Names of postures.
+            bar: The bar between the tool and its fixed ball.
+            radius: Radius about the axis of the bar in which no rod may be, [m].
+        """
+        if not names or not self.robot.rods:
+            return list(names)
+        drives = np.array([self.postures[n].drives for n in names])
+        closure, functions = nominal_closure(self.robot), robot_functions(self.robot)
+        passive, placements = closure.close(drives), closure.geometry().placements
+
+        def poses(frame: str) -> Array:
+            return functions.pose(frame)(drives, passive, placements)[0]
+
+        tool = poses(require_tcp(self.robot).frame)
+        ball = tool[:, :3, 3] + tool[:, :3, :3] @ np.array(bar.tool)
+        fixed = np.broadcast_to(bar.centre, ball.shape)
+        clear = np.ones(len(names), dtype=np.bool_)
+        for rod in self.robot.rods.values():
+            ends = (poses(frame)[:, :3, 3] for frame in (rod.root, rod.tip))
+            clear &= segment_distances(ball, fixed, *ends) >= rod.radius + radius
+        return [name for name, is_clear in zip(names, clear, strict=True) if is_clear]
+
     def approached(
         self, sensor: Sensor, names: Sequence[str]
     ) -> Iterator[tuple[str, Conditions | None]]:
@@ -175,6 +214,31 @@ class _Positions:
             return
         for approach, possible in self.by_approach.items():
             yield from ((name, Conditions(approach)) for name in names if name in possible)
+
+
+def segment_distances(start: Array, end: Array, other_start: Array, other_end: Array) -> Array:
+    """Distances of pairs of segments, shape (n,), [m].
+
+    The nearest points are x = a + s u and y = b + t v with s, t in [0, 1]. Source: Ericson,
+    Real-Time Collision Detection, 5.1.9.
+
+    Args:
+        start: Start a of each first segment, shape (n, 3), [m].
+        end: Its end a + u, shape (n, 3), [m].
+        other_start: Start b of each second segment, shape (n, 3), [m].
+        other_end: Its end b + v, shape (n, 3), [m].
+    """
+    u, v, between = end - start, other_end - other_start, start - other_start
+    uu, vv, uv = np.vecdot(u, u), np.vecdot(v, v), np.vecdot(u, v)
+    ub, vb = np.vecdot(u, between), np.vecdot(v, between)
+    determinant = uu * vv - uv**2
+    parallel = determinant <= PARALLEL * uu * vv  # then any s, here 0, has a nearest t
+    s = np.where(parallel, 0.0, (uv * vb - ub * vv) / np.where(parallel, 1.0, determinant))
+    s = np.clip(s, 0.0, 1.0)
+    t = np.clip((uv * s + vb) / vv, 0.0, 1.0)
+    s = np.clip((uv * t - ub) / uu, 0.0, 1.0)
+    nearest = between + s[:, None] * u - t[:, None] * v
+    return np.asarray(np.linalg.norm(nearest, axis=1))
 
 
 def _places(
@@ -224,6 +288,7 @@ def _bars(
             circles.append(ball + share * length * unit[axis] + radius * around)
         points = np.unique(np.concatenate(circles).round(9), axis=0)
         inside = ((points >= box[:, 0]) & (points <= box[:, 1])).all(axis=1)
+        inside &= _is_inclined(sensor, (ball - points) @ np.eye(3)[list(coordinates)])
         in_space = np.array(fixed)
         in_space[list(coordinates)] = ball
         keys = {
@@ -231,6 +296,18 @@ def _bars(
             "ball": f"{sensor.name}_{k + 1}",
         }
         yield f"{sensor.name}_{k}", keys, points[inside]
+
+
+def _is_inclined(sensor: OwnedSensor, bars: Array) -> Mask:
+    """Mask of bars whose elevation is within the range that the sensor's file states.
+
+    Args:
+        sensor: The ball bar.
+        bars: Vectors from the tool's ball to the fixed ball, shape (n, 3), [m].
+    """
+    low, high = sensor.elevation
+    elevation = np.arctan2(bars[:, 2], np.hypot(bars[:, 0], bars[:, 1]))
+    return np.asarray((elevation >= low - SAME_ANGLE) & (elevation <= high + SAME_ANGLE))
 
 
 def _beds(

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from orthocal.arguments import require_numbers
 from orthocal.errors import ParameterError
 from orthocal.text import composed
-from orthocal.units import UNIT_SUFFIXES, InUnit, Unit, read_limit, show_limit
+from orthocal.units import UNIT_SUFFIXES, InUnit, Unit, read_limit, show_limit, tidy
 
 COMPLETE: Literal["complete"] = "complete"
 """Keyword for a model of all observable errors."""
@@ -125,7 +125,7 @@ class ParameterSet:
         self.defaults: ParameterSet = self
         """Parameters with the tolerances of the robot's YAML."""
         self.stated: Mapping[str, float] = {}
-        """Tolerances that replace the defaults (see `with_tolerances`)."""
+        """Tolerances that differ from the defaults (see `with_tolerances`)."""
 
     def __iter__(self) -> Iterator[Parameter]:
         return iter(self._parameters.values())
@@ -270,7 +270,8 @@ class ParameterSet:
         Args:
             tolerances: Names or globs with unit, such as `*.offset_mm`, mapped to limits of ±2
                 prior standard deviations in that unit. Earlier stated tolerances remain unless
-                these match all their parameters. Later entries replace earlier ones.
+                these match all their parameters. Later entries replace earlier ones. Entries that
+                change nothing are omitted.
 
         Raises:
             ParameterError: If a name or unit is unknown, or a number is implausible.
@@ -285,11 +286,13 @@ class ParameterSet:
         stated = remaining | dict(tolerances)
         if stated == self.stated:
             return self
-        parameters = {p.name: p for p in self.defaults}
-        for glob, value in self.defaults.read_tolerances(stated).items():
-            for name in self.defaults.select([glob]):
-                std = require_prior_std(value, self.defaults[name])
-                parameters[name] = replace(parameters[name], prior_std=std)
+        parameters = self._replaced(stated)
+        for key in list(stated):
+            without = {k: v for k, v in stated.items() if k != key}
+            if self._replaced(without) == parameters:
+                stated = without
+        if stated == self.stated:
+            return self
         result = ParameterSet(
             self.elementary.values(),
             parameters.values(),
@@ -298,6 +301,27 @@ class ParameterSet:
         )
         result.defaults, result.stated = self.defaults, stated
         return result
+
+    def _replaced(self, stated: Mapping[str, float]) -> dict[str, Parameter]:
+        """Parameters by name with stated tolerances instead of the defaults.
+
+        Raises:
+            ParameterError: If a name or unit is unknown, or a number is implausible.
+        """
+        parameters = {p.name: p for p in self.defaults}
+        for glob, value in self.defaults.read_tolerances(stated).items():
+            for name in self.defaults.select([glob]):
+                std = require_prior_std(value, self.defaults[name])
+                parameters[name] = replace(parameters[name], prior_std=std)
+        return parameters
+
+    def limit_of(self, name: str) -> float:
+        """Tolerance of a parameter, a limit of ±2 prior standard deviations, [`edge_unit`].
+
+        Raises:
+            ParameterError: If the name is unknown.
+        """
+        return tidy(show_limit(self[name].prior_std) * self[name].edge_factor)
 
     def read_quantity(self, key: str, value: float) -> tuple[str, float]:
         """Parameter name and SI value of a key with unit, such as x_slide.offset_mm.

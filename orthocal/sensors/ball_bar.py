@@ -156,7 +156,11 @@ class BallBar(ToolSensor):
             "Mount one ball at the tool. Place the other, the fixed ball, on its post only after "
             f"the tool is in the alignment posture: at about X{x} Y{y} Z{z} mm from the tool "
             f"centre point at the mechanical zero, by eye.{stays}",
-            f"Put the bar between the balls. Its dial shows 0 at a length of {length}. {known}.",
+            "Before you connect the bar, hold it at the tool's ball and turn it by hand through "
+            "the directions of this setup. It must touch neither the platform nor a rod.",
+            f"Put the bar between the balls. Its dial shows 0 at a length of {length}. {known}. If "
+            "the dial comes to an end of its range in a posture, move the fixed ball that far and "
+            "begin its setups again.",
             "Make the bar longer with your hand. The reading must grow. If it falls, enter "
             "every reading of this setup with the opposite sign.",
         )

@@ -251,7 +251,7 @@ class Session:
     controller_offsets: Array | None = None
     """Active offsets, shape (n_drives,), [m, rad]; None if not stated."""
     compensation: Compensation = ()
-    """Compensation of backlash and errors of screws by the controller; empty if there is none."""
+    """Compensation of backlash and errors of screws by the controller; empty if not stated."""
     firmware: DeltaSettings | None = None
     """Settings of the firmware of a delta printer; postures are in its coordinates."""
     adjusted: Mapping[str, float] = field(default_factory=dict)

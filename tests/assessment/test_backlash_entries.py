@@ -26,6 +26,7 @@ from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.output.text.answer import render_answer
 from orthocal.output.text.layout import to_text
+from orthocal.units import MM
 
 QUICK = {"solver": "variable-projection"}
 TRUTH = {
@@ -166,6 +167,15 @@ def test_backlash_that_the_controller_compensates_stays(plan, calibration):
     text = to_text(render_answer(second, saved=Path("out")))
     assert text.count(" stays ") == 2
     assert "Next: nothing to enter" in text or "Next: correct" in text
+
+
+def test_a_session_that_states_no_backlash_is_asked_for_it(calibration):
+    """A stated 0 is an answer; so is any other number."""
+    assert calibration.assessment.of_kind("backlash not stated")
+    for trims in ((JointTrim(),) * 3, (JointTrim(0.02 * MM), JointTrim(), JointTrim())):
+        record = replace(calibration.session, compensation=trims)
+        stated = assess(replace(calibration, assessment=None, session=record))
+        assert not stated.of_kind("backlash not stated")
 
 
 def test_backlash_alone_is_entered_where_the_offsets_stay(plan):

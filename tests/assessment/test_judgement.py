@@ -31,6 +31,7 @@ from orthocal.assessment import assess, comparison
 from orthocal.assessment.judgement import judge_session
 from orthocal.calibration.assessment_record import EXIT_CODES, Finding, FindingKind, Severity
 from orthocal.output.text.summary import result_json
+from orthocal.session.session import Conditions
 
 QUICK = {"solver": "variable-projection"}
 
@@ -288,6 +289,13 @@ NOTES = {
     "no offset": lambda c, t: calibrate(c, Choice(free=["x_leg.length"]), **QUICK),
     "no change needed": lambda c, t: calibrated("table1/experiment-3"),
     "fits": lambda c, t: calibrated("raw-cycles"),
+    "backlash not stated": lambda c, t: calibrate(
+        replace(
+            c.with_effects(["backlash"]),
+            readings=tuple(replace(r, conditions=Conditions("ppp")) for r in c.readings),
+        ),
+        **QUICK,
+    ),
     "earlier readings": lambda c, t: calibrate(c.with_controller(np.full(3, 1e-3)), **QUICK),
 }
 

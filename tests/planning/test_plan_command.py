@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -36,7 +37,8 @@ def test_a_plan_is_written_ready_to_measure(tmp_path):
     dial.write_text(DIAL)
     out = tmp_path / "monday"
     entered = ["--tolerance", "*.offset_mm=1"]
-    words = ["plan", "orthoglide", *QUICK, *entered, "--gauge", dial, "--out", out]
+    backlash = ["--backlash", "0,0.02,0"]
+    words = ["plan", "orthoglide", *QUICK, *entered, *backlash, "--gauge", dial, "--out", out]
     code, text, err = run_orthocal(".", *words)
     assert code == 0
     assert "24 readings (6 closing) in 6 setups, about 72 min" in text
@@ -49,6 +51,7 @@ def test_a_plan_is_written_ready_to_measure(tmp_path):
     session = load_plan(out)
     assert session.purpose == Purpose("full")
     assert session.robot.parameters.stated == {"*.offset_mm": 1.0}
+    assert [trim.backlash for trim in session.compensation] == pytest.approx([0.0, 2e-5, 0.0])
     assert session.gauge.range == (-1e-3, 1e-3)
     assert {s.sensor.tip.form for s in session.setups.values()} == {"blade"}
     assert {s.sensor.mounting.direction for s in session.setups.values()} == {5e-3}
@@ -57,6 +60,8 @@ def test_a_plan_is_written_ready_to_measure(tmp_path):
     assert all(row.endswith(",") for row in rows[1:])
     assert len(rows) == 1 + 24
     assert "an empty readings.csv" in err
+    next_commands = [f"orthocal record {out}", f"orthocal calibrate {out} --out {out}-calibration"]
+    assert [line.strip() for line in err.splitlines()[-2:]] == next_commands
     document = json.loads((out / "plan.json").read_text())
     assert document["readings"] + document["closing_readings"] == 24
     assert (out / "plan.svg").read_text().startswith('<?xml version="1.0"')
@@ -64,6 +69,20 @@ def test_a_plan_is_written_ready_to_measure(tmp_path):
     code, _, err = run_orthocal(".", *words)
     assert code == 2
     assert f"orthocal: {out / 'session.yaml'}: exists already; --force overwrites it" in err
+
+
+@pytest.mark.parametrize("text", ["0,0", "-0.1", "0,0,9", "none", "0.02,,0"])
+def test_a_wrong_backlash_of_the_controller_is_refused_before_the_search(text):
+    code, out, err = run_orthocal(".", "plan", "orthoglide", f"--backlash={text}")
+    assert (code, out) == (2, "")
+    assert err.startswith("orthocal: --backlash: ")
+    assert "computing" not in err
+
+
+def test_the_controller_is_stated_once(tmp_path):
+    words = ["--backlash", "0", "--ini", tmp_path / "machine.ini"]
+    code, _, err = run_orthocal(".", "plan", "orthoglide", *words)
+    assert (code, err) == (2, "orthocal: --backlash: found with --ini; expected one\n")
 
 
 @pytest.mark.parametrize("much", [["--setups", "3", "--out"], ["--hours", "0.5"]])
@@ -129,14 +148,17 @@ def test_offsets_that_too_few_readings_leave_are_named():
     assert err.endswith("--out DIRECTORY writes session, sheet and programs.\n")
 
 
-def test_further_setups_of_a_session_are_planned(root):
+def test_further_setups_of_a_session_are_planned(root, tmp_path):
     session = root / "examples/workshop"
     code, text, _ = run_orthocal(".", "plan", session, "--add", 2, "--json", *QUICK)
     assert code == 0
     found = json.loads(text)
     assert found["setups"] == 2
     assert found["expected"]["aligned_um"] < found["before"]["aligned_um"]
-    code, text, _ = run_orthocal(".", "plan", session, "--add", 2, *QUICK)
+    option, out = ["--tolerance", "*.offset_mm=8"], tmp_path / "out"
+    code, text, err = run_orthocal(".", "plan", session, "--add", 2, *QUICK, *option, "--out", out)
+    calibrating = ["orthocal", "calibrate", str(session), str(out), *option]
+    assert shlex.split(err.splitlines()[-1]) == [*calibrating, "--out", f"{out}-calibration"]
     said = " ".join(text.split())
     words = r"([\d.]+) mm with these readings added \(([\d.]+) mm with those of the session alone\)"
     after, before = map(float, re.search(words, said).groups())

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import run_orthocal
+from machines import frames
 from tolerances import SAME_OPTIMUM
 
 from orthocal import (
@@ -18,6 +19,7 @@ from orthocal import (
     load_robot,
     plan_readings,
     simulate_session,
+    summarize,
     write_session,
 )
 from orthocal.assessment.judgement import judge_session
@@ -37,7 +39,7 @@ from orthocal.planning.expected_error import ToolForecast
 from orthocal.planning.owned_sensors import load_owned_sensor
 from orthocal.planning.planned_session import _order_readings, build_session
 from orthocal.planning.selection import PlannedSetup, SetupSearch
-from orthocal.planning.tool_candidates import list_tool_candidates
+from orthocal.planning.tool_candidates import list_tool_candidates, segment_distances
 from orthocal.sensors.ball_bar import SAGITTA
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Reading, Session, Setup
@@ -206,6 +208,9 @@ def test_approaches_of_a_bar_follow_from_its_path(owned):
         (BAR.replace("ball_bar", "leg"), ""),
         (BAR.replace("sigma_mm: 0.002\n", ""), "sigma_mm"),
         (BAR + "centre_mm: [0, 0, 0]\n", "centre_mm"),
+        (BAR + "elevation_deg: [10, -90]\n", "elevation_deg"),
+        (BAR + "radius_mm: wide\n", "radius_mm"),
+        (PROBE + "elevation_deg: [-90, 0]\n", "elevation_deg"),
     ],
 )
 def test_a_wrong_file_is_refused_by_its_key(owned, text, place):
@@ -313,6 +318,94 @@ def test_postures_in_which_a_drive_turns_round_are_omitted(owned):
     assert not any("u" in r.conditions.approach for r in plan.readings)
     assert {r.posture for r in plan.readings} == {r.posture for r in as_chosen.readings} - unclear
     assert plan.readings[-1].posture == plan.readings[0].posture
+
+
+def on_segments(starts, ends, count=101):
+    """Points on segments, shape (n, count, 3)."""
+    return starts[:, None] + np.linspace(0.0, 1.0, count)[:, None] * (ends - starts)[:, None]
+
+
+def nearest(one, other):
+    """Least distance of the points on each pair of segments, (n,)."""
+    return np.linalg.norm(one[:, :, None] - other[:, None], axis=3).min(axis=(1, 2))
+
+
+def test_distances_of_segments_are_those_of_their_points():
+    """Random ones, parallel ones, and ones that cross."""
+    rng = np.random.default_rng(1)
+    ends = rng.uniform(-1.0, 1.0, size=(4, 60, 3))
+    ends[3, :10] = ends[2, :10] + ends[1, :10] - ends[0, :10]
+    ends[2, 10:20], ends[3, 10:20] = ends[0, 10:20] + 0.3, 2.0 * ends[1, 10:20] - ends[0, 10:20]
+    sampled = nearest(on_segments(*ends[:2]), on_segments(*ends[2:]))
+    found = segment_distances(*ends)
+    assert (found <= sampled + 1e-12).all()
+    assert (sampled - found).max() < 0.04  # the points are up to 0.02 apart along each
+
+
+@pytest.mark.parametrize(("radius", "clear"), [(10, True), (0, False)])
+def test_no_rod_is_in_the_way_of_a_bar(owned, orthoglide, radius, clear):
+    """Rods by Pinocchio. Without room for the bar itself, its axis passes them by 1 mm."""
+    sensors = owned(bar=BAR + f"radius_mm: {radius}\n")
+    _, postures, setups, readings = list_tool_candidates(orthoglide, sensors, None)
+    read = [r for r in readings if r.setup == "bar_10"]
+    gaps = []
+    for posture in (postures[r.posture] for r in read[::5]):
+        found = frames(orthoglide, posture.drives)
+        bar = on_segments(found["tcp"][None], np.array([setups["bar_10"].sensor.centre]))
+        for rod in orthoglide.rods.values():
+            ends = on_segments(found[rod.root][None], found[rod.tip][None])
+            gaps.append(nearest(bar, ends)[0] - rod.radius)
+    assert (min(gaps) > 0.0099) == clear
+
+
+def test_a_bar_is_as_steep_as_its_file_states(owned, orthoglide):
+    """From the tool's ball downwards: the tool is above the fixed ball."""
+    sensors = owned(bar=BAR + "elevation_deg: [-90, -10]\ntool_mm: [0, 0, -40]\n")
+    _, postures, setups, readings = list_tool_candidates(orthoglide, sensors, None)
+    bars = [
+        np.array(setups[r.setup].sensor.centre) - postures[r.posture].values - [0.0, 0.0, -0.04]
+        for r in readings
+    ]
+    sines = np.array([bar[2] / np.linalg.norm(bar) for bar in bars])
+    assert -0.25 < sines.max() <= np.sin(np.radians(-10.0))
+    assert sines.min() == pytest.approx(-1.0)
+
+
+def needed_range(robot, sensors, **options):
+    """Range to either side that the bar needs if its dial is too short, [mm]; 0 if it is not."""
+    session = list_candidates(robot, Equipment(owned=sensors))
+    forecast = ToolForecast(robot, resolve_choice("offsets", None).select(robot.parameters))
+    found = measure_candidates(session, forecast.problem(session), spare_range=3.0, **options)
+    assert any(s.reachable.any() for s in found.setups) != bool(found.unusable)
+    return 1e3 * found.unusable.get("bar", 0.0)
+
+
+@pytest.mark.parametrize(
+    ("length", "offset", "entered", "expected"),
+    [
+        ("unknown", 0.4, False, 3.0 * np.hypot(1.0, np.hypot(0.25, 0.2))),
+        ("0.4", 0.4, False, 0.0),  # 3 × 0.38 mm
+        ("0.4", 4.0, False, 3.0 * np.hypot(0.2, np.hypot(0.25, 2.0))),
+        ("0.4", 4.0, True, 0.0),  # after a calibration, 3 × 0.38 mm
+    ],
+)
+def test_the_range_of_a_bar_holds_the_tolerances_of_length_place_and_offsets(
+    owned, length, offset, entered, expected
+):
+    """Nobody sets the zero of a bar. A drive moves the tool about as far as itself."""
+    text = BAR.replace("[-25, 25]", "[-3, 3]").replace("unknown", length)
+    sensors = owned(bar=text + "centre_tolerance_mm: 0.5\nscale_tolerance: 0\n")
+    robot = without_legs(**{"*.offset_mm": offset})
+    assert needed_range(robot, sensors, entered=entered) == pytest.approx(expected, rel=0.05)
+
+
+def test_a_plan_says_which_sensor_has_too_short_a_range(owned):
+    robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 0.4})
+    short = owned(bar=BAR.replace("[-25, 25]", "[-2, 2]"))
+    plan = plan_readings(robot, hours=0.5, equipment=Equipment(owned=short, **QUICK), starts=1)
+    assert {s.gauge for s in plan.session.setups.values()} == {"dial"}
+    assert json.loads(plan_json(plan))["unusable_mm"]["bar"] == pytest.approx(4.3, abs=0.1)
+    assert "Not in the plan: bar." in summarize(plan)
 
 
 @pytest.mark.parametrize("names", [("dial",), ("bar", "bar")])

@@ -15,7 +15,7 @@ from orthocal.calibration.refit import repeat_calibration, restore_session
 from orthocal.cli.options import state_tolerances
 from orthocal.estimation.choice import resolve_choice
 from orthocal.measurement.files.session_file import load_session
-from orthocal.measurement.files.write_session import write_session
+from orthocal.measurement.files.write_session import session_document, write_session
 from orthocal.measurement.joining import join_sessions
 from orthocal.session.session import Purpose
 from orthocal.study.sensitivity import build_sensitivity_study
@@ -80,7 +80,7 @@ def test_options_take_precedence_over_a_statement(stated):
 
 
 def test_the_default_model_without_a_statement(raw_cycles, stated):
-    silent = replace(raw_cycles, purpose=None)
+    silent = replace(raw_cycles, purpose=None).with_tolerances(TOLERANCES)
     assert resolve_choice(None, raw_cycles).model == "offsets"  # as stated
     assert resolve_choice(None, silent).model == "full"
     assert resolve_choice(None, silent, default_model="lengths").model == "lengths"
@@ -94,11 +94,11 @@ def test_a_session_may_state_globs_instead_of_a_model(raw_cycles, tmp_path):
 
 
 def test_joined_sessions_must_state_one_model(raw_cycles, stated, tmp_path):
-    also = state(raw_cycles, tmp_path / "also", model="full", tolerances={"*.scale_ppm": 100.0})
+    also = state(raw_cycles, tmp_path / "also", model="full", tolerances=TOLERANCES)
     joined = join_sessions([stated, also])
     assert joined.purpose == Purpose("full")
-    assert joined.robot.parameters.stated == {**TOLERANCES, "*.scale_ppm": 100.0}
-    offsets = state(raw_cycles, tmp_path / "offsets", model="offsets")
+    assert joined.robot.parameters.stated == TOLERANCES
+    offsets = state(raw_cycles, tmp_path / "offsets", model="offsets", tolerances=TOLERANCES)
     joined = join_sessions([stated, offsets])
     with pytest.raises(ParameterError) as e:
         resolve_choice(None, joined)
@@ -107,21 +107,51 @@ def test_joined_sessions_must_state_one_model(raw_cycles, stated, tmp_path):
         f"{offsets.path}; choose one"
     )
     assert resolve_choice("full", joined).model == "full"
-    silent = replace(raw_cycles, purpose=None)
+    silent = replace(raw_cycles, purpose=None).with_tolerances(TOLERANCES)
     assert resolve_choice(None, join_sessions([stated, silent])).model == "full"
 
 
-def test_joined_sessions_must_state_equal_tolerances(raw_cycles, stated, tmp_path):
-    other = state(raw_cycles, tmp_path, model="full", tolerances={"*.offset_mm": 4.0})
+@pytest.mark.parametrize(
+    "tolerances",
+    [
+        {"*.offset_mm": 4.0},
+        {},  # those of the robot
+        {**TOLERANCES, "x_slide.offset_mm": 4.0},  # another key, the same error
+    ],
+)
+def test_joined_sessions_must_state_equal_tolerances(raw_cycles, stated, tmp_path, tolerances):
+    other = state(raw_cycles, tmp_path, model="full", tolerances=tolerances)
+    for pair in ([stated, other], [other, stated]):
+        with pytest.raises(SessionError) as e:
+            join_sessions(pair)
+        assert e.value.where == f"{pair[1].path}: calibration.tolerances"
+        assert str(pair[0].path) in str(e.value)
+    options = [f"{key}={value:g}" for key, value in TOLERANCES.items()]
+    agreed = [state_tolerances(s, options) for s in (stated, other)]
+    assert join_sessions(agreed).robot.parameters.stated == TOLERANCES
+
+
+def test_the_message_says_what_to_state(raw_cycles, stated, tmp_path):
+    other = state(raw_cycles, tmp_path, tolerances={**TOLERANCES, "*.offset_mm": 4.0})
     with pytest.raises(SessionError) as e:
         join_sessions([stated, other])
     assert str(e.value) == (
-        f"{other.path}: calibration.tolerances.*.offset_mm: is 4; it is 0.8 in {stated.path}, and "
-        "the machine is the same; expected one value. --tolerance '*.offset_mm=0.8' states it for "
-        "all sessions"
+        f"{other.path}: calibration.tolerances: 'x_slide.offset' is within ±4 mm, but within "
+        f"±0.8 mm in {stated.path}; expected one value, because the machine is the same. A session "
+        "without `tolerances` has those of the robot's YAML. For all: "
+        "--tolerance '*_fork.rx_mrad=6' --tolerance '*_swivel.rx_mrad=4' "
+        "--tolerance '*.offset_mm=0.8'"
     )
-    agreed = [state_tolerances(s, ["*.offset_mm=0.8"]) for s in (stated, other)]
-    assert join_sessions(agreed).robot.parameters.stated == TOLERANCES
+
+
+def test_a_session_states_only_what_differs_from_the_robot(raw_cycles):
+    """Also where a general key, a repeated one and one of another unit say what the robot says."""
+    own = 2e3 * raw_cycles.robot.parameters["x_slide.offset"].prior_std
+    same = raw_cycles.with_tolerances({"*.offset_mm": own, "x_slide.offset_m": own * 1e-3})
+    assert same.robot.parameters.stated == {}
+    assert "tolerances" not in session_document(same).get("calibration", {})
+    narrow = {"*.offset_mm": 1.0, "x_slide.offset_mm": own}  # the second key undoes the first
+    assert raw_cycles.with_tolerances(narrow).robot.parameters.stated == narrow
 
 
 def test_a_worker_has_the_stated_tolerances(stated):

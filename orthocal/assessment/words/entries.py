@@ -148,6 +148,17 @@ def controller_not_stated(drives: Sequence[str], *, keep: bool) -> Finding:
     )
 
 
+def backlash_not_stated(n_drives: int) -> Finding:
+    """Finding that the backlash which the controller compensates is not known."""
+    zeros = ", ".join(["0"] * n_drives)
+    return note(
+        "backlash not stated",
+        "The session does not state which backlash the controller compensates. It counts as none "
+        "(`now`).",
+        f"State it in session.yaml, such as controller: {{backlash_mm: [{zeros}]}} for none.",
+    )
+
+
 def earlier_readings() -> Finding:
     """Finding about active offsets, which may result from readings of another session."""
     return note(

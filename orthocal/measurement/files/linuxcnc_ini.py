@@ -35,7 +35,7 @@ class ControllerJoints:
     latched: tuple[int, ...] | None
     """Sign of HOME_LATCH_VEL, 1 or -1; None if no joint states one, as in an exported fragment."""
     compensation: Compensation
-    """BACKLASH and COMP_FILE; empty if no joint has any."""
+    """BACKLASH and COMP_FILE of each joint."""
 
 
 def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
@@ -65,12 +65,11 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
         homes.append(home)
         latched.append(latch)
         trims.append(trim)
-    compensated = any(t.backlash or t.table is not None for t in trims)
     stated = any(latch is not None for latch in latched)
     return ControllerJoints(
         tuple(homes),
         tuple(latch or 1 for latch in latched) if stated else None,
-        tuple(trims) if compensated else (),
+        tuple(trims),
     )
 
 

@@ -68,7 +68,7 @@ def build_offsets(keys: ControllerKeys | None, robot: Robot, where: str) -> Arra
 def build_compensation(
     keys: ControllerKeys | None, robot: Robot, *, folder: Path, where: str
 ) -> Compensation:
-    """Backlash and errors of screws that the controller compensates; empty if it does not.
+    """Backlash and errors of screws that the controller compensates; empty if not stated.
 
     Args:
         keys: Keys under `controller`; None if absent.

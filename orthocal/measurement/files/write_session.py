@@ -134,7 +134,7 @@ def _controller_document(session: Session) -> dict[str, Any]:
         for drive, offset in zip(session.robot.drives, session.active_offsets, strict=True):
             key = "offsets_mm" if drive.unit == "m" else "offsets_mrad"
             document.setdefault(key, []).append(tidy(float(offset) / MM))
-    if any(joint.backlash for joint in session.compensation):
+    if any(joint.backlash or joint.table is None for joint in session.compensation):
         for drive, joint in zip(session.robot.drives, session.compensation, strict=True):
             unit, factor = DRIVE_UNITS[drive.unit]
             document.setdefault(f"backlash_{unit}", []).append(tidy(joint.backlash / factor))

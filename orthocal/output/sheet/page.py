@@ -514,11 +514,16 @@ def _compensation(session: Session) -> str:
         )
     if "approach" not in needed_conditions(session.robot):
         return ""
+    if session.compensation:
+        return (
+            "Check that the controller compensates no backlash, as session.yaml states (LinuxCNC: "
+            "BACKLASH is 0 or missing, no COMP_FILE)."
+        )
     return (
-        "session.yaml states that the controller compensates no backlash. If it compensates "
-        "backlash (LinuxCNC: BACKLASH, COMP_FILE), add it to `controller` in session.yaml: "
-        f"`backlash_mm: [{', '.join(['0.02'] * len(session.robot.drives))}]` for "
-        f"{', '.join(d.name for d in session.robot.drives)}."
+        "session.yaml does not state which backlash the controller compensates (LinuxCNC: "
+        "BACKLASH, COMP_FILE). Write it into session.yaml, 0 for none, in the order "
+        f"{', '.join(d.name for d in session.robot.drives)}: controller: {{backlash_mm: ["
+        f"{', '.join(['0'] * len(session.robot.drives))}]}}."
     )
 
 

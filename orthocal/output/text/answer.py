@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Group, RenderableType
@@ -56,6 +56,7 @@ LISTED: tuple[FindingKind, ...] = (
     "above tolerances",
     "no redundancy",
     "earlier readings",
+    "backlash not stated",
     "held by a bound",
     "not significant",
     "line assumed",
@@ -258,8 +259,20 @@ def gains_from_correction(calibration: Calibration) -> bool:
     )
 
 
+def calibrate_command(sessions: Sequence[Path], tolerances: Mapping[str, float]) -> str:
+    """Command that calibrates from several sessions.
+
+    Args:
+        sessions: Directories of the sessions.
+        tolerances: Tolerances that differ from those of the robot, by their keys.
+    """
+    names = [quote_path(session) for session in sessions]
+    options = [f"--tolerance {quote_path(f'{key}={value:g}')}" for key, value in tolerances.items()]
+    return " ".join(["orthocal calibrate", *names, *options, f"--out {names[-1]}-calibration"])
+
+
 def quote_path(path: str | Path) -> str:
-    """A path as it can be typed in a shell."""
+    """A path or another word as it can be typed in a shell."""
     return printable(shlex.quote(str(path)))
 
 

@@ -29,6 +29,7 @@ from orthocal.planning.cost_curve import HOUR, HOURLY_GAIN, Stage
 from orthocal.planning.expected_error import Criterion, Expected
 from orthocal.planning.first_plan import FixedPlan
 from orthocal.planning.further_readings import FurtherReadings
+from orthocal.planning.owned_sensors import DIAL
 from orthocal.planning.plan import MeasuringPlan
 from orthocal.planning.plan_comparison import Alternative
 from orthocal.planning.sensor_gains import SensorGain
@@ -106,6 +107,7 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
         Text(),
         *map(Text, describe_expected(plan)),
         *map(Text, _undetermined(plan, gains)),
+        *map(Text, _unusable(plan)),
         Text(_when_enough(plan)),
         section("Other plans in the same time", _alternatives(plan)),
         section("What would help", bullets(_helps(plan, gains))),
@@ -153,6 +155,16 @@ def _undetermined(plan: MeasuringPlan | FixedPlan, gains: Sequence[SensorGain]) 
     if not drives:
         return []
     return [describe_remedy(drives, gains, plan.expected.reported.rms)]
+
+
+def _unusable(plan: MeasuringPlan) -> list[str]:
+    """Gauges whose range is too small for their readings, as sentences."""
+    return [
+        f"Not in the plan: {name or DIAL}. Within the tolerances of machine, place and gauge its "
+        f"readings reach ±{needed / MM:.1f} mm, beyond its range. State smaller tolerances, use a "
+        "gauge of more range, or enter offsets of other readings first and plan from their session."
+        for name, needed in plan.unusable.items()
+    ]
 
 
 def _undetermined_offsets(plan: MeasuringPlan | FixedPlan) -> list[str]:
@@ -279,6 +291,7 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
         "helps": [alternative(a) for a in plan.helps],
         "curve": [stage(s) for s in plan.curve],
         "enough": None if plan.enough is None else stage(plan.enough),
+        "unusable_mm": {name: needed / MM for name, needed in plan.unusable.items()},
         "effects": [asdict(e) for e in plan.effects],
         "further_readings": [asdict(f) for f in plan.further],
         "remaining": [

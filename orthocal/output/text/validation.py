@@ -12,11 +12,11 @@ from orthocal.assessment.validation import Validation
 from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.calibration.assessment_record import FindingKind
 from orthocal.output.text.answer import (
+    calibrate_command,
     describe_columns,
     describe_conditions,
     entry_table,
     gains_from_correction,
-    quote_path,
     render_backlash,
     render_headline,
     render_next,
@@ -99,8 +99,8 @@ def _next_step(validation: Validation, *, further: bool) -> list[RenderableType]
         words = "to correct the other identified errors, too, calibrate from all readings:"
     else:
         return []
-    sessions = [quote_path(Path(path).parent) for path in paths if path is not None]
-    command = f"orthocal calibrate {' '.join(sessions)} --out {sessions[-1]}-calibration"
+    stated = validation.final_calibration.robot.parameters.stated
+    command = calibrate_command([Path(path).parent for path in paths if path is not None], stated)
     return [Text(), render_next(words, [command])]
 
 

@@ -192,7 +192,7 @@ def test_front_page_states_zero_travel_and_approach(page):
 
 
 def test_front_page_states_what_the_controller_compensates(small):
-    """What the session states; that it states none only where backlash matters."""
+    """What the session states; a question if it states nothing, only where backlash matters."""
     table = np.array([[0.0, 1e-5, -1e-5], [0.4, 2e-5, -2e-5]])
     trims = (JointTrim(table=table), JointTrim(0.05 * MM), JointTrim())
 
@@ -204,7 +204,11 @@ def test_front_page_states_what_the_controller_compensates(small):
     assert "controller compensates backlash" in stated
     assert "x_slide by a table, y_slide 0.050 mm (LinuxCNC" in stated
     assert "compensates" not in front(small)
-    assert "compensates no backlash" in front(small.with_effects(["backlash"]))
+    with_backlash = small.with_effects(["backlash"])
+    assert "into session.yaml, 0 for none" in front(with_backlash)
+    assert "backlash_mm: [0, 0, 0]" in front(with_backlash)
+    without = replace(with_backlash, compensation=(JointTrim(),) * 3)
+    assert "compensates no backlash, as session.yaml states" in front(without)
 
 
 def test_sheet_after_a_calibration_has_shifted_travel_and_ends_with_validation(small):
