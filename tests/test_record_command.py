@@ -163,6 +163,11 @@ ENTRIES = {
         ["0.30", "0.20"],
         "Line 2: yx zero (4 of 6 missing)",
     ),
+    "back to an earlier setup": (
+        [*["0.1"] * 4, "back 2", "0.2"],
+        ["0.20", *["0.10"] * 3],
+        "The stand has been moved since yx was read: correct only typing errors",
+    ),
     "back after a repetition": (
         ["0.1", "again", "0.11", "back", "0.12"],
         ["0.10", *[""] * 5, "0.12"],
