@@ -108,6 +108,15 @@ def marked_plots():
         yield
 
 
+@contextmanager
+def marked_reports():
+    """A mark in place of reports, which have tests of their own."""
+    from orthocal.output.report import page
+
+    with patch.object(page, "build_report", lambda *_, **__: "<html></html>"):
+        yield
+
+
 @pytest.fixture
 def without_sensor_gains():
     """Plans and details without gains of usual sensors, which have tests of their own."""

@@ -1,10 +1,10 @@
-"""A builder's whole way, by the command line: legs of 250 mm, from nothing to a better part.
+"""Complete use of the command line on a machine with legs of 250 mm, up to a better part.
 
 new → record → check → calibrate → enter → record → validate → calibrate → export → LinuxCNC. The
-machine itself is simulated: all its errors at tolerance, dials as hands make them stand.
+machine is simulated with all errors at their tolerances and realistic gauge misalignment.
 
 With effects beside geometry: new → simulate → check → calibrate → compare → export → again →
-simulate → validate → calibrate both → correct. The part is made by the independent simulator.
+simulate → validate → calibrate both → correct. The independent simulator makes the part.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from adjusting import aligned_rms
 from commands import run_orthocal
+from conftest import no_sensor_gains
 from independent import Expansion, IndependentMachine, States
 from linuxcnc import Joint, play, require_linuxcnc, run_program
 from programs import read_polyline
@@ -34,8 +35,8 @@ from orthocal.assessment.controller_entries import find_entries
 from orthocal.observation.simulate import collect_errors
 from orthocal.units import MM
 
-SIZES = """--leg-mm 250 --travel-mm 100:325 --attachment-mm 30 --rods-apart-mm 60 --rod-radius-mm 4
---counts up,down,up --at-zero-mm 0 --effects none --paper"""
+DIMENSIONS = """--leg-mm 250 --travel-mm 100:325 --attachment-mm 30 --rods-apart-mm 60
+--rod-radius-mm 4 --counts up,down,up --at-zero-mm 0 --effects none --paper"""
 
 
 SEED = 3
@@ -48,35 +49,35 @@ def run(folder, *words, typed="", code=0):
 
 
 def measure(folder, session, errors, seed):
-    """Read a planned session on the machine, and type it in, line by line."""
-    shown = simulate_session(load_plan(folder / session), errors, seed=seed).session
-    typed = [f"{v / MM:.2f}".replace(".", ",") for v in shown.values]
-    said = run(folder, "record", session, typed="\n".join([*typed, ""]))
-    assert f"All {len(typed)} readings are recorded." in said
+    """Simulate the readings of a plan and type them line by line."""
+    simulated = simulate_session(load_plan(folder / session), errors, seed=seed).session
+    typed = [f"{v / MM:.2f}".replace(".", ",") for v in simulated.values]
+    printed = run(folder, "record", session, typed="\n".join([*typed, ""]))
+    assert f"All {len(typed)} readings are recorded." in printed
     with open(folder / session / "readings.csv") as file:
         read = [float(row["reading_mm"]) * MM for row in csv.DictReader(file)]
-    assert read == pytest.approx(shown.values, abs=1e-12)
+    assert read == pytest.approx(simulated.values, abs=1e-12)
 
 
-def left_at_tool(calibration, errors, send):
-    """What the real machine's tool is off over the workspace, shift and rotation out, [m]."""
+def actual_tool_error(calibration, errors, command):
+    """Tool error of the actual machine over the workspace after alignment, RMS, [m]."""
     tool = assess_tool(calibration)
-    reached = Machine(calibration.robot, errors).forward(send(tool.targets))
+    reached = Machine(calibration.robot, errors).forward(command(tool.targets))
     return tool.measure(reached - tool.targets).aligned.rms
 
 
 @pytest.fixture(scope="module")
-def walked(tmp_path_factory, short_reports):
-    """The folder after two rounds, the machine's errors, both calibrations, and the last answer."""
+def two_rounds(tmp_path_factory, short_reports):
+    """Directory after two rounds, true errors, both calibrations and the last answer."""
     folder = tmp_path_factory.mktemp("walk")
-    run(folder, "new", "mill", *SIZES.split(), "--tolerance", "*.offset_mm=4")
+    run(folder, "new", "mill", *DIMENSIONS.split(), "--tolerance", "*.offset_mm=4")
     robot = load_robot(folder / "mill")
     errors = draw_errors(robot, ["*"], seed=SEED, tolerances={"*.offset_mm": 4.0})
     measure(folder, "mill/first", errors, SEED)
     run(folder, "check", "mill/first")
     run(folder, "calibrate", "mill/first", "--out", "one")
     one = load_calibration(folder / "one")
-    # the same plan once more, with what is to be entered
+    # the same plan with the offsets entered
     first, second = folder / "mill/first", folder / "mill/second"
     second.mkdir()
     entered = ", ".join(f"{e.enter / MM:.3f}" for e in find_entries(one))
@@ -91,35 +92,39 @@ def walked(tmp_path_factory, short_reports):
     (second / "readings.csv").write_text(text + "\n")
     measure(folder, "mill/second", errors, SEED + 1)
     run(folder, "validate", "one", "mill/second")
-    said = run(folder, "calibrate", "mill/second", "--out", "two")
-    return folder, errors, one, load_calibration(folder / "two"), " ".join(said.split())
+    answer = run(folder, "calibrate", "mill/second", "--out", "two")
+    return folder, errors, one, load_calibration(folder / "two"), " ".join(answer.split())
 
 
 @pytest.mark.slow
-def test_the_part_is_as_good_as_promised(walked):
-    _, errors, one, two, said = walked
-    robot = one.robot
-    nominal = Machine(robot, {})
-    before = left_at_tool(one, errors, nominal.inverse)
-    entered = np.array([e.enter for e in find_entries(one)])
-    after = left_at_tool(one, errors, lambda p: nominal.inverse(p) - entered + one.active_offsets)
-    whole = left_at_tool(two, errors, two.machine.inverse)
-    promised = assess_tool(two).after.sizes.aligned.rms
-    assert whole < 1.2 * promised
-    assert whole < 0.5 * after
-    assert after < 0.5 * before
-    told = re.search(r"With all identified errors corrected: ([0-9.]+) mm", said)
-    assert float(told[1]) == pytest.approx(promised * 1e3, abs=0.5e-3)
-    assert two.assessment.tool.compensated == pytest.approx(promised)
+def test_actual_tool_error_is_the_expected_one(two_rounds):
+    _, errors, one, two, answer = two_rounds
+    nominal = Machine(one.robot, {})
+    enter = np.array([e.enter for e in find_entries(one)])
+    before, entered, corrected = (
+        actual_tool_error(calibration, errors, command)
+        for calibration, command in (
+            (one, nominal.inverse),
+            (one, lambda p: nominal.inverse(p) - enter + one.active_offsets),
+            (two, two.machine.inverse),
+        )
+    )
+    expected = assess_tool(two).after.sizes.aligned.rms
+    assert corrected < 1.2 * expected
+    assert corrected < 0.5 * entered
+    assert entered < 0.5 * before
+    printed = re.search(r"With all identified errors corrected: ([0-9.]+) mm", answer)
+    assert float(printed[1]) == pytest.approx(expected * 1e3, abs=0.5e-3)
+    assert two.assessment.tool.compensated == pytest.approx(expected)
 
 
 @pytest.mark.slow
-def test_linuxcnc_moves_the_machine_as_it_was_calibrated(walked):
-    """Its joints, recorded, put through the real machine: off by what the calibration leaves."""
+def test_linuxcnc_moves_the_calibrated_machine(two_rounds):
+    """The actual machine with the recorded joints has the errors that the calibration expects."""
     require_linuxcnc()
-    folder, errors, _, two, _ = walked
-    said = run(folder, "export", "two", "--to", "linuxcnc", "--out", "cnc", "--within", "0.5")
-    assert said == ""
+    folder, errors, _, two, _ = two_rounds
+    printed = run(folder, "export", "two", "--to", "linuxcnc", "--out", "cnc", "--within", "0.5")
+    assert printed == ""
     corners = [(30, -30, 20), (-40, 10, -30), (10, 40, 30)]
     program = [
         f"G21 G90 G61 {'G1 ' if i == 0 else ''}X{x} Y{y} Z{z} F6000"
@@ -140,78 +145,76 @@ def test_linuxcnc_moves_the_machine_as_it_was_calibrated(walked):
     commanded = two.machine.forward(slides)
     assert np.linalg.norm(commanded[-1] / MM - corners[-1]) < 1e-3
     assert len(commanded) > 30
-    off = Machine(two.robot, errors).forward(slides) - commanded
+    deviation = Machine(two.robot, errors).forward(slides) - commanded
     exact = Machine(two.robot, errors).forward(two.machine.inverse(commanded)) - commanded
-    assert np.abs(off - exact).max() < 1e-9
-    promised = assess_tool(two).after.sizes
-    assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 3.0 * promised.absolute.rms
+    assert np.abs(deviation - exact).max() < 1e-9
+    expected = assess_tool(two).after.sizes
+    assert np.sqrt(np.mean(np.sum(deviation**2, axis=1))) < 3.0 * expected.absolute.rms
 
 
-WARM = "--tolerance *.offset_mm=2 --effects backlash,thermal --temperature 18:26"
-DAYS = "18:26", "19:27"
+EFFECTS = "--tolerance *.offset_mm=2 --effects backlash,thermal --temperature 18:26"
+TEMPERATURES = "18:26", "19:27"
 """Temperatures of the first and the last reading of both sessions, [°C]."""
 
-CUT_AT = 26.0
+BACKLASH = 40e-6
+"""Backlash of each drive, [m]."""
+
+CUTTING_TEMPERATURE = 26.0
 """[°C]"""
 
 HOLES = np.random.default_rng(4).uniform(-42.0, 42.0, (40, 3)).round(2)
 """Holes of the part in the order of drilling, [mm]."""
 
-TAKEN_UP = 3
+FIRST_HOLE = 3
 """Holes after which every drive has reversed."""
 
 
 @pytest.fixture(scope="module")
-def warm_mill(tmp_path_factory, short_reports):
-    """A machine with a plan for a day that warms by 8 K."""
-    folder = tmp_path_factory.mktemp("warm")
-    run(folder, "new", "mill", *SIZES.removesuffix("--effects none --paper").split(), *WARM.split())
-    return folder / "mill"
+def warming_machine(tmp_path_factory, short_reports):
+    """Directory of two sessions on days that warm by 8 K, up to the corrected program.
 
-
-@pytest.fixture(scope="module", params=[40e-6, 0.0], ids=["backlash", "no backlash"])
-def warmed(request, tmp_path_factory, warm_mill):
-    """Two sessions on days that warm by 8 K, up to the corrected program.
-
-    With the directory, the backlash of each drive, and what was printed.
+    With the output of two commands.
     """
-    folder, said = tmp_path_factory.mktemp("warmed"), {}
-    shutil.copytree(warm_mill, folder / "mill")
+    folder, printed = tmp_path_factory.mktemp("warming"), {}
+    options = DIMENSIONS.removesuffix("--effects none --paper") + EFFECTS
+    with no_sensor_gains():
+        run(folder, "new", "mill", *options.split())
 
     def identify(name, *sessions):  # without its report
         (folder / name).mkdir()
         document = run(folder, "calibrate", *sessions, "--json")
         (folder / name / "calibration.json").write_text(document)
 
-    truth = [f"--error={d}_slide.backlash_mm={request.param / MM:g}" for d in "xyz"]
+    truth = [f"--error={d}_slide.backlash_mm={BACKLASH / MM:g}" for d in "xyz"]
     draw = "--draw", "full", "--seed", SEED, *truth
-    run(folder, "simulate", "mill/first", *draw, "--temperature", DAYS[0], "--out", "one")
+    run(folder, "simulate", "mill/first", *draw, "--temperature", TEMPERATURES[0], "--out", "one")
     run(folder, "check", "one")
     identify("first", "one")
-    said["compare"] = " ".join(run(folder, "compare", "one").split())
+    printed["compare"] = " ".join(run(folder, "compare", "one", "--models", "offsets").split())
     home = "--offsets", "--home-offset", "0,0,0", "--latched=+,+,+"
     run(folder, "export", "first", "--to", "linuxcnc", *home, "--out", "cnc")
     run(folder, "again", "first", "--ini", "cnc/joints.ini", "--out", "mill/second")
     same = "--errors", "one/truth.yaml", "--seed", SEED + 1
-    run(folder, "simulate", "mill/second", *same, "--temperature", DAYS[1], "--out", "two")
-    said["validate"] = " ".join(run(folder, "validate", "first", "two").split())
+    run(folder, "simulate", "mill/second", *same, "--temperature", TEMPERATURES[1], "--out", "two")
+    printed["validate"] = " ".join(run(folder, "validate", "first", "two").split())
     identify("both", "one", "two")
     drilled = [
         f"N{n} {'G1' if n > 1 else 'G0'} X{x} Y{y} Z{z} F600"
         for n, (x, y, z) in enumerate(HOLES, start=1)
     ]
     (folder / "part.ngc").write_text("\n".join(["G21 G90 G61", *drilled, "M2", ""]))
-    options = "--offsets", "active", "--temperature", CUT_AT
+    options = "--offsets", "active", "--temperature", CUTTING_TEMPERATURE
     run(folder, "correct", "both", "part.ngc", *options, "--out", "good.ngc")
-    run(folder, "accuracy", "both", "--temperature", CUT_AT)
-    return folder, request.param, said
+    with no_sensor_gains():
+        run(folder, "accuracy", "both", "--temperature", CUTTING_TEMPERATURE)
+    return folder, printed
 
 
-def drill(folder, program, backlash):
-    """Error of the real holes after alignment of the part, RMS, [m].
+def drill(folder, program):
+    """Error of the actual holes after alignment of the part, RMS, [m].
 
     The controller has nominal kinematics, the offsets and the backlash of the second session. The
-    machine is that of the independent simulator; its slides have play.
+    machine is that of the independent simulator; its slides have backlash.
     """
     both, bare = load_calibration(folder / "both"), folder / "bare"
     robot = both.robot
@@ -227,37 +230,36 @@ def drill(folder, program, backlash):
     moved = np.maximum.accumulate(np.where(steps, np.arange(len(steps))[:, None], 0), axis=0)
     sides = np.sign(np.take_along_axis(steps, moved, axis=0))
     slides = motors + 0.5 * sides * both.compensated_backlash
-    slides = play(slides, np.full(slides.shape[1], backlash))
+    slides = play(slides, np.full(slides.shape[1], BACKLASH))
     truth = collect_errors(robot, file=folder / "one/truth.yaml")
     rigid = {n: v for n, v in truth.items() if not n.endswith(".backlash")}
     machine = IndependentMachine(bare, rigid, expansion=Expansion())
-    states = States(slides, np.zeros_like(slides), np.full(len(slides), CUT_AT))
+    states = States(slides, np.zeros_like(slides), np.full(len(slides), CUTTING_TEMPERATURE))
     (reached,) = machine.tool(states)
     last = {n: i for i, (n, _) in enumerate(written)}
     holes = reached[[last[n] for n in range(1, len(HOLES) + 1)]]
-    return aligned_rms(holes[TAKEN_UP:], HOLES[TAKEN_UP:] * MM)
+    return aligned_rms(holes[FIRST_HOLE:], HOLES[FIRST_HOLE:] * MM)
 
 
 @pytest.mark.slow
-def test_a_part_of_a_machine_with_effects_is_as_good_as_promised(warmed):
-    folder, backlash, said = warmed
+def test_part_of_a_machine_with_effects_has_the_expected_error(warming_machine):
+    folder, printed = warming_machine
     with open(folder / "one/readings.csv") as file:
         readings = list(csv.DictReader(file))
     assert {r["approach"] for r in readings} == {"ppp", "nnn"}
     assert {float(r["temperature_C"]) for r in readings} >= {18.0, 26.0}
     first, both = (load_calibration(folder / name) for name in ("first", "both"))
-    supported = "Recommended effects: backlash" if backlash else "Recommended effects: none"
-    assert supported in said["compare"]
-    assert "The calibration is confirmed." in said["validate"]
+    assert "Recommended effects: backlash" in printed["compare"]
+    assert "The calibration is confirmed." in printed["validate"]
     # the first alone corrects all errors, too, but from half of the readings
-    assert "orthocal calibrate one two --out two-calibration" in said["validate"]
+    assert "orthocal calibrate one two --out two-calibration" in printed["validate"]
     for p in both.free:
         if p.name.endswith(".backlash"):  # three of them, to 99.7 %
             half = 1.5 * both.expand_estimate(p)
-            assert p.value == pytest.approx(backlash, abs=half)
+            assert p.value == pytest.approx(BACKLASH, abs=half)
     entered = [e.enter for e in first.assessment.backlash]
     assert both.compensated_backlash == pytest.approx(np.round(entered, 6), abs=1e-12)
-    promised = both.assessment.tool.compensated
-    corrected, plain = (drill(folder, name, backlash) for name in ("good.ngc", "part.ngc"))
-    assert corrected < 1.15 * promised
+    expected = both.assessment.tool.compensated
+    corrected, plain = (drill(folder, name) for name in ("good.ngc", "part.ngc"))
+    assert corrected < 1.15 * expected
     assert corrected < 0.8 * plain

@@ -78,8 +78,9 @@ def calibration_json(calibration: Calibration) -> str:
     Raises:
         SolverError: If it could not be loaded again; names the impossible number.
     """
-    _require_loadable(calibration)
-    return json.dumps(calibration_document(calibration), indent=1, allow_nan=False) + "\n"
+    document = calibration_document(calibration)
+    _require_loadable(document, calibration)
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
 def write_calibration(calibration: Calibration, path: str | Path) -> Path:
@@ -92,12 +93,10 @@ def write_calibration(calibration: Calibration, path: str | Path) -> Path:
     return Path(path)
 
 
-def _require_loadable(calibration: Calibration) -> None:
+def _require_loadable(document: dict[str, Any], calibration: Calibration) -> None:
     """Refuse a result that could not be loaded from its file."""
     try:
-        _read_document(
-            calibration_document(calibration), "calibration.json", robot=calibration.robot
-        )
+        _read_document(document, "calibration.json", robot=calibration.robot)
     except CalibrationFileError as e:
         raise absurd_result(str(e), calibration.solver.iterations) from None
 

@@ -12,6 +12,7 @@ import pytest
 from effect_plans import effect_plan
 
 from orthocal import ExportOptions, calibrate, export_calibration, simulate_session
+from orthocal.assessment.assess import assess
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.controller_entries import (
     backlash_changes,

@@ -1,7 +1,7 @@
-"""BACKLASH, COMP_FILE and screws in the kinematics module, run in LinuxCNC.
+"""BACKLASH, COMP_FILE and periodic errors of screws in exports, run in LinuxCNC.
 
-The recorded motors move slides with play and periodic screws, simulated here without the effects'
-formulas: a slide follows its screw with a hysteresis, whatever the direction is called.
+The recorded motors move slides with backlash and periodic screws. The simulation shares no formula
+with the effects: a slide follows its screw with a hysteresis.
 """
 
 from __future__ import annotations
@@ -62,15 +62,15 @@ TRUTH = {
 }
 
 LATCHED = (1, -1, -1)
-"""With the sign of the search: of another sign the switch may open before a play is taken up."""
+"""Sign of the search; with the other one the switch may open before the backlash is taken up."""
 
 SWITCH = np.array([352.0, 340.0, 331.0]) * MM
 
 ROUNDING = np.sqrt(3.0) * 0.5e-6
 """Effect of offsets that are entered to 1 µm, [m]."""
 
-PROMISED = 1e-6
-"""Largest distance of the real path from the programmed one, [m]."""
+PATH_ERROR = 1e-6
+"""Largest distance of the actual path from the programmed one, [m]."""
 
 
 @pytest.fixture(scope="module")
@@ -80,23 +80,23 @@ def calibration(tmp_path_factory):
     )
     plan = load_plan(folder).with_controller(ACTIVE)
     session = simulate_session(plan, TRUTH, seed=4, sigma=0.5e-6).session
-    found = calibrate(session, Choice("offsets"), solver="variable-projection")
-    # unmodelled errors leave some backlash and waves undetermined, which the real machine here has
-    # as found
-    entered = tuple(replace(e, enter=e.identified) for e in found.assessment.backlash)
-    unmodelled = replace(found.unmodelled, leakage=0.0 * found.unmodelled.leakage)
-    stds = dict(zip((p.name for p in found.free), np.diag(found.model_covariance), strict=True))
+    result = calibrate(session, Choice("offsets"), solver="variable-projection")
+    # unmodelled errors make some backlash and periodic errors insignificant, which this machine has
+    # as identified
+    entered = tuple(replace(e, enter=e.identified) for e in result.assessment.backlash)
+    unmodelled = replace(result.unmodelled, leakage=0.0 * result.unmodelled.leakage)
+    stds = dict(zip((p.name for p in result.free), np.diag(result.model_covariance), strict=True))
     parameters = (
-        replace(p, std=float(np.sqrt(stds[p.name]))) if p.free else p for p in found.parameters
+        replace(p, std=float(np.sqrt(stds[p.name]))) if p.free else p for p in result.parameters
     )
-    assessment = replace(found.assessment, backlash=entered)
+    assessment = replace(result.assessment, backlash=entered)
     return replace(
-        found, assessment=assessment, unmodelled=unmodelled, parameters=tuple(parameters)
+        result, assessment=assessment, unmodelled=unmodelled, parameters=tuple(parameters)
     )
 
 
 def follow(calibration, motors):
-    """Tool of the calibrated machine whose motors were recorded, shape (K, 3), [m]."""
+    """Tool of the calibrated machine for recorded motors, shape (K, 3), [m]."""
     robot, errors = calibration.robot, calibration.errors
 
     def of_drives(kind):
@@ -140,9 +140,9 @@ CORNERS = [
 PATH = CENTRE, RADIUS, CORNERS
 COUNTS = [150, 5, 100, 60, 60]
 TAKEN_UP = 0.5
-"""Way after which every play is taken up, [mm]."""
+"""Distance after which all backlash is taken up, [mm]."""
 REVERSING = 0.3
-"""Distance from a corner, at which drives take up their play within some milliseconds, [mm]."""
+"""Distance from a corner within which drives take up their backlash in milliseconds, [mm]."""
 
 
 def run(calibration, files, tmp_path, *, module, inverse=None, homes=None):
@@ -150,7 +150,7 @@ def run(calibration, files, tmp_path, *, module, inverse=None, homes=None):
         (tmp_path / name).write_text(text)
     tables = {name: text for name, text in files.items() if name.endswith(".comp")}
     program = [
-        "G21 G90 G61 G1 X24 Y-14 Z12 F6000",  # a way off, so that every play is taken up
+        "G21 G90 G61 G1 X24 Y-14 Z12 F6000",  # far enough that all backlash is taken up
         "G21 G90 G61 F1500 G1 X28 Y-8 Z15",
         "G2 X28 Y-8 Z15 I-16 J0",
         *(f"G1 X{x:g} Y{y:g} Z{z:g} F6000" for x, y, z in CORNERS[2:]),
@@ -171,17 +171,17 @@ def run(calibration, files, tmp_path, *, module, inverse=None, homes=None):
     return points[(away[0] > TAKEN_UP) & (np.min(away, axis=0) > REVERSING)]
 
 
-def test_the_module_and_backlash_keep_the_path(calibration, tmp_path):
+def test_module_and_backlash_keep_the_path(calibration, tmp_path):
     require_linuxcnc()
     options = ExportOptions(module=True, within=0.05e-6, latched=LATCHED)
     files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
     assert len(re.findall(r"^BACKLASH = ", files["kinematics.ini"], re.M)) == 3
-    real = run(calibration, files, tmp_path, module=True)
-    require_followed(from_pieces(real, *PATH), PROMISED, COUNTS)
+    actual = run(calibration, files, tmp_path, module=True)
+    require_followed(from_pieces(actual, *PATH), PATH_ERROR, COUNTS)
 
 
 def test_tables_and_home_offset_keep_the_path(calibration, tmp_path):
-    """With nominal kinematics and offsets: the module of a machine without errors."""
+    """The module of a machine without errors stands for nominal kinematics."""
     require_linuxcnc()
     old = old_home_offsets(calibration)
     options = ExportOptions(module=False, latched=LATCHED, home_offsets=old)
@@ -191,8 +191,8 @@ def test_tables_and_home_offset_keep_the_path(calibration, tmp_path):
     ]
     rows = files["joint_0.comp"].splitlines()
     assert len(rows) == 256
-    promised = float(re.search(r"error is up to ([\d.]+) µm", files["README.md"])[1])
-    assert 0.1 < promised < 1.0
+    stated = float(re.search(r"error is up to ([\d.]+) µm", files["README.md"])[1])
+    assert 0.1 < stated < 1.0
     nominal = tmp_path / "nominal"
     nominal.mkdir()
     plan = load_plan(write_plan(tmp_path / "plain", effects="", joints=JOINTS))
@@ -202,9 +202,9 @@ def test_tables_and_home_offset_keep_the_path(calibration, tmp_path):
     for name, text in module.items():
         (nominal / name).write_text(text)
     files = {**files, "joints.ini": module["kinematics.ini"] + files["joints.ini"]}
-    real = run(calibration, files, tmp_path, module=False, inverse=nominal)
-    within = PROMISED + promised * 1e-6 + ROUNDING
-    require_followed(from_pieces(real, *PATH), within, COUNTS)
+    actual = run(calibration, files, tmp_path, module=False, inverse=nominal)
+    within = PATH_ERROR + stated * 1e-6 + ROUNDING
+    require_followed(from_pieces(actual, *PATH), within, COUNTS)
 
 
 @pytest.mark.parametrize(
@@ -214,7 +214,7 @@ def test_tables_and_home_offset_keep_the_path(calibration, tmp_path):
         ({"module": False, "latched": LATCHED}, "--home-offset"),
     ],
 )
-def test_what_homing_does_must_be_stated(calibration, options, where):
+def test_export_with_backlash_needs_home_offsets_and_latch_directions(calibration, options, where):
     with pytest.raises(ParameterError) as caught:
         export_calibration(calibration, "linuxcnc", anyway=True, options=ExportOptions(**options))
     assert caught.value.where == where
@@ -224,14 +224,14 @@ def home_offsets(lines):
     return [float(v) for v in re.findall(r"^HOME_OFFSET = (\S+)", lines, re.M)]
 
 
-def test_switches_are_latched_in_positive_direction_unless_stated(calibration):
-    """The lines then also have HOME_OFFSET for the other direction."""
+def test_latch_direction_is_positive_by_default(calibration):
+    """The lines then also state HOME_OFFSET of the other direction."""
 
     def export(**options):
         options = ExportOptions(home_offsets=(0.3, 0.3, 0.3), **options)
         return export_calibration(calibration, "linuxcnc", anyway=True, options=options)
 
-    for module in (False, True):
+    for module in (True, False):
         default, stated = (export(module=module, latched=s) for s in (None, (1, 1, 1)))
         for name in {"joints.ini", "orthocal_core.c"} & default.keys():
             bare = "".join(
@@ -242,7 +242,7 @@ def test_switches_are_latched_in_positive_direction_unless_stated(calibration):
             assert bare == stated[name]
         assert "assumed" in default["README.md"]
         assert "assumed" not in stated["README.md"]
-    lines = export(module=False)["joints.ini"]
+    lines = default["joints.ini"]
     other = [float(v) for v in re.findall(r"negative: HOME_OFFSET = (\S+)", lines)]
     opposite = home_offsets(export(module=False, latched=(-1, -1, -1))["joints.ini"])
     assert other == opposite
@@ -273,20 +273,20 @@ def under_tables(calibration, tmp_path_factory):
     return replace(calibration, session=record), entered
 
 
-def test_an_export_under_its_own_compensation_changes_nothing(under_tables):
-    """A session under the exported tables: HOME_OFFSET then contains their trims already."""
+def test_second_export_under_the_exported_tables_is_the_same(under_tables):
+    """HOME_OFFSET of the session already contains the trims of the tables."""
     under, entered = under_tables
     options = ExportOptions(module=False, latched=LATCHED, home_offsets=entered)
     again = export_calibration(under, "linuxcnc", anyway=True, options=options)
     assert np.abs(np.array(home_offsets(again["joints.ini"])) * MM - entered).max() < 2e-7
-    for e in find_screws(under):  # of straight lines between rows that are 0.106 of a turn apart
+    for e in find_screws(under):  # straight lines between rows that are 0.106 of a turn apart
         size = np.linalg.norm(e.identified)
         assert e.active == pytest.approx(np.sinc(0.106) ** 2 * e.identified, abs=0.01 * size)
 
 
 @pytest.fixture(scope="module")
 def complete(tmp_path_factory):
-    """Calibration of all errors of a machine whose y screw is straight."""
+    """Calibration of all errors of a machine whose y screw has no periodic error."""
     effects = EFFECTS.replace("0.02", "0.04")
     plan = load_plan(write_plan(tmp_path_factory.mktemp("screws") / "plan", effects=effects))
     plan = plan.with_controller(np.zeros(3))
@@ -296,8 +296,8 @@ def complete(tmp_path_factory):
     return calibrate(session, "full", solver="variable-projection")
 
 
-def test_a_periodic_error_is_entered_where_it_is_determined(complete):
-    """By the ellipse of A and B: against its probability, sampled."""
+def test_significant_periodic_errors_are_entered(complete):
+    """The significance of A and B agrees with sampling."""
     rng = np.random.default_rng(0)
     names = [p.name for p in complete.free]
     entries = find_screws(complete)
@@ -322,10 +322,10 @@ def test_a_periodic_error_is_entered_where_it_is_determined(complete):
     assert len(backlash) == 1  # that of y, which has no table
 
 
-def test_an_undetermined_periodic_error_is_entered_if_that_lowers_the_tool_error(complete):
-    """All but the screws is known nearly, or hardly: the y screw then moves the tool more or less.
+def test_insignificant_periodic_error_is_entered_if_the_tool_error_decreases(complete):
+    """The y screw dominates the tool error only if the other errors are known.
 
-    Rows and columns of the screws keep their covariance, so that x and z are determined.
+    The covariance of the screws is unchanged, so that x and z are significant.
     """
     names = [p.name for p in complete.free]
     screws = np.array([".screw_" in name for name in names])
@@ -342,8 +342,8 @@ def test_an_undetermined_periodic_error_is_entered_if_that_lowers_the_tool_error
         assert y.enter.any() == entered
 
 
-def test_an_undetermined_change_leaves_a_table_as_it_is(complete, tmp_path):
-    """A session under the exported tables that says little: only of the z screw something new."""
+def test_insignificant_change_keeps_a_table(complete, tmp_path):
+    """Under the exported tables only the z screw has a significant change."""
     options = ExportOptions(module=False, latched=LATCHED, home_offsets=(0.3, 0.3, 0.3))
     session, files = enter_export(complete, tmp_path, options)
     kept = tuple(replace(e, active=e.enter) for e in complete.assessment.backlash)
@@ -367,9 +367,9 @@ def test_an_undetermined_change_leaves_a_table_as_it_is(complete, tmp_path):
 
 
 def test_module_and_tables_together_are_the_exact_correction(under_tables, tmp_path):
-    """Motors of a controller that adds the tables to the module, on both sides of each drive.
+    """A controller that adds the tables to the module moves the slides to their places.
 
-    The exact ones by root finding: a slide follows its screw by half of the backlash.
+    A slide lags behind its screw by half of the backlash, on both sides.
     """
     under, entered = under_tables
     options = ExportOptions(module=True, within=0.05e-6, latched=LATCHED, home_offsets=entered)
@@ -403,49 +403,50 @@ def test_module_and_tables_together_are_the_exact_correction(under_tables, tmp_p
             motors = d.from_joint(joints[:, i] + begin + trim) - under.active_offsets[i]
             screws = slides[:, i] + d.direction * grew * 0.5 * backlash
             turns = 2.0 * np.pi * motors / 10e-3
-            off = motors + sine * np.sin(turns) + cosine * np.cos(turns) - screws
-            assert np.abs(off).max() < stated * 1e-6 + 0.05e-6
+            missed = motors + sine * np.sin(turns) + cosine * np.cos(turns) - screws
+            assert np.abs(missed).max() < stated * 1e-6 + 0.05e-6
 
 
-def test_the_module_and_tables_keep_the_path(under_tables, tmp_path):
+def test_module_and_tables_keep_the_path(under_tables, tmp_path):
     require_linuxcnc()
     under, entered = under_tables
     options = ExportOptions(module=True, within=0.05e-6, latched=LATCHED, home_offsets=entered)
     files = export_calibration(under, "linuxcnc", anyway=True, options=options)
-    real = run(under, files, tmp_path, module=True, homes=entered)
-    require_followed(from_pieces(real, *PATH), PROMISED, COUNTS)
+    actual = run(under, files, tmp_path, module=True, homes=entered)
+    require_followed(from_pieces(actual, *PATH), PATH_ERROR, COUNTS)
 
 
-def test_module_with_backlash_states_what_it_leaves(calibration):
-    """The phase of the periodic error, shifted by half of the backlash."""
+def test_module_with_backlash_states_its_error_on_one_side(calibration):
+    """Backlash shifts the phase of the periodic error by half of its size."""
     options = ExportOptions(module=True, latched=LATCHED)
     page = export_calibration(calibration, "linuxcnc", anyway=True, options=options)["README.md"]
     stated = float(re.search(r"On one side the error is up to ([\d.]+) µm", page)[1])
     periodic = find_periodic_errors(calibration.robot, calibration.errors)
     half = [0.5 * calibration.errors[f"{d.name}.backlash"] for d in calibration.robot.drives]
     at = np.linspace(0.2, 0.21, 4001)[:, None] * np.ones(3)
-    left = np.abs(periodic.invert(at + half) - periodic.invert(at) - half).max()
-    assert left <= stated * 1e-6 < 1.2 * left
+    error = np.abs(periodic.invert(at + half) - periodic.invert(at) - half).max()
+    assert error <= stated * 1e-6 < 1.2 * error
 
 
-def test_screws_are_inverted_exactly():
+def test_periodic_errors_are_inverted_exactly():
     errors = PeriodicErrors(5e-3, np.array([9e-6, 0.0]), np.array([-4e-6, 0.0]))
     coordinates = np.random.default_rng(0).uniform(0.1, 0.4, (200, 2))
     assert np.abs(errors.invert(coordinates + errors(coordinates)) - coordinates).max() < 1e-15
     assert np.abs(errors(coordinates)[:, 0]).max() > 9e-6
 
 
-# ---- programs that take up backlash themselves
+# ---- corrected programs that take up backlash
 
-DENSE = 0.02
+SPACING = 0.1
 """Distance of the points at which a corrected program is followed, [mm]."""
 
-
+SHORT = [*CORNERS[:2], (8.0, 0.0, 5.0), (10.0, -12.0, 20.0)]
+PART = CENTRE, RADIUS, SHORT
 PROGRAM = [
-    "G21 G90 G0 X{:g} Y{:g} Z{:g}".format(*CORNERS[0]),
+    "G21 G90 G0 X{:g} Y{:g} Z{:g}".format(*SHORT[0]),
     "G1 X28 Y-8 Z15 F600",
     "G2 X28 Y-8 Z15 I-16 J0",
-    *(f"G1 X{x:g} Y{y:g} Z{z:g}" for x, y, z in CORNERS[2:]),
+    *(f"G1 X{x:g} Y{y:g} Z{z:g}" for x, y, z in SHORT[2:]),
 ]
 
 
@@ -453,7 +454,7 @@ def points_along(lines):
     """Points along a program of straight lines, shape (K, 3), [mm]."""
     corners = np.array([point for written in read_polyline(lines).values() for point, _ in written])
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
-    counts = np.maximum(np.ceil(lengths / DENSE).astype(int), 1)
+    counts = np.maximum(np.ceil(lengths / SPACING).astype(int), 1)
     pieces = zip(corners[:-1], corners[1:], counts, strict=True)
     return np.vstack([a + (b - a) * np.linspace(0, 1, n + 1)[1:, None] for a, b, n in pieces])
 
@@ -467,24 +468,28 @@ def run_corrected(calibration, field, *, backlash):
     text = "".join(corrector.run(f"{line}\n" for line in PROGRAM))
     points = points_along(text.splitlines())
     motors = Machine(load_robot("orthoglide"), {}).inverse(points * MM) - ACTIVE
-    real = follow(calibration, motors) / MM
-    return real[np.linalg.norm(real - CORNERS[0], axis=1) > TAKEN_UP]
+    return after_start(follow(calibration, motors))
+
+
+def after_start(tool):
+    """Points after all backlash is taken up, shape (K, 3), [mm]."""
+    points = tool / MM
+    return points[np.linalg.norm(points - SHORT[0], axis=1) > TAKEN_UP]
 
 
 WITHIN = 1e-6
 
 
-def test_a_corrected_program_takes_up_backlash(calibration):
+def test_corrected_program_takes_up_backlash(calibration):
     field = CorrectionField(calibration, ACTIVE, within=WITHIN)
-    off = from_pieces(run_corrected(calibration, field, backlash=True), *PATH)
-    assert off.min(axis=0).max() < WITHIN
-    assert (np.count_nonzero(off < WITHIN, axis=1) > COUNTS).all()
-    ignored = from_pieces(run_corrected(calibration, field, backlash=False), *PATH)
+    pieces = from_pieces(run_corrected(calibration, field, backlash=True), *PART)
+    require_followed(pieces, WITHIN, COUNTS[:4])
+    ignored = from_pieces(run_corrected(calibration, field, backlash=False), *PART)
     assert ignored.min(axis=0).max() > 20 * WITHIN
 
 
 def motors_of(calibration, points):
-    """Motors of a controller that adds its trims to nominal kinematics, shape (K, 3), [m]."""
+    """Motors of a controller that adds trims to nominal kinematics, shape (K, 3), [m]."""
     displayed = Machine(load_robot("orthoglide"), {}).inverse(points * MM)
     motors = displayed - calibration.active_offsets
     trims = zip(calibration.robot.drives, calibration.session.compensation, strict=True)
@@ -503,10 +508,10 @@ def motors_of(calibration, points):
 
 
 @pytest.mark.parametrize("controller", ["tables", "half of the backlash"])
-def test_correct_leaves_to_the_controller_what_it_compensates(
+def test_program_for_a_controller_with_compensation(
     controller, calibration, under_tables, tmp_path
 ):
-    """A program for a controller with the compensation of the measurement."""
+    """`correct` omits what the controller of the measurement compensates."""
     result, _ = under_tables
     if controller != "tables":
         backlash = [calibration.errors[f"{d.name}.backlash"] for d in calibration.robot.drives]
@@ -519,17 +524,12 @@ def test_correct_leaves_to_the_controller_what_it_compensates(
     done = run_orthocal(tmp_path, *words)
     assert done.returncode == 0, done.stderr
     points = points_along((tmp_path / "good.ngc").read_text().splitlines())
-    real = follow(calibration, motors_of(result, points)) / MM
-    real = real[np.linalg.norm(real - CORNERS[0], axis=1) > TAKEN_UP]
-    off = from_pieces(real, *PATH)
-    assert off.min(axis=0).max() < WITHIN + SIDED
-    # a controller that compensates nothing would need another program
-    none = follow(
-        calibration,
-        Machine(load_robot("orthoglide"), {}).inverse(points * MM) - result.active_offsets,
-    )
-    none = none[np.linalg.norm(none / MM - CORNERS[0], axis=1) > TAKEN_UP] / MM
-    assert from_pieces(none, *PATH).min(axis=0).max() > 10 * WITHIN
+    tool = after_start(follow(calibration, motors_of(result, points)))
+    assert from_pieces(tool, *PART).min(axis=0).max() < WITHIN + SIDED
+    # a controller without compensation would need another program
+    motors = Machine(load_robot("orthoglide"), {}).inverse(points * MM) - result.active_offsets
+    tool = after_start(follow(calibration, motors))
+    assert from_pieces(tool, *PART).min(axis=0).max() > 10 * WITHIN
 
 
 SIDED = 1.0e-6
@@ -544,14 +544,14 @@ def test_lags_are_half_the_backlash(calibration, orthoglide):
 
 
 def test_drives_without_backlash_change_no_program(calibration):
-    """Sides that move nothing divide motions, but do not move their ends."""
+    """Such sides divide motions, but do not move their ends."""
     points = np.array([[10.0, 5.0, 0.0], [20.0, -5.0, 30.0]]) * MM
     sides = ApproachSides(calibration.robot, np.zeros(3))
     assert np.array_equal(sides.command(points, np.ones((2, 3))), points)
 
 
 def test_motions_are_divided_where_a_drive_reverses():
-    """Drives that are the coordinates themselves: a circle reverses each of two twice."""
+    """If the drives are the coordinates, a circle reverses each of two twice."""
 
     class Plain:
         last = np.zeros(3)

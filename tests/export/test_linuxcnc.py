@@ -126,7 +126,7 @@ def exported(full):
 
 
 def machine_of(robot, errors):
-    """A stand-in for the calibration of a machine with known errors."""
+    """Substitute for the calibration of a machine with known errors."""
     n = len(robot.drives)
     return SimpleNamespace(
         assessment=SimpleNamespace(entries=(), backlash=()),
@@ -160,7 +160,7 @@ class Core:
         )
         assert done.returncode == 0, done.stderr
         used = subprocess.run(["nm", "-u", "core.so"], cwd=folder, capture_output=True, text=True)
-        # besides weak symbols and the stack protector the core needs these functions only
+        # the core needs no other functions except the stack protector
         functions = {"sqrt", "sin", "cos", "sincos"} if periodic else {"sqrt"}
         needed = {line.split()[1] for line in used.stdout.splitlines() if line.split()[0] == "U"}
         assert {name.split("@")[0] for name in needed} <= {*functions, "__stack_chk_fail"}
@@ -169,7 +169,7 @@ class Core:
         self.type = ctypes.c_double * self.n
 
     def inverse(self, points, *, untouched=7.0):
-        """Joints in mm or degrees, (k, n), for points in mm; NaN for those that are refused."""
+        """Joints in mm or degrees, (k, n), for points in mm; NaN for refused points."""
         return self._each(self.library.orthocal_inverse, points, lambda p: [untouched] * self.n)
 
     def forward(self, joints, *, start):
@@ -198,28 +198,26 @@ def drives_of(calibration, joints):
 
 
 def test_core_reaches_the_targets_of_the_tip(full, core):
-    points = np.random.default_rng(7).uniform(-0.06, 0.06, (2000, 3))
+    points = np.random.default_rng(7).uniform(-0.06, 0.06, (400, 3))
     tip = ToolTip(full, TOOL)
-    reached = tip.place(drives_of(full, core.inverse(points / MM)))
-    off = np.linalg.norm(reached - (points + TOOL), axis=1)
-    assert off.max() < WITHIN
+    drives = drives_of(full, core.inverse(points / MM))
+    assert np.linalg.norm(tip.place(drives) - (points + TOOL), axis=1).max() < WITHIN
     # a level platform needs other drive coordinates
-    level = full.machine.inverse(points[:200])
-    assert np.abs(drives_of(full, core.inverse(points[:200] / MM)) - level).max() > 20e-6
+    level = full.machine.inverse(points[:20])
+    assert np.abs(drives[:20] - level).max() > 20e-6
 
 
 def test_core_without_a_tool_equals_the_calibrated_machine(full, tmp_path):
-    """At 10,000 points that were neither fitted nor checked."""
+    """At points that were neither fitted nor checked."""
     approximation = approximate(full, within=WITHIN)
     core = Core(tmp_path, write_core(full, approximation, homes_of(full)))
-    points = np.random.default_rng(8).uniform(-0.06, 0.06, (10_000, 3))
-    joints = drives_of(full, core.inverse(points / MM))
-    off = full.machine.forward(joints) - points
-    assert np.linalg.norm(off, axis=1).max() < approximation.achieved <= WITHIN
+    points = np.random.default_rng(8).uniform(-0.06, 0.06, (1000, 3))
+    errors = full.machine.forward(drives_of(full, core.inverse(points / MM))) - points
+    assert np.linalg.norm(errors, axis=1).max() < approximation.achieved <= WITHIN
 
 
 def test_tip_equals_pinocchio(full, core):
-    """With placements of a robot with these errors, and loops closed by Pinocchio."""
+    """Pinocchio closes the loops of a robot with these errors."""
     robot = full.robot.with_errors(full.errors)
     points = np.random.default_rng(9).uniform(-0.06, 0.06, (8, 3))
     data, passive = robot.model.createData(), robot.reference_passive
@@ -272,7 +270,7 @@ def test_slides_with_rods_are_identified(orthoglide, biglide, fivebar):
 
 @pytest.mark.parametrize("name", ["biglide", "fivebar"])
 def test_core_of_planar_robots(root, tmp_path, name):
-    """Slides have a closed form, motors a tangent."""
+    """Slides have a closed form, motors a linear one."""
     folder = tmp_path / name
     shutil.copytree(root / "tests/robots" / name, folder)
     errors = {"x_slide.offset": 1e-3, "y_tip.x": 2e-4} if name == "biglide" else {}
@@ -368,7 +366,7 @@ def test_rounded_up():
         (["--module", "--half-side-mm", "250"], 3, "the machine does not reach ±250 mm"),
     ],
 )
-def test_bad_options_are_named(offsets, tmp_path, words, code, message):
+def test_bad_options_are_refused(offsets, tmp_path, words, code, message):
     file = write_calibration(offsets, tmp_path / "calibration.json")
     to = [] if "--to" in words else ["--to", "linuxcnc"]
     done = run_orthocal(tmp_path, "export", file, *to, "--out", "out", "--anyway", *words)
@@ -381,7 +379,7 @@ def test_bad_options_are_named(offsets, tmp_path, words, code, message):
 
 
 def test_home_offset_follows_direction_and_active_offsets(offsets):
-    """Hand calculation of HOME_OFFSET and limits."""
+    """HOME_OFFSET and limits agree with a calculation by hand."""
     old = (0.35, 0.3, 0.02)
     homes = homes_of(offsets, old=old)
     change = (np.array(list(OFFSETS.values())) - ACTIVE) * [1, -1, -1]
@@ -443,7 +441,7 @@ def test_module_files_state_tool_limits_and_error(full, exported):
 
 
 def test_module_of_offsets_alone(offsets):
-    """The correction of nominal legs is constant; HOME_OFFSET does not change."""
+    """The correction of nominal legs is constant, and HOME_OFFSET does not change."""
     options = ExportOptions(module=True, home_offsets=(0.35, 0.3, -0.02))
     files = export_calibration(offsets, "linuxcnc", options=options)
     assert "identified offsets only; a module was requested" in files["README.md"]
@@ -454,7 +452,7 @@ def test_module_of_offsets_alone(offsets):
 
 
 def test_offsets_of_a_complete_model(full):
-    """Offsets that minimise the tool error, not the identified ones."""
+    """HOME_OFFSET has the offsets that minimise the tool error, not the identified ones."""
     old = (0.35, 0.3, -0.02)
     options = ExportOptions(module=False, home_offsets=old)
     files = export_calibration(full, "linuxcnc", options=options)
@@ -488,7 +486,7 @@ def from_pieces(points, centre, radius, corners):
 
 
 def require_followed(pieces, within, counts):
-    """Every point is near one of the pieces, and each piece has points of its own."""
+    """Require that every point is near a piece, and that each piece has enough points."""
     assert pieces.min(axis=0).max() < within
     assert (np.count_nonzero(pieces < within, axis=1) > counts).all()
 
@@ -528,8 +526,8 @@ def test_linuxcnc_follows_a_path_with_the_exported_module(full, tmp_path):
     )
 
     path = centre, radius, corners
-    real = full.machine.forward(slides[::5] * MM) / MM
-    require_followed(from_pieces(real, *path), PATH, [150, 100, 80])
+    tool = full.machine.forward(slides[::5] * MM) / MM
+    require_followed(from_pieces(tool, *path), PATH, [150, 100, 80])
     # the errors of the machine are large
     nominal = Machine(full.robot, {}).forward(slides[::5] * MM + ACTIVE) / MM
     assert from_pieces(nominal, *path).min(axis=0).max() > 1.0 * MM
@@ -541,7 +539,7 @@ FILTERED = 0.3
 
 @pytest.fixture
 def filtered(root, full, tmp_path):
-    """A function that opens a program as LinuxCNC's window does, with the INI lines of the docs."""
+    """Function that opens a program as LinuxCNC's window does, with the INI lines of the page."""
     write_calibration(full, tmp_path / "calibration.json")
     page = (root / "docs/controllers.md").read_text()
     ini = re.search(r"(?m)(?:^    .+\n)+", page[page.index("    [FILTER]") :])[0]
@@ -559,8 +557,8 @@ def filtered(root, full, tmp_path):
         (tmp_path / "result").mkdir(exist_ok=True)
         (tmp_path / name).write_text("".join(f"{line}\n" for line in lines))
         result = tmp_path / "result" / name
-        code, said, progress = filter_program(ini, tmp_path / name, result)
-        return code, said, progress, result.read_text() if result.exists() else None
+        code, message, progress = filter_program(ini, tmp_path / name, result)
+        return code, message, progress, result.read_text() if result.exists() else None
 
     return open_program
 
@@ -574,9 +572,9 @@ def test_linuxcnc_follows_a_path_with_a_filtered_program(root, mixed, full, filt
         "N1 F6000 G2 X15 Y-8 Z15 I-5 J0",
         *(f"G1 X{x:g} Y{y:g} Z{z:g}" for x, y, z in corners[1:]),
     ]
-    code, said, progress, text = filtered(program)
-    assert code == 0, said
-    assert "For a tip at 5, 0, -50 mm" in said
+    code, message, progress, text = filtered(program)
+    assert code == 0, message
+    assert "For a tip at 5, 0, -50 mm" in message
     assert progress[-1] == 100
     assert progress == sorted(progress)
     nominal = calibrated(root, mixed, "raw-cycles", {}, "offsets", active=np.zeros(3))
@@ -600,22 +598,22 @@ def test_linuxcnc_follows_a_path_with_a_filtered_program(root, mixed, full, filt
     assert from_pieces(unfiltered, *path).min(axis=0).max() > 1.0 * MM
 
 
-def test_linuxcnc_window_shows_why_a_program_is_refused(filtered):
-    code, said, _, text = filtered(["G21 G0 X0 Y0 Z0", "G81 X1 Z-1 R1 F100"])
+def test_linuxcnc_window_shows_the_message_of_a_refused_program(filtered):
+    code, message, _, text = filtered(["G21 G0 X0 Y0 Z0", "G81 X1 Z-1 R1 F100"])
     assert (code, text) == (2, "")
-    assert said.startswith("orthocal: ")
-    assert "part.ngc:2: found G81, which is a canned cycle" in said
-    assert said.count("\n") == 1
+    assert message.startswith("orthocal: ")
+    assert "part.ngc:2: found G81, which is a canned cycle" in message
+    assert message.count("\n") == 1
     # file names without a filter in the INI
     assert filtered(["G0 X0 Y0 Z0"], name="part.nc")[0] is None
     assert filtered(["G0 X0 Y0 Z0"], name="PART.NGC")[0] is None
 
 
 def test_linuxcnc_reaches_the_target_with_the_exported_home_offset(offsets):
-    """With one joint that counts up and two that count down."""
+    """One joint counts up, two count down."""
     require_linuxcnc()
     old = joints_at_switch(offsets, SWITCH)
-    real = Machine(offsets.robot, OFFSETS)
+    machine = Machine(offsets.robot, OFFSETS)
     point = np.array([20.0, -15.0, 30.0]) * MM
     options = ExportOptions(home_offsets=tuple(old))
     entered = export_calibration(offsets, "linuxcnc", options=options)["joints.ini"]
@@ -624,9 +622,9 @@ def test_linuxcnc_reaches_the_target_with_the_exported_home_offset(offsets):
     words = " ".join(f"{letter}{v:.7f}" for letter, v in zip("XYZ", joints, strict=True))
     program = [f"G21 G90 G1 {words} F6000", "G4 P0.15"]
     slides = run_program(program, joints_of(offsets, old), lines=entered)
-    assert np.linalg.norm(real.forward(slides[-1] * MM) - point) < ENTERED
-    # with the offsets that were active before, the error is large
-    assert np.linalg.norm(real.forward(drives - ACTIVE) - point) > 0.5 * MM
+    assert np.linalg.norm(machine.forward(slides[-1] * MM) - point) < ENTERED
+    # with the previous offsets the error is large
+    assert np.linalg.norm(machine.forward(drives - ACTIVE) - point) > 0.5 * MM
 
 
 def test_module_is_built_without_warnings(exported, tmp_path):

@@ -49,7 +49,7 @@ TRUTH = {
     "screws.expansion": -1e-6,
 }
 SCREWS = {"x_slide.screw_sin": 9e-6, "y_slide.screw_cos": -7e-6, "z_slide.screw_sin": 4e-6}
-WARM = "thermal: {reference_C: 22, screws_ppm: 9}"
+THERMAL = "thermal: {reference_C: 22, screws_ppm: 9}"
 TEMPERATURES = (7.0, 13.1, 22.0, 28.7, 37.0)
 """The module covers 15 K to both sides of the reference."""
 
@@ -64,10 +64,10 @@ def drives_of(robot, joints):
     return np.stack([d.from_joint(j) for d, j in columns], axis=-1)
 
 
-class WarmCore(Core):
-    """A core that depends on the temperature."""
+class ThermalCore(Core):
+    """Core that depends on the temperature."""
 
-    def warm(self, temperature):
+    def at(self, temperature):
         self.library.orthocal_set_temperature(ctypes.c_double(temperature))
         return self
 
@@ -75,37 +75,36 @@ class WarmCore(Core):
 def build(tmp_path, known, *, periodic=False, within=WITHIN, **options):
     approximation = approximate(known, within=within, half_side=0.06, **options)
     files = write_core(known, approximation, homes_of(known))
-    return approximation, WarmCore(tmp_path, files, periodic=periodic)
+    return approximation, ThermalCore(tmp_path, files, periodic=periodic)
 
 
 @pytest.fixture(scope="module")
-def warm(tmp_path_factory):
-    """A machine, its approximation and its core."""
-    folder = tmp_path_factory.mktemp("warm")
-    known = machine_of(load_robot(write_robot(folder / "m", WARM, joints=JOINTS)), TRUTH)
+def thermal(tmp_path_factory):
+    """Machine with thermal expansion, its approximation and its core."""
+    folder = tmp_path_factory.mktemp("thermal")
+    known = machine_of(load_robot(write_robot(folder / "m", THERMAL, joints=JOINTS)), TRUTH)
     return known, *build(folder, known)
 
 
-def test_core_equals_the_machine_at_many_points(warm):
+def test_core_equals_the_machine_at_every_temperature(thermal):
     """At points that were neither fitted nor checked."""
-    known, approximation, core = warm
-    points = points_in_region(2000, seed=4)
+    known, approximation, core = thermal
+    points = points_in_region(400, seed=4)
     largest = []
     for t in TEMPERATURES:
-        drives = drives_of(known.robot, core.warm(t).inverse(points / MM))
+        drives = drives_of(known.robot, core.at(t).inverse(points / MM))
         reached = known.machine.forward(drives, conditions=UseConditions(temperature=t))
         largest.append(np.linalg.norm(reached - points, axis=1).max())
     assert max(largest) < approximation.achieved <= WITHIN
-    # a module that does not know the temperature
-    cold = drives_of(known.robot, core.warm(22.0).inverse(points / MM))
-    reached = known.machine.forward(cold, conditions=UseConditions(temperature=37.0))
-    off = np.linalg.norm(reached - points, axis=1).max()
-    assert 20e-6 < off < approximation.unheated < 1.5 * off
+    # a module without the temperature
+    drives = drives_of(known.robot, core.at(22.0).inverse(points / MM))
+    reached = known.machine.forward(drives, conditions=UseConditions(temperature=37.0))
+    error = np.linalg.norm(reached - points, axis=1).max()
+    assert 20e-6 < error < approximation.unheated < 1.5 * error
 
 
-def test_core_reaches_points_at_every_temperature(tmp_path):
-    """On a simulated machine that shares no formula with orthocal."""
-    folder = write_robot(tmp_path / "machine", f"{WARM}, screw: {{lead_mm: 5}}", joints=JOINTS)
+def test_core_reaches_points_on_an_independent_machine(tmp_path):
+    folder = write_robot(tmp_path / "machine", f"{THERMAL}, screw: {{lead_mm: 5}}", joints=JOINTS)
     errors = TRUTH | SCREWS
     known = machine_of(load_robot(folder), errors)
     approximation, core = build(tmp_path, known, periodic=True)
@@ -113,30 +112,30 @@ def test_core_reaches_points_at_every_temperature(tmp_path):
     machine = IndependentMachine(folder, errors, lead=5 * MM, expansion=expansion)
     points = points_in_region(60, seed=3)
     for t in TEMPERATURES:
-        drives = drives_of(known.robot, core.warm(t).inverse(points / MM))
+        drives = drives_of(known.robot, core.at(t).inverse(points / MM))
         states = States(drives, np.zeros_like(drives), np.full(len(drives), t))
-        off = np.linalg.norm(machine.tool(states)[0] - points, axis=1)
-        assert off.max() < approximation.achieved + CLOSED
+        errors = np.linalg.norm(machine.tool(states)[0] - points, axis=1)
+        assert errors.max() < approximation.achieved + CLOSED
         assert (
             np.abs(core.forward(core.inverse(points / MM), start=[0.0] * 3) * MM - points).max()
             < 1e-12
         )
 
 
-def test_temperature_is_clamped_and_begins_at_the_reference(warm, tmp_path):
-    known, approximation, core = warm
+def test_temperature_is_clamped_and_begins_at_the_reference(thermal, tmp_path):
+    known, approximation, core = thermal
     point = [[30.0, -20.0, 10.0]]
-    first = WarmCore(tmp_path, write_core(known, approximation, homes_of(known))).inverse(point)
+    first = ThermalCore(tmp_path, write_core(known, approximation, homes_of(known))).inverse(point)
     change = approximation.inverse.thermal
     assert (change.reference, change.lowest, change.highest) == (22.0, 7.0, 37.0)
     for t, same in ((60.0, 37.0), (-40.0, 7.0), (float("nan"), 22.0), (float("inf"), 37.0)):
-        assert np.array_equal(core.warm(t).inverse(point), core.warm(same).inverse(point))
-    assert np.array_equal(core.warm(22.0).inverse(point), first)
-    assert np.abs(core.warm(37.0).inverse(point) - first).max() > 0.01
+        assert np.array_equal(core.at(t).inverse(point), core.at(same).inverse(point))
+    assert np.array_equal(core.at(22.0).inverse(point), first)
+    assert np.abs(core.at(37.0).inverse(point) - first).max() > 0.01
 
 
 def test_range_of_use_widens_that_of_the_module(tmp_path):
-    folder = write_robot(tmp_path / "m", WARM)
+    folder = write_robot(tmp_path / "m", THERMAL)
     text = (folder / "machine.yaml").read_text()
     (folder / "machine.yaml").write_text(
         text.replace("\n  tcp: ", "\n  use: {temperature_C: [10, 45]}\n  tcp: ")
@@ -150,8 +149,8 @@ def test_range_of_use_widens_that_of_the_module(tmp_path):
 SOFT = "compliance: {rod_N_per_um: 1, platform_kg: 5}"
 
 
-def test_payload_of_the_module(tmp_path):
-    """The tool comes to rest at the point by least energy of springs and weight."""
+def test_module_corrects_the_deflection_by_a_payload(tmp_path):
+    """At rest the energy of springs and weight is least."""
     known = machine_of(load_robot(write_robot(tmp_path / "m", SOFT)), {})
     approximation, core = build(tmp_path, known, payload=3.0, within=1e-6)
     assert approximation.payload == 3.0
@@ -163,16 +162,16 @@ def test_payload_of_the_module(tmp_path):
         tool, _ = settle(drives, stiffness=1e6, weight=weight)
         assert np.linalg.norm(tool - point) < approximation.achieved + SECOND_ORDER
         heavier, _ = settle(drives, stiffness=1e6, weight=weight * 9.0 / 8.0)
-        off = np.linalg.norm(heavier - point)
-        assert 1e-6 < off < approximation.heavier < 5.0 * off
+        error = np.linalg.norm(heavier - point)
+        assert 1e-6 < error < approximation.heavier < 5.0 * error
 
 
 SECOND_ORDER = 50e-9
 """Forces of the loaded machine differ from those of the nominal one by 1e-3, [m]."""
 
 
-def test_page_states_temperature_and_payload(warm):
-    known, approximation, _ = warm
+def test_page_states_temperature_and_payload(thermal):
+    known, approximation, _ = thermal
     known = SimpleNamespace(**vars(known), only_offsets=False)
     loaded = replace(approximation, payload=0.5, heavier=1.2e-6)
     page = write_module_page(known, loaded, homes_of(known), stated=True)
@@ -185,7 +184,7 @@ def test_page_states_temperature_and_payload(warm):
     assert "hal_pin_float_newf" in write_component(approximation)["orthocal_kins.c"]
 
 
-def test_machines_that_depend_on_nothing_have_no_pin(tmp_path):
+def test_module_without_thermal_expansion_has_no_pin(tmp_path):
     known = machine_of(load_robot("orthoglide"), {})
     approximation = approximate(known, within=1e-6, half_side=0.06)
     files = write_core(known, approximation, homes_of(known))
@@ -211,9 +210,9 @@ FOLLOWED = 0.2e-6
 
 
 def test_joints_follow_the_pin_in_linuxcnc(tmp_path):
-    """The pin is set while the machine stands still, then while it stands at another point."""
+    """The pin changes while the machine is at rest at two points."""
     require_linuxcnc()
-    plan = load_plan(write_plan(tmp_path / "plan", effects=WARM, joints=JOINTS))
+    plan = load_plan(write_plan(tmp_path / "plan", effects=THERMAL, joints=JOINTS))
     truth = {k: v for k, v in TRUTH.items() if k.endswith((".offset", ".expansion"))}
     session = simulate_session(
         plan.with_controller(np.array([0.4, -0.1, 0.2]) * MM), truth, exact=True
@@ -241,6 +240,6 @@ def test_joints_follow_the_pin_in_linuxcnc(tmp_path):
         columns = zip(result.robot.drives, joints * MM, active, strict=True)
         drives = np.array([d.from_joint(j) - a for d, j, a in columns])
         machine = Machine(result.robot, result.errors)
-        real = machine.forward(drives, conditions=UseConditions(temperature=temperature))
-        assert np.linalg.norm(real - points[at] * MM) < FOLLOWED
+        tool = machine.forward(drives, conditions=UseConditions(temperature=temperature))
+        assert np.linalg.norm(tool - points[at] * MM) < FOLLOWED
     assert np.abs(pauses[0][1] - pauses[0][0]).max() > 0.01

@@ -1,4 +1,4 @@
-"""Standard streams and signals of a real process: full, closed, not read, and Ctrl-C."""
+"""Processes with full, closed or unread standard streams, and Ctrl-C."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ from orthocal.calibration.file import write_calibration
 from orthocal.errors import OrthocalError
 
 COMMAND = [sys.executable, "-m", "orthocal"]
-PATIENCE = 120.0
+TIMEOUT = 120.0
+"""Longest time of a process, [s]."""
 
 
 @pytest.fixture(scope="module")
 def folder(root, tmp_path_factory):
-    """A calibration with a table of joints."""
+    """Directory of a session, its calibration and a table of joint coordinates."""
     folder = tmp_path_factory.mktemp("calibrated")
     for name in ("session.yaml", "readings.csv"):
         shutil.copy(root / "examples/table1/experiment-2" / name, folder)
@@ -36,10 +37,10 @@ def folder(root, tmp_path_factory):
 
 
 def run(words, redirection="", **kwargs):
-    """Run the command line in a shell, for its redirections; exit code, stdout, stderr."""
+    """Run a command in a shell with a redirection; returns exit code, stdout and stderr."""
     command = " ".join([*COMMAND, *(f"'{w}'" for w in map(str, words)), redirection])
     done = subprocess.run(
-        ["sh", "-c", command], capture_output=True, timeout=PATIENCE, check=False, **kwargs
+        ["sh", "-c", command], capture_output=True, timeout=TIMEOUT, check=False, **kwargs
     )
     err = done.stderr.decode(errors="replace")
     assert "Traceback" not in err
@@ -51,7 +52,6 @@ WORDS = {
     "--version": ["--version"],
     "--help": ["--help"],
     "forward": ["forward", "calibration.json", "joints.csv"],
-    "calibrate": ["calibrate", ".", "--out", "out"],
     "calibrate --json": ["calibrate", ".", "--json", "--out", "out"],
 }
 
@@ -62,10 +62,9 @@ FULL, CLOSED = ("> /dev/full", "No space left on device"), (">&-", "it is closed
 @pytest.mark.parametrize(
     ("words", "redirection"),
     [
-        *(("--version", r) for r in (FULL, CLOSED)),
+        ("--version", CLOSED),
         ("--help", FULL),
         ("forward", CLOSED),
-        ("calibrate", CLOSED),
         ("calibrate --json", FULL),
     ],
 )
@@ -77,7 +76,7 @@ def test_unwritable_output_ends_with_1(words, redirection, folder):
 
 
 @pytest.mark.parametrize("words", [WORDS["forward"], WORDS["--help"]])
-def test_a_closed_pipe_is_no_error(words, folder):
+def test_closed_pipe_is_not_an_error(words, folder):
     with subprocess.Popen(
         [*COMMAND, *words], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -95,25 +94,25 @@ def test_unwritable_error_stream_is_ignored(folder):
     assert run(["calibrate", "nothing"], "2> /dev/full", cwd=folder)[0] == 2
     words = ["export", "calibration.json", "--to", "yaml", "--anyway", "--out", "silent"]
     assert run(words, "2>&-", cwd=folder)[0] == 0
-    # the closed stream's number was not given to a file that was written
+    # no written file has the descriptor of the closed stream
     assert (folder / "silent/errors.yaml").read_text().startswith("# ")
 
 
 def test_no_temporary_directory_is_needed(monkeypatch):
-    """Messages of Pinocchio are captured in a temporary file, if there can be one."""
-    asked = []
+    """Messages of Pinocchio are captured in a temporary file if possible."""
+    calls = []
 
-    def none():
-        asked.append(1)
+    def fail():
+        calls.append(1)
         raise FileNotFoundError(2, "No usable temporary directory")
 
-    monkeypatch.setattr(tempfile, "TemporaryFile", none)
+    monkeypatch.setattr(tempfile, "TemporaryFile", fail)
     assert load_afresh("orthoglide").name == "orthoglide"
-    assert asked
+    assert calls
 
 
 @pytest.mark.parametrize("name", [b"caf\xe9", b"a\x1b[31mb", b"a\nb"])
-def test_a_directory_name_that_documents_cannot_contain_is_refused(name, folder, tmp_path):
+def test_directory_name_that_documents_cannot_contain_is_refused(name, folder, tmp_path):
     odd = tmp_path / os.fsdecode(name)
     odd.mkdir()
     for file in ("session.yaml", "readings.csv"):
@@ -126,7 +125,7 @@ def test_a_directory_name_that_documents_cannot_contain_is_refused(name, folder,
     assert not (tmp_path / "out").exists()
 
 
-def test_a_robot_directory_name_that_documents_cannot_contain_is_refused(root, tmp_path):
+def test_robot_directory_name_that_documents_cannot_contain_is_refused(root, tmp_path):
     odd = tmp_path / "a\x1b[31mb"
     shutil.copytree(root / "tests/robots/biglide", odd / "biglide")
     with pytest.raises(OrthocalError, match=r"contains '\\x1b', which documents cannot contain"):
@@ -146,36 +145,35 @@ def test_control_characters_of_arguments_are_escaped(folder):
 
 
 def interrupt(words, delay, cwd):
-    """Start, wait, send SIGINT: exit code or None if it had ended, seconds, stderr."""
+    """Start a command and send SIGINT.
+
+    Returns:
+        Exit code, None if the command had ended before; time until the end, [s]; stderr.
+    """
     process = subprocess.Popen(
         [*COMMAND, *map(str, words)], cwd=cwd, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
     )
     maps = Path(f"/proc/{process.pid}/maps")
     while process.poll() is None and maps.exists() and "numpy" not in maps.read_text():
-        time.sleep(0.02)  # the duration of the start differs among machines
+        time.sleep(0.02)  # the duration of the start differs among computers
     time.sleep(delay)
     done = process.poll() is not None
     began = time.monotonic()
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=PATIENCE)
+    _, err = process.communicate(timeout=TIMEOUT)
     return None if done else process.returncode, time.monotonic() - began, err.decode()
 
 
 def test_ctrl_c_ends_the_process_at_once(root, tmp_path):
-    """While libraries are loaded, functions built, Ipopt iterates or intervals are sought."""
+    """While libraries are loaded, while functions are built, and while the solver iterates."""
     options = ["--model", "full", "--profile", "*.offset", "--out", tmp_path / "out"]
     words = ["calibrate", root / "examples/raw-cycles", *options]
-    interrupted = 0
-    for delay in (0.0, 0.3, 0.8, 1.6, 2.6):
+    for delay in (0.0, 0.4, 1.2):
         code, seconds, err = interrupt(words, delay, tmp_path)
-        if code is None:
-            break
-        interrupted += 1
         assert code == 130
         assert seconds < 1.0
         assert err == ""
         assert list(tmp_path.iterdir()) == []
-    assert interrupted >= 3
 
 
 RAISED = """
@@ -198,7 +196,7 @@ except KeyboardInterrupt:
 
 
 def test_ctrl_c_within_ipopt_raises_in_scripts(root):
-    """CasADi reports a failed solve, or continues."""
+    """CasADi alone would report a failed solve or continue."""
     done = subprocess.run(
         [sys.executable, "-c", RAISED, str(root / "examples/raw-cycles")],
         capture_output=True,
@@ -208,7 +206,7 @@ def test_ctrl_c_within_ipopt_raises_in_scripts(root):
     assert done.stdout == "raised\n", done.stderr
 
 
-def test_ctrl_c_while_files_are_staged_leaves_none(tmp_path):
+def test_ctrl_c_while_files_are_staged_leaves_no_file(tmp_path):
     code = (
         "import os, signal, sys\n"
         "from pathlib import Path\n"
