@@ -252,8 +252,14 @@ def _apply_stated(
     Raises:
         SessionError: If a session belongs to the calibration, or an adjustment does not fit.
     """
-    restated = [session.with_tolerances(tolerances) for session in sessions]
-    robot = calibration.robot.with_tolerances(tolerances)
+    robot, settings = calibration.robot, calibration.session.firmware
+    placed = sessions
+    if settings is not None:
+        placed = [
+            s if s.firmware is None else s.on_printer(robot, settings.homed) for s in sessions
+        ]
+    restated = [session.with_tolerances(tolerances) for session in placed]
+    robot = robot.with_tolerances(tolerances)
     calibration = _adjust_to_sessions(replace(calibration, robot=robot), restated)
     _require_new(calibration, restated)
     return calibration, restated
@@ -412,6 +418,7 @@ def _describe_agreement(
             limit,
             None if explained else refit.rms_after,
             explains=refit.rms_after < EXPLAINED_RATIO * achieved,
+            firmware=refit.session.firmware is not None,
             numbers=numbers,
             place=Place(line=worst.line, setup=worst.setup, posture=worst.postures),
         )
@@ -450,6 +457,8 @@ def _find_further_change(joint: Calibration | None) -> list[Finding]:
     assessment = assessment_of(joint)
     if assessment.keeps_offsets:
         return []
+    if joint.session.firmware is not None:
+        return [words.further_settings()]
     return [words.further_change([e for e in assessment.entries if is_significant(joint, e)])]
 
 

@@ -73,6 +73,7 @@ class Probe(ToolIndicator):
     zero: ClassVar[GaugeZero] = "known"
     states_readings: ClassVar[bool] = True
     is_trigger: ClassVar[bool] = True
+    instrument: ClassVar[str] = "probe"
 
     @classmethod
     def from_keys(cls, keys: Any) -> Probe:  # noqa: ANN401 - of `keys`

@@ -167,6 +167,9 @@ class Sensor(Protocol):
     # and its reading is prescribed. Then nobody misreads a number or writes it into a wrong row
     # (`is_trigger`)
 
+    # instrument: ClassVar[str], optional: noun for what shows a reading; dial by default
+    # (`instrument`)
+
     # reads_pairs: ClassVar[bool], optional: whether a reading belongs to a pair of postures: the
     # posture of its row and the one in the column `minus`. It is a single reading (`reads_pairs`)
 
@@ -324,6 +327,12 @@ def states_readings(sensor: Sensor) -> bool:
     """True if equal readings are expected and no anomaly."""
     stated: bool = getattr(sensor, "states_readings", False)
     return stated
+
+
+def instrument(sensor: Sensor) -> str:
+    """Noun for what shows a reading, such as dial or ball bar."""
+    noun: str = getattr(sensor, "instrument", "dial")
+    return noun
 
 
 def is_trigger(sensor: Sensor) -> bool:

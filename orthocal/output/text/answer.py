@@ -69,6 +69,9 @@ STYLES: dict[Verdict, str] = {"enter": "bold green", "review": "bold yellow", "r
 LONGEST_LINE = 150
 """Characters of a line with names from files, in the short answer."""
 
+PRINT = "print. After a crash or a change of the printer probe again."
+"""Next step if the settings of a printer are kept."""
+
 MORE = "--details prints all readings, residuals, parameters and tool errors."
 
 
@@ -196,6 +199,8 @@ def _next_step(
         return "keep the result by adding `--out DIRECTORY` to this command.", ()
     firmware = calibration.session.firmware
     if firmware is not None:
+        if unchanged:
+            return PRINT, ()
         directory, new = (quote_path(p) for p in (saved, f"{saved}-{firmware.firmware}"))
         return "write settings for the firmware; its README says what to expect.", (
             f"orthocal export {directory} --to {firmware.firmware} --out {new}",

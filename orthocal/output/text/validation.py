@@ -11,6 +11,7 @@ from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.validation import Validation
 from orthocal.calibration.assessment_record import FindingKind
 from orthocal.output.text.answer import (
+    PRINT,
     describe_conditions,
     entry_table,
     gains_from_correction,
@@ -76,12 +77,15 @@ def render_validation(
 
 def _next_step(validation: Validation, *, further: bool) -> list[RenderableType]:
     """The command that calibrates from all readings, where they improve the machine further."""
+    joint = validation.joint is not None and validation.assessment.decision.verdict == "enter"
+    firmware = validation.refit.session.firmware is not None
+    if firmware and not further:
+        return [Text(), render_next(PRINT)] if joint else []
     paths = [part.path for part in validation.final_calibration.session.parts]
     if not paths or None in paths:
         return []
-    joint = validation.joint is not None and validation.assessment.decision.verdict == "enter"
     if further:
-        words = "to use the better offsets:"
+        words = f"to use the better {'settings' if firmware else 'offsets'}:"
     elif joint and gains_from_correction(validation.final_calibration):
         words = "to correct the other identified errors, too, calibrate from all readings:"
     else:
