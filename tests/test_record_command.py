@@ -61,6 +61,34 @@ def run(monkeypatch):
     return record
 
 
+@pytest.mark.parametrize(
+    ("sensor", "instrument"),
+    [
+        ("ball_bar, centre_mm: [0, 0, 0], length_mm: 100}", "ball bar"),
+        ("probe, direction: -z}", "probe"),
+        ("distance}", "calliper"),
+        ("tool_indicator, direction: -z, artefact: {kind: plate}}", "dial"),
+    ],
+)
+def test_words_of_the_instrument(folder, run, sensor, instrument):
+    """Nobody looks for a dial on a ball bar, a probe or a calliper."""
+    pairs = sensor.startswith("distance")
+    plan = PLAN[: PLAN.index("gauge:")] + PLAN[PLAN.index("postures:") : PLAN.index("setups:")]
+    (folder / "session.yaml").write_text(
+        f"{plan}gauge: {{sigma_mm: 0.005}}\nsetups:\n  s: {{sensor: {sensor}\n"
+        + ("readings: readings.csv\n" if pairs else "")
+    )
+    if pairs:
+        (folder / "readings.csv").write_text("setup,posture,minus,reading_mm\ns,x_max,x_min,\n")
+    done = run(folder, "", "quit")
+    assert f"Type the reading of the {instrument} in mm" in done.stdout
+    assert f"type the reading of the {instrument}," in done.stdout
+    head = " ".join(done.stdout[: done.stdout.index("[mm]>")].split())
+    words = {"ball bar": "ball bar", "probe": "probe", "stand or the dial": "dial"}
+    touched = [noun for text, noun in words.items() if f"do not touch the {text}" in head]
+    assert touched == ([] if pairs else [instrument])
+
+
 def rows_of(folder):
     """Rows of readings.csv without the blank lines of deleted rows."""
     head, *rows = (folder / "readings.csv").read_text().splitlines()

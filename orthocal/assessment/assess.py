@@ -22,6 +22,7 @@ from orthocal.assessment.controller_entries import (
 )
 from orthocal.assessment.fit_findings import find_fit_findings
 from orthocal.assessment.judgement import Judgement, judge_session, rank, verdict_of
+from orthocal.assessment.printer_settings import fit_firmware
 from orthocal.assessment.recommendation import Recommendation, recommend_model
 from orthocal.assessment.tool_error import assess_placed, require_tool, summarise_tool
 from orthocal.assessment.words import entries as words
@@ -39,7 +40,7 @@ from orthocal.calibration.assessment_record import (
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.identify import identify
 from orthocal.calibration.refit import restore_session
-from orthocal.errors import ClosureError, RobotError
+from orthocal.errors import ClosureError, ExportError, RobotError
 from orthocal.estimation.choice import Choice
 from orthocal.estimation.loss import Loss, LossKind
 from orthocal.estimation.options import SolverKind, SolverOptions
@@ -148,10 +149,15 @@ def assess(
     chosen = _choose_values(calibration)
     entries, tool, keep = chosen.entries, chosen.tool, chosen.keep
     firmware = calibration.session.firmware is not None  # settings are written, no offsets entered
+    entry_findings = (
+        _setting_findings(calibration, tool)
+        if firmware
+        else _entry_findings(calibration, entries, tool, keep=keep)
+    )
     notes = [
         *find_fit_findings(calibration),
         *([_no_change_needed(calibration, entries, chosen.best)] if keep else []),
-        *([] if firmware else _entry_findings(calibration, entries, tool, keep=keep)),
+        *entry_findings,
         *(_backlash_findings(calibration) if chosen.backlash and not firmware else []),
         *describe_recommendation(
             recommendation or recommend_model(session_used),
@@ -302,6 +308,25 @@ def _no_change_needed(
     return words.no_change_needed(drives, max(ratios, default=0.0), best, share=min_reduction)
 
 
+def _setting_findings(calibration: Calibration, tool: ToolErrorSummary | None) -> list[Finding]:
+    """Finding that the settings of a firmware are kept, if others are hardly better."""
+    settings = calibration.session.firmware
+    if settings is None:
+        return []
+    try:
+        fit = fit_firmware(calibration, settings.firmware, tool=tool)
+    except ExportError:  # no bed, or no workspace; the export names it
+        return []
+    if fit.worth_entering:
+        return []
+    return [
+        words.settings_kept(
+            tool=tuple(fit.expect_tool(e) for e in (fit.now, fit.new)),
+            layer=tuple(fit.expect_layer(e) for e in (fit.now, fit.new)),
+        )
+    ]
+
+
 def _entry_findings(
     calibration: Calibration,
     entries: Sequence[ControllerEntry],
@@ -363,6 +388,8 @@ def _decide(findings: Sequence[Finding], *, firmware: bool, backlash: bool) -> D
         return Decision(verdict, headlines[verdict], lead.text, lead.action)
     for kind, headline in KEEPING.items():
         finding = first_of(findings, kind)
+        if finding is not None and firmware:
+            return Decision(verdict, words.FIRMWARE_KEEP_HEADLINE, finding.text, finding.action)
         if finding is not None:
             if backlash:
                 headline = f"{headline} {words.BACKLASH_HEADLINE}"

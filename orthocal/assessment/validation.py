@@ -255,12 +255,18 @@ def _apply_stated(
         SessionError: If a session belongs to the calibration, an adjustment does not fit, or
             tolerances differ from those of the calibration.
     """
-    robot = calibration.robot.with_tolerances(tolerances)
+    robot, settings = calibration.robot.with_tolerances(tolerances), calibration.session.firmware
+    placed = sessions
+    if settings is not None:
+        placed = [
+            s if s.firmware is None else s.on_printer(calibration.robot, settings.homed)
+            for s in sessions
+        ]
     restated = [
         session.with_tolerances(
             tolerances if session.robot.parameters.stated else robot.parameters.stated
         )
-        for session in sessions
+        for session in placed
     ]
     for session in restated:
         require_same_tolerances(robot, session, source="the calibration")
@@ -420,6 +426,7 @@ def _describe_agreement(
             limit,
             None if explained else refit.rms_after,
             explains=refit.rms_after < EXPLAINED_RATIO * achieved,
+            firmware=refit.session.firmware is not None,
             numbers=numbers,
             place=Place(line=worst.line, setup=worst.setup, posture=worst.postures),
         )
@@ -458,6 +465,8 @@ def _find_further_change(joint: Calibration | None) -> list[Finding]:
     assessment = assessment_of(joint)
     if assessment.keeps_offsets:
         return []
+    if joint.session.firmware is not None:
+        return [words.further_settings()]
     return [words.further_change([e for e in assessment.entries if is_significant(joint, e)])]
 
 

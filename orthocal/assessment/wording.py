@@ -70,6 +70,13 @@ def um(value: float) -> str:
     return f"{size:.0f}" if abs(size) >= 20.0 else f"{size:.1f}"
 
 
+def name_offsets(drives: Sequence[str], *, firmware: bool) -> str:
+    """Noun phrase for the offsets of drives; on a printer for its endstops."""
+    if not firmware:
+        return f"the offset of {joined(tuple(drives))}"
+    return f"the endstop of tower {joined([d.partition('_')[0] for d in drives])}"
+
+
 def counted(count: int, noun: str) -> str:
     """Number with a noun, such as "1 reading" or "2 readings"."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

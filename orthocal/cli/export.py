@@ -25,6 +25,7 @@ from orthocal.cli.overwriting import mark_written, require_replaceable_results
 from orthocal.cli.printing import put_note, put_out, write_results
 from orthocal.errors import ParameterError
 from orthocal.io.files import exists
+from orthocal.text import printable
 from orthocal.units import DRIVE_UNITS, MM, UM
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ def export(
     _require_free(out, files, force=force)
     write_results(out, mark_written(files))
     if result.session.firmware is not None:
-        _show_settings(result, to)
+        _show_settings(result, to, calibration, out)
     if "kinematics.ini" in files:
         _note_payload(result, payload)
     if to == "linuxcnc":
@@ -95,14 +96,26 @@ def export(
         put_out(f"Next: follow {out / 'README.md'}.")
 
 
-def _show_settings(calibration: orthocal.Calibration, firmware: str) -> None:
-    """Print the new settings of a firmware, with their uncertainty."""
-    from orthocal.export.printer import describe_settings, fit_firmware
+def _show_settings(
+    calibration: orthocal.Calibration, firmware: str, saved: Path, out: Path
+) -> None:
+    """Print the new settings of a firmware, with their uncertainty, and the next step.
+
+    Args:
+        calibration: The calibration.
+        firmware: Format of the export.
+        saved: Directory of the calibration.
+        out: Directory of the export.
+    """
+    from orthocal.assessment.printer_settings import fit_firmware
+    from orthocal.export.printer import describe_next, describe_settings
     from orthocal.printers.firmwares import FIRMWARES
 
     for name in FIRMWARES:
         if firmware == name:
-            put_out(describe_settings(fit_firmware(calibration, name)))
+            fit = fit_firmware(calibration, name)
+            put_out(describe_settings(fit))
+            put_out(printable(describe_next(fit, saved, out), keep="\n"))
 
 
 def _note_latching(calibration: orthocal.Calibration, options: orthocal.ExportOptions) -> None:

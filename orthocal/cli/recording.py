@@ -192,7 +192,8 @@ class Dialogue:
             raise _EndOfDialogue
         if not self._recording.rows[self._asked].is_read:
             is_point = len(self._recording.point(self._asked)) > 1
-            expected = "x, y and z of the point" if is_point else "the reading of the dial"
+            reading = f"the reading of the {self._text.instrument(self._asked)}"
+            expected = "x, y and z of the point" if is_point else reading
             raise SessionError(f"type {expected}, or `skip`, or `help`")
         self._ask_for_next()
 

@@ -44,8 +44,9 @@ def gather_sessions(sources: Given | Sequence[Given]) -> list[Session]:
 def join_sessions(sessions: Sequence[Session]) -> Session:
     """Join sessions on the same robot into one session with all their readings.
 
-    Setups, postures and gauges are named after their session. Active offsets and mechanical
-    adjustments are those of the last session. So the errors are those of the machine at that time.
+    Setups, postures and gauges are named after their session. Active offsets, adjustments and
+    settings of a firmware are those of the last session. So the errors are those of the machine at
+    that time. The nominal dimensions of a printer are those of the first session.
 
     Args:
         sessions: Sessions in the order of measurement, each joined before or not. A single one is
@@ -58,6 +59,11 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
         raise SessionError("there is no session to join")
     if len(sessions) == 1:
         return sessions[0]
+    if settings := sessions[0].firmware:
+        robot = sessions[0].robot
+        sessions = [
+            s if s.firmware is None else s.on_printer(robot, settings.homed) for s in sessions
+        ]
     last = sessions[-1]
     _require_same_machine(sessions)
     purposes = {s.purpose for s in sessions} - {None}
@@ -98,10 +104,10 @@ def _require_same_machine(sessions: Sequence[Session]) -> None:
                 "states the effects {}; another session has {}: choose them".format(*names),
                 where=f"{session.path or 'session'}: calibration.effects",
             )
-        if session.firmware != last.firmware:
+        if (session.firmware is None) != (last.firmware is None):
             raise SessionError(
-                "states other settings of the firmware than another session; expected readings "
-                "with the same settings",
+                "states settings of a firmware, unlike another session; expected logs of one "
+                "printer",
                 where=f"{session.path or 'session'}: controller.firmware",
             )
         source = str(first.path or first.title or "another session")

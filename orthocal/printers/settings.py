@@ -13,7 +13,7 @@ Marlin/src/module/delta.cpp of Marlin, LinearDeltaKinematics.cpp of RepRapFirmwa
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
@@ -65,6 +65,9 @@ class DeltaSettings:
     """Tilts of the bed about y and x, [1]; RepRapFirmware only."""
     probe: Three = (0.0, 0.0, 0.0)
     """Position of the probe's tip at the trigger relative to the nozzle, [m]."""
+    shift: Three = (0.0, 0.0, 0.0)
+    """Coordinates of the carriages less those of the firmware, [m]; not 0 if they refer to the
+    coordinates of earlier settings."""
 
     @property
     def towers(self) -> Array:
@@ -75,12 +78,17 @@ class DeltaSettings:
     @property
     def middle(self) -> Array:
         """Coordinates of the carriages with the nozzle at 0, shape (3,), [m]."""
-        return np.sqrt(np.array(self.rods) ** 2 - self.radius**2)
+        return np.sqrt(np.array(self.rods) ** 2 - self.radius**2) + self.shift
 
     @property
     def endstops(self) -> Array:
         """Heights of the nozzle at the endstops (Klipper: position_endstop), shape (3,), [m]."""
         return np.array(self.homed) - self.middle
+
+    def moved(self, change: Array) -> DeltaSettings:
+        """Same settings with coordinates of the carriages that differ by `change`, (3,), [m]."""
+        homed, shift = np.array(self.homed) + change, np.array(self.shift) + change
+        return replace(self, homed=tuple(homed.tolist()), shift=tuple(shift.tolist()))
 
     def inverse(self, points: ArrayLike) -> Array:
         """Coordinates of the carriages at nozzle positions (K, 3), shape (K, 3), [m].
@@ -98,7 +106,7 @@ class DeltaSettings:
                 "position within the radius of the printer"
             )
         height = p[:, 2] + p[:, :2] @ np.array(self.tilts)
-        return np.asarray(np.sqrt(squared) + height[:, None])
+        return np.asarray(np.sqrt(squared) + height[:, None] + self.shift)
 
     def forward(self, carriages: ArrayLike) -> Array:
         """Nozzle positions at coordinates of the carriages (K, 3), shape (K, 3), [m].
@@ -106,7 +114,7 @@ class DeltaSettings:
         Differences of the three spheres |p − cᵢ|² = Lᵢ² are linear and give x and y as functions of
         z. The first sphere is then a quadratic equation whose lower root is below the carriages.
         """
-        h = np.atleast_2d(np.asarray(carriages, dtype=np.float64))
+        h = np.atleast_2d(np.asarray(carriages, dtype=np.float64)) - self.shift
         t, rods = self.towers, np.array(self.rods)
         power = np.sum(t**2, axis=1) + h**2 - rods**2
         inverse = np.linalg.inv(2.0 * (t[1:] - t[0]))

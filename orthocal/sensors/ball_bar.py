@@ -95,6 +95,7 @@ class BallBar(ToolSensor):
 
     kind: ClassVar[str] = "ball_bar"
     noun: ClassVar[str] = "a ball bar"
+    instrument: ClassVar[str] = "ball bar"
     keys: ClassVar[type[SetupKeys]] = BallBarKeys
     ideal: ClassVar[str] = "its sphere"
     zero: ClassVar[GaugeZero] = "known"

@@ -66,6 +66,7 @@ class Distance(ToolSensor):
 
     kind: ClassVar[str] = "distance"
     noun: ClassVar[str] = "a printed distance"
+    instrument: ClassVar[str] = "calliper"
     keys: ClassVar[type[SetupKeys]] = DistanceKeys
     ideal: ClassVar[str] = "its nominal length"
     zero: ClassVar[GaugeZero] = "known"

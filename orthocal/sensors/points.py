@@ -120,6 +120,7 @@ class Points(ToolSensor):
 
     kind: ClassVar[str] = "points"
     noun: ClassVar[str] = "a target"
+    instrument: ClassVar[str] = "instrument"
     keys: ClassVar[type[SetupKeys]] = PointKeys
     ideal: ClassVar[str] = "its nominal position"
     zero: ClassVar[GaugeZero] = "known"

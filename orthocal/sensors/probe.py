@@ -72,6 +72,7 @@ class Probe(ToolIndicator):
     ideal: ClassVar[str] = "the surface"
     zero: ClassVar[GaugeZero] = "known"
     states_readings: ClassVar[bool] = True
+    instrument: ClassVar[str] = "probe"
 
     @classmethod
     def from_keys(cls, keys: Any) -> Probe:  # noqa: ANN401 - of `keys`

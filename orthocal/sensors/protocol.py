@@ -167,6 +167,9 @@ class Sensor(Protocol):
     # readings, such as equal lengths of a print; by default if readings are prescribed. Then equal
     # readings do not indicate a sticking dial (`equal_readings`)
 
+    # instrument: ClassVar[str], optional: noun for what shows a reading; dial by default
+    # (`instrument`)
+
     # reads_pairs: ClassVar[bool], optional: whether a reading belongs to a pair of postures: the
     # posture of its row and the one in the column `minus`. It is a single reading (`reads_pairs`)
 
@@ -330,3 +333,9 @@ def equal_readings(sensor: Sensor) -> bool:
     """True if equal readings of different postures are no anomaly."""
     equal: bool = getattr(sensor, "equal_readings", states_readings(sensor))
     return equal
+
+
+def instrument(sensor: Sensor) -> str:
+    """Noun for what shows a reading, such as dial or ball bar."""
+    noun: str = getattr(sensor, "instrument", "dial")
+    return noun

@@ -21,6 +21,7 @@ from orthocal.arguments import require_array
 from orthocal.arrays import Array
 from orthocal.effects.compensation import Compensation
 from orthocal.effects.loading import with_effects
+from orthocal.errors import SessionError
 from orthocal.io.documents import Number
 from orthocal.io.fields import CLOSED, read_only
 from orthocal.io.html import paragraph, table
@@ -400,6 +401,32 @@ class Session:
             for name, p in self.postures.items()
         }
         return replace(self, postures=postures, controller_offsets=read_only(active), sha256="")
+
+    def on_printer(self, robot: Robot, homed: ArrayLike) -> Session:
+        """Session of a printer in the coordinates of its robot before settings changed.
+
+        Settings change the nominal dimensions and the coordinates of the homed carriages, but not
+        the travel of the carriages below their endstops.
+
+        Args:
+            robot: Robot with other nominal dimensions.
+            homed: Coordinates of its homed carriages, shape (3,), [m].
+
+        Raises:
+            SessionError: If the session states no settings of a firmware.
+        """
+        if self.firmware is None:
+            raise SessionError(
+                "states no settings of a firmware", where=str(self.path or "session")
+            )
+        change = np.asarray(homed, dtype=np.float64) - self.firmware.homed
+        drives = {name: read_only(p.drives + change) for name, p in self.postures.items()}
+        return replace(
+            self,
+            robot=robot,
+            firmware=self.firmware.moved(change),
+            postures={name: Posture(name, "joints", d, d) for name, d in drives.items()},
+        )
 
     def with_tolerances(self, tolerances: Mapping[str, float]) -> Session:
         """Session of the robot with other tolerances.

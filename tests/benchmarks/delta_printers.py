@@ -30,7 +30,7 @@ from klipper_peer import calibrate_as_klipper
 from simulated_printer import Printer, nominal, read_settings, rings, write_log
 
 from orthocal import calibrate, draw_errors
-from orthocal.export.printer import fit_firmware
+from orthocal.assessment.printer_settings import fit_firmware
 from orthocal.measurement.importing.printer_log import import_printer_log
 from orthocal.printers.firmwares import FIRMWARES
 from orthocal.units import MM

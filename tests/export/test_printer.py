@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,14 +21,20 @@ from orthocal import (
     export_calibration,
     load_calibration,
     load_session,
+    validate_calibration,
     write_calibration,
 )
+from orthocal.assessment.printer_settings import _find_targets, fit_firmware
 from orthocal.calibration.refit import restore_covariances
-from orthocal.export.printer import _find_targets, fit_firmware
+from orthocal.export.printer import describe_next
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.measurement.importing.printer_log import import_printer_log
+from orthocal.output.text.accuracy import FIRMWARE_NOTE
+from orthocal.output.text.answer import PRINT
+from orthocal.output.text.layout import to_text
+from orthocal.output.text.validation import render_validation
 from orthocal.printers.firmwares import FIRMWARES
-from orthocal.units import DEG, MM
+from orthocal.units import DEG, MM, UM
 
 NOISE_MM = 0.02
 TRIGGER_MM = 1.85
@@ -84,7 +91,8 @@ def test_walk_of_the_owner_of_a_printer(tmp_path, firmware):
         assert done.returncode == 0, done.stderr
     shown = [line.split() for line in done.stdout.splitlines()]
     assert shown[0] == ["now", "new", "±"]
-    assert len(shown) == 11
+    assert len(shown) == 14
+    assert shown[11][0] == "Next:"
     lines = (tmp_path / "new" / FIRMWARES[firmware].file).read_text()
     new = read_settings(firmware, lines, m851=-TRIGGER_MM)
     before = printer.probe(settings, rings()) - TRIGGER_MM
@@ -111,7 +119,7 @@ def test_no_nearby_settings_are_better(calibrated):
     """The stated errors are those of the calibrated machine, and each change makes them worse."""
     _, calibration = calibrated
     fit = fit_firmware(calibration, "klipper")
-    targets, _ = _find_targets(calibration)
+    targets, _ = _find_targets(calibration, "bed")
     closure = LoopClosure(calibration.robot, fixed=calibration.errors)
     real = closure.forward(targets.layer_carriages)
     value = {p.name: p.value for p in calibration.sensors}
@@ -159,6 +167,78 @@ def test_one_length_for_all_rods(calibrated):
     flat = printer.probe(new, rings()) - TRIGGER_MM
     expected = np.hypot(fit.new.layer_rms, fit.layer_unknown) / MM
     assert np.sqrt(np.mean(flat**2)) < PROMISE * expected
+
+
+@pytest.fixture(scope="module")
+def probed_again(calibrated, tmp_path_factory):
+    """Session of the bed after the settings of the export were entered."""
+    printer, calibration = calibrated
+    lines = FIRMWARES["klipper"].config_lines(fit_firmware(calibration, "klipper").settings)
+    new = read_settings("klipper", lines)
+    log = tmp_path_factory.mktemp("again") / "log.txt"
+    log.write_text(probe_log("klipper", printer, new, np.random.default_rng(3)))
+    return import_printer_log(log).session
+
+
+def test_settings_change_coordinates_but_no_travel(calibrated, probed_again):
+    """The endstops stay, and the firmware is as much at a place as before."""
+    _, calibration = calibrated
+    before, here = calibration.session.firmware, probed_again
+    moved = here.on_printer(calibration.robot, before.homed)
+    assert moved.firmware.homed == before.homed
+    assert moved.firmware.endstops == pytest.approx(here.firmware.endstops, abs=1e-12)
+    for name, posture in here.postures.items():
+        drives = moved.postures[name].drives
+        travel = here.firmware.homed - posture.drives
+        assert before.homed - drives == pytest.approx(travel, abs=1e-12)
+        where = here.firmware.forward(posture.drives)
+        assert moved.firmware.forward(drives) == pytest.approx(where, abs=1e-12)
+        assert moved.firmware.inverse(where)[0] == pytest.approx(drives, abs=1e-12)
+    assert probed_again.robot.sha256 != calibration.robot.sha256
+
+
+def test_the_second_probing_ends_the_walk(calibrated, probed_again):
+    """It confirms the first, and nothing more has to be entered."""
+    _, calibration = calibrated
+    validation = validate_calibration(calibration, probed_again)
+    assert validation.confirmed
+    assert validation.nothing_to_change
+    assert validation.enter == ()
+    (kept,) = validation.assessment.of_kind("no change needed")
+    assert "Nothing more has to be entered" in kept.text
+    fit = fit_firmware(validation.joint, "klipper")
+    assert not fit.worth_entering
+    now = fit.expect_layer(fit.now), fit.expect_tool(fit.now)
+    assert (kept.numbers["layer_now_um"], kept.numbers["now_um"]) == pytest.approx(
+        np.array(now) / UM, rel=1e-6
+    )
+    assert now[0] < 0.05 * MM
+    assert validation.assessment.decision.verdict == "enter"
+    present = validation.joint.session.firmware
+    assert present.endstops == pytest.approx(probed_again.firmware.endstops, abs=1e-12)
+    before = fit_firmware(calibration, "klipper")
+    assert before.worth_entering
+    sizes = [[r.uncertainty for r in f.rows] for f in (fit, before)]
+    assert (np.array(sizes[0]) <= sizes[1]).all()  # of both beds, only that of the last counts
+    assert PRINT in to_text(render_validation(validation))
+    assert describe_next(fit, Path("one"), Path("new")).startswith("Next: print.")
+
+
+def test_an_endstop_that_moved_is_named(calibrated, probed_again):
+    """By 0.4 mm between the probings."""
+    _, calibration = calibrated
+    shift = np.array([0.0, 0.4 * MM, 0.0])
+    moved = {
+        name: replace(p, values=p.values + shift, drives=p.drives + shift)
+        for name, p in probed_again.postures.items()
+    }
+    validation = validate_calibration(calibration, replace(probed_again, postures=moved))
+    assert validation.confirmed is False
+    change = validation.mistake.explanation
+    assert change.drives == ("b_slide",)
+    assert abs(change.amount) == pytest.approx(0.4 * MM, abs=3.0 * change.std)
+    assert "endstop of tower b" in validation.assessment.decision.reason
+    assert "export its settings" in validation.assessment.decision.action
 
 
 def test_uncertainty_of_the_settings(calibrated):
@@ -223,6 +303,16 @@ def test_a_machine_that_the_firmware_can_express_is_met(calibrated):
     assert np.array(fit.settings.rods) - present.rods == pytest.approx([4e-4, 0, 0], abs=1e-6)
     turned = np.diff(np.array(fit.settings.angles) - present.angles)
     assert np.abs(turned) == pytest.approx([0.7e-3 / 0.1411, 0.0], abs=5e-5)
+
+
+def test_accuracy_of_a_printer_names_no_offsets(calibrated, tmp_path):
+    """It has none: its firmware has settings."""
+    _, calibration = calibrated
+    write_calibration(calibration, tmp_path / "one")
+    done = run_orthocal(tmp_path, "accuracy", "one")
+    assert done.returncode == 0, done.stderr
+    assert "offset" not in done.stdout
+    assert FIRMWARE_NOTE in " ".join(done.stdout.split())
 
 
 def test_other_sessions_are_refused(root):

@@ -32,8 +32,8 @@ from simulated_printer import (
 from tolerances import CLOSED_FORM, SAME_OPTIMUM
 
 from orthocal import SolverOptions, calibrate, check_session, load_plan, load_session
+from orthocal.assessment.printer_settings import fit_firmware
 from orthocal.errors import SessionError
-from orthocal.export.printer import fit_firmware
 from orthocal.hypotheses.search import find_anomalies
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.sensitivity import ToolSensitivity

@@ -18,8 +18,8 @@ from simulated_printer import Firmware, Printer, nominal, read_settings, rings, 
 
 from orthocal import Choice, calibrate, check_session
 from orthocal.assessment.assess import assess
+from orthocal.assessment.printer_settings import fit_firmware
 from orthocal.assessment.words.entries import FIRMWARE_HEADLINES
-from orthocal.export.printer import fit_firmware
 from orthocal.measurement.importing.printer_log import import_printer_log
 from orthocal.printers.firmwares import FIRMWARES
 from orthocal.units import MM

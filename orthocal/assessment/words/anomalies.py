@@ -6,7 +6,16 @@ import math
 import shlex
 from collections.abc import Callable, Sequence
 
-from orthocal.assessment.wording import joined, mm, note, plain, review, signed, um
+from orthocal.assessment.wording import (
+    joined,
+    mm,
+    name_offsets,
+    note,
+    plain,
+    review,
+    signed,
+    um,
+)
 from orthocal.assessment.words.effects import identify_effects
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.effects.loading import errors_of_no_model, robot_effects, with_effects
@@ -503,6 +512,8 @@ def _swapped(session: Session, e: Explanation) -> str:
 def _changed(session: Session, e: Explanation) -> str:
     """Clause about a change of the machine."""
     what = joined(e.drives) or joined(e.parameters)
+    if e.drives and session.firmware is not None:
+        what = name_offsets(e.drives, firmware=True)
     verb = "moved" if e.drives else "changed"
     when = f"before session {e.sessions[0]}"
     if e.apart:
@@ -601,6 +612,11 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
 def _session_remedy(session: Session, e: Explanation) -> str:
     """Action for a change between sessions."""
     first = e.sessions[0]
+    if session.firmware is not None:
+        return (
+            "Calibrate the last log alone and export its settings: they must belong to the present "
+            "printer."
+        )
     if e.kind != "machine changed":
         return (
             f"Compare the offsets in the controller with `controller.offsets_mm` of session "

@@ -27,6 +27,9 @@ FIRMWARE_HEADLINES: dict[Verdict, str] = {
 }
 """Headlines of a calibration of a printer, whose firmware has settings beside offsets."""
 
+FIRMWARE_KEEP_HEADLINE = "Leave the settings as they are."
+"""Headline of a calibration of a printer that changes no setting."""
+
 FIRMWARE_STEP = "`orthocal export` writes the settings."
 """Next step after the calibration of a printer."""
 
@@ -106,6 +109,25 @@ def no_change_needed(
             f"{share:.0%}."
         )
     return note("no change needed", text, "", named(*drives), **numbers)
+
+
+def settings_kept(*, tool: tuple[float, ...], layer: tuple[float, ...]) -> Finding:
+    """Finding that the settings of a printer's firmware are kept.
+
+    Args:
+        tool: Expected tool error with the present and with the best settings, [m].
+        layer: Expected height error of the first layer with them, [m].
+    """
+    texts = [f"from {tool_mm(now)} to {tool_mm(new)}" for now, new in (layer, tool)]
+    return note(
+        "no change needed",
+        "Nothing more has to be entered: the best settings would change the expected height error "
+        f"of the first layer {texts[0]}, and the tool error {texts[1]}.",
+        now_um=tool[0] / UM,
+        best_um=tool[1] / UM,
+        layer_now_um=layer[0] / UM,
+        layer_best_um=layer[1] / UM,
+    )
 
 
 def must_change(drives: Sequence[str]) -> Finding:

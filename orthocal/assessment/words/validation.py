@@ -14,6 +14,8 @@ INCONCLUSIVE = "The validation is inconclusive."
 
 RECALIBRATE = "Calibrate from this session and enter its offsets."
 
+RECALIBRATE_PRINTER = "Calibrate from this log and export its settings."
+
 CALIBRATE_JOINTLY = "Calibrate the sessions together and enter these offsets."
 
 
@@ -33,6 +35,7 @@ def larger_than_predicted(
     refit: float | None,
     *,
     explains: bool,
+    firmware: bool,
     numbers: Mapping[str, float],
     place: Place,
 ) -> Finding:
@@ -44,6 +47,7 @@ def larger_than_predicted(
             a mean over all patterns and may be larger.
         refit: RMS residual of a fit of the new readings, [m]; None if an anomaly explains them.
         explains: Whether that fit explains the deviations.
+        firmware: Whether a printer with its settings is validated.
         numbers: Numbers of the finding.
         place: Reading with the largest deviation.
     """
@@ -54,11 +58,13 @@ def larger_than_predicted(
     action = ""
     if refit is not None:
         if explains:
-            cause = "the machine has changed, or a gauge was mounted elsewhere than stated"
-            action = RECALIBRATE
+            where = "other settings were active" if firmware else "a gauge was mounted elsewhere"
+            cause = f"the machine has changed, or {where} than stated"
+            action = RECALIBRATE_PRINTER if firmware else RECALIBRATE
         else:
             cause = "the readings scatter more than before, or something moved during the session"
-            action = "Check the mounting of the gauge, then read again."
+            action = f"Check the mounting of the {'probe' if firmware else 'gauge'}, then "
+            action += "probe again." if firmware else "read again."
         text += f" A new calibration leaves {mm(refit)} mm RMS of this. Probably {cause}."
     return review("larger than predicted", text, action, (place,), **numbers)
 
@@ -91,6 +97,15 @@ def further_change(entries: Sequence[ControllerEntry]) -> Finding:
         noun = "an offset" if len(changes) == 1 else "offsets"
         text = f"The new readings still improve {noun}: {joined(changes)}."
     return note("further change", text, CALIBRATE_JOINTLY, named(*(e.drive for e in entries)))
+
+
+def further_settings() -> Finding:
+    """Finding that the joint calibration improves the settings of a printer's firmware."""
+    return note(
+        "further change",
+        "Settings from both probings are still better.",
+        "Calibrate the sessions together and export again.",
+    )
 
 
 def describe_repetition(

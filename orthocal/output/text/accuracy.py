@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,7 @@ from orthocal.assessment.tool_error import (
     assess_tool,
     summarise_tool,
 )
-from orthocal.assessment.wording import joined, tool_mm
+from orthocal.assessment.wording import name_offsets, tool_mm
 from orthocal.assessment.words.entries import (
     describe_compensated,
     describe_tool_error,
@@ -51,6 +51,12 @@ ABSOLUTE_NOTE = (
     "  orthocal accuracy {}"
 )
 """Note beside the errors at points; {} is the calibration."""
+
+FIRMWARE_NOTE = (
+    "Settings of the firmware correct a part of this error. `orthocal export` states them with the "
+    "errors to expect."
+)
+"""Note on the tool error of a printer, which has no offsets to enter."""
 
 COLUMNS_NOTE = (
     "RMS, 95 % and worst point: workpiece aligned on the machine (translation and rotation "
@@ -107,7 +113,8 @@ def render_accuracy(
     """
     rows = [("identified error, now", accuracy.measure(accuracy.deviation))]
     keep = assessment_of(calibration).keeps_offsets
-    if not calibration.only_offsets and not keep:
+    firmware = calibration.session.firmware is not None
+    if not (calibration.only_offsets or keep or firmware):
         entered = accuracy.measure(accuracy.deviation_with_entries)
         rows.append(("identified error, offsets entered", entered))
     rows.append(("uncertainty before calibration", accuracy.before.sizes))
@@ -143,6 +150,8 @@ def _describe_expected(calibration: Calibration, accuracy: ToolAccuracy) -> list
     if summary is None:
         return []
     texts = [describe_tool_error(summary, keep=assessment_of(calibration).keeps_offsets)]
+    if calibration.session.firmware is not None:
+        texts = [FIRMWARE_NOTE]
     if not calibration.only_offsets:
         texts.append(describe_compensated(summary.compensated))
     if summary.use is not None:
@@ -167,16 +176,23 @@ def describe_undetermined(
     if not unknown:
         return []
     further = expect_further_hour(calibration) if further is None else further
-    return [describe_remedy(unknown, further.gains, further.rms)]
+    offset = name_offsets(unknown, firmware=calibration.session.firmware is not None)
+    return [describe_remedy(offset, further.gains, further.rms)]
 
 
-def describe_remedy(drives: Sequence[str], gains: Iterable[SensorGain], rms: float) -> str:
-    """Offsets that readings do not determine, and the sensor that helps most, as sentences."""
+def describe_remedy(offsets: str, gains: Iterable[SensorGain], rms: float) -> str:
+    """Offsets that readings do not determine, and the sensor that helps most, as sentences.
+
+    Args:
+        offsets: Noun phrase for the offsets.
+        gains: Expected tool errors after another hour with each sensor.
+        rms: Expected tool error now, [m].
+    """
     helpful, remedy = helpful_gains(gains, rms, HELPFUL), "Plan more time or setups."
     if helpful:
         best = helpful[0]
         remedy = f"Another hour with {best.words} would reduce the error to {tool_mm(best.rms)}."
-    return f"These readings do not determine the offset of {joined(drives)}. {remedy}"
+    return f"These readings do not determine {offsets}. {remedy}"
 
 
 def expect_further_hour(

@@ -75,6 +75,9 @@ NEW_NOTE = (
 )
 """Meaning of the column `new` of offsets."""
 
+PRINT = "print. After a crash or a change of the printer probe again."
+"""Next step if the settings of a printer are kept."""
+
 MORE = "--details prints all readings, all errors of the machine and the tool error."
 
 
@@ -219,6 +222,8 @@ def _next_step(
         return "keep the result by adding `--out DIRECTORY` to this command.", ()
     firmware = calibration.session.firmware
     if firmware is not None:
+        if unchanged:
+            return PRINT, ()
         directory, new = (quote_path(p) for p in (saved, f"{saved}-{firmware.firmware}"))
         return "write settings for the firmware; its README says what to expect.", (
             f"orthocal export {directory} --to {firmware.firmware} --out {new}",

@@ -13,7 +13,7 @@ from rich.padding import Padding
 from rich.text import Text
 
 from orthocal.assessment.effect_limits import DETERMINED, EffectLimits
-from orthocal.assessment.wording import tool_mm
+from orthocal.assessment.wording import name_offsets, tool_mm
 from orthocal.assessment.words.entries import describe_aligned
 from orthocal.kinematics.conditions import stated_use
 from orthocal.kinematics.reachable_box import find_workspace
@@ -154,7 +154,8 @@ def _undetermined(plan: MeasuringPlan | FixedPlan, gains: Sequence[SensorGain]) 
     drives = _undetermined_offsets(plan)
     if not drives:
         return []
-    return [describe_remedy(drives, gains, plan.expected.reported.rms)]
+    offsets = name_offsets(drives, firmware=False)
+    return [describe_remedy(offsets, gains, plan.expected.reported.rms)]
 
 
 def _unusable(plan: MeasuringPlan) -> list[str]:

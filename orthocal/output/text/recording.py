@@ -25,7 +25,7 @@ from orthocal.measurement.recording import Recording
 from orthocal.observation.observations import drive_table
 from orthocal.output.sheet.gauge_position import hinge_distances
 from orthocal.sensors.points import Points
-from orthocal.sensors.protocol import mounting_steps
+from orthocal.sensors.protocol import instrument, mounting_steps, reads_pairs
 from orthocal.session.points import base_name
 from orthocal.session.session import Conditions, Reading, Session, Setup
 from orthocal.text import printable, spans
@@ -42,7 +42,7 @@ COMMANDS = {
     "again": "read the last line once more, as another cycle; `again 7` line 7",
     "skip": "leave this line empty for now",
     "drop": "delete this line from the session; `drop 7` line 7",
-    "restart": "delete the readings of this setup and read it again, if stand or dial moved",
+    "restart": "delete the readings of this setup and read it again, if the gauge has moved",
     "temperature": "temperature of the following readings in °C, such as `t 22.5`",
     "side": "side of approach of the following readings where the plan states none: `side n`",
     "clock": "begin or stop to note the time of each reading; stop if you type from paper",
@@ -160,10 +160,16 @@ class RecordingText:
 
     def _what_to_type(self) -> str:
         """Instruction for typing a reading or a point."""
-        points = [isinstance(s.sensor, Points) for s in self._session.setups.values()]
-        dial = "Type the reading of the dial in mm." if not all(points) else ""
-        point = "Type x, y and z of a point in mm, with blanks between them." if any(points) else ""
-        return f"{dial} {point}".strip()
+        sensors = [s.sensor for s in self._session.setups.values()]
+        nouns = dict.fromkeys(instrument(s) for s in sensors if not isinstance(s, Points))
+        reading = f"Type the reading of the {joined(tuple(nouns), 'or')} in mm." if nouns else ""
+        points = any(isinstance(s, Points) for s in sensors)
+        point = "Type x, y and z of a point in mm, with blanks between them." if points else ""
+        return f"{reading} {point}".strip()
+
+    def instrument(self, index: int) -> str:
+        """Noun for what shows the reading of a row."""
+        return instrument(self._session.setups[self._recording.rows[index].setup].sensor)
 
     def setup(self, name: str) -> str:
         """Position of the gauge of a setup, and preparation of its dial."""
@@ -179,18 +185,19 @@ class RecordingText:
         )
         sensor = setup.sensor.in_file if isinstance(setup.sensor, Points) else setup.sensor
         parts = [f"Place: {sensor.describe()}", self._stand(name), _gauge(session, setup)]
+        noun = instrument(setup.sensor)
+        gauge = "stand or the dial" if noun == "dial" else noun
         if any(r.is_read for r in of_setup) and any(r.minus is None for r in of_setup):
             parts.append(
-                "This setup has readings. If the stand or the dial has moved since, `restart` the "
-                "setup."
+                f"This setup has readings. If the {gauge} has moved since, `restart` the setup."
             )
         elif isinstance(setup.sensor, Points):
             parts.append("From then on do not touch the instrument until the setup is complete.")
-        else:
+        elif not reads_pairs(setup.sensor):
             parts.append(
-                f"Go to {aligned} and align the gauge. {go}"
-                f"{set_dial(session, setup.name)} From then on touch neither stand nor "
-                "dial until the setup is complete."
+                f"Go to {aligned} and align the {'gauge' if noun == 'dial' else noun}. {go}"
+                f"{set_dial(session, setup.name)} From then on do not touch the {gauge} until the "
+                "setup is complete."
             )
         if all(map(session.is_difference, of_setup)):
             parts.append(
@@ -289,7 +296,7 @@ class RecordingText:
         lines = [self.wrap(text, indent="  ")]
         if is_far(row.value, mean, std):
             differs = f"Line {row.line}{of} differs by {mm(abs(row.value - mean))} mm."
-            check = f"Check the {'point' if of else 'dial'}."
+            check = f"Check the {'point' if of else self.instrument(index)}."
             lines.append(self.wrap(f"{differs} {check}", indent="  ", first="! "))
         return "\n".join(lines)
 
@@ -419,9 +426,11 @@ def _gauge(session: Session, setup: Setup) -> str:
         facts.append(f"{gauge.range[0] / MM:g} to {gauge.range[1] / MM:g} mm")
     if gauge.resolution is not None:
         facts.append(f"resolution {gauge.resolution / MM:g} mm")
-    name = f" {setup.gauge}" if setup.gauge else ""
-    noun = "Instrument" if isinstance(setup.sensor, Points) else "Dial"
-    return ": ".join(t for t in (f"{noun}{name}", ", ".join(facts)) if t) if facts or name else ""
+    if not facts and not setup.gauge:
+        return ""
+    noun = instrument(setup.sensor)
+    name = f" {setup.gauge}" if setup.gauge not in ("", noun) else ""
+    return ": ".join(t for t in (f"{noun.capitalize()}{name}", ", ".join(facts)) if t)
 
 
 def find_rows(finding: Finding, rows: Sequence[Reading]) -> list[int]:

@@ -12,6 +12,7 @@ from orthocal.assessment.validation import Validation
 from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.calibration.assessment_record import FindingKind
 from orthocal.output.text.answer import (
+    PRINT,
     calibrate_command,
     describe_columns,
     describe_conditions,
@@ -89,12 +90,15 @@ def _next_step(validation: Validation, *, further: bool) -> list[RenderableType]
     action = validation.assessment.decision.action
     if action:
         return [Text(), render_next(action)]
+    joint = validation.joint is not None and validation.assessment.decision.verdict == "enter"
+    firmware = validation.refit.session.firmware is not None
+    if firmware and not further:
+        return [Text(), render_next(PRINT)] if joint else []
     paths = [part.path for part in validation.final_calibration.session.parts]
     if not paths or None in paths:
         return []
-    joint = validation.joint is not None and validation.assessment.decision.verdict == "enter"
     if further:
-        words = "to use the better offsets:"
+        words = f"to use the better {'settings' if firmware else 'offsets'}:"
     elif joint and gains_from_correction(validation.final_calibration):
         words = "to correct the other identified errors, too, calibrate from all readings:"
     else:

@@ -1,0 +1,418 @@
+"""Settings of a delta printer's firmware with the smallest error, from a calibration.
+
+A firmware has a radius, three towers, three rods and three endstops as settings φ. Let h be the
+coordinates of the carriages that bring the real nozzle to p. The firmware computes the position
+f(h + Δ; φ), with Δ the change of its homed carriages. φ and Δ minimise the difference between the
+computed and the real position above the bed. A translation s and a rotation γ in the plane of the
+bed are free, because no print shows them:
+
+    min Σ wₖ |f(h(pₖ) + Δ; φ) − Rz(γ) pₖ − s|² + λ Σ z²(first layer)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from orthocal.arrays import Array
+from orthocal.assessment.calibrated_tool import find_tool
+from orthocal.assessment.controller_entries import lowers
+from orthocal.assessment.tool_error import assess_tool
+from orthocal.calibration.assessment_record import ToolErrorSummary
+from orthocal.calibration.calibration import Calibration, propagate_stds
+from orthocal.calibration.refit import restore_covariances
+from orthocal.errors import ClosureError, ExportError
+from orthocal.kinematics.sensitivity import ToolSensitivity
+from orthocal.kinematics.workspace import Workspace, box_workspace
+from orthocal.printers.firmwares import FIRMWARES
+from orthocal.printers.settings import DeltaSettings, FirmwareName
+from orthocal.units import DEG, MM
+
+FIRST_LAYER = 10.0
+"""Weight λ of the mean squared height of the first layer, relative to that of the tool error. The
+first layer holds the print. The weight of 10 makes it twice as flat for 5 % more tool error."""
+
+WORTH_LAYER = 0.01 * MM
+"""Smallest reduction of the RMS height error of the first layer that is worth new settings, [m]:
+half of the scatter of a probe."""
+
+DIFFERENCE_STEP = 1e-5
+"""Step of central differences, [m]."""
+
+RINGS = 6
+"""Number of rings of points of the first layer."""
+
+UNKNOWN_SCALES = (MM, *(10.0 * MM,) * 2, *(MM,) * 6, 10.0 * MM, *(MM,) * 4)
+"""Scales of the unknowns of the fit, as in `_residuals`: radius, angles a and b, rods, homed
+carriages, rotation and translation of the print, tilts, [m, rad]."""
+
+
+@dataclass(frozen=True, slots=True)
+class FirmwareError:
+    """Errors of a firmware's kinematics relative to the calibrated machine, [m].
+
+    Tool errors are over the workspace, with translation and rotation in the plane of the bed
+    removed. Layer errors are heights of the first layer above the bed.
+    """
+
+    tool_rms: float
+    tool_largest: float
+    layer_rms: float
+    layer_largest: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FirmwareFit:
+    """New settings of a firmware."""
+
+    settings: DeltaSettings
+    now: FirmwareError
+    """Errors with the present settings."""
+    new: FirmwareError
+    """Errors with the new settings."""
+    tool_unknown: float
+    """RMS uncertainty of the tool error after the calibration, [m]."""
+    layer_unknown: float
+    """RMS uncertainty of the heights of the first layer, [m]."""
+    rows: tuple[SettingRow, ...]
+    """Settings one by one: radius, rods, towers, endstops."""
+    gain: Array
+    """Derivative of the settings with respect to the free errors of the machine and the nuisance
+    parameters, shape (10, n), [SI]."""
+
+    def expect_tool(self, error: FirmwareError) -> float:
+        """Expected tool error with the uncertainty of the calibration, RMS, [m]."""
+        return math.hypot(error.tool_rms, self.tool_unknown)
+
+    def expect_layer(self, error: FirmwareError) -> float:
+        """Expected height error of the first layer with its uncertainty, RMS, [m]."""
+        return math.hypot(error.layer_rms, self.layer_unknown)
+
+    @property
+    def worth_entering(self) -> bool:
+        """True if the new settings lower the expected errors enough to be entered."""
+        lowered = self.expect_layer(self.now) - self.expect_layer(self.new)
+        tool = lowers(self.expect_tool(self.now), self.expect_tool(self.new))
+        return tool or not lowered < WORTH_LAYER
+
+
+@dataclass(frozen=True, slots=True)
+class SettingRow:
+    """A setting before and after, with its expanded uncertainty."""
+
+    name: str
+    now: float
+    new: float
+    uncertainty: float
+    """Expanded uncertainty of the new value; NaN if it is unknown."""
+    unit: str
+    """Unit of the numbers."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Targets:
+    """Carriages of the calibrated machine, and positions of its nozzle above the bed.
+
+    Derivatives are in the axes of the bed, with respect to the n free errors of the machine and
+    nuisance parameters, or with respect to the carriages.
+    """
+
+    points: Array
+    """Positions of the nozzle in the workspace, shape (K, 3), [m]."""
+    weights: Array
+    """Weights of these points, shape (K,)."""
+    carriages: Array
+    """Coordinates of the carriages at these points, shape (K, 3), [m]."""
+    layer_points: Array
+    """Positions of the nozzle on the bed, shape (M, 3), [m]."""
+    layer_carriages: Array
+    """Coordinates of the carriages at the points on the bed, shape (M, 3), [m]."""
+    jacobian: Array
+    """Derivative of the points with respect to errors, shape (K, 3, n), [m per SI unit]."""
+    layer_jacobian: Array
+    """Derivative of the points on the bed with respect to errors, shape (M, 3, n)."""
+    by_drives: Array
+    """Derivative of the points with respect to the carriages, shape (K, 3, 3), [1]."""
+    layer_by_drives: Array
+    """Derivative of the points on the bed with respect to the carriages, shape (M, 3, 3)."""
+
+
+def fit_firmware(
+    calibration: Calibration, firmware: FirmwareName, *, tool: ToolErrorSummary | None = None
+) -> FirmwareFit:
+    """Settings of a firmware with the smallest tool error.
+
+    Args:
+        calibration: Calibration whose session states the present settings of the firmware.
+        firmware: Firmware of the new settings.
+        tool: Tool error after the calibration; by default that of its assessment.
+
+    Raises:
+        ExportError: If the session states no settings, or the machine does not reach the workspace.
+    """
+    present = calibration.session.firmware
+    if present is None:
+        raise ExportError(
+            "the session states no settings of a firmware (controller.firmware); "
+            "`orthocal import LOG DIRECTORY` makes a session with them"
+        )
+    bed = _bed_of(calibration)
+    targets, layer_unknown = _find_targets(calibration, bed)
+    start, unknowns = _start(present, firmware), _unknowns(firmware)
+    solution = least_squares(
+        lambda y: _residuals(targets, start, unknowns @ y),
+        np.zeros(unknowns.shape[1]),
+        x_scale=(UNKNOWN_SCALES @ unknowns) / unknowns.sum(axis=0),
+        method="lm",
+    )
+    settings = _changed(start, unknowns @ solution.x)
+    if tool is None and calibration.assessment is not None:
+        tool = calibration.assessment.tool
+    homed_change = np.array(settings.homed) - present.homed
+    gain = _setting_gain(targets, settings, solution.jac, homed_change)
+    return FirmwareFit(
+        settings=settings,
+        now=_measure(targets, present, np.zeros(3)),
+        new=_measure(targets, settings, homed_change),
+        tool_unknown=math.nan if tool is None else tool.compensated,
+        layer_unknown=layer_unknown,
+        rows=_setting_rows(calibration, settings, gain),
+        gain=gain,
+    )
+
+
+def _start(present: DeltaSettings, firmware: FirmwareName) -> DeltaSettings:
+    """Present settings, as a firmware can have them."""
+    rod = float(np.mean(present.rods))
+    return replace(
+        present,
+        firmware=firmware,
+        rods=(rod, rod, rod) if FIRMWARES[firmware].equal_rods else present.rods,
+        tilts=present.tilts if FIRMWARES[firmware].tilts else (0.0, 0.0),
+    )
+
+
+def _unknowns(firmware: FirmwareName) -> Array:
+    """Settings that each unknown of the fit changes, as in `_changed`, shape (14, n), [1]."""
+    unknowns = np.eye(len(UNKNOWN_SCALES))
+    if not FIRMWARES[firmware].tilts:
+        unknowns = unknowns[:, :-2]
+    if FIRMWARES[firmware].equal_rods:
+        common = unknowns[:, 3:6].sum(axis=1, keepdims=True)
+        unknowns = np.concatenate([unknowns[:, :3], common, unknowns[:, 6:]], axis=1)
+    return unknowns
+
+
+def _differentiate(settings: DeltaSettings, carriages: Array) -> Array:
+    """Derivative of the computed position with respect to the carriages, shape (K, 3, 3), [1]."""
+    steps = DIFFERENCE_STEP * np.eye(3)
+    differences = [settings.forward(carriages + s) - settings.forward(carriages - s) for s in steps]
+    return np.stack(differences, axis=2) / (2.0 * DIFFERENCE_STEP)
+
+
+def _setting_gain(
+    targets: _Targets, settings: DeltaSettings, jacobian: Array, homed_change: Array
+) -> Array:
+    """Derivative of the settings with respect to the free errors, shape (n_settings, n), [SI].
+
+    At the minimum Jᵀr = 0, so dx = −(JᵀJ)⁻¹ Jᵀ dr. For a change dθ of the errors, the carriages
+    that bring the nozzle to a point change by dh = −(∂p/∂h)⁻¹ T dθ, with T the sensitivity of the
+    nozzle. The computed position changes by dr = ∂f/∂h dh. Endstops follow from the homed
+    carriages: e = h − √(rod² − radius²).
+
+    Args:
+        targets: The points.
+        settings: The new settings.
+        jacobian: Derivative of the residuals with respect to the unknowns, shape (m, k).
+        homed_change: Change of the homed carriages, shape (3,), [m].
+    """
+    n = targets.jacobian.shape[-1]
+    computed, layer = (
+        _differentiate(settings, carriages + homed_change) @ np.linalg.solve(by_drives, errors)
+        for carriages, by_drives, errors in (
+            (targets.carriages, targets.by_drives, targets.jacobian),
+            (targets.layer_carriages, targets.layer_by_drives, targets.layer_jacobian),
+        )
+    )
+    change = np.sqrt(targets.weights)[:, None, None] * computed
+    layer = math.sqrt(FIRST_LAYER / len(targets.layer_points)) * layer[:, 2]
+    change = np.concatenate([change.reshape(-1, n), layer])
+    gain = _unknowns(settings.firmware) @ np.linalg.lstsq(jacobian, change, rcond=None)[0]
+    rods = np.array(settings.rods)[:, None] * gain[3:6] - settings.radius * gain[:1]
+    endstops = gain[6:9] - rods / (settings.middle - settings.shift)[:, None]
+    fixed = np.zeros((1, n))
+    return np.concatenate([gain[:1], gain[3:6], gain[1:3], fixed, endstops])
+
+
+def _setting_rows(
+    calibration: Calibration, settings: DeltaSettings, gain: Array
+) -> tuple[SettingRow, ...]:
+    """Settings before and after.
+
+    Args:
+        calibration: The calibration.
+        settings: The new settings.
+        gain: Derivative of radius, rods, angles and endstops with respect to errors, (10, n), [SI].
+    """
+    present = calibration.session.firmware or settings
+    uncertainties = np.full(len(gain), np.nan)
+    if not calibration.unmodelled.prior_stds.size:
+        stds = propagate_stds(gain, restore_covariances(calibration))
+        uncertainties = calibration.expand(*stds)
+    values = [("radius", present.radius / MM, settings.radius / MM, MM, "mm")]
+    for field, label, size, unit in (
+        ("rods", "rod", MM, "mm"),
+        ("angles", "direction of tower", DEG, "°"),
+        ("endstops", "endstop", MM, "mm"),
+    ):
+        for k, tower in enumerate("abc"):
+            now, new = (getattr(s, field)[k] / size for s in (present, settings))
+            values.append((f"{label} {tower}", float(now), float(new), size, unit))
+    return tuple(
+        SettingRow(name, now, new, float(u) / size, unit)
+        for (name, now, new, size, unit), u in zip(values, uncertainties.tolist(), strict=True)
+    )
+
+
+def _find_targets(calibration: Calibration, bed: str) -> tuple[_Targets, float]:
+    """Points over the workspace and on the bed, and the uncertainty of heights on the bed, [m].
+
+    Args:
+        calibration: The calibration.
+        bed: Name of the setup that measured the bed.
+
+    Raises:
+        ExportError: If the machine does not reach the points.
+    """
+    robot, tool, tilt = calibration.robot, find_tool(calibration), _bed_tilt(calibration, bed)
+    if tool is None:
+        raise ExportError("the machine does not reach a workspace")
+    limits = tool.workspace.limits
+    space = box_workspace(robot, limits)
+    layer = _disc(limits)
+    offsets = calibration.active_offsets
+    try:
+        carriages, layer_carriages = (
+            calibration.machine.inverse(p @ tilt.T) + offsets for p in (space.points, layer)
+        )
+        accuracy = assess_tool(calibration, Workspace.even(layer))
+    except ClosureError as e:
+        raise ExportError(f"the calibrated machine does not reach the bed: {e}") from None
+    layer_unknown, turn = math.nan, _bed_turn(calibration, bed)
+    to_errors, to_drives = (
+        ToolSensitivity(robot, free=names, values=calibration.errors)
+        for names in (
+            [p.name for p in calibration.free],
+            [f"{d.name}.offset" for d in robot.drives],
+        )
+    )
+    jacobians = [
+        np.concatenate([tilt.T @ to_errors(c), -np.einsum("ijk,nj->nik", turn, p)], axis=2)
+        for p, c in ((space.points, carriages), (layer, layer_carriages))
+    ]
+    by_drives = [tilt.T @ to_drives(c) for c in (carriages, layer_carriages)]
+    if accuracy.after is not None:
+        layer_unknown = math.sqrt(float(accuracy.after.aligned_covariance[:, 2, 2].mean()))
+    points = space.points, space.weights, carriages, layer, layer_carriages
+    return _Targets(*points, *jacobians, *by_drives), layer_unknown
+
+
+def _bed_of(calibration: Calibration) -> str:
+    """Name of the last setup that measured the bed with a probe.
+
+    Raises:
+        ExportError: If no probe measured the bed.
+    """
+    beds = [s.name for s in calibration.setups if s.sensor.kind == "probe"]
+    if not beds:
+        raise ExportError("no setup measured the bed with a probe: the plane of prints is unknown")
+    return beds[-1]
+
+
+def _bed_tilt(calibration: Calibration, bed: str) -> Array:
+    """Rotation from the axes of the bed to those of the machine, shape (3, 3)."""
+    values = {p.name: p.value for p in calibration.sensors}
+    yaw, roll = (values.get(f"setup.{bed}.{k}", 0.0) for k in ("yaw", "roll"))
+    return np.asarray(Rotation.from_euler("xy", [roll, yaw]).as_matrix())
+
+
+def _bed_turn(calibration: Calibration, bed: str) -> Array:
+    """Derivative of the bed's rotation with respect to nuisance parameters, (3, 3, n), [1/rad].
+
+    Element i, j, k: change of coordinate i of a point per unit of coordinate j and parameter k.
+    """
+    turn = np.zeros((3, 3, len(calibration.sensors)))
+    axes = {f"setup.{bed}.roll": [1.0, 0.0, 0.0], f"setup.{bed}.yaw": [0.0, 1.0, 0.0]}
+    for k, parameter in enumerate(calibration.sensors):
+        if parameter.name in axes:
+            turn[:, :, k] = np.cross(axes[parameter.name], np.eye(3)).T
+    return turn
+
+
+def _disc(limits: Array) -> Array:
+    """Points of equal areas within the circle around the workspace on the bed, (M, 3), [m]."""
+    middle, half = limits[:2].mean(axis=1), 0.5 * (limits[:2, 1] - limits[:2, 0])
+    points = [np.zeros(2)]
+    for ring in range(1, RINGS + 1):
+        angles = 2.0 * np.pi * np.arange(6 * ring) / (6 * ring)
+        points += list(ring / RINGS * np.column_stack([np.cos(angles), np.sin(angles)]))
+    xy = middle + math.sqrt(2.0) * half * np.array(points)
+    return np.column_stack([xy, np.full(len(xy), limits[2, 0])])
+
+
+def _changed(settings: DeltaSettings, x: Array) -> DeltaSettings:
+    """Settings with changes of radius, angles a and b, rods, homed carriages and tilts.
+
+    Tower c keeps its angle: it fixes the axes of the print.
+    """
+    rods, homed = np.array(settings.rods) + x[3:6], np.array(settings.homed) + x[6:9]
+    a, b, c = settings.angles
+    return replace(
+        settings,
+        radius=settings.radius + x[0],
+        angles=(a + x[1], b + x[2], c),
+        rods=tuple(rods.tolist()),
+        homed=tuple(homed.tolist()),
+        tilts=(settings.tilts[0] + x[12], settings.tilts[1] + x[13]),
+    )
+
+
+def _residuals(targets: _Targets, present: DeltaSettings, x: Array) -> Array:
+    """Weighted errors of changed settings, with a free translation and rotation in the bed's plane.
+
+    Args:
+        targets: The points.
+        present: Present settings.
+        x: Changes of the settings, then rotation x[9] and translation x[10:12].
+    """
+    settings = _changed(present, x)
+    change = np.array(settings.homed) - present.homed
+    aligned = targets.points @ Rotation.from_euler("z", x[9]).as_matrix().T
+    aligned[:, :2] += x[10:12]
+    error = settings.forward(targets.carriages + change) - aligned
+    heights = settings.forward(targets.layer_carriages + change)[:, 2] - targets.layer_points[:, 2]
+    weighted = np.sqrt(targets.weights)[:, None] * error
+    return np.concatenate([weighted.ravel(), math.sqrt(FIRST_LAYER / len(heights)) * heights])
+
+
+def _measure(targets: _Targets, settings: DeltaSettings, change: Array) -> FirmwareError:
+    """Errors of settings with homed carriages changed by `change`, shape (3,), [m]."""
+    error = settings.forward(targets.carriages + change) - targets.points
+    motions = np.zeros((len(error), 3, 3))
+    motions[:, 0, 0] = motions[:, 1, 1] = 1.0
+    motions[:, 0, 2], motions[:, 1, 2] = -targets.points[:, 1], targets.points[:, 0]
+    root = np.sqrt(np.repeat(targets.weights, 3))[:, None]
+    columns, flat = motions.reshape(-1, 3), error.reshape(-1, 1)
+    motion = np.linalg.lstsq(root * columns, root * flat, rcond=None)[0]
+    lengths = np.linalg.norm((flat - columns @ motion).reshape(-1, 3), axis=1)
+    heights = settings.forward(targets.layer_carriages + change)[:, 2] - targets.layer_points[:, 2]
+    return FirmwareError(
+        tool_rms=math.sqrt(float(targets.weights @ lengths**2)),
+        tool_largest=float(lengths.max()),
+        layer_rms=math.sqrt(float(np.mean(heights**2))),
+        layer_largest=float(np.abs(heights).max()),
+    )
