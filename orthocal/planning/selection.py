@@ -201,10 +201,14 @@ class SetupSearch:
             plan = self.empty
             for count, drawn in start:
                 plan = self.extend(plan, drawn or self._find_best(plan.information, count))
+            kept: set[int] = set()  # setups of this plan for which no better one was found
             for _ in range(MAX_ROUNDS):
                 before = plan.error
                 for k in range(len(plan.setups)):
-                    plan = self._exchange(plan, k)
+                    if k not in kept:
+                        exchanged = self._exchange(plan, k)
+                        kept = {*kept, k} if exchanged is plan else set()
+                        plan = exchanged
                 if plan.error > before * (1.0 - MIN_IMPROVEMENT):
                     break
             return plan
@@ -283,7 +287,7 @@ class SetupSearch:
         restarted = (s for r in ranked for s in gains.restart(r))
         for new in dict.fromkeys(gains.exchange_readings(s) for s in (old, *restarted)):
             new = gains.exchange_first(new)
-            if gains.rough_error(new) > best.error * (1.0 + ROUNDING_ERROR):
+            if new == old or gains.rough_error(new) > best.error * (1.0 + ROUNDING_ERROR):
                 continue
             information = others + self.information_of(new)
             error = self.error_of(information)
@@ -373,9 +377,8 @@ class Gains:
         if not setup.aligned:
             return planned
         reordered = [(first, *(i for i in chosen if i != first)) for first in chosen]
-        new_first = np.setdiff1d(np.arange(len(setup.rows)), chosen)
-        others = np.broadcast_to(chosen[1:], (len(new_first), len(chosen) - 1))
-        sets = np.vstack([reordered, np.column_stack([new_first, others])])
+        new_first = [(i, *chosen[1:]) for i in range(len(setup.rows)) if i not in chosen]
+        sets = np.array([*reordered, *new_first])
         possible = sets[setup.reachable[sets[:, :1], sets].all(axis=1)]
         best = first_largest(self.setup(planned.candidate).gains(possible))
         return PlannedSetup(planned.candidate, tuple(possible[best].tolist()))
