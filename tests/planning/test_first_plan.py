@@ -26,7 +26,7 @@ from orthocal.sensors.tips import Tip
 
 
 def test_the_first_plan_of_the_orthoglide_is_the_paper_plan(orthoglide, root):
-    """It has the postures and setups of the workshop example. Each setup ends in its first posture."""
+    """Postures and setups are those of the workshop example. Setups end in their first posture."""
     plan, workshop = paper_plan(orthoglide, Equipment()), load_plan(root / "examples/workshop")
     assert {n: p.values.tolist() for n, p in plan.postures.items()} == {
         n: p.values.tolist() for n, p in workshop.postures.items()
