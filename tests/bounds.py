@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.stats import chi2
 
 from orthocal.assessment.tool_error import measure_uncertainty
 from orthocal.estimation.problem import build_problem
@@ -34,3 +35,21 @@ def bound_um(plan, space, *, offset_std=2e-3):
     tool = ToolSensitivity(plan.robot, free=problem.free[:n])(drives)
     covariance = posterior * np.outer(scale, scale)
     return 1e6 * measure_uncertainty(tool, covariance, space, space.points).sizes.aligned.rms
+
+
+def rms_band(field, weights, covariance, count):
+    """99 % band of the ratio of an RMS tool error over machines to its expectation.
+
+    The mean square is a quadratic form of normal errors. Its distribution is that of a χ² with the
+    same mean and variance (Satterthwaite).
+
+    Args:
+        field: Jacobian of the tool errors at the points, shape (K, 3, n), [m/SI].
+        weights: Weights of the points, shape (K,).
+        covariance: Covariance of the errors, shape (n, n), [SI].
+        count: Number of machines.
+    """
+    rows = (np.sqrt(weights)[:, None, None] * field).reshape(-1, field.shape[-1])
+    eigenvalues = np.linalg.eigvalsh(rows @ covariance @ rows.T)
+    dof = count * eigenvalues.sum() ** 2 / (eigenvalues**2).sum()
+    return np.sqrt(np.array(chi2.interval(0.99, dof)) / dof)

@@ -88,14 +88,18 @@ def load_afresh(robot):
 
 @pytest.fixture(scope="module")
 def short_reports():
-    """Reports with marks in place of plots and without gains of usual sensors.
+    """Reports with marks in place of plots and scenes, and without gains of usual sensors.
 
-    Both take seconds and have tests of their own, the gains in `test_sensor_gains.py`.
+    All of these take seconds and have tests of their own, the gains in `test_sensor_gains.py`.
     """
     from orthocal.output.report import page
     from orthocal.output.text.accuracy import FurtherHour
 
-    with marked_plots(), patch.object(page, "expect_further_hour", lambda _: FurtherHour(0.0, ())):
+    with (
+        marked_plots(),
+        patch.object(page, "expect_further_hour", lambda _: FurtherHour(0.0, ())),
+        patch.object(page, "_scene", lambda _: "<!-- scene -->"),
+    ):
         yield
 
 
@@ -120,6 +124,13 @@ def marked_reports():
 @pytest.fixture
 def without_sensor_gains():
     """Plans and details without gains of usual sensors, which have tests of their own."""
+    with no_sensor_gains():
+        yield
+
+
+@pytest.fixture(scope="module")
+def module_without_sensor_gains():
+    """`without_sensor_gains` for all tests of a module."""
     with no_sensor_gains():
         yield
 

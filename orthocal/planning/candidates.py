@@ -23,7 +23,7 @@ from orthocal.measurement.motion.approach import can_approach, usual_approaches
 from orthocal.observation.contacts import locate_contacts
 from orthocal.observation.model import nominal_sensitivity
 from orthocal.observation.observations import build_observations
-from orthocal.planning.equipment import Equipment, choose_box, place_tool, posture_name, reachable
+from orthocal.planning.equipment import Equipment, choose_box, place_reachable
 from orthocal.planning.expected_error import ENTERED_OFFSET_STD, is_offset
 from orthocal.planning.owned_sensors import DIAL
 from orthocal.planning.tool_candidates import list_tool_candidates
@@ -378,13 +378,12 @@ def _add_postures(
     points = np.stack(np.meshgrid(*coordinate_values, indexing="ij"), axis=-1)
     points = points.reshape(-1, len(coordinate_values))
     points = np.unique(np.vstack([np.clip(middle, box[:, 0], box[:, 1]), points.round(9)]), axis=0)
-    points = points[reachable(robot, points)]
-    if len(points) < MIN_READINGS:
+    placed = place_reachable(robot, points, middle)
+    if len(placed) < MIN_READINGS:
         raise ParameterError("the machine reaches no posture in this box", where="plan: box")
-    names = [posture_name(robot, p, middle) for p in points]
-    for name, posture in place_tool(robot, names, points).items():
+    for name, posture in placed.items():
         postures.setdefault(name, posture)
-    return names
+    return list(placed)
 
 
 def _phases(robot: Robot, count: int) -> Array:

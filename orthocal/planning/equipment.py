@@ -215,12 +215,33 @@ def reachable(robot: Robot, points: Array) -> NDArray[np.bool_]:
         robot: The robot.
         points: Coordinates of the tool, shape (n, n_coordinates), [m].
     """
+    return _reach_points(robot, points)[1]
+
+
+def _reach_points(robot: Robot, points: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Drive coordinates of tool positions, and the mask of those within the travel."""
     failures = Failures()
     drives = nominal_closure(robot).inverse(points, failures=failures)
     lower, upper = np.array([(d.lower, d.upper) for d in robot.drives]).T
     reached = np.asarray(((drives >= lower) & (drives <= upper)).all(axis=1))
     reached[list(failures)] = False
-    return reached
+    return drives, reached
+
+
+def place_reachable(robot: Robot, points: Array, middle: Array) -> dict[str, Posture]:
+    """Postures of the tool positions that the nominal machine reaches within its travel, by name.
+
+    Args:
+        robot: The robot.
+        points: Coordinates of the tool, shape (n, n_coordinates), [m].
+        middle: Coordinates in the mechanical zero, shape (n_coordinates,), [m].
+    """
+    drives, reached = _reach_points(robot, points)
+    postures = {}
+    for point, coordinates in zip(points[reached], drives[reached], strict=True):
+        name = posture_name(robot, point, middle)
+        postures[name] = Posture(name, "tcp", point, coordinates)
+    return postures
 
 
 def place_tool(robot: Robot, names: Sequence[str], points: Array) -> dict[str, Posture]:

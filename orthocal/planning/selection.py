@@ -203,10 +203,14 @@ class SetupSearch:
             plan = self.empty
             for count, drawn in start:
                 plan = self.extend(plan, drawn or self._find_best(plan.information, count))
+            kept: set[int] = set()  # setups of this plan for which no better one was found
             for _ in range(MAX_ROUNDS):
                 before = plan.error
                 for k in range(len(plan.setups)):
-                    plan = self._exchange(plan, k)
+                    if k not in kept:
+                        exchanged = self._exchange(plan, k)
+                        kept = {*kept, k} if exchanged is plan else set()
+                        plan = exchanged
                 if plan.error > before * (1.0 - MIN_IMPROVEMENT):
                     break
             return plan
@@ -283,7 +287,7 @@ class SetupSearch:
         gains = Gains.of(self, others)
         ranked = gains.rank(len(old.chosen))[:MAX_REFINED]
         for new, rough_error in gains.refine([old], restarted=ranked):
-            if rough_error > best.error * (1.0 + ROUNDING_ERROR):
+            if new == old or rough_error > best.error * (1.0 + ROUNDING_ERROR):
                 continue
             information = others + self.information_of(new)
             error = self.error_of(information)

@@ -150,11 +150,15 @@ class TimedSearch:
 
     def _improve(self, plan: PlannedSetups, minutes: float, *, together: int) -> PlannedSetups:
         """Exchange setups, one or two at a time, until the gain is small."""
+        kept: set[tuple[PlannedSetup, ...]] = set()  # setups for which no better ones were found
         for _ in range(MAX_ROUNDS):
             before = plan.error
             for old in combinations(plan.setups, together):
-                if Counter(old) <= Counter(plan.setups):  # not exchanged in this round
-                    plan = self._exchange(plan, old, minutes)
+                if old in kept or not Counter(old) <= Counter(plan.setups):
+                    continue
+                exchanged = self._exchange(plan, old, minutes)
+                kept = {*kept, old} if exchanged is plan else set()
+                plan = exchanged
             if plan.error > before * (1.0 - MIN_IMPROVEMENT):
                 break
         return plan

@@ -15,7 +15,7 @@ from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.robot_functions import robot_functions
 from orthocal.kinematics.workspace import position_at_zero, tool_at_zero
 from orthocal.measurement.motion.approach import can_approach, usual_approaches
-from orthocal.planning.equipment import choose_box, place_tool, posture_name, reachable
+from orthocal.planning.equipment import choose_box, place_reachable, posture_name
 from orthocal.planning.owned_sensors import DIAL, OwnedSensor
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.ball_bar import BallBar
@@ -162,8 +162,7 @@ class _Positions:
     def of(robot: Robot, middle: Array, points: Array) -> _Positions:
         """Reachable positions among tool positions of shape (n, n_coordinates), [m]."""
         unique = np.unique(points.round(9), axis=0)
-        reached = unique[reachable(robot, unique)]
-        postures = place_tool(robot, [posture_name(robot, p, middle) for p in reached], reached)
+        postures = place_reachable(robot, unique, middle)
         names, drives = np.array(list(postures)), np.array([p.drives for p in postures.values()])
         by_approach = {
             a: frozenset(names[can_approach(robot, drives, a)].tolist())

@@ -1,4 +1,4 @@
-"""First plan of any machine: clear of hinges, within reach, in the range of the dial."""
+"""First plan of machines: distance from hinges, reach, range of the dial."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from orthocal.sensors.tips import Tip
 
 
 def test_the_first_plan_of_the_orthoglide_is_the_paper_plan(orthoglide, root):
-    """The seven postures of the workshop example, and its setups; the zero again at the end."""
+    """Postures and setups are those of the workshop example. Setups end in their first posture."""
     plan, workshop = paper_plan(orthoglide, Equipment()), load_plan(root / "examples/workshop")
     assert {n: p.values.tolist() for n, p in plan.postures.items()} == {
         n: p.values.tolist() for n, p in workshop.postures.items()
@@ -61,13 +61,13 @@ def test_the_paper_plan_of_other_dimensions_is_within_reach(tmp_path, sizes):
     assert np.abs(points).max() <= 0.1
     equipment = first_equipment(robot, Equipment())
     clear = min(CLEARANCE, 0.2 * sizes.leg)
-    for section in equipment.sections:  # from a hinge, wherever the leg goes
+    for section in equipment.sections:  # distance from both hinges in all postures
         assert section * sizes.leg + equipment.box.max() <= sizes.leg - clear + 1e-9
         assert section * sizes.leg + equipment.box.min() >= clear - 1e-9
     assert 1 <= len(equipment.sections) <= 3
 
 
-def test_the_paper_plan_uses_the_given_equipment(orthoglide):
+def test_the_paper_plan_has_tip_and_rods_of_the_equipment(orthoglide):
     blade = Equipment(tip=Tip("blade", 0.0, 0.02), rods=("b",))
     sensors = [s.sensor for s in paper_plan(orthoglide, blade).setups.values()]
     assert {(s.tip.form, s.rod) for s in sensors} == {("blade", "b")}
@@ -94,7 +94,7 @@ def test_the_bed_of_a_delta_is_read_on_a_grid_from_above(delta):
     grid = {(x, y, 0.0) for x in places for y in places}
     assert {tuple(p) for p in points.round(6).tolist()} == grid
     steps = np.linalg.norm(np.diff(points[1:], axis=0), axis=1)
-    assert steps.max() <= 0.07 + 1e-9  # no long ways over the bed
+    assert steps.max() <= 0.07 + 1e-9  # short motions over the bed
     assert {r.approach for r in plan.readings} == {"nnn"}
     assert (plan.readings[-1].posture, plan.readings[-1].cycle) == (plan.readings[0].posture, 2)
     (motion,) = [program for name, program in sheet_files(plan).items() if name.endswith(".ngc")]
@@ -106,9 +106,9 @@ def test_the_bed_of_a_delta_is_read_on_a_grid_from_above(delta):
 
 
 def test_the_bed_determines_a_delta_better_than_its_legs(delta):
-    """0.16 mm beside 0.98 before; 24 readings of the lines of the legs leave 0.23.
+    """0.98 mm before, 0.16 mm after the bed, 0.23 mm after 24 readings of the legs.
 
-    Neither shows the mean offset: all slides together lift the tool, and turn no leg.
+    Neither determines the mean offset: a motion of all slides lifts the tool and rotates no leg.
     """
     choice = Choice("full")
     bed = expect_fixed(bed_plan(delta, Equipment()), choice, Equipment())

@@ -1,4 +1,4 @@
-"""Plans for machines with effects: sides of approach, limits, positions, conditions in a day."""
+"""Plans for machines with effects: approaches, limits, positions, times and temperatures."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ from orthocal.planning.plan import plan_readings
 from orthocal.session.session import Gauge
 from orthocal.units import MM, PPM, UM
 
-TODAY = 24
+WITHOUT_BACKLASH = 24
 """Readings of the first plan of a machine without backlash, closing readings included."""
 
 PROMISED = 16 * UM
 """Largest limit of backlash after the first plan."""
 
-FEW = Equipment(sections=(0.5,), across=0.0, along=7)
+FEW = Equipment(sections=(0.5,), across=0.0, along=3)
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +49,8 @@ def machine(orthoglide):
 
 @pytest.fixture(scope="module")
 def planned(machine):
-    """By one search, which is no better than the three of a user's plan."""
-    equipment = first_equipment(machine, Equipment())
+    """First plan of a machine; its search has fewer candidates and starts than a user's plan."""
+    equipment = replace(first_equipment(machine, Equipment()), along=7, across=0.0)
     return plan_readings(machine, "full", equipment=equipment, starts=1)
 
 
@@ -60,14 +60,15 @@ def test_the_first_plan_determines_backlash(planned):
     assert backlash.before == pytest.approx(0.04 * MM)
     assert backlash.after <= PROMISED
     rows = planned.session.readings
-    assert len(rows) <= TODAY + 4
+    assert len(rows) <= WITHOUT_BACKLASH + 4
     assert {r.approach for r in rows} == {"ppp", "nnn"}
-    for setup in planned.session.setups:  # the first posture again, from the same side
-        own = [r for r in rows if r.setup == setup]
-        assert (own[0].posture, own[0].approach) == (own[-1].posture, own[-1].approach)
+    for setup in planned.session.setups:  # ends with its first posture and approach
+        of_setup = [r for r in rows if r.setup == setup]
+        first, last = of_setup[0], of_setup[-1]
+        assert (first.posture, first.approach) == (last.posture, last.approach)
 
 
-def test_a_plan_from_one_side_determines_no_backlash(planned):
+def test_readings_with_one_approach_do_not_determine_backlash(planned):
     rows = planned.session.readings
     same = tuple(
         replace(r, conditions=replace(r.conditions, approach="ppp"), cycle=i)
@@ -79,8 +80,7 @@ def test_a_plan_from_one_side_determines_no_backlash(planned):
 
 
 @pytest.mark.slow
-def test_calibrations_reach_the_promised_limits(planned):
-    """Backlash of simulated machines within their tolerances, each read as planned."""
+def test_backlash_of_calibrated_machines_is_within_the_expected_limits(planned):
     problem = CalibrationProblem(planned.session, planned.forecast.selection)
     names, rng, count = problem.machine_selection.names, np.random.default_rng(0), 60
     robot, scale = problem.session.robot, problem.theta_scale
@@ -91,43 +91,45 @@ def test_calibrations_reach_the_promised_limits(planned):
     values, _, reached = problem.simulate(theta)
     assert reached.all()
     sigma = stated_sigma(problem.session.gauge)
-    found = BatchSolver(problem).solve(values + sigma * rng.normal(size=values.shape), sigma=sigma)
-    own = [i for i, name in enumerate(names) if name.endswith(".backlash")]
-    missed, true = (found.theta - theta)[:, own], theta[:, own]
+    fit = BatchSolver(problem).solve(values + sigma * rng.normal(size=values.shape), sigma=sigma)
+    indices = [i for i, name in enumerate(names) if name.endswith(".backlash")]
+    deviation, true = (fit.theta - theta)[:, indices], theta[:, indices]
     # near 0, where it cannot be negative, backlash is known better; the RMS of about 110 values
-    # scatters by 7 %, and is 4 % larger, because an estimate is pulled towards 0
+    # scatters by 7 %, and is 4 % larger, because the prior reduces the estimates
     expected = planned.forecast.about_nominal(planned.session)
-    at = [expected.names.index(names[i]) for i in own]
+    at = [expected.names.index(names[i]) for i in indices]
     limits = 2.0 * np.sqrt(expected.covariance[at, at])
     assert limits.max() == pytest.approx(planned.effects[0].after)
-    limit = 2.0 * np.sqrt(np.mean(missed[true > 10.0 * UM] ** 2))
+    limit = 2.0 * np.sqrt(np.mean(deviation[true > 10.0 * UM] ** 2))
     assert limit == pytest.approx(1.04 * np.sqrt(np.mean(limits**2)), rel=0.2)
 
 
 def test_candidates_begin_their_approach_within_the_travel(machine):
-    """The x drive ends 1 mm beyond its largest coordinate: it cannot come from there."""
-    equipment = replace(FEW, box=np.array([[-0.06, 0.06]] * 3))
+    """The travel of the x drive ends 1 mm beyond its largest coordinate."""
+    equipment = replace(FEW, along=7, box=np.array([[-0.06, 0.06]] * 3))
     session = list_candidates(machine, equipment)
     largest = max(p.drives[0] for p in session.postures.values())
     drives = (replace(machine.drives[0], upper=largest + 1e-3), *machine.drives[1:])
     session = list_candidates(replace(machine, drives=drives), equipment)
-    sides = {p: {r.approach for r in session.readings if r.posture == p} for p in session.postures}
+    approaches = {p: set() for p in session.postures}
+    for r in session.readings:
+        approaches[r.posture].add(r.approach)
     for name, posture in session.postures.items():
         near = posture.drives[0] > largest - 1e-3
-        assert sides[name] == ({"ppp"} if near else {"ppp", "nnn"})
-    assert any(len(s) == 1 for s in sides.values())
-    for side in ("ppp", "nnn"):
-        own = [n for n, s in sides.items() if side in s]
-        at = np.array([session.postures[n].drives for n in own])
-        assert can_approach(session.robot, at, side).all()
+        assert approaches[name] == ({"ppp"} if near else {"ppp", "nnn"})
+    assert {"ppp"} in approaches.values()
+    for approach in ("ppp", "nnn"):
+        names = [n for n, of_posture in approaches.items() if approach in of_posture]
+        at = np.array([session.postures[n].drives for n in names])
+        assert can_approach(session.robot, at, approach).all()
 
 
 def test_positions_lie_at_fractions_of_the_lead(orthoglide):
-    """On whole multiples of 5 mm the periodic error of a screw of 5 mm is constant."""
+    """At multiples of 5 mm the periodic error of a screw with a lead of 5 mm is constant."""
     declared = replace(orthoglide.declared, effects={"screw": {"lead_mm": 5.0}})
     screw = with_effects(replace(orthoglide, declared=declared), ["screw"])
     for robot, least in ((orthoglide, 1), (screw, 4)):
-        session = list_candidates(robot, FEW)
+        session = list_candidates(robot, replace(FEW, along=7))
         along = [p.values[0] for n, p in session.postures.items() if n.startswith("x")]
         phases = {round(v / 5e-3 % 1.0 % 1.0, 6) for v in along}
         assert len(phases - {1.0}) == least
@@ -172,13 +174,13 @@ def test_a_plan_determines_both_parts_of_a_periodic_error(orthoglide):
     assert bound < screw.after < 3.0 * bound < 0.25 * screw.before
 
 
-def test_the_paper_plan_is_read_from_one_side(machine, orthoglide):
+def test_the_paper_plan_has_one_approach(machine, orthoglide):
     assert {r.approach for r in paper_plan(machine, Equipment()).readings} == {"ppp"}
     assert {r.conditions for r in paper_plan(orthoglide, Equipment()).readings} == {None}
 
 
-def test_temperature_and_drift_in_a_plan(orthoglide):
-    """A day that warms by 8 K hardly shows the coefficients of expansion, a constant one never."""
+def test_a_constant_temperature_does_not_determine_thermal_expansion(orthoglide):
+    """A day that warms by 8 K reduces the limit a little."""
     robot = with_effects(orthoglide, ["thermal", "drift"])
     after = []
     for temperatures in (None, (20.0, 28.0)):
@@ -192,8 +194,8 @@ def test_temperature_and_drift_in_a_plan(orthoglide):
     assert after[1] < after[0]
 
 
-def test_further_readings_for_effects_that_a_plan_does_not_determine(orthoglide):
-    """Drift by a line through readings of one posture at three times, on its tolerance."""
+def test_further_readings_determine_drift(orthoglide):
+    """Its limit is that of a line through one posture's readings at three times, with the prior."""
     robot = with_effects(orthoglide, ["thermal", "drift"])
     plan = plan_readings(robot, "full", equipment=FEW, setups=2, starts=1)
     assert not any(e.determined for e in plan.effects)
@@ -217,7 +219,7 @@ def test_further_readings_for_effects_that_a_plan_does_not_determine(orthoglide)
         assert 0.0 < one.gain < 0.3
 
 
-def test_a_day_by_the_clock(planned):
+def test_planned_readings_have_times_and_temperatures(planned):
     session = schedule_readings(planned.session, temperatures=(20.0, 28.0))
     times = [r.conditions.time for r in session.readings]
     setups = [r.setup for r in session.readings]
@@ -246,7 +248,7 @@ def test_planned_approaches_are_written_and_read(planned, tmp_path):
     simulate_session(again, {"x_slide.backlash": 30e-6})
 
 
-def test_arrows_follow_the_numbers_of_the_joints(orthoglide):
+def test_arrows_show_the_direction_of_joint_coordinates(orthoglide):
     down = replace(orthoglide.drives[1], direction=-1)
     mixed = replace(orthoglide, drives=(orthoglide.drives[0], down, orthoglide.drives[2]))
     shown = [describe_approach(orthoglide, a) for a in ("ppp", "nnn", "pnu")]
@@ -254,7 +256,8 @@ def test_arrows_follow_the_numbers_of_the_joints(orthoglide):
     assert describe_approach(mixed, "ppp") == "↑↓↑"
 
 
-def test_plan_command_with_effects(tmp_path):
+@pytest.mark.usefixtures("without_sensor_gains")
+def test_the_command_plans_for_effects(tmp_path):
     quick = ["--along", "3", "--across-mm", "0", "--sections", "0.5", "--starts", "1"]
     words = ["plan", "orthoglide", *quick, "--effects", "backlash,thermal", "--out", "monday"]
     code, text, _ = run_orthocal(tmp_path, *words, "--temperature", "20:28")
@@ -268,8 +271,9 @@ def test_plan_command_with_effects(tmp_path):
     assert run_orthocal(tmp_path, "plan", "orthoglide", "--effects", "rust").returncode == 2
 
 
-def test_simulated_readings_state_what_effects_need(planned, tmp_path):
-    """Sides as planned, else those of programs; time and temperature where an effect needs them."""
+def test_simulated_readings_state_the_conditions_of_effects(planned, tmp_path):
+    """Approaches are the planned ones, by default those of the programs. Time and temperature are
+    stated if an effect depends on them."""
     write_session(planned.session, tmp_path / "plan", blank=True)
     words = ["simulate", "plan", "--error", "x_slide.backlash_mm=0.04", "--exact"]
 
@@ -277,15 +281,15 @@ def test_simulated_readings_state_what_effects_need(planned, tmp_path):
         assert run_orthocal(tmp_path, *words, *more, "--out", "try", "--force").returncode == 0
         return [r.conditions for r in load_plan(tmp_path / "try").readings]
 
-    sides = [r.approach for r in planned.session.readings]
     stated = simulated()
-    assert [c.approach for c in stated] == sides
+    assert [c.approach for c in stated] == [r.approach for r in planned.session.readings]
     assert {(c.temperature, c.time) for c in stated} == {(None, None)}
     stated = simulated("--effects", "backlash,thermal")
     assert {c.temperature for c in stated} == {20.0}
     stated = simulated("--temperature", "20:28")
     assert [stated[0].temperature, stated[-1].temperature] == [20.0, 28.0]
-    assert stated[-1].time - stated[0].time == timedelta(minutes=5 * 10 + 27 * 0.5)
+    later = (len(planned.session.setups) - 1) * 10 + (len(stated) - 1) * 0.5
+    assert stated[-1].time - stated[0].time == timedelta(minutes=later)
     plan = replace(
         planned.session,
         readings=tuple(
@@ -297,11 +301,9 @@ def test_simulated_readings_state_what_effects_need(planned, tmp_path):
 
 
 @pytest.mark.usefixtures("short_reports", "without_sensor_gains")
-def test_backlash_of_a_warm_day_from_plan_to_calibration(tmp_path):
-    """Backlash of 0.04 mm, and a day that warms by 8 K: the commands as a user types them."""
-    quick = ["--along", "5", "--across-mm", "0", "--sections", "0.5", "--starts", "1"]
-    chosen = ["--effects", "backlash,thermal"]
-    assert run_orthocal(tmp_path, "plan", "orthoglide", *quick, *chosen, "--out", "m")[0] == 0
+def test_backlash_is_identified_on_a_day_that_gets_warmer(planned, tmp_path):
+    """Backlash of 0.04 mm, from 20 to 28 °C."""
+    write_session(planned.session.with_effects(["backlash", "thermal"]), tmp_path / "m", blank=True)
     errors = [w for k in "xyz" for w in ("--error", f"{k}_slide.backlash_mm=0.04")]
     words = ["simulate", "m", *errors, "--temperature", "20:28", "--seed", "2", "--out", "day"]
     assert run_orthocal(tmp_path, *words)[0] == 0
@@ -310,9 +312,9 @@ def test_backlash_of_a_warm_day_from_plan_to_calibration(tmp_path):
     assert code == 0, err
     calibration = load_calibration(tmp_path / "one")
     for k in "xyz":
-        found = calibration.errors[f"{k}_slide.backlash"]
-        assert found == pytest.approx(0.04 * MM, abs=0.02 * MM)
-    # the same plan again: the same sides, new temperatures and times
+        value = calibration.errors[f"{k}_slide.backlash"]
+        assert value == pytest.approx(0.04 * MM, abs=0.02 * MM)
+    # the next session has the same approaches, without temperatures and times
     assert run_orthocal(tmp_path, "again", "one", "--out", "two", "--anyway")[0] == 0
     before, after = (load_plan(tmp_path / name).readings for name in ("day", "two"))
     assert [r.key for r in after] == [r.key for r in before]
@@ -320,5 +322,5 @@ def test_backlash_of_a_warm_day_from_plan_to_calibration(tmp_path):
     head = (tmp_path / "two/readings.csv").read_text().partition("\n")[0]
     assert {"approach", "temperature_C"} <= set(head.split(","))
     assert "temperature [°C]" in (tmp_path / "two/sheet.html").read_text()
-    both = restore_session(calibration).readings
-    assert [r.conditions for r in both] == [r.conditions for r in before]
+    restored = restore_session(calibration).readings
+    assert [r.conditions for r in restored] == [r.conditions for r in before]

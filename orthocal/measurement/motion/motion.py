@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array
 from orthocal.errors import ClosureError, SessionError
+from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.workspace import position_at_zero, tool_at_zero
 from orthocal.measurement.files.readings_file import FIRST_LINE
@@ -455,25 +456,18 @@ def _follow_stops(session: Session, setup: str, stops: Sequence[Stop]) -> list[S
     Raises:
         SessionError: If neither path is within reach.
     """
-    robot = session.robot
+    robot, checked = session.robot, list(stops)
     zero = tool_at_zero(robot)
-    checked, paths, position = [], [], zero
-    for stop in stops:
-        corners = [np.asarray(stop.approach_point), np.asarray(stop.point)]
-        path = _sample_path(robot, [position, *corners])
-        if path is None:
-            path = _sample_path(robot, [position, zero, *corners])
-            stop = replace(stop, via=(zero,))
-        if path is None:
-            raise SessionError(
-                f"the path to posture '{stop.posture}' of setup '{setup}' leaves the workspace, "
-                "both directly and through the mechanical zero; insert a posture between them",
-                where=str(session.path or "session"),
-            )
-        checked.append(stop)
-        paths.append(path)
-        position = corners[-1]
-    return _predict(session, setup, checked, paths)
+    ends = [(np.asarray(s.approach_point), np.asarray(s.point)) for s in stops]
+    starts = [zero, *(point for _, point in ends[:-1])]
+    paths = _sample_paths(robot, [(a, *b) for a, b in zip(starts, ends, strict=True)])
+    indirect = [i for i, path in enumerate(paths) if path is None]
+    if indirect:
+        through_zero = _sample_paths(robot, [(starts[i], zero, *ends[i]) for i in indirect])
+        for i, path in zip(indirect, through_zero, strict=True):
+            paths[i], checked[i] = path, replace(checked[i], via=(zero,))
+    how = ", both directly and through the mechanical zero; insert a posture between them"
+    return _predict(session, setup, checked, _require_paths(session, setup, checked, paths, how))
 
 
 def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path) -> list[Stop]:
@@ -490,7 +484,7 @@ def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path
     others = [s.point for s in stops if s.point is not None and not np.allclose(s.point, first)]
     ahead = path(first, np.asarray(others[0])) if others else np.array([first, first + length])
     begin = 2.0 * first - _walk(ahead, length)  # nothing is mounted yet
-    position, checked, paths = begin, list[Stop](), []
+    position, checked, polylines = begin, list[Stop](), []
     for stop in stops:
         point = np.asarray(stop.point)
         corners = np.vstack([begin, point]) if not checked else path(position, point)
@@ -499,15 +493,32 @@ def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path
         arrival = _arrive(session, setup, stop, corners, length)
         checked.append(arrival)
         begin = np.asarray(arrival.approach_point)
-        sampled = _sample_path(robot, [position, *arrival.via, begin, point])
-        if sampled is None:
+        polylines.append([position, *arrival.via, begin, point])
+        position = point
+    paths = _sample_paths(robot, polylines)
+    return _predict(session, setup, checked, _require_paths(session, setup, checked, paths))
+
+
+def _require_paths(
+    session: Session,
+    setup: str,
+    stops: Sequence[Stop],
+    paths: Sequence[_Path | None],
+    remark: str = "",
+) -> list[_Path]:
+    """Paths to the stops of a setup.
+
+    Raises:
+        SessionError: If a path leaves the workspace; names the posture.
+    """
+    for stop, path in zip(stops, paths, strict=True):
+        if path is None:
             raise SessionError(
-                f"the path to posture '{stop.posture}' of setup '{setup}' leaves the workspace",
+                f"the path to posture '{stop.posture}' of setup '{setup}' leaves the workspace"
+                f"{remark}",
                 where=str(session.path or "session"),
             )
-        paths.append(sampled)
-        position = point
-    return _predict(session, setup, checked, paths)
+    return [path for path in paths if path is not None]
 
 
 def _arrive(session: Session, setup: str, stop: Stop, corners: Array, length: float) -> Stop:
@@ -563,20 +574,33 @@ def _walk(corners: Array, length: float) -> Array:
     return np.asarray(corners[-1])
 
 
-def _sample_path(robot: Robot, corners: Sequence[Array]) -> _Path | None:
-    """Samples of a polyline of tool coordinates; None if the machine does not reach all of it."""
+def _sample_paths(robot: Robot, polylines: Sequence[Sequence[Array]]) -> list[_Path | None]:
+    """Samples of polylines of tool coordinates; None if the machine does not reach all of one."""
+    sampled = [_sample(corners) for corners in polylines]
+    closure, points, failures = nominal_closure(robot), np.concatenate(sampled), Failures()
+    try:
+        drives, passive = closure.reach(points)  # cached: gauges of a leg have the same path
+    except ClosureError:
+        drives, passive = closure.reach(points, failures=failures)
+    paths, first = list[_Path | None](), 0
+    for part in sampled:
+        last = first + len(part)
+        path = _Path(part, drives[first:last], passive[first:last])
+        reached = failures.keys().isdisjoint(range(first, last))
+        if reached and find_beyond_travel(robot, path.drives, [""] * len(part)):
+            reached = False
+        paths.append(path if reached else None)
+        first = last
+    return paths
+
+
+def _sample(corners: Sequence[Array]) -> Array:
+    """Points of a polyline at distances of at most STEP, shape (n, n_coordinates), [m]."""
     segments = [corners[0][None]]
     for start, end in pairwise(corners):
         count = max(2, int(np.ceil(np.linalg.norm(end - start) / STEP)))
         segments.append(start + np.arange(1, count + 1)[:, None] / count * (end - start))
-    points = np.concatenate(segments)
-    try:
-        drives, passive = nominal_closure(robot).reach(points)
-    except ClosureError:
-        return None
-    if find_beyond_travel(robot, drives, [""] * len(points)):
-        return None
-    return _Path(points, drives, passive)
+    return np.concatenate(segments)
 
 
 def _predict(

@@ -1,0 +1,22 @@
+"""Plans that several files of tests share; each is computed once in a process."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from orthocal import load_robot, plan_readings
+from orthocal.planning.equipment import Equipment
+
+QUICK = {"along": 5, "across": 0.0, "sections": (0.5,)}
+"""Arguments of Equipment with few candidate readings."""
+
+
+def entered(robot):
+    """A packaged robot whose offsets were entered: ±1 mm remain."""
+    return load_robot(robot).with_tolerances({"*.offset_mm": 1.0})
+
+
+@cache
+def quick_plan(robot="orthoglide"):
+    """Plan with a dial at the legs of a packaged robot."""
+    return plan_readings(entered(robot), equipment=Equipment(**QUICK), starts=1)
