@@ -252,7 +252,7 @@ def test_compare_recommends_a_model_and_exits_with_the_verdict(experiment, root)
     code, out, err = orthocal("compare", experiment, "--repeat", repeat)
     assert (code, err) == (0, "")
     assert "Recommended model: full." in out
-    assert "unknown whether the residuals repeat in 'Experiment 3" in " ".join(out.split())
+    assert "unknown whether the same deviations remain in 'Experiment 3" in " ".join(out.split())
     code, out, _ = orthocal(
         "compare", root / "examples/raw-cycles", "--models", "offsets,lengths", "--json"
     )

@@ -64,7 +64,7 @@ def run(monkeypatch):
 @pytest.mark.parametrize(
     ("sensor", "instrument"),
     [
-        ("ball_bar, centre_mm: [0, 0, 0], length_mm: 100}", "ball bar"),
+        ("ball_bar, centre_mm: [0, 0, -100], length_mm: 100}", "ball bar"),
         ("probe, direction: -z}", "probe"),
         ("distance}", "calliper"),
         ("tool_indicator, direction: -z, artefact: {kind: plate}}", "dial"),

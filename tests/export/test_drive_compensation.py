@@ -87,7 +87,8 @@ def calibration(tmp_path_factory):
     unmodelled = replace(result.unmodelled, leakage=0.0 * result.unmodelled.leakage)
     stds = dict(zip((p.name for p in result.free), np.diag(result.model_covariance), strict=True))
     parameters = (
-        replace(p, std=float(np.sqrt(stds[p.name]))) if p.free else p for p in result.parameters
+        replace(p, std=float(np.sqrt(stds[p.name])), std_scaled=0.0) if p.free else p
+        for p in result.parameters
     )
     assessment = replace(result.assessment, backlash=entered)
     return replace(

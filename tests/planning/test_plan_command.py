@@ -164,7 +164,7 @@ def test_further_setups_of_a_session_are_planned(root, tmp_path):
     calibrating = ["orthocal", "calibrate", str(session), str(out), *option]
     assert shlex.split(err.splitlines()[-1]) == [*calibrating, "--out", f"{out}-calibration"]
     said = " ".join(text.split())
-    words = r"([\d.]+) mm with these readings added \(([\d.]+) mm with those of the session alone\)"
+    words = r"([\d.]+) mm with these readings added, ([\d.]+) mm with those of the session alone"
     after, before = map(float, re.search(words, said).groups())
     assert after < before
     assert "now" not in words.partition("Beyond")[0]

@@ -188,7 +188,7 @@ def test_approaches_and_minutes_of_a_bar_follow_from_path_and_file(owned):
     plan_motion(session)  # refuses approaches that are not those of the path
     assert plan.minutes == 20.0 * len(session.setups) + 2.0 * len(session.readings)
     assert 50.0 < plan.minutes <= 60.0 + 1e-9
-    times = [r.conditions.time for r in equipment.in_course(session).readings]
+    times = [r.conditions.time for r in equipment.schedule(session).readings]
     assert (times[-1] - times[0]).total_seconds() / 60.0 == plan.minutes - 22.0
 
 
@@ -365,7 +365,8 @@ def test_the_range_of_a_bar_holds_the_tolerances_of_length_place_and_offsets(
     """Nobody sets the zero of a bar. A drive moves the tool about as far as itself."""
     text = BAR.replace("[-25, 25]", "[-3, 3]").replace("unknown", length)
     sensors = owned(bar=text + "centre_tolerance_mm: 0.5\nscale_tolerance: 0\n")
-    robot = without_legs(**{"*.offset_mm": offset})
+    robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": offset})
+    robot = replace(robot, legs={})
     assert needed_range(robot, sensors, entered=entered) == pytest.approx(expected, rel=0.05)
 
 
