@@ -92,7 +92,7 @@ def export(
         _note_payload(result, payload)
     if to == "linuxcnc":
         _note_latching(result, options)
-    if "README.md" in files:
+    if "README.md" in files and result.session.firmware is None:
         put_out(f"Next: follow {out / 'README.md'}.")
 
 
