@@ -52,6 +52,7 @@ from orthocal.measurement.joining import (
     Given,
     gather_sessions,
     join_sessions,
+    on_one_printer,
     require_same_tolerances,
 )
 from orthocal.session.session import Session
@@ -258,10 +259,7 @@ def _apply_stated(
     robot, settings = calibration.robot.with_tolerances(tolerances), calibration.session.firmware
     placed = sessions
     if settings is not None:
-        placed = [
-            s if s.firmware is None else s.on_printer(calibration.robot, settings.homed)
-            for s in sessions
-        ]
+        placed = on_one_printer(sessions, calibration.robot, settings.homed)
     restated = [
         session.with_tolerances(
             tolerances if session.robot.parameters.stated else robot.parameters.stated

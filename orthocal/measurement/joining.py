@@ -9,6 +9,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
 
+from numpy.typing import ArrayLike
+
 from orthocal.arguments import require_kind
 from orthocal.effects.adjustment import subtract_amounts
 from orthocal.effects.loading import with_adjustments
@@ -60,10 +62,7 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
     if len(sessions) == 1:
         return sessions[0]
     if settings := sessions[0].firmware:
-        robot = sessions[0].robot
-        sessions = [
-            s if s.firmware is None else s.on_printer(robot, settings.homed) for s in sessions
-        ]
+        sessions = on_one_printer(sessions, sessions[0].robot, settings.homed)
     last = sessions[-1]
     _require_same_machine(sessions)
     purposes = {s.purpose for s in sessions} - {None}
@@ -87,6 +86,17 @@ def join_sessions(sessions: Sequence[Session]) -> Session:
         joined=True,
         purpose=purposes.pop() if len(purposes) == 1 else None,
     )
+
+
+def on_one_printer(sessions: Sequence[Session], robot: Robot, homed: ArrayLike) -> list[Session]:
+    """Sessions of a printer in the coordinates of one robot; others are returned unchanged.
+
+    Args:
+        sessions: Sessions, each with settings of a firmware or without.
+        robot: Robot with the nominal dimensions of one of the settings.
+        homed: Coordinates of its homed carriages, shape (3,), [m].
+    """
+    return [s if s.firmware is None else s.on_printer(robot, homed) for s in sessions]
 
 
 def _require_same_machine(sessions: Sequence[Session]) -> None:

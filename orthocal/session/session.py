@@ -406,7 +406,8 @@ class Session:
         """Session of a printer in the coordinates of its robot before settings changed.
 
         Settings change the nominal dimensions and the coordinates of the homed carriages, but not
-        the travel of the carriages below their endstops.
+        the travel of the carriages below their endstops. Stated tolerances and effects of the
+        session stay.
 
         Args:
             robot: Robot with other nominal dimensions.
@@ -421,9 +422,11 @@ class Session:
             )
         change = np.asarray(homed, dtype=np.float64) - self.firmware.homed
         drives = {name: read_only(p.drives + change) for name, p in self.postures.items()}
+        plain = replace(robot, parameters=robot.parameters.defaults)
+        here = with_effects(plain, self.robot.chosen_effects)
         return replace(
             self,
-            robot=robot,
+            robot=here.with_tolerances(self.robot.parameters.stated),
             firmware=self.firmware.moved(change),
             postures={name: Posture(name, "joints", d, d) for name, d in drives.items()},
         )

@@ -197,6 +197,19 @@ def test_settings_change_coordinates_but_no_travel(calibrated, probed_again):
     assert probed_again.robot.sha256 != calibration.robot.sha256
 
 
+def test_settings_keep_stated_tolerances_and_effects(calibrated, probed_again):
+    """Those of the session itself, also where the other robot states some of its own."""
+    robot = calibrated[1].robot
+    homed = calibrated[1].session.firmware.homed
+    glob = "*.offset_mm"
+    here = probed_again.with_effects(["drift"]).with_tolerances({glob: 7.0})
+    for other in (robot, robot.with_tolerances({glob: 3.0})):
+        moved = here.on_printer(other, homed).robot
+        assert moved.effect_names == ("drift",)
+        assert moved.parameters.stated == {glob: 7.0}
+        assert not probed_again.on_printer(other, homed).robot.parameters.stated
+
+
 def test_the_second_probing_ends_the_walk(calibrated, probed_again):
     """It confirms the first, and nothing more has to be entered."""
     _, calibration = calibrated

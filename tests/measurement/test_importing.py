@@ -237,10 +237,24 @@ FORMS = [
          "{}:2: '1,000.000' may be two cells or one number with a comma between thousands; for two "
          "cells use `orthocal import --separator comma`, for one number save the table with "
          "semicolons"),
-    text("two-cycles-by-another-row",
+    text("thousands-or-two-cycles-beside-another-row",
+         "setup,posture,cycle 1 [um],cycle 2 [um]\nxy,zero,1,100.0\nxy,x_max,0.5,0.4\n",
+         "{}:2: '1,100.0' may be two cells or one number with a comma between thousands; for two "
+         "cells use `orthocal import --separator comma`, for one number save the table with "
+         "semicolons"),
+    text("two-cycles-with-option",
          "setup,posture,cycle 1 [um],cycle 2 [um]\nxy,zero,1,100.0\nxy,x_max,0.5,0.4\n",
          (("xy", "zero", "", 1, "0.001"), ("xy", "zero", "", 2, "0.1"),
+          ("xy", "x_max", "", 1, "0.0005"), ("xy", "x_max", "", 2, "0.0004")), separator="comma"),
+    text("two-cycles-of-similar-size",
+         "setup,posture,cycle 1 [um],cycle 2 [um]\nxy,zero,101,100.0\nxy,x_max,0.5,0.4\n",
+         (("xy", "zero", "", 1, "0.101"), ("xy", "zero", "", 2, "0.1"),
           ("xy", "x_max", "", 1, "0.0005"), ("xy", "x_max", "", 2, "0.0004"))),
+    text("thousands-without-an-empty-last-cell",
+         "setup,posture,cycle 1,cycle 2\nxy,x_max,1,000\nxy,zero,,0.000\n",
+         "{}:2: '1,000' may be two cells or one number with a comma between thousands; for two "
+         "cells use `orthocal import --separator comma`, for one number save the table with "
+         "semicolons"),
     text("decimal-comma-between-commas", "setup,posture,reading_mm\nxy,zero,0,5\n",
          "{}:2: has 4 fields; expected 3; a decimal comma between commas? Save the table with "
          "semicolons, or its numbers in quotes"),

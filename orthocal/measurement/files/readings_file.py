@@ -339,7 +339,15 @@ def _is_grouped(row: Row, pairs: Collection[tuple[int, int]]) -> bool:
     return any(_INTEGER.fullmatch(a) and _GROUP.fullmatch(b) for a, b in cells)
 
 
+def _ends_in_thousands(row: Row, first: int, second: int) -> bool:
+    """True if the last two filled cells of a row may be one number such as 1,000 or 12,500.0."""
+    followed = any(row.cell(i).text.strip() for i in range(second + 1, row.width))
+    a, b = row.cell(first).text.strip(), row.cell(second).text.strip()
+    return not followed and bool(_UP_TO_99.fullmatch(a) and _GROUP.fullmatch(b))
+
+
 _INTEGER = re.compile(r"[-+\u2212\u2013]?[0-9]+(?:[\s'\u2019][0-9]{3})*")
+_UP_TO_99 = re.compile(r"[-+\u2212\u2013]?[0-9]{1,2}")
 _DIGITS = re.compile(r"[0-9]+")
 _GROUP = re.compile(r"[0-9]{3}(\.[0-9]*)?")
 
@@ -351,7 +359,8 @@ def require_unsplit_numbers(
 
     An unquoted 3,5 between commas becomes two cells. Then the row has more cells than the headings.
     If its last cell is empty, it looks like a row with two integers. An unquoted 1,000.0 does the
-    same. A table is accepted if some row cannot be read in this way.
+    same. A table is accepted if some row cannot be read in this way, except for a row that ends
+    in one or two digits and a group of three: its last cell may be missing.
 
     Args:
         table: The table.
@@ -377,12 +386,13 @@ def require_unsplit_numbers(
                 "between commas? Save the table with semicolons, or its numbers in quotes",
                 where=table.place(row.line),
             )
-        if sign_known and not grouped:
-            continue
         for first, second in sorted(pairs):
             a, b = row.cell(first).text.strip(), row.cell(second).text.strip()
-            if _INTEGER.fullmatch(a) and (_GROUP if grouped else _DIGITS).fullmatch(b):
-                sign = "comma between thousands" if grouped else "decimal comma"
+            thousands = grouped or (not separator_known and _ends_in_thousands(row, first, second))
+            if sign_known and not thousands:
+                continue
+            if _INTEGER.fullmatch(a) and (_GROUP if thousands else _DIGITS).fullmatch(b):
+                sign = "comma between thousands" if thousands else "decimal comma"
                 raise SessionError(
                     f"'{shorten(a)},{shorten(b)}' may be two cells or one number with a {sign}; "
                     "for two cells use `orthocal import --separator comma`, for one number save "
