@@ -58,6 +58,28 @@ def test_only_a_gauge_with_a_free_zero_is_set(files):
     assert "set the dial" not in files["02-bar.ngc"]
 
 
+@pytest.mark.parametrize(
+    ("setup", "with_dial"),
+    [
+        ("{sensor: probe, direction: -z, surface: plane}", False),
+        ("{sensor: points, target_mm: [0, 0, -40], frame: unknown}", False),
+        ("{sensor: ball_bar, centre_mm: [0, 0, -20], length_mm: 50}", True),
+    ],
+    ids=("probe", "points", "bar"),
+)
+def test_rules_for_readings_speak_of_a_dial_only_where_one_is_read(tmp_path, setup, with_dial):
+    (tmp_path / "plan.yaml").write_text(
+        "robot: orthoglide\npostures: {out: {tcp_mm: [50, 0, -20]}, in: {tcp_mm: [-50, 0, -20]}}\n"
+        f"setups: {{only: {setup}}}\n"
+    )
+    page = etree.HTML(sheet_files(load_plan(tmp_path / "plan.yaml"))["sheet.html"])
+    (head,) = (h for h in page.iter("h3") if words(h) == "Rules for all readings")
+    rules = words(head.getnext())
+    assert "leave the box empty" in rules
+    for words_of_dials in ("bezel", "dial", "in contact"):
+        assert (words_of_dials in rules) is with_dial
+
+
 def test_only_a_sheet_with_a_bar_warns_of_its_fixed_ball(plan, files):
     """In the rules for programs, before the first motion, at the mounting and at the end."""
     page = etree.HTML(files["sheet.html"])

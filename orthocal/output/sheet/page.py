@@ -36,7 +36,7 @@ from orthocal.output.text.layout import counted, true_minus
 from orthocal.robot.model import PARALLEL_SINE, Robot
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.points import AXES, Points
-from orthocal.sensors.protocol import mounting_steps, tool_path
+from orthocal.sensors.protocol import instrument, mounting_steps, tool_path
 from orthocal.session.points import one_row_per_point
 from orthocal.session.session import Session, Setup
 from orthocal.units import DRIVE_UNITS, LIMIT, MM, format_fixed
@@ -82,6 +82,9 @@ BALL_IN_THE_WAY = (
     "Remove them before you start the program of another gauge."
 )
 """Rule for programs of a session with a ball bar."""
+
+INDICATORS = frozenset(("dial", "ball bar"))
+"""Instruments with a bezel and a plunger."""
 
 BY_EYE = 0.01
 """Angle between a leg and its axis that the eye does not see: half a degree, [rad]."""
@@ -162,14 +165,6 @@ def _front(
         *([text] if (text := _compensation(session)) else []),
         "Check each rod and each hinge for play. The calibration does not remove play.",
     ]
-    rules = [
-        _approach_rule(session, motions),
-        _contact_rule(session, motions),
-        "After you have set the gauge zero, do not touch the bezel, the stand or the arm of the "
-        "gauge. If the gauge was bumped, start that setup again.",
-        "Write down what the dial shows, with its sign, to the nearest step of its scale. If you "
-        "could not take a reading, leave the box empty.",
-    ]
     blanks = "".join(
         f"<p>{escape(text)}: <span class='fill'>&nbsp;</span></p>"
         for text in ("Date, name", *_asked_once(session))
@@ -181,7 +176,7 @@ def _front(
         + heading("Before the first reading", level=3)
         + _numbered(checks)
         + heading("Rules for all readings", level=3)
-        + _numbered(rules)
+        + _numbered(_reading_rules(session, motions))
         + heading("Setups, in this order", level=3)
         + table(headers, rows, left=3)
         + (_programs(options, with_bar=_has_bar(session)) if with_programs else "")
@@ -549,6 +544,22 @@ def _count_outwards(robot: Robot) -> str:
     if len({d.direction for d in robot.drives}) == 1:
         return verbs[robot.drives[0].direction]
     return ", ".join(f"{verbs[d.direction]} for {d.name}" for d in robot.drives)
+
+
+def _reading_rules(session: Session, motions: Sequence[SetupMotion]) -> list[str]:
+    """Rules for all readings; those about contact and bezel only where an indicator reads."""
+    approach = _approach_rule(session, motions)
+    empty = "If you could not take a reading, leave the box empty."
+    instruments = {instrument(setup.sensor) for setup in session.setups.values()}
+    if instruments.isdisjoint(INDICATORS):
+        return [approach, f"Write down what the instrument shows, with its sign. {empty}"]
+    return [
+        approach,
+        _contact_rule(session, motions),
+        "After you have set the gauge zero, do not touch the bezel, the stand or the arm of the "
+        "gauge. If the gauge was bumped, start that setup again.",
+        f"Write down what the dial shows, with its sign, to the nearest step of its scale. {empty}",
+    ]
 
 
 def _contact_rule(session: Session, motions: Sequence[SetupMotion]) -> str:
