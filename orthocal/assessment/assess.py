@@ -17,6 +17,7 @@ from orthocal.assessment.controller_entries import (
     compute_backlash,
     compute_entries,
     expanded_uncertainty,
+    find_screws,
     is_worth_changing,
     lowers,
 )
@@ -47,7 +48,7 @@ from orthocal.estimation.options import SolverKind, SolverOptions
 from orthocal.estimation.tolerance_scale import ToleranceScale
 from orthocal.measurement.files.readings_checks import require_read
 from orthocal.measurement.joining import Given
-from orthocal.session.session import Session
+from orthocal.session.session import Session, split_label
 
 EXPLANATIONS: tuple[FindingKind, ...] = (
     "no redundancy",
@@ -158,7 +159,7 @@ def assess(
         *find_fit_findings(calibration),
         *([_no_change_needed(calibration, entries, chosen.best)] if keep else []),
         *entry_findings,
-        *(_backlash_findings(calibration) if chosen.backlash and not firmware else []),
+        *([] if firmware else _compensation_findings(calibration, chosen.backlash)),
         *describe_recommendation(
             recommendation or recommend_model(session_used),
             judged_scale=judgement.tolerance_scale.factor,
@@ -359,14 +360,27 @@ def _entry_findings(
     return findings
 
 
-def _backlash_findings(calibration: Calibration) -> list[Finding]:
-    """Finding that a session does not state the backlash that its controller compensates."""
-    session = calibration.session
-    stated = [
-        session.compensation if s.compensation is None else s.compensation
-        for s in calibration.setups
-    ]
-    return [] if all(stated) else [words.backlash_not_stated(len(calibration.robot.drives))]
+def _compensation_findings(
+    calibration: Calibration, backlash: Sequence[BacklashEntry]
+) -> list[Finding]:
+    """Findings about backlash and periodic errors that the controller compensates.
+
+    Args:
+        calibration: The calibration.
+        backlash: The backlash to enter.
+    """
+    session, screws = calibration.session, find_screws(calibration)
+    effects = [*(["backlash"] if backlash else []), *(["screw"] if screws else [])]
+    findings = [words.periodic_errors(screws)] if any(e.change.any() for e in screws) else []
+    unstated = {
+        split_label(setup.name, joined=bool(session.parts))[0]: None
+        for setup in calibration.setups
+        if not (session.compensation if setup.compensation is None else setup.compensation)
+    }
+    if effects and unstated:
+        drives = len(calibration.robot.drives)
+        findings.append(words.compensation_not_stated(list(unstated), effects, drives))
+    return findings
 
 
 def is_significant(calibration: Calibration, entry: ControllerEntry) -> bool:

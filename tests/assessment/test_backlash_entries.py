@@ -170,13 +170,22 @@ def test_backlash_that_the_controller_compensates_stays(plan, calibration):
     assert "Next: nothing to enter" in text or "Next: correct" in text
 
 
-def test_a_session_that_states_no_backlash_is_asked_for_it(calibration):
-    """A stated 0 is an answer; so is any other number."""
-    assert calibration.assessment.of_kind("backlash not stated")
-    for trims in ((JointTrim(),) * 3, (JointTrim(0.02 * MM), JointTrim(), JointTrim())):
+def test_a_session_that_states_no_compensation_is_asked_for_it(plan, calibration):
+    """A stated 0 is an answer; so is any other number. A joined session is named."""
+    kind = "compensation not stated"
+    assert calibration.assessment.of_kind(kind)
+    stated = (JointTrim(0.02 * MM), JointTrim(), JointTrim())
+    for trims in ((JointTrim(),) * 3, stated):
         record = replace(calibration.session, compensation=trims)
-        stated = assess(replace(calibration, assessment=None, session=record))
-        assert not stated.of_kind("backlash not stated")
+        assessed = assess(replace(calibration, assessment=None, session=record))
+        assert not assessed.of_kind(kind)
+    plans = [replace(plan, compensation=stated, path=Path("first/session.yaml"))]
+    plans.append(replace(plan, path=Path("second/session.yaml")))
+    sessions = [simulate_session(p, TRUTH, seed=6, sigma=NOISE).session for p in plans]
+    both = [replace(s, path=p.path) for s, p in zip(sessions, plans, strict=True)]
+    (asked,) = calibrate(both, "offsets", **QUICK).assessment.of_kind(kind)
+    assert "second" in asked.text
+    assert "first" not in asked.text
 
 
 def test_backlash_alone_is_entered_where_the_offsets_stay(plan):

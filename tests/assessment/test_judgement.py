@@ -289,7 +289,7 @@ NOTES = {
     "no offset": lambda c, t: calibrate(c, Choice(free=["x_leg.length"]), **QUICK),
     "no change needed": lambda c, t: calibrated("table1/experiment-3"),
     "fits": lambda c, t: calibrated("raw-cycles"),
-    "backlash not stated": lambda c, t: calibrate(
+    "compensation not stated": lambda c, t: calibrate(
         replace(
             c.with_effects(["backlash"]),
             readings=tuple(replace(r, conditions=Conditions("ppp")) for r in c.readings),

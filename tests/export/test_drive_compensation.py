@@ -39,6 +39,7 @@ from orthocal.gcode.path import Motion, Paths, arc_about
 from orthocal.gcode.program import ProgramCorrector
 from orthocal.gcode.reversals import split_at_reversals
 from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
+from orthocal.units import UM
 
 MM = 1e-3
 
@@ -312,6 +313,9 @@ def test_significant_periodic_errors_are_entered(complete):
         drawn = np.einsum("ni,ij,nj->n", drawn, inverse, drawn)
         farther = np.mean(drawn > e.identified @ inverse @ e.identified)
         assert (farther < 0.05) == e.enter.any()
+    (finding,) = complete.assessment.of_kind("periodic errors")
+    shown = [(e.drive, np.hypot(*e.enter) / UM) for e in entries if e.enter.any()]
+    assert re.findall(r"(\w_slide) (\d+) ±", finding.text) == [(d, f"{a:.0f}") for d, a in shown]
     options = ExportOptions(module=False, latched=LATCHED, home_offsets=(0.3, 0.3, 0.3))
     files = export_calibration(complete, "linuxcnc", anyway=True, options=options)
     tables = sorted(name for name in files if name.endswith(".comp"))

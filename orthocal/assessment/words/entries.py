@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
+from orthocal.assessment.controller_entries import ScrewEntry
 from orthocal.assessment.wording import counted, joined, named, note, tool_mm
 from orthocal.assessment.words.anomalies import MAX_PLACES, place_of
 from orthocal.calibration.assessment_record import Finding, ToolErrorSummary, Verdict
 from orthocal.kinematics.conditions import StatedUse
 from orthocal.measurement.files.readings_checks import describe_missing
 from orthocal.session.session import Session
-from orthocal.units import UM
+from orthocal.units import UM, format_fixed
 
 HEADLINES: dict[Verdict, str] = {
     "enter": "Enter these offsets, then measure again.",
@@ -48,6 +51,9 @@ SESSION_HEADLINES: dict[Verdict, str] = {
     "reject": "These readings cannot be used.",
 }
 """Headlines of the verdicts on readings."""
+
+COMPENSATED = {"backlash": "backlash", "screw": "periodic errors of screws"}
+"""Nouns for what a controller compensates, by the name of the effect."""
 
 NEXT_STEP = "`orthocal again` makes the session that measures again, `orthocal validate` judges it."
 """Next step after the offsets are entered."""
@@ -170,14 +176,48 @@ def controller_not_stated(drives: Sequence[str], *, keep: bool) -> Finding:
     )
 
 
-def backlash_not_stated(n_drives: int) -> Finding:
-    """Finding that the backlash which the controller compensates is not known."""
+def compensation_not_stated(
+    sessions: Sequence[str], effects: Sequence[str], n_drives: int
+) -> Finding:
+    """Finding that a session does not state what its controller compensates.
+
+    Args:
+        sessions: Labels of these sessions within a joined one; otherwise an empty label.
+        effects: Names of the identified effects that a controller compensates.
+        n_drives: Number of drives.
+    """
     zeros = ", ".join(["0"] * n_drives)
+    compensated = joined([COMPENSATED[effect] for effect in effects])
+    which = "The session does"
+    if all(sessions):
+        which = f"Sessions {joined(sessions)} do" if sessions[1:] else f"Session {sessions[0]} does"
     return note(
-        "backlash not stated",
-        "The session does not state which backlash the controller compensates. It counts as none "
-        "(`now`).",
-        f"State it in session.yaml, such as controller: {{backlash_mm: [{zeros}]}} for none.",
+        "compensation not stated",
+        f"{which} not state which {compensated} the controller compensates. It counts as none.",
+        f"State it in session.yaml, such as controller: {{backlash_mm: [{zeros}]}} for none"
+        f"{', or comp_file for tables' if 'screw' in effects else ''}.",
+    )
+
+
+def periodic_errors(entries: Sequence[ScrewEntry]) -> Finding:
+    """Finding about periodic errors of screws that a table of the controller corrects.
+
+    Args:
+        entries: Periodic errors of the screws.
+    """
+    amplitudes = joined(
+        [
+            f"{e.drive} {format_fixed(float(np.linalg.norm(e.enter)) / UM, 0)} "
+            f"±{format_fixed(e.uncertainty / UM, 0)} µm"
+            for e in entries
+            if e.change.any()
+        ]
+    )
+    return note(
+        "periodic errors",
+        f"Periodic errors of the screws (amplitude): {amplitudes}. Offsets and BACKLASH do not "
+        "correct them.",
+        "`orthocal export` writes tables (COMP_FILE) that do.",
     )
 
 
