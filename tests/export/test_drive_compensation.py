@@ -39,9 +39,7 @@ from orthocal.gcode.path import Motion, Paths, arc_about
 from orthocal.gcode.program import ProgramCorrector
 from orthocal.gcode.reversals import split_at_reversals
 from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
-from orthocal.units import UM
-
-MM = 1e-3
+from orthocal.units import MM, UM
 
 EFFECTS = "backlash: {tolerance_mm: 0.08}, screw: {lead_mm: 10, periodic_tolerance_mm: 0.02}"
 
