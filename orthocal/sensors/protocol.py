@@ -335,6 +335,15 @@ def equal_readings(sensor: Sensor) -> bool:
     return equal
 
 
+WITH_DIAL = frozenset(("dial", "ball bar"))
+"""Nouns of instruments with a dial: bezel, hand and plunger."""
+
+
+def has_dial(sensor: Sensor) -> bool:
+    """True if a dial shows the readings of a sensor."""
+    return instrument(sensor) in WITH_DIAL
+
+
 def instrument(sensor: Sensor) -> str:
     """Noun for what shows a reading, such as dial or ball bar."""
     noun: str = getattr(sensor, "instrument", "dial")

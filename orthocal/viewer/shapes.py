@@ -185,8 +185,9 @@ def draw_gauge(
     *,
     ball: float | None = None,
     edge: Array | None = None,
+    with_dial: bool = True,
 ) -> None:
-    """Draw a dial indicator with its stem along the measured direction.
+    """Draw a dial indicator, or a probe, with its stem along the measured direction.
 
     Args:
         scene: The scene.
@@ -197,6 +198,7 @@ def draw_gauge(
         size: Radius of the dial, [m].
         ball: Radius of a ball or pin at the tip, [m].
         edge: Vector from one end of a blade or pin to the other, shape (3,), [m].
+        with_dial: Whether it has a dial; a probe has none.
     """
     axes = np.column_stack([np.cross(direction, face), face, direction])
     scene.place(path, np.block([[axes, tip[:, None]], [np.zeros(3), np.ones(1)]]))
@@ -214,6 +216,8 @@ def draw_gauge(
     above = ball or (stem if edge is not None else 0.0)
     scene.add(f"{path}/probe", cylinder(reach - size - above, probe, start=above), steel)
     scene.add(f"{path}/stem", cylinder(0.75 * size, stem, start=reach - 1.6 * size), dark)
+    if not with_dial:
+        return
     # from the axis of a cylinder, z, to the axis of the dial, y of the gauge
     dial = _shift(0.0, 0.0, reach)
     dial[:3, :3] = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])

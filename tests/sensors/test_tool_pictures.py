@@ -67,12 +67,15 @@ def test_only_a_gauge_with_a_free_zero_is_set(files):
     ],
     ids=("probe", "points", "bar"),
 )
-def test_rules_for_readings_speak_of_a_dial_only_where_one_is_read(tmp_path, setup, with_dial):
+def test_a_dial_is_drawn_and_named_only_where_one_is_read(tmp_path, setup, with_dial):
     (tmp_path / "plan.yaml").write_text(
         "robot: orthoglide\npostures: {out: {tcp_mm: [50, 0, -20]}, in: {tcp_mm: [-50, 0, -20]}}\n"
         f"setups: {{only: {setup}}}\n"
     )
-    page = etree.HTML(sheet_files(load_plan(tmp_path / "plan.yaml"))["sheet.html"])
+    plan = load_plan(tmp_path / "plan.yaml")
+    page = etree.HTML(sheet_files(plan)["sheet.html"])
+    assert ("dial grows" in words(page)) is with_dial
+    assert ("dial must show" in words(page)) is with_dial
     (head,) = (h for h in page.iter("h3") if words(h) == "Rules for all readings")
     rules = words(head.getnext())
     assert "leave the box empty" in rules

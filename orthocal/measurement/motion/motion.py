@@ -38,7 +38,7 @@ from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import build_observations, drive_table
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.points import Points
-from orthocal.sensors.protocol import Contact, Sensor, ToolPath, tool_path
+from orthocal.sensors.protocol import Contact, Sensor, ToolPath, has_dial, instrument, tool_path
 from orthocal.session.session import Conditions, Gauge, Posture, Reading, Session
 from orthocal.units import MM
 
@@ -154,7 +154,7 @@ class SetupMotion:
         if isinstance(sensor, Points):
             return f"the instrument must show the point of line {stop.repeats} again"
         first = "0" if self.stops[0].role == "subtracted" else f"the reading of line {stop.repeats}"
-        return f"the dial must show {first} again"
+        return f"the {'dial' if has_dial(sensor) else instrument(sensor)} must show {first} again"
 
 
 class _Path(NamedTuple):

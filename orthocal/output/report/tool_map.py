@@ -91,9 +91,9 @@ def plot_tool_map(calibration: Calibration, accuracy: ToolAccuracy, *, which: Fi
         which: The present error, the error with the offsets entered, or the uncertainty.
 
     Returns:
-        The inline `<svg>`. It is "" in three cases: the points are not such a grid; the uncertainty
-        is unknown; or only offsets were identified, so that the error with the offsets entered is
-        zero by definition.
+        The inline `<svg>`. It is "" in four cases: the points are not such a grid; the uncertainty
+        is unknown; no offsets are entered; or only offsets were identified, so that the error with
+        the offsets entered is zero by definition.
     """
     return Plot(f"tool-{which}", _draw_tool_map)(calibration, accuracy, which)
 
@@ -101,9 +101,12 @@ def plot_tool_map(calibration: Calibration, accuracy: ToolAccuracy, *, which: Fi
 def _draw_tool_map(calibration: Calibration, accuracy: ToolAccuracy, which: Field) -> Figure | None:
     """Figure with one panel per plane; None without content."""
     lines = _find_grid(accuracy.points)
+    enters_offsets = (
+        calibration.session.firmware is None and not assessment_of(calibration).keeps_offsets
+    )
     shown = {
         "now": True,
-        "entered": not calibration.only_offsets and not assessment_of(calibration).keeps_offsets,
+        "entered": enters_offsets and not calibration.only_offsets,
         "uncertainty": accuracy.after is not None,
     }
     if lines is None or not shown[which]:

@@ -17,7 +17,7 @@ from orthocal.output.scene.deviations import (
     worst_of_setups,
 )
 from orthocal.output.text.layout import counted, list_places, short_name, typeset
-from orthocal.sensors.protocol import Contact
+from orthocal.sensors.protocol import Contact, has_dial
 from orthocal.session.session import Setup
 from orthocal.units import MM
 from orthocal.viewer.machine import VIEW, MachineScene
@@ -176,6 +176,7 @@ def _draw_gauge(drawing: MachineScene, setup: Setup, contact: Contact, dial: flo
         dial,
         ball=None if tip is None else tip.radius,
         edge=None if tip is None or tip.edge is None else tip.width * tip.edge,
+        with_dial=has_dial(setup.sensor),
     )
     return node
 

@@ -36,7 +36,7 @@ from orthocal.output.text.layout import counted, true_minus
 from orthocal.robot.model import PARALLEL_SINE, Robot
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.sensors.points import AXES, Points
-from orthocal.sensors.protocol import instrument, mounting_steps, tool_path
+from orthocal.sensors.protocol import has_dial, mounting_steps, tool_path
 from orthocal.session.points import one_row_per_point
 from orthocal.session.session import Session, Setup
 from orthocal.units import DRIVE_UNITS, LIMIT, MM, format_fixed
@@ -82,9 +82,6 @@ BALL_IN_THE_WAY = (
     "Remove them before you start the program of another gauge."
 )
 """Rule for programs of a session with a ball bar."""
-
-INDICATORS = frozenset(("dial", "ball bar"))
-"""Instruments with a bezel and a plunger."""
 
 BY_EYE = 0.01
 """Angle between a leg and its axis that the eye does not see: half a degree, [rad]."""
@@ -550,8 +547,7 @@ def _reading_rules(session: Session, motions: Sequence[SetupMotion]) -> list[str
     """Rules for all readings; those about contact and bezel only where an indicator reads."""
     approach = _approach_rule(session, motions)
     empty = "If you could not take a reading, leave the box empty."
-    instruments = {instrument(setup.sensor) for setup in session.setups.values()}
-    if instruments.isdisjoint(INDICATORS):
+    if not any(has_dial(setup.sensor) for setup in session.setups.values()):
         return [approach, f"Write down what the instrument shows, with its sign. {empty}"]
     return [
         approach,

@@ -26,6 +26,7 @@ from orthocal.output.sheet.gauge_position import (
 )
 from orthocal.output.text.layout import short_name
 from orthocal.robot.model import Robot
+from orthocal.sensors.protocol import has_dial
 from orthocal.units import MM
 from orthocal.viewer.machine import VIEW
 from orthocal.viewer.visuals import Visual
@@ -478,7 +479,7 @@ def _draw_tool_path(picture: Picture, view: _View, gauge: GaugePosition) -> None
 def _draw_dial(
     picture: Picture, view: _View, gauge: GaugePosition, top: Array, dial: Array, *, radius: float
 ) -> None:
-    """Plunger, dial, and an arrow in the direction in which the dial grows; no dial of points.
+    """Plunger, dial or probe, and an arrow in the direction in which readings grow; not for points.
 
     Args:
         picture: The picture.
@@ -492,9 +493,13 @@ def _draw_dial(
         return
     picture.line([top, dial], stroke="#fff", width=2.4)
     picture.line([top, dial], width=0.9)
-    picture.circle(dial, radius, fill="#fff", width=0.9)
-    picture.line([dial, dial + 0.7 * radius * np.array([0.5, -0.86])], width=0.6)
-    text = f"dial grows {axis_name(gauge.contact.direction)}".strip()
+    shown = "dial" if has_dial(gauge.setup.sensor) else "reading"
+    if shown == "dial":
+        picture.circle(dial, radius, fill="#fff", width=0.9)
+        picture.line([dial, dial + 0.7 * radius * np.array([0.5, -0.86])], width=0.6)
+    else:
+        picture.line([top + 0.6 * (dial - top), dial], width=5.0)
+    text = f"{shown} grows {axis_name(gauge.contact.direction)}".strip()
     way = view.direction(gauge.contact.direction)
     length = float(np.linalg.norm(way))
     if length < 0.1:

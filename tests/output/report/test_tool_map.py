@@ -16,6 +16,7 @@ from orthocal.calibration.identify import identify
 from orthocal.kinematics.workspace import Workspace, cube
 from orthocal.output.report import figure as style
 from orthocal.output.report import tool_map
+from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.model import Tcp
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -275,8 +276,12 @@ def test_axes_are_the_coordinates_that_the_drives_control(planar):
     np.testing.assert_allclose(vector[:, 1], 0.0, atol=GRID)
 
 
-def test_no_map_without_uncertainty_or_further_errors(table1, accuracy):
+def test_no_map_without_uncertainty_further_errors_or_offsets_to_enter(table1, accuracy):
     assert tool_map.plot_tool_map(table1, replace(accuracy, after=None), which="uncertainty") == ""
+    settings = DeltaSettings("klipper", 0.14, (0.28,) * 3, (0.56,) * 3)
+    printer = replace(table1, session=replace(table1.session, firmware=settings))
+    assert tool_map.plot_tool_map(printer, accuracy, which="entered") == ""
+    assert tool_map.plot_tool_map(printer, accuracy, which="now")
     offsets = replace(table1, parameters=table1.parameters[:3])
     assert tool_map.plot_tool_map(offsets, accuracy, which="entered") == ""
     assert tool_map.plot_tool_map(offsets, accuracy, which="now")
