@@ -52,6 +52,27 @@ class Pairs:
         return Pairs(self.first[kept], self.second[kept], self.flat[kept], self.within_range)
 
 
+def pair_gains(product: Array, spread: Array, noise: float, *, absolute: bool) -> Array:
+    """Gains of all pairs of readings, shape (..., m, m).
+
+    With a free gauge zero only the difference of the readings counts.
+
+    Args:
+        product: A C T C Aᵀ, shape (..., m, m).
+        spread: V, shape (..., m, m), [m²].
+        noise: σ², [m²].
+        absolute: Whether the gauge zero is known.
+    """
+    q, v = (np.diagonal(x, axis1=-2, axis2=-1)[..., None] for x in (product, spread))
+    if not absolute:
+        gains = q + q.mT - 2.0 * product
+        return np.asarray(gains / (v + v.mT - 2.0 * spread + 2.0 * noise))
+    variance = v + noise
+    gains = q * variance.mT
+    gains = gains + gains.mT - 2.0 * product * spread
+    return np.asarray(gains / (variance * variance.mT - spread**2))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _AlignedTerms:
     """Terms of a nuisance parameter that is aligned in the first posture of a setup.
@@ -175,10 +196,12 @@ class SetupGain:
         i, j = pairs.first, pairs.second
         if not i.size:
             return []
-        if self.setup.absolute:
-            gains = self._absolute_gains(pairs)
+        absolute = self.setup.absolute
+        if not self.aligned:
+            product = self.effect @ self.effect.T
+            gains = pair_gains(product, self.spread, self.noise, absolute=absolute)[i, j]
         else:
-            gains = self._aligned_gains()[i, j] if self.aligned else self._difference_gains(pairs)
+            gains = self.gains(np.column_stack([i, j])) if absolute else self._aligned_gains()[i, j]
         ranked: list[tuple[float, tuple[int, int]]] = []
         while True:
             best = first_largest(gains)
@@ -193,25 +216,6 @@ class SetupGain:
                 continue
             for row in pair:
                 gains[(i == row) | (j == row)] = -1.0
-
-    def _difference_gains(self, pairs: Pairs) -> Array:
-        """Gains of the differences of pairs, for a free gauge zero, shape (n_pairs,)."""
-        i, j, flat = pairs.first, pairs.second, pairs.flat
-        product = self.effect @ self.effect.T
-        q, v = product.diagonal(), self.variance
-        gains = q[i] + q[j] - 2.0 * product.reshape(-1)[flat]
-        gains /= v[i] + (v + 2.0 * self.noise)[j] - 2.0 * self.spread.reshape(-1)[flat]
-        return np.asarray(gains)
-
-    def _absolute_gains(self, pairs: Pairs) -> Array:
-        """Gains of pairs of absolute readings, for a known gauge zero, shape (n_pairs,)."""
-        if self.aligned:
-            return self.gains(np.column_stack([pairs.first, pairs.second]))
-        product, variance = self.effect @ self.effect.T, self.variance + self.noise
-        gains = np.outer(product.diagonal(), variance)
-        gains = gains + gains.T - 2.0 * product * self.spread
-        gains /= np.outer(variance, variance) - self.spread**2
-        return np.asarray(gains.reshape(-1)[pairs.flat])
 
     def _aligned_gains(self) -> Array:
         """Gains of the differences of all pairs, aligned in the first reading (row), (m, m)."""

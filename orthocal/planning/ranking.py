@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from orthocal.arrays import Array
+from orthocal.arrays import Array, Indices
 
 Item = TypeVar("Item")
 
@@ -27,6 +27,17 @@ def first_largest(values: Array) -> int:
     """
     largest = values.max()
     return int((values >= largest - EQUALITY_TOLERANCE * abs(largest)).argmax())
+
+
+def first_largest_of_rows(values: Array) -> Indices:
+    """Index in each row of the first value that equals the largest one of the row, shape (k,).
+
+    Args:
+        values: Values, shape (k, n), n > 0.
+    """
+    largest = values.max(axis=1, keepdims=True)
+    equal = values >= largest - EQUALITY_TOLERANCE * np.abs(largest)
+    return np.asarray(equal.argmax(axis=1))
 
 
 def is_less(value: float, other: float) -> bool:

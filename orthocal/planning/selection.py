@@ -22,6 +22,7 @@ from orthocal.errors import ParameterError
 from orthocal.planning.candidates import MIN_READINGS, AlignedParameter, Candidates, CandidateSetup
 from orthocal.planning.information_gain import Gain, Pairs, PointGain, SetupGain
 from orthocal.planning.ranking import first_largest, is_less, sort_by
+from orthocal.planning.setup_stack import SetupStack, stack_setups
 from orthocal.runtime.worker_pool import run_in_parallel
 from orthocal.units import MM
 
@@ -104,6 +105,8 @@ class SetupSearch:
     """Candidate setups with Jacobians A Bᵀ with respect to these directions."""
     pairs: tuple[Pairs, ...]
     """First pairs of readings of each candidate setup."""
+    stacks: tuple[SetupStack, ...]
+    """Candidate setups that are ranked together, with the alignment averaged over all postures."""
 
     @staticmethod
     def of(candidates: Candidates, prior: Array, weight: WeightFunction) -> SetupSearch:
@@ -130,9 +133,25 @@ class SetupSearch:
             )
             for k in candidates.setups
         )
-        first_pairs = tuple(map(Pairs.of, reduced))
-        prior = np.array(prior)
-        return SetupSearch(candidates.without_session, prior, weight, basis, reduced, first_pairs)
+        averaged = candidates.count > MAX_EXACTLY_RANKED
+        return SetupSearch(
+            candidates.without_session,
+            np.array(prior),
+            weight,
+            basis,
+            reduced,
+            pairs=tuple(map(Pairs.of, reduced)),
+            stacks=tuple(
+                stack_setups(
+                    reduced,
+                    [
+                        i
+                        for i, k in enumerate(reduced)
+                        if k.width == 1 and (averaged or not k.aligned)
+                    ],
+                )
+            ),
+        )
 
     def choose(
         self,
@@ -313,8 +332,6 @@ class Gains:
     """B C R, shape (n_directions, p)."""
     total: float | None
     """tr(T C); None if T depends on C."""
-    averaged: bool
-    """Whether setups are ranked with the alignment averaged over all postures."""
 
     @staticmethod
     def of(search: SetupSearch, information: Array) -> Gains:
@@ -324,8 +341,7 @@ class Gains:
         constant = search.weight(covariance) is root
         total = float(np.vdot(root, covariance @ root)) if constant else None
         reduced = search.basis @ covariance
-        averaged = search.candidates.count > MAX_EXACTLY_RANKED
-        return Gains(search, reduced @ search.basis.T, reduced @ root, total, averaged)
+        return Gains(search, reduced @ search.basis.T, reduced @ root, total)
 
     def gain_of(self, setup: CandidateSetup) -> Gain:
         """Gain by a candidate setup."""
@@ -394,22 +410,31 @@ class Gains:
         Returns:
             The candidate setup, the pair, and the gain with the gauge aligned in its first reading.
         """
-        candidates = []
-        for which, setup in enumerate(self.search.reduced):
-            pairs = self.search.pairs[which].with_count(count)
-            if (gauges is None or setup.gauge in gauges) and pairs.flat.size:
-                ranked = replace(setup, aligned=()) if self.averaged else setup
-                gain = self.gain_of(ranked)
-                candidates += [(best, which, p, gain) for best, p in gain.best_pairs(pairs, 1)]
         listed: Counter[str] = Counter()
         best = []
-        for _, which, pair, gain in sort_by(candidates, lambda c: c[0]):
+        for _, which, pair in sort_by(self._best_pairs(count, gauges), lambda c: c[0]):
             setup = self.search.reduced[which]
             listed[setup.gauge] += 1
             if listed[setup.gauge] <= MAX_COMPLETED:
-                exact = self.gain_of(setup) if self.averaged and setup.aligned else gain
-                best.append((which, pair, exact.begin_with(pair[0])))
+                best.append((which, pair, self.gain_of(setup).begin_with(pair[0])))
         return best
+
+    def _best_pairs(
+        self, count: int, gauges: Collection[str] | None
+    ) -> list[tuple[float, int, tuple[int, int]]]:
+        """Gain, candidate setup and best pair of readings of each setup, in the order of setups."""
+        search, noise = self.search, self.search.candidates.sigma**2
+        ranked, stacked = [], set[int]()
+        for stack in search.stacks:
+            stacked.update(stack.which.tolist())
+            if gauges is None or stack.gauge in gauges:
+                ranked += stack.best_pairs(self.covariance, self.root, noise, count)
+        for which in set(range(len(search.reduced))) - stacked:
+            setup, pairs = search.reduced[which], search.pairs[which].with_count(count)
+            if (gauges is None or setup.gauge in gauges) and pairs.flat.size:
+                found = self.gain_of(setup).best_pairs(pairs, 1)
+                ranked += [(gain, which, pair) for gain, pair in found]
+        return sorted(ranked, key=lambda r: r[1])
 
 
 def _exchange_first(planned: PlannedSetup, gain: Gain) -> PlannedSetup:

@@ -10,6 +10,7 @@ import pytest
 
 from orthocal.planning.candidates import AlignedParameter, CandidateSetup
 from orthocal.planning.information_gain import Pairs, PointGain, SetupGain
+from orthocal.planning.setup_stack import stack_setups
 
 SIGMA, STATE, READINGS = 0.5, 5, 7
 
@@ -125,6 +126,41 @@ def test_best_pairs_have_the_largest_gains_and_share_no_reading(drawn, count):
         assert pair in possible
         possible = [p for p in possible if not set(p) & set(pair)]
     assert len(found) == 3 or not possible
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+@pytest.mark.parametrize("count", [2, 4, 8])
+def test_stacked_setups_have_the_best_pairs_of_each(absolute, count):
+    """Setups of two gauges and two sizes, some of which cannot have as many readings."""
+    setups = [replace(draw(seed)[0], absolute=absolute, gauge="ab"[seed % 2]) for seed in range(6)]
+    few = np.arange(5)
+    setups += [
+        replace(
+            k,
+            rows=few,
+            jacobian=k.jacobian[:5],
+            covariance=k.covariance[:5, :5],
+            reachable=k.reachable[:5, :5],
+        )
+        for k in setups[:3]
+    ]
+    _, information, root = draw(0)
+    covariance = np.linalg.inv(information)
+    stacks = list(stack_setups(setups, range(len(setups))))
+    assert {(s.gauge, s.jacobian.shape[:2]) for s in stacks} == {
+        ("a", (3, 7)), ("b", (3, 7)), ("a", (2, 5)), ("b", (1, 5)),
+    }  # fmt: skip
+    found = {
+        which: (gain, pair)
+        for stack in stacks
+        for gain, which, pair in stack.best_pairs(covariance, covariance @ root, SIGMA**2, count)
+    }
+    for which, setup in enumerate(setups):
+        gain = gain_of(SetupGain, setup, information, root)
+        expected = gain.best_pairs(Pairs.of(setup).with_count(count), 1)
+        assert (which in found) == bool(expected)
+        for value, pair in expected:
+            assert found[which] == (pytest.approx(value, rel=1e-9), pair)
 
 
 def align(setup, first):
