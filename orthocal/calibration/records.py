@@ -136,16 +136,18 @@ class SolverRecord:
     name: SolverKind
     status: str
     iterations: Count
-    """Iterations of all solutions until σ converged."""
+    """Iterations of all solutions."""
     seconds_build: Number
     """Time for building the functions and the program, [s]."""
     seconds_solve: Number
-    """Time for all solutions until σ converged, [s]."""
+    """Time of all solutions, [s]."""
     hessian: str
     loss: LossKind
     """Loss function: squares or pseudo-Huber."""
     loss_width: PositiveInSI
     """Residual at which the loss changes from square to linear, [standard deviations]."""
+    noise_converged: bool = True
+    """True if the noise of a reading agrees with that of the previous solution."""
 
     @property
     def shows_linearisation_error(self) -> bool:

@@ -42,8 +42,8 @@ SIGMA_TOLERANCE = 0.03
 than a twentieth of its standard deviation."""
 
 MAX_SIGMA_ROUNDS = 8
-"""Largest number of solutions until sigma and the noise ratios converge. The last solution is
-returned if they do not, as when sigma alternates between cycles and residuals."""
+"""Largest number of solutions until sigma and the noise ratios converge. Otherwise, as when sigma
+alternates between cycles and residuals, the last solution is returned, marked as not converged."""
 
 SMALL_DOF = 20.0
 """Residual degrees of freedom below which the initial sigma does not come from residuals."""
@@ -63,9 +63,11 @@ class Fit:
     seconds_build: float
     """Time to build the functions and the program, [s]."""
     seconds_solve: float
-    """Time to solve until sigma converged, [s]."""
+    """Time of all solutions, [s]."""
     iterations: int
     """Iterations of the solver in all solutions."""
+    noise_converged: bool
+    """False if sigma or a noise ratio still changed after `MAX_SIGMA_ROUNDS` solutions."""
     linearisation: LinearProblem
     """Problem linearised about the active offsets of the controller."""
     linearised_theta: Array
@@ -209,7 +211,7 @@ def fit_problem(
     require_determined(problem, linear.information)
     program = build_program(problem, options) if program is None else program.with_problem(problem)
     built = time.perf_counter()
-    solved = _solve_until_converged(program, linear, groups, start)
+    solved = _solve_with_noise(program, linear, groups, start)
     program, linear, noise = solved.program, solved.linear, solved.evaluation.noise
     require_assembly(program.problem, solved.solution, options=program.options)
     sigma = floored_sigma(noise)
@@ -219,6 +221,7 @@ def fit_problem(
         seconds_build=built - began,
         seconds_solve=time.perf_counter() - built,
         iterations=solved.iterations,
+        noise_converged=solved.converged,
         linearisation=linear,
         linearised_theta=linear.solve(sigma=sigma if math.isfinite(sigma) else solved.sigma),
         solution=solved.solution,
@@ -230,8 +233,8 @@ def fit_problem(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _ConvergedSolution:
-    """Solution whose sigma and noise ratios agree with its residuals."""
+class _NoiseSolution:
+    """Solution, with sigma and the noise ratios of the gauges from its residuals."""
 
     program: Program
     linear: LinearProblem
@@ -241,15 +244,17 @@ class _ConvergedSolution:
     """Sigma with which the last solution was computed, [m]."""
     iterations: int
     """Iterations of all solutions."""
+    converged: bool
+    """True if sigma and the noise ratios of the last two solutions agree."""
 
 
-def _solve_until_converged(
+def _solve_with_noise(
     program: Program,
     linear: LinearProblem,
     groups: Sequence[GaugeReadings],
     start: ArrayLike | None,
-) -> _ConvergedSolution:
-    """Solve until sigma and the noise ratios of the gauges agree with the residuals."""
+) -> _NoiseSolution:
+    """Solve repeatedly until sigma and the noise ratios of the gauges agree with the residuals."""
     problem = program.problem
     repeatability = estimate_repeatability(problem.values, problem.observations)
     solution, sigma = _solve_first(program, linear, repeatability, start)
@@ -260,7 +265,8 @@ def _solve_until_converged(
         ratio = _estimate_noise_ratio(problem, groups, evaluation, sigma)
         ratio_agrees = bool(np.abs(ratio / problem.noise_ratio - 1.0).max() < SIGMA_TOLERANCE)
         sigma_agrees = not _depends_on_sigma(program) or _sigma_agrees(estimated, sigma)
-        if (ratio_agrees and sigma_agrees) or not remaining:
+        converged = ratio_agrees and sigma_agrees
+        if converged or not remaining:
             break
         if not sigma_agrees:  # sigma first, because the ratios depend on it
             sigma = estimated
@@ -270,7 +276,7 @@ def _solve_until_converged(
         start_theta, start_passive = solution.theta, solution.passive
         solution = program.solve(sigma=sigma, start=start_theta, start_passive=start_passive)
         iterations += solution.iterations
-    return _ConvergedSolution(program, linear, solution, evaluation, sigma, iterations)
+    return _NoiseSolution(program, linear, solution, evaluation, sigma, iterations, converged)
 
 
 def _solve_first(

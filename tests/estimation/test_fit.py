@@ -145,6 +145,21 @@ def test_iterations_and_times_are_told(session):
     assert result.solver.seconds_solve > 0.0
 
 
+def test_noise_that_does_not_converge_is_reported(session, monkeypatch):
+    """Without tolerance no two estimates agree, so that all rounds end without convergence."""
+    from orthocal.estimation import fit
+
+    converged = calibrate(session, "full")
+    assert converged.solver.noise_converged
+    assert not converged.assessment.of_kind("no convergence")
+    monkeypatch.setattr(fit, "SIGMA_TOLERANCE", 0.0)
+    result = calibrate(session, "full")
+    assert not result.solver.noise_converged
+    (finding,) = result.assessment.of_kind("no convergence")
+    assert finding.severity == "note"
+    assert finding.numbers["sigma_mm"] == pytest.approx(result.noise.sigma * 1e3)
+
+
 def test_correlations_are_those_of_the_covariance(session):
     result = calibrate(session)
     covariance = result.model_covariance

@@ -24,6 +24,22 @@ def noise_unknown() -> Finding:
     )
 
 
+def noise_not_converged(sigma: float) -> Finding:
+    """Finding that the noise still differs between the last two solutions."""
+    return note(
+        "no convergence",
+        "The estimated noise of a reading differs between the last two solutions, so the values "
+        "and their ± are approximate.",
+        "State gauge.sigma_mm, or repeat all readings in cycles.",
+        sigma_mm=sigma / MM,
+    )
+
+
+def no_solution() -> Finding:
+    """Finding that the solver fails with these readings."""
+    return note("no convergence", "The solver finds no machine that fits these readings.")
+
+
 def noise_from_residuals(sigma: float) -> Finding:
     """Finding that the noise is known from the residuals only."""
     return note(
