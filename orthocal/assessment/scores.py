@@ -142,9 +142,9 @@ def _assess(calibration: Calibration) -> ToolAccuracy | None:
 
 def _effective(fit: Fit) -> float:
     """Effective number of parameters of a fit."""
-    return fit.information.effective_parameters(
+    return fit.information.posterior(
         sigma=fit.sigma, precision=fit.problem.prior_precision
-    )
+    ).effective_parameters
 
 
 def _score(fit: Fit, linearisation: LinearProblem, method: Method, noise: float) -> Score:

@@ -14,8 +14,3 @@ KINDS: dict[str, type[Dimensions]] = {
 
 USUAL = Orthoglide.kind
 """Default kind."""
-
-
-def describe_kinds() -> str:
-    """Names of the kinds, separated by commas."""
-    return ", ".join(KINDS)

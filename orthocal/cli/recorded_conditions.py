@@ -34,11 +34,6 @@ class RecordedConditions:
         self._asked: set[str] = set()
         """Setups whose temperature was asked for."""
 
-    @property
-    def needs_time(self) -> bool:
-        """True if an effect depends on the time."""
-        return "time" in self._needed
-
     def question(self, row: Reading) -> str | None:
         """Condition to ask for before a row is read; None if all are known."""
         if row.minus is not None:

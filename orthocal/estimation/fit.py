@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,6 +28,7 @@ from orthocal.estimation.weighting import (
 )
 from orthocal.statistics.information import (
     Information,
+    Posterior,
     assume_others_known,
     decompose,
     marginalise,
@@ -131,42 +131,45 @@ class Fit:
             noise: Standard deviation of a reading, [m of the first gauge]; by default `sigma`, with
                 which the parameters were estimated.
         """
-        return self._to_si(self.information.covariance, noise)
+        return self._to_si(self._posterior(noise).covariance)
 
     def noise_covariance(self, *, noise: float | None = None) -> Array:
         """Part of `covariance` that is due to noise, shape (n_free, n_free), [SI]."""
-        return self._to_si(self.information.noise_covariance, noise)
+        return self._to_si(self._posterior(noise).noise_covariance)
 
     def inverse_normal(self) -> Array:
         """Inverse curvature of the objective, shape (n_free, n_free), [SI]."""
-        return self._to_si(self.information.inverse_normal, None)
+        return self._to_si(self._posterior().inverse_normal)
 
     def scaled_covariance(self) -> Array:
         """Part of `covariance` that is due to priors which the tolerance scale multiplies.
 
         Shape (n_free, n_free), [SI].
         """
-        priors = self.problem.selection.scaled
-        return self._to_si(partial(self.information.prior_covariance, priors=priors), None)
+        return self._to_si(self._posterior().prior_covariance(self.problem.selection.scaled))
 
-    def _to_si(self, compute: Callable[..., Array], noise: float | None) -> Array:
+    def _posterior(self, noise: float | None = None) -> Posterior:
+        """Posterior of θ̂; for `noise` see `covariance`."""
+        gain, noise_factor = 1.0, 1.0
+        if self.loss.robust:
+            used = self.problem.observations.size - self.noise.residual_dof
+            gain = self.loss.gain(self.residual / self.sigma, used=used)
+            noise_factor = self.loss.normal_square
+        if noise is not None:
+            noise_factor *= (noise / self.sigma) ** 2
+        return self.information.posterior(
+            sigma=self.sigma,  # above 0, also for readings without scatter
+            precision=self.problem.prior_precision,
+            at_bound=self.at_bound,
+            loss=(gain, noise_factor),
+        )
+
+    def _to_si(self, covariance: Array) -> Array:
         """Covariance of the free parameters, (n_free, n_free), [SI], from that of θ̂."""
         scale = np.outer(self.problem.theta_scale, self.problem.theta_scale)
         if not math.isfinite(self.noise.sigma):
             return np.full_like(scale, np.nan)
-        factors = (1.0, 1.0)
-        if self.loss.robust:
-            used = self.problem.observations.size - self.noise.residual_dof
-            gain = self.loss.gain(self.residual / self.sigma, used=used)
-            factors = (gain, self.loss.normal_square)
-        if noise is not None:
-            factors = (factors[0], factors[1] * (noise / self.sigma) ** 2)
-        return scale * compute(
-            sigma=self.sigma,  # above 0, also for readings without scatter
-            precision=self.problem.prior_precision,
-            at_bound=self.at_bound,
-            loss=factors,
-        )
+        return scale * covariance
 
     @property
     def mounting_covariance(self) -> Array:
@@ -339,9 +342,9 @@ def _estimate_noise_ratio(
     """Noise of each entry relative to the first gauge, from the residuals, (n_entries,)."""
     if len(groups) < 2:
         return problem.noise_ratio
-    covariance = evaluation.information.covariance(
+    covariance = evaluation.information.posterior(
         sigma=sigma, precision=problem.prior_precision, at_bound=evaluation.at_bound
-    )
+    ).covariance
     std = estimate_gauge_sigmas(
         groups,
         problem.observations,
@@ -430,7 +433,9 @@ def _residual_dof(
 ) -> float:
     """Number of readings minus free zeros and effective parameters."""
     o, precision = problem.observations, problem.prior_precision
-    used = information.effective_parameters(sigma=sigma, precision=precision, at_bound=at_bound)
+    used = information.posterior(
+        sigma=sigma, precision=precision, at_bound=at_bound
+    ).effective_parameters
     return o.size - o.n_free_zeros - used
 
 
@@ -530,9 +535,11 @@ def find_mounting_covariance(
     """
     n, precision = problem.n_machine, problem.prior_precision
     at_bound = np.zeros(problem.n_free, dtype=np.bool_) if at_bound is None else at_bound
-    total = information.covariance(sigma=sigma, precision=precision, at_bound=at_bound)
-    without_mounting = assume_others_known(information, n).covariance(
-        sigma=sigma, precision=precision[:n], at_bound=at_bound[:n]
+    total = information.posterior(sigma=sigma, precision=precision, at_bound=at_bound).covariance
+    without_mounting = (
+        assume_others_known(information, n)
+        .posterior(sigma=sigma, precision=precision[:n], at_bound=at_bound[:n])
+        .covariance
     )
     scale = problem.theta_scale[:n]
     return np.asarray((total[:n, :n] - without_mounting) * np.outer(scale, scale))

@@ -310,7 +310,7 @@ class ToolForecast:
         precision = np.maximum(problem.prior_precision, VAGUE)
         weight = noise if weight is None else weight
         jacobian = project_out_zeros(jacobian[possible], o)
-        inverse = Information(jacobian).covariance(sigma=weight, precision=precision)
+        inverse = Information(jacobian).posterior(sigma=weight, precision=precision).covariance
         scale = problem.theta_scale[:n]
         covariance = inverse
         if weight != noise:  # the scatter of the readings is smaller than their weight implies

@@ -107,11 +107,11 @@ def test_the_robust_covariance_is_that_of_many_simulated_calibrations(exact_plan
     predicted, _, _ = problem.simulate(solved.theta)
     for left, theta in zip(measured - predicted, solved.theta, strict=True):
         residual = project_out_zeros(left, o) / sigma
-        covariance = information.covariance(
+        covariance = information.posterior(
             sigma=sigma,
             precision=problem.prior_precision,
             loss=(loss.gain(residual, used=3 + o.n_zeros), loss.normal_square),
-        )
+        ).covariance
         error = (theta - truth) / problem.theta_scale
         white.append(np.linalg.solve(np.linalg.cholesky(covariance), error))
     # 900 squares have a standard error of 5 %; the formula is one for many readings

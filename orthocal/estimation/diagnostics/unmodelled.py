@@ -158,9 +158,9 @@ def propagate_unmodelled(fit: Fit, errors: UnmodelledErrors) -> tuple[Unmodelled
         return no_effect, np.zeros((problem.n_free - n, 0))
     o, sigma = problem.observations, fit.sigma
     jacobian = project_out_zeros(fit.jacobian, o)
-    inverse = fit.information.covariance(
+    inverse = fit.information.posterior(
         sigma=sigma, precision=problem.prior_precision, at_bound=fit.at_bound
-    )
+    ).covariance
     scaled = inverse @ (jacobian.T @ errors.jacobian) / sigma**2
     residual = o.rows(errors.jacobian - jacobian @ scaled)
     bias = scaled * problem.theta_scale[:, None]  # per prior standard deviation of each error

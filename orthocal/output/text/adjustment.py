@@ -43,7 +43,7 @@ def render_adjustments(calibration: Calibration, *, saved: Path | None = None) -
     if decision.verdict != "enter":
         return Text(f"Not planned: {decision.headline}")
     try:
-        return render_plan(calibration, plan_adjustments(calibration), saved=saved)
+        return render_plan(plan_adjustments(calibration), saved=saved)
     except (OrthocalError, ClosureError) as e:
         return Text(f"The adjustments cannot be planned: {e}.")
 
@@ -53,19 +53,18 @@ def print_plan(
 ) -> None:
     """Print a plan of adjustments; arguments as for `render_plan`."""
     head = f"Mechanical adjustment of {calibration.robot_record.name}, model '{calibration.model}'"
-    shown = render_plan(calibration, plan, saved=saved, details=details)
+    shown = render_plan(plan, saved=saved, details=details)
     print_rich(Group(Text(head), Text(), shown))
 
 
 def render_plan(
-    calibration: Calibration, plan: AdjustmentPlan, *, saved: Path | None, details: bool = False
+    plan: AdjustmentPlan, *, saved: Path | None, details: bool = False
 ) -> RenderableType:
     """A plan of adjustments.
 
     Args:
-        calibration: The calibration.
-        plan: Its plan.
-        saved: Its directory, for the next command.
+        plan: The plan of a calibration.
+        saved: Directory of the calibration, for the next command.
         details: Whether to list adjustments that are not worth doing.
     """
     parts: list[RenderableType] = [Text(HEADLINES[plan.judgement]), Text()]
