@@ -15,8 +15,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from orthocal.arrays import Array
 from orthocal.assessment.calibrated_tool import find_tool
@@ -154,6 +152,8 @@ def fit_firmware(
     Raises:
         ExportError: If the session states no settings, or the machine does not reach the workspace.
     """
+    from scipy.optimize import least_squares
+
     present = calibration.session.firmware
     if present is None:
         raise ExportError(
@@ -335,6 +335,8 @@ def _bed_of(calibration: Calibration) -> str:
 
 def _bed_tilt(calibration: Calibration, bed: str) -> Array:
     """Rotation from the axes of the bed to those of the machine, shape (3, 3)."""
+    from scipy.spatial.transform import Rotation
+
     values = {p.name: p.value for p in calibration.sensors}
     yaw, roll = (values.get(f"setup.{bed}.{k}", 0.0) for k in ("yaw", "roll"))
     return np.asarray(Rotation.from_euler("xy", [roll, yaw]).as_matrix())
@@ -389,6 +391,8 @@ def _residuals(targets: _Targets, present: DeltaSettings, x: Array) -> Array:
         present: Present settings.
         x: Changes of the settings, then rotation x[9] and translation x[10:12].
     """
+    from scipy.spatial.transform import Rotation
+
     settings = _changed(present, x)
     change = np.array(settings.homed) - present.homed
     aligned = targets.points @ Rotation.from_euler("z", x[9]).as_matrix().T

@@ -13,14 +13,24 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
+from orthocal.builder.biglide import Biglide
 from orthocal.builder.dimensions import Dimension, Dimensions, box_text, in_mm
-from orthocal.builder.kinds import KINDS, USUAL
+from orthocal.builder.linear_delta import LinearDelta
+from orthocal.builder.orthoglide import InclinedOrthoglide, Orthoglide
 from orthocal.errors import RobotError
 from orthocal.io.documents import Number, read_yaml, validate
 from orthocal.robot.description import WorkspaceBox
 from orthocal.units import MM
 
 MACHINE = "machine.yaml"
+
+KINDS: dict[str, type[Dimensions]] = {
+    k.kind: k for k in (Orthoglide, InclinedOrthoglide, LinearDelta, Biglide)
+}
+"""Name in machine.yaml and on the command line, to the class of dimensions."""
+
+USUAL = Orthoglide.kind
+"""Default kind."""
 
 MAX_COORDINATE = 100.0
 """Largest coordinate of a controller's joint in the mechanical zero, [m]."""

@@ -130,7 +130,7 @@ class DimensionOptions:
         Raises:
             ParameterError: If there is no such kind.
         """
-        from orthocal.builder.kinds import KINDS, USUAL
+        from orthocal.builder.machine_file import KINDS, USUAL
 
         kind = KINDS.get(self.kind or USUAL)
         if kind is None:

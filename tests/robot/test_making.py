@@ -11,8 +11,7 @@ import yaml
 from tolerances import CLOSED_FORM
 
 from orthocal.builder.build import describe_machine, make_robot, remake_robot
-from orthocal.builder.kinds import KINDS
-from orthocal.builder.machine_file import MACHINE, Counting, read_machine
+from orthocal.builder.machine_file import KINDS, MACHINE, Counting, read_machine
 from orthocal.builder.orthoglide import FEET, Orthoglide
 from orthocal.errors import RobotError
 from orthocal.kinematics.loop_closure import LoopClosure
