@@ -145,7 +145,7 @@ def compare_models(
             r.label + (f", cycle {r.cycle}" if several_cycles else "") for r in session.readings
         ),
         noise=noise,
-        independent=results[0].spare + results[0].rank if results else 0,
+        independent=results[0].redundancy + results[0].rank if results else 0,
         results=results,
         undetermined=undetermined,
         repetition=None,
@@ -318,7 +318,7 @@ def _result_document(result: ModelResult) -> dict[str, Any]:
         "model": result.model,
         "n_free": result.n_free,
         "rank": result.rank,
-        "spare": result.spare,
+        "spare": result.redundancy,
         "effective_parameters": result.effective,
         "linearised": score(result.linearised),
         "exact": score(result.exact),

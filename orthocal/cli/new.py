@@ -14,12 +14,12 @@ import typer
 import orthocal
 from orthocal.cli.options import (
     ControllerOptions,
-    Day,
     Force,
     Gauge,
     Hours,
     Model,
     Owned,
+    TemperatureRange,
     Tolerances,
     WorkspaceMm,
     command,
@@ -157,7 +157,7 @@ class FirstPlanOptions:
     with_: Owned = None
     model: Model = None
     effects: str = EFFECTS
-    temperature: Day = None
+    temperature: TemperatureRange = None
     tolerance: Tolerances = None
 
 

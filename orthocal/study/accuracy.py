@@ -138,7 +138,7 @@ class AccuracyStudy(Study):
         """
         session, prepared = self._session_with_ignored, prepare_once(self)
         effects = {e.name: e for e in robot_effects(session.robot)}
-        if any(effects[n].setup_errors for n in self.ignored) or not prepared.alike_without_errors:
+        if any(effects[n].setup_errors for n in self.ignored) or not prepared.equal_without_errors:
             return None
         selection = prepared.model.problem.machine_selection
         workspace = prepared.tool.workspace.once(prepared.tool.use.size)

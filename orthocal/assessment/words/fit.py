@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from orthocal.assessment.wording import counted, mm, named, note, plain, times
+from orthocal.assessment.wording import counted, mm, note, parameter_places, plain, times
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.statistics.identifiability import Combination
@@ -141,7 +141,7 @@ def nothing_depends(names: Sequence[str]) -> Finding:
         "no sensitivity",
         "No reading depends on any free parameter, so all keep their start values.",
         "Read setups and postures that depend on the parameters.",
-        named(*names),
+        parameter_places(*names),
     )
 
 
@@ -167,7 +167,7 @@ def held_by_bound(parameter: ParameterEstimate, *, offset: bool) -> Finding:
             f"value_{parameter.edge_unit}" if parameter.unit != "1" else "value": parameter.value
             * parameter.edge_factor
         },
-        named(parameter.name),
+        parameter_places(parameter.name),
     )
 
 
@@ -185,7 +185,7 @@ def linearisation_error(parameter: ParameterEstimate, change: float, std: float)
         f"{parameter.name} by {plain(change * parameter.edge_factor)} {parameter.edge_unit}, "
         f"{change / std:.2g} times its standard deviation.",
         "",
-        named(parameter.name),
+        parameter_places(parameter.name),
         part_of_std=change / std,
     )
 
@@ -196,7 +196,7 @@ def inseparable(combination: Combination) -> Finding:
         "inseparable",
         f"Determined only in combination: {combination.words}.",
         "",
-        named(*combination.names),
+        parameter_places(*combination.names),
     )
 
 
@@ -210,7 +210,7 @@ def below_noise(names: Sequence[str]) -> Finding:
         f"The {effect} of {counted(count, 'parameter')}{listed} on the readings {remains} below "
         "the noise, at one prior standard deviation.",
         "",
-        named(*names),
+        parameter_places(*names),
         parameters=float(count),
     )
 

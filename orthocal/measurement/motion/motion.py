@@ -25,7 +25,7 @@ from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.workspace import position_at_zero, tool_at_zero
 from orthocal.measurement.files.readings_file import FIRST_LINE
 from orthocal.measurement.motion.approach import (
-    APPROACH,
+    USUAL_LENGTH,
     approach_length,
     approach_share,
     approach_steps,
@@ -479,7 +479,7 @@ def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path
     Raises:
         SessionError: If the path leaves the workspace, or no direction has the stated approach.
     """
-    robot, length = session.robot, approach_share(session) * APPROACH
+    robot, length = session.robot, approach_share(session) * USUAL_LENGTH
     first = np.asarray(stops[0].point)
     others = [s.point for s in stops if s.point is not None and not np.allclose(s.point, first)]
     ahead = path(first, np.asarray(others[0])) if others else np.array([first, first + length])
