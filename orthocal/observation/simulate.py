@@ -10,12 +10,12 @@ from typing import Annotated
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from orthocal.arguments import require_kind, require_names, require_numbers, require_seed
 from orthocal.arrays import Array
 from orthocal.errors import ParameterError, SessionError
-from orthocal.io.documents import Number, parse_number, read_yaml, validate
+from orthocal.io.documents import Keys, Number, parse_number, read_yaml, validate
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import Observations, build_observations
 from orthocal.observation.sensor_groups import OF_GAUGE, nuisance_parameters
@@ -242,10 +242,8 @@ def _where(plan: Session, gauge: str, key: str) -> str:
     return path if plan.path is None else f"{plan.path}: {path}"
 
 
-class _TruthKeys(BaseModel):
+class _TruthKeys(Keys):
     """Keys of a file of errors, such as truth.yaml."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     errors: Annotated[dict[str, Number], Field(min_length=1)]
     zeros_mm: dict[str, Number] = {}
