@@ -367,6 +367,15 @@ def validate(
         raise error(problem, where=f"{where}: {key}" if key else where) from None
 
 
+def format_json(document: object) -> str:
+    """Text of a JSON document, with a line end.
+
+    Raises:
+        ValueError: If a number is not finite.
+    """
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
 def write_plain(record: object, schema: type[Any]) -> dict[str, Any]:
     """Plain data of a dataclass, which `validate` reads."""
     adapter = _adapter(schema)  # type: ignore[arg-type] # types are hashable

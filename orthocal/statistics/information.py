@@ -5,9 +5,8 @@ All quantities are in scaled parameters θ̂ = θ/(prior std), with gauge zeros 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from orthocal.arrays import Array, Mask
 from orthocal.errors import NotIdentifiableError
 from orthocal.observation.observations import Observations
 from orthocal.statistics.zeros import project_out_zeros
+from orthocal.text import list_some
 
 RANK_THRESHOLD = 1e-10
 """Ratio to the largest singular value below which others count as zero."""
@@ -27,6 +27,8 @@ MAX_LISTED = 6
 
 MAX_DIRECTIONS = 2
 """Largest number of null space directions that a message lists."""
+
+_list = partial(list_some, most=MAX_LISTED)
 
 
 class Information:
@@ -244,7 +246,7 @@ def require_identifiable(
         information = assume_others_known(information, len(names))
         advice = _advise(information, names, null)
         raise NotIdentifiableError(
-            f"the readings do not determine {_list_some(undetermined)}: {information.rank} of "
+            f"the readings do not determine {_list(undetermined)}: {information.rank} of "
             f"{len(names)} free parameters are identifiable. {advice} Or use tolerances as a prior "
             "(--prior), or identify base parameters (--base)",
             parameters=undetermined,
@@ -268,7 +270,7 @@ def _advise(information: Information, names: tuple[str, ...], null: Array) -> st
             n for n, has_none in zip(names, without_effect, strict=True) if has_none
         ]
         sentences.append(
-            f"No reading depends on {_list_some(names_without_effect)}: read the legs that are "
+            f"No reading depends on {_list(names_without_effect)}: read the legs that are "
             "missing, in postures along their own axes."
         )
     # each row of the reduced echelon form is one unobservable change of the others
@@ -280,14 +282,8 @@ def _advise(information: Information, names: tuple[str, ...], null: Array) -> st
         changes = [
             f"{other_names[i]} {'up' if row[i] * row[terms[0]] > 0 else 'down'}" for i in terms
         ]
-        sentences.append(f"No reading depends on this combined change: {_list_some(changes)}.")
+        sentences.append(f"No reading depends on this combined change: {_list(changes)}.")
     return " ".join(sentences)
-
-
-def _list_some(items: Sequence[str]) -> str:
-    """First items and the number of the others."""
-    more = f" and {len(items) - MAX_LISTED} more" if len(items) > MAX_LISTED else ""
-    return ", ".join(items[:MAX_LISTED]) + more
 
 
 def _reduce(rows: Array) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from rich.console import Group, RenderableType
@@ -21,7 +20,7 @@ from orthocal.assessment.words.entries import describe_region
 from orthocal.calibration.assessment_record import ControllerEntry, ToolErrorSummary
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, OrthocalError
-from orthocal.io.documents import write_plain
+from orthocal.io.documents import format_json, write_plain
 from orthocal.io.fields import finite_or_none
 from orthocal.output.text.answer import quote_path, render_next
 from orthocal.output.text.layout import bullets, plain, print_rich, signed, table_of
@@ -142,4 +141,4 @@ def plan_json(calibration: Calibration, plan: AdjustmentPlan) -> str:
         "before": write_plain(plan.before, ToolErrorSummary),
         "after": write_plain(plan.after, ToolErrorSummary),
     }
-    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+    return format_json(document)
