@@ -71,16 +71,9 @@ def draw_errors(
     require_names(patterns, argument="patterns")
     require_seed(seed)
     rng = np.random.default_rng(seed)
-    parameters = robot.parameters
-    chosen = parameters.select(patterns)
-    chosen = tuple(
-        n
-        for n in chosen
-        if len(parameters[n].terms) == 1 or not {t for t, _ in parameters[n].terms} & set(chosen)
-    )
-    replaced = parameters.read_tolerances(tolerances or {})
-    stds = {n: value for g, value in replaced.items() for n in parameters.select([g])}
-    drawn = {n: float(rng.normal() * stds.get(n, parameters[n].prior_std)) for n in chosen}
+    parameters = robot.parameters.with_tolerances(tolerances or {})
+    chosen = parameters.without_sums(parameters.select(patterns))
+    drawn = {n: float(rng.normal() * parameters[n].prior_std) for n in chosen}
     return {n: abs(v) if parameters[n].positive else v for n, v in drawn.items()}
 
 

@@ -30,6 +30,7 @@ from orthocal.arrays import Array
 from orthocal.assessment.controller_entries import (
     ENTERED_DECIMALS,
     find_backlash,
+    find_screw_effect,
     find_screws,
 )
 from orthocal.calibration.calibration import Calibration
@@ -84,7 +85,7 @@ def find_periodic_errors(robot: Robot, errors: Mapping[str, float]) -> PeriodicE
         robot: The robot.
         errors: Values by parameter name, [SI].
     """
-    screw = next((e for e in robot_effects(robot) if isinstance(e, Screw)), None)
+    screw = find_screw_effect(robot)
     if screw is None:
         return None
     sine, cosine = (
@@ -98,8 +99,8 @@ def find_periodic_errors(robot: Robot, errors: Mapping[str, float]) -> PeriodicE
 
 def without_periodic_errors(robot: Robot, errors: Mapping[str, float]) -> dict[str, float]:
     """Errors of a machine without the periodic errors of its screws."""
-    screws = [e for e in robot_effects(robot) if isinstance(e, Screw)]
-    periodic = {error.name for screw in screws for error in screw.errors}
+    screw = find_screw_effect(robot)
+    periodic = set() if screw is None else {error.name for error in screw.errors}
     return {name: value for name, value in errors.items() if name not in periodic}
 
 
