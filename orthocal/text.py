@@ -89,6 +89,12 @@ def spans(numbers: Sequence[int], noun: str) -> str:
     return f"{noun if len(numbers) == 1 else f'{noun}s'} {', '.join(words)}{more}"
 
 
+def list_some(items: Sequence[str], most: int, *, separator: str = ", ") -> str:
+    """First items of a list, and the number of the others."""
+    more = f" and {len(items) - most} more" if len(items) > most else ""
+    return separator.join(items[:most]) + more
+
+
 def comment_safe(text: str, longest: int = 60) -> str:
     """Text in characters that comments of G-code, C and INI files and Markdown tables accept."""
     return _UNSAFE.sub("_", text)[:longest]

@@ -33,6 +33,10 @@ class DrawnMachines:
         scale = np.where(self.is_offset, 1.0, level) * self.prior_stds
         return scale * rng.normal(size=scale.size)
 
+    def by_name(self, errors):
+        """Errors of a machine by their names, [SI]."""
+        return dict(zip(self.machine.machine_selection.names, errors.tolist(), strict=False))
+
     def read(self, rng, errors, *, sigma=None):
         """Readings of a machine, rounded to the gauge's resolution, [m]."""
         gauge, o = self.plan.gauge, self.problem.observations

@@ -110,7 +110,7 @@ def test_covariance_at_the_tool():
     without = math.sqrt(mean(e @ calibration.total_covariance @ e.transpose(0, 2, 1)))
     text = f"gives {without * 1e6:.0f} µm instead of {math.sqrt(square) * 1e6:.0f} µm"
     assert text in PAGE
-    text = f"from {eta.contrasts:.2f} contrasts. Its tool error is {total * 1e6:.0f} µm with it"
+    text = f"from {eta.contrasts:.2f} contrasts, and a tool error of {total * 1e6:.0f} µm"
     assert f"$\\eta = {eta.factor:.1f}$ {text}" in PAGE
 
 

@@ -157,7 +157,7 @@ def assess(
     )
     notes = [
         *find_fit_findings(calibration),
-        *([_no_change_needed(calibration, entries, chosen.best)] if keep else []),
+        *([_no_change_needed(entries, chosen.best)] if keep else []),
         *entry_findings,
         *([] if firmware else _compensation_findings(calibration, chosen.backlash)),
         *describe_recommendation(
@@ -299,14 +299,11 @@ def _determined_by_readings(entries: Sequence[ControllerEntry]) -> list[Controll
     return [e for e in entries if e.held is None and math.isfinite(e.std)]
 
 
-def _no_change_needed(
-    calibration: Calibration, entries: Sequence[ControllerEntry], best: ToolErrorSummary | None
-) -> Finding:
+def _no_change_needed(entries: Sequence[ControllerEntry], best: ToolErrorSummary | None) -> Finding:
     """Finding that the offsets are kept; `best` is the tool error with the best ones."""
     ratios = [abs(e.best_change) / e.std for e in _determined_by_readings(entries) if e.std > 0.0]
     drives = [e.drive for e in entries]
-    min_reduction = WORTH_ENTERING
-    return words.no_change_needed(drives, max(ratios, default=0.0), best, share=min_reduction)
+    return words.no_change_needed(drives, max(ratios, default=0.0), best, share=WORTH_ENTERING)
 
 
 def _setting_findings(calibration: Calibration, tool: ToolErrorSummary | None) -> list[Finding]:

@@ -141,7 +141,7 @@ def find_tool(calibration: Calibration, use: UseSamples | None = None) -> Calibr
         None if the drives do not command a tool, or if no box of ±1 mm can be reached.
     """
     robot = calibration.robot
-    if robot.tcp is None or len(robot.tcp.coordinates) != len(robot.drives):
+    if not robot.commands_tool:
         return None
     use = sample_use(robot) if use is None else use
     sensitivities = _sensitivities(calibration, use)

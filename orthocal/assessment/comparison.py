@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +15,6 @@ from orthocal.assessment.judgement import Judgement, judge_session, rank
 from orthocal.assessment.predictive import Repetition, measure_repetition
 from orthocal.assessment.recommendation import Recommendation, recommend_model
 from orthocal.assessment.scores import ModelResult, Score, Undetermined, score_model
-from orthocal.assessment.tool_error import ErrorStatistics
 from orthocal.assessment.words import comparison as words
 from orthocal.assessment.words.entries import SESSION_HEADLINES
 from orthocal.assessment.words.validation import describe_repetition
@@ -25,6 +23,7 @@ from orthocal.calibration.refit import repeat_calibration
 from orthocal.errors import NotIdentifiableError, SessionError
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem, build_problem
+from orthocal.io.documents import format_json
 from orthocal.io.fields import finite_or_none
 from orthocal.measurement.joining import Given, gather_sessions, join_sessions, require_same_robot
 from orthocal.session.session import Session
@@ -100,7 +99,7 @@ class Comparison:
             },
             "effects": None if self.effects is None else _effects_document(self.effects),
         }
-        return json.dumps(document, indent=1, allow_nan=False) + "\n"
+        return format_json(document)
 
 
 def compare_models(
@@ -145,7 +144,7 @@ def compare_models(
             r.label + (f", cycle {r.cycle}" if several_cycles else "") for r in session.readings
         ),
         noise=noise,
-        independent=results[0].spare + results[0].rank if results else 0,
+        independent=results[0].redundancy + results[0].rank if results else 0,
         results=results,
         undetermined=undetermined,
         repetition=None,
@@ -308,27 +307,21 @@ def _result_document(result: ModelResult) -> dict[str, Any]:
             **{name: finite_or_none(getattr(s, name)) for name in CRITERIA},
         }
 
-    def size(s: ErrorStatistics | None) -> dict[str, float] | None:
-        if s is None:
-            return None
-        return {"rms": s.rms, "percentile_95": s.percentile_95, "largest": s.largest}
-
-    uncertainty = None if result.tool is None else result.tool.after
+    after = None if result.tool is None else result.tool.after
+    uncertainty, cost = after and after.sizes, result.linearisation_cost
     return {
         "model": result.model,
         "n_free": result.n_free,
         "rank": result.rank,
-        "spare": result.spare,
+        "spare": result.redundancy,
         "effective_parameters": result.effective,
         "linearised": score(result.linearised),
         "exact": score(result.exact),
         "standard_deviations": {p.name: finite_or_none(p.std) for p in result.calibration.free},
-        "tool_uncertainty": size(None if uncertainty is None else uncertainty.sizes.aligned),
-        "tool_uncertainty_relative": size(
-            None if uncertainty is None else uncertainty.sizes.relative
-        ),
-        "tool_uncertainty_absolute": size(
-            None if uncertainty is None else uncertainty.sizes.absolute
-        ),
-        "linearisation_at_tool": size(result.linearisation_cost),
+        "tool_uncertainty": uncertainty
+        and uncertainty.aligned
+        and uncertainty.aligned.to_document(),
+        "tool_uncertainty_relative": uncertainty and uncertainty.relative.to_document(),
+        "tool_uncertainty_absolute": uncertainty and uncertainty.absolute.to_document(),
+        "linearisation_at_tool": cost and cost.to_document(),
     }

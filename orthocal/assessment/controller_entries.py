@@ -25,6 +25,7 @@ from orthocal.effects.compensation import Compensation, JointTrim
 from orthocal.effects.loading import robot_effects
 from orthocal.effects.screw import SCREW_COMPONENTS, Screw
 from orthocal.io.fields import read_only
+from orthocal.robot.model import Robot
 
 ALIGNED_SHARE = 1e-2
 """Ratio of aligned to absolute tool error below which the absolute error determines a combination
@@ -175,6 +176,11 @@ class ScrewEntry:
         return _screw_parameters(self.drive, self.enter)
 
 
+def find_screw_effect(robot: Robot) -> Screw | None:
+    """Effect of periodic errors of a robot; None without any."""
+    return next((e for e in robot_effects(robot) if isinstance(e, Screw)), None)
+
+
 def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
     """Periodic errors of screws to enter, by the rule for backlash; empty if there are none.
 
@@ -182,7 +188,7 @@ def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
     around 0, or outside that around the active values.
     """
     robot = calibration.robot
-    screw = next((e for e in robot_effects(robot) if isinstance(e, Screw)), None)
+    screw = find_screw_effect(robot)
     if screw is None:
         return ()
     errors, entries, determined = calibration.errors, [], []

@@ -54,7 +54,9 @@ def find_limits(problem: CalibrationProblem, noise: float) -> tuple[EffectLimits
     _, jacobian = problem.predict_and_jacobian(problem.active_theta)
     projected = project_out_zeros(jacobian, problem.observations)
     precision = np.maximum(problem.prior_precision, VAGUE)
-    variance = np.diag(Information(projected).covariance(sigma=noise, precision=precision))
+    variance = np.diag(
+        Information(projected).posterior(sigma=noise, precision=precision).covariance
+    )
     after = LIMIT * np.sqrt(variance) * problem.theta_scale
     before = LIMIT * problem.theta_scale
     limits = []

@@ -46,6 +46,7 @@ def find_fit_findings(calibration: Calibration) -> list[Finding]:
     return [
         *_redundancy(calibration),
         *_residuals(calibration),
+        *_convergence(calibration),
         *_standstill(calibration),
         *find_held(calibration),
         *_linearisation(calibration),
@@ -95,6 +96,13 @@ def _residuals(calibration: Calibration) -> list[Finding]:
     if noise.exceeds_residuals(stated):
         return [words.gauge_overstated(noise.residual_sigma, stated)]
     return [words.fits(noise.residual_sigma, STATED)]
+
+
+def _convergence(calibration: Calibration) -> list[Finding]:
+    """Finding about noise that did not converge."""
+    if calibration.solver.noise_converged:
+        return []
+    return [words.noise_not_converged(calibration.noise.sigma)]
 
 
 def _standstill(calibration: Calibration) -> list[Finding]:

@@ -15,8 +15,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from orthocal.arrays import Array
 from orthocal.assessment.calibrated_tool import find_tool
@@ -74,9 +72,9 @@ class FirmwareFit:
     """Errors with the present settings."""
     new: FirmwareError
     """Errors with the new settings."""
-    tool_unknown: float
+    tool_uncertainty: float
     """RMS uncertainty of the tool error after the calibration, [m]."""
-    layer_unknown: float
+    layer_uncertainty: float
     """RMS uncertainty of the heights of the first layer, [m]."""
     rows: tuple[SettingRow, ...]
     """Settings one by one: radius, rods, towers, endstops."""
@@ -86,11 +84,11 @@ class FirmwareFit:
 
     def expect_tool(self, error: FirmwareError) -> float:
         """Expected tool error with the uncertainty of the calibration, RMS, [m]."""
-        return math.hypot(error.tool_rms, self.tool_unknown)
+        return math.hypot(error.tool_rms, self.tool_uncertainty)
 
     def expect_layer(self, error: FirmwareError) -> float:
         """Expected height error of the first layer with its uncertainty, RMS, [m]."""
-        return math.hypot(error.layer_rms, self.layer_unknown)
+        return math.hypot(error.layer_rms, self.layer_uncertainty)
 
     @property
     def worth_entering(self) -> bool:
@@ -154,39 +152,41 @@ def fit_firmware(
     Raises:
         ExportError: If the session states no settings, or the machine does not reach the workspace.
     """
+    from scipy.optimize import least_squares
+
     present = calibration.session.firmware
     if present is None:
         raise ExportError(
             "the session states no settings of a firmware (controller.firmware); "
             "`orthocal import LOG DIRECTORY` makes a session with them"
         )
-    bed = _bed_of(calibration)
-    targets, layer_unknown = _find_targets(calibration, bed)
-    start, unknowns = _start(present, firmware), _unknowns(firmware)
+    bed = _find_bed(calibration)
+    targets, layer_uncertainty = _find_targets(calibration, bed)
+    start, columns = _initial_settings(present, firmware), _unknown_columns(firmware)
     solution = least_squares(
-        lambda y: _residuals(targets, start, unknowns @ y),
-        np.zeros(unknowns.shape[1]),
-        x_scale=(UNKNOWN_SCALES @ unknowns) / unknowns.sum(axis=0),
+        lambda y: _residuals(targets, start, columns @ y),
+        np.zeros(columns.shape[1]),
+        x_scale=(UNKNOWN_SCALES @ columns) / columns.sum(axis=0),
         method="lm",
     )
-    settings = _changed(start, unknowns @ solution.x)
+    settings = _apply_changes(start, columns @ solution.x)
     if tool is None and calibration.assessment is not None:
         tool = calibration.assessment.tool
     homed_change = np.array(settings.homed) - present.homed
     gain = _setting_gain(targets, settings, solution.jac, homed_change)
     return FirmwareFit(
         settings=settings,
-        now=_measure(targets, present, np.zeros(3)),
-        new=_measure(targets, settings, homed_change),
-        tool_unknown=math.nan if tool is None else tool.compensated,
-        layer_unknown=layer_unknown,
+        now=_evaluate(targets, present, np.zeros(3)),
+        new=_evaluate(targets, settings, homed_change),
+        tool_uncertainty=math.nan if tool is None else tool.compensated,
+        layer_uncertainty=layer_uncertainty,
         rows=_setting_rows(calibration, settings, gain),
         gain=gain,
     )
 
 
-def _start(present: DeltaSettings, firmware: FirmwareName) -> DeltaSettings:
-    """Present settings, as a firmware can have them."""
+def _initial_settings(present: DeltaSettings, firmware: FirmwareName) -> DeltaSettings:
+    """Present settings without what the firmware lacks: different rods, tilts."""
     rod = float(np.mean(present.rods))
     return replace(
         present,
@@ -196,15 +196,18 @@ def _start(present: DeltaSettings, firmware: FirmwareName) -> DeltaSettings:
     )
 
 
-def _unknowns(firmware: FirmwareName) -> Array:
-    """Settings that each unknown of the fit changes, as in `_changed`, shape (14, n), [1]."""
-    unknowns = np.eye(len(UNKNOWN_SCALES))
+def _unknown_columns(firmware: FirmwareName) -> Array:
+    """Change of the settings (in the order of `_apply_changes`) per unknown, shape (14, n), [1].
+
+    A firmware without tilts, or with one length for all rods, has fewer unknowns.
+    """
+    columns = np.eye(len(UNKNOWN_SCALES))
     if not FIRMWARES[firmware].tilts:
-        unknowns = unknowns[:, :-2]
+        columns = columns[:, :-2]
     if FIRMWARES[firmware].equal_rods:
-        common = unknowns[:, 3:6].sum(axis=1, keepdims=True)
-        unknowns = np.concatenate([unknowns[:, :3], common, unknowns[:, 6:]], axis=1)
-    return unknowns
+        common = columns[:, 3:6].sum(axis=1, keepdims=True)
+        columns = np.concatenate([columns[:, :3], common, columns[:, 6:]], axis=1)
+    return columns
 
 
 def _differentiate(settings: DeltaSettings, carriages: Array) -> Array:
@@ -241,7 +244,7 @@ def _setting_gain(
     change = np.sqrt(targets.weights)[:, None, None] * computed
     layer = math.sqrt(FIRST_LAYER / len(targets.layer_points)) * layer[:, 2]
     change = np.concatenate([change.reshape(-1, n), layer])
-    gain = _unknowns(settings.firmware) @ np.linalg.lstsq(jacobian, change, rcond=None)[0]
+    gain = _unknown_columns(settings.firmware) @ np.linalg.lstsq(jacobian, change, rcond=None)[0]
     rods = np.array(settings.rods)[:, None] * gain[3:6] - settings.radius * gain[:1]
     endstops = gain[6:9] - rods / (settings.middle - settings.shift)[:, None]
     fixed = np.zeros((1, n))
@@ -264,17 +267,17 @@ def _setting_rows(
         stds = propagate_stds(gain, restore_covariances(calibration))
         uncertainties = calibration.expand(*stds)
     values = [("radius", present.radius / MM, settings.radius / MM, MM, "mm")]
-    for field, label, size, unit in (
+    for field, label, scale, unit in (
         ("rods", "rod", MM, "mm"),
         ("angles", "direction of tower", DEG, "°"),
         ("endstops", "endstop", MM, "mm"),
     ):
         for k, tower in enumerate("abc"):
-            now, new = (getattr(s, field)[k] / size for s in (present, settings))
-            values.append((f"{label} {tower}", float(now), float(new), size, unit))
+            now, new = (getattr(s, field)[k] / scale for s in (present, settings))
+            values.append((f"{label} {tower}", float(now), float(new), scale, unit))
     return tuple(
-        SettingRow(name, now, new, float(u) / size, unit)
-        for (name, now, new, size, unit), u in zip(values, uncertainties.tolist(), strict=True)
+        SettingRow(name, now, new, float(u) / scale, unit)
+        for (name, now, new, scale, unit), u in zip(values, uncertainties.tolist(), strict=True)
     )
 
 
@@ -293,7 +296,7 @@ def _find_targets(calibration: Calibration, bed: str) -> tuple[_Targets, float]:
         raise ExportError("the machine does not reach a workspace")
     limits = tool.workspace.limits
     space = box_workspace(robot, limits)
-    layer = _disc(limits)
+    layer = _layer_points(limits)
     offsets = calibration.active_offsets
     try:
         carriages, layer_carriages = (
@@ -302,7 +305,7 @@ def _find_targets(calibration: Calibration, bed: str) -> tuple[_Targets, float]:
         accuracy = assess_tool(calibration, Workspace.even(layer))
     except ClosureError as e:
         raise ExportError(f"the calibrated machine does not reach the bed: {e}") from None
-    layer_unknown, turn = math.nan, _bed_turn(calibration, bed)
+    layer_uncertainty, rotation_derivative = math.nan, _bed_rotation_derivative(calibration, bed)
     to_errors, to_drives = (
         ToolSensitivity(robot, free=names, values=calibration.errors)
         for names in (
@@ -311,17 +314,29 @@ def _find_targets(calibration: Calibration, bed: str) -> tuple[_Targets, float]:
         )
     )
     jacobians = [
-        np.concatenate([tilt.T @ to_errors(c), -np.einsum("ijk,nj->nik", turn, p)], axis=2)
+        np.concatenate(
+            [tilt.T @ to_errors(c), -np.einsum("ijk,nj->nik", rotation_derivative, p)], axis=2
+        )
         for p, c in ((space.points, carriages), (layer, layer_carriages))
     ]
     by_drives = [tilt.T @ to_drives(c) for c in (carriages, layer_carriages)]
     if accuracy.after is not None:
-        layer_unknown = math.sqrt(float(accuracy.after.aligned_covariance[:, 2, 2].mean()))
-    points = space.points, space.weights, carriages, layer, layer_carriages
-    return _Targets(*points, *jacobians, *by_drives), layer_unknown
+        layer_uncertainty = math.sqrt(float(accuracy.after.aligned_covariance[:, 2, 2].mean()))
+    targets = _Targets(
+        points=space.points,
+        weights=space.weights,
+        carriages=carriages,
+        layer_points=layer,
+        layer_carriages=layer_carriages,
+        jacobian=jacobians[0],
+        layer_jacobian=jacobians[1],
+        by_drives=by_drives[0],
+        layer_by_drives=by_drives[1],
+    )
+    return targets, layer_uncertainty
 
 
-def _bed_of(calibration: Calibration) -> str:
+def _find_bed(calibration: Calibration) -> str:
     """Name of the last setup that measured the bed with a probe.
 
     Raises:
@@ -335,25 +350,27 @@ def _bed_of(calibration: Calibration) -> str:
 
 def _bed_tilt(calibration: Calibration, bed: str) -> Array:
     """Rotation from the axes of the bed to those of the machine, shape (3, 3)."""
+    from scipy.spatial.transform import Rotation
+
     values = {p.name: p.value for p in calibration.sensors}
     yaw, roll = (values.get(f"setup.{bed}.{k}", 0.0) for k in ("yaw", "roll"))
     return np.asarray(Rotation.from_euler("xy", [roll, yaw]).as_matrix())
 
 
-def _bed_turn(calibration: Calibration, bed: str) -> Array:
+def _bed_rotation_derivative(calibration: Calibration, bed: str) -> Array:
     """Derivative of the bed's rotation with respect to nuisance parameters, (3, 3, n), [1/rad].
 
     Element i, j, k: change of coordinate i of a point per unit of coordinate j and parameter k.
     """
-    turn = np.zeros((3, 3, len(calibration.sensors)))
+    derivative = np.zeros((3, 3, len(calibration.sensors)))
     axes = {f"setup.{bed}.roll": [1.0, 0.0, 0.0], f"setup.{bed}.yaw": [0.0, 1.0, 0.0]}
     for k, parameter in enumerate(calibration.sensors):
         if parameter.name in axes:
-            turn[:, :, k] = np.cross(axes[parameter.name], np.eye(3)).T
-    return turn
+            derivative[:, :, k] = np.cross(axes[parameter.name], np.eye(3)).T
+    return derivative
 
 
-def _disc(limits: Array) -> Array:
+def _layer_points(limits: Array) -> Array:
     """Points of equal areas within the circle around the workspace on the bed, (M, 3), [m]."""
     middle, half = limits[:2].mean(axis=1), 0.5 * (limits[:2, 1] - limits[:2, 0])
     points = [np.zeros(2)]
@@ -364,10 +381,10 @@ def _disc(limits: Array) -> Array:
     return np.column_stack([xy, np.full(len(xy), limits[2, 0])])
 
 
-def _changed(settings: DeltaSettings, x: Array) -> DeltaSettings:
+def _apply_changes(settings: DeltaSettings, x: Array) -> DeltaSettings:
     """Settings with changes of radius, angles a and b, rods, homed carriages and tilts.
 
-    Tower c keeps its angle: it fixes the axes of the print.
+    The angle of tower c is unchanged, because it defines the axes of the print.
     """
     rods, homed = np.array(settings.rods) + x[3:6], np.array(settings.homed) + x[6:9]
     a, b, c = settings.angles
@@ -389,7 +406,9 @@ def _residuals(targets: _Targets, present: DeltaSettings, x: Array) -> Array:
         present: Present settings.
         x: Changes of the settings, then rotation x[9] and translation x[10:12].
     """
-    settings = _changed(present, x)
+    from scipy.spatial.transform import Rotation
+
+    settings = _apply_changes(present, x)
     change = np.array(settings.homed) - present.homed
     aligned = targets.points @ Rotation.from_euler("z", x[9]).as_matrix().T
     aligned[:, :2] += x[10:12]
@@ -399,16 +418,20 @@ def _residuals(targets: _Targets, present: DeltaSettings, x: Array) -> Array:
     return np.concatenate([weighted.ravel(), math.sqrt(FIRST_LAYER / len(heights)) * heights])
 
 
-def _measure(targets: _Targets, settings: DeltaSettings, change: Array) -> FirmwareError:
-    """Errors of settings with homed carriages changed by `change`, shape (3,), [m]."""
+def _evaluate(targets: _Targets, settings: DeltaSettings, change: Array) -> FirmwareError:
+    """Errors of settings with homed carriages changed by `change`, shape (3,), [m].
+
+    The best translation in x and y and rotation about z are removed from the tool errors.
+    """
     error = settings.forward(targets.carriages + change) - targets.points
-    motions = np.zeros((len(error), 3, 3))
-    motions[:, 0, 0] = motions[:, 1, 1] = 1.0
-    motions[:, 0, 2], motions[:, 1, 2] = -targets.points[:, 1], targets.points[:, 0]
+    by_alignment = np.zeros((len(error), 3, 3))  # with respect to x, y and the rotation
+    by_alignment[:, 0, 0] = by_alignment[:, 1, 1] = 1.0
+    by_alignment[:, 0, 2] = -targets.points[:, 1]
+    by_alignment[:, 1, 2] = targets.points[:, 0]
     root = np.sqrt(np.repeat(targets.weights, 3))[:, None]
-    columns, flat = motions.reshape(-1, 3), error.reshape(-1, 1)
-    motion = np.linalg.lstsq(root * columns, root * flat, rcond=None)[0]
-    lengths = np.linalg.norm((flat - columns @ motion).reshape(-1, 3), axis=1)
+    columns, flat = by_alignment.reshape(-1, 3), error.reshape(-1, 1)
+    alignment = np.linalg.lstsq(root * columns, root * flat, rcond=None)[0]
+    lengths = np.linalg.norm((flat - columns @ alignment).reshape(-1, 3), axis=1)
     heights = settings.forward(targets.layer_carriages + change)[:, 2] - targets.layer_points[:, 2]
     return FirmwareError(
         tool_rms=math.sqrt(float(targets.weights @ lengths**2)),

@@ -45,8 +45,8 @@ class Score:
     bic: float
     """n ln(Σ r²/n) + k ln n; infinite without degrees of freedom."""
     unseen: Array
-    """Cross-validation errors: the rows of each setup, predicted from all others, shape (n_rows,),
-    [m]; NaN if the others do not determine the model."""
+    """Cross-validation errors of the rows of each setup, predicted from all other setups, shape
+    (n_rows,), [m]; NaN if these do not determine the model."""
 
     @property
     def unseen_rms(self) -> float:
@@ -63,16 +63,15 @@ class ModelResult:
     n_free: int
     rank: int
     """Number of combinations of its parameters that readings without noise would determine."""
-    spare: int
+    redundancy: int
     """Independent readings minus the rank: number of checks of the model. Repeated readings count
     once."""
     effective: float
-    """Effective number of parameters that the readings determine."""
+    """Effective number of parameters."""
     prior: bool
     """True if the tolerances are used as a prior."""
     by_choice: bool
-    """True if the prior is used, or not used, by choice; False if it is used because readings do
-    not determine the model."""
+    """False if the prior is used only because the readings do not determine the model."""
     linearised: Score
     exact: Score
     calibration: Calibration
@@ -115,13 +114,13 @@ def score_model(
     linearisation = fit.linearisation
     rank = assume_others_known(linearisation.information, problem.n_machine).rank
     calibration = assemble_calibration(fit)
-    tool = _assess(calibration)
+    tool = _assess_tool(calibration)
     return ModelResult(
         model=problem.selection.label,
         n_free=problem.n_machine,
         rank=rank,
-        spare=fit.independent_readings - rank,
-        effective=_effective(fit),
+        redundancy=fit.independent_readings - rank,
+        effective=_effective_parameters(fit),
         prior=bool(problem.machine_selection.prior.any()),
         by_choice=by_choice,
         linearised=_score(fit, linearisation, "linearised", noise),
@@ -132,7 +131,7 @@ def score_model(
     )
 
 
-def _assess(calibration: Calibration) -> ToolAccuracy | None:
+def _assess_tool(calibration: Calibration) -> ToolAccuracy | None:
     """Tool errors; None if they cannot be computed."""
     try:
         return assess_tool(calibration)
@@ -140,11 +139,11 @@ def _assess(calibration: Calibration) -> ToolAccuracy | None:
         return None
 
 
-def _effective(fit: Fit) -> float:
+def _effective_parameters(fit: Fit) -> float:
     """Effective number of parameters of a fit."""
-    return fit.information.effective_parameters(
+    return fit.information.posterior(
         sigma=fit.sigma, precision=fit.problem.prior_precision
-    )
+    ).effective_parameters
 
 
 def _score(fit: Fit, linearisation: LinearProblem, method: Method, noise: float) -> Score:
@@ -153,9 +152,9 @@ def _score(fit: Fit, linearisation: LinearProblem, method: Method, noise: float)
     theta = fit.linearised_theta if method == "linearised" else fit.solution.theta
     try:
         residual = project_out_zeros(problem.values - problem.predict(theta), observations)
-    except ClosureError:  # the linearised machine cannot be assembled
+    except ClosureError:  # the linearised machine cannot reach a posture
         residual = np.full(observations.size, np.nan)
-    count, effective = observations.size - observations.n_zeros, _effective(fit)
+    count, effective = observations.size - observations.n_zeros, _effective_parameters(fit)
     sum_of_squares = float(residual @ residual)
     rows = observations.rows(residual)
     k = effective + 1.0  # with the noise
@@ -174,12 +173,12 @@ def _score(fit: Fit, linearisation: LinearProblem, method: Method, noise: float)
         if denominator > 0.0
         else math.inf,
         bic=misfit + k * math.log(count) if count - effective >= 0.5 else math.inf,
-        unseen=_predict_unseen(fit, linearisation, method),
+        unseen=_cross_validate(fit, linearisation, method),
     )
 
 
-def _predict_unseen(fit: Fit, linearisation: LinearProblem, method: Method) -> Array:
-    """Errors of the rows of each setup, predicted from all others, shape (n_rows,), [m]."""
+def _cross_validate(fit: Fit, linearisation: LinearProblem, method: Method) -> Array:
+    """Cross-validation errors as in `Score.unseen`."""
     problem, observations = fit.problem, fit.problem.observations
     errors = np.full(observations.plus.size, np.nan)
     setups = np.unique(observations.setup)

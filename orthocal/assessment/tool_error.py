@@ -76,6 +76,10 @@ class ErrorStatistics:
         """95 % quantile of the errors over all points."""
         return self.find_percentile()
 
+    def to_document(self) -> dict[str, float]:
+        """Plain data for JSON, [m]."""
+        return {"rms": self.rms, "percentile_95": self.percentile_95, "largest": self.largest}
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolErrorStatistics:

@@ -8,7 +8,6 @@ calibration. Then the values to enter come from a joint calibration of all sessi
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -47,6 +46,7 @@ from orthocal.errors import SessionError
 from orthocal.estimation.fit import Fit
 from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomalies, Anomaly
 from orthocal.hypotheses.search import find_anomalies
+from orthocal.io.documents import format_json
 from orthocal.io.fields import finite_or_none
 from orthocal.measurement.joining import (
     Given,
@@ -161,7 +161,7 @@ class Validation:
             "enter": [{"drive": e.drive, "unit": e.unit, "value": e.enter} for e in self.enter],
             **self.repetition.to_document(),
         }
-        return json.dumps(document, indent=1, allow_nan=False) + "\n"
+        return format_json(document)
 
 
 def _mistake_document(mistake: Anomaly) -> dict[str, Any]:

@@ -44,8 +44,8 @@ def reject(kind: FindingKind, text: str, action: str = "", /, **numbers: float) 
     return Finding(kind, "reject", text, action, numbers)
 
 
-def named(*names: str) -> tuple[Place, ...]:
-    """Places of a finding that are parameters or drives."""
+def parameter_places(*names: str) -> tuple[Place, ...]:
+    """Places of a finding for the names of parameters or drives."""
     return tuple(Place(parameter=name) for name in names)
 
 
@@ -90,12 +90,6 @@ def times(ratio: float) -> str:
 def joined(names: Sequence[str], word: str = "and") -> str:
     """Names as a list in a sentence, such as "a, b and c"."""
     return f" {word} ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
-
-
-def count_of(value: int) -> str:
-    """Number, below ten as a word."""
-    words = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
-    return words[value] if 0 <= value < len(words) else str(value)
 
 
 def tool_mm(value: float) -> str:

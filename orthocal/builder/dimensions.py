@@ -158,11 +158,6 @@ class Dimensions(ABC):
         return ""
 
     @classmethod
-    def find_key(cls, key: str) -> Dimension | None:
-        """Dimension of a key of machine.yaml."""
-        return next((d for d in cls.keys if d.key == key), None)
-
-    @classmethod
     def of_keys(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """Fields of the dimensions, [m, rad], from keys of machine.yaml."""
         return {

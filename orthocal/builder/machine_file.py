@@ -11,16 +11,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, Field, create_model
 
+from orthocal.builder.biglide import Biglide
 from orthocal.builder.dimensions import Dimension, Dimensions, box_text, in_mm
-from orthocal.builder.kinds import KINDS, USUAL
+from orthocal.builder.linear_delta import LinearDelta
+from orthocal.builder.orthoglide import InclinedOrthoglide, Orthoglide
 from orthocal.errors import RobotError
-from orthocal.io.documents import Number, read_yaml, validate
+from orthocal.io.documents import Keys, Number, read_yaml, validate
 from orthocal.robot.description import WorkspaceBox
 from orthocal.units import MM
 
 MACHINE = "machine.yaml"
+
+KINDS: dict[str, type[Dimensions]] = {
+    k.kind: k for k in (Orthoglide, InclinedOrthoglide, LinearDelta, Biglide)
+}
+"""Name in machine.yaml and on the command line, to the class of dimensions."""
+
+USUAL = Orthoglide.kind
+"""Default kind."""
 
 MAX_COORDINATE = 100.0
 """Largest coordinate of a controller's joint in the mechanical zero, [m]."""
@@ -51,13 +61,7 @@ def find_counting_problem(counting: Sequence[Counting], count: int) -> str | Non
     return None
 
 
-class _Keys(BaseModel):
-    """Base of keys that refuses unknown ones."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
-
-
-class CountingKeys(_Keys):
+class CountingKeys(Keys):
     """Keys of a controller's joint."""
 
     counts: Literal["up", "down"] = "up"
@@ -102,14 +106,14 @@ def _keys_of(kind: type[Dimensions]) -> type[BaseModel]:
     joints: dict[str, Any] = {d: (CountingKeys, CountingKeys()) for d in kind.drives_of()}
     count = len(kind.coordinates)
     box = Annotated[WorkspaceBox, Field(min_length=count, max_length=count)]
-    joints_keys = create_model("JointsKeys", __base__=_Keys, **joints)
+    joints_keys = create_model("JointsKeys", __base__=Keys, **joints)
     fields: dict[str, Any] = {
         "kind": (str, USUAL),
         **{d.key: (_type_of(d), ...) for d in kind.keys},
         "workspace_mm": (box | None, None),
         "joints": (joints_keys, joints_keys()),
     }
-    return create_model("MachineKeys", __base__=_Keys, **fields)
+    return create_model("MachineKeys", __base__=Keys, **fields)
 
 
 def _type_of(dimension: Dimension) -> Any:  # noqa: ANN401 - a type

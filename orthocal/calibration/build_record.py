@@ -152,6 +152,7 @@ def _solver_record(fit: Fit) -> SolverRecord:
         hessian=fit.solution.hessian,
         loss=fit.loss.kind,
         loss_width=fit.loss.width,
+        noise_converged=fit.noise_converged,
     )
 
 

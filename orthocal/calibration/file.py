@@ -6,7 +6,6 @@ record, for use without orthocal. Loading recomputes and compares them.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
@@ -19,7 +18,7 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.recorded_robot import load_recorded_robot, require_consistent
 from orthocal.calibration.records import CalibrationRecord
 from orthocal.errors import CalibrationFileError, SolverError
-from orthocal.io.documents import read_json, validate, write_plain
+from orthocal.io.documents import format_json, read_json, validate, write_plain
 from orthocal.io.fields import finite_or_none
 from orthocal.io.files import exists, is_folder, write_file
 from orthocal.robot.model import Robot
@@ -80,7 +79,7 @@ def calibration_json(calibration: Calibration) -> str:
     """
     document = calibration_document(calibration)
     _require_loadable(document, calibration)
-    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+    return format_json(document)
 
 
 def write_calibration(calibration: Calibration, path: str | Path) -> Path:

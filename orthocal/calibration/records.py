@@ -118,7 +118,7 @@ class SessionRecord:
     seed: Count | None
     """Seed of simulated readings; None for measured readings."""
     compensation: Many[JointTrim] = ()
-    """Compensation of the controller for each drive; empty without any."""
+    """Compensation of the controller for each drive; empty if there is none."""
     firmware: DeltaSettings | None = None
     """Settings of the firmware of a delta printer."""
     adjusted: Many[tuple[str, Number]] = ()
@@ -136,16 +136,18 @@ class SolverRecord:
     name: SolverKind
     status: str
     iterations: Count
-    """Iterations of all solutions until σ converged."""
+    """Iterations of all solutions."""
     seconds_build: Number
     """Time for building the functions and the program, [s]."""
     seconds_solve: Number
-    """Time for all solutions until σ converged, [s]."""
+    """Time of all solutions, [s]."""
     hessian: str
     loss: LossKind
     """Loss function: squares or pseudo-Huber."""
     loss_width: PositiveInSI
     """Residual at which the loss changes from square to linear, [standard deviations]."""
+    noise_converged: bool = True
+    """True if the noise of a reading agrees with that of the previous solution."""
 
     @property
     def shows_linearisation_error(self) -> bool:
@@ -182,7 +184,7 @@ class ParameterEstimate(InUnit):
     identifiable: bool
     """True if the readings alone determine it better than its prior."""
     start: Number
-    """Active value in the controller, the point of linearisation, [unit]."""
+    """Value at which the readings were linearised: the active one in the controller, [unit]."""
     prior: bool
     """True if its prior was used."""
     mean: Number
@@ -192,9 +194,10 @@ class ParameterEstimate(InUnit):
     upper: Number | None
     """Upper bound, [unit]."""
     at_bound: Literal["lower", "upper"] | None
-    """Active bound, at which the parameter is fixed with the standard deviation 0; None without."""
+    """Bound that holds the estimate, so that its standard deviation is 0; None if no bound does."""
     interval: tuple[Number, Number] | None
-    """Profile-likelihood interval with the coverage of ±, [unit]; None if not requested."""
+    """Profile-likelihood interval for the probability of the expanded uncertainty, [unit]; None if
+    it was not requested."""
 
     @property
     def data_share(self) -> float:
@@ -302,7 +305,8 @@ class CalibrationRecord:
     """Noise of one reading of the first gauge."""
     rows_are_differences: bool
     critical: SizeOrInf
-    """Limit of studentised residuals for outliers; infinite if the noise is unknown."""
+    """Critical value: rows with a larger absolute studentised residual are outliers. Infinite if
+    the noise is unknown."""
     residuals: Annotated[Many[ResidualRow], Field(min_length=1)]
     postures: Many[PostureRecord]
     setups: Many[SetupRecord]

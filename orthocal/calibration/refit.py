@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -89,21 +88,16 @@ def restore_covariances(calibration: Calibration) -> tuple[Array, Array, Array]:
     if not math.isfinite(calibration.noise.sigma):
         unknown = np.full_like(scale, np.nan)
         return unknown, unknown, unknown
-    information = _recorded_information(calibration, problem)
-    covariances = (
-        compute(
-            sigma=max(calibration.noise.sigma, SMALLEST_SIGMA),
-            precision=problem.prior_precision,
-            at_bound=_at_bound(calibration),
-        )
-        for compute in (
-            information.covariance,
-            information.noise_covariance,
-            partial(information.prior_covariance, priors=problem.selection.scaled),
-        )
+    posterior = _recorded_information(calibration, problem).posterior(
+        sigma=max(calibration.noise.sigma, SMALLEST_SIGMA),
+        precision=problem.prior_precision,
+        at_bound=_at_bound(calibration),
     )
-    covariance, noise_covariance, scaled_covariance = (np.asarray(scale * c) for c in covariances)
-    return covariance, noise_covariance, scaled_covariance
+    return (
+        scale * posterior.covariance,
+        scale * posterior.noise_covariance,
+        scale * posterior.prior_covariance(problem.selection.scaled),
+    )
 
 
 def _recorded_problem(calibration: Calibration) -> CalibrationProblem:

@@ -116,7 +116,7 @@ def calibrate(
         loss=orthocal.Loss(loss),  # type: ignore[arg-type] # checked by Loss
     )
     judgement = orthocal.judge_session(session)
-    with judgement_on_failure(session, judgement, json=json):
+    with judgement_on_failure(session, judgement, json=json, details=details):
         result = orthocal.calibrate(
             session,
             chosen,

@@ -45,7 +45,7 @@ def compare(
     others = load_each_once(repeat, effects=chosen, tolerance=tolerance) if repeat else None
     session = orthocal.join_sessions(loaded)
     judgement = orthocal.judge_session(session)
-    with judgement_on_failure(session, judgement, json=json):
+    with judgement_on_failure(session, judgement, json=json, details=details):
         comparison = orthocal.compare_models(
             loaded,
             models=split_globs([models] if models else None),

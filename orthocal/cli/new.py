@@ -14,12 +14,12 @@ import typer
 import orthocal
 from orthocal.cli.options import (
     ControllerOptions,
-    Day,
     Force,
     Gauge,
     Hours,
     Model,
     Owned,
+    TemperatureRange,
     Tolerances,
     WorkspaceMm,
     command,
@@ -130,7 +130,7 @@ class DimensionOptions:
         Raises:
             ParameterError: If there is no such kind.
         """
-        from orthocal.builder.kinds import KINDS, USUAL
+        from orthocal.builder.machine_file import KINDS, USUAL
 
         kind = KINDS.get(self.kind or USUAL)
         if kind is None:
@@ -157,7 +157,7 @@ class FirstPlanOptions:
     with_: Owned = None
     model: Model = None
     effects: str = EFFECTS
-    temperature: Day = None
+    temperature: TemperatureRange = None
     tolerance: Tolerances = None
 
 

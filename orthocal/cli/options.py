@@ -189,7 +189,7 @@ Effects = Annotated[
         "session states, else those of the robot.",
     ),
 ]
-Day = Annotated[
+TemperatureRange = Annotated[
     str | None,
     Option(
         "--temperature",

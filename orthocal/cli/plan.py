@@ -11,7 +11,6 @@ from typer import Option
 import orthocal
 from orthocal.cli.options import (
     ControllerOptions,
-    Day,
     Details,
     Effects,
     Force,
@@ -23,6 +22,7 @@ from orthocal.cli.options import (
     Owned,
     Positive,
     Seed,
+    TemperatureRange,
     Tolerances,
     Workers,
     WorkspaceMm,
@@ -88,7 +88,7 @@ class PlanOptions:
     workspace_mm: WorkspaceMm = None
     criterion: str = "aligned"
     effects: Effects = None
-    temperature: Day = None
+    temperature: TemperatureRange = None
     tolerance: Tolerances = None
     starts: Annotated[int | None, Option(min=1, max=100)] = None
     seed: Seed = 0

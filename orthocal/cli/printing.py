@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -94,15 +95,24 @@ def deliver_judged(
 
 @contextmanager
 def judgement_on_failure(
-    session: orthocal.Session, judgement: orthocal.Judgement | None = None, *, json: bool
+    session: orthocal.Session,
+    judgement: orthocal.Judgement | None = None,
+    *,
+    json: bool,
+    details: bool,
 ) -> Iterator[None]:
     """Print the judgement of the readings instead of a failure of the solver, if it explains it.
+
+    The failure is a finding of the printed assessment.
 
     Args:
         session: The readings.
         judgement: Their judgement, if it was made before.
         json: Whether to print JSON instead of text.
+        details: Whether to list the evidence for each finding.
     """
+    from orthocal.assessment.words.fit import no_solution
+
     try:
         yield
     except (SolverError, ClosureError) as failure:
@@ -112,8 +122,8 @@ def judgement_on_failure(
             raise failure from None
         if not assessment.decision.exit_code:
             raise
-        put_note(f"orthocal: {failure}")
-        deliver_judged(assessment, json=json)
+        findings = (*assessment.findings, no_solution())
+        deliver_judged(replace(assessment, findings=findings), json=json, details=details)
 
 
 def write_results(directory: Path, files: Mapping[str, Content]) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import orthocal
 from orthocal.cli.files import state_conditions
 from orthocal.cli.options import (
-    Day,
     Error,
     Errors,
     Force,
     OutDirectory,
     PlanPath,
     Seed,
+    TemperatureRange,
     Tolerances,
     command,
     read_temperatures,
@@ -32,7 +32,7 @@ def simulate(
     errors: Errors = None,
     draw: str | None = None,
     effects: str | None = None,
-    temperature: Day = None,
+    temperature: TemperatureRange = None,
     tolerance: Tolerances = None,
     exact: bool = False,
     seed: Seed = 0,

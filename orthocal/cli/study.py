@@ -17,7 +17,6 @@ from orthocal.cli.files import state_conditions
 from orthocal.cli.options import (
     LARGEST_MM,
     AllRows,
-    Day,
     Error,
     Errors,
     Force,
@@ -29,6 +28,7 @@ from orthocal.cli.options import (
     PlanPath,
     Seed,
     SessionPath,
+    TemperatureRange,
     Tolerances,
     Workers,
     app,
@@ -102,7 +102,7 @@ def accuracy(
     errors: Errors = None,
     effects: str | None = None,
     ignore: str | None = None,
-    temperature: Day = None,
+    temperature: TemperatureRange = None,
     tolerance: Tolerances = None,
     half_side_mm: HalfSideMm = None,
     seed: Seed = 0,
@@ -117,8 +117,8 @@ def accuracy(
         draw (MODEL|PATTERNS): Errors that are random, by their tolerances; default: all.
         effects (EFFECTS): Effects that the machines have, such as backlash,thermal, or none;
             default: those of the plan.
-        ignore (EFFECTS): Those of them that the calibration ignores; the answer says what that
-            costs.
+        ignore (EFFECTS): Effects of the machines that the calibration ignores; the answer states
+            the increase of the tool error.
     """
     from orthocal.observation.simulate import collect_errors
 
@@ -214,9 +214,9 @@ def linearisation(
         largest_mm (SIZE): Largest size of the errors, mm or mrad.
         sizes (N): Number of sizes, from 0.1 mm on.
         directions (N): Number of random directions of the errors.
-        along (A,B,...): One direction instead, such as 1,-0.6,0.3.
+        along (A,B,...): One direction in place of random ones, such as 1,-0.6,0.3.
         max_mm (MM): Displacement of the paper's maximum postures; default: 60 mm, scaled with legs.
-        min_mm (MM): Displacement of its minimum postures; default: -100 mm, scaled with legs.
+        min_mm (MM): Displacement of the minimum postures; default: -100 mm, scaled with legs.
         sigma_mm (MM): Standard deviation of a reading, mm; default: 0.02, as in the paper.
         resolution_mm (MM): Resolution of a reading, mm; default: 0.01, as in the paper.
     """
@@ -227,7 +227,7 @@ def linearisation(
     for name, value in (("--sigma-mm", sigma_mm), ("--resolution-mm", resolution_mm)):
         if value is not None:
             require_between(value, 0.0, 1e3, name)
-    with _source(subject, leg_mm) as (session, robot):
+    with _read_subject(subject, leg_mm) as (session, robot):
         gauge = PAPER_GAUGE if session is None else session.gauge
         study = orthocal.build_linearisation_study(
             session or robot,
@@ -279,7 +279,7 @@ def sensitivity(
         free (MODEL|GLOBS): Errors; default: all that change a reading or the tool.
         at (X,Y,Z): Tool position, mm, at which every setup is read. Can be repeated.
     """
-    with _source(subject, leg_mm) as (session, robot):
+    with _read_subject(subject, leg_mm) as (session, robot):
         count = 0 if robot.tcp is None else len(robot.tcp.coordinates)
         points = []
         for text in at or []:
@@ -399,10 +399,10 @@ def _duration(seconds: float) -> str:
 
 
 @contextmanager
-def _source(
+def _read_subject(
     subject: str, leg_mm: float | None
 ) -> Iterator[tuple[orthocal.Session | None, orthocal.Robot]]:
-    """Session to study, or None, and the robot, with the stated leg length.
+    """Session to study (None for a robot alone) and its robot, with the stated leg length.
 
     Args:
         subject: Name or path of a robot or a session.

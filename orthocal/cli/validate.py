@@ -38,6 +38,6 @@ def validate(
     before = orthocal.load_calibration(calibration)
     loaded = load_each_once(sessions, tolerance=tolerance)
     tolerances = read_tolerances(tolerance, before.robot)
-    with judgement_on_failure(orthocal.join_sessions(loaded), json=json):
+    with judgement_on_failure(orthocal.join_sessions(loaded), json=json, details=details):
         validation = orthocal.validate_calibration(before, loaded, tolerances=tolerances)
     deliver_judged(validation, json=json, details=details, all_rows=all_rows)

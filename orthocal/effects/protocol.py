@@ -19,9 +19,9 @@ from typing import Any, ClassVar, Literal, Self
 
 import casadi as ca
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from orthocal.arrays import Array
+from orthocal.io.documents import Keys
 from orthocal.robot.frames import Placement as Placement
 from orthocal.robot.model import Robot
 from orthocal.robot.parameters import ElementaryError
@@ -73,10 +73,8 @@ def condition_size(robot: Robot, name: Condition) -> int:
     return sizes.get(name, 1)
 
 
-class EffectKeys(BaseModel):
+class EffectKeys(Keys):
     """Keys of an effect in the robot's YAML, under `orthocal.effects.<name>`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class Effect:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,6 +28,7 @@ from orthocal.estimation.weighting import (
 )
 from orthocal.statistics.information import (
     Information,
+    Posterior,
     assume_others_known,
     decompose,
     marginalise,
@@ -42,8 +42,8 @@ SIGMA_TOLERANCE = 0.03
 than a twentieth of its standard deviation."""
 
 MAX_SIGMA_ROUNDS = 8
-"""Largest number of solutions until sigma and the noise ratios converge. The last solution is
-returned if they do not, as when sigma alternates between cycles and residuals."""
+"""Largest number of solutions until sigma and the noise ratios converge. Otherwise, as when sigma
+alternates between cycles and residuals, the last solution is returned, marked as not converged."""
 
 SMALL_DOF = 20.0
 """Residual degrees of freedom below which the initial sigma does not come from residuals."""
@@ -63,9 +63,11 @@ class Fit:
     seconds_build: float
     """Time to build the functions and the program, [s]."""
     seconds_solve: float
-    """Time to solve until sigma converged, [s]."""
+    """Time of all solutions, [s]."""
     iterations: int
     """Iterations of the solver in all solutions."""
+    noise_converged: bool
+    """False if sigma or a noise ratio still changed after `MAX_SIGMA_ROUNDS` solutions."""
     linearisation: LinearProblem
     """Problem linearised about the active offsets of the controller."""
     linearised_theta: Array
@@ -129,42 +131,45 @@ class Fit:
             noise: Standard deviation of a reading, [m of the first gauge]; by default `sigma`, with
                 which the parameters were estimated.
         """
-        return self._to_si(self.information.covariance, noise)
+        return self._to_si(self._posterior(noise).covariance)
 
     def noise_covariance(self, *, noise: float | None = None) -> Array:
         """Part of `covariance` that is due to noise, shape (n_free, n_free), [SI]."""
-        return self._to_si(self.information.noise_covariance, noise)
+        return self._to_si(self._posterior(noise).noise_covariance)
 
     def inverse_normal(self) -> Array:
         """Inverse curvature of the objective, shape (n_free, n_free), [SI]."""
-        return self._to_si(self.information.inverse_normal, None)
+        return self._to_si(self._posterior().inverse_normal)
 
     def scaled_covariance(self) -> Array:
         """Part of `covariance` that is due to priors which the tolerance scale multiplies.
 
         Shape (n_free, n_free), [SI].
         """
-        priors = self.problem.selection.scaled
-        return self._to_si(partial(self.information.prior_covariance, priors=priors), None)
+        return self._to_si(self._posterior().prior_covariance(self.problem.selection.scaled))
 
-    def _to_si(self, compute: Callable[..., Array], noise: float | None) -> Array:
+    def _posterior(self, noise: float | None = None) -> Posterior:
+        """Posterior of θ̂; for `noise` see `covariance`."""
+        gain, noise_factor = 1.0, 1.0
+        if self.loss.robust:
+            used = self.problem.observations.size - self.noise.residual_dof
+            gain = self.loss.gain(self.residual / self.sigma, used=used)
+            noise_factor = self.loss.normal_square
+        if noise is not None:
+            noise_factor *= (noise / self.sigma) ** 2
+        return self.information.posterior(
+            sigma=self.sigma,  # above 0, also for readings without scatter
+            precision=self.problem.prior_precision,
+            at_bound=self.at_bound,
+            loss=(gain, noise_factor),
+        )
+
+    def _to_si(self, covariance: Array) -> Array:
         """Covariance of the free parameters, (n_free, n_free), [SI], from that of θ̂."""
         scale = np.outer(self.problem.theta_scale, self.problem.theta_scale)
         if not math.isfinite(self.noise.sigma):
             return np.full_like(scale, np.nan)
-        factors = (1.0, 1.0)
-        if self.loss.robust:
-            used = self.problem.observations.size - self.noise.residual_dof
-            gain = self.loss.gain(self.residual / self.sigma, used=used)
-            factors = (gain, self.loss.normal_square)
-        if noise is not None:
-            factors = (factors[0], factors[1] * (noise / self.sigma) ** 2)
-        return scale * compute(
-            sigma=self.sigma,  # above 0, also for readings without scatter
-            precision=self.problem.prior_precision,
-            at_bound=self.at_bound,
-            loss=factors,
-        )
+        return scale * covariance
 
     @property
     def mounting_covariance(self) -> Array:
@@ -209,7 +214,7 @@ def fit_problem(
     require_determined(problem, linear.information)
     program = build_program(problem, options) if program is None else program.with_problem(problem)
     built = time.perf_counter()
-    solved = _solve_until_converged(program, linear, groups, start)
+    solved = _solve_with_noise(program, linear, groups, start)
     program, linear, noise = solved.program, solved.linear, solved.evaluation.noise
     require_assembly(program.problem, solved.solution, options=program.options)
     sigma = floored_sigma(noise)
@@ -219,6 +224,7 @@ def fit_problem(
         seconds_build=built - began,
         seconds_solve=time.perf_counter() - built,
         iterations=solved.iterations,
+        noise_converged=solved.converged,
         linearisation=linear,
         linearised_theta=linear.solve(sigma=sigma if math.isfinite(sigma) else solved.sigma),
         solution=solved.solution,
@@ -230,8 +236,8 @@ def fit_problem(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _ConvergedSolution:
-    """Solution whose sigma and noise ratios agree with its residuals."""
+class _NoiseSolution:
+    """Solution, with sigma and the noise ratios of the gauges from its residuals."""
 
     program: Program
     linear: LinearProblem
@@ -241,15 +247,17 @@ class _ConvergedSolution:
     """Sigma with which the last solution was computed, [m]."""
     iterations: int
     """Iterations of all solutions."""
+    converged: bool
+    """True if sigma and the noise ratios of the last two solutions agree."""
 
 
-def _solve_until_converged(
+def _solve_with_noise(
     program: Program,
     linear: LinearProblem,
     groups: Sequence[GaugeReadings],
     start: ArrayLike | None,
-) -> _ConvergedSolution:
-    """Solve until sigma and the noise ratios of the gauges agree with the residuals."""
+) -> _NoiseSolution:
+    """Solve repeatedly until sigma and the noise ratios of the gauges agree with the residuals."""
     problem = program.problem
     repeatability = estimate_repeatability(problem.values, problem.observations)
     solution, sigma = _solve_first(program, linear, repeatability, start)
@@ -260,7 +268,8 @@ def _solve_until_converged(
         ratio = _estimate_noise_ratio(problem, groups, evaluation, sigma)
         ratio_agrees = bool(np.abs(ratio / problem.noise_ratio - 1.0).max() < SIGMA_TOLERANCE)
         sigma_agrees = not _depends_on_sigma(program) or _sigma_agrees(estimated, sigma)
-        if (ratio_agrees and sigma_agrees) or not remaining:
+        converged = ratio_agrees and sigma_agrees
+        if converged or not remaining:
             break
         if not sigma_agrees:  # sigma first, because the ratios depend on it
             sigma = estimated
@@ -270,7 +279,7 @@ def _solve_until_converged(
         start_theta, start_passive = solution.theta, solution.passive
         solution = program.solve(sigma=sigma, start=start_theta, start_passive=start_passive)
         iterations += solution.iterations
-    return _ConvergedSolution(program, linear, solution, evaluation, sigma, iterations)
+    return _NoiseSolution(program, linear, solution, evaluation, sigma, iterations, converged)
 
 
 def _solve_first(
@@ -333,9 +342,9 @@ def _estimate_noise_ratio(
     """Noise of each entry relative to the first gauge, from the residuals, (n_entries,)."""
     if len(groups) < 2:
         return problem.noise_ratio
-    covariance = evaluation.information.covariance(
+    covariance = evaluation.information.posterior(
         sigma=sigma, precision=problem.prior_precision, at_bound=evaluation.at_bound
-    )
+    ).covariance
     std = estimate_gauge_sigmas(
         groups,
         problem.observations,
@@ -424,7 +433,9 @@ def _residual_dof(
 ) -> float:
     """Number of readings minus free zeros and effective parameters."""
     o, precision = problem.observations, problem.prior_precision
-    used = information.effective_parameters(sigma=sigma, precision=precision, at_bound=at_bound)
+    used = information.posterior(
+        sigma=sigma, precision=precision, at_bound=at_bound
+    ).effective_parameters
     return o.size - o.n_free_zeros - used
 
 
@@ -524,9 +535,11 @@ def find_mounting_covariance(
     """
     n, precision = problem.n_machine, problem.prior_precision
     at_bound = np.zeros(problem.n_free, dtype=np.bool_) if at_bound is None else at_bound
-    total = information.covariance(sigma=sigma, precision=precision, at_bound=at_bound)
-    without_mounting = assume_others_known(information, n).covariance(
-        sigma=sigma, precision=precision[:n], at_bound=at_bound[:n]
+    total = information.posterior(sigma=sigma, precision=precision, at_bound=at_bound).covariance
+    without_mounting = (
+        assume_others_known(information, n)
+        .posterior(sigma=sigma, precision=precision[:n], at_bound=at_bound[:n])
+        .covariance
     )
     scale = problem.theta_scale[:n]
     return np.asarray((total[:n, :n] - without_mounting) * np.outer(scale, scale))

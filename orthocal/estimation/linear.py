@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array, Mask
-from orthocal.errors import NotIdentifiableError, SessionError
+from orthocal.errors import NotIdentifiableError, SessionError, UnreachableError
 from orthocal.estimation.problem import CalibrationProblem
-from orthocal.kinematics.orthoglide import displacement_angle
 from orthocal.statistics.information import RANK_THRESHOLD, Information, decompose
 from orthocal.statistics.zeros import project_out_zeros
+from orthocal.units import MM
 
 TWELVE_ROWS = tuple(
     f"{row}{sign}"
@@ -32,6 +32,27 @@ minimum posture minus that in the zero posture. The last block is (Δx_z, Δz_x)
 
 SIX_ROWS = ("xy", "xz", "yx", "yz", "zx", "zy")
 """Rows of the reduced system, maximum minus minimum, in the order of the paper's Table 1."""
+
+
+def displacement_angle(displacement: float, *, length: float) -> float:
+    """Angle α of the other two legs when the tool moves along an axis: sin α = displacement/L.
+
+    For the minimum posture α_min = asin((ρ_min − L)/L), negative (corrected: the paper prints
+    asin(ρ_min/L)).
+
+    Args:
+        displacement: Signed displacement of the tool from the mechanical zero, [m].
+        length: Leg length L, [m].
+
+    Raises:
+        UnreachableError: If the displacement is not below the leg length.
+    """
+    if not abs(displacement) < length:
+        raise UnreachableError(
+            f"a displacement of {displacement / MM:g} mm is out of reach of legs of "
+            f"{length / MM:g} mm"
+        )
+    return float(np.arcsin(displacement / length))
 
 
 def leg_parallelism_matrix(

@@ -378,11 +378,6 @@ class CalibrationProblem:
             noise_ratio=self.noise_ratio,
         )
 
-    def error_values(self, theta: ArrayLike) -> dict[str, float]:
-        """Values of the machine's free and known error parameters by name, [SI]."""
-        names, values = self.machine_selection.names, self._of_machine(theta).tolist()
-        return {**self.fixed, **dict(zip(names, values, strict=True))}
-
     def _of_machine(self, theta: ArrayLike) -> Array:
         """Errors of the machine among the free parameters, shape (..., n_machine), [SI]."""
         return np.asarray(theta, dtype=np.float64)[..., : self.n_machine]

@@ -69,7 +69,7 @@ class ToolTip:
         conditions: UseConditions | None = None,
     ) -> None:
         robot = calibration.robot
-        if robot.tcp is None or len(robot.tcp.coordinates) != len(robot.drives):
+        if robot.tcp is None or not robot.commands_tool:
             raise ExportError("the machine has no tool that its drives command")
         self.tool = np.array(tool, dtype=np.float64)
         require_tip(self.tool.tolist())

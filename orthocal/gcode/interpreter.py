@@ -148,8 +148,6 @@ class Modes:
     """Whether centres of arcs are absolute (G90.1)."""
     feed: float | None = None
     """Feed in units of the program per minute; None if unknown."""
-    system: str | None = None
-    """Work coordinate system that the program has selected."""
     ended: bool = False
     """Whether the program has ended."""
 
@@ -404,7 +402,7 @@ class Interpreter:
                         f"--work-offset-mm {name}=X,Y,Z (0,0,0 for machine coordinates)",
                         where=where,
                     )
-                self.modes, self.offset = replace(modes, system=name), self._offsets[name]
+                self.offset = self._offsets[name]
 
     def _check_arguments(
         self, words: Mapping[str, float], codes: Sequence[Word], where: str

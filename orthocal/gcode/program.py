@@ -31,7 +31,7 @@ LONGEST_READ = 252
 """Number of bytes of a line that LinuxCNC reads, without the newline."""
 
 SHORT = LONGEST_READ // 4
-"""Number of characters with at most LONGEST_READ bytes in UTF-8."""
+"""Number of characters that never need more than LONGEST_READ bytes in UTF-8."""
 
 
 @dataclass(slots=True)
@@ -48,7 +48,7 @@ class Summary:
     correction: float = 0.0
     """Largest correction, [m]."""
     stretch: list[float] = field(default_factory=lambda: [1.0, 1.0])
-    """Smallest and largest factor of a feed."""
+    """Smallest and largest factor by which a feed changes."""
     unit_assumed: bool = False
     """Whether coordinates precede any G20 or G21."""
     ended: bool = False
@@ -61,9 +61,9 @@ class ProgramCorrector:
     Args:
         interpreter: New interpreter of the program.
         correct: Correction of points.
-        within: Largest distance of the written path from the corrected path, [m].
+        within: Tolerance: largest distance of the written path from the exact corrected path, [m].
         region: Limits of x, y and z, shape (3, 2), [m]. The summary has the first line beyond them.
-        sides: Sides of approach of drives whose backlash the program takes up.
+        sides: Sides of approach of the drives, if the program compensates backlash.
 
     Raises:
         GcodeError: If the error bound of the correction exceeds the tolerance.
@@ -103,12 +103,12 @@ class ProgramCorrector:
             GcodeError: If a line cannot be corrected; names the first such line.
         """
         steps: list[Step | str] = []
-        segments, marks = 0.0, 0
+        segment_count, percent_signs = 0.0, 0  # the second % ends a program
         summary, interpreter = self.summary, self._interpreter
         for text in lines:
             summary.lines += 1
-            if text.strip() == "%" or interpreter.modes.ended or marks > 1:
-                marks += text.strip() == "%"
+            if text.strip() == "%" or interpreter.modes.ended or percent_signs > 1:
+                percent_signs += text.strip() == "%"
                 if CONTROL.search(text.rstrip("\r\n")):
                     where = f"{self._file}:{summary.lines}"
                     raise GcodeError("holds a control character", where=where)
@@ -119,12 +119,12 @@ class ProgramCorrector:
                 steps.append(step)
                 if step.motion is not None:
                     summary.unit_assumed |= not step.modes.has_unit
-                    segments += _estimate(step.motion)
-            if len(steps) >= LINES_PER_BLOCK or segments > SEGMENTS_PER_BLOCK:
+                    segment_count += _estimate_segments(step.motion)
+            if len(steps) >= LINES_PER_BLOCK or segment_count > SEGMENTS_PER_BLOCK:
                 yield self._write(steps)
-                steps, segments = [], 0.0
+                steps, segment_count = [], 0.0
         yield self._write(steps)
-        summary.ended = interpreter.modes.ended or marks > 1
+        summary.ended = interpreter.modes.ended or percent_signs > 1
 
     def _read(self, text: str, pending: Sequence[Step | str]) -> Step:
         """Effect of a line.
@@ -180,7 +180,8 @@ class ProgramCorrector:
                     low = min(low, *segments.stretch)
                     high = max(high, *segments.stretch)
                 written = self._writer.write(step, segments)
-            if len(written[0]) > SHORT or len(written[-1]) > SHORT:  # others have coordinates only
+            # lines between the first and the last contain coordinates only and are short
+            if len(written[0]) > SHORT or len(written[-1]) > SHORT:
                 self._require_readable(written, step.line.number)
             texts += written
         summary.stretch = [low, high]
@@ -199,7 +200,7 @@ class ProgramCorrector:
 
 
 def _subject(step: Step, refused: Refused) -> str:
-    """Point out of reach, in the program's coordinates, or "it" for the motion."""
+    """Subject of the message: the point out of reach in the program's coordinates, else "it"."""
     if refused.point is None:
         return "it"
     values = zip(AXES, refused.point, step.offset, strict=True)
@@ -207,7 +208,7 @@ def _subject(step: Step, refused: Refused) -> str:
     return f"{' '.join(coordinates)} mm"
 
 
-def _estimate(motion: Motion) -> float:
+def _estimate_segments(motion: Motion) -> float:
     """Estimated number of segments of a motion."""
     length = math.dist(motion.start, motion.end)
     if motion.arc is None:

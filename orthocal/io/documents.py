@@ -16,7 +16,15 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import yaml
-from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, TypeAdapter, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+)
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
@@ -62,6 +70,12 @@ def _at_least(smallest: float) -> AfterValidator:
         return value
 
     return AfterValidator(refuse_smaller)
+
+
+class Keys(BaseModel):
+    """Keys of a document; unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 Number = Annotated[
@@ -351,6 +365,15 @@ def validate(
         key, problem = explain_validation_error(e, schema)
         key = ".".join(name for name in (under, key) if name)
         raise error(problem, where=f"{where}: {key}" if key else where) from None
+
+
+def format_json(document: object) -> str:
+    """Text of a JSON document, with a line end.
+
+    Raises:
+        ValueError: If a number is not finite.
+    """
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
 def write_plain(record: object, schema: type[Any]) -> dict[str, Any]:

@@ -33,7 +33,9 @@ LOGARITHM_SERIES_ABOVE = 0.999
 """Cosine above which the coefficients of the logarithm come from their series."""
 
 _ARCSINE = (1.0, 1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240, 10395 / 599040)
+"""Series of θ/sin θ in sin² θ."""
 _BERNOULLI = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
+"""Series of 1/θ² − (1 + cos θ)/(2 θ sin θ) in θ²."""
 
 
 class _Operations(NamedTuple):

@@ -22,11 +22,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from orthocal.arrays import Array
 from orthocal.errors import OrthocalError, OutputError, SessionError
-from orthocal.io.documents import Number, read_yaml, validate
+from orthocal.io.documents import Keys, Number, read_yaml, validate
 from orthocal.io.files import exists, read_file, sync_folder, write_file
 from orthocal.io.journal import Journal, open_journal_file
 from orthocal.measurement.files.point_rows import (
@@ -63,10 +63,8 @@ DECIMALS = 9
 BUSY = "these readings are being recorded by another process; one at a time"
 
 
-class Change(BaseModel):
+class Change(Keys):
     """Change of the rows of a recording."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     done: Literal["read", "emptied", "added", "dropped"]
     """Kind of change: `read` gives a row its value; `emptied` removes the values of all rows of its

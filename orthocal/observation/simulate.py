@@ -10,12 +10,12 @@ from typing import Annotated
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from orthocal.arguments import require_kind, require_names, require_numbers, require_seed
 from orthocal.arrays import Array
 from orthocal.errors import ParameterError, SessionError
-from orthocal.io.documents import Number, parse_number, read_yaml, validate
+from orthocal.io.documents import Keys, Number, parse_number, read_yaml, validate
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import Observations, build_observations
 from orthocal.observation.sensor_groups import OF_GAUGE, nuisance_parameters
@@ -71,16 +71,9 @@ def draw_errors(
     require_names(patterns, argument="patterns")
     require_seed(seed)
     rng = np.random.default_rng(seed)
-    parameters = robot.parameters
-    chosen = parameters.select(patterns)
-    chosen = tuple(
-        n
-        for n in chosen
-        if len(parameters[n].terms) == 1 or not {t for t, _ in parameters[n].terms} & set(chosen)
-    )
-    replaced = parameters.read_tolerances(tolerances or {})
-    stds = {n: value for g, value in replaced.items() for n in parameters.select([g])}
-    drawn = {n: float(rng.normal() * stds.get(n, parameters[n].prior_std)) for n in chosen}
+    parameters = robot.parameters.with_tolerances(tolerances or {})
+    chosen = parameters.without_sums(parameters.select(patterns))
+    drawn = {n: float(rng.normal() * parameters[n].prior_std) for n in chosen}
     return {n: abs(v) if parameters[n].positive else v for n, v in drawn.items()}
 
 
@@ -242,10 +235,8 @@ def _where(plan: Session, gauge: str, key: str) -> str:
     return path if plan.path is None else f"{plan.path}: {path}"
 
 
-class _TruthKeys(BaseModel):
+class _TruthKeys(Keys):
     """Keys of a file of errors, such as truth.yaml."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     errors: Annotated[dict[str, Number], Field(min_length=1)]
     zeros_mm: dict[str, Number] = {}

@@ -125,10 +125,8 @@ class ToolForecast:
         parameters = robot.parameters
         free = selection.names
         determined = {parameters[n].terms[0][0] for n in (*free, *selection.fixed)}
-        self.others = tuple(
-            n
-            for n in (machine_errors(robot) if others is None else others)
-            if not determined & {term for term, _ in parameters[n].terms}
+        self.others = parameters.without_terms(
+            machine_errors(robot) if others is None else others, determined
         )
         self.names = (*free, *self.others)
         stds = {**(others or {}), **{p.name: p.prior_std for p in selection.parameters}}
@@ -310,7 +308,7 @@ class ToolForecast:
         precision = np.maximum(problem.prior_precision, VAGUE)
         weight = noise if weight is None else weight
         jacobian = project_out_zeros(jacobian[possible], o)
-        inverse = Information(jacobian).covariance(sigma=weight, precision=precision)
+        inverse = Information(jacobian).posterior(sigma=weight, precision=precision).covariance
         scale = problem.theta_scale[:n]
         covariance = inverse
         if weight != noise:  # the scatter of the readings is smaller than their weight implies

@@ -234,15 +234,6 @@ class SetupGain:
                 spreads += changes * a.product(other)[:, None]
         return np.asarray(gains / spreads)
 
-    def complete(self, pair: tuple[int, int], count: int) -> tuple[float, tuple[int, ...]]:
-        """Add readings greedily to a pair.
-
-        Returns:
-            The gain of all readings, and the readings.
-        """
-        gains, chosen = self.grow(pair, count)
-        return gains[-1], chosen
-
     def grow(self, pair: tuple[int, int], count: int) -> tuple[tuple[float, ...], tuple[int, ...]]:
         """Add readings greedily to a pair.
 
@@ -366,11 +357,6 @@ class PointGain:
             allowed[[first, second]] = False
             allowed[:, [first, second]] = False
         return ranked
-
-    def complete(self, pair: tuple[int, int], count: int) -> tuple[float, tuple[int, ...]]:
-        """Add points greedily to a pair; see `SetupGain.complete`."""
-        gains, chosen = self.grow(pair, count)
-        return gains[-1], chosen
 
     def grow(self, pair: tuple[int, int], count: int) -> tuple[tuple[float, ...], tuple[int, ...]]:
         """Add points greedily to a pair; see `SetupGain.grow`."""

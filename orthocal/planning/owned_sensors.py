@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from orthocal.errors import SessionError
 from orthocal.estimation.weighting import stated_sigma
-from orthocal.io.documents import Number, read_yaml, validate
+from orthocal.io.documents import Keys, Number, read_yaml, validate
 from orthocal.measurement.files.session_keys import GaugeKeys
 from orthocal.sensors.registry import read_setup
 from orthocal.session.session import Gauge
@@ -61,10 +61,8 @@ OF_BARS = ("radius_mm", "elevation_deg")
 """Keys of a plan that only ball bars have."""
 
 
-class PlanKeys(BaseModel):
+class PlanKeys(Keys):
     """Keys of a sensor's file that only a plan uses."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     minutes_per_setup: Minutes | None = None
     minutes_per_reading: Minutes | None = None

@@ -378,8 +378,7 @@ class Gains:
         which, count = planned.candidate, len(planned.chosen)
         pairs = gain.best_pairs(self.search.pairs[which].with_count(count), MAX_PAIRS)
         return [
-            PlannedSetup(which, gain.begin_with(pair[0]).complete(pair, count)[1])
-            for _, pair in pairs
+            PlannedSetup(which, gain.begin_with(pair[0]).grow(pair, count)[1]) for _, pair in pairs
         ]
 
     def rank(self, count: int) -> list[PlannedSetup]:
@@ -391,8 +390,8 @@ class Gains:
         for which, pair, gain in self.begin(count):
             if count < self.search.reduced[which].min_readings:
                 continue
-            total, chosen = gain.complete(pair, count)
-            completed.append((total, PlannedSetup(which, chosen)))
+            gains, chosen = gain.grow(pair, count)
+            completed.append((gains[-1], PlannedSetup(which, chosen)))
         return [planned for _, planned in sort_by(completed, lambda c: c[0])]
 
     def begin(

@@ -8,10 +8,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from orthocal.errors import RobotError
-from orthocal.io.documents import Number, PositiveNumber, read_yaml, validate
+from orthocal.io.documents import Keys, Number, PositiveNumber, read_yaml, validate
 from orthocal.robot.joint_types import JOINT_TYPES
 from orthocal.text import composed
 
@@ -42,20 +42,14 @@ MOST_PARTS = 100
 """Largest number of legs, of closures and of named sums."""
 
 
-class _Keys(BaseModel):
-    """Keys that refuse unknown ones."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
-
-
-class ClosureKeys(_Keys):
+class ClosureKeys(Keys):
     """Keys that orthocal adds to one pair of `closed_loop`."""
 
     rows: list[Row] | None = None
     """Constrained rows, in the axes of the first frame of the pair; all by default."""
 
 
-class JointKeys(_Keys):
+class JointKeys(Keys):
     """Joint coordinate of the controller, if it differs from the drive coordinate."""
 
     counts: Literal["up", "down"] = "up"
@@ -67,7 +61,7 @@ class JointKeys(_Keys):
     """Joint coordinate at the mechanical zero, for a revolute drive."""
 
 
-class DriveKeys(_Keys):
+class DriveKeys(Keys):
     """Keys that orthocal adds to one motor."""
 
     zero_mm: Number | None = None
@@ -78,7 +72,7 @@ class DriveKeys(_Keys):
     """Joint coordinate of the controller; the drive coordinate by default."""
 
 
-class RodKeys(_Keys):
+class RodKeys(Keys):
     """Round rod of a leg."""
 
     root: Name
@@ -89,7 +83,7 @@ class RodKeys(_Keys):
     """Radius of the rod."""
 
 
-class LegKeys(_Keys):
+class LegKeys(Keys):
     """Leg: its centre line, and its rods."""
 
     root: Name
@@ -100,7 +94,7 @@ class LegKeys(_Keys):
     """Round rods that a gauge can touch, by name."""
 
 
-class TcpKeys(_Keys):
+class TcpKeys(Keys):
     """Tool centre point."""
 
     frame: Name
@@ -131,7 +125,7 @@ WorkspaceBox = Annotated[
 """Lower and upper limit of each tool coordinate, relative to the mechanical zero, [mm]."""
 
 
-class WorkspaceKeys(_Keys):
+class WorkspaceKeys(Keys):
     """Workspace: the region over which errors at the tool are reported."""
 
     box_mm: WorkspaceBox
@@ -149,7 +143,7 @@ def _require_rising(limits: list[float]) -> list[float]:
 _Range = Annotated[list[Number], Field(min_length=2, max_length=2), AfterValidator(_require_rising)]
 
 
-class UseKeys(_Keys):
+class UseKeys(Keys):
     """Conditions under which the machine is used."""
 
     approach: str = "both"
@@ -173,7 +167,7 @@ class UseKeys(_Keys):
         return self
 
 
-class OrthocalKeys(_Keys):
+class OrthocalKeys(Keys):
     """Keys below `orthocal`."""
 
     closures: dict[Name, ClosureKeys] | None = None
@@ -202,7 +196,7 @@ class OrthocalKeys(_Keys):
     """Models by name: patterns of parameter names, or `complete` for all observable errors."""
 
 
-class RobotKeys(_Keys):
+class RobotKeys(Keys):
     """Keys of a robot's YAML."""
 
     closed_loop: Annotated[

@@ -245,6 +245,11 @@ class Robot:
         return np.array([d.zero for d in self.drives])
 
     @property
+    def commands_tool(self) -> bool:
+        """True if the tool centre point has as many commanded coordinates as there are drives."""
+        return self.tcp is not None and len(self.tcp.coordinates) == len(self.drives)
+
+    @property
     def reference_passive(self) -> Array:
         """Passive coordinates of the reference posture, shape (n_passive,), [m, rad]."""
         return np.asarray(self.reference_posture[self.passive_index])

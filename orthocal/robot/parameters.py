@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
@@ -255,6 +255,19 @@ class ParameterSet:
             else:
                 chosen.update(names)
         return tuple(name for name in self._parameters if name in chosen)
+
+    def without_sums(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Names without sums of elementary errors that are named, too."""
+        listed = set(names)
+        return tuple(
+            n
+            for n in names
+            if len(self[n].terms) == 1 or not listed & {t for t, _ in self[n].terms}
+        )
+
+    def without_terms(self, names: Iterable[str], terms: Set[str]) -> tuple[str, ...]:
+        """Names of parameters that contain none of some elementary errors."""
+        return tuple(n for n in names if not terms & {term for term, _ in self[n].terms})
 
     def select_model(self, model: str) -> tuple[str, ...]:
         """Names of the free parameters of a model of the robot's YAML.

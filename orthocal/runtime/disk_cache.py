@@ -2,8 +2,8 @@
 
 The directory is ORTHOCAL_CACHE, or `orthocal` in XDG_CACHE_HOME or ~/.cache; ORTHOCAL_CACHE=off
 disables the cache. Directory and files are used only if the user owns them, nobody else can write
-to them, and the checksum of key and content is right. Otherwise the result is computed again.
-Failures of the cache are ignored.
+to them, and a file only if its checksum is right. Otherwise the result is computed again. Failures
+of the cache are ignored.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def load(key: str) -> bytes | None:
         key: Text with everything that the content depends on.
     """
     try:
-        with _folder(create=False) as folder:
+        with _opened_folder(create=False) as folder:
             return None if folder is None else _read(folder, key)
     except (OSError, ValueError):
         return None
@@ -59,7 +59,7 @@ def store(key: str, content: bytes) -> None:
     """
     if len(content) > LARGEST_ENTRY:
         return
-    with suppress(OSError, ValueError), _folder(create=True) as folder:
+    with suppress(OSError, ValueError), _opened_folder(create=True) as folder:
         if folder is not None:
             _write(folder, key, content)
             _remove_oldest(folder)
@@ -77,7 +77,7 @@ def cache_folder() -> Path | None:
 
 
 @contextmanager
-def _folder(*, create: bool) -> Iterator[int | None]:
+def _opened_folder(*, create: bool) -> Iterator[int | None]:
     """Descriptor of the directory; None if it cannot be trusted."""
     path = cache_folder()
     if path is None or not hasattr(os, "geteuid") or os.open not in os.supports_dir_fd:

@@ -23,11 +23,11 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import casadi as ca
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from orthocal.arrays import Array
 from orthocal.errors import SessionError
-from orthocal.io.documents import Name, Number
+from orthocal.io.documents import Keys, Name, Number
 from orthocal.robot.model import Leg, Robot
 from orthocal.sensors.direction import (
     DIRECTIONS,
@@ -72,10 +72,8 @@ BESIDE_ROUNDING = 1e-5
 Millimetres = Annotated[Number, Field(ge=-LARGEST_BESIDE_MM, le=LARGEST_BESIDE_MM)]
 
 
-class SectionKeys(BaseModel):
+class SectionKeys(Keys):
     """Section: position along the leg's nominal axis at which the gauge touches."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     coordinate_mm: Number | None = None
     """World coordinate along the axis of the leg."""

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import casadi as ca
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from orthocal.io.documents import Name, Number
+from orthocal.io.documents import Keys, Name, Number
 from orthocal.sensors.protocol import NuisanceParameter
 from orthocal.units import MM, MRAD, read_limit, show_limit, tidy
 
@@ -39,10 +39,8 @@ Millimetres = Annotated[Number, Field(ge=0.0, le=LARGEST_TOLERANCE_MM)]
 Milliradians = Annotated[Number, Field(ge=0.0, le=LARGEST_TOLERANCE_MRAD)]
 
 
-class MountingKeys(BaseModel):
+class MountingKeys(Keys):
     """Tolerances of a gauge's mounting in a session.yaml; 0 for a parameter without error."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     direction_tolerance_mrad: Milliradians = show_limit(DIRECTION_STD) / MRAD
     section_tolerance_mm: Millimetres = show_limit(POSITION_STD) / MM

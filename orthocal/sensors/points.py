@@ -25,11 +25,11 @@ from typing import Annotated, Any, ClassVar, Literal
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from orthocal.arrays import Array
 from orthocal.errors import SessionError
-from orthocal.io.documents import Name, Number
+from orthocal.io.documents import Keys, Name, Number
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.mounting import rotate
 from orthocal.sensors.protocol import (
@@ -61,18 +61,14 @@ Covariance = Annotated[
 Triple = tuple[float, float, float]
 
 
-class _Keys(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
-
-
-class FrameKeys(_Keys):
+class FrameKeys(Keys):
     """Tolerances of a station whose frame is nominally the world frame."""
 
     tolerance_mm: Annotated[Number, Field(ge=0.0, le=1000.0)] = 0.0
     tolerance_mrad: Annotated[Number, Field(ge=0.0, le=400.0)] = 0.0
 
 
-class AxisKeys(_Keys):
+class AxisKeys(Keys):
     """Coordinate axis of one of the three sensors of a setup, in the record of a calibration."""
 
     along: Annotated[list[Number], Field(min_length=3, max_length=3)]

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import casadi as ca
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from orthocal.io.documents import Keys
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import GaugeZero, NuisanceParameter, SetupKeys, View
 from orthocal.sensors.tool_indicator import (
@@ -38,10 +39,8 @@ FORM_DEGREE = 4
 """Largest degree of the polynomial deviations of a bed from flat."""
 
 
-class SurfaceKeys(BaseModel):
+class SurfaceKeys(Keys):
     """Keys of a surface that is not flat."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     flat_tolerance_mm: Millimetres
     length_mm: Length = LENGTH_MM

@@ -13,12 +13,12 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
 
 import casadi as ca
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from orthocal.arrays import Array
 from orthocal.effects.protocol import Condition
 from orthocal.errors import SessionError
-from orthocal.io.documents import Name
+from orthocal.io.documents import Keys, Name
 from orthocal.kinematics.symbolic import Pose
 from orthocal.robot.model import Robot
 from orthocal.units import Unit
@@ -123,10 +123,8 @@ class Contact:
     """Corners of the touched surface of an artefact in the world frame, shape (4, 3), [m]."""
 
 
-class SetupKeys(BaseModel):
+class SetupKeys(Keys):
     """Keys of a setup in a session.yaml that all kinds of sensor share."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     sensor: str = "leg"
     """Kind of sensor."""

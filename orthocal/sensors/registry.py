@@ -9,20 +9,20 @@ its object is the class:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from orthocal.errors import OrthocalError
 from orthocal.io.documents import validate
 from orthocal.io.fields import As
 from orthocal.runtime.registry import Registry
-from orthocal.sensors.ball_bar import BallBar, BallBarKeys
-from orthocal.sensors.distance import Distance, DistanceKeys
-from orthocal.sensors.leg_indicator import LegIndicator, LegKeys
-from orthocal.sensors.points import PointKeys, Points
-from orthocal.sensors.probe import Probe, ProbeKeys
+from orthocal.sensors.ball_bar import BallBar
+from orthocal.sensors.distance import Distance
+from orthocal.sensors.leg_indicator import LegIndicator
+from orthocal.sensors.points import Points
+from orthocal.sensors.probe import Probe
 from orthocal.sensors.protocol import Sensor, SetupKeys
-from orthocal.sensors.tool_indicator import ToolIndicator, ToolIndicatorKeys
+from orthocal.sensors.tool_indicator import ToolIndicator
 
 DEFAULT = LegIndicator.kind
 """Kind of sensor of a setup that states none."""
@@ -30,41 +30,40 @@ DEFAULT = LegIndicator.kind
 GROUP = "orthocal.sensors"
 """Group of the entry points by which installed packages offer kinds of sensor."""
 
-Kind = tuple[type[SetupKeys], Callable[[Any], Sensor]]
-"""Keys of a kind of sensor, and the function that builds a sensor from them."""
+
+def _read_sensor(name: str, offered: type[Sensor]) -> type[Sensor]:
+    """Require that an offered class is a sensor of the kind of its entry point."""
+    if offered.kind != name or not issubclass(offered.keys, SetupKeys):
+        raise TypeError(f"{offered.__qualname__} is not a sensor with kind = '{name}' and keys")
+    return offered
 
 
-def _read_kind(name: str, sensor: type[Sensor]) -> Kind:
-    """Kind from the class of an entry point."""
-    if sensor.kind != name or not issubclass(sensor.keys, SetupKeys):
-        raise TypeError(f"{sensor.__qualname__} is not a sensor with kind = '{name}' and keys")
-    return sensor.keys, sensor.from_keys
+BUILT_IN: tuple[type[Sensor], ...] = (
+    LegIndicator,
+    BallBar,
+    Distance,
+    ToolIndicator,
+    Points,
+    Probe,
+)
+_SENSORS = Registry[type[Sensor]](
+    GROUP, "sensor", _read_sensor, {sensor.kind: sensor for sensor in BUILT_IN}
+)
 
 
-_BUILT_IN: dict[str, Kind] = {
-    DEFAULT: (LegKeys, LegIndicator.from_keys),
-    BallBar.kind: (BallBarKeys, BallBar.from_keys),
-    Distance.kind: (DistanceKeys, Distance.from_keys),
-    ToolIndicator.kind: (ToolIndicatorKeys, ToolIndicator.from_keys),
-    Points.kind: (PointKeys, Points.from_keys),
-    Probe.kind: (ProbeKeys, Probe.from_keys),
-}
-_KINDS = Registry[Kind](GROUP, "sensor", _read_kind, _BUILT_IN)
-
-
-def register_sensor(kind: type[Sensor]) -> None:
-    """Register a kind of sensor; it replaces a kind of the same name."""
-    _KINDS.register(kind.kind, (kind.keys, kind.from_keys))
+def register_sensor(sensor: type[Sensor]) -> None:
+    """Register a sensor; it replaces a sensor of the same kind."""
+    _SENSORS.register(sensor.kind, sensor)
 
 
 def unregister_sensor(kind: str) -> None:
     """Remove a registered kind of sensor."""
-    _KINDS.unregister(kind)
+    _SENSORS.unregister(kind)
 
 
 def sensor_kinds() -> tuple[str, ...]:
     """Names of all kinds, including those of installed packages."""
-    return _KINDS.names
+    return _SENSORS.names
 
 
 def read_setup(
@@ -88,12 +87,12 @@ def read_setup(
         OrthocalError: Of kind `error`, if a key is wrong; names the key.
     """
     name = data.get("sensor", DEFAULT)
-    schema, build = _KINDS.find(name, where=f"{where}: {under}.sensor", error=error)
-    defaults = {k: v for k, v in (gauge or {}).items() if k in schema.model_fields}
+    kind = _SENSORS.find(name, where=f"{where}: {under}.sensor", error=error)
+    defaults = {k: v for k, v in (gauge or {}).items() if k in kind.keys.model_fields}
     data = {**defaults, **data}
-    keys = validate(schema, data, where=where, error=error, under=under)
+    keys = validate(kind.keys, data, where=where, error=error, under=under)
     try:
-        return keys, build(keys)
+        return keys, kind.from_keys(keys)
     except OrthocalError as e:
         raise error(e.problem, where=f"{where}: {under}.{e.where}") from None
 

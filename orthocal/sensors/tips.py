@@ -19,9 +19,9 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import casadi as ca
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from orthocal.io.documents import Number, PositiveNumber
+from orthocal.io.documents import Keys, Number, PositiveNumber
 from orthocal.units import MM, to_mm
 
 LARGEST_TIP_MM = 100.0
@@ -74,28 +74,22 @@ def touch_by_ball(
     return (ca.sqrt(discriminant) - b) / a
 
 
-class BallKeys(BaseModel):
+class BallKeys(Keys):
     """Keys of a ball at the end of a plunger."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     radius_mm: Annotated[PositiveNumber, Field(le=LARGEST_TIP_MM)]
 
 
-class BladeKeys(BaseModel):
+class BladeKeys(Keys):
     """Keys of a straight edge across a rod."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     width_mm: Annotated[PositiveNumber, Field(le=LARGEST_TIP_MM)]
     radius_mm: Annotated[Number, Field(ge=0.0, le=LARGEST_TIP_MM)] = 0.0
     """Radius of an edge that is a pin; 0 for a sharp edge."""
 
 
-class TipKeys(BaseModel):
+class TipKeys(Keys):
     """Keys of a tip in a session.yaml: ball or blade."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     ball: BallKeys | None = None
     blade: BladeKeys | None = None

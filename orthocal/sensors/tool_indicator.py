@@ -23,11 +23,11 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import casadi as ca
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from orthocal.arrays import Array
 from orthocal.errors import SessionError
-from orthocal.io.documents import Name, Number, PositiveNumber
+from orthocal.io.documents import Keys, Name, Number, PositiveNumber
 from orthocal.robot.model import Robot, require_tcp
 from orthocal.sensors.direction import direction_vector
 from orthocal.sensors.mounting import SCALE, rotate
@@ -77,10 +77,8 @@ def flat_terms(degree: int) -> tuple[str, ...]:
     return tuple(f"flat_{n - j}{j}" for n in range(2, degree + 1) for j in range(n + 1))
 
 
-class _ArtefactKeys(BaseModel):
+class _ArtefactKeys(Keys):
     """Keys of every artefact."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
     direction_tolerance_mrad: Milliradians = show_limit(ALIGNMENT_STD) / MRAD
 

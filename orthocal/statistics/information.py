@@ -5,8 +5,8 @@ All quantities are in scaled parameters θ̂ = θ/(prior std), with gauge zeros 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from orthocal.arrays import Array, Mask
 from orthocal.errors import NotIdentifiableError
 from orthocal.observation.observations import Observations
 from orthocal.statistics.zeros import project_out_zeros
+from orthocal.text import list_some
 
 RANK_THRESHOLD = 1e-10
 """Ratio to the largest singular value below which others count as zero."""
@@ -26,6 +27,8 @@ MAX_LISTED = 6
 
 MAX_DIRECTIONS = 2
 """Largest number of null space directions that a message lists."""
+
+_list = partial(list_some, most=MAX_LISTED)
 
 
 class Information:
@@ -89,114 +92,82 @@ class Information:
         variance[nonzero] = (sigma / self.singular_values[nonzero]) ** 2
         return np.asarray(((self.directions**2).T @ variance < 1.0) & self.identifiable)
 
-    def effective_parameters(
-        self, *, sigma: float, precision: Array, at_bound: Mask | None = None
-    ) -> float:
-        """Effective number of parameters, n − tr(P⁻¹ C); the rank if there is no prior.
-
-        Args:
-            sigma: Standard deviation of one reading, [m].
-            precision: Diagonal of P⁻¹: 1 or 0, shape (n_free,).
-            at_bound: Mask of the parameters at a bound.
-        """
-        n_at_bound = 0 if at_bound is None else int(at_bound.sum())
-        if not precision.any():
-            return float(self.rank - n_at_bound)
-        covariance = self.covariance(sigma=sigma, precision=precision, at_bound=at_bound)
-        return float(len(precision) - n_at_bound - precision @ np.diag(covariance))
-
-    def covariance(
+    def posterior(
         self,
         *,
         sigma: float,
         precision: Array,
         at_bound: Mask | None = None,
         loss: tuple[float, float] = (1.0, 1.0),
-    ) -> Array:
-        """Covariance of θ̂, (Jᵀ J/σ² + P⁻¹)⁻¹, shape (n_free, n_free).
+    ) -> Posterior:
+        """Posterior of θ̂; the arguments are the fields of `Posterior`."""
+        free = np.ones(len(precision), dtype=np.bool_) if at_bound is None else ~at_bound
+        return Posterior(self.factor, sigma, precision, free, loss)
 
-        With a robust loss it is A⁻¹ B A⁻¹, A = a Jᵀ J/σ² + P⁻¹ and B = b Jᵀ J/σ² + P⁻¹ (Huber,
-        Robust Statistics, 1981, section 7.6, with a prior).
 
-        Args:
-            sigma: Standard deviation of one reading, [m].
-            precision: Diagonal of P⁻¹: 1 or 0, shape (n_free,).
-            at_bound: Mask of the parameters at a bound, whose covariance is 0.
-            loss: Mean a of ρ'' and mean square b of ρ' over the residuals; (1, 1) for squares.
-        """
-        free = np.ones(len(precision), dtype=bool) if at_bound is None else ~at_bound
-        rows = self.factor[:, free] / sigma
-        gain, noise = loss
-        prior = np.diag(np.sqrt(precision[free]))
-        stacked = np.vstack([np.sqrt(gain) * rows, prior])
-        inverse = _inverse_square(stacked)
-        if loss != (1.0, 1.0):
-            root = np.hstack([np.sqrt(noise) * inverse @ rows.T, inverse @ prior])
-            inverse = root @ root.T
-        covariance = np.zeros((len(free), len(free)))
-        covariance[np.ix_(free, free)] = 0.5 * (inverse + inverse.T)
-        return covariance
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Normal posterior of θ̂ from readings and priors.
 
-    def inverse_normal(
-        self,
-        *,
-        sigma: float,
-        precision: Array,
-        at_bound: Mask | None = None,
-        loss: tuple[float, float] = (1.0, 1.0),
-    ) -> Array:
-        """A⁻¹ of `covariance`, shape (n_free, n_free); arguments as there.
+    With A = a Jᵀ J/σ² + P⁻¹ and B = b Jᵀ J/σ² + P⁻¹, the covariance is A⁻¹ B A⁻¹ (Huber, Robust
+    Statistics, 1981, section 7.6, with a prior). Squares have a = b = 1. Rows and columns of
+    parameters at a bound are 0 in all matrices.
+    """
 
-        It is the inverse curvature of the objective. For squares it equals `covariance`.
-        """
-        return self.covariance(
-            sigma=sigma / np.sqrt(loss[0]), precision=precision, at_bound=at_bound
-        )
+    factor: Array
+    """Factor of JᵀJ, shape (n, n_free), [m per prior std]."""
+    sigma: float
+    """Standard deviation of one reading, [m]."""
+    precision: Array
+    """Diagonal of P⁻¹: 1 or 0, shape (n_free,)."""
+    free: Mask
+    """Mask of the parameters that are not at a bound, shape (n_free,)."""
+    loss: tuple[float, float]
+    """Mean a of ρ'' and mean square b of ρ' over the residuals; (1, 1) for squares."""
 
-    def noise_covariance(
-        self,
-        *,
-        sigma: float,
-        precision: Array,
-        at_bound: Mask | None = None,
-        loss: tuple[float, float] = (1.0, 1.0),
-    ) -> Array:
-        """Part of `covariance` from noise, b A⁻¹ Jᵀ J A⁻¹/σ², shape (n_free, n_free).
+    @cached_property
+    def inverse_normal(self) -> Array:
+        """Inverse curvature A⁻¹ of the objective, shape (n_free, n_free)."""
+        free = self.free
+        rows = np.sqrt(self.loss[0]) * (self.factor[:, free] / self.sigma)
+        inverse = _inverse_square(np.vstack([rows, np.diag(np.sqrt(self.precision[free]))]))
+        result = np.zeros((len(free), len(free)))
+        result[np.ix_(free, free)] = 0.5 * (inverse + inverse.T)
+        return result
 
-        Arguments are those of `covariance`.
-        """
-        inverse = self.inverse_normal(
-            sigma=sigma, precision=precision, at_bound=at_bound, loss=loss
-        )
-        root = np.sqrt(loss[1]) * inverse @ self.factor.T / sigma
+    @property
+    def covariance(self) -> Array:
+        """Covariance of θ̂, shape (n_free, n_free)."""
+        if self.loss == (1.0, 1.0):
+            return self.inverse_normal
+        return self.noise_covariance + self.prior_covariance(np.ones_like(self.free))
+
+    @property
+    def noise_covariance(self) -> Array:
+        """Part of `covariance` from noise, b A⁻¹ Jᵀ J A⁻¹/σ², shape (n_free, n_free)."""
+        root = np.sqrt(self.loss[1]) * self.inverse_normal @ self.factor.T / self.sigma
         return np.asarray(root @ root.T)
 
-    def prior_covariance(
-        self,
-        *,
-        sigma: float,
-        precision: Array,
-        priors: Mask,
-        at_bound: Mask | None = None,
-        loss: tuple[float, float] = (1.0, 1.0),
-    ) -> Array:
+    def prior_covariance(self, priors: Mask) -> Array:
         """Part of `covariance` from some of the priors, A⁻¹ P⁻¹ A⁻¹, shape (n_free, n_free).
 
         The priors draw the estimate towards their means. This part grows with their variances. Over
         all priors it is `covariance` less `noise_covariance`.
 
         Args:
-            sigma: Standard deviation of one reading, [m].
-            precision: Diagonal of P⁻¹: 1 or 0, shape (n_free,).
             priors: Mask of the parameters whose priors count, shape (n_free,).
-            at_bound: Mask of the parameters at a bound, whose covariance is 0.
-            loss: Mean a of ρ'' and mean square b of ρ' over the residuals; (1, 1) for squares.
         """
-        inverse = self.inverse_normal(
-            sigma=sigma, precision=precision, at_bound=at_bound, loss=loss
-        )
-        root = inverse[:, priors] * np.sqrt(precision[priors])
+        root = self.inverse_normal[:, priors] * np.sqrt(self.precision[priors])
         return np.asarray(root @ root.T)
+
+    @property
+    def effective_parameters(self) -> float:
+        """Effective number of parameters for squares, n − tr(P⁻¹ C); the rank without a prior."""
+        n_at_bound = int((~self.free).sum())
+        if not self.precision.any():
+            return float(Information(self.factor).rank - n_at_bound)
+        used = len(self.free) - n_at_bound - self.precision @ np.diag(self.inverse_normal)
+        return float(used)
 
 
 def _inverse_square(matrix: Array) -> Array:
@@ -275,7 +246,7 @@ def require_identifiable(
         information = assume_others_known(information, len(names))
         advice = _advise(information, names, null)
         raise NotIdentifiableError(
-            f"the readings do not determine {_list_some(undetermined)}: {information.rank} of "
+            f"the readings do not determine {_list(undetermined)}: {information.rank} of "
             f"{len(names)} free parameters are identifiable. {advice} Or use tolerances as a prior "
             "(--prior), or identify base parameters (--base)",
             parameters=undetermined,
@@ -299,7 +270,7 @@ def _advise(information: Information, names: tuple[str, ...], null: Array) -> st
             n for n, has_none in zip(names, without_effect, strict=True) if has_none
         ]
         sentences.append(
-            f"No reading depends on {_list_some(names_without_effect)}: read the legs that are "
+            f"No reading depends on {_list(names_without_effect)}: read the legs that are "
             "missing, in postures along their own axes."
         )
     # each row of the reduced echelon form is one unobservable change of the others
@@ -311,14 +282,8 @@ def _advise(information: Information, names: tuple[str, ...], null: Array) -> st
         changes = [
             f"{other_names[i]} {'up' if row[i] * row[terms[0]] > 0 else 'down'}" for i in terms
         ]
-        sentences.append(f"No reading depends on this combined change: {_list_some(changes)}.")
+        sentences.append(f"No reading depends on this combined change: {_list(changes)}.")
     return " ".join(sentences)
-
-
-def _list_some(items: Sequence[str]) -> str:
-    """First items and the number of the others."""
-    more = f" and {len(items) - MAX_LISTED} more" if len(items) > MAX_LISTED else ""
-    return ", ".join(items[:MAX_LISTED]) + more
 
 
 def _reduce(rows: Array) -> Array:

@@ -138,7 +138,7 @@ class AccuracyStudy(Study):
         """
         session, prepared = self._session_with_ignored, prepare_once(self)
         effects = {e.name: e for e in robot_effects(session.robot)}
-        if any(effects[n].setup_errors for n in self.ignored) or not prepared.alike_without_errors:
+        if any(effects[n].setup_errors for n in self.ignored) or not prepared.equal_without_errors:
             return None
         selection = prepared.model.problem.machine_selection
         workspace = prepared.tool.workspace.once(prepared.tool.use.size)
@@ -192,10 +192,8 @@ def build_accuracy_study(
     machine_effects = session.robot.effect_names if effects is None else order_effects(effects)
     plan = session.with_effects(machine_effects)
     robot, fixed = plan.robot, dict(fixed or {})
-    parameters = robot.parameters
+    parameters = robot.parameters.with_tolerances(chosen.tolerances)
     names = _select_drawn(drawn, fixed, parameters)
-    stated_stds = parameters.read_tolerances(chosen.tolerances)
-    stated_stds = {n: std for glob, std in stated_stds.items() for n in parameters.select([glob])}
     chosen = replace(chosen, effects=None, tolerances=_tolerances_of_model(chosen, session, plan))
     chosen.select(session.robot.parameters)
     _require_noise(session)
@@ -205,7 +203,7 @@ def build_accuracy_study(
         session=session.with_values(np.zeros(len(session.readings))),
         choice=chosen,
         effects=tuple(machine_effects),
-        drawn={n: stated_stds.get(n, parameters[n].prior_std) for n in names},
+        drawn={n: parameters[n].prior_std for n in names},
         fixed=fixed,
         machines=machines,
         seed=seed,
@@ -241,18 +239,9 @@ def _select_drawn(
     """Names of the random errors, without sums of them and without fixed errors."""
     if drawn is None:
         drawn = () if fixed else parameters.patterns("full")
-    names = _without_sums(parameters.select(drawn), parameters) if drawn else ()
+    names = parameters.without_sums(parameters.select(drawn)) if drawn else ()
     fixed_terms = {term for n in fixed for term, _ in parameters[n].terms}
-    return tuple(n for n in names if not fixed_terms & {t for t, _ in parameters[n].terms})
-
-
-def _without_sums(names: Sequence[str], parameters: ParameterSet) -> tuple[str, ...]:
-    """Names without sums of errors that are also in the list and would be drawn twice."""
-    return tuple(
-        n
-        for n in names
-        if len(parameters[n].terms) == 1 or not {t for t, _ in parameters[n].terms} & set(names)
-    )
+    return parameters.without_terms(names, fixed_terms)
 
 
 def _true_selection(study: AccuracyStudy, robot: Robot) -> Selection:

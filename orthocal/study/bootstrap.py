@@ -235,9 +235,9 @@ def _rescaled_residuals(fit: Fit) -> Array:
         SessionError: If parameters and gauge zeros explain all residuals.
     """
     observations = fit.problem.observations
-    covariance = fit.information.covariance(
+    covariance = fit.information.posterior(
         sigma=fit.sigma, precision=fit.problem.prior_precision, at_bound=fit.at_bound
-    )
+    ).covariance
     leverage = leverages(fit.jacobian, observations, covariance, fit.sigma)
     share = (
         1.0

@@ -107,8 +107,8 @@ class MachineModel:
         estimated = theta[:, : self.problem.n_machine] @ self.columns.T
         return np.asarray(self.problem.closure.errors() + estimated)
 
-    def translate(self, errors: Array, names: Sequence[str]) -> Array:
-        """Reorder errors of a robot with other effects to the order of this one, absent ones 0.
+    def reorder_errors(self, errors: Array, names: Sequence[str]) -> Array:
+        """Errors of a robot with other effects in the order of this model; 0 for missing ones.
 
         Args:
             errors: Elementary errors, shape (n_sets, n), [SI].
@@ -116,10 +116,10 @@ class MachineModel:
         """
         position = {name: i for i, name in enumerate(names)}
         error_names = self.problem.functions.errors.names
-        translated = np.zeros((len(errors), len(error_names)))
+        reordered = np.zeros((len(errors), len(error_names)))
         common = [i for i, name in enumerate(error_names) if name in position]
-        translated[:, common] = errors[:, [position[error_names[i]] for i in common]]
-        return translated
+        reordered[:, common] = errors[:, [position[error_names[i]] for i in common]]
+        return reordered
 
     def identified_part(self, errors: Array, names: Sequence[str]) -> Array:
         """True values of the identified parameters, shape (n_sets, n_machine), [SI].
@@ -131,14 +131,14 @@ class MachineModel:
             names: Their names, shape (n,).
         """
         columns = self.columns
-        return np.asarray(self.translate(errors, names) @ (columns / (columns**2).sum(axis=0)))
+        return np.asarray(self.reorder_errors(errors, names) @ (columns / (columns**2).sum(axis=0)))
 
     def explains(self, truth: CalibrationProblem) -> bool:
-        """True if the model identifies all errors of the machines."""
+        """True if the model contains all errors of the machines, `truth`."""
         if not set(truth.robot.effect_names) <= set(self.robot.effect_names):
             return False
         columns = self.columns
-        true_errors = self.translate(truth.errors_per_theta.T, truth.functions.errors.names).T
+        true_errors = self.reorder_errors(truth.errors_per_theta.T, truth.functions.errors.names).T
         return np.allclose(
             columns @ (np.linalg.pinv(columns) @ true_errors), true_errors, atol=1e-12
         )
@@ -215,7 +215,7 @@ class RandomMachines:
 
     seed: int
     truth: CalibrationProblem
-    """Problem of all errors of the machines."""
+    """Problem whose free parameters are all errors of the machines."""
     models: tuple[MachineModel, ...]
     """Model of the study; if it ignores effects, also the model with all effects."""
     tool: Tool
@@ -266,7 +266,7 @@ class RandomMachines:
         return self.truth.functions.errors.names
 
     @property
-    def alike_without_errors(self) -> bool:
+    def equal_without_errors(self) -> bool:
         """True if model and machines without errors have equal readings and tool positions."""
         readings, tools = [], []
         for problem in (self.truth, self.model.problem):
@@ -276,7 +276,7 @@ class RandomMachines:
         return all(np.abs(one - other).max() < NEGLIGIBLE for one, other in (readings, tools))
 
     def draw(self, number: int) -> tuple[Array, np.random.Generator]:
-        """Scaled true errors of a machine and its gauges, and the random generator of its noise."""
+        """True errors of a machine and its gauges in prior stds, and the generator of its noise."""
         rng = np.random.default_rng((self.seed, number))
         drawn = rng.normal(size=self.truth.n_free)
         positive = [p.positive for p in self.truth.parameters]

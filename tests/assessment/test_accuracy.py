@@ -11,6 +11,7 @@ import numpy as np
 import plans
 import pytest
 from calibrated import plan_of, session_of
+from closed_form import inverse
 from conftest import ROOT
 from derivatives import assert_derivative
 from gauges import exact
@@ -44,7 +45,6 @@ from orthocal.estimation.problem import build_problem
 from orthocal.export.formats import export_corrections
 from orthocal.export.linuxcnc.approximation import approximate
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
-from orthocal.kinematics.orthoglide import inverse
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.kinematics.workspace import Workspace, cube, tool_at_zero
@@ -254,7 +254,7 @@ def test_the_tool_error_of_a_plan_is_that_of_an_independent_model(
     information = decompose(slopes, problem.observations)
     scale = np.outer(tolerances, tolerances)
     precision = problem.prior_precision
-    posterior = information.covariance(sigma=sigma * 1e-6, precision=precision) * scale
+    posterior = information.posterior(sigma=sigma * 1e-6, precision=precision).covariance * scale
     found = measure_uncertainty(jacobian, posterior, workspace, workspace.points).sizes
     # three digits are printed, fewer where the number is small
     assert found.relative.rms * 1e3 == pytest.approx(full, abs=max(SAMPLING * full, 0.0006))

@@ -190,14 +190,13 @@ def test_a_plan_after_an_adjustment_with_small_gain_is_refused(plan, tmp_path):
     assert all(name in (new / "session.yaml").read_text() for name in amounts)
 
 
-def test_adjustments_with_uncertain_gain_are_details(machines, plans):
-    _, calibration = machines[4]
+def test_adjustments_with_uncertain_gain_are_details(plans):
     assert plans[4].judgement == "worthwhile"
     uncertain = replace(plans[4], displacement_uncertainty=1.0)
     assert uncertain.judgement == "uncertain gain"
 
     def show(plan, **options):
-        return to_text(render_plan(calibration, plan, saved=None, **options))
+        return to_text(render_plan(plan, saved=None, **options))
 
     names = [p.adjustment.name for p in plans[4].adjustments]
     assert all(name in show(plans[4]) for name in names)

@@ -55,8 +55,10 @@ def bound(plan, space, *, sigma, free):
     n = problem.n_machine
     tool = ToolSensitivity(robot, free=problem.free[:n])(LoopClosure(robot).inverse(space.points))
     _, slopes = problem.predict_and_jacobian(np.zeros(problem.n_free))
-    posterior = decompose(slopes, problem.observations).covariance(
-        sigma=sigma, precision=problem.prior_precision
+    posterior = (
+        decompose(slopes, problem.observations)
+        .posterior(sigma=sigma, precision=problem.prior_precision)
+        .covariance
     )
     scale = problem.theta_scale[:n]
     covariance = posterior[:n, :n] * np.outer(scale, scale)

@@ -53,7 +53,7 @@ def test_the_complete_model_is_recommended_for_table_1(table1):
     """Residuals of offsets are ten times the noise of the dial."""
     assert table1.recommendation.model == "full"
     assert table1.best is table1["full"]
-    assert (table1["offsets"].spare, table1["full"].spare) == (3, 0)
+    assert (table1["offsets"].redundancy, table1["full"].redundancy) == (3, 0)
     found = table1.assessment
     assert (found.decision.verdict, found.decision.exit_code) == ("enter", 0)
     (recommended,) = found.of_kind("recommended")
@@ -177,7 +177,7 @@ def test_linearised_and_exact_predictions_nearly_agree(cycles):
 def test_repeated_readings_are_not_counted_as_new_ones(cycles):
     """Six setups in three postures, three times over: twelve differences, whatever the cycles."""
     assert cycles.independent == 12
-    assert cycles["full"].spare == 0
+    assert cycles["full"].redundancy == 0
     assert cycles.noise.source == "cycles"
     assert cycles.recommendation.model == "offsets"
     assert cycles.assessment.of_kind("fits")
@@ -197,7 +197,7 @@ def test_undetermined_offsets_have_their_tolerances_as_prior(raw_cycles):
     rows = tuple(r for r in raw_cycles.readings if r.setup == "yx")
     found = compare_models(replace(raw_cycles, readings=rows), models=["offsets"], options=QUICK)
     (result,) = found.results
-    assert (result.prior, result.by_choice, result.spare) == (True, False, 0)
+    assert (result.prior, result.by_choice, result.redundancy) == (True, False, 0)
     json.loads(found.to_json())
 
 

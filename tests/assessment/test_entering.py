@@ -57,7 +57,7 @@ def test_offsets_of_the_model_of_offsets_are_entered_as_identified():
 def test_offsets_to_enter_have_the_least_tool_error(quarter):
     """Their gain is their derivative by the parameters."""
     machines = DrawnMachines(quarter)
-    errors = machines.machine.error_values(machines.draw(np.random.default_rng(1)))
+    errors = machines.by_name(machines.draw(np.random.default_rng(1)))
     result = calibrate(simulate_session(quarter, errors, seed=1).session, "full")
     tool = find_tool(result)
     space = tool.workspace
@@ -92,7 +92,7 @@ def test_the_tool_error_with_the_offsets_to_enter_is_the_predicted_one(quarter):
     errors_by_offsets = {"chosen": [], "identified": [], "offsets": [], "predicted": []}
     for seed in range(6):
         drawn = machines.draw(np.random.default_rng(100 + seed))
-        errors = machines.machine.error_values(drawn)
+        errors = machines.by_name(drawn)
         session = simulate_session(quarter, errors, seed=seed).session
         (full, _), (alone, _) = (
             identify(session, m, solver="variable-projection", find_scale=find_tolerance_scale)

@@ -61,9 +61,9 @@ class Machines:
         problem = self.problem
         jacobian = ToolSensitivity(self.plan.robot, free=problem.free)(self.drives)
         _, slopes = problem.predict_and_jacobian(np.zeros(problem.n_free))
-        covariance = decompose(slopes, problem.observations).covariance(
+        covariance = decompose(slopes, problem.observations).posterior(
             sigma=SIGMA, precision=problem.prior_precision
-        ) * np.outer(problem.theta_scale, problem.theta_scale)
+        ).covariance * np.outer(problem.theta_scale, problem.theta_scale)
         points = self.workspace.points
         sizes = measure_uncertainty(jacobian, covariance, self.workspace, points).sizes
         return sizes.relative.rms

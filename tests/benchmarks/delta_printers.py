@@ -131,8 +131,8 @@ def examine(folder, seed, *, solver="variable-projection"):
         layer=tuple(first_layer(printer, s) for s in used),
         tool=tuple(tool_error(printer, s) for s in used),
         expected=(
-            math.hypot(fit.new.layer_rms, fit.layer_unknown) / MM,
-            math.hypot(fit.new.tool_rms, fit.tool_unknown) / MM,
+            math.hypot(fit.new.layer_rms, fit.layer_uncertainty) / MM,
+            math.hypot(fit.new.tool_rms, fit.tool_uncertainty) / MM,
         ),
         covered=intervals(calibration, printer.errors),
         verdict=calibration.assessment.decision.verdict,

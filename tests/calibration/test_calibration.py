@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 
+import closed_form
 import numpy as np
 import pytest
 from calibrated import calibrated, plan_of
@@ -24,7 +25,6 @@ from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.file import calibration_document, calibration_json, write_calibration
 from orthocal.calibration.identify import identify
 from orthocal.errors import ClosureError
-from orthocal.kinematics import orthoglide as closed_form
 from orthocal.statistics.chance import COVERAGE, confidence_factor
 
 QUICK = {"solver": "variable-projection"}

@@ -196,9 +196,9 @@ class EffectMachines:
         _, jacobian = problem.predict_and_jacobian(theta)
         information = decompose(jacobian, problem.observations)
         held = None if at_bound is None else problem.selection.held_at_bound(at_bound)
-        covariance = information.covariance(
+        covariance = information.posterior(
             sigma=SIGMA, precision=problem.prior_precision, at_bound=held
-        )
+        ).covariance
         return covariance * np.outer(problem.theta_scale, problem.theta_scale)
 
     def tool(self, theta):

@@ -107,11 +107,11 @@ def test_the_robust_covariance_is_that_of_many_simulated_calibrations(exact_plan
     predicted, _, _ = problem.simulate(solved.theta)
     for left, theta in zip(measured - predicted, solved.theta, strict=True):
         residual = project_out_zeros(left, o) / sigma
-        covariance = information.covariance(
+        covariance = information.posterior(
             sigma=sigma,
             precision=problem.prior_precision,
             loss=(loss.gain(residual, used=3 + o.n_zeros), loss.normal_square),
-        )
+        ).covariance
         error = (theta - truth) / problem.theta_scale
         white.append(np.linalg.solve(np.linalg.cholesky(covariance), error))
     # 900 squares have a standard error of 5 %; the formula is one for many readings
@@ -143,6 +143,21 @@ def test_iterations_and_times_are_told(session):
     assert result.solver.iterations >= 1
     assert result.solver.seconds_build > 0.0
     assert result.solver.seconds_solve > 0.0
+
+
+def test_noise_that_does_not_converge_is_reported(session, monkeypatch):
+    """Without tolerance no two estimates agree, so that all rounds end without convergence."""
+    from orthocal.estimation import fit
+
+    converged = calibrate(session, "full")
+    assert converged.solver.noise_converged
+    assert not converged.assessment.of_kind("no convergence")
+    monkeypatch.setattr(fit, "SIGMA_TOLERANCE", 0.0)
+    result = calibrate(session, "full")
+    assert not result.solver.noise_converged
+    (finding,) = result.assessment.of_kind("no convergence")
+    assert finding.severity == "note"
+    assert finding.numbers["sigma_mm"] == pytest.approx(result.noise.sigma * 1e3)
 
 
 def test_correlations_are_those_of_the_covariance(session):

@@ -40,7 +40,7 @@ from orthocal.assessment.controller_entries import offsets_to_enter
 from orthocal.calibration.machine import Machine
 from orthocal.export.linuxcnc.approximation import approximate, rounded_up
 from orthocal.export.linuxcnc.c_source import braced, write_core
-from orthocal.export.linuxcnc.drive_compensation import find_compensation, find_old_compensation
+from orthocal.export.linuxcnc.drive_compensation import find_active_compensation, find_compensation
 from orthocal.export.linuxcnc.export import ExportOptions
 from orthocal.export.linuxcnc.home_offsets import find_homes
 from orthocal.export.linuxcnc.nominal_form import SlidesWithRods, Tangent, find_nominal_form
@@ -474,7 +474,7 @@ def test_offsets_of_a_complete_model(full):
 
 
 def homes_of(calibration, old=None):
-    new, before = (f(calibration, None) for f in (find_compensation, find_old_compensation))
+    new, before = (f(calibration, None) for f in (find_compensation, find_active_compensation))
     return find_homes(calibration, new, before, old=old)
 
 

@@ -165,7 +165,7 @@ def test_one_length_for_all_rods(calibrated):
     assert rods == pytest.approx(np.full(3, rods[0]))
     new = read_settings("marlin1", FIRMWARES["marlin1"].config_lines(fit.settings), -TRIGGER_MM)
     flat = printer.probe(new, rings()) - TRIGGER_MM
-    expected = np.hypot(fit.new.layer_rms, fit.layer_unknown) / MM
+    expected = np.hypot(fit.new.layer_rms, fit.layer_uncertainty) / MM
     assert np.sqrt(np.mean(flat**2)) < PROMISE * expected
 
 

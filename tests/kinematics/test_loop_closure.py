@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import closed_form
 import numpy as np
 import pytest
 from tolerances import CLOSED, CLOSED_FORM
 
 from orthocal.errors import ClosureError, RobotError
 from orthocal.kinematics import continuation
-from orthocal.kinematics import orthoglide as closed_form
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.kinematics.robot_functions import robot_functions
 

@@ -26,7 +26,7 @@ from orthocal.effects.loading import with_effects
 from orthocal.errors import ParameterError, SessionError
 from orthocal.export.linuxcnc.export import ExportOptions
 from orthocal.kinematics.loop_closure import nominal_closure
-from orthocal.measurement.motion.approach import APPROACH, approach_length
+from orthocal.measurement.motion.approach import USUAL_LENGTH, approach_length
 from orthocal.measurement.motion.motion import plan_motion, shown_joints
 from orthocal.measurement.motion.motion_program import ProgramOptions, program_name, write_program
 from orthocal.session.session import Conditions, Reading
@@ -148,7 +148,7 @@ def test_every_drive_approaches_from_the_same_side(small, motions):
             shares = np.linspace(0.0, 1.0, 9)[:, None]
             drives = nominal_closure(robot).inverse((before + shares * (after - before)) * MM)
             assert np.all(np.diff(drives, axis=0) > 0.0)
-            assert drives[-1] - drives[0] == pytest.approx([APPROACH] * 3, abs=3e-7)
+            assert drives[-1] - drives[0] == pytest.approx([USUAL_LENGTH] * 3, abs=3e-7)
 
 
 def test_approach_from_the_other_side_at_the_end_of_travel(small):
@@ -157,7 +157,7 @@ def test_approach_from_the_other_side_at_the_end_of_travel(small):
     motion = plan_motion(replace(small, robot=robot))[0]
     assert {s.approach for s in motion.stops} == {"nnn"}
     stop = motion.stops[0]
-    assert stop.approach_drives - stop.drives == pytest.approx([APPROACH] * 3)
+    assert stop.approach_drives - stop.drives == pytest.approx([USUAL_LENGTH] * 3)
     both = replace(lower, upper=max(s.drives[0] for s in motion.stops) + 1e-3)
     robot = replace(small.robot, drives=(both, *small.robot.drives[1:]))
     with pytest.raises(SessionError, match="neither from below nor from above by 2 mm: x_slide"):
@@ -218,7 +218,7 @@ def test_every_drive_approaches_as_its_reading_states(sided):
         drives = inverse((before + shares * (after - before)) * MM)
         way = directions(stop.approach)
         assert np.all(np.diff(drives, axis=0) * way > 0.0)
-        assert drives[-1] - drives[0] == pytest.approx(APPROACH * way, abs=3e-7)
+        assert drives[-1] - drives[0] == pytest.approx(USUAL_LENGTH * way, abs=3e-7)
         signs = "".join(
             "+" if w * d.direction > 0 else "-"
             for w, d in zip(way, sided.robot.drives, strict=True)

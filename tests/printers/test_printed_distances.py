@@ -316,7 +316,7 @@ def test_a_slip_of_04_that_is_not_named_is_within_the_stated_tool_error(printer,
     for of in (session, slip(session, changed, -0.4)[0]):
         fit = fit_firmware(calibrate(of, solver="variable-projection"), "klipper")
         real = tool_error(Printer(robot, printer.errors), as_firmware(fit.settings))
-        errors.append((real, math.hypot(fit.new.tool_rms, fit.tool_unknown) / MM))
+        errors.append((real, math.hypot(fit.new.tool_rms, fit.tool_uncertainty) / MM))
     (sound, _), (wrong, expected) = errors
     assert 0.01 < wrong - sound < 0.05
     assert wrong < 0.75 * expected
@@ -417,6 +417,6 @@ def test_tool_errors_of_printers_with_distances(tmp_path):
         result = calibrate(import_printer_log(log).session, solver="variable-projection")
         fit = fit_firmware(result, "klipper")
         squares.append(tool_error(drawn, as_firmware(fit.settings)) ** 2)
-        promised.append((fit.new.tool_rms**2 + fit.tool_unknown**2) / MM**2)
+        promised.append((fit.new.tool_rms**2 + fit.tool_uncertainty**2) / MM**2)
     ratio = math.sqrt(np.mean(squares) / np.mean(promised))
     assert ratio < WITHIN, (ratio, math.sqrt(np.mean(squares)))

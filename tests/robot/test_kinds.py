@@ -15,8 +15,8 @@ from tolerances import CLOSED, KINEMATICS
 
 from orthocal import load_robot
 from orthocal.builder.biglide import Biglide
-from orthocal.builder.kinds import KINDS
 from orthocal.builder.linear_delta import LinearDelta
+from orthocal.builder.machine_file import KINDS
 from orthocal.builder.orthoglide import ORTHOGONAL, InclinedOrthoglide, Orthoglide
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.robot.loading import packaged_robots

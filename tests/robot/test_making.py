@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import closed_form
 import numpy as np
 import pytest
 import yaml
 from tolerances import CLOSED_FORM
 
 from orthocal.builder.build import describe_machine, make_robot, remake_robot
-from orthocal.builder.kinds import KINDS
-from orthocal.builder.machine_file import MACHINE, Counting, read_machine
+from orthocal.builder.machine_file import KINDS, MACHINE, Counting, read_machine
 from orthocal.builder.orthoglide import FEET, Orthoglide
 from orthocal.errors import RobotError
-from orthocal.kinematics import orthoglide as closed_forms
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.robot.loading import packaged_robots
 
@@ -34,7 +33,7 @@ def test_the_packaged_machine_comes_out_of_its_own_sizes():
 def test_a_machine_of_other_sizes_moves_as_the_papers_equations_say(tmp_path, sizes):
     robot = make_robot(sizes, tmp_path / "mine")
     points = np.random.default_rng(0).uniform(-0.06, 0.06, (20, 3))
-    drives = closed_forms.inverse(points, length=sizes.leg)
+    drives = closed_form.inverse(points, length=sizes.leg)
     assert np.abs(LoopClosure(robot).forward(drives) - points).max() < CLOSED_FORM
     assert robot.drive_zero == pytest.approx([sizes.leg] * 3)
     assert [(d.lower, d.upper) for d in robot.drives] == [sizes.travel] * 3

@@ -55,16 +55,16 @@ def test_covariance_of_a_line_solved_by_hand():
     """y = a u + zero at u = −1, 0, 2: the slope has variance σ²/Σ(u − ū)² = σ²/(14/3)."""
     o = observations([0, 0, 0], [0, 1, 2], [0, 0, 0])
     information = decompose(np.array([[-1.0], [0.0], [2.0]]), o)
-    assert information.covariance(sigma=0.3, precision=np.zeros(1))[0, 0] == pytest.approx(
-        0.3**2 / (14 / 3), rel=KINEMATICS
-    )
+    assert information.posterior(sigma=0.3, precision=np.zeros(1)).covariance[
+        0, 0
+    ] == pytest.approx(0.3**2 / (14 / 3), rel=KINEMATICS)
     # with a prior of one: precisions add
-    assert information.covariance(sigma=0.3, precision=np.ones(1))[0, 0] == pytest.approx(
+    assert information.posterior(sigma=0.3, precision=np.ones(1)).covariance[0, 0] == pytest.approx(
         1.0 / (1.0 + (14 / 3) / 0.3**2), rel=KINEMATICS
     )
-    assert information.effective_parameters(sigma=0.3, precision=np.ones(1)) == pytest.approx(
-        (14 / 3) / (14 / 3 + 0.3**2), rel=KINEMATICS
-    )
+    assert information.posterior(
+        sigma=0.3, precision=np.ones(1)
+    ).effective_parameters == pytest.approx((14 / 3) / (14 / 3 + 0.3**2), rel=KINEMATICS)
 
 
 def test_dependent_columns_reduce_the_rank():
@@ -197,13 +197,12 @@ def test_parts_of_a_covariance_are_those_of_the_errors_that_cause_them():
     normal = rows.T @ rows + np.diag(precision[free])
     inverse[np.ix_(free, free)] = np.linalg.inv(normal)
     known = {"sigma": sigma, "precision": precision, "at_bound": held}
-    found = information.prior_covariance(priors=scaled, **known)
+    found = information.posterior(**known).prior_covariance(scaled)
     assert found == pytest.approx(np.outer(inverse[:, 2], inverse[2]))
     for loss in ((1.0, 1.0), (0.8, 0.6)):
-        parts = information.noise_covariance(loss=loss, **known)
-        for priors in (scaled, ~scaled):
-            parts = parts + information.prior_covariance(priors=priors, loss=loss, **known)
-        assert parts == pytest.approx(information.covariance(loss=loss, **known))
+        posterior = information.posterior(loss=loss, **known)
+        parts = sum(posterior.prior_covariance(priors) for priors in (scaled, ~scaled))
+        assert parts + posterior.noise_covariance == pytest.approx(posterior.covariance)
 
 
 def test_undetermined_offsets_are_named(raw_cycles):
@@ -219,7 +218,9 @@ def test_six_equations_have_the_closed_form_covariance(experiment_2):
     information = decompose(jacobian, problem.observations)
     scale = np.outer(problem.theta_scale, problem.theta_scale)
     precision = problem.prior_precision
-    covariance = information.covariance(sigma=1.0 / np.sqrt(2.0), precision=precision) * scale
+    covariance = (
+        information.posterior(sigma=1.0 / np.sqrt(2.0), precision=precision).covariance * scale
+    )
     assert np.abs(np.sqrt(np.diag(covariance)) - 1.4031).max() < 0.00006
     assert abs(covariance[0, 1] / covariance[0, 0] + 0.25) < 0.005
 
@@ -239,8 +240,10 @@ def test_predicted_covariance_is_that_of_many_simulated_calibrations():
     whitened = []
     _, jacobians = problem.predict_and_jacobian(solved.theta, found)
     for truth, theta, jacobian in zip(truths, solved.theta, jacobians, strict=True):
-        covariance = decompose(jacobian, problem.observations).covariance(
-            sigma=sigma, precision=problem.prior_precision
+        covariance = (
+            decompose(jacobian, problem.observations)
+            .posterior(sigma=sigma, precision=problem.prior_precision)
+            .covariance
         )
         error = theta / problem.theta_scale - truth
         whitened.append(np.linalg.solve(np.linalg.cholesky(covariance), error))
@@ -259,7 +262,7 @@ def test_a_covariance_is_the_inverse_of_the_sum_of_both_informations(rows):
     rng = np.random.default_rng(rows)
     factor, sigma = rng.normal(size=(rows, 6)), 0.3
     precision = np.array([1.0, 1.0, 1.0, 1e-3, 1.0, 1.0])
-    found = Information(factor).covariance(sigma=sigma, precision=precision)
+    found = Information(factor).posterior(sigma=sigma, precision=precision).covariance
     expected = np.linalg.inv(factor.T @ factor / sigma**2 + np.diag(precision))
     assert np.allclose(found, expected, rtol=1e-9, atol=1e-12)
 
@@ -304,8 +307,8 @@ def test_marginal_information_is_that_of_the_complete_covariance():
     whole = decompose(jacobian, o)
     kept = marginalise(whole, 3, sigma=sigma)
     prior = np.array([0.0, 0.0, 0.0, 1.0, 1.0])
-    expected = whole.covariance(sigma=sigma, precision=prior)[:3, :3]
-    found = kept.covariance(sigma=sigma, precision=np.zeros(3))
+    expected = whole.posterior(sigma=sigma, precision=prior).covariance[:3, :3]
+    found = kept.posterior(sigma=sigma, precision=np.zeros(3)).covariance
     assert found == pytest.approx(expected, rel=1e-9)
-    alone = decompose(jacobian[:, :3], o).covariance(sigma=sigma, precision=np.zeros(3))
+    alone = decompose(jacobian[:, :3], o).posterior(sigma=sigma, precision=np.zeros(3)).covariance
     assert (np.diag(alone) < 0.99 * np.diag(expected)).all()

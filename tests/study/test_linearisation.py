@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import closed_form
 import numpy as np
 import pytest
 from gauges import exact
@@ -12,7 +13,6 @@ from orthocal.builder.build import make_robot
 from orthocal.builder.orthoglide import Orthoglide
 from orthocal.errors import NotIdentifiableError, ParameterError
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
-from orthocal.kinematics import orthoglide as closed_forms
 from orthocal.session.session import Gauge
 from orthocal.study.linearisation import (
     IDENTIFIED,
@@ -54,8 +54,8 @@ def test_linearisation_errors_agree_with_the_closed_forms(orthoglide):
 
     def reading(setup, displacement, error):
         direction, leg = ("xyz".index(c) for c in setup)
-        drives = closed_forms.inverse(displacement * np.eye(3)[leg], length=length)
-        tool = closed_forms.direct(drives, length=length, offsets=error)
+        drives = closed_form.inverse(displacement * np.eye(3)[leg], length=length)
+        tool = closed_form.direct(drives, length=length, offsets=error)
         root = np.eye(3)[leg] * (drives + error)[leg]
         # where the section of the leg is that the gauge stands at
         at = length / 2 + error[leg]

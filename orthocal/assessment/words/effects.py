@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from orthocal.assessment.wording import joined, named, note
+from orthocal.assessment.wording import joined, note, parameter_places
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.effects.protocol import Effect
 
@@ -55,7 +55,7 @@ def approached_from_one_side(drives: Mapping[str, str]) -> Finding:
         f"All readings approach {joined(list(drives))} from the same side. They cannot show "
         f"{'its' if len(drives) == 1 else 'their'} backlash, whatever its size.",
         f"Approach {postures} also from the other side.",
-        named(*drives),
+        parameter_places(*drives),
     )
 
 
@@ -97,7 +97,7 @@ def effects_alike(
         "effects inseparable",
         f"These readings do not separate {pairs_text}: {reason}.",
         _separating({one.name, other.name}),
-        named(*parameters, *partners),
+        parameter_places(*parameters, *partners),
     )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from orthocal.assessment.controller_entries import ScrewEntry
-from orthocal.assessment.wording import counted, joined, named, note, tool_mm
+from orthocal.assessment.wording import counted, joined, note, parameter_places, tool_mm
 from orthocal.assessment.words.anomalies import MAX_PLACES, place_of
 from orthocal.calibration.assessment_record import Finding, ToolErrorSummary, Verdict
 from orthocal.kinematics.conditions import StatedUse
@@ -114,7 +114,7 @@ def no_change_needed(
             "Keep the active offsets: others would lower the expected tool error by less than "
             f"{share:.0%}."
         )
-    return note("no change needed", text, "", named(*drives), **numbers)
+    return note("no change needed", text, "", parameter_places(*drives), **numbers)
 
 
 def settings_kept(*, tool: tuple[float, ...], layer: tuple[float, ...]) -> Finding:
@@ -138,7 +138,7 @@ def settings_kept(*, tool: tuple[float, ...], layer: tuple[float, ...]) -> Findi
 
 def must_change(drives: Sequence[str]) -> Finding:
     """Finding about offsets that change by more than their uncertainty."""
-    return note("must change", _describe_change(drives, "more"), "", named(*drives))
+    return note("must change", _describe_change(drives, "more"), "", parameter_places(*drives))
 
 
 def not_significant(drives: Sequence[str]) -> Finding:
@@ -147,7 +147,7 @@ def not_significant(drives: Sequence[str]) -> Finding:
         f"{_describe_change(drives, 'less')} Enter all offsets together or none: the tool error "
         "depends on all of them."
     )
-    return note("not significant", text, "", named(*drives))
+    return note("not significant", text, "", parameter_places(*drives))
 
 
 def _describe_change(drives: Sequence[str], compared: str) -> str:

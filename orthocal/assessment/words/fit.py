@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from orthocal.assessment.wording import counted, mm, named, note, plain, times
+from orthocal.assessment.wording import counted, mm, note, parameter_places, plain, times
 from orthocal.calibration.assessment_record import Finding, Place
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.statistics.identifiability import Combination
@@ -22,6 +22,22 @@ def noise_unknown() -> Finding:
         "gauge's noise: the uncertainty is unknown.",
         "State gauge.sigma_mm, or repeat the readings in cycles.",
     )
+
+
+def noise_not_converged(sigma: float) -> Finding:
+    """Finding that the noise still differs between the last two solutions."""
+    return note(
+        "no convergence",
+        "The estimated noise of a reading differs between the last two solutions, so the values "
+        "and their ± are approximate.",
+        "State gauge.sigma_mm, or repeat all readings in cycles.",
+        sigma_mm=sigma / MM,
+    )
+
+
+def no_solution() -> Finding:
+    """Finding that the solver fails with these readings."""
+    return note("no convergence", "The solver finds no machine that fits these readings.")
 
 
 def noise_from_residuals(sigma: float) -> Finding:
@@ -125,7 +141,7 @@ def nothing_depends(names: Sequence[str]) -> Finding:
         "no sensitivity",
         "No reading depends on any free parameter, so all keep their start values.",
         "Read setups and postures that depend on the parameters.",
-        named(*names),
+        parameter_places(*names),
     )
 
 
@@ -151,7 +167,7 @@ def held_by_bound(parameter: ParameterEstimate, *, offset: bool) -> Finding:
             f"value_{parameter.edge_unit}" if parameter.unit != "1" else "value": parameter.value
             * parameter.edge_factor
         },
-        named(parameter.name),
+        parameter_places(parameter.name),
     )
 
 
@@ -169,7 +185,7 @@ def linearisation_error(parameter: ParameterEstimate, change: float, std: float)
         f"{parameter.name} by {plain(change * parameter.edge_factor)} {parameter.edge_unit}, "
         f"{change / std:.2g} times its standard deviation.",
         "",
-        named(parameter.name),
+        parameter_places(parameter.name),
         part_of_std=change / std,
     )
 
@@ -180,7 +196,7 @@ def inseparable(combination: Combination) -> Finding:
         "inseparable",
         f"Determined only in combination: {combination.words}.",
         "",
-        named(*combination.names),
+        parameter_places(*combination.names),
     )
 
 
@@ -194,7 +210,7 @@ def below_noise(names: Sequence[str]) -> Finding:
         f"The {effect} of {counted(count, 'parameter')}{listed} on the readings {remains} below "
         "the noise, at one prior standard deviation.",
         "",
-        named(*names),
+        parameter_places(*names),
         parameters=float(count),
     )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from orthocal.assessment.predictive import MIN_ROWS, Repetition
-from orthocal.assessment.wording import joined, mm, named, note, review, signed
+from orthocal.assessment.wording import joined, mm, note, parameter_places, review, signed
 from orthocal.calibration.assessment_record import ControllerEntry, Finding, Place
 
 CONFIRMED = "The calibration is confirmed."
@@ -43,8 +43,8 @@ def larger_than_predicted(
 
     Args:
         achieved: RMS of the deviations, [m].
-        limit: RMS above which deviations of this pattern are significant, [m]. The predicted RMS is
-            a mean over all patterns and may be larger.
+        limit: RMS at which these deviations, scaled by a common factor, become significant, [m]. It
+            depends on their distribution over the readings and may be below the predicted RMS.
         refit: RMS residual of a fit of the new readings, [m]; None if an anomaly explains them.
         explains: Whether that fit explains the deviations.
         firmware: Whether a printer with its settings is validated.
@@ -65,7 +65,7 @@ def larger_than_predicted(
             cause = "the readings scatter more than before, or something moved during the session"
             action = f"Check the mounting of the {'probe' if firmware else 'gauge'}, then "
             action += "probe again." if firmware else "read again."
-        text += f" A new calibration leaves {mm(refit)} mm RMS of this. Probably {cause}."
+        text += f" After a new fit {mm(refit)} mm RMS remain. Probably {cause}."
     return review("larger than predicted", text, action, (place,), **numbers)
 
 
@@ -83,8 +83,8 @@ def further_change(entries: Sequence[ControllerEntry]) -> Finding:
     """Finding that the joint calibration improves offsets.
 
     Args:
-        entries: Offsets that change by more than their uncertainty; empty if only the changes of
-            all together are significant.
+        entries: Offsets that change by more than their uncertainty; empty if each change is smaller
+            but all together are significant.
     """
     changes = [
         f"{e.drive} from {signed(e.active * e.edge_factor)} to {signed(e.enter * e.edge_factor)} "
@@ -96,7 +96,9 @@ def further_change(entries: Sequence[ControllerEntry]) -> Finding:
     if changes:
         noun = "an offset" if len(changes) == 1 else "offsets"
         text = f"The new readings still improve {noun}: {joined(changes)}."
-    return note("further change", text, CALIBRATE_JOINTLY, named(*(e.drive for e in entries)))
+    return note(
+        "further change", text, CALIBRATE_JOINTLY, parameter_places(*(e.drive for e in entries))
+    )
 
 
 def further_settings() -> Finding:
@@ -115,13 +117,13 @@ def describe_repetition(
 
     Args:
         repetition: The correlation.
-        exceeded: Whether the deviations are larger than predicted, so that residuals are new.
+        exceeded: Whether the deviations are larger than predicted.
         title: Title of the other session; "" not to name it.
     """
     r, where = repetition, f" in '{title}'" if title else ""
     numbers = {"rows": float(r.matched), "correlation": r.correlation, "chance": r.p_value}
     if r.repeats is None:
-        reason = f"the calibration leaves none in nearly all of the {r.matched} shared lines"
+        reason = f"nearly all residuals of the calibration in the {r.matched} shared lines are 0"
         if r.matched < MIN_ROWS:
             reason = "too few lines are shared"
         text = f"It is unknown whether the same deviations remain{where}: {reason}."

@@ -68,8 +68,10 @@ def diagnose_readings(fit: Fit) -> Diagnostics:
     if not (np.isfinite(sigma) and sigma >= SMALLEST_SIGMA):
         zeros = np.zeros(count)
         return Diagnostics(np.full(count, np.nan), zeros, zeros.astype(np.int64), np.inf)
-    inverse = _weighted_information(fit).covariance(
-        sigma=sigma, precision=problem.prior_precision, at_bound=fit.at_bound
+    inverse = (
+        _weighted_information(fit)
+        .posterior(sigma=sigma, precision=problem.prior_precision, at_bound=fit.at_bound)
+        .covariance
     )
     weights, s_inv_x, m_y, s_inv_diagonal = _eliminate_zeros(fit)
     gain = s_inv_x @ inverse / sigma**2

@@ -103,18 +103,15 @@ def find_unmodelled_errors(fit: Fit, *, represented: Collection[str] = ()) -> Un
     # a sum models its first error; the other errors may differ from it
     free = problem.machine_selection.names
     modelled = {parameters[n].terms[0][0] for n in (*free, *problem.fixed, *represented)}
-    names = [
-        n
-        for n in machine_errors(problem.robot)
-        if n not in represented and not modelled & {term for term, _ in parameters[n].terms}
-    ]
+    others = [n for n in machine_errors(problem.robot) if n not in represented]
+    names = parameters.without_terms(others, modelled)
     o = problem.observations
     if not names:
         none = np.zeros(0, dtype=np.bool_)
         return UnmodelledErrors((), read_only([]), none, read_only(np.zeros((o.size, 0))))
-    factors = problem.machine_selection.tolerance_scale.factors(parameters, tuple(names))
+    factors = problem.machine_selection.tolerance_scale.factors(parameters, names)
     return UnmodelledErrors(
-        tuple(names),
+        names,
         read_only(factors * [parameters[n].prior_std for n in names]),
         np.array([parameters.are_scaled(n) for n in names], dtype=np.bool_),
         read_only(error_jacobian(fit, names) * factors),
@@ -158,9 +155,9 @@ def propagate_unmodelled(fit: Fit, errors: UnmodelledErrors) -> tuple[Unmodelled
         return no_effect, np.zeros((problem.n_free - n, 0))
     o, sigma = problem.observations, fit.sigma
     jacobian = project_out_zeros(fit.jacobian, o)
-    inverse = fit.information.covariance(
+    inverse = fit.information.posterior(
         sigma=sigma, precision=problem.prior_precision, at_bound=fit.at_bound
-    )
+    ).covariance
     scaled = inverse @ (jacobian.T @ errors.jacobian) / sigma**2
     residual = o.rows(errors.jacobian - jacobian @ scaled)
     bias = scaled * problem.theta_scale[:, None]  # per prior standard deviation of each error

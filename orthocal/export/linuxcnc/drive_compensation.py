@@ -5,17 +5,17 @@ motion:
 
     motor = j + T_s(j) − T_l(h) + constant,  T_s(j) = s b/2 with BACKLASH = b.
 
-Homing latches the switch in the direction l and displays HOME_OFFSET h there. So the trim of that
-direction does not change the motor's position at the switch. For a displacement Δ of the display,
-HOME_OFFSET is therefore
+Homing latches the switch in the direction l and displays HOME_OFFSET h there. The motor's position
+at the switch does not depend on the trim, because T_l(h) is subtracted. To shift the display by Δ,
+enter
 
     h_new = h_old + Δ + T_l(h_old) − T_l(h_new),
 
 where T_l(h_old) is the trim of the compensation that was active during the measurement.
 
 A table of COMP_FILE (type 1) lists T₊ and T₋ over the travel and replaces BACKLASH. It has at most
-256 entries. So a kinematics module contains the periodic errors for the middle of both sides.
-BACKLASH or COMP_FILE then contain only the part that depends on the side.
+256 entries. If a kinematics module is exported, it corrects the mean of T₊ and T₋, which contains
+the periodic errors. BACKLASH or COMP_FILE then contain only the difference of the two sides.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from orthocal.arrays import Array
 from orthocal.assessment.controller_entries import (
     ENTERED_DECIMALS,
     find_backlash,
+    find_screw_effect,
     find_screws,
 )
 from orthocal.calibration.calibration import Calibration
@@ -84,7 +85,7 @@ def find_periodic_errors(robot: Robot, errors: Mapping[str, float]) -> PeriodicE
         robot: The robot.
         errors: Values by parameter name, [SI].
     """
-    screw = next((e for e in robot_effects(robot) if isinstance(e, Screw)), None)
+    screw = find_screw_effect(robot)
     if screw is None:
         return None
     sine, cosine = (
@@ -98,8 +99,8 @@ def find_periodic_errors(robot: Robot, errors: Mapping[str, float]) -> PeriodicE
 
 def without_periodic_errors(robot: Robot, errors: Mapping[str, float]) -> dict[str, float]:
     """Errors of a machine without the periodic errors of its screws."""
-    screws = [e for e in robot_effects(robot) if isinstance(e, Screw)]
-    periodic = {error.name for screw in screws for error in screw.errors}
+    screw = find_screw_effect(robot)
+    periodic = set() if screw is None else {error.name for error in screw.errors}
     return {name: value for name, value in errors.items() if name not in periodic}
 
 
@@ -110,15 +111,15 @@ class JointCompensation(JointTrim):
     latched: int = 1
     """Sign of HOME_LATCH_VEL, 1 or -1."""
     error: float = 0.0
-    """Largest remaining error of the joint, [m, rad]: of a table between its entries, or of a
-    constant backlash that shifts the phase of a periodic error."""
-    beside_module: bool = False
-    """Whether the table is used with a kinematics module, which contains the periodic errors."""
+    """Largest error of the joint after compensation, [m, rad]: interpolation error of a table, or
+    error of a constant BACKLASH, because backlash shifts the phase of a periodic error."""
+    with_module: bool = False
+    """True if a kinematics module corrects the periodic errors."""
 
     def file_name(self, joint: int) -> str:
         """File name of the table of joint number `joint`."""
         name = table_name(joint)
-        return name.replace(".comp", "_module.comp") if self.beside_module else name
+        return name.replace(".comp", "_module.comp") if self.with_module else name
 
     def trim_at_home(self, home: float | None, *, opposite: bool = False) -> float:
         """T_l: trim in the latching direction at HOME_OFFSET, [m, rad].
@@ -152,10 +153,10 @@ def require_latched(robot: Robot, latched: Sequence[int] | None) -> tuple[int, .
     return tuple(latched)
 
 
-def find_old_compensation(
+def find_active_compensation(
     calibration: Calibration, latched: Sequence[int] | None
 ) -> tuple[JointCompensation, ...]:
-    """Active compensation during the measurement, in the order of the drives.
+    """Compensation that was active during the measurement, in the order of the drives.
 
     Raises:
         ParameterError: If the numbers of directions and drives differ.
@@ -179,48 +180,48 @@ def find_compensation(
         ParameterError: If the numbers of directions and drives differ.
         ExportError: If tables were active, and the model has only one of both effects.
     """
-    robot, old = calibration.robot, find_old_compensation(calibration, latched)
+    robot, active = calibration.robot, find_active_compensation(calibration, latched)
     modelled = {type(e) for e in robot_effects(robot)} & {Backlash, Screw}
     if not modelled:
-        return old
-    if len(modelled) < 2 and any(joint.table is not None for joint in old):
+        return active
+    if len(modelled) < 2 and any(joint.table is not None for joint in active):
         raise ExportError(
             "the controller has tables (comp_file) of backlash and periodic errors; identify both "
             "with --effects backlash,screw"
         )
     if Backlash not in modelled:
-        return old
+        return active
     enter = {e.drive: e.enter for e in find_backlash(calibration)}
     backlash = [
-        enter.get(d.name, joint.backlash) for d, joint in zip(robot.drives, old, strict=True)
+        enter.get(d.name, joint.backlash) for d, joint in zip(robot.drives, active, strict=True)
     ]
     return tuple(
         JointCompensation(b if b >= NEGLIGIBLE else 0.0, None, joint.latched)
-        for b, joint in zip(backlash, old, strict=True)
+        for b, joint in zip(backlash, active, strict=True)
     )
 
 
 def round_backlash(
-    compensation: Sequence[JointCompensation], before: Sequence[JointCompensation]
+    compensation: Sequence[JointCompensation], active: Sequence[JointCompensation]
 ) -> tuple[JointCompensation, ...]:
-    """Round each BACKLASH to enter as it is printed; tables and unchanged values are not rounded.
+    """Round each changed BACKLASH to the printed decimals.
 
     Args:
         compensation: Compensation to enter.
-        before: Compensation during the measurement.
+        active: Compensation during the measurement.
     """
     return tuple(
         joint
-        if joint.table is not None or joint.backlash == was.backlash
+        if joint.table is not None or joint.backlash == old.backlash
         else replace(joint, backlash=round(joint.backlash, ENTERED_DECIMALS))
-        for joint, was in zip(compensation, before, strict=True)
+        for joint, old in zip(compensation, active, strict=True)
     )
 
 
 def tabulate(
     calibration: Calibration,
     compensation: Sequence[JointCompensation],
-    before: Sequence[JointCompensation],
+    active: Sequence[JointCompensation],
     offsets: Array,
 ) -> tuple[JointCompensation, ...]:
     """Tables of backlash and periodic errors, for joints with significant periodic errors.
@@ -228,7 +229,7 @@ def tabulate(
     Args:
         calibration: The calibration.
         compensation: Compensation of backlash.
-        before: Compensation during the measurement; unchanged tables are kept.
+        active: Compensation during the measurement; unchanged tables are kept.
         offsets: Offsets in the controller with these tables, shape (n_drives,), [m, rad].
 
     Raises:
@@ -243,7 +244,7 @@ def tabulate(
     changed = {e.drive for e in screws if e.change.any()}
     changed |= {e.drive for e in find_backlash(calibration) if e.change}
     tabulated = []
-    for i, (d, joint, old) in enumerate(zip(robot.drives, compensation, before, strict=True)):
+    for i, (d, joint, old) in enumerate(zip(robot.drives, compensation, active, strict=True)):
         if old.table is not None and d.name not in changed:
             tabulated.append(old)
             continue
@@ -261,31 +262,31 @@ def tabulate(
     return tuple(tabulated)
 
 
-def compensate_beside_module(
+def compensate_with_module(
     calibration: Calibration,
     compensation: Sequence[JointCompensation],
-    before: Sequence[JointCompensation],
+    active: Sequence[JointCompensation],
 ) -> tuple[JointCompensation, ...]:
-    """Compensation of backlash beside a kinematics module that contains the periodic errors.
+    """Compensation of backlash for use with a kinematics module that corrects periodic errors.
 
-    If a joint had a table during the measurement, a new table replaces it. It contains the part
-    that depends on the side: the backlash, and the difference of the periodic error between both
-    sides. A table that the model does not describe is kept.
+    If a joint had a table during the measurement, a new table replaces it. It contains the
+    difference of the two sides: the backlash, and the difference of the periodic error between
+    both sides. If the model has neither effect, the table is kept.
 
     Args:
         calibration: The calibration.
         compensation: Compensation of backlash.
-        before: Compensation during the measurement.
+        active: Compensation during the measurement.
     """
     robot, offsets = calibration.robot, calibration.active_offsets
     periodic = find_periodic_errors(robot, calibration.errors)
     compensated = []
-    for i, (joint, old) in enumerate(zip(compensation, before, strict=True)):
+    for i, (joint, old) in enumerate(zip(compensation, active, strict=True)):
         half = 0.5 * joint.backlash
         if joint.table is None and old.table is not None:
-            trims = _Trims(robot, i, offsets[i], half, periodic, beside_module=True)
+            trims = _Trims(robot, i, offsets[i], half, periodic, with_module=True)
             table = _tabulate_joint(joint, trims, old.table[[0, -1], 0])
-            compensated.append(replace(table, beside_module=True))
+            compensated.append(replace(table, with_module=True))
         elif joint.table is None and periodic is not None:
             slope = 2.0 * np.pi / periodic.lead * np.hypot(periodic.sine[i], periodic.cosine[i])
             compensated.append(replace(joint, error=float(slope) * half))
@@ -306,8 +307,8 @@ class _Trims:
     half: float
     """Half of the backlash, [m, rad]."""
     periodic: PeriodicErrors | None
-    beside_module: bool = False
-    """Whether the commanded position is already corrected for the middle of both sides."""
+    with_module: bool = False
+    """True if a kinematics module already corrects the mean of both sides."""
 
     def __call__(self, joints: Array) -> Array:
         """Trims of both sides at positions (n,) of the joint, shape (n, 2), [m, rad]."""
@@ -315,7 +316,7 @@ class _Trims:
         commanded = np.tile(self.robot.drive_zero, (len(joints), 1))
         commanded[:, self.drive] = drive.from_joint(joints) - self.offset
         target = commanded
-        if self.beside_module and periodic is not None:
+        if self.with_module and periodic is not None:
             target = commanded + periodic(commanded)
         columns = []
         for side in (1.0, -1.0):

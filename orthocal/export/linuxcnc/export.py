@@ -15,9 +15,9 @@ from orthocal.export.linuxcnc.approximation import approximate
 from orthocal.export.linuxcnc.c_source import write_component, write_core
 from orthocal.export.linuxcnc.drive_compensation import (
     JointCompensation,
-    compensate_beside_module,
+    compensate_with_module,
+    find_active_compensation,
     find_compensation,
-    find_old_compensation,
     round_backlash,
     tabulate,
 )
@@ -110,7 +110,7 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         ParameterError: If an option of a module is stated for HOME_OFFSET, or values are missing.
     """
     compensation = find_compensation(calibration, options.latched)
-    before = find_old_compensation(calibration, options.latched)
+    before = find_active_compensation(calibration, options.latched)
     stated = options.latched is not None
     module = not calibration.only_offsets if options.module is None else options.module
     if not module:
@@ -127,7 +127,7 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
             "joints.ini": write_home_lines(homes, stated=stated),
             **_write_tables(calibration, compensation, before),
         }
-    compensation = compensate_beside_module(calibration, compensation, before)
+    compensation = compensate_with_module(calibration, compensation, before)
     compensation = round_backlash(compensation, before)
     if not compensates_alike(compensation, before):
         _require_home_offsets(options, before)
@@ -212,7 +212,7 @@ def assumes_latching(calibration: Calibration, options: ExportOptions) -> bool:
     """True if the export depends on signs of HOME_LATCH_VEL that the options do not state."""
     if options.latched is not None:
         return False
-    old, new = (f(calibration, None) for f in (find_old_compensation, find_compensation))
+    old, new = (f(calibration, None) for f in (find_active_compensation, find_compensation))
     if not compensates_alike(old, new):
         return True
     return any(e.change.any() for e in find_screws(calibration))

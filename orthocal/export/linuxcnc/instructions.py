@@ -159,7 +159,7 @@ def _describe_compensation(homes: Sequence[JointHome], *, stated: bool) -> str:
             )
     tables = [h.compensation for h in homes if h.compensation.table is not h.was.table]
     tables = [c for c in tables if c.table is not None]
-    if any(c.beside_module for c in tables):
+    if any(c.with_module for c in tables):
         paragraphs.append(
             "**Tables:** copy the files `joint_*_module.comp` beside your INI file. They replace\n"
             "the tables of the measurement. The periodic errors of the screws are in the module;\n"

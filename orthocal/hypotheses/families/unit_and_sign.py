@@ -20,24 +20,24 @@ DECIMAL_POINTS = (10.0, 0.1, 100.0, 0.01)
 """Factors that correct a misplaced decimal point."""
 
 MAX_RELATIVE_STEP = 10.0
-"""Largest step of the corrected numbers, relative to the noise, of a considered unit."""
+"""Largest plausible step of the corrected numbers, relative to the noise."""
 
 MIN_RELATIVE_STEP = 1e-3
-"""Smallest step of the corrected numbers, relative to the noise, of a considered unit: finer
-numbers are computed, not read from a dial."""
+"""Smallest plausible step of the corrected numbers, relative to the noise. Nobody reads a dial more
+finely; such numbers were computed."""
 
 MAX_DECIMALS = 9
-"""Most decimals of a number in mm for which the step is sought."""
+"""Largest number of decimals, in mm, of a step."""
 
 STEP_TOLERANCE = 1e-3
 """Largest distance of a number from a multiple of the step, in steps."""
 
 MAX_PAIRED_SETUPS = 24
-"""Most setups of a session of which pairs are considered."""
+"""Number of setups of a session above which pairs of setups are not tested."""
 
 
 def wrong_units_and_signs(rows: Rows, sigma: float) -> Iterator[Family]:
-    """Factors that groups of readings share.
+    """Hypotheses that all readings of a group have a wrong unit, decimal point or sign.
 
     Args:
         rows: The rows.
@@ -46,11 +46,11 @@ def wrong_units_and_signs(rows: Rows, sigma: float) -> Iterator[Family]:
     groups = [g for g in _groups(rows) if rows.written[list(g.rows)].all()]
     if not groups:
         return
-    yield multiplied(rows, groups)
+    yield factor_family(rows, groups)
     names = [name for name, indices in rows.setups.items() if rows.written[indices].all()]
     if 3 < len(names) <= MAX_PAIRED_SETUPS:
         pairs = combinations(names, 2)
-        yield multiplied(rows, [_reversed("setups", rows.of_setups(p), p) for p in pairs])
+        yield factor_family(rows, [_reversed("setups", rows.of_setups(p), p) for p in pairs])
     groups += [
         _reversed("cycle", indices, names=(name,), cycle=cycle)
         for (name, cycle), indices in rows.cycles.items()
@@ -60,10 +60,10 @@ def wrong_units_and_signs(rows: Rows, sigma: float) -> Iterator[Family]:
     yield _scaled(rows, groups, "decimal point", DECIMAL_POINTS, sigma)
 
 
-def multiplied(
+def factor_family(
     rows: Rows, explanations: Sequence[Explanation], *, size: int | None = None
 ) -> Family:
-    """Family of explanations that correct their rows by a factor.
+    """Family of hypotheses that correct their rows by a factor.
 
     Args:
         rows: The rows.
@@ -74,6 +74,7 @@ def multiplied(
     changes = [
         (f - 1.0) * rows.values[list(e.rows)] for f, e in zip(factors, explanations, strict=True)
     ]
+    # the likelihood is a density of the readings, so a change of their scale changes it
     dimensions = np.array([_dimensions(rows, e) for e in explanations])
     volume = dimensions * np.log(np.abs(factors))
     return Family.edited(rows, explanations, changes, size=size, log_volume=volume)
@@ -92,7 +93,10 @@ def _reversed(
 
 
 def _groups(rows: Rows) -> list[Explanation]:
-    """Reversed sign of each group of readings that may share a factor."""
+    """Groups of readings that may have a common factor: session, legs, gauges and setups.
+
+    The explanation of each group is a reversed sign; `_scaled` replaces it.
+    """
     setup_names = tuple(rows.setups)
     explanations = [_reversed("session", np.arange(rows.count), setup_names)]
     for (scope, name), setups in rows.groups.items():
@@ -112,7 +116,7 @@ def _scaled(
     factors: tuple[float, ...],
     sigma: float,
 ) -> Family:
-    """Groups of readings multiplied by a factor, if the corrected step is plausible."""
+    """Family of groups multiplied by each factor after which the decimal step is plausible."""
     steps = [_step(rows.values[list(g.rows)]) for g in groups]
     explanations = [
         replace(g, kind=kind, factor=factor)
@@ -120,11 +124,11 @@ def _scaled(
         for g, step in zip(groups, steps, strict=True)
         if factor < 1.0 or MIN_RELATIVE_STEP * sigma <= factor * step <= MAX_RELATIVE_STEP * sigma
     ]
-    return multiplied(rows, explanations, size=len(groups) * len(factors))
+    return factor_family(rows, explanations, size=len(groups) * len(factors))
 
 
 def _dimensions(rows: Rows, group: Explanation) -> int:
-    """Number of independent readings in rows: that of rows minus zeros of complete setups."""
+    """Number of independent readings in a group: its rows minus the gauge zeros of its setups."""
     if not group.setups:
         return len(group.rows)
     readings = rows.session.readings
@@ -132,7 +136,7 @@ def _dimensions(rows: Rows, group: Explanation) -> int:
 
 
 def _step(values: Array) -> float:
-    """Decimal step of numbers, a power of ten of 1 mm, [m]; 0 if it is too fine."""
+    """Largest decimal step (1 mm, 0.1 mm, …) that divides all values, [m]; 0 if there is none."""
     for decimals in range(MAX_DECIMALS):
         step = 10.0**-decimals * MM
         if np.abs(values / step - np.round(values / step)).max() < STEP_TOLERANCE:

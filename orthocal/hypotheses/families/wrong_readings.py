@@ -8,7 +8,7 @@ import numpy as np
 
 from orthocal.arrays import Indices
 from orthocal.hypotheses.anomaly import AnomalyKind, Explanation, Scope
-from orthocal.hypotheses.families.unit_and_sign import DECIMAL_POINTS, multiplied
+from orthocal.hypotheses.families.unit_and_sign import DECIMAL_POINTS, factor_family
 from orthocal.hypotheses.hypothesis import Family, Rows
 
 MISREAD = (1e-3, 0.5e-3, 0.2e-3, 0.1e-3)
@@ -69,7 +69,7 @@ def _multiplied(
     rows: Rows, groups: Sequence[Indices], factors: Sequence[float], kind: AnomalyKind
 ) -> Family:
     explanations = [_explain(rows, i, kind, factor=factor) for factor in factors for i in groups]
-    return multiplied(rows, explanations)
+    return factor_family(rows, explanations)
 
 
 def _misread(rows: Rows, groups: Sequence[Indices]) -> Family:

@@ -1,8 +1,8 @@
 """Rows of a readings.csv, as orthocal writes it or as a spreadsheet saved it.
 
-orthocal writes UTF-8 with commas, decimal points and mm. A spreadsheet may save semicolons or tabs,
-decimal commas, another encoding, German headings or a typographic minus. Such a file is read if it
-has one meaning only; ambiguous files need `orthocal import`.
+orthocal writes UTF-8 with commas, decimal points and mm: the standard form. A spreadsheet may save
+semicolons or tabs, decimal commas, another encoding, German headings or a typographic minus. Such a
+file is read unless its numbers are ambiguous; then the user needs `orthocal import`.
 """
 
 from __future__ import annotations
@@ -39,9 +39,10 @@ from orthocal.units import trim_zeros
 
 @dataclass(frozen=True, slots=True)
 class RawReading:
-    """Row of a table of readings, as text. The fields after the first two are the columns.
+    """Row of a table of readings, as text. Numbers have a decimal point.
 
-    Numbers have a decimal point.
+    The fields from `setup` on are the columns of readings.csv. The columns x_mm to z_mm are a
+    measured point; cov_xx_um2 to cov_yz_um2 are its covariance, if it differs from its setup's.
     """
 
     where: str
@@ -53,11 +54,9 @@ class RawReading:
     cycle: str = ""
     reading_mm: str = ""
     x_mm: str = ""
-    """Coordinates of a measured point, x to z."""
     y_mm: str = ""
     z_mm: str = ""
     cov_xx_um2: str = ""
-    """Covariance of the point, xx to yz, if it is not the one of its setup."""
     cov_yy_um2: str = ""
     cov_zz_um2: str = ""
     cov_xy_um2: str = ""
@@ -81,7 +80,7 @@ REQUIRED_OF_POINTS = ("setup", "posture", *COORDINATES)
 """Required columns of a table with points; the others are optional."""
 
 NUMBERS = ("reading_mm", *COORDINATES, *COVARIANCES, "temperature_C")
-"""Columns of numbers that may have a decimal sign."""
+"""Columns of numbers, which may have a decimal point or comma."""
 
 COLUMN_OF_ROLE = {"reading": "reading_mm", "temperature": "temperature_C"}
 """Columns of a readings.csv whose name differs from their role in other tables, by role."""
@@ -96,7 +95,7 @@ FIRST_LINE = 2
 """Line of the first row of a readings.csv, after the header."""
 
 OPTIONAL_DEFAULTS = {"cycle": "1"}
-"""Values of optional columns that need not be stated."""
+"""Values of optional columns in rows that do not state them."""
 
 
 def format_readings(
@@ -127,11 +126,12 @@ def format_readings(
         ]
         for r in rows
     ]
-    lines = [columns, *cells]  # ISO 8601 allows a comma in a fraction of a second
+    lines = [columns, *cells]
+    # a time in ISO 8601 may contain a comma before fractions of a second
     return "".join(",".join(c.replace(",", ".") for c in line) + "\n" for line in lines)
 
 
-def mm_text(value: Decimal) -> str:
+def format_mm(value: Decimal) -> str:
     """Text of a reading in mm in a readings.csv: exact, with at least two decimals."""
     return trim_zeros(f"{value:f}") if -30 < value.adjusted() < 30 else f"{value:e}"
 
@@ -144,16 +144,16 @@ def has_standard_headings(header: Iterable[str]) -> bool:
 
 
 def _schema(header: Collection[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Required and optional columns of a table, with points or without."""
+    """Required and optional columns of a table of readings or of points."""
     if not set(COORDINATES) & set(header):
         return REQUIRED, OPTIONAL
     return REQUIRED_OF_POINTS, tuple(name for name in COLUMNS if name not in REQUIRED_OF_POINTS)
 
 
-def decide_sign(
+def decide_decimal_sign(
     cells: Sequence[Numeral], *, standard: bool, advice: str, place: Callable[[int], str]
 ) -> DecimalSign:
-    """Common decimal sign of the readings of a table.
+    """Common decimal sign (point or comma) of the readings of a table.
 
     Args:
         cells: The readings.
@@ -162,7 +162,7 @@ def decide_sign(
         place: Function from a line to file and line, for messages.
 
     Raises:
-        SessionError: If two signs are possible, or both occur.
+        SessionError: If both signs are possible, or both occur.
     """
     sign = infer_decimal_sign(cells)
     if sign.sign is not None:
@@ -212,17 +212,17 @@ def read_rows(path: Path, content: bytes) -> Iterator[RawReading]:
     try:
         decoded = decode(content, where=str(path))
     except SessionError:
-        return _plain_rows(path, content)
+        return _standard_rows(path, content)
     first_line = decoded.text.partition("\n")[0]
     if any(has_standard_headings(first_line.split(separator)) for separator in ",;"):
         if decoded.encoding != "utf-8":
             content = decoded.text.encode()
-        return _plain_rows(path, content)
-    table = _clean_table(path, content)
-    return _plain_rows(path, content) if table is None else _table_rows(*table)
+        return _standard_rows(path, content)
+    table = _read_spreadsheet_table(path, content)
+    return _standard_rows(path, content) if table is None else _spreadsheet_rows(*table)
 
 
-def _plain_rows(path: Path, content: bytes) -> Iterator[RawReading]:
+def _standard_rows(path: Path, content: bytes) -> Iterator[RawReading]:
     """Rows below the headings of a readings.csv."""
     text = read_text(path, error=SessionError, content=content)
     header = text.partition("\n")[0].replace(";", ",").split(",")
@@ -245,7 +245,7 @@ def _plain_rows(path: Path, content: bytes) -> Iterator[RawReading]:
             for line, row in islice(rows(), MOST_READINGS + 1):
                 names = ("reading_mm", *COORDINATES)
                 numerals += [Numeral(row[name], line) for name in names if row.get(name)]
-        sign = _plain_sign(numerals, path)
+        sign = _standard_decimal_sign(numerals, path)
     for line, cells in rows():
         if sign is not None:
             cells |= {name: _with_decimal_point(cells.get(name, ""), sign) for name in NUMBERS}
@@ -255,11 +255,11 @@ def _plain_rows(path: Path, content: bytes) -> Iterator[RawReading]:
 SIGN_ADVICE = "write it with a decimal point, or use `orthocal import --decimal comma|point`"
 
 
-def _plain_sign(cells: Sequence[Numeral], path: Path) -> Sign | None:
-    """Decimal sign below the headings of a readings.csv, where a point is a decimal point."""
+def _standard_decimal_sign(cells: Sequence[Numeral], path: Path) -> Sign | None:
+    """Decimal sign of a table with standard headings, where a point is always a decimal point."""
     if not any("," in cell.text for cell in cells) or infer_decimal_sign(cells).contradictory:
         return "point"
-    return decide_sign(
+    return decide_decimal_sign(
         cells, standard=True, advice=SIGN_ADVICE, place=lambda line: f"{path}:{line}"
     ).sign
 
@@ -269,11 +269,13 @@ def _with_decimal_point(text: str, sign: Sign) -> str:
     if sign == "point":
         return plain_minus(text)
     value = parse_numeral(text, sign)
-    return text if value is None else mm_text(value)
+    return text if value is None else format_mm(value)
 
 
-def _clean_table(path: Path, content: bytes) -> tuple[Table, Columns] | None:
-    """Table saved by a spreadsheet program, without text above the headings; None for other files.
+def _read_spreadsheet_table(path: Path, content: bytes) -> tuple[Table, Columns] | None:
+    """Table that a spreadsheet program saved; None for other files.
+
+    Text above the headings is not accepted.
 
     Raises:
         SessionError: If a column does not belong to a session.
@@ -302,12 +304,12 @@ def _clean_table(path: Path, content: bytes) -> tuple[Table, Columns] | None:
     return table, columns
 
 
-def _table_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
+def _spreadsheet_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
     """Rows of a table saved by a spreadsheet program."""
     require_unsplit_numbers(table, columns)
     (reading,) = columns.readings
     numerals = [Numeral(row.cell(reading).text, row.line) for row in table.rows]
-    sign = decide_sign(
+    sign = decide_decimal_sign(
         numerals,
         standard=has_standard_headings(table.header),
         advice=SIGN_ADVICE,
@@ -329,18 +331,18 @@ def _table_rows(table: Table, columns: Columns) -> Iterator[RawReading]:
         for name in NUMBERS:
             value = None if sign is None else parse_numeral(cells.get(name, ""), sign)
             if value is not None:
-                cells[name] = mm_text(value)
+                cells[name] = format_mm(value)
         yield RawReading(where, row.line, **cells)
 
 
-def _is_grouped(row: Row, pairs: Collection[tuple[int, int]]) -> bool:
-    """True if two cells of a row may be one number with a comma between thousands."""
+def _may_be_split_thousands(row: Row, pairs: Collection[tuple[int, int]]) -> bool:
+    """True if two neighbouring cells may be parts of one number, such as 1,000."""
     cells = [(row.cell(i).text.strip(), row.cell(j).text.strip()) for i, j in pairs]
     return any(_INTEGER.fullmatch(a) and _GROUP.fullmatch(b) for a, b in cells)
 
 
-def _ends_in_thousands(row: Row, first: int, second: int) -> bool:
-    """True if the last two filled cells of a row may be one number such as 1,000 or 12,500.0."""
+def _may_end_in_split_thousands(row: Row, first: int, second: int) -> bool:
+    """True if the last two filled cells may be parts of one number, such as 12,500.0."""
     followed = any(row.cell(i).text.strip() for i in range(second + 1, row.width))
     a, b = row.cell(first).text.strip(), row.cell(second).text.strip()
     return not followed and bool(_UP_TO_99.fullmatch(a) and _GROUP.fullmatch(b))
@@ -355,12 +357,12 @@ _GROUP = re.compile(r"[0-9]{3}(\.[0-9]*)?")
 def require_unsplit_numbers(
     table: Table, columns: Columns, *, separator_known: bool = False
 ) -> None:
-    """Refuse a table with commas as separators in which a comma may be a decimal sign as well.
+    """Refuse a table with commas as separators in which a comma may be part of a number.
 
-    An unquoted 3,5 between commas becomes two cells. Then the row has more cells than the headings.
-    If its last cell is empty, it looks like a row with two integers. An unquoted 1,000.0 does the
-    same. A table is accepted if some row cannot be read in this way, except for a row that ends
-    in one or two digits and a group of three: its last cell may be missing.
+    An unquoted 3,5 or 1,000.0 becomes two cells, so that the row has more cells than the headings.
+    If the last cell of the row is empty, the number of cells does not show this. Then the table is
+    accepted only if at least one row cannot contain such a number. A row that ends in a number such
+    as 12,500.0 is refused in any case, because its last cell may be missing.
 
     Args:
         table: The table.
@@ -378,7 +380,7 @@ def require_unsplit_numbers(
     sign_known = separator_known or any("." in t or "," in t for t in texts)
     pairs = {(i, i + 1) for i in readings} | {(i - 1, i) for i in readings if i}
     pairs -= {(i - 1, i) for i in readings if i - 1 in columns.keys}
-    grouped = not separator_known and all(_is_grouped(row, pairs) for row in table.rows)
+    grouped = not separator_known and all(_may_be_split_thousands(row, pairs) for row in table.rows)
     for row in table.rows:
         if row.width > table.header_width:
             raise SessionError(
@@ -388,7 +390,9 @@ def require_unsplit_numbers(
             )
         for first, second in sorted(pairs):
             a, b = row.cell(first).text.strip(), row.cell(second).text.strip()
-            thousands = grouped or (not separator_known and _ends_in_thousands(row, first, second))
+            thousands = grouped or (
+                not separator_known and _may_end_in_split_thousands(row, first, second)
+            )
             if sign_known and not thousands:
                 continue
             if _INTEGER.fullmatch(a) and (_GROUP if thousands else _DIGITS).fullmatch(b):

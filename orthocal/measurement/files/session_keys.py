@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from orthocal.effects.adjustment import LARGEST_AMOUNT_MM
-from orthocal.io.documents import Count, Name, Number, PositiveNumber
+from orthocal.io.documents import Count, Keys, Name, Number, PositiveNumber
 from orthocal.printers.settings import DeltaSettings, FirmwareName, Three
 from orthocal.robot.description import HEAVIEST_KG
 from orthocal.sensors.mounting import LARGEST_SCALE
@@ -72,11 +72,7 @@ BACKLASH_KEYS: dict[str, tuple[Unit, float]] = {
 """Backlash keys of `controller`: SI unit of their drives and factor to SI."""
 
 
-class _Keys(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
-
-
-class GaugeKeys(_Keys):
+class GaugeKeys(Keys):
     """Keys of a gauge."""
 
     sigma_mm: GaugeNoise | None = None
@@ -105,7 +101,7 @@ class GaugeKeys(_Keys):
         return self
 
 
-class PostureKeys(_Keys):
+class PostureKeys(Keys):
     """Keys of a posture: commanded tool coordinates or drive coordinates."""
 
     tcp_mm: Coordinates | None = None
@@ -133,7 +129,7 @@ class PostureKeys(_Keys):
         return key, values
 
 
-class FirmwareKeys(_Keys):
+class FirmwareKeys(Keys):
     """Settings of the firmware of a delta printer during the measurement."""
 
     name: FirmwareName
@@ -175,7 +171,7 @@ def _scaled(values: Three, factor: float) -> Three:
     return a * factor, b * factor, c * factor
 
 
-class ControllerKeys(_Keys):
+class ControllerKeys(Keys):
     """Active corrections of the controller.
 
     A list has one number per prismatic or revolute drive, in the order of the robot's drives.
@@ -211,7 +207,7 @@ class ControllerKeys(_Keys):
         return self
 
 
-class CalibrationKeys(_Keys):
+class CalibrationKeys(Keys):
     """Model, free errors and tolerances of the calibration."""
 
     model: str | None = None
@@ -225,7 +221,7 @@ class CalibrationKeys(_Keys):
     """Effects beside geometry; by default those of the robot's YAML."""
 
 
-class SessionKeys(_Keys):
+class SessionKeys(Keys):
     """Keys of a session.yaml, or of a plan, which has no `readings`."""
 
     robot: str

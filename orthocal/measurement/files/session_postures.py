@@ -87,7 +87,7 @@ def _read_posture(keys: PostureKeys, robot: Robot, where: str) -> tuple[PostureF
     key, values = keys.coordinates
     count = len(robot.drives)
     if key == "tcp_mm":
-        if not _has_tool_coordinates(robot):
+        if not robot.commands_tool:
             raise SessionError(
                 f"{robot.name} has no tool coordinate for every drive; use {_usable_key(robot)}",
                 where=where,
@@ -108,17 +108,12 @@ def _read_posture(keys: PostureKeys, robot: Robot, where: str) -> tuple[PostureF
     return "joints", np.array(values) * MM if unit == "m" else np.deg2rad(values)
 
 
-def _has_tool_coordinates(robot: Robot) -> bool:
-    """True if the tool centre point has one commanded coordinate for each drive."""
-    return robot.tcp is not None and len(robot.tcp.coordinates) == len(robot.drives)
-
-
 def _usable_key(robot: Robot) -> str:
     """Key with which a posture of a robot can be stated, and what the robot's YAML lacks for it."""
     units = {d.unit for d in robot.drives}
     if len(units) == 1:
         return f"joints_{DRIVE_UNITS[units.pop()][0]}"
-    if _has_tool_coordinates(robot):
+    if robot.commands_tool:
         return "tcp_mm"
     return (
         "tcp_mm, because the drives are of both kinds, and state one tool coordinate for each "

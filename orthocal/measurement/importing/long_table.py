@@ -30,9 +30,9 @@ from orthocal.io.tables.numerals import (
 from orthocal.io.tables.table import Table
 from orthocal.measurement.files.readings_file import (
     RawReading,
-    decide_sign,
+    decide_decimal_sign,
+    format_mm,
     has_standard_headings,
-    mm_text,
     require_unsplit_numbers,
 )
 from orthocal.measurement.importing.headings import (
@@ -195,7 +195,7 @@ class _Rows:
             self.commanded.setdefault(row.line, {})[entry.role] = value
             return
         key = row.line, row.cycle
-        cell: dict[str, Any] = {f"{entry.role}_mm": mm_text(value)}
+        cell: dict[str, Any] = {f"{entry.role}_mm": format_mm(value)}
         self.read[key] = replace(self.read.get(key, row), **cell)
 
     def located(self, points: Mapping[str, Array]) -> tuple[RawReading, ...]:
@@ -456,7 +456,7 @@ def _decide_decimal_sign(table: Table, entries: list[Entry], stated: Sign | None
     numerals = [
         Numeral(e.number, e.row.line) for e in entries if e.number is not None and e.value is None
     ]
-    return decide_sign(
+    return decide_decimal_sign(
         numerals,
         standard=has_standard_headings(table.header),
         advice=SIGN_ADVICE,

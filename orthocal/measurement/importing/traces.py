@@ -82,8 +82,6 @@ class BinnedTrace:
     """Motion of the tool through each bin, shape (m, n_coordinates), [m]."""
     std: float
     """Standard deviation of a reading, [m]."""
-    samples: int
-    """Number of samples of the trace."""
 
 
 def read_trace(path: str | Path, robot: Robot) -> Trace:
@@ -170,7 +168,7 @@ def bin_trace(trace: Trace) -> BinnedTrace:
     middle = np.array([b[index] for b, (_, index, _) in zip(bins, fits, strict=True)])
     values += smooth[middle]
     motions = np.array([trace.points[b[-1]] - trace.points[b[0]] for b in bins])
-    return BinnedTrace(trace.points[middle], values, motions, std, len(trace.values))
+    return BinnedTrace(trace.points[middle], values, motions, std)
 
 
 def _split_runs(points: Array, length: Array) -> list[slice]:

@@ -13,17 +13,17 @@ import numpy as np
 
 from orthocal.arrays import Array, Mask
 from orthocal.effects.loading import robot_effects
-from orthocal.kinematics.conditions import APPROACH as DIRECTIONS
+from orthocal.kinematics.conditions import APPROACH as SIGN_OF_LETTER
 from orthocal.kinematics.continuation import Failures
 from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.robot.model import Robot
 from orthocal.session.session import Conditions, Reading, Session
 from orthocal.units import DEG, LIMIT, MM
 
-APPROACH = 2e-3
+USUAL_LENGTH = 2e-3
 """Usual length of the approach of a prismatic drive, [m]."""
 
-APPROACH_TURN = 0.5 * DEG
+USUAL_ANGLE = 0.5 * DEG
 """Usual angle of the approach of a revolute drive, [rad]."""
 
 SHORTEST_APPROACH = 0.2e-3
@@ -59,7 +59,7 @@ def approach_share(session: Session) -> float:
     never too short to take up the backlash.
     """
     ranges = [g.range for g in session.gauges.values() if g.range is not None]
-    half_range = min((0.5 * (high - low) for low, high in ranges), default=APPROACH)
+    half_range = min((0.5 * (high - low) for low, high in ranges), default=USUAL_LENGTH)
     backlash = max(
         (
             LIMIT * session.robot.parameters[error.name].prior_std
@@ -75,15 +75,15 @@ def approach_share(session: Session) -> float:
         SHORTEST_APPROACH,
         APPROACH_PER_BACKLASH * backlash,
     )
-    return min(length / APPROACH, 1.0)
+    return min(length / USUAL_LENGTH, 1.0)
 
 
 def approach_length(session: Session) -> str:
     """Length of the approaches of a session, as text with its unit."""
     share = approach_share(session)
     if any(d.unit == "m" for d in session.robot.drives):
-        return f"{share * APPROACH / MM:.3g} mm"
-    return f"{share * APPROACH_TURN / DEG:.3g}°"
+        return f"{share * USUAL_LENGTH / MM:.3g} mm"
+    return f"{share * USUAL_ANGLE / DEG:.3g}°"
 
 
 def describe_approach(robot: Robot, approach: str) -> str:
@@ -92,7 +92,7 @@ def describe_approach(robot: Robot, approach: str) -> str:
     The arrow is · if the direction is not stated. If all arrows are equal, one is returned.
     """
     arrows = [
-        ARROWS[DIRECTIONS[letter] * d.direction]
+        ARROWS[SIGN_OF_LETTER[letter] * d.direction]
         for letter, d in zip(approach, robot.drives, strict=True)
     ]
     return arrows[0] if len(set(arrows)) == 1 else "".join(arrows)
@@ -108,7 +108,7 @@ def label_reading(robot: Robot, reading: Reading) -> str:
 
 
 def name_approach(motion: Array) -> str:
-    """Letters of the approach of a last motion; u for a drive that moves less than LEAST_MOTION.
+    """Letters of an approach from its motion; u for a drive that moves less than LEAST_MOTION.
 
     Args:
         motion: Motion of the drives, shape (n_drives,), [m, rad].
@@ -124,11 +124,13 @@ def approach_steps(robot: Robot, approach: str, other: str = "p", *, share: floa
     Args:
         robot: The robot.
         approach: A letter for each drive.
-        other: Letter that replaces u.
+        other: Letter used in place of u.
         share: Length as a share of the usual length.
     """
-    lengths = share * np.array([APPROACH if d.unit == "m" else APPROACH_TURN for d in robot.drives])
-    return lengths * [DIRECTIONS[letter] or DIRECTIONS[other] for letter in approach]
+    lengths = share * np.array(
+        [USUAL_LENGTH if d.unit == "m" else USUAL_ANGLE for d in robot.drives]
+    )
+    return lengths * [SIGN_OF_LETTER[letter] or SIGN_OF_LETTER[other] for letter in approach]
 
 
 def common_approach(robot: Robot, drives: Array) -> str | None:
@@ -142,15 +144,15 @@ def common_approach(robot: Robot, drives: Array) -> str | None:
 
 
 def fill_approach(robot: Robot, stated: str | None, other: str) -> str:
-    """Approach in which a letter replaces every u; all letters are u if it is not stated."""
+    """Stated approach with `other` in place of every u; `other` for all drives if unstated."""
     return (stated or "u" * len(robot.drives)).replace("u", other)
 
 
 def state_common_approach(session: Session) -> Session:
-    """Session whose readings without a stated approach are approached from one side.
+    """Session in which readings without a stated approach get a common one, as in programs.
 
-    Programs move in this way. The session is unchanged if no effect depends on the approach, or if
-    no side is possible in all postures.
+    The session is unchanged if no effect depends on the approach, or if no common approach is
+    possible in all postures.
     """
     drives = np.array([p.drives for p in session.postures.values()]) + session.active_offsets
     common = common_approach(session.robot, drives)

@@ -25,7 +25,7 @@ from orthocal.kinematics.loop_closure import find_beyond_travel, nominal_closure
 from orthocal.kinematics.workspace import position_at_zero, tool_at_zero
 from orthocal.measurement.files.readings_file import FIRST_LINE
 from orthocal.measurement.motion.approach import (
-    APPROACH,
+    USUAL_LENGTH,
     approach_length,
     approach_share,
     approach_steps,
@@ -201,7 +201,7 @@ def plan_motion(session: Session) -> tuple[SetupMotion, ...]:
             stops = _follow_path(session, setup, listed, guided[setup])
         else:
             stops = _list_stops(rows, aligned_at[setup], stop_at)
-            if _commands_tool(session.robot):
+            if session.robot.commands_tool:
                 stops = _follow_stops(session, setup, stops)
         alignment = stops.pop(0) if stops[0].role == "alignment" else None
         motions.append(SetupMotion(setup, number, len(rows_by_setup), alignment, tuple(stops)))
@@ -267,11 +267,6 @@ def shown_joints(robot: Robot, drives: ArrayLike) -> Array:
     return np.stack(columns, axis=-1)
 
 
-def _commands_tool(robot: Robot) -> bool:
-    """True if the drives command as many tool coordinates as there are drives."""
-    return robot.tcp is not None and len(robot.tcp.coordinates) == len(robot.drives)
-
-
 Path = Callable[[Array, Array], Array]
 """Corners of the path of the tool between two coordinates, shape (n, n_coordinates), [m]."""
 
@@ -281,7 +276,7 @@ Approaches = dict[tuple[str, str | None], Stop]
 
 def _guided_setups(session: Session) -> dict[str, Path]:
     """Prescribed paths of the tool between readings, by setup, for sensors that have one."""
-    if not _commands_tool(session.robot):
+    if not session.robot.commands_tool:
         return {}
     paths = {name: tool_path(s.sensor) for name, s in session.setups.items()}
     return {
@@ -399,7 +394,7 @@ def _begin_approaches(
         return {}, {places[i]: error for i, error in failures.items()}
     ends: Sequence[Array | None] = [None] * len(names)
     starts = ends
-    if _commands_tool(robot) and robot.tcp is not None:
+    if robot.commands_tool and robot.tcp is not None:
         coordinates = list(robot.tcp.coordinates)
         ends = list(closure.forward(nominal, names=names)[:, coordinates])
         starts = list(closure.tcp(drives, passive)[:, coordinates])
@@ -479,7 +474,7 @@ def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path
     Raises:
         SessionError: If the path leaves the workspace, or no direction has the stated approach.
     """
-    robot, length = session.robot, approach_share(session) * APPROACH
+    robot, length = session.robot, approach_share(session) * USUAL_LENGTH
     first = np.asarray(stops[0].point)
     others = [s.point for s in stops if s.point is not None and not np.allclose(s.point, first)]
     ahead = path(first, np.asarray(others[0])) if others else np.array([first, first + length])

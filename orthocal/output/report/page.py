@@ -5,7 +5,6 @@ The page is self-contained and needs no network.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
@@ -51,6 +50,7 @@ from orthocal.output.text.tables import (
     render_readings,
     render_sensors,
 )
+from orthocal.text import list_some
 from orthocal.units import MM, show_limit
 from orthocal.viewer.scene import frame_of
 
@@ -346,7 +346,7 @@ def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
             low, high = ("∞" if v is None else f"{v * f:g}" for v in (p.lower, p.upper))
             bounds.append(f"{p.name} {low} … {high} {unit}".replace(" ∞ …", " −∞ …"))
     rows = [
-        (name, _abbreviate(texts))
+        (name, list_some(texts, MAX_NAMED, separator="; "))
         for name, texts in (
             ("Tolerances", tolerances),
             ("Known values", known_values),
@@ -357,12 +357,6 @@ def _assumptions(calibration: Calibration) -> list[tuple[str, str]]:
     if factor != 1.0:
         rows.append(("Tolerance scale", f"{factor:.2f}, all tolerances except those of offsets"))
     return rows or [("Assumptions", "the tolerances of the robot")]
-
-
-def _abbreviate(texts: Sequence[str]) -> str:
-    """Texts as a list; of many, the first ones and the number of the others."""
-    more = len(texts) - MAX_NAMED
-    return "; ".join(texts[:MAX_NAMED]) + (f"; and {more} more" if more > 0 else "")
 
 
 def _scene(calibration: Calibration) -> str:

@@ -58,9 +58,9 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
         for d in (accuracy.deviation, accuracy.deviation_with_entries)
     )
     now_largest, entered_largest = (_largest(d) for d in (now, entered))
-    # RMS in space, as in all tables; the axes of an ellipsoid are shorter
-    after, scale_factor = accuracy.after, calibration.tolerance_scale.factor
-    uncertainty = 0.0 if after is None else after.sizes.reported.largest
+    # uncertainty as in all tables: RMS in space, longer than the axes of its ellipsoid
+    calibrated, scale_factor = accuracy.after, calibration.tolerance_scale.factor
+    uncertainty = 0.0 if calibrated is None else calibrated.sizes.reported.largest
     largest = max(now_largest, entered_largest, uncertainty)
     if largest < NEGLIGIBLE:
         return ""
@@ -76,8 +76,8 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
         text = f"Tool error, offsets entered: up to {um(entered_largest)} µm ({scale})"
         scene.explain(LegendEntry(text, (TOOL_ENTERED,), css(ENTERED_COLOUR), "arrow", shown))
     headline = f"Tool error now: up to {um(now_largest)} µm over {region}, workpiece aligned."
-    if after is not None:
-        _draw_ellipsoids(scene, targets, accuracy.average(after.aligned_covariance)[chosen])
+    if calibrated is not None:
+        _draw_ellipsoids(scene, targets, accuracy.average(calibrated.aligned_covariance)[chosen])
         scaled = f", errors at {scale_factor:.1f} × tolerances" if scale_factor > 1.0 else ""
         size = f"up to {um(uncertainty)} µm RMS"
         text = f"Tool uncertainty, all identified errors corrected: {size}{scaled} ({scale})"
@@ -93,7 +93,7 @@ def _largest(deviations: Array) -> float:
 
 
 def _choose_points(accuracy: ToolAccuracy) -> NDArray[np.int64]:
-    """Indices of the drawn grid points, at middles and ends of the sides."""
+    """Indices of the drawn grid points: first, middle and last along each axis."""
     points = accuracy.points
     chosen = np.ones(len(points), dtype=bool)
     for column in points.T:
@@ -123,6 +123,6 @@ def _draw_ellipsoids(scene: Scene, targets: Array, covariances: Array) -> None:
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = vectors, target
         radii = scene.tool_scale * np.sqrt(np.maximum(values, 1e-18))
-        look = material(UNCERTAINTY_COLOUR, opacity=0.3)
+        appearance = material(UNCERTAINTY_COLOUR, opacity=0.3)
         path = f"{TOOL_UNCERTAINTY}/point {i + 1}"
-        scene.add(path, g.Sphere(1.0), look, pose @ np.diag([*radii, 1.0]))
+        scene.add(path, g.Sphere(1.0), appearance, pose @ np.diag([*radii, 1.0]))

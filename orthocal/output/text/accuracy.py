@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -32,6 +31,7 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.refit import restore_session
 from orthocal.errors import ClosureError, OrthocalError, RobotError
 from orthocal.estimation.selection import complete_model, select_parameters
+from orthocal.io.documents import format_json
 from orthocal.output.text.conditions import describe_conditions_of
 from orthocal.output.text.layout import noted, print_rich, table_of, um
 from orthocal.planning.expected_error import ToolForecast, state_noise
@@ -283,12 +283,8 @@ def accuracy_json(calibration: Calibration, accuracy: ToolAccuracy) -> str:
     """Tool errors over a region as JSON, SI units."""
 
     def sizes(field: ToolErrorStatistics) -> dict[str, Any]:
-        names = ("rms", "percentile_95", "largest")
         forms = {"aligned": field.aligned, "relative": field.relative, "absolute": field.absolute}
-        return {
-            form: None if size is None else {name: getattr(size, name) for name in names}
-            for form, size in forms.items()
-        }
+        return {form: size and size.to_document() for form, size in forms.items()}
 
     after = accuracy.after
     document = {
@@ -302,4 +298,4 @@ def accuracy_json(calibration: Calibration, accuracy: ToolAccuracy) -> str:
         "uncertainty_before": sizes(accuracy.before.sizes),
         "uncertainty_after": None if after is None else sizes(after.sizes),
     }
-    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+    return format_json(document)

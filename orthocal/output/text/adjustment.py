@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from rich.console import Group, RenderableType
@@ -21,7 +20,7 @@ from orthocal.assessment.words.entries import describe_region
 from orthocal.calibration.assessment_record import ControllerEntry, ToolErrorSummary
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, OrthocalError
-from orthocal.io.documents import write_plain
+from orthocal.io.documents import format_json, write_plain
 from orthocal.io.fields import finite_or_none
 from orthocal.output.text.answer import quote_path, render_next
 from orthocal.output.text.layout import bullets, plain, print_rich, signed, table_of
@@ -43,7 +42,7 @@ def render_adjustments(calibration: Calibration, *, saved: Path | None = None) -
     if decision.verdict != "enter":
         return Text(f"Not planned: {decision.headline}")
     try:
-        return render_plan(calibration, plan_adjustments(calibration), saved=saved)
+        return render_plan(plan_adjustments(calibration), saved=saved)
     except (OrthocalError, ClosureError) as e:
         return Text(f"The adjustments cannot be planned: {e}.")
 
@@ -53,19 +52,18 @@ def print_plan(
 ) -> None:
     """Print a plan of adjustments; arguments as for `render_plan`."""
     head = f"Mechanical adjustment of {calibration.robot_record.name}, model '{calibration.model}'"
-    shown = render_plan(calibration, plan, saved=saved, details=details)
+    shown = render_plan(plan, saved=saved, details=details)
     print_rich(Group(Text(head), Text(), shown))
 
 
 def render_plan(
-    calibration: Calibration, plan: AdjustmentPlan, *, saved: Path | None, details: bool = False
+    plan: AdjustmentPlan, *, saved: Path | None, details: bool = False
 ) -> RenderableType:
     """A plan of adjustments.
 
     Args:
-        calibration: The calibration.
-        plan: Its plan.
-        saved: Its directory, for the next command.
+        plan: The plan of a calibration.
+        saved: Directory of the calibration, for the next command.
         details: Whether to list adjustments that are not worth doing.
     """
     parts: list[RenderableType] = [Text(HEADLINES[plan.judgement]), Text()]
@@ -143,4 +141,4 @@ def plan_json(calibration: Calibration, plan: AdjustmentPlan) -> str:
         "before": write_plain(plan.before, ToolErrorSummary),
         "after": write_plain(plan.after, ToolErrorSummary),
     }
-    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+    return format_json(document)

@@ -55,6 +55,7 @@ LISTED: tuple[FindingKind, ...] = (
     "change unknown",
     "above tolerances",
     "no redundancy",
+    "no convergence",
     "earlier readings",
     "compensation not stated",
     "periodic errors",

@@ -96,7 +96,7 @@ def _scores(comparison: Comparison) -> RenderableType:
     rows: list[tuple[str, ...]] = []
     for result in comparison.results:
         after = None if result.tool is None else result.tool.after
-        checked = result.spare > 0
+        checked = result.redundancy > 0
         evidence = comparison.recommendation.log_evidence_of(result.model)
         for score in (result.linearised, result.exact):
             first = score.method == "linearised"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from orthocal.assessment.wording import counted
+from orthocal.io.documents import format_json
 from orthocal.io.tables.cell import column_letters
 from orthocal.io.tables.table import Table
 from orthocal.measurement.files.readings_file import RawReading, has_standard_headings
@@ -19,7 +19,7 @@ from orthocal.measurement.importing.import_readings import VALUES, TableImport
 from orthocal.measurement.importing.printer_log import PrinterImport
 from orthocal.printers.log import PrintedDistance
 from orthocal.printers.settings import DeltaSettings
-from orthocal.text import runs
+from orthocal.text import list_some, runs
 from orthocal.units import DEG, MM, to_mm
 
 UNIT_SYMBOLS = {"um": "µm"}
@@ -81,8 +81,7 @@ def _interpretation(result: TableImport) -> list[tuple[str, str]]:
         items.append(("empty", f"{counted(len(lines), 'reading')}: {_format_rows(lines)}"))
     if long_table.renamed:
         pairs = [f"'{written}' as {name}" for written, name in long_table.renamed]
-        more = f" and {len(pairs) - MOST_NAMES} more" if len(pairs) > MOST_NAMES else ""
-        items.append(("names", ", ".join(pairs[:MOST_NAMES]) + more))
+        items.append(("names", list_some(pairs, MOST_NAMES)))
     if table.formulas:
         items.append(("formulas", f"{table.formulas}, imported with their saved values"))
     if table.hidden:
@@ -123,9 +122,8 @@ def _format_rows(lines: Iterable[int]) -> str:
     """Numbers of rows as ranges, such as `rows 3, 7-12`."""
     numbers = sorted(set(lines))
     ranges = [str(a) if a == b else f"{a}-{b}" for a, b in runs(numbers)]
-    more = f" and {len(ranges) - MOST_RANGES} more" if len(ranges) > MOST_RANGES else ""
     word = "row" if len(numbers) == 1 else "rows"
-    return f"{word} {', '.join(ranges[:MOST_RANGES])}{more}"
+    return f"{word} {list_some(ranges, MOST_RANGES)}"
 
 
 def _describe_changes(result: TableImport) -> str:
@@ -166,7 +164,7 @@ def format_import_json(result: TableImport, *, written: bool) -> str:
         **{name: getattr(result, name) for name in (*CHANGES, "empty")},
         "written": str(result.readings_path) if written else None,
     }
-    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+    return format_json(document)
 
 
 def _conditions(row: RawReading) -> dict[str, str | float]:
@@ -240,7 +238,7 @@ def format_printer_json(result: PrinterImport, path: Path, written: Path | None)
         "notes": list(log.notes),
         "written": None if written is None else str(written),
     }
-    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+    return format_json(document)
 
 
 def printer_commands(result: PrinterImport, directory: Path) -> str:

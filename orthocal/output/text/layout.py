@@ -66,8 +66,6 @@ GAP = 3
 TIGHT_GAP = 1
 """Columns between those of a table that is too wide with GAP."""
 
-NEW_LINE = Segment("\n")
-
 
 class NumberTable(Table):
     """A table whose numbers are never cut: where it is too wide each row becomes a paragraph."""

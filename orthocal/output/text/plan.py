@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -15,6 +14,7 @@ from rich.text import Text
 from orthocal.assessment.effect_limits import DETERMINED, EffectLimits
 from orthocal.assessment.wording import name_offsets, tool_mm
 from orthocal.assessment.words.entries import describe_aligned
+from orthocal.io.documents import format_json
 from orthocal.kinematics.conditions import stated_use
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.measurement.motion.approach import approach_length, describe_approach
@@ -304,7 +304,7 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
 
 def plan_json(plan: MeasuringPlan) -> str:
     """Plan as JSON."""
-    return json.dumps(plan_document(plan), indent=1, allow_nan=False) + "\n"
+    return format_json(plan_document(plan))
 
 
 def draw_plan(plan: MeasuringPlan) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from orthocal.assessment.wording import joined, tool_mm
+from orthocal.io.documents import format_json
 from orthocal.kinematics.workspace import describe_box
 from orthocal.output.text.layout import counted, noted, plain, section, table_of
 from orthocal.study.accuracy import (
@@ -104,7 +104,7 @@ def study_json(table: StudyTable, report: StudyReport) -> str:
         "answer": report.answer,
         "summary": report.document,
     }
-    return json.dumps(_finite(document), indent=1, allow_nan=False) + "\n"
+    return format_json(_finite(document))
 
 
 def render_report(report: StudyReport) -> RenderableType:

@@ -13,6 +13,7 @@ from orthocal.arguments import require_kind
 from orthocal.assessment.assess import assessment_of
 from orthocal.calibration.assessment_record import Assessment
 from orthocal.calibration.calibration import Calibration
+from orthocal.io.documents import format_json
 from orthocal.output.text.answer import (
     MORE,
     name_values,
@@ -132,7 +133,7 @@ def result_json(result: Calibration | Validation | Comparison | Assessment) -> s
     else:
         document = {} if isinstance(result, Assessment) else json.loads(result.to_json())
     document |= assessment_in(result).to_document()
-    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+    return format_json(document)
 
 
 def assessment_in(result: Calibration | Validation | Comparison | Assessment) -> Assessment:

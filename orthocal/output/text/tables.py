@@ -27,6 +27,7 @@ from orthocal.output.text.layout import (
     signed,
     table_of,
 )
+from orthocal.text import list_some
 from orthocal.units import MM, UM, show_limit
 
 MANY_PARAMETERS = 12
@@ -110,9 +111,8 @@ def _parameter_notes(c: Calibration, *, omitted: int, by_noise: bool) -> list[st
         notes.append("resolved: how much the readings improved a value; 100 %: completely")
     pairs = c.correlated(above=0.5)
     if pairs:
-        listed = ", ".join(f"{a} with {b} {r:+.2f}" for a, b, r in pairs[:MOST_PAIRS])
-        more = f", and {len(pairs) - MOST_PAIRS} more" if len(pairs) > MOST_PAIRS else ""
-        notes.append(f"Correlations above 0.5: {listed}{more}")
+        listed = list_some([f"{a} with {b} {r:+.2f}" for a, b, r in pairs], MOST_PAIRS)
+        notes.append(f"Correlations above 0.5: {listed}")
     return notes
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 
+import closed_form as og
 import numpy as np
 import pytest
 from derivatives import assert_derivative
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from tolerances import KINEMATICS, PRINTED
 
 from orthocal.errors import UnreachableError
-from orthocal.kinematics import orthoglide as og
+from orthocal.estimation.linear import displacement_angle
 
 LENGTH = 0.31025
 inside = st.floats(-0.12, 0.12)
@@ -85,7 +86,7 @@ def test_equation_6_at_the_papers_maximum():
     sensitivity = og.displacement_jacobian(0, 0.06, length=LENGTH)
     tangent = 0.06 / np.sqrt(LENGTH**2 - 0.06**2)
     assert np.abs(sensitivity - [[1, 0, 0], [tangent, 1, 0], [tangent, 0, 1]]).max() < KINEMATICS
-    assert abs(np.sin(og.displacement_angle(-0.1, length=LENGTH)) + 0.32232) < PRINTED
+    assert abs(np.sin(displacement_angle(-0.1, length=LENGTH)) + 0.32232) < PRINTED
 
 
 def test_points_out_of_reach_are_named():
@@ -100,4 +101,4 @@ def test_points_out_of_reach_are_named():
     with pytest.raises(UnreachableError, match="root is 2"):
         og.direct([0.3, 0.3, 0.3], length=LENGTH, root=2)
     with pytest.raises(UnreachableError, match="400 mm is out of reach"):
-        og.displacement_angle(0.4, length=LENGTH)
+        displacement_angle(0.4, length=LENGTH)

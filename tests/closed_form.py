@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array
 from orthocal.errors import UnreachableError
+from orthocal.estimation.linear import displacement_angle
 from orthocal.units import MM
 
 
@@ -169,27 +170,6 @@ def jacobian(
         return np.asarray(np.linalg.inv(inverse_jacobian(points, joints, offsets=offsets)))
     except np.linalg.LinAlgError:
         raise UnreachableError("a posture is singular: the legs lie in one plane") from None
-
-
-def displacement_angle(displacement: float, *, length: float) -> float:
-    """Angle α of the other two legs when the tool moves along an axis: sin α = displacement/L.
-
-    For the minimum posture α_min = asin((ρ_min − L)/L), negative (corrected: the paper prints
-    asin(ρ_min/L)).
-
-    Args:
-        displacement: Signed displacement of the tool from the mechanical zero, [m].
-        length: Leg length L, [m].
-
-    Raises:
-        UnreachableError: If the displacement is not below the leg length.
-    """
-    if not abs(displacement) < length:
-        raise UnreachableError(
-            f"a displacement of {displacement / MM:g} mm is out of reach of legs of "
-            f"{length / MM:g} mm"
-        )
-    return float(np.arcsin(displacement / length))
 
 
 def displacement_jacobian(axis: int, displacement: float, *, length: float) -> Array:
