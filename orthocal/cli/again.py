@@ -55,7 +55,9 @@ def again(
             tables of the last session.
     """
     from orthocal.assessment.controller_entries import compensation_to_enter
+    from orthocal.assessment.wording import joined
     from orthocal.export.formats import require_entering
+    from orthocal.export.linuxcnc.entered_lines import describe_other_lines, find_unstated_tables
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
     require_new_session(out, FILES, force=force)
@@ -65,10 +67,12 @@ def again(
         require_entering(result)
     amounts = _read_amounts(result, adjusted, anyway=anyway)
     new = _plan_again(result, session, amounts)
+    joints = None
     if ini is None:
         new = replace(new, compensation=compensation_to_enter(result) or new.compensation)
     else:
-        new = replace(new, compensation=read_controller_joints(ini, result.robot).compensation)
+        joints = read_controller_joints(ini, result.robot)
+        new = replace(new, compensation=joints.compensation)
     comment = (
         "A plan: enter these offsets, then run `orthocal record .` in this directory, or fill in\n"
         "readings.csv. Compare the readings with the calibration by `orthocal validate`."
@@ -81,6 +85,18 @@ def again(
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
         put_out(f"Set these adjustments before you measure: {settings}.")
     put_out(_describe_entries(new, changes=result.session.controller_offsets is None))
+    if joints is None and (tables := find_unstated_tables(result, new.compensation)):
+        put_note(
+            f"An export writes a table (COMP_FILE) for {joined(tables)}, and the new session does "
+            "not state it. If you enter this table, prepare the session with it: --ini and the "
+            "file joints.ini of the export."
+        )
+    elif joints is not None and (
+        differences := describe_other_lines(
+            result, joints.compensation, joints.offsets, entered=new.active_offsets, file=str(ini)
+        )
+    ):
+        put_note(differences)
     put_out(f"  orthocal record {out}\n  orthocal validate {calibration} {out}")
     put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, and sheet.html")
 
