@@ -384,6 +384,33 @@ def test_a_switch_at_a_limit_stays_within_the_limits(calibration, end):
     assert outside == 3  # for one of both directions of latching each
 
 
+def test_linuxcnc_leaves_a_switch_at_a_limit(calibration, tmp_path):
+    """Homed at the switch, it would refuse to move if HOME_OFFSET were outside the soft limits.
+
+    The switches are at the outer ends of travel, and homing latches them on the way inwards.
+    """
+    require_linuxcnc()
+    drives, latched = calibration.robot.drives, tuple(-sign for sign in LATCHED)
+    old = tuple(float(d.to_joint(d.upper + a)) for d, a in zip(drives, ACTIVE, strict=True))
+    options = ExportOptions(module=False, latched=latched, home_offsets=old)
+    files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    homes = home_offsets(files["joints.ini"])
+    joints = [
+        Joint(d.direction, d.upper / MM, h, h, latched=sign)
+        for d, h, sign in zip(drives, homes, latched, strict=True)
+    ]
+    program = []
+    for distance in (5.0, 10.0):
+        x, y, z = (h + distance * sign for h, sign in zip(homes, latched, strict=True))
+        program.append(f"G21 G90 G1 X{x:.4f} Y{y:.4f} Z{z:.4f} F3000")
+    tables = {name: text for name, text in files.items() if name.endswith(".comp")}
+    slides = run_program(program, joints, lines=files["joints.ini"], files=tables)
+    expected = [d.upper / MM - 10.0 for d in drives]
+    assert np.abs(slides[-1] - expected).max() < 0.2
+
+
 def test_insignificant_periodic_error_is_entered_if_the_tool_error_decreases(complete):
     """The y screw dominates the tool error only if the other errors are known.
 
