@@ -111,16 +111,23 @@ def test_python_of_a_page_runs(make_directory, registries, page):
         assert (done.returncode, done.stderr) == (0, "")
 
 
+class Printed(dict):
+    """What each command of a page prints, and the directory in which they ran."""
+
+    directory = None
+
+
 @pytest.fixture(scope="module")
 def run_page(make_directory, short_reports):
     """Function that runs the commands of a page in order, once; returns what each prints."""
 
     @cache
     def run(page):
-        directory, printed = make_directory(), {}
+        printed = Printed()
+        printed.directory = make_directory()
         with nullcontext() if page in WITH_REPORTS else marked_reports():
             for command, expected in commands(page):
-                done = run_line(directory, command)
+                done = run_line(printed.directory, command)
                 assert done.returncode == expected, f"{command}: {done.stderr}"
                 printed[command] = done.stdout
         return printed
@@ -161,6 +168,40 @@ def test_tutorial_shows_what_its_commands_print(root, tmp_path):
     identified = second["x_slide.offset"].value * 1e3
     results = " ".join((root / "docs/results.md").read_text().split())
     assert f"x_slide has {enter:+.3f} mm to enter and {identified:+.3f} mm identified" in results
+
+
+@pytest.mark.parametrize(
+    ("page", "texts"),
+    [("docs/adjusting.md", 3), ("docs/controllers.md", 3), ("docs/measuring.md", 2)],
+)
+def test_a_page_shows_what_its_commands_print(root, run_page, page, texts):
+    """A text that follows commands shows lines that the last of them prints."""
+    printed, last, shown = run_page(page), "", 0
+    text = (root / page).read_text()
+    for language, block in re.findall(r"```(\w+)\n(.*?)```", text, flags=re.DOTALL):
+        if language == "sh":
+            last = [line.partition("  # ")[0].strip() for line in lines_of(block)][-1]
+        elif language == "text" and last:
+            lines = [line.rstrip() for line in printed[last].splitlines()]
+            assert [line for line in block.splitlines() if line.rstrip() not in lines] == []
+            shown += 1
+            last = ""
+    assert shown == texts
+
+
+@pytest.mark.parametrize(
+    ("page", "start", "file"),
+    [
+        ("docs/controllers.md", "[JOINT_0]", "out/enter/joints.ini"),
+        ("docs/controllers.md", "controller:", "out/mill/second/session.yaml"),
+        ("docs/measuring.md", "setups:\n  bar:", "out/bar/session.yaml"),
+    ],
+)
+def test_a_page_shows_what_is_in_a_file(root, run_page, page, start, file):
+    text = (root / page).read_text()
+    assert file in text
+    (shown,) = re.findall(rf"```(?:ini|yaml)\n({re.escape(start)}.*?)```", text, flags=re.DOTALL)
+    assert shown in (run_page(page).directory / file).read_text()
 
 
 def test_reference_has_every_name(root):

@@ -21,6 +21,7 @@ from orthocal import calibrate, load_plan, load_robot
 from orthocal.builder.build import remake_robot
 from orthocal.builder.orthoglide import Orthoglide
 from orthocal.cli import dialogue as asking
+from orthocal.effects.loading import robot_effects
 from orthocal.errors import ClosureError, ParameterError
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.reachable_box import find_workspace
@@ -96,14 +97,31 @@ def test_a_new_machine_has_backlash(made, tmp_path):
     assert load_robot(folder).effect_names == ("backlash", "thermal")
 
 
+def test_a_new_machine_has_screws_of_a_lead(tmp_path):
+    folder = tmp_path / "screws"
+    assert orthocal("new", folder, *options(), "--paper", "--screw-lead-mm", "5").returncode == 0
+    robot = load_robot(folder)
+    assert robot.effect_names == ("backlash", "screw")
+    assert [e.period for e in robot_effects(robot) if e.period] == pytest.approx([5e-3])
+    for lead in ("0", "-5", "nan", "500"):  # the travel is shorter
+        words = (tmp_path / "bad", *options(), "--paper", "--screw-lead-mm", lead)
+        code, _, err = orthocal("new", *words)
+        assert code == 2
+        assert err.startswith("orthocal: --screw-lead-mm: ")
+        assert not (tmp_path / "bad").exists()
+
+
 @pytest.mark.parametrize(
     ("effects", "message"),
-    [("rust", "found 'rust'; expected one of"), ("screw", "screw.lead_mm: is missing")],
+    [
+        ("rust", "--effects: found 'rust'; expected one of"),
+        ("screw", "--screw-lead-mm: is missing"),
+    ],
 )
 def test_effects_without_usual_keys_are_refused(tmp_path, effects, message):
     code, _, err = orthocal("new", tmp_path / "mill", *options(), "--effects", effects)
     assert code == 2
-    assert f"orthocal: --effects: {message}" in err
+    assert f"orthocal: {message}" in err
     assert not (tmp_path / "mill").exists()
 
 

@@ -41,6 +41,9 @@ _ORTHOCAL_KEY = re.compile(r"(?m)^orthocal:[^\n]*\n(?: *(?:#.*)?\n)*(?P<indent> 
 _RADIUS_KEY = re.compile(r"radius_mm: [-+.0-9e]+")
 _TOLERANCES_LINE = re.compile(r"(?m)^( *tolerances: \{[^{}\n]*)\}")
 
+EffectKeyValues = Mapping[str, Mapping[str, float]]
+"""Effects beside geometry, mapped to keys that replace their defaults."""
+
 
 def describe_machine(
     dimensions: Dimensions,
@@ -49,7 +52,7 @@ def describe_machine(
     counting: Sequence[Counting] | None = None,
     description: str | None = None,
     tolerances: Mapping[str, float] | None = None,
-    effects: Sequence[str] = (),
+    effects: Sequence[str] | EffectKeyValues = (),
 ) -> dict[str, str]:
     """Texts of the files of a machine by file name.
 
@@ -60,8 +63,8 @@ def describe_machine(
         description: YAML of the robot to change; by default that of the kind.
         tolerances: Tolerances that replace those of the kind, by error name or glob with its unit,
             such as *.offset_mm. They are not used with a description.
-        effects: Effects beside geometry, with their default keys. They are not used with a
-            description.
+        effects: Effects beside geometry, with their default keys, or mapped to other keys. They are
+            not used with a description.
 
     Raises:
         RobotError: If the dimensions are impossible, or the YAML lacks the line of one of them.
@@ -93,7 +96,7 @@ def make_robot(
     folder: Path,
     *,
     counting: Sequence[Counting] | None = None,
-    effects: Sequence[str] = (),
+    effects: Sequence[str] | EffectKeyValues = (),
 ) -> Robot:
     """Write the directory of a machine, with machine.yaml, and load it.
 
@@ -101,7 +104,7 @@ def make_robot(
         dimensions: Dimensions of the machine.
         folder: Directory; created if it does not exist.
         counting: Relation of the controller's joints to the drives; by default they are equal.
-        effects: Effects beside geometry, with their default keys.
+        effects: Effects beside geometry, with their default keys, or mapped to other keys.
 
     Raises:
         RobotError: If the dimensions are impossible, or an effect has no default keys.
@@ -192,12 +195,14 @@ def _complete_yaml(
     return f"# {dimensions.title}\n# Made from {MACHINE}: change dimensions there.\n{text}"
 
 
-def _effects_text(names: Sequence[str]) -> str:
-    """Effects beside geometry with their default limits, as YAML."""
+def _effects_text(effects: Sequence[str] | EffectKeyValues) -> str:
+    """Effects beside geometry with their default limits, or with stated keys, as YAML."""
+    stated = effects if isinstance(effects, Mapping) else {}
     lines = []
-    for name in order_effects(names):
+    for name in order_effects(effects):
         fields = find_effect(name, where="effects", error=RobotError).keys.model_fields.items()
         keys = {key: f.default for key, f in fields if isinstance(f.default, float)}
+        keys |= stated.get(name, {})
         lines.append(f"    {name}: {json.dumps(keys).replace(chr(34), '')}\n")
     return (
         "  # Effects beside geometry: limits of backlash and others, which are identified from\n"

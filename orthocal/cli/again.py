@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import orthocal
 from orthocal.cli.options import (
@@ -24,6 +25,9 @@ from orthocal.cli.sheet import sheet_or_problem
 from orthocal.errors import ExportError, ParameterError
 from orthocal.io.files import exists
 from orthocal.units import MM
+
+if TYPE_CHECKING:
+    from orthocal.measurement.files.linuxcnc_ini import ControllerJoints
 
 FILES = ("session.yaml", "readings.csv", "sheet.html")
 
@@ -65,10 +69,12 @@ def again(
         require_entering(result)
     amounts = _read_amounts(result, adjusted, anyway=anyway)
     new = _plan_again(result, session, amounts)
+    joints = None
     if ini is None:
         new = replace(new, compensation=compensation_to_enter(result) or new.compensation)
     else:
-        new = replace(new, compensation=read_controller_joints(ini, result.robot).compensation)
+        joints = read_controller_joints(ini, result.robot)
+        new = replace(new, compensation=joints.compensation)
     comment = (
         "A plan: enter these offsets, then run `orthocal record .` in this directory, or fill in\n"
         "readings.csv. Compare the readings with the calibration by `orthocal validate`."
@@ -81,8 +87,45 @@ def again(
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
         put_out(f"Set these adjustments before you measure: {settings}.")
     put_out(_describe_entries(new, changes=result.session.controller_offsets is None))
+    _note_other_lines(result, new, ini, joints)
     put_out(f"  orthocal record {out}\n  orthocal validate {calibration} {out}")
     put_note(f"Wrote {out / 'session.yaml'}, readings.csv to fill in, and sheet.html")
+
+
+def _note_other_lines(
+    calibration: orthocal.Calibration,
+    new: orthocal.Session,
+    ini: Path | None,
+    joints: ControllerJoints | None,
+) -> None:
+    """Note tables of an export that a session does not state, or other lines of an INI file.
+
+    Args:
+        calibration: The calibration.
+        new: The new session.
+        ini: INI file of the option `--ini`.
+        joints: Its joints; None without the file.
+    """
+    from orthocal.assessment.wording import joined
+    from orthocal.export.linuxcnc.entered_lines import describe_other_lines, find_unstated_tables
+
+    if joints is None:
+        if tables := find_unstated_tables(calibration, new.compensation):
+            put_note(
+                f"An export writes a table (COMP_FILE) for {joined(tables)}, and the new session "
+                "does not state it. If you enter this table, prepare the session with it: --ini "
+                "and the file joints.ini of the export."
+            )
+        return
+    differences = describe_other_lines(
+        calibration,
+        joints.compensation,
+        joints.offsets,
+        entered=new.active_offsets,
+        file=str(ini),
+    )
+    if differences:
+        put_note(differences)
 
 
 def _describe_entries(new: orthocal.Session, *, changes: bool) -> str:

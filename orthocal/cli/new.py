@@ -34,6 +34,7 @@ from orthocal.errors import OrthocalError, ParameterError, RobotError
 from orthocal.io.files import exists, read_file, require_plain_name, write_files
 
 if TYPE_CHECKING:
+    from orthocal.builder.build import EffectKeyValues
     from orthocal.builder.dimensions import Dimensions
     from orthocal.builder.machine_file import Counting
     from orthocal.cli.dialogue import Stated
@@ -146,6 +147,8 @@ class FirstPlanOptions:
 
     Args:
         effects (EFFECTS): Effects that the machine has, such as backlash,thermal, or none.
+        screw_lead_mm (MM): Travel per turn of the screws, for a machine with periodic errors of the
+            screws (effect screw).
         paper: Read each leg in the mechanical zero and at both ends of its axis, as in the paper;
             no search.
     """
@@ -157,8 +160,18 @@ class FirstPlanOptions:
     with_: Owned = None
     model: Model = None
     effects: str = EFFECTS
+    screw_lead_mm: float | None = None
     temperature: TemperatureRange = None
     tolerance: Tolerances = None
+
+    def read_effects(self) -> dict[str, dict[str, float]]:
+        """Effects of the machine, mapped to keys that replace their defaults."""
+        effects: dict[str, dict[str, float]] = {
+            name: {} for name in split_effects(self.effects) or []
+        }
+        if self.screw_lead_mm is not None:
+            effects["screw"] = {"lead_mm": self.screw_lead_mm}
+        return effects
 
 
 @command()
@@ -207,7 +220,7 @@ class _Design:
 
     machine: Dimensions
     counting: tuple[Counting, ...]
-    effects: Sequence[str]
+    effects: EffectKeyValues
     tolerance_stated: bool
     """Whether the tolerance of the zeros of the joints was stated."""
     plan: orthocal.MeasuringPlan | FixedPlan | None
@@ -238,7 +251,7 @@ def _design(
     )
     if options.gauge is not None:
         equipment = load_dial(options.gauge, equipment)
-    effects = split_effects(options.effects) or []
+    effects = options.read_effects()
     kind, tolerance = dimensions.read_kind(), options.tolerance
     reads_legs = kind.read_legs or bool(equipment.owned)
     if not reads_legs:
@@ -289,7 +302,7 @@ def _write(folder: Path, name: str, design: _Design) -> None:
 
 
 def _make_trial(
-    machine: Dimensions, folder: Path, counting: Sequence[Counting], effects: Sequence[str]
+    machine: Dimensions, folder: Path, counting: Sequence[Counting], effects: EffectKeyValues
 ) -> orthocal.Robot:
     """Robot of the machine in a temporary directory.
 
@@ -302,6 +315,8 @@ def _make_trial(
         key = (e.where or "").partition("orthocal.effects.")[2]
         if not key and e.where != "effects":
             raise
+        if key == "screw.lead_mm":
+            raise ParameterError(e.problem, where="--screw-lead-mm") from None
         problem = e.problem
         if key:
             problem = f"{key}: {problem}; add the effect to the robot's YAML later"

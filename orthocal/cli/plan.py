@@ -41,7 +41,7 @@ from orthocal.cli.overwriting import require_new_session
 from orthocal.cli.printing import deliver, put_note
 from orthocal.cli.sheet import sheet_or_problem
 from orthocal.errors import ParameterError
-from orthocal.units import MM
+from orthocal.units import DRIVE_UNITS, MM
 
 FILES = ("session.yaml", "readings.csv", "plan.json", "plan.svg", "sheet.html")
 
@@ -206,18 +206,37 @@ def _describe_next(subject: str, plan: orthocal.MeasuringPlan, out: Path, *, sta
     )
 
 
+def _missing_controller(session: orthocal.Session) -> str:
+    """Lines about keys of the controller that a session does not state; "" if it states all."""
+    drives = session.robot.drives
+    zeros, unit = ", ".join(["0"] * len(drives)), DRIVE_UNITS[drives[0].unit][0]
+    keys = []
+    if session.controller_offsets is None:
+        keys.append(f"offsets_{unit}: [{zeros}]")
+    if not session.compensation:
+        keys.append(f"backlash_{unit}: [{zeros}]")
+    if not keys:
+        return ""
+    head = "State what the controller corrects during the measurement, one number for each drive"
+    if len(keys) == 1:
+        return f"{head}.\nAdd to `controller` below, such as {keys[0]}\n"
+    return f"{head}:\ncontroller: {{{', '.join(keys)}}}\n"
+
+
 def _write(plan: orthocal.MeasuringPlan, directory: Path) -> None:
     """Write a plan as a session with its sheet and its figure."""
     from orthocal.output.text.plan import draw_plan, plan_json
     from orthocal.runtime.worker_pool import call_in_parallel
+    from orthocal.sensors.protocol import tool_path
 
     stated = any(r.approach for r in plan.session.readings)
-    side = "as the column approach states" if stated else "from the same side"
+    arcs = all(tool_path(setup.sensor) for setup in plan.session.setups.values())
+    side = "along its arc" if arcs else "from the same side"
+    side = "as the column approach states" if stated else side
     comment = (
         "A plan: run `orthocal record .` in this directory, or fill in readings.csv; then\n"
         "orthocal calibrate .\n"
-        "State what the controller corrects during the measurement, one number for each drive:\n"
-        "controller: {offsets_mm: [0, 0, 0], backlash_mm: [0, 0, 0]}\n"
+        f"{_missing_controller(plan.session)}"
         f"Approach every posture {side}. The last reading of a setup is its first\n"
         "posture again."
     )

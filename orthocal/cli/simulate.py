@@ -42,7 +42,8 @@ def simulate(
 
     The directory receives session.yaml, readings.csv and truth.yaml. Readings state the conditions
     that effects of the machine need, and their time and temperature with --temperature. With the
-    truth.yaml of an earlier session (--errors) machine and gauges are the same, mounted anew.
+    truth.yaml of an earlier session (--errors) machine and gauges are the same, mounted anew. If
+    the sessions state different mechanical adjustments (adjusted_mm), the machine is adjusted.
 
     Args:
         draw (MODEL|PATTERNS): Draw random errors by their tolerances: those of a model, or by name
@@ -68,6 +69,7 @@ def simulate(
         single=error or [],
         draw=draw,
         nuisance=nuisance_parameters(planned).parameters,
+        adjusted=planned.adjusted,
         seed=seed,
     )
     simulated = orthocal.simulate_session(planned, true_errors, seed=seed, exact=exact)

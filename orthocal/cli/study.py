@@ -126,7 +126,7 @@ def accuracy(
     robot, machine_effects = session.robot, session.robot.effect_names
     fixed = {}
     if error or errors is not None:
-        fixed = collect_errors(robot, file=errors, single=error or [])
+        fixed = collect_errors(robot, file=errors, single=error or [], adjusted=session.adjusted)
     tolerances = read_tolerances(tolerance, robot)
     if half_side_mm is not None:
         read_workspace(f"{half_side_mm:g}", robot, where="--half-side-mm")

@@ -98,7 +98,8 @@ REFUSED_CODES: dict[str, tuple[str, str]] = {
         ("G43", "G43.1", "G43.2"),
         (
             "is a tool length offset, and the length is in the controller",
-            f"{_CENTER_PATH} and remove the offset, then state the tip with --tool",
+            "remove G43, H and G49 from the program; add the length to Z of the work zero, in the "
+            "controller and in --work-offset-mm; and state the tip with --tool",
         ),
     ),
     "G53": ("is a motion in machine coordinates", "write it in coordinates of the program"),

@@ -14,6 +14,12 @@ from pydantic import Field
 
 from orthocal.arguments import require_kind, require_names, require_numbers, require_seed
 from orthocal.arrays import Array
+from orthocal.effects.adjustment import (
+    LARGEST_AMOUNT_MM,
+    SUFFIX,
+    require_adjustment,
+    subtract_amounts,
+)
 from orthocal.errors import ParameterError, SessionError
 from orthocal.io.documents import Keys, Number, parse_number, read_yaml, validate
 from orthocal.observation.model import predict_readings
@@ -89,8 +95,9 @@ def simulate_session(
 
     Args:
         plan: Setups, postures and rows.
-        errors: Names of parameters, mapped to values, [SI]. Absent errors are 0, absent nuisance
-            parameters of the setups are drawn.
+        errors: Errors of the machine after all adjustments that the plan states: names of
+            parameters, mapped to values, [SI]. Absent errors are 0, absent nuisance parameters of
+            the setups are drawn.
         seed: Seed of noise, gauge zeros and nuisance parameters.
         sigma: Standard deviation of a reading, [m]; that of the gauge by default.
         exact: Simulate no noise, no rounding and no drawn mounting errors; the first reading of
@@ -239,22 +246,35 @@ class _TruthKeys(Keys):
     """Keys of a file of errors, such as truth.yaml."""
 
     errors: Annotated[dict[str, Number], Field(min_length=1)]
+    adjusted_mm: dict[
+        str, Annotated[Number, Field(ge=-LARGEST_AMOUNT_MM, le=LARGEST_AMOUNT_MM)]
+    ] = {}
+    """Mechanical adjustments of the machine that has these errors."""
     zeros_mm: dict[str, Number] = {}
     sensors: dict[str, Number] = {}
 
 
 def load_errors(
-    path: str | Path, robot: Robot, nuisance: Iterable[Parameter] = ()
+    path: str | Path,
+    robot: Robot,
+    nuisance: Iterable[Parameter] = (),
+    *,
+    adjusted: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
     """Load errors from a YAML file: `errors:` with keys such as x_slide.offset_mm.
 
     A gauge keeps its errors: those that the file lists under `sensors`, such as the scale of a dial
     or the length of a bar, are loaded too. Setups are mounted anew.
 
+    The errors are those of a machine with the mechanical adjustments `adjusted_mm` of the file, by
+    default none. The differences to `adjusted` are added to them.
+
     Args:
         path: The file, such as a truth.yaml.
         robot: The robot.
         nuisance: Nuisance parameters of the plan to simulate.
+        adjusted: Mechanical adjustments of the machine to simulate, name to amount, [m]; None
+            without a conversion of the errors.
 
     Returns:
         Names of parameters, mapped to values, [SI].
@@ -266,6 +286,12 @@ def load_errors(
     data = read_yaml(file, error=ParameterError)
     keys = validate(_TruthKeys, data, where=str(file), error=ParameterError)
     errors = read_errors(keys.errors, robot.parameters, where=f"{file}: errors")
+    for name in keys.adjusted_mm:
+        require_adjustment(robot, name, where=f"{file}: adjusted_mm", error=ParameterError)
+    if adjusted is not None:
+        before = {name: amount * MM for name, amount in keys.adjusted_mm.items()}
+        for name, change in subtract_amounts(adjusted, before).items():
+            errors[name + SUFFIX] = errors.get(name + SUFFIX, 0.0) + change
     of_gauges = ParameterSet((), (p for p in nuisance if p.name.startswith(OF_GAUGE)))
     known = {k: v for k, v in keys.sensors.items() if k.rpartition("_")[0] in of_gauges}
     return errors | read_errors(known, of_gauges, where=f"{file}: sensors")
@@ -278,6 +304,7 @@ def collect_errors(
     single: Sequence[str] = (),
     draw: str | None = None,
     nuisance: Iterable[Parameter] = (),
+    adjusted: Mapping[str, float] | None = None,
     seed: int = 0,
 ) -> dict[str, float]:
     """Collect errors drawn from priors, of a file and of single texts; later ones replace earlier.
@@ -288,6 +315,8 @@ def collect_errors(
         single: Texts such as x_slide.offset_mm=1.2.
         draw: Model of the robot, or names and globs separated by commas, to draw.
         nuisance: Nuisance parameters of a plan: texts may state any, a file those of gauges.
+        adjusted: Mechanical adjustments of the machine to simulate, for the errors of a file; see
+            `load_errors`.
         seed: Seed of the random numbers.
 
     Returns:
@@ -316,7 +345,7 @@ def collect_errors(
                 where="--draw",
             ) from None
     if file is not None:
-        errors.update(load_errors(file, robot, nuisance))
+        errors.update(load_errors(file, robot, nuisance, adjusted=adjusted))
     parameters = ParameterSet((), (*robot.parameters, *nuisance))
     for text in single:
         key, equals, number = text.partition("=")
@@ -357,10 +386,10 @@ def truth_document(simulated: SimulatedSession) -> str:
     for name, value in simulated.errors.items():
         p = parameters[name]
         errors[f"{name}_{p.edge_unit}"] = float(f"{value * p.edge_factor:.9g}")
-    document = {
-        "errors": errors,
-        "zeros_mm": {name: to_mm(value) for name, value in simulated.zeros.items()},
-    }
+    document = {"errors": errors}
+    if adjusted := simulated.session.adjusted:
+        document["adjusted_mm"] = {name: to_mm(amount) for name, amount in adjusted.items()}
+    document["zeros_mm"] = {name: to_mm(value) for name, value in simulated.zeros.items()}
     if simulated.nuisance:
         by_name = {p.name: p for p in nuisance_parameters(simulated.session).parameters}
         document["sensors"] = {

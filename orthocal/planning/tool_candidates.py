@@ -292,7 +292,7 @@ def _bars(
         in_space[list(coordinates)] = ball
         keys = {
             "centre_mm": ((in_space + tool) / MM).round(6).tolist(),
-            "ball": f"{sensor.name}_{k + 1}",
+            "ball": f"{sensor.name}_ball_{k + 1}",
         }
         yield f"{sensor.name}_{k}", keys, points[inside]
 

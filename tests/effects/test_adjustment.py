@@ -9,8 +9,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from adjusting import TOLERANCES, shim, shimmed_plan, turned
+from commands import run_orthocal
 from derivatives import assert_derivative
-from machines import frames
+from machines import frames, reading_by_pinocchio
 from tolerances import CLOSED, DERIVATIVE, KINEMATICS
 
 from orthocal import (
@@ -26,9 +27,10 @@ from orthocal import (
 )
 from orthocal.calibration.identify import identify
 from orthocal.effects.adjustment import find_adjustments
-from orthocal.errors import RobotError, SessionError
+from orthocal.errors import ParameterError, RobotError, SessionError
 from orthocal.estimation.problem import build_problem
 from orthocal.kinematics.loop_closure import LoopClosure
+from orthocal.observation.simulate import collect_errors, load_errors, truth_document
 from orthocal.robot.loading import packaged_robots
 
 QUICK = {"solver": "variable-projection"}
@@ -292,6 +294,56 @@ def test_a_session_file_states_the_adjustments(plan, tmp_path):
             load_session(tmp_path / "after")
         assert "adjusted_mm" in str(caught.value)
         assert message in str(caught.value)
+
+
+# ---- simulation after an adjustment
+
+
+def test_simulated_readings_are_those_of_the_shimmed_machine(plan, tmp_path):
+    """By command, with the truth.yaml of before; the shims are rigid motions in Pinocchio."""
+    write_session(replace(plan, adjusted=AMOUNTS), tmp_path / "plan", blank=True)
+    before = simulate_session(plan, TRUTH, exact=True)
+    (tmp_path / "truth.yaml").write_text(truth_document(before))
+    words = "simulate plan --errors truth.yaml --exact --effects none --out".split()
+    assert run_orthocal(tmp_path, *words, "after").returncode == 0
+    shown = load_session(tmp_path / "after")
+    machine = plan.robot.with_errors(TRUTH)
+    machine = replace(machine, model=shim(machine, AMOUNTS)).displaced({})
+    largest = differing = 0.0
+    for name in shown.setups:
+        rows = [i for i, r in enumerate(shown.readings) if r.setup == name]
+        postures = [shown.postures[shown.readings[i].posture] for i in rows]
+        expected = [reading_by_pinocchio(shown, machine, shown.setups[name], p) for p in postures]
+        difference = shown.values[rows] - (np.array(expected) - expected[0])
+        differing = max(differing, np.abs(difference).max())
+        change = shown.values[rows] - before.session.values[rows]
+        largest = max(largest, np.abs(change).max())
+    assert largest > 50e-6
+    assert differing < 0.05 * largest  # of second order: rails with errors of 3 mrad turn by 1.4
+
+
+def test_errors_of_an_adjusted_machine_are_adjusted_once(plan, tmp_path):
+    """A truth.yaml states the adjustments of its machine."""
+    robot, file = plan.robot, tmp_path / "truth.yaml"
+    of = {n: f"{n}.adjustment" for n in AMOUNTS}
+    adjusted = replace(plan, adjusted=AMOUNTS)
+    file.write_text(truth_document(simulate_session(plan, TRUTH, exact=True)))
+    errors = load_errors(file, robot, adjusted=AMOUNTS)
+    assert {n: errors[of[n]] for n in AMOUNTS} == pytest.approx(AMOUNTS)
+    # an amount that is stated alone replaces the planned amount
+    single = ["x_outer_foot_z.adjustment_mm=0.45"]
+    errors = collect_errors(robot, file=file, single=single, adjusted=AMOUNTS)
+    assert errors[of["x_outer_foot_z"]] == pytest.approx(0.45e-3)
+    file.write_text(truth_document(simulate_session(adjusted, errors, exact=True)))
+    again = load_errors(file, robot, adjusted=AMOUNTS)
+    assert again == pytest.approx(errors)
+    further = load_errors(file, robot, adjusted={**AMOUNTS, "x_outer_foot_z": 0.7e-3})
+    assert further[of["x_outer_foot_z"]] == pytest.approx(0.65e-3)
+    assert further[of["y_side_foot_x"]] == pytest.approx(AMOUNTS["y_side_foot_x"])
+    assert load_errors(file, robot) == pytest.approx(errors)
+    file.write_text(file.read_text().replace("y_side_foot_x:", "y_side_feet_x:"))
+    with pytest.raises(ParameterError, match="adjusted_mm"):
+        load_errors(file, robot)
 
 
 def test_feet_follow_the_dimensions(plan):

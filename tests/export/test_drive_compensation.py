@@ -325,6 +325,90 @@ def test_significant_periodic_errors_are_entered(complete):
     assert len(backlash) == 1  # that of y, which has no table
 
 
+def test_again_names_the_tables_of_an_export(complete, tmp_path):
+    """Without --ini, the new session does not state them; with the exported lines it does."""
+    write_calibration(complete, tmp_path / "one.json")
+    words = ["again", "one.json", "--anyway", "--out"]
+    done = run_orthocal(tmp_path, *words, "without")
+    assert done.returncode == 0, done.stderr
+    assert "a table (COMP_FILE) for x_slide and z_slide" in " ".join(done.stderr.split())
+    options = ExportOptions(module=False, latched=LATCHED, home_offsets=(0.3, 0.3, 0.3))
+    for name, text in export_calibration(
+        complete, "linuxcnc", anyway=True, options=options
+    ).items():
+        (tmp_path / name).write_text(text)
+    done = run_orthocal(tmp_path, *words, "with", "--ini", "joints.ini")
+    assert done.returncode == 0, done.stderr
+    assert "COMP_FILE" not in done.stderr
+    assert [t.table is not None for t in load_plan(tmp_path / "with").compensation] == [
+        True,
+        False,
+        True,
+    ]
+    lines = (tmp_path / "joints.ini").read_text()
+    for comp in ("joint_0.comp", "joint_2.comp"):
+        lines = lines.replace(f"COMP_FILE = {comp}\nCOMP_FILE_TYPE = 1\n", "")
+    (tmp_path / "without.ini").write_text(lines)
+    done = run_orthocal(tmp_path, *words, "other", "--ini", "without.ini")
+    text = " ".join(done.stderr.split())
+    assert "JOINT_0 has BACKLASH 0.000 mm instead of a table (COMP_FILE)" in text
+    assert "JOINT_1" not in text
+
+
+@pytest.mark.parametrize("end", [0, 1])
+def test_a_switch_at_a_limit_stays_within_the_limits(calibration, end):
+    """Half of the backlash is in HOME_OFFSET, but not in the position of the slide."""
+    drives = zip(calibration.robot.drives, ACTIVE, strict=True)
+    limits = [np.array(d.joint_limits) + d.direction * active for d, active in drives]
+    old = tuple(float(pair[end]) for pair in limits)
+    outside = 0
+    for latched in ((1, 1, 1), (-1, -1, -1)):
+        options = ExportOptions(module=False, latched=latched, home_offsets=old)
+        files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
+        lines = files["joints.ini"]
+        homes = home_offsets(lines)
+        low, high = (
+            [float(v) for v in re.findall(rf"^{name}_LIMIT = (\S+)", lines, re.M)]
+            for name in ("MIN", "MAX")
+        )
+        for i, d in enumerate(calibration.robot.drives):
+            assert low[i] <= homes[i] <= high[i]
+            change = d.direction * (offsets_to_enter(calibration)[i] - ACTIVE[i])
+            shifted = (limits[i] + change) / MM
+            widened = np.abs(np.array([low[i], high[i]]) - shifted)
+            assert widened[1 - end] < 1e-4
+            assert widened[end] < 0.06  # half of the backlash and the periodic error
+            outside += widened[end] > 1e-3
+    assert outside == 3  # for one of both directions of latching each
+
+
+def test_linuxcnc_leaves_a_switch_at_a_limit(calibration, tmp_path):
+    """Homed at the switch, it would refuse to move if HOME_OFFSET were outside the soft limits.
+
+    The switches are at the outer ends of travel, and homing latches them on the way inwards.
+    """
+    require_linuxcnc()
+    drives, latched = calibration.robot.drives, tuple(-sign for sign in LATCHED)
+    old = tuple(float(d.to_joint(d.upper + a)) for d, a in zip(drives, ACTIVE, strict=True))
+    options = ExportOptions(module=False, latched=latched, home_offsets=old)
+    files = export_calibration(calibration, "linuxcnc", anyway=True, options=options)
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    homes = home_offsets(files["joints.ini"])
+    joints = [
+        Joint(d.direction, d.upper / MM, h, h, latched=sign)
+        for d, h, sign in zip(drives, homes, latched, strict=True)
+    ]
+    program = []
+    for distance in (5.0, 10.0):
+        x, y, z = (h + distance * sign for h, sign in zip(homes, latched, strict=True))
+        program.append(f"G21 G90 G1 X{x:.4f} Y{y:.4f} Z{z:.4f} F3000")
+    tables = {name: text for name, text in files.items() if name.endswith(".comp")}
+    slides = run_program(program, joints, lines=files["joints.ini"], files=tables)
+    expected = [d.upper / MM - 10.0 for d in drives]
+    assert np.abs(slides[-1] - expected).max() < 0.2
+
+
 def test_insignificant_periodic_error_is_entered_if_the_tool_error_decreases(complete):
     """The y screw dominates the tool error only if the other errors are known.
 

@@ -246,7 +246,8 @@ HEAD = ["G21 G90 G17", "G0 X0 Y0 Z0", "F100"]
 REFUSED = {
     "G81 X1 Z-1 R1": "found G81, which is a canned cycle, whose motions the controller makes",
     "G41 D1": "found G41, which is cutter compensation",
-    "G43 H1": "found G43, which is a tool length offset",
+    "G43 H1": "found G43, which is a tool length offset, and the length is in the controller; "
+    "remove G43, H and G49 from the program; add the length to Z of the work zero",
     "H1": "found H1, a tool length offset; remove it, and state the tip with --tool",
     "G92 X0": "found G92, which moves the zero of the program; set it before",
     "G93": "found G93, which is inverse time feed; expected G94",

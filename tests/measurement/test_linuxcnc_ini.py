@@ -164,6 +164,30 @@ def test_again_states_the_backlash_of_the_file(folder, one, plain):
     identified = [result.errors[f"{d.name}.backlash"] for d in second.robot.drives]
     assert entered == pytest.approx(np.round(identified, 6), abs=1e-12)
     assert "x_slide" in done.stdout.partition("compensates this backlash")[2]
+    assert "instead of" not in done.stderr
+
+
+def test_again_says_what_differs_in_the_file_of_another_calibration(folder, one, plain):
+    """HOME_OFFSET by the comment of exported lines, BACKLASH by its values."""
+    assert export(folder, one, "home", "--ini", plain).returncode == 0
+    lines = (folder / "home/joints.ini").read_text()
+    (stated,) = re.findall(r"(?m)^# controller: \{offsets_mm: \[(\S+), .*\]\}$", lines)
+    (backlash, *_) = re.findall(r"(?m)^BACKLASH = (\S+)$", lines)
+    other = f"{float(stated) + 0.1:.6g}"
+    (folder / "other.ini").write_text(lines.replace(f"[{stated},", f"[{other},"))
+    done = run_orthocal(folder, "again", one, "--out", "second", "--ini", "other.ini")
+    assert done.returncode == 0
+    text = " ".join(done.stderr.split())
+    assert f"x_slide {float(other):+.3f} mm instead of {float(stated):+.3f} mm" in text
+    assert "y_slide" not in text
+    assert "JOINT_" not in text
+    done = run_orthocal(folder, "again", one, "--out", "third", "--ini", "plain.ini")
+    assert done.returncode == 0
+    text = " ".join(done.stderr.split())
+    expected = f"JOINT_0 has BACKLASH 0.000 mm instead of BACKLASH {float(backlash):.3f} mm"
+    assert expected in text
+    assert len(re.findall(r"JOINT_\d has", text)) == 3
+    assert "other offsets" not in text  # an INI file states none
 
 
 def test_again_states_the_tables_of_the_file(folder, one):

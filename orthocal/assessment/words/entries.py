@@ -217,7 +217,7 @@ def periodic_errors(entries: Sequence[ScrewEntry]) -> Finding:
         "periodic errors",
         f"Periodic errors of the screws (amplitude): {amplitudes}. Offsets and BACKLASH do not "
         "correct them.",
-        "`orthocal export` writes tables (COMP_FILE) that do.",
+        "`orthocal export --to linuxcnc --offsets` writes tables (COMP_FILE) that do.",
     )
 
 

@@ -32,6 +32,7 @@ from orthocal.assessment.controller_entries import (
     find_backlash,
     find_screw_effect,
     find_screws,
+    offsets_to_enter,
 )
 from orthocal.calibration.calibration import Calibration
 from orthocal.effects.backlash import Backlash
@@ -260,6 +261,26 @@ def tabulate(
         trims = _Trims(robot, i, offsets[i], 0.5 * joint.backlash, periodic)
         tabulated.append(_tabulate_joint(joint, trims, np.sort(travel)))
     return tuple(tabulated)
+
+
+def compensate_with_offsets(
+    calibration: Calibration, latched: Sequence[int] | None = None
+) -> tuple[JointCompensation, ...]:
+    """Compensation to enter together with the offsets: BACKLASH, or a table that contains it.
+
+    Args:
+        calibration: The calibration.
+        latched: Sign of HOME_LATCH_VEL of each joint; 1 by default.
+
+    Raises:
+        ParameterError: If the numbers of directions and drives differ.
+        ExportError: If tables were active, and the model has only one of both effects; or a drive
+            with a periodic error has no limits of travel.
+    """
+    active = find_active_compensation(calibration, latched)
+    compensation = find_compensation(calibration, latched)
+    compensation = tabulate(calibration, compensation, active, offsets_to_enter(calibration))
+    return round_backlash(compensation, active)
 
 
 def compensate_with_module(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 from orthocal.assessment.assess import assessment_of
-from orthocal.assessment.controller_entries import find_entries, find_screws, offsets_to_enter
+from orthocal.assessment.controller_entries import find_entries, find_screws
 from orthocal.calibration.calibration import Calibration
 from orthocal.effects.compensation import compensates_alike, format_table
 from orthocal.errors import ExportError, ParameterError
@@ -16,10 +16,10 @@ from orthocal.export.linuxcnc.c_source import write_component, write_core
 from orthocal.export.linuxcnc.drive_compensation import (
     JointCompensation,
     compensate_with_module,
+    compensate_with_offsets,
     find_active_compensation,
     find_compensation,
     round_backlash,
-    tabulate,
 )
 from orthocal.export.linuxcnc.home_offsets import find_homes
 from orthocal.export.linuxcnc.instructions import (
@@ -109,7 +109,6 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         ExportError: If there is no offset to enter, or no module meets the tolerance.
         ParameterError: If an option of a module is stated for HOME_OFFSET, or values are missing.
     """
-    compensation = find_compensation(calibration, options.latched)
     before = find_active_compensation(calibration, options.latched)
     stated = options.latched is not None
     module = not calibration.only_offsets if options.module is None else options.module
@@ -117,16 +116,16 @@ def export_linuxcnc(calibration: Calibration, options: ExportOptions) -> dict[st
         _refuse_module_options(options)
         if not find_entries(calibration):
             raise ExportError("the calibration identified no offset: there is nothing to enter")
-        compensation = tabulate(calibration, compensation, before, offsets_to_enter(calibration))
-        compensation = round_backlash(compensation, before)
+        compensation = compensate_with_offsets(calibration, options.latched)
         _require_change(calibration, compensation, before)
         _require_home_offsets(options, [*before, *compensation])
         homes = find_homes(calibration, compensation, before, old=options.home_offsets)
         return {
             "README.md": write_home_page(calibration, homes, stated=stated),
-            "joints.ini": write_home_lines(homes, stated=stated),
+            "joints.ini": write_home_lines(calibration, homes, stated=stated),
             **_write_tables(calibration, compensation, before),
         }
+    compensation = find_compensation(calibration, options.latched)
     compensation = compensate_with_module(calibration, compensation, before)
     compensation = round_backlash(compensation, before)
     if not compensates_alike(compensation, before):

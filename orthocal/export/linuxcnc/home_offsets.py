@@ -6,7 +6,8 @@ the change ΔT of the trim at the home switch (`drive_compensation.py`),
 
     HOME_OFFSET_new = HOME_OFFSET_old + s (o_new − o_active) − ΔT.
 
-Soft limits are positions of the slide. They change by s (o_new − o_active).
+Soft limits are positions of the slide. They change by s (o_new − o_active). If the switch is at a
+limit, HOME_OFFSET would be outside by ΔT, and the limit is widened.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ParameterError
 from orthocal.export.linuxcnc.drive_compensation import JointCompensation
 from orthocal.units import DRIVE_UNITS, Unit, format_fixed
+
+SAME_POSITION = 1e-9
+"""Largest difference between equal positions of a joint, [m, rad]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,10 +57,20 @@ class JointHome:
 
     @property
     def new_limits(self) -> tuple[float, float] | None:
-        """Soft limits to enter, [unit]."""
+        """Soft limits to enter, [unit].
+
+        They contain HOME_OFFSET if it was within the limits during the measurement.
+        """
         if self.limits is None:
             return None
-        return self.limits[0] + self.limit_change, self.limits[1] + self.limit_change
+        low, high = (limit + self.limit_change for limit in self.limits)
+        if self.old is not None and self.new is not None:
+            # the trim at the switch displaces HOME_OFFSET, but not the limits
+            if self.old > self.limits[0] - SAME_POSITION:
+                low = min(low, self.new)
+            if self.old < self.limits[1] + SAME_POSITION:
+                high = max(high, self.new)
+        return low, high
 
     @property
     def joint_unit(self) -> str:

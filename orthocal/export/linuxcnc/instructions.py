@@ -35,14 +35,19 @@ SMALLEST_ERROR = 1e-9
 """Smallest error that README.md states, [m]."""
 
 
-def write_home_lines(homes: Sequence[JointHome], *, stated: bool) -> str:
+def write_home_lines(calibration: Calibration, homes: Sequence[JointHome], *, stated: bool) -> str:
     """INI lines with HOME_OFFSET, MIN_LIMIT and MAX_LIMIT of each joint.
 
     Args:
+        calibration: The calibration.
         homes: The joints.
         stated: Whether the directions in which homing latches the switches were stated.
     """
-    lines = ["# HOME_OFFSET and soft limits with the calibrated offsets. Keep all other lines."]
+    lines = [
+        "# HOME_OFFSET and soft limits with the calibrated offsets. Keep all other lines.",
+        "# With these lines a session states the offsets of the slides:",
+        f"# {_describe_offsets(calibration)}",
+    ]
     for i, home in enumerate(homes):
         lines += [
             "",
@@ -55,6 +60,14 @@ def write_home_lines(homes: Sequence[JointHome], *, stated: bool) -> str:
             *_compensation_lines(i, home),
         ]
     return "\n".join(lines) + "\n"
+
+
+def _describe_offsets(calibration: Calibration) -> str:
+    """Key of session.yaml with the offsets to enter."""
+    drives = calibration.robot.drives
+    unit, size = DRIVE_UNITS[drives[0].unit]
+    values = ", ".join(f"{v / size:.6g}" for v in offsets_to_enter(calibration))
+    return f"controller: {{offsets_{unit}: [{values}]}}"
 
 
 def write_module_lines(approximation: Approximation, homes: Sequence[JointHome]) -> str:
@@ -278,8 +291,6 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, sta
             home.joint_unit,
         )
         rows.append(f"| {' | '.join(cells)} |")
-    unit, size = DRIVE_UNITS[homes[0].unit]
-    active = ", ".join(f"{v / size:.6g}" for v in offsets_to_enter(calibration))
     scope = "The calibration identified offsets of the drives only."
     if not calibration.only_offsets:
         scope = (
@@ -292,8 +303,7 @@ def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, sta
         "robot": comment_safe(calibration.robot.name),
         "scope": scope,
         "table": "\n".join(rows),
-        "unit": unit,
-        "active": active,
+        "active": _describe_offsets(calibration),
         "compensation": _describe_compensation(homes, stated=stated)
         + _describe_undetermined(calibration)
         + _describe_undetermined_screws(calibration),

@@ -22,6 +22,9 @@ from orthocal.units import DRIVE_UNITS
 COMP_FILE_COLUMNS = ("position", "forward trim", "reverse trim")
 """Columns of a COMP_FILE of type 1."""
 
+EXPORTED_OFFSETS = re.compile(r"(?m)^# controller: \{offsets_(\w+): \[([^\]]*)\]\}$")
+"""Comment of exported lines with the offsets of the slides."""
+
 METRIC_UNITS = ("mm", "metric")
 """Values of LINEAR_UNITS with which lengths are in mm."""
 
@@ -36,6 +39,8 @@ class ControllerJoints:
     """Sign of HOME_LATCH_VEL, 1 or -1; None if no joint states one, as in an exported fragment."""
     compensation: Compensation
     """BACKLASH and COMP_FILE of each joint."""
+    offsets: tuple[float, ...] | None = None
+    """Offsets of the slides that the comment of exported lines states, [m, rad]; None otherwise."""
 
 
 def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
@@ -70,7 +75,22 @@ def read_controller_joints(path: Path, robot: Robot) -> ControllerJoints:
         tuple(homes),
         tuple(latch or 1 for latch in latched) if stated else None,
         tuple(trims),
+        None if stated else _read_offsets(path, len(robot.drives)),
     )
+
+
+def _read_offsets(path: Path, n_drives: int) -> tuple[float, ...] | None:
+    """Offsets of the slides that a comment of exported lines states, [m, rad]; None without it."""
+    sizes = {unit: size for unit, size in DRIVE_UNITS.values()}
+    match = EXPORTED_OFFSETS.search(read_text(path, error=ParameterError))
+    if match is None or match[1] not in sizes:
+        return None
+    cells = match[2].split(",")
+    try:
+        values = tuple(float(cell) * sizes[match[1]] for cell in cells)
+    except ValueError:
+        return None
+    return values if len(values) == n_drives else None
 
 
 def _read_joint(

@@ -260,12 +260,14 @@ def short_name(text: str, longest: int = LONGEST_NAME) -> str:
 
 
 def list_places(places: Iterable[tuple[str, str]]) -> str:
-    """Places of sensors, such as "legs x, y, z" or "leg x and tool"."""
+    """Places of sensors, such as "legs x, y, z" or "leg x and the tool"."""
     named: dict[str, list[str]] = {}
     for kind, name in sorted(set(places)):
         named.setdefault(kind, []).append(name)
     words = [
-        f"{kind}{'' if len(names) == 1 else 's'} {', '.join(names)}".strip()
+        f"{kind}{'' if len(names) == 1 else 's'} {', '.join(names)}"
+        if any(names)
+        else f"the {kind}"
         for kind, names in named.items()
     ]
     return " and ".join(words)

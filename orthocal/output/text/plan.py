@@ -12,7 +12,7 @@ from rich.padding import Padding
 from rich.text import Text
 
 from orthocal.assessment.effect_limits import DETERMINED, EffectLimits
-from orthocal.assessment.wording import name_offsets, tool_mm
+from orthocal.assessment.wording import joined, name_offsets, tool_mm
 from orthocal.assessment.words.entries import describe_aligned
 from orthocal.io.documents import format_json
 from orthocal.kinematics.conditions import stated_use
@@ -66,6 +66,9 @@ MOST_LISTED = 24
 
 EVENLY = "evenly spaced"
 
+KNOWN_ZERO = {BallBar.kind: "the ball bar", Probe.kind: "the probe"}
+"""Sensors whose zero is known, with their nouns."""
+
 HOW_TO = {
     LegIndicator.kind: (
         "Dial at a leg: mount it so that it touches at the stated part of the length from the "
@@ -98,6 +101,7 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
     s, robot = plan.session, plan.session.robot
     remaining = describe_remaining(plan.find_remaining()) if details else []
     gains = plan.find_sensor_gains()
+    helps = _helps(plan, gains)
     parts: list[RenderableType] = [
         Text(
             f"Plan for {robot.name}, model {plan.forecast.selection.label}: {describe_size(s)}, "
@@ -110,7 +114,7 @@ def render_plan(plan: MeasuringPlan, *, details: bool = False) -> RenderableType
         *map(Text, _unusable(plan)),
         Text(_when_enough(plan)),
         section("Other plans in the same time", _alternatives(plan)),
-        section("What would help", bullets(_helps(plan, gains))),
+        *([section("What would help", bullets(helps))] if helps else []),
         *([section("Largest contributions", bullets(remaining))] if remaining else []),
         section("Setups", _setups(plan)),
         section("How to measure", bullets(_how_to_measure(plan))),
@@ -221,8 +225,11 @@ def _how_to_measure(plan: MeasuringPlan) -> list[str]:
         words.append(
             f"Go to the first posture{only} and set the dial to the middle of its range there."
         )
-    if "known" in zeros:
-        words.append("Do not set the zero of other sensors on the machine: it is known.")
+    fixed = {setup.sensor.kind for setup in session.setups.values() if setup.zero == "known"}
+    if known := [noun for kind, noun in KNOWN_ZERO.items() if kind in fixed]:
+        words.append(
+            f"Do not set the zero of {joined(known)} on the machine: readings are absolute."
+        )
     length = approach_length(session)
     stated = any(r.approach for r in session.readings)
     if any(tool_path(sensor) is None for sensor in sensors) and not stated:

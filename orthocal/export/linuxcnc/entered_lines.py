@@ -1,0 +1,109 @@
+"""Comparison of a controller's lines with those that an export of a calibration would write."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from orthocal.arrays import Array
+from orthocal.assessment.wording import joined
+from orthocal.calibration.calibration import Calibration
+from orthocal.effects.compensation import Compensation, JointTrim, compensates_alike
+from orthocal.errors import ExportError
+from orthocal.export.linuxcnc.drive_compensation import compensate_with_offsets
+from orthocal.robot.model import Drive
+from orthocal.units import DRIVE_UNITS
+
+SAME_OFFSET = 0.6e-6
+"""Largest difference between equal offsets, [m, rad]: they are printed to 1 µm."""
+
+
+def find_unstated_tables(calibration: Calibration, stated: Compensation) -> tuple[str, ...]:
+    """Drives whose table (COMP_FILE) of an export differs from a stated compensation.
+
+    Args:
+        calibration: The calibration.
+        stated: Compensation that a new session states; empty for none.
+    """
+    return tuple(
+        drive.name
+        for drive, joint, trim in _pair_trims(calibration, stated)
+        if joint.table is not None and not compensates_alike([joint], [trim])
+    )
+
+
+def describe_other_lines(
+    calibration: Calibration,
+    compensation: Compensation,
+    offsets: Sequence[float] | None,
+    *,
+    entered: Array,
+    file: str,
+) -> str:
+    """Differences between the lines of a controller and those that an export would write.
+
+    HOME_OFFSET itself cannot be compared: a session does not state the old one.
+
+    Args:
+        calibration: The calibration.
+        compensation: BACKLASH and COMP_FILE of the controller.
+        offsets: Offsets that a comment of exported lines states, [m, rad]; None without it.
+        entered: Offsets that the new session states, shape (n_drives,), [m, rad].
+        file: Name of the file with the lines.
+
+    Returns:
+        Sentences; "" without a difference.
+    """
+    sentences = []
+    if offsets is not None and np.abs(np.array(offsets) - entered).max() > SAME_OFFSET:
+        values = joined(
+            [
+                f"{d.name} {_show(d, v, sign=True)} instead of {_show(d, e, sign=True)}"
+                for d, v, e in zip(calibration.robot.drives, offsets, entered.tolist(), strict=True)
+                if abs(v - e) > SAME_OFFSET
+            ]
+        )
+        sentences.append(
+            f"{file} has HOME_OFFSET for other offsets of the slides than the new session: "
+            f"{values}. Enter those of the session, or use the lines of this calibration's export."
+        )
+    differences = [
+        f"JOINT_{i} has {_describe(drive, trim)} instead of {_describe(drive, joint, trim)}"
+        for i, (drive, joint, trim) in enumerate(_pair_trims(calibration, compensation))
+        if not compensates_alike([joint], [trim])
+    ]
+    if differences:
+        sentences.append(
+            f"{file} differs from the lines that this calibration says to enter: "
+            f"{joined(differences)}. The new session states what the file contains: measure with "
+            "these lines, or enter the others and run `orthocal again` anew."
+        )
+    return "\n".join(sentences)
+
+
+def _pair_trims(
+    calibration: Calibration, stated: Compensation
+) -> list[tuple[Drive, JointTrim, JointTrim]]:
+    """Drives with the trim that an export writes and a stated trim; empty if it writes none."""
+    drives = calibration.robot.drives
+    try:
+        expected = compensate_with_offsets(calibration)
+    except ExportError:
+        return []
+    trims = stated or (JointTrim(),) * len(drives)
+    return list(zip(drives, expected, trims, strict=True))
+
+
+def _describe(drive: Drive, trim: JointTrim, other: JointTrim | None = None) -> str:
+    """Compensation of a joint in a few words, beside another one."""
+    if trim.table is not None:
+        both = other is not None and other.table is not None
+        return "another table" if both else "a table (COMP_FILE)"
+    return f"BACKLASH {_show(drive, trim.backlash)}"
+
+
+def _show(drive: Drive, value: float, *, sign: bool = False) -> str:
+    """Value with its unit, mm or deg."""
+    unit, size = DRIVE_UNITS[drive.unit]
+    return f"{value / size:{'+' if sign else ''}.3f} {unit}"
