@@ -29,7 +29,7 @@ from orthocal.measurement.joining import Given, gather_sessions, join_sessions, 
 from orthocal.session.session import Session
 from orthocal.statistics.noise import KnownNoise, estimate_repeatability
 
-CRITERIA = ("rms", "chi_square", "dof", "aicc", "bic", "unseen_rms")
+CRITERIA = ("rms", "chi_square", "dof", "aicc", "bic", "prediction_rms")
 """Numbers of a score in the JSON document."""
 
 
@@ -237,8 +237,8 @@ def _models_not_recommended(comparison: Comparison, best: ModelResult) -> list[F
         words.not_recommended(
             r.model,
             recommendation.log_evidence_of(r.model) - recommendation.log_evidence_of(best.model),
-            r.exact.unseen_rms,
-            best.exact.unseen_rms,
+            r.exact.prediction_rms,
+            best.exact.prediction_rms,
         )
         for r in comparison.results
         if r is not best
@@ -289,7 +289,7 @@ def _effects_document(comparison: EffectComparison) -> dict[str, Any]:
             {
                 "effects": list(w.effects),
                 "log_evidence": finite_or_none(w.log_evidence),
-                "unseen_rms": finite_or_none(w.unseen_rms),
+                "prediction_rms": finite_or_none(w.prediction_rms),
             }
             for w in comparison.weighed
         ],

@@ -29,7 +29,7 @@ class WeighedEffects:
     effects: tuple[str, ...]
     log_evidence: float
     """ln p(y) minus that without any of the candidates."""
-    unseen_rms: float
+    prediction_rms: float
     """RMS error of the prediction of each setup from all others, [m]."""
 
 

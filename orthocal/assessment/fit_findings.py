@@ -109,7 +109,7 @@ def _standstill(calibration: Calibration) -> list[Finding]:
     """Finding about a fit that changed no parameter."""
     if any(abs(p.value - p.start) > STANDSTILL * p.prior_std for p in calibration.free):
         return []
-    if len(calibration.identifiability.unseen) == len(calibration.free):
+    if len(calibration.identifiability.below_noise) == len(calibration.free):
         return [words.nothing_depends([p.name for p in calibration.free])]
     return [words.nothing_deviates(calibration.rms_before)]
 
@@ -138,8 +138,8 @@ def find_unresolved(calibration: Calibration) -> list[Finding]:
     """Findings about parameters determined only in combination, and about those below the noise."""
     identifiability = calibration.identifiability
     findings = [words.inseparable(c) for c in identifiability.alike]
-    if identifiability.unseen:
-        findings.append(words.below_noise(identifiability.unseen))
+    if identifiability.below_noise:
+        findings.append(words.below_noise(identifiability.below_noise))
     return findings
 
 

@@ -44,14 +44,14 @@ class Score:
     """n ln(Σ r²/n) + 2 k + 2 k (k + 1)/(n − k − 1); infinite if n − k − 1 is not positive."""
     bic: float
     """n ln(Σ r²/n) + k ln n; infinite without degrees of freedom."""
-    unseen: Array
+    prediction_error: Array
     """Cross-validation errors of the rows of each setup, predicted from all other setups, shape
     (n_rows,), [m]; NaN if these do not determine the model."""
 
     @property
-    def unseen_rms(self) -> float:
+    def prediction_rms(self) -> float:
         """RMS of the cross-validation errors, [m]."""
-        finite = self.unseen[np.isfinite(self.unseen)]
+        finite = self.prediction_error[np.isfinite(self.prediction_error)]
         return float(np.sqrt(np.mean(finite**2))) if finite.size else math.nan
 
 
@@ -173,12 +173,12 @@ def _score(fit: Fit, linearisation: LinearProblem, method: Method, noise: float)
         if denominator > 0.0
         else math.inf,
         bic=misfit + k * math.log(count) if count - effective >= 0.5 else math.inf,
-        unseen=_cross_validate(fit, linearisation, method),
+        prediction_error=_cross_validate(fit, linearisation, method),
     )
 
 
 def _cross_validate(fit: Fit, linearisation: LinearProblem, method: Method) -> Array:
-    """Cross-validation errors as in `Score.unseen`."""
+    """Cross-validation errors as in `Score.prediction_error`."""
     problem, observations = fit.problem, fit.problem.observations
     errors = np.full(observations.plus.size, np.nan)
     setups = np.unique(observations.setup)

@@ -310,7 +310,7 @@ def _residual_rows(
     except ClosureError:  # the linearised machine cannot be assembled
         by_linear = np.full(len(session.readings), np.nan)
     predicted = session.values - row_noise * observations.rows(fit.residual)
-    unseen = row_noise * cross_validate_setups(fit)
+    prediction_error = row_noise * cross_validate_setups(fit)
     return tuple(
         ResidualRow(
             setup=r.setup,
@@ -326,7 +326,7 @@ def _residual_rows(
             studentised=float(diagnostics.studentised[i]),
             influence=float(diagnostics.max_dfbetas[i]),
             influenced=problem.free[diagnostics.dfbetas_parameter[i]],
-            unseen=float(unseen[i]),
+            prediction_error=float(prediction_error[i]),
             conditions=r.conditions,
         )
         for i, r in enumerate(session.readings)

@@ -63,7 +63,7 @@ def reading_table(calibration: Calibration) -> list[Record]:
             "predicted": r.predicted,
             "deviation": r.deviation,
             "residual": r.residual,
-            "unseen": finite_or_none(r.unseen),
+            "prediction_error": finite_or_none(r.prediction_error),
             "studentised": finite_or_none(r.studentised),
             "file": r.file or calibration.session.readings_path,
             "line": r.line,

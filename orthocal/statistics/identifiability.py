@@ -94,7 +94,7 @@ class Identifiability:
     n_postures: Annotated[Count, Field(ge=1)]
     n_readings: Count
     """Independent readings: readings minus repetitions and gauge zeros."""
-    unseen: Many[str]
+    below_noise: Many[str]
     """Parameters that change the readings by less than the threshold."""
     resolvable: Many[str]
     """Parameters whose standard deviation from the readings alone is below the prior one."""
@@ -161,7 +161,7 @@ def analyse_identifiability(
         structural_rank=information.rank,
         n_postures=n_postures,
         n_readings=n_readings,
-        unseen=tuple(n for n, size in zip(names, norms, strict=True) if size <= threshold),
+        below_noise=tuple(n for n, size in zip(names, norms, strict=True) if size <= threshold),
         resolvable=tuple(n for n, ok in zip(names, resolvable, strict=True) if ok),
         alike=_find_alike(factor, parameters, threshold),
         base=find_base_parameters(factor, parameters, threshold=threshold),

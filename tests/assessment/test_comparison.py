@@ -61,8 +61,8 @@ def test_the_complete_model_is_recommended_for_table_1(table1):
     others = {f.text.split(":")[0]: f.numbers for f in found.of_kind("not recommended")}
     assert others.keys() == {"offsets", "lengths"}
     assert others["offsets"]["log_evidence"] == pytest.approx(-117.1, abs=0.2)
-    expected = table1["offsets"].exact.unseen_rms * 1e3
-    assert others["offsets"]["unseen_rms_mm"] == pytest.approx(expected, rel=1e-12)
+    expected = table1["offsets"].exact.prediction_rms * 1e3
+    assert others["offsets"]["prediction_rms_mm"] == pytest.approx(expected, rel=1e-12)
     (scale,) = found.of_kind("above tolerances")
     assert scale.numbers["tolerance_scale"] == table1.judgement.tolerance_scale.factor > 1.0
     assert found.of_kind("repetition unknown")  # no reading is redundant
@@ -148,7 +148,7 @@ def test_omitted_setups_are_predicted_by_fits_without_their_rows(experiment_2, t
         theta = extend_to(problem, replace(fit, solution=solution))
         o = problem.observations
         error = o.rows(project_out_zeros(problem.values - problem.predict(theta), o))[i]
-        assert table1["offsets"].exact.unseen[i] == pytest.approx(error, abs=1e-9)
+        assert table1["offsets"].exact.prediction_error[i] == pytest.approx(error, abs=1e-9)
 
 
 def test_an_omitted_setup_is_predicted_with_priors(raw_cycles, cycles):
@@ -164,12 +164,12 @@ def test_an_omitted_setup_is_predicted_with_priors(raw_cycles, cycles):
     errors = o.rows(project_out_zeros(problem.values - problem.predict(theta), o))
     for i, row in enumerate(raw_cycles.readings):
         if row.setup == setup:
-            assert result.exact.unseen[i] == pytest.approx(errors[i], abs=2e-8)
+            assert result.exact.prediction_error[i] == pytest.approx(errors[i], abs=2e-8)
 
 
 def test_linearised_and_exact_predictions_nearly_agree(cycles):
     offsets = cycles["offsets"]
-    gap = np.abs(offsets.linearised.unseen - offsets.exact.unseen)
+    gap = np.abs(offsets.linearised.prediction_error - offsets.exact.prediction_error)
     assert 0.0 < gap.max() < 0.01e-3
     assert offsets.linearisation_cost.rms < 2e-6
 
@@ -188,7 +188,7 @@ def test_displaced_lines_support_the_full_model(lines):
     assert lines.recommendation.model == "full"
     assert lines.assessment.decision.verdict == "enter"
     full, offsets = lines["full"], lines["offsets"]
-    assert full.exact.unseen_rms < 0.8 * offsets.exact.unseen_rms
+    assert full.exact.prediction_rms < 0.8 * offsets.exact.prediction_rms
     assert full.tool.after.sizes.aligned.rms < 0.25 * offsets.tool.after.sizes.aligned.rms
     assert lines.independent == 264
 
@@ -213,7 +213,7 @@ def test_a_setup_that_the_others_do_not_determine_has_no_prediction(raw_cycles):
     """Each setup of leg x is needed for one offset."""
     rows = tuple(r for r in raw_cycles.readings if r.setup in ("yx", "zx", "xz"))
     found = compare_models(replace(raw_cycles, readings=rows), models=["offsets"], options=QUICK)
-    assert np.isnan(found["offsets"].exact.unseen).any()
+    assert np.isnan(found["offsets"].exact.prediction_error).any()
 
 
 def test_an_unknown_model_is_refused(experiment_2):

@@ -39,7 +39,7 @@ def test_the_supported_effect_is_recommended(session):
         (), *((n,) for n in ("backlash", "thermal", "screw", "drift")),
     ]  # fmt: skip
     assert found.best.log_evidence > 10.0
-    assert found.best.unseen_rms < found.weighed[0].unseen_rms
+    assert found.best.prediction_rms < found.weighed[0].prediction_rms
     assert found.weighed[0].log_evidence == 0.0
 
 
@@ -127,7 +127,7 @@ def test_the_option_is_named_unless_the_effect_is_identified(session, identified
 def test_the_evidence_decides_where_omitted_setups_disagree(session):
     found = compare_effects(session.with_effects(["backlash"]))
     none, best = found.weighed
-    worse = replace(best, unseen_rms=1.5 * none.unseen_rms)
+    worse = replace(best, prediction_rms=1.5 * none.prediction_rms)
     texts = [describe_effects(replace(found, weighed=(none, w)), 40)[0].text for w in (best, worse)]
     assert ["the evidence of all readings" in text for text in texts] == [False, True]
 

@@ -134,7 +134,7 @@ def test_nothing_to_move_is_explained(exact_plan):
     result = calibrate(plan_with_truth(exact_plan), Choice(free=["frame.tcp.*"]))
     (found,) = result.assessment.of_kind("no sensitivity")
     assert {p.parameter for p in found.places} == {p.name for p in result.free}
-    assert set(result.identifiability.unseen) == {p.name for p in result.free}
+    assert set(result.identifiability.below_noise) == {p.name for p in result.free}
 
 
 def test_iterations_and_times_are_told(session):

@@ -84,7 +84,7 @@ def describe_effects(comparison: EffectComparison | None, readings: int) -> list
         single = [w.effects[0] for w in comparison.weighed if len(w.effects) == 1]
         text, action = "Recommended effects: none. The readings do not clearly show ", ""
         text += f"{joined(single, 'or')}; effects that the machine states may stay."
-    numbers = {"log_evidence": best.log_evidence, "unseen_rms_mm": best.unseen_rms / MM}
+    numbers = {"log_evidence": best.log_evidence, "prediction_rms_mm": best.prediction_rms / MM}
     return [note("effects recommended", text, action, **numbers), *notes]
 
 
@@ -92,7 +92,7 @@ def _describe_recommended_effects(comparison: EffectComparison) -> tuple[str, st
     """Text and action of the finding about recommended effects."""
     names, without, best = comparison.recommended, comparison.weighed[0], comparison.best
     them, are = ("it", "is") if len(names) == 1 else ("them", "are")
-    with_mm, without_mm = mm(best.unseen_rms), mm(without.unseen_rms)
+    with_mm, without_mm = mm(best.prediction_rms), mm(without.prediction_rms)
     text = (
         f"Recommended effects: {joined(names)}. The readings are much more likely with {them} "
         f"(ln evidence {best.log_evidence:+.1f}). RMS prediction error of left-out setups: "
@@ -107,22 +107,26 @@ def _describe_recommended_effects(comparison: EffectComparison) -> tuple[str, st
     return f"{text} {listed[:1].upper()}{listed[1:]} {are} identified already.", ""
 
 
-def not_recommended(model: str, evidence: float, unseen: float, best_unseen: float) -> Finding:
+def not_recommended(
+    model: str, evidence: float, prediction_error: float, best_error: float
+) -> Finding:
     """Finding about a model that is not recommended.
 
     Args:
         model: Name of the model.
         evidence: Log evidence relative to the recommended model.
-        unseen: RMS cross-validation error of the model, [m].
-        best_unseen: RMS cross-validation error of the recommended model, [m].
+        prediction_error: RMS cross-validation error of the model, [m].
+        best_error: RMS cross-validation error of the recommended model, [m].
     """
-    predicts = f"it predicts left-out setups to {mm(unseen)} mm instead of {mm(best_unseen)} mm"
+    predicts = (
+        f"it predicts left-out setups to {mm(prediction_error)} mm instead of {mm(best_error)} mm"
+    )
     return note(
         "not recommended",
         f"{model}: ln evidence {evidence:+.1f} relative to the recommended model; {predicts}.",
         log_evidence=evidence,
-        unseen_rms_mm=unseen / MM,
-        recommended_unseen_rms_mm=best_unseen / MM,
+        prediction_rms_mm=prediction_error / MM,
+        recommended_prediction_rms_mm=best_error / MM,
     )
 
 

@@ -43,7 +43,7 @@ class ResidualRow:
     parameter."""
     influenced: str
     """Name of the parameter with the largest change."""
-    unseen: NumberOrNaN
+    prediction_error: NumberOrNaN
     """Measured minus predicted from all other setups, [m]; NaN if these do not determine it."""
     conditions: Conditions | None = None
     """Conditions of the reading, if stated."""

@@ -198,7 +198,7 @@ def _maps(calibration: Calibration, accuracy: ToolAccuracy) -> str:
 def _fit(calibration: Calibration) -> str:
     """Content of the section with the residuals."""
     parts = [to_markup(render_fit(calibration))]
-    if any(r.unseen == r.unseen for r in calibration.residuals):
+    if any(r.prediction_error == r.prediction_error for r in calibration.residuals):
         text = (
             "Predicted: readings of each setup, predicted from all other setups. A good model "
             "predicts them nearly as well as it fits them."

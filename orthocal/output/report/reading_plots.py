@@ -38,7 +38,9 @@ from orthocal.output.report.figure import (
 from orthocal.output.text.layout import short_name
 from orthocal.units import MM, UM
 
-_deviation, _residual, _prediction_error = map(attrgetter, ("deviation", "residual", "unseen"))
+_deviation, _residual, _prediction_error = map(
+    attrgetter, ("deviation", "residual", "prediction_error")
+)
 
 SMALLEST_LENGTH = 1e-9
 """Smallest length on a logarithmic axis, [m]."""

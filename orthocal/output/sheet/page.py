@@ -189,9 +189,9 @@ def _largest_difference(robot: Robot) -> str:
     largest: dict[str, float] = {}
     for drive in robot.drives:
         unit, size = DRIVE_UNITS[drive.unit]
-        unseen = BY_EYE * (leg if drive.unit == "m" else 1.0)
+        by_eye = BY_EYE * (leg if drive.unit == "m" else 1.0)
         offset = robot.parameters[f"{drive.name}.offset"]
-        limit = math.ceil((LIMIT * offset.prior_std + unseen) / size)
+        limit = math.ceil((LIMIT * offset.prior_std + by_eye) / size)
         largest[unit] = max(largest.get(unit, 0), limit)
     return " or ".join(f"{limit} {unit}" for unit, limit in largest.items())
 

@@ -115,7 +115,7 @@ def _scores(comparison: Comparison) -> RenderableType:
                 f"{result.effective:.1f}" if first else "",
                 *(fits if checked else ("–",) * len(fits)),
                 f"{evidence:+.1f}" if first and math.isfinite(evidence) else "",
-                plain(score.unseen_rms / MM, 4),
+                plain(score.prediction_rms / MM, 4),
                 "" if after is None or first else um(after.sizes.reported.rms),
             )
             rows.append(row)
@@ -135,7 +135,7 @@ def _scores(comparison: Comparison) -> RenderableType:
 def _effects(comparison: Comparison) -> RenderableType:
     weighed = comparison.effects.weighed if comparison.effects else ()
     rows = [
-        (", ".join(w.effects) or "none", f"{w.log_evidence:+.1f}", plain(w.unseen_rms / MM, 4))
+        (", ".join(w.effects) or "none", f"{w.log_evidence:+.1f}", plain(w.prediction_rms / MM, 4))
         for w in weighed
     ]
     return table_of(("effects", "ln evidence", "CV [mm]"), rows)

@@ -25,24 +25,24 @@ def test_leaving_a_setup_out_is_solving_without_it(root, session, model):
     """Against Ipopt, which solves again without every setup in turn."""
     loaded = exact(load_session(root / "examples" / session))
     rows = calibrate(loaded, model).residuals
-    unseen = np.array([r.unseen for r in rows])
-    solved = compare_models(loaded, models=[model])[model].exact.unseen
-    assert np.abs(unseen - solved).max() < FIRST_ORDER * np.abs(solved).max()
-    assert np.linalg.norm(unseen) > 1.05 * np.linalg.norm([r.residual for r in rows])
+    prediction_error = np.array([r.prediction_error for r in rows])
+    solved = compare_models(loaded, models=[model])[model].exact.prediction_error
+    assert np.abs(prediction_error - solved).max() < FIRST_ORDER * np.abs(solved).max()
+    assert np.linalg.norm(prediction_error) > 1.05 * np.linalg.norm([r.residual for r in rows])
 
 
 def test_a_setup_that_the_others_do_not_determine_has_no_prediction(raw_cycles):
     """Only yx sees the offset of y; each of the others sees two offsets, in two ways."""
     rows = tuple(r for r in raw_cycles.readings if r.setup in ("yx", "zx", "xz"))
     result = calibrate(replace(raw_cycles, readings=rows))
-    assert {r.setup for r in result.residuals if np.isnan(r.unseen)} == {"yx"}
-    assert {r.setup for r in result.residuals if np.isfinite(r.unseen)} == {"zx", "xz"}
+    assert {r.setup for r in result.residuals if np.isnan(r.prediction_error)} == {"yx"}
+    assert {r.setup for r in result.residuals if np.isfinite(r.prediction_error)} == {"zx", "xz"}
 
 
 def test_one_setup_alone_predicts_nothing(raw_cycles):
     rows = tuple(r for r in raw_cycles.readings if r.setup == "yx")
     result = calibrate(replace(raw_cycles, readings=rows), "lengths")
-    assert all(np.isnan(r.unseen) for r in result.residuals)
+    assert all(np.isnan(r.prediction_error) for r in result.residuals)
 
 
 def test_with_a_robust_loss_it_is_the_robust_fit_that_predicts(raw_cycles):

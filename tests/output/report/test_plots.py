@@ -308,7 +308,7 @@ def test_setups_are_sorted_by_their_residuals(raw):
     for label, attribute, shift in (
         ("before", "deviation", -0.2),
         ("after", "residual", 0.0),
-        ("predicted", "unseen", 0.2),
+        ("predicted", "prediction_error", 0.2),
     ):
         x, y = line(axes, label)
         np.testing.assert_allclose(x, [rms(n, attribute) for n in names], rtol=UNIT)
@@ -323,7 +323,7 @@ def test_setups_are_sorted_by_their_residuals(raw):
 
 def test_setups_that_no_other_predicts_have_no_such_marker(table1, unknown):
     def forget(row):
-        return replace(row, unseen=np.nan) if row.setup in ("xy", "zy") else row
+        return replace(row, prediction_error=np.nan) if row.setup in ("xy", "zy") else row
 
     calibration = replace(table1, residuals=tuple(map(forget, table1.residuals)))
     axes = reading_plots.plot_setups.figure(calibration).axes[0]

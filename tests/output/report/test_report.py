@@ -209,7 +209,7 @@ def test_report_without_prediction_and_noise(raw_cycles):
         replace(raw_cycles.gauge, sigma=None, resolution=None)
     )
     found = calibrate(session, "full")
-    assert not np.isfinite([r.unseen for r in found.residuals]).any()
+    assert not np.isfinite([r.prediction_error for r in found.residuals]).any()
     page = build_report(found)
     assert "No setup can be predicted" in page
     assert not Reader(page).open
