@@ -152,6 +152,13 @@ def robot_effects(robot: Robot) -> tuple[Effect, ...]:
     for name in order_effects(robot.effect_names):
         data, prefix = robot.declared.effects.get(name, {}), f"orthocal.effects.{name}"
         kind = find_effect(name, where=f"{robot.yaml}: {prefix}", error=RobotError)
+        for key, field in kind.keys.model_fields.items():
+            if field.is_required() and key not in data:
+                raise RobotError(
+                    f"is missing; the effect {name} needs it. Write `{name}: {{{key}: NUMBER}}` "
+                    "under `orthocal: effects:`",
+                    where=f"{robot.yaml}: {prefix}.{key}",
+                )
         keys = validate(kind.keys, data, where=str(robot.yaml), error=RobotError, under=prefix)
         try:
             effects.append(kind.from_keys(keys, robot))
