@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 import pytest
+from calibrated import identified, session_of
 from tolerances import DESIGN_MM, FOUR_DECIMALS_MM, PAPER_MM, THREE_DECIMALS_MM
 
-from orthocal import calibrate, load_session
+from orthocal import load_session
 from orthocal.estimation.linear import leg_parallelism_matrix, solve_equation_8
 
 # Independent computation of the reduced system (mm): offsets, r.m.s. before and after, sigma
@@ -35,8 +36,8 @@ PAPER_RESIDUALS = {
 
 
 @pytest.fixture(scope="module")
-def results(root):
-    return {name: calibrate(load_session(root / "examples/table1" / name)) for name in LINEAR}
+def results():
+    return {name: identified(session_of(f"table1/{name}")) for name in LINEAR}
 
 
 @pytest.mark.parametrize("name", LINEAR)
@@ -110,7 +111,7 @@ def test_offsets_scale_with_the_displacements_assumed_and_residuals_do_not(root,
         scaled = scaled.replace("60]", f"{60 * factor}]")
         (folder / "session.yaml").write_text(scaled)
         (folder / "readings.csv").write_text(readings)
-        found.append(calibrate(load_session(folder)))
+        found.append(identified(load_session(folder)))
     offsets = [np.array([p.value for p in c.free]) for c in found]
     assert np.all(np.abs(offsets[1]) > np.abs(offsets[0]))
     assert abs(found[1].rms_after - found[0].rms_after) < 1e-3 * found[0].rms_after
