@@ -80,7 +80,7 @@ def test_crooked_readings_are_those_of_solids_that_touch(tmp_path, tip, oblique)
     beside = ObservationModel(session).alignment(error_map(session.robot).expand(ERRORS))
     rng, known = np.random.default_rng(0), nuisance_parameters(session)
     setups, missed = list(session.setups), 0
-    for _ in range(40):
+    for _ in range(20):
         values = 3.0 * rng.normal(size=len(known.parameters))
         values *= [p.prior_std for p in known.parameters]
         found = predict_readings(session, ERRORS, observations=o, nuisance=values)
@@ -92,7 +92,7 @@ def test_crooked_readings_are_those_of_solids_that_touch(tmp_path, tip, oblique)
             touched = workshop.read(r.setup, r.posture, stood)
             assert found[i] == pytest.approx(touched, abs=1e-9, nan_ok=True)
             missed += np.isnan(touched)
-    assert missed < 10  # a ball far beside its place passes the rod
+    assert missed < 5  # a ball far beside its place passes the rod
 
 
 def test_a_line_is_read_as_by_an_edge_without_a_radius(tmp_path, root):
@@ -158,7 +158,7 @@ def test_it_is_written_and_read(tmp_path):
     session = simulate_session(made, truth, seed=1).session
     again = load_session(write_session(session, tmp_path / "session"))
     assert [s.sensor for s in again.setups.values()] == [s.sensor for s in made.setups.values()]
-    found = calibrate(again)
+    found = calibrate(again, solver="variable-projection")
     loaded = load_calibration(write_calibration(found, tmp_path / "calibration.json"))
     assert [s.sensor for s in loaded.setups] == [s.sensor for s in made.setups.values()]
     assert [p.name for p in loaded.sensors] == names(made)

@@ -100,7 +100,7 @@ def test_its_readings_are_those_of_the_tool(plan):
 
 
 def test_nuisance_parameters_are_identified_with_the_machine(plan):
-    """Slopes of 2 and 3 in a thousand at 0.16 m of travel, read to 2 µm, are known to about 1e-5."""
+    """Slopes of 2 and 3 in a thousand at 0.16 m of travel, read to 2 µm: known to about 1e-5."""
     simulated = simulate_session(plan, TRUTH, seed=4)
     assert set(simulated.nuisance) == {"dial.d.slope", "setup.tz.slope"}
     result = identified(simulated.session)
