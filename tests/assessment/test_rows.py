@@ -27,7 +27,7 @@ BEYOND_TRAVEL = [0.1, 0.0, 0.0]
 
 @pytest.fixture(scope="module")
 def calibration(experiment_2):
-    return calibrate(experiment_2)
+    return calibrate(experiment_2, solver="variable-projection")
 
 
 @pytest.fixture(autouse=True)

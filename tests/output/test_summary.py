@@ -1,4 +1,4 @@
-"""What people read: everything that was promised is there, and is true."""
+"""Answer and details of a calibration: numbers of tables and sentences."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ import pytest
 from calibrated import EXPERIMENT_2, calibrated
 
 from orthocal import calibrate, summarize
+
+QUICK = {"solver": "variable-projection"}
+
+pytestmark = pytest.mark.usefixtures("without_sensor_gains")
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +63,7 @@ def test_an_unstated_controller_is_said_to_be_so():
 
 
 def _silent(session):
-    """The same readings, with no word on the gauge: its cycles tell the noise."""
+    """The session without a stated noise: that of its cycles remains."""
     return session.with_gauge(replace(session.gauge, sigma=None))
 
 
@@ -72,24 +76,24 @@ def spoil(session, rows, by):
 def every_time(session):
     """One posture of one setup off by as much in every cycle."""
     rows = [(r.setup, r.posture) == ("yx", "x_max") for r in session.readings]
-    return calibrate(spoil(session, rows, 0.3e-3))
+    return calibrate(spoil(session, rows, 0.3e-3), **QUICK)
 
 
 def once(session):
     rows = tuple(r for r in session.readings if r.cycle == 1)
-    return calibrate(_silent(replace(session, readings=rows)))
+    return calibrate(_silent(replace(session, readings=rows)), **QUICK)
 
 
 def three_rows(session):
-    return calibrate(_silent(replace(session, readings=session.readings[1:4])))
+    return calibrate(_silent(replace(session, readings=session.readings[1:4])), **QUICK)
 
 
 def three_stated_rows(session):
-    return calibrate(replace(session, readings=session.readings[1:4]))
+    return calibrate(replace(session, readings=session.readings[1:4]), **QUICK)
 
 
 EXPLAINED = {
-    "fits": (lambda c, e: calibrate(_silent(c)), {"sigma_mm": 0.0102}),
+    "fits": (lambda c, e: calibrate(_silent(c), **QUICK), {"sigma_mm": 0.0102}),
     "model error": (lambda c, e: calibrated(EXPERIMENT_2), {"ratio": 9.8, "sigma_mm": 0.195}),
     "model error beside cycles": (lambda c, e: every_time(c), {}),
     "noise from residuals": (lambda c, e: once(c), {}),
@@ -109,7 +113,6 @@ def test_a_fit_is_explained(raw_cycles, experiment_2, case):
     assert " ".join(found.text.split()) in " ".join(summarize(result, details=True).split())
 
 
-@pytest.mark.usefixtures("without_sensor_gains")
 def test_a_prior_marks_what_the_readings_leave_open():
     result = calibrated(EXPERIMENT_2, "lengths")
     text = summarize(result, details=True)

@@ -67,7 +67,8 @@ def raw():
 
 @pytest.fixture(scope="module")
 def bound(experiment_2):
-    return calibrate(experiment_2, Choice(bounds={"x_slide.offset_m": (-0.1e-3, 0.1e-3)}))
+    choice = Choice(bounds={"x_slide.offset_m": (-0.1e-3, 0.1e-3)})
+    return calibrate(experiment_2, choice, solver="variable-projection")
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +80,7 @@ def unknown(root, tmp_path_factory):
     (folder / "session.yaml").write_text(text.replace("sigma_mm: 0.02, ", ""))
     rows = (source / "readings.csv").read_text().splitlines()
     (folder / "readings.csv").write_text("\n".join(rows[:2]) + "\n")
-    return calibrate(load_session(folder), "full")
+    return calibrate(load_session(folder), "full", solver="variable-projection")
 
 
 @pytest.fixture(scope="module")
