@@ -110,7 +110,7 @@ def test_experiment_3_validates_experiment_2_as_in_the_paper(paper, experiment_3
 def test_the_probability_of_a_repetition_is_that_of_a_random_direction(sign):
     """The cosine c of residuals of noise in d dimensions: c √((d−1)/(1−c²)) is Student's t."""
     first, second = (identified(session_of(f"table1/experiment-{n}")) for n in (2, 3))
-    rows = tuple(replace(r, residual=sign * r.residual) for r in second.residuals)
+    rows = tuple(replace(r, predicted=r.measured - sign * r.residual) for r in second.residuals)
     found = measure_repetition(first, replace(second, residuals=rows))
     key = [(r.setup, r.posture, r.minus) for r in second.residuals]
     assert [(r.setup, r.posture, r.minus) for r in first.residuals] == key

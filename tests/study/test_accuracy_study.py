@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibrated import plan_of
 from gauges import exact
 from machines import place
 from tolerances import TRUTH_BACK
 
-from orthocal import Choice, load_plan, load_robot
+from orthocal import Choice, load_robot
 from orthocal.errors import ParameterError, SessionError
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import cube, gauss_box
@@ -26,8 +27,8 @@ SIGMA = 5e-6
 
 
 @pytest.fixture(scope="module")
-def workshop(root):
-    return load_plan(root / "examples/workshop/plan.yaml")
+def workshop():
+    return plan_of("workshop")
 
 
 def summary(study):
@@ -35,10 +36,12 @@ def summary(study):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["full", "offsets"])
-def test_tool_error_agrees_with_the_covariance(workshop, model):
+@pytest.mark.parametrize(("name", "model"), [("workshop", "full"), ("raw-cycles", "offsets")])
+def test_tool_error_agrees_with_the_covariance(name, model):
     """All errors are random, all or offsets are identified, gauges have mounting errors."""
-    result = summary(build_accuracy_study(workshop, Choice(model, tolerances=NEAR), machines=120))
+    result = summary(
+        build_accuracy_study(plan_of(name), Choice(model, tolerances=NEAR), machines=120)
+    )
     assert result.machines > 115
     assert abs(result.after - result.predicted.reported.rms) < 3.0 * result.standard_error
     assert result.standard_error < 0.08 * result.after
