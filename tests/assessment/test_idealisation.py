@@ -14,7 +14,7 @@ from orthocal.units import MM
 QUICK = {"solver": "variable-projection"}
 
 
-def test_a_rod_differs_from_the_line_as_placements_say(raw_cycles):
+def test_the_deviation_of_a_rod_from_its_line_is_that_by_pinocchio(raw_cycles):
     """Every error at a tenth of its tolerance: central differences of the two readings."""
     robot, setup = raw_cycles.robot, raw_cycles.setups["yx"]
     zero, low = (raw_cycles.postures[n] for n in ("zero", "x_min"))

@@ -105,10 +105,7 @@ def with_backlash():
 VERDICTS = {
     "sound": "enter",
     "workshop": "enter",
-    "experiment 2": "enter",
-    "experiment 3": "enter",
     "experiment 1 as printed": "reject",
-    "reversed setup": "review",
     "reversed sign": "review",
     "decimal point": "review",
     "inches": "review",
@@ -121,6 +118,9 @@ VERDICTS = {
 }
 """Cases, and the verdict of each."""
 
+CALIBRATED = ("reversed sign", "backlash", "experiment 1 as printed")
+"""Cases that are checked and calibrated."""
+
 
 @pytest.fixture(scope="module")
 def cases(cycles, workshop, table1):
@@ -130,10 +130,7 @@ def cases(cycles, workshop, table1):
     return {
         "sound": cycles,
         "workshop": workshop,
-        "experiment 2": table1["2"],
-        "experiment 3": table1["3"],
         "experiment 1 as printed": table1["1-printed"],
-        "reversed setup": reverse(cycles, "zx"),
         "reversed sign": change(cycles, largest, -cycles.values[largest]),
         "decimal point": change(cycles, largest, 0.1 * cycles.values[largest]),
         "inches": cycles.with_values(np.round(cycles.values / 25.4, 7)),
@@ -169,7 +166,7 @@ def test_every_command_has_the_same_verdict(cases, case, tmp_path):
         assert run_orthocal(tmp_path, *words, "--anyway").returncode == 0
 
 
-@pytest.mark.parametrize("case", VERDICTS)
+@pytest.mark.parametrize("case", [c for c in VERDICTS if c not in CALIBRATED])
 def test_a_case_has_its_verdict(cases, case):
     """Findings are of known kinds with numbers of stated units."""
     checked = check_session(cases[case])
@@ -189,6 +186,8 @@ def test_a_case_has_its_verdict(cases, case):
 def test_the_judgement_does_not_depend_on_the_model(cases, case, model, tmp_path):
     """It is that of a check, and is loaded again from a file."""
     checked = check_session(cases[case])
+    assert checked.decision.verdict == VERDICTS[case]
+    require_known_findings(checked.to_document()["findings"])
     calibration = calibrate(cases[case], model, **QUICK)
     assert of_readings(calibration.assessment) == of_readings(checked)
     assert calibration.assessment.decision.verdict == VERDICTS[case]

@@ -28,7 +28,7 @@ def session(exact_plan):
     return simulate_session(exact_plan, TRUTH, seed=11).session
 
 
-def test_a_bound_holds_a_parameter_and_the_others_make_up_for_it(session):
+def test_a_bound_holds_a_parameter_and_changes_the_others(session):
     """As the linear problem with the same bounds, to what linearising costs."""
     bounds = {"x_slide.offset": (-1e-3, 0.9e-3)}
     fit = fit_problem(build_problem(session, bounds=bounds, model="offsets"))
@@ -43,7 +43,7 @@ def test_a_bound_holds_a_parameter_and_the_others_make_up_for_it(session):
     assert fit.linearised_theta == pytest.approx(expected, abs=1e-9)
 
 
-def test_a_parameter_at_its_bound_has_no_deviation_and_others_hold_with_it_there(session):
+def test_a_parameter_at_its_bound_acts_like_a_known_value(session):
     bounded = identified(session, Choice(bounds={"x_slide.offset_m": (-1e-3, 0.9e-3)}))
     known = identified(session, Choice(known={"x_slide.offset_m": 0.9e-3}))
     p = bounded["x_slide.offset"]

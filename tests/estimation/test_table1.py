@@ -56,7 +56,7 @@ def test_linear_offsets_residuals_and_sigma(root, name):
 
 
 @pytest.mark.parametrize("name", LINEAR)
-def test_the_calibration_carries_the_linear_solution(results, name):
+def test_a_calibration_contains_the_linearised_solution(results, name):
     linear = np.array([p.linear for p in results[name].free])
     assert np.abs(linear - 1e-3 * np.array(LINEAR[name][0])).max() < FOUR_DECIMALS_MM
 
@@ -68,7 +68,7 @@ def test_exact_offsets(results, name):
 
 
 @pytest.mark.parametrize("name", PAPER_RESIDUALS)
-def test_printed_residuals_come_out(results, name):
+def test_residuals_are_those_of_the_paper(results, name):
     """The paper's own linear residuals, to its rounding of readings and residuals."""
     rows = {r.setup: r.measured - r.linear for r in results[name].residuals}
     found = np.array([rows[s] for s in ("xy", "xz", "yx", "yz", "zx", "zy")])
@@ -82,7 +82,7 @@ def test_the_printed_first_experiment_contradicts_itself(results):
     assert abs(results["experiment-1-corrected"].rms_before * 1e3 - 1.19) < 0.005
 
 
-def test_what_remains_of_experiments_2_and_3_is_the_same(results):
+def test_residuals_of_experiments_2_and_3_are_the_same(results):
     """The paper's rounded residuals correlate 0.992, unrounded ones no less."""
     printed = [PAPER_RESIDUALS[f"experiment-{n}"] for n in (2, 3)]
     assert abs(np.corrcoef(*printed)[0, 1] - 0.992) < 0.0005

@@ -66,7 +66,7 @@ def test_sessions_that_are_joined_keep_what_was_active_in_each(plan):
             assert found[f"{label}/{name}"] == pytest.approx(value, abs=1e-15)
 
 
-def test_a_blade_and_what_is_known_exactly_are_as_drawn(plan):
+def test_blades_and_exact_mountings_are_at_their_nominal_position(plan):
     setups = {
         n: replace(s, sensor=replace(s.sensor, mounting=replace(s.sensor.mounting, lateral=0.0)))
         for n, s in plan.setups.items()

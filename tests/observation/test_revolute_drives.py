@@ -262,7 +262,7 @@ def test_square_means_within_a_degree(root, tmp_path, degrees, good):
             load_plan(plan)
 
 
-def test_somebody_who_records_is_shown_degrees_as_the_controller_has_them(root, tmp_path):
+def test_recording_shows_the_degrees_of_the_controller(root, tmp_path):
     robot = write_fivebar(root, tmp_path / "rails")
     folder = write_plan(tmp_path / "s", robot, "{offsets_mrad: [6, -2]}")
     with open_recording(folder) as recording:

@@ -23,7 +23,7 @@ def line(text, beginning):
     return next(row for row in text.splitlines() if row.strip().startswith(beginning))
 
 
-def test_linear_and_exact_stand_side_by_side(table1):
+def test_linear_and_exact_estimates_are_in_one_row(table1):
     row = line(summarize(table1, details=True), "y_slide.offset").split()
     assert row[1:4] == ["+0.599", "+0.592", "3.127"]
     assert row[-3:] == ["-0.0068", "-0.007", "mm"]
@@ -37,7 +37,7 @@ def test_every_reading_is_listed_before_and_after(table1):
     assert line(text, "largest").split()[-3:] == ["1.140", "0.278", "-76%"]
 
 
-def test_sigma_is_held_against_the_gauges_own(table1):
+def test_sigma_is_compared_with_that_of_the_gauge(table1):
     text = " ".join(summarize(table1, details=True).split())
     assert "σ of a difference: 0.276 mm, from the residuals, 3 degrees of freedom" in text
     assert "σ stated for the gauge: 0.020 mm a reading, 0.028 mm a difference" in text
@@ -54,7 +54,7 @@ def test_details_list_the_values_to_enter_and_significant_changes(table1):
     assert found.text in " ".join(text.split())
 
 
-def test_an_unstated_controller_is_said_to_be_so():
+def test_an_unstated_controller_is_noted():
     result = calibrated("table1/experiment-3")
     (found,) = result.assessment.of_kind("controller not stated")
     text = " ".join(summarize(result, details=True).split())

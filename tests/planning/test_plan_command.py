@@ -222,7 +222,7 @@ def searches(orthoglide, headline):
 
 
 @pytest.mark.parametrize("criterion", CRITERIA[1:])
-def test_a_plan_is_better_by_its_own_criterion(searches, criterion):
+def test_a_plan_is_best_by_its_criterion(searches, criterion):
     """The other plan minimises the RMS tool error after alignment."""
     (own, of_own), (other, of_other) = searches[criterion], searches["aligned"]
     assert own.error_of(of_own) < own.error_of(of_other)

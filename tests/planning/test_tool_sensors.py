@@ -361,9 +361,10 @@ def needed_range(robot, sensors, **options):
     ],
 )
 def test_the_range_of_a_bar_holds_the_tolerances_of_length_place_and_offsets(
-    owned, length, offset, entered, expected
+    owned, monkeypatch, length, offset, entered, expected
 ):
-    """Nobody sets the zero of a bar. A drive moves the tool about as far as itself."""
+    """The zero of a bar is not set. A drive moves the tool about as far as itself."""
+    monkeypatch.setattr(tool_candidates, "BALLS", tool_candidates.BALLS[:1])
     text = BAR.replace("[-25, 25]", "[-3, 3]").replace("unknown", length)
     sensors = owned(bar=text + "centre_tolerance_mm: 0.5\nscale_tolerance: 0\n")
     robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": offset})
@@ -371,7 +372,7 @@ def test_the_range_of_a_bar_holds_the_tolerances_of_length_place_and_offsets(
     assert needed_range(robot, sensors, entered=entered) == pytest.approx(expected, rel=0.05)
 
 
-def test_a_plan_says_which_sensor_has_too_short_a_range(owned):
+def test_a_sensor_with_too_short_a_range_is_named(owned):
     robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 0.4})
     short = owned(bar=BAR.replace("[-25, 25]", "[-2, 2]"))
     plan = plan_readings(robot, hours=0.5, equipment=Equipment(owned=short, **FEW), starts=1)

@@ -134,7 +134,7 @@ def test_one_dial_has_one_scale_and_a_block_one_roll(tmp_path):
     assert {"setup.yx.square", "setup.zx.square", "setup.yz.roll"} <= {*shared}
 
 
-def test_of_two_days_the_dial_is_one_and_the_stands_are_two(tmp_path):
+def test_two_sessions_share_the_dial_and_not_the_mountings(tmp_path):
     days = [plan(tmp_path / day, yx=BLOCK, zx=BLOCK) for day in ("monday", "tuesday")]
     found = names(join_sessions(days))
     assert found.count("gauge.scale") == 1
@@ -142,7 +142,7 @@ def test_of_two_days_the_dial_is_one_and_the_stands_are_two(tmp_path):
     assert {"setup.monday/yx.pitch", "setup.tuesday/yx.pitch"} <= {*found}
 
 
-def test_what_is_known_exactly_is_no_unknown(tmp_path):
+def test_exact_mountings_have_no_nuisance_parameters(tmp_path):
     exact = ", direction_tolerance_mrad: 0, section_tolerance_mm: 0, lateral_tolerance_mm: 0"
     session = plan(tmp_path, yx=exact, zx=exact, yz=exact)
     assert names(session) == ["gauge.scale"]
@@ -151,7 +151,7 @@ def test_what_is_known_exactly_is_no_unknown(tmp_path):
     assert names(load_plan(tmp_path / "plan.yaml")) == []
 
 
-def test_it_is_written_and_read(tmp_path):
+def test_files_keep_the_mounting(tmp_path):
     own = ", stand: block, square_tolerance_mrad: 0.1, direction_tolerance_mrad: 8"
     made = plan(tmp_path / "plan", yx=own, zx=own, yz=", lateral_tolerance_mm: 0.4")
     truth = {n: v for n, v in ERRORS.items() if n.endswith("offset")}
@@ -180,7 +180,7 @@ def test_it_is_written_and_read(tmp_path):
         ({"zx": ", scale_tolerance: 2"}, "setups.zx.scale_tolerance"),
     ],
 )
-def test_what_does_not_fit_is_refused_by_key(tmp_path, keys, message):
+def test_a_wrong_key_is_named(tmp_path, keys, message):
     with pytest.raises(SessionError) as caught:
         plan(tmp_path, **keys)
     assert message in str(caught.value)

@@ -107,7 +107,7 @@ def test_a_simulated_session_comes_back_from_its_files(tmp_path, keys, station):
     )
 
 
-def test_a_row_may_have_a_covariance_of_its_own(tmp_path):
+def test_a_row_can_state_its_covariance(tmp_path):
     session = simulate_session(grid(tmp_path, side=2), ERRORS, seed=3).session
     write_session(session, tmp_path / "session")
     file = tmp_path / "session" / "readings.csv"

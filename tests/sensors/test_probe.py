@@ -130,7 +130,7 @@ def published(folder, printer):
 SIX = ["radius", "a_tower.tangential", "b_tower.tangential", "*.offset"]
 
 
-def test_klippers_answer_from_its_own_triggers(tmp_path, printer):
+def test_parameters_of_klipper_from_its_triggers(tmp_path, printer):
     """Six parameters without priors, as Klipper's search has them."""
     session = published(tmp_path, printer)
     value = {p.name: p.value / MM for p in identified(session, Choice(free=SIX, prior=False)).free}

@@ -197,6 +197,6 @@ def test_sessions_with_one_bar_are_not_accused(tmp_path, seed):
     assert warnings_of(two_sessions(tmp_path, seed, change=0.0)) == []
 
 
-def test_a_bar_of_another_name_has_a_length_of_its_own(tmp_path):
+def test_a_bar_of_another_name_has_another_length(tmp_path):
     """The remedy that the finding states."""
     assert warnings_of(two_sessions(tmp_path, 1, change=-0.3e-3, renamed=True)) == []

@@ -94,8 +94,7 @@ def test_an_incomplete_line_is_computed_again(study, undisturbed, tmp_path):
         assert file.read_bytes() == whole
 
 
-@pytest.mark.parametrize("forked", [True, False])
-@pytest.mark.parametrize("workers", [2, 3])
+@pytest.mark.parametrize(("workers", "forked"), [(2, False), (3, True)])
 def test_results_do_not_depend_on_the_number_of_workers(
     study, undisturbed, workers, forked, monkeypatch
 ):

@@ -19,7 +19,7 @@ from orthocal.statistics.chance import confidence_factor
 from orthocal.statistics.zeros import project_out_zeros
 
 
-def test_where_the_problem_is_nearly_linear_it_is_students_interval(raw_cycles):
+def test_nearly_linear_problems_have_students_interval(raw_cycles):
     result = identified(raw_cycles, profile=["x_slide.offset"])
     p = result["x_slide.offset"]
     # that of the readings' scatter, and beside it what errors that were not free may have done
@@ -32,7 +32,7 @@ def test_where_the_problem_is_nearly_linear_it_is_students_interval(raw_cycles):
     assert result["y_slide.offset"].interval is None
 
 
-def test_its_ends_cost_what_they_should_by_another_solver(experiment_2):
+def test_ends_of_an_interval_have_the_expected_cost_by_another_solver(experiment_2):
     """SciPy on the reduced problem, the offset held at the ends of its interval."""
     fit = fit_problem(build_problem(experiment_2, model="offsets"))
     problem, sigma = fit.problem, fit.noise.sigma
@@ -53,7 +53,7 @@ def test_its_ends_cost_what_they_should_by_another_solver(experiment_2):
         assert 2.0 * (cost(end) - best) == pytest.approx(factor**2, rel=5e-3)
 
 
-def test_where_the_problem_bends_it_is_not_symmetric(experiment_2):
+def test_the_interval_of_a_nonlinear_problem_is_not_symmetric(experiment_2):
     """At 99.9 % and three degrees of freedom the interval is 10 mm wide."""
     fit = fit_problem(build_problem(exact(experiment_2), model="offsets"))
     p = fit.solution.theta[0]
@@ -73,7 +73,7 @@ def test_a_bound_ends_an_interval(experiment_2):
     assert result["x_slide.offset"].interval == pytest.approx((-1e-3, 0.5e-3))
 
 
-def test_beside_a_prior_it_is_that_of_the_posterior(raw_cycles):
+def test_the_interval_with_a_prior_is_that_of_the_posterior(raw_cycles):
     result = identified(raw_cycles, "lengths", profile=["x_leg.length"])
     p = result["x_leg.length"]
     i = [q.name for q in result.free].index(p.name)
@@ -83,7 +83,7 @@ def test_beside_a_prior_it_is_that_of_the_posterior(raw_cycles):
     assert p.interval == pytest.approx((p.value - half, p.value + half), abs=0.02 * half)
 
 
-def test_without_noise_or_a_free_parameter_there_is_none(experiment_2):
+def test_without_noise_or_a_free_parameter_there_is_no_interval(experiment_2):
     rows = tuple(experiment_2.readings[i] for i in (2, 0, 4))
     session = replace(experiment_2, readings=rows).with_gauge(
         replace(experiment_2.gauge, sigma=None)

@@ -184,12 +184,12 @@ def test_a_calibration_states_its_solver(tmp_path):
         assert r.value == pytest.approx(p.linear, abs=1e-12)
 
 
-def test_only_known_solvers_are_taken():
+def test_an_unknown_solver_is_refused():
     with pytest.raises(OrthocalError, match="the solver is 'newton'; expected one of ipopt"):
         SolverOptions(solver="newton")
 
 
-def test_readings_left_out_and_parameters_held():
+def test_readings_are_excluded_and_parameters_prescribed():
     problem = problem_of("raw-cycles", "lengths", "plain")
     given = {"excluded": [3, 11], "prescribed": {0: 0.4e-3}}
     ours, ipopts = solve_by_both(problem, loss="squares", sigma=10e-6, **given)

@@ -153,7 +153,7 @@ def test_plots_are_drawn_into_the_page(page, read):
     assert "://" not in re.sub(r'xmlns(:\w+)?="[^"]*"', "", own)
 
 
-def test_scene_is_embedded_whole(read):
+def test_the_scene_is_embedded(read):
     (frame,) = read.frames
     assert frame.startswith("<!DOCTYPE html>")
     assert "Leg x is furthest from parallel" in frame
