@@ -39,7 +39,6 @@ NOT_SAID = (
 EXAMPLES = {
     "raw-cycles": None,
     "sweep": "offsets",
-    "lines": "offsets",
     "workshop": "full",
     **{f"table1/experiment-{n}": None for n in ("1-printed", "2", "3")},
 }
@@ -95,7 +94,6 @@ def judged(session, choice=None, **options):
 
 OTHERS = {
     "turned": lambda a: judged(reversed_sign(a.cycles, "zx")),
-    "turned lines": lambda a: judged(reversed_sign(session_of("lines"), "yx"), "offsets"),
     "slips": lambda a: judged(outliers(a.cycles)),
     "huber": lambda a: judged(outliers(a.cycles), loss="huber"),
     "inches": lambda a: judged(a.cycles.with_values(np.round(a.cycles.values / 25.4, 7))),
