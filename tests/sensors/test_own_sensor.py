@@ -151,6 +151,8 @@ def test_standard_deviations_hold_on_machines_with_all_errors(plan):
     for truth, fit in simulated_fits(plan, 20, others):
         result = build_record.assemble_calibration(fit)
         of_offsets.append(recorded_scores(result, TRUTH)[0])
+        total = np.sqrt(np.diag(result.total_covariance))
+        assert [p.std for p in result.free] == pytest.approx(total, rel=1e-9)
         of_slopes.append([(p.value - truth[p.name]) / p.std for p in result.sensors])
     assert_unit_variance(of_offsets)
     # the noise of the slopes is that of the residuals, which contain the other errors

@@ -44,7 +44,7 @@ def test_tool_error_agrees_with_the_covariance(name, model):
     )
     assert result.machines > 115
     assert abs(result.after - result.predicted.reported.rms) < 3.0 * result.standard_error
-    assert result.standard_error < 0.08 * result.after
+    assert result.standard_error < 0.062 * result.after
     for e in result.parameters:
         assert abs(e.rms - e.predicted) < 4.5 * e.standard_error + 0.02 * e.predicted
 
