@@ -14,7 +14,6 @@ from tolerances import KINEMATICS
 
 from orthocal import (
     SessionError,
-    calibrate,
     join_sessions,
     load_calibration,
     load_plan,
@@ -25,6 +24,7 @@ from orthocal import (
     write_calibration,
     write_session,
 )
+from orthocal.assessment.controller_entries import find_entries
 from orthocal.calibration.identify import identify
 from orthocal.measurement.recording import _is_outdated
 from orthocal.observation.model import predict_readings
@@ -188,12 +188,12 @@ def test_compensation_of_effects_that_the_model_lacks_is_ignored(compensated):
 
 
 def test_validation_expects_the_stated_compensation(compensated):
-    plan = load_plan(compensated)
+    plan = load_plan(compensated).with_effects(["backlash"])
     plan = plan.select([r for r in plan.readings if r.setup in FEW])
     first = replace(plan, compensation=())
     truth = {f"{d}_slide.backlash": 0.04 * MM for d in "xyz"}
-    result = calibrate(simulate_session(first, truth, seed=3).session, "offsets", **QUICK)
-    entered = plan.with_controller([e.enter for e in result.assessment.entries])
+    result, _ = identify(simulate_session(first, truth, seed=3).session, "offsets", **QUICK)
+    entered = plan.with_controller([e.enter for e in find_entries(result)])
     measured = simulate_session(entered, truth, seed=4).session
     assert validate_calibration(result, measured).confirmed
     unstated = replace(measured, compensation=())

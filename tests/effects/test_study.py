@@ -129,7 +129,7 @@ def test_unknown_effects_and_missing_conditions_are_refused(folder):
 
 
 def test_the_command_prints_the_cost_of_ignoring_an_effect(folder, root):
-    words = ["study", "accuracy", folder, "--effects", "backlash", "--machines", 4]
+    words = ["study", "accuracy", folder, "--effects", "backlash", "--machines", 12]
     code, out, _ = run_orthocal(root, *words, "--ignore", "backlash", "--workers", 1)
     assert code == 0
     answer = " ".join(out.split())
