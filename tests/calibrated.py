@@ -9,6 +9,7 @@ from conftest import ROOT
 from folders import session_folder
 
 from orthocal import calibrate, draw_scene, load_plan, load_session
+from orthocal.calibration.identify import identify
 from orthocal.output.report.page import build_report
 
 EXPERIMENT_2 = "table1/experiment-2"
@@ -30,6 +31,11 @@ def session_of(name):
 def calibrated(name, model=None, **options):
     """Calibration of an example with a model; by default the model of its session."""
     return calibrate(session_of(name), model, **options)
+
+
+def identified(sessions, choice=None, *, solver="variable-projection", **options):
+    """Calibration without assessment: a third of the time of a complete one."""
+    return identify(sessions, choice, solver=solver, **options)[0]
 
 
 @cache

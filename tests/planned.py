@@ -7,6 +7,9 @@ from functools import cache
 from orthocal import load_robot, plan_readings
 from orthocal.planning.equipment import Equipment
 
+FEW = {"along": 3, "across": 0.0, "sections": (0.5,)}
+"""Arguments of Equipment with the fewest candidate readings."""
+
 QUICK = {"along": 5, "across": 0.0, "sections": (0.5,)}
 """Arguments of Equipment with few candidate readings."""
 

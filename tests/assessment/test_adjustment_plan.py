@@ -32,7 +32,7 @@ from orthocal.output.text.adjustment import render_plan
 from orthocal.output.text.layout import to_text
 
 QUICK = {"solver": "variable-projection"}
-SEEDS = (2, 4)
+SEEDS = (4,)
 
 
 def machine_of(plan, seed, **options):
@@ -148,7 +148,7 @@ def test_uncertainties_of_amounts_are_those_of_sampled_machines(machines):
 
 
 def test_an_adjusted_calibration_is_the_machine_with_its_amounts(machines):
-    _, calibration = machines[2]
+    _, calibration = machines[4]
     adjusted = adjust_calibration(calibration, {"x_outer_foot_z": 0.3e-3})
     terms = dict(calibration.robot.parameters["x_outer_foot_z.adjustment"].terms)
     moved = {n: calibration.errors[n] + 0.3e-3 * c for n, c in terms.items()}

@@ -32,6 +32,12 @@ def session():
     return simulate_session(effect_plan("backlash", setups=FEW), ERRORS, seed=4).session
 
 
+@pytest.fixture(scope="module")
+def compared(session):
+    """Comparison of backlash with no effect."""
+    return compare_effects(session.with_effects(["backlash"]))
+
+
 def test_the_supported_effect_is_recommended(session):
     found = compare_effects(session.with_effects(None))
     assert found.recommended == ("backlash",)
@@ -115,20 +121,20 @@ def test_without_the_effect_a_comparison_asks_for_a_review(session, tmp_path):
     ("identified", "option"),
     [(("backlash",), ""), (("thermal",), "thermal,backlash"), ((), "backlash")],
 )
-def test_the_option_is_named_unless_the_effect_is_identified(session, identified, option):
+def test_the_option_is_named_unless_the_effect_is_identified(compared, identified, option):
     """It includes the identified effects, because it replaces their choice."""
-    found = compare_effects(session.with_effects(["backlash"]))
-    (note, *_) = describe_effects(replace(found, identified=identified), 40)
+    (note, *_) = describe_effects(replace(compared, identified=identified), 40)
     assert note.kind == "effects recommended"
     stated = re.findall(r"--effects (\S+)`", note.action)
     assert [set(s.split(",")) for s in stated] == ([set(option.split(","))] if option else [])
 
 
-def test_the_evidence_decides_where_omitted_setups_disagree(session):
-    found = compare_effects(session.with_effects(["backlash"]))
-    none, best = found.weighed
+def test_the_evidence_decides_where_omitted_setups_disagree(compared):
+    none, best = compared.weighed
     worse = replace(best, prediction_rms=1.5 * none.prediction_rms)
-    texts = [describe_effects(replace(found, weighed=(none, w)), 40)[0].text for w in (best, worse)]
+    texts = [
+        describe_effects(replace(compared, weighed=(none, w)), 40)[0].text for w in (best, worse)
+    ]
     assert ["the evidence of all readings" in text for text in texts] == [False, True]
 
 

@@ -25,6 +25,8 @@ from orthocal.assessment.tool_error import assess_placed, summarise_tool
 from orthocal.calibration.identify import identify
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 
+QUICK = {"solver": "variable-projection"}
+
 
 @pytest.fixture(scope="module")
 def quarter(tmp_path_factory):
@@ -58,7 +60,7 @@ def test_offsets_to_enter_have_the_least_tool_error(quarter):
     """Their gain is their derivative by the parameters."""
     machines = DrawnMachines(quarter)
     errors = machines.by_name(machines.draw(np.random.default_rng(1)))
-    result = calibrate(simulate_session(quarter, errors, seed=1).session, "full")
+    result = calibrate(simulate_session(quarter, errors, seed=1).session, "full", **QUICK)
     tool = find_tool(result)
     space = tool.workspace
     best = entered_offsets(result)
@@ -133,7 +135,7 @@ def summed(tmp_path_factory):
 
 
 def test_offsets_that_were_identified_as_a_sum_are_entered(summed):
-    result = calibrate(summed, Choice(free=["common"]))
+    result = calibrate(summed, Choice(free=["common"]), **QUICK)
     assert not result.prior  # as with offsets
     entries = {e.drive: e for e in find_entries(result)}
     value, std = result["common"].value, result["common"].std
@@ -146,7 +148,7 @@ def test_offsets_that_were_identified_as_a_sum_are_entered(summed):
 
 
 def test_offsets_identified_as_a_sum_beside_lengths_have_the_least_tool_error(summed):
-    result = calibrate(summed, Choice(free=["common", "*_leg.length"]))
+    result = calibrate(summed, Choice(free=["common", "*_leg.length"]), **QUICK)
     entries = find_entries(result)
     assert [e.drive for e in entries] == ["x_slide", "y_slide", "z_slide"]
     assert all(np.isfinite(e.std) for e in entries)

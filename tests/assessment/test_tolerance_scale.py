@@ -147,7 +147,7 @@ def test_compare_refits_and_files_have_the_same_factor(session, full, offsets, t
 @pytest.mark.parametrize("factor", [1.0, 2.83])
 def test_intervals_contain_the_truth_at_any_factor(session, factor):
     """A sample; `tests/benchmarks/worse_machines.py` has more machines, and the full model."""
-    count = 16
+    count = 8
     outcome = calibrate_machines(session, "offsets", factor=factor, count=count, profile=[OFFSET])
     # three offsets of a machine are wrong together
     judged = outcome.covered if factor == 1.0 else outcome.covered[outcome.found]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from calibrated import plan_of, session_of
+from calibrated import identified, plan_of, session_of
 from gauges import exact
 from machines import place, reading_by_pinocchio
 from models import JOINTS
 
-from orthocal import Choice, calibrate, draw_errors
+from orthocal import Choice, draw_errors
 from orthocal.assessment.tool_error import assess_tool, measure_uncertainty
 from orthocal.calibration.build_record import assemble_calibration
 from orthocal.estimation.fit import fit_problem
@@ -28,8 +28,8 @@ IN_SI = {"*.offset": 2e-3}
 QUICK = SolverOptions("variable-projection")
 
 MACHINES = 60
-"""The sweep leaves a few directions undetermined: the RMS error of so many machines scatters by
-7 %. That of 200 machines is 1.03 of the predicted one, with the lines 0.98."""
+"""The sweep leaves a few directions undetermined: the RMS error of 60 machines scatters by 7 %.
+That of 200 machines is 1.03 of the predicted one, with the lines 0.98."""
 
 PREDICTED = {"sweep": 0.062, "lines": 0.008}
 """RMS tool error over the cube without the common translation, by an independent rigid-body model
@@ -118,7 +118,7 @@ def test_exact_readings_give_the_tool_where_they_determine_it(machines):
 def test_pinocchio_reproduces_predicted_readings_and_tool():
     """All errors of the model in a pin.Model, to 1e-9 m."""
     session = exact(session_of("sweep"))
-    result = calibrate(session, Choice("full", tolerances=OFFSETS), solver=QUICK)
+    result = identified(session, Choice("full", tolerances=OFFSETS))
     machine = session.robot.with_errors(result.errors)
     zeros = {s.name: s.zero for s in result.setups}
     for row in result.residuals[::6]:

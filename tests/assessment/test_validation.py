@@ -8,9 +8,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from calibrated import calibrated, plan_of, session_of
+from calibrated import calibrated, identified, plan_of, session_of
 from models import TRUTH
 from scipy.stats import binom
+from scipy.stats import t as student
 from tolerances import THREE_DECIMALS_MM
 
 from orthocal import (
@@ -105,6 +106,23 @@ def test_experiment_3_validates_experiment_2_as_in_the_paper(paper, experiment_3
     assert document["nothing_to_change"] is True
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_probability_of_a_repetition_is_that_of_a_random_direction(sign):
+    """The cosine c of residuals of noise in d dimensions: c √((d−1)/(1−c²)) is Student's t."""
+    first, second = (identified(session_of(f"table1/experiment-{n}")) for n in (2, 3))
+    rows = tuple(replace(r, predicted=r.measured - sign * r.residual) for r in second.residuals)
+    found = measure_repetition(first, replace(second, residuals=rows))
+    key = [(r.setup, r.posture, r.minus) for r in second.residuals]
+    assert [(r.setup, r.posture, r.minus) for r in first.residuals] == key
+    a, b = (np.array([r.residual for r in c]) for c in (first.residuals, rows))
+    cosine = a @ b / np.sqrt((a @ a) * (b @ b))
+    d = second.noise.residual_dof  # all rows of the second session are in the first
+    expected = student.sf(cosine * np.sqrt((d - 1.0) / (1.0 - cosine**2)), d - 1.0)
+    assert found.p_value == pytest.approx(expected, rel=1e-6)
+    assert found.correlation == pytest.approx(np.corrcoef(a, b)[0, 1])
+    assert found.repeats is (sign > 0.0)
+
+
 @pytest.mark.parametrize(
     ("chance", "text"), [(0.22, "by chance 22 %"), (1e-9, "by chance below 0.01 %")]
 )
@@ -138,7 +156,7 @@ def test_a_session_with_other_offsets_is_refused(paper, experiment_3):
 
 def test_only_identified_offsets_must_be_active(experiment_3):
     choice = Choice(free=["x_slide.offset", "z_slide.offset"])
-    calibration = calibrate(session_of("table1/experiment-2"), choice)
+    calibration = calibrate(session_of("table1/experiment-2"), choice, **QUICK)
     entered = np.add(entered_offsets(calibration), [0.0, 0.3e-3, 0.0])
     validation = validate_calibration(calibration, experiment_3.with_controller(entered))
     assert validation.offsets_stated
@@ -149,7 +167,7 @@ def test_only_identified_offsets_must_be_active(experiment_3):
 
 def test_sessions_of_the_calibration_are_refused(experiment_3):
     session = session_of("table1/experiment-2")
-    both = calibrate([session, experiment_3])
+    both = identified([session, experiment_3])
     for used in (session, experiment_3):
         with pytest.raises(SessionError, match="belongs to the calibration itself"):
             validate_calibration(both, used)
@@ -163,7 +181,7 @@ def test_another_robot_is_refused(paper, experiment_3, biglide):
 def test_a_calibration_without_redundant_readings_predicts_nothing(experiment_3):
     session = session_of("table1/experiment-2")
     few = session.select([r for r in session.readings if r.setup in ("yx", "xy", "xz")])
-    result = validate_calibration(calibrate(few), experiment_3)
+    result = validate_calibration(calibrate(few, **QUICK), experiment_3)
     assert result.as_expected is None
     assert result.assessment.of_kind("nothing predicted")
     assert result.assessment.decision.exit_code == 3
@@ -183,7 +201,7 @@ def test_repetition_is_unknown_where_the_fit_absorbs_the_shared_lines():
 @pytest.fixture(scope="module")
 def calibration(plan):
     """Calibration of a machine without errors except offsets."""
-    return calibrate(simulate_session(plan, TRUTH, seed=1).session)
+    return calibrate(simulate_session(plan, TRUTH, seed=1).session, **QUICK)
 
 
 def test_several_sessions_are_validated_together(plan, calibration):
@@ -208,7 +226,7 @@ def test_each_of_several_sessions_must_have_the_offsets(plan, calibration):
         validate_calibration(calibration, sessions)
 
 
-SOUND = [("raw-cycles", "offsets", 1), ("raw-cycles", "full", 2), ("workshop", "full", 1)]
+SOUND = [("raw-cycles", "offsets", 1), ("workshop", "full", 1)]
 """Plan, model and seed of sound machines; the offsets of the first stay as they are."""
 
 
@@ -303,7 +321,7 @@ def test_identified_offsets_in_place_of_those_to_enter_are_not_confirmed(plan):
 
 
 @pytest.mark.slow
-def test_mistakes_are_named_by_eighteen_readings_of_rods():
+def test_a_mistake_is_named_by_eighteen_readings_of_rods():
     """Although the complete model has more parameters than there are readings."""
     plan, seed = plan_of("workshop"), 5
     tolerances = {"*.offset_mm": 4.0}
@@ -311,8 +329,7 @@ def test_mistakes_are_named_by_eighteen_readings_of_rods():
     session = simulate_session(plan, errors, seed=seed).session
     calibration = calibrate(session, Choice("full", tolerances=tolerances), **QUICK)
     right = entered_offsets(calibration)
-    for kind, factor in {"offsets reversed": -1.0, "offsets entered twice": 2.0}.items():
-        again = measure(plan, errors, factor * right, stated=right, seed=1000 + seed)
-        result = validate_calibration(calibration, again)
-        assert result.as_expected is False
-        assert result.mistake.explanation.kind == kind
+    again = measure(plan, errors, -right, stated=right, seed=1000 + seed)
+    result = validate_calibration(calibration, again)
+    assert result.as_expected is False
+    assert result.mistake.explanation.kind == "offsets reversed"

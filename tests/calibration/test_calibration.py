@@ -9,7 +9,7 @@ from dataclasses import replace
 import closed_form
 import numpy as np
 import pytest
-from calibrated import calibrated, plan_of
+from calibrated import calibrated, identified, plan_of
 from models import TRUTH
 from tolerances import CLOSED_FORM, KINEMATICS
 
@@ -125,7 +125,7 @@ def test_offsets_to_enter_include_the_active_ones():
     active = np.array([1e-3, 0.0, 0.4e-3])
     plan = plan_of("raw-cycles").with_controller(active)
     session = simulate_session(plan, TRUTH, exact=True).session
-    entries = find_entries(calibrate(session, **QUICK))
+    entries = find_entries(identified(session))
     assert [e.active for e in entries] == pytest.approx(active)
     assert [e.enter for e in entries] == pytest.approx(list(TRUTH.values()), abs=1e-9)
     assert [e.change for e in entries] == pytest.approx(
@@ -142,17 +142,17 @@ def test_without_stated_offsets_the_changes_are_entered():
 def test_without_redundant_readings_sigma_is_that_of_the_gauge(experiment_2):
     chosen = {"yx", "xy", "xz"}
     few = experiment_2.select([r for r in experiment_2.readings if r.setup in chosen])
-    result = calibrate(few)
+    result = identified(few)
     assert result.noise.source == "gauge"
     assert math.isinf(result.dof)
     assert result.sigma == pytest.approx(math.hypot(0.02e-3, 0.01e-3 / math.sqrt(12.0)) * 2**0.5)
-    silent = calibrate(few.with_gauge(replace(few.gauge, sigma=None)))
+    silent = identified(few.with_gauge(replace(few.gauge, sigma=None)))
     assert silent.noise.source == "unknown"
     assert math.isnan(silent.free[0].std)
 
 
 def test_exact_readings_give_the_true_offsets():
-    result = calibrate(simulate_session(plan_of("raw-cycles"), TRUTH, exact=True).session)
+    result = identified(simulate_session(plan_of("raw-cycles"), TRUTH, exact=True).session)
     assert np.abs([p.value - TRUTH[p.name] for p in result.free]).max() < 1e-9
     assert result.rms_after < 1e-12
 
@@ -163,7 +163,7 @@ def test_with_priors_sigma_and_solution_agree():
     plan = plan.select([r for r in plan.readings if r.cycle == 1])
     plan = plan.with_gauge(replace(plan.gauge, sigma=5e-6, resolution=None))
     session = simulate_session(plan, {**TRUTH, "x_leg.length": 2e-4}, seed=2, sigma=50e-6).session
-    result = calibrate(session, "lengths", **QUICK)
+    result = identified(session, "lengths")
     assert result.noise.source == "residuals"
     assert 25e-6 < result.sigma < 100e-6
     assert result.prior
@@ -214,6 +214,7 @@ def test_offsets_at_a_bound_or_with_a_known_value_are_not_significant(experiment
     bounded = calibrate(
         experiment_2,
         Choice(bounds={"x_slide.offset_m": (-0.2e-3, 2e-3)}, known={"y_slide.offset_m": 0.5e-3}),
+        **QUICK,
     )
     held = {e.drive: e.held for e in find_entries(bounded)}
     assert held == {"x_slide": "lower bound", "y_slide": "known", "z_slide": None}
@@ -244,17 +245,18 @@ def test_cycles_that_are_all_equal_scatter_by_the_resolution(raw_cycles):
     first = {(r.setup, r.posture): r.value for r in raw_cycles.readings if r.cycle == 1}
     values = [first[r.setup, r.posture] for r in raw_cycles.readings]
     for model in ("offsets", "full"):
-        result = calibrate(raw_cycles.with_values(values), model, **QUICK)
+        result = identified(raw_cycles.with_values(values), model)
         assert result.noise.cycles_sigma == pytest.approx(0.01e-3 / np.sqrt(12.0))
         assert np.isfinite(result.total_covariance).all()
-        assert "unknown" not in summarize(result, details=True)
+    result = calibrate(raw_cycles.with_values(values), "offsets", **QUICK)
+    assert "unknown" not in summarize(result, details=True)
     zero, _ = identify(raw_cycles.with_values(np.zeros(len(values))), "full", **QUICK)
     assert zero["x_slide.offset"].std > 0.1e-3  # inseparable from other errors
 
 
 def test_one_free_parameter_alone(experiment_2):
     rows = experiment_2.readings[:1]
-    result = calibrate(replace(experiment_2, readings=rows), Choice(base=True))
+    result = identified(replace(experiment_2, readings=rows), Choice(base=True))
     assert len(result.free) == 1
     assert np.isfinite(result.total_covariance).all()
 

@@ -14,21 +14,23 @@ from tolerances import KINEMATICS
 
 from orthocal import (
     SessionError,
-    calibrate,
     join_sessions,
     load_calibration,
     load_plan,
     load_session,
     restore_session,
     simulate_session,
-    validate_calibration,
     write_calibration,
     write_session,
 )
+from orthocal.assessment.controller_entries import find_entries
+from orthocal.assessment.predictive import judge_deviations
 from orthocal.calibration.identify import identify
+from orthocal.calibration.refit import repeat_fit
 from orthocal.measurement.recording import _is_outdated
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import drive_table
+from orthocal.statistics.chance import BY_CHANCE
 
 MM = 1e-3
 QUICK = {"solver": "variable-projection"}
@@ -188,16 +190,18 @@ def test_compensation_of_effects_that_the_model_lacks_is_ignored(compensated):
 
 
 def test_validation_expects_the_stated_compensation(compensated):
-    plan = load_plan(compensated)
+    plan = load_plan(compensated).with_effects(["backlash"])
     plan = plan.select([r for r in plan.readings if r.setup in FEW])
     first = replace(plan, compensation=())
     truth = {f"{d}_slide.backlash": 0.04 * MM for d in "xyz"}
-    result = calibrate(simulate_session(first, truth, seed=3).session, "offsets", **QUICK)
-    entered = plan.with_controller([e.enter for e in result.assessment.entries])
+    result, _ = identify(simulate_session(first, truth, seed=3).session, "offsets", **QUICK)
+    entered = plan.with_controller([e.enter for e in find_entries(result)])
     measured = simulate_session(entered, truth, seed=4).session
-    assert validate_calibration(result, measured).confirmed
     unstated = replace(measured, compensation=())
-    assert validate_calibration(result, unstated).confirmed is not True
+    stated, wrong = (
+        judge_deviations(result, repeat_fit(result, s)).p_value for s in (measured, unstated)
+    )
+    assert stated > BY_CHANCE > wrong
 
 
 @pytest.mark.parametrize(

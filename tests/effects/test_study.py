@@ -71,16 +71,16 @@ def test_the_tool_of_a_machine_agrees_with_the_independent_one(folder):
 
 
 def test_ignored_backlash_costs_what_the_covariance_predicts(folder):
-    study = study_of(folder, ("backlash",), (), machines=24)
+    study = study_of(folder, ("backlash",), (), machines=16)
     assert study.ignored == ("backlash",)
     table = run_study(study, workers=1)
     s = summarise_accuracy(study, table)
-    assert s.machines == 24
+    assert s.machines == 16
     assert abs(s.after - s.predicted.reported.rms) < 3.0 * s.standard_error
     # half the backlash of three drives remains
     remaining = np.sqrt(3.0) * 0.5 * 0.02e-3
     assert s.after > np.hypot(0.95 * s.all_effects, 0.8 * remaining)
-    identified = study_of(folder, ("backlash",), ("backlash",), machines=24)
+    identified = study_of(folder, ("backlash",), ("backlash",), machines=16)
     known = summarise_accuracy(identified, run_study(identified, workers=1))
     assert known.all_effects is None
     assert known.after == pytest.approx(s.all_effects, rel=1e-9)

@@ -91,8 +91,8 @@ def by_hand(elevation):
     return np.array(rows)
 
 
-@pytest.mark.parametrize("elevation", [20 * DEG, ORTHOGONAL, 45 * DEG, 70 * DEG])
-def test_readings_depend_on_offsets_as_the_geometry_says(tmp_path, elevation):
+@pytest.mark.parametrize("elevation", [ORTHOGONAL, 70 * DEG])
+def test_sensitivities_to_offsets_are_those_of_the_geometry(tmp_path, elevation):
     assert differences(tmp_path, elevation) == pytest.approx(by_hand(elevation), abs=1e-9)
 
 

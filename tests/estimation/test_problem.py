@@ -91,7 +91,7 @@ def test_nothing_free_is_refused(plan):
         build_problem(plan, free=["!*"])
 
 
-def test_an_unknown_model_is_named_with_what_there_is(plan):
+def test_an_unknown_model_is_named_with_the_models(plan):
     with pytest.raises(ParameterError, match="'all' is not a model of this robot; models: offsets"):
         build_problem(plan, model="all")
 

@@ -99,7 +99,7 @@ def test_choices_that_make_no_sense_are_refused(parameters, choice, message):
         select_parameters(parameters, **choice)
 
 
-def test_a_known_zero_of_a_sum_leaves_its_parts_free(parameters):
+def test_a_known_sum_of_zero_has_free_parts(parameters):
     chosen = select_parameters(parameters, model="full", known={"x_leg.length": 0.0})
     assert "x_coupler.x" in chosen.names
 

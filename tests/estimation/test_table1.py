@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 import pytest
+from calibrated import identified, session_of
 from tolerances import DESIGN_MM, FOUR_DECIMALS_MM, PAPER_MM, THREE_DECIMALS_MM
 
-from orthocal import calibrate, load_session
+from orthocal import load_session
 from orthocal.estimation.linear import leg_parallelism_matrix, solve_equation_8
 
 # Independent computation of the reduced system (mm): offsets, r.m.s. before and after, sigma
@@ -35,8 +36,8 @@ PAPER_RESIDUALS = {
 
 
 @pytest.fixture(scope="module")
-def results(root):
-    return {name: calibrate(load_session(root / "examples/table1" / name)) for name in LINEAR}
+def results():
+    return {name: identified(session_of(f"table1/{name}")) for name in LINEAR}
 
 
 @pytest.mark.parametrize("name", LINEAR)
@@ -55,7 +56,7 @@ def test_linear_offsets_residuals_and_sigma(root, name):
 
 
 @pytest.mark.parametrize("name", LINEAR)
-def test_the_calibration_carries_the_linear_solution(results, name):
+def test_a_calibration_contains_the_linearised_solution(results, name):
     linear = np.array([p.linear for p in results[name].free])
     assert np.abs(linear - 1e-3 * np.array(LINEAR[name][0])).max() < FOUR_DECIMALS_MM
 
@@ -67,7 +68,7 @@ def test_exact_offsets(results, name):
 
 
 @pytest.mark.parametrize("name", PAPER_RESIDUALS)
-def test_printed_residuals_come_out(results, name):
+def test_residuals_are_those_of_the_paper(results, name):
     """The paper's own linear residuals, to its rounding of readings and residuals."""
     rows = {r.setup: r.measured - r.linear for r in results[name].residuals}
     found = np.array([rows[s] for s in ("xy", "xz", "yx", "yz", "zx", "zy")])
@@ -81,7 +82,7 @@ def test_the_printed_first_experiment_contradicts_itself(results):
     assert abs(results["experiment-1-corrected"].rms_before * 1e3 - 1.19) < 0.005
 
 
-def test_what_remains_of_experiments_2_and_3_is_the_same(results):
+def test_residuals_of_experiments_2_and_3_are_the_same(results):
     """The paper's rounded residuals correlate 0.992, unrounded ones no less."""
     printed = [PAPER_RESIDUALS[f"experiment-{n}"] for n in (2, 3)]
     assert abs(np.corrcoef(*printed)[0, 1] - 0.992) < 0.0005
@@ -110,7 +111,7 @@ def test_offsets_scale_with_the_displacements_assumed_and_residuals_do_not(root,
         scaled = scaled.replace("60]", f"{60 * factor}]")
         (folder / "session.yaml").write_text(scaled)
         (folder / "readings.csv").write_text(readings)
-        found.append(calibrate(load_session(folder)))
+        found.append(identified(load_session(folder)))
     offsets = [np.array([p.value for p in c.free]) for c in found]
     assert np.all(np.abs(offsets[1]) > np.abs(offsets[0]))
     assert abs(found[1].rms_after - found[0].rms_after) < 1e-3 * found[0].rms_after

@@ -38,9 +38,7 @@ def reverse(session, setup):
     return session.with_values(values)
 
 
-@pytest.mark.parametrize(
-    ("session", "setup"), [("raw-cycles", "yx"), ("raw-cycles", "zy"), ("sweep", "zy_50")]
-)
+@pytest.mark.parametrize(("session", "setup"), [("raw-cycles", "yx"), ("sweep", "zy_50")])
 def test_a_reversed_setup_is_named(session, setup):
     found = check_session(reverse(session_of(session), setup))
     assert found.decision.verdict == "review"
@@ -48,9 +46,8 @@ def test_a_reversed_setup_is_named(session, setup):
     assert {p.setup for p in finding.places} == {setup}
 
 
-@pytest.mark.parametrize("number", ["1-printed", "2"])
-def test_one_difference_per_setup_does_not_determine_its_sign(number):
-    session = session_of(f"table1/experiment-{number}")
+def test_one_difference_per_setup_does_not_determine_its_sign():
+    session = session_of("table1/experiment-2")
     for setup in session.setups:
         assert not check_session(reverse(session, setup)).of_kind("reversed sign")
 

@@ -85,7 +85,7 @@ def test_the_instructions_of_all_readings_are_known(root, example):
             assert llvm.list_instructions(batch.function) is not None
 
 
-def test_a_function_with_an_unknown_instruction_is_left_to_casadi():
+def test_a_function_with_an_unknown_instruction_is_evaluated_by_casadi():
     x = ca.SX.sym("x")
     function = ca.Function("unknown", [x], [ca.erf(x)])
     assert llvm.list_instructions(function) is None
@@ -106,7 +106,7 @@ def test_the_backend_depends_on_the_call_alone(orthoglide, monkeypatch, installe
         assert bool(used) == expected
 
 
-def test_casadi_stands_in_where_the_interpreter_cannot_be_compiled(orthoglide, monkeypatch):
+def test_casadi_evaluates_where_the_interpreter_cannot_be_compiled(orthoglide, monkeypatch):
     function, where = robot_functions(orthoglide).closure_by_passive, points(orthoglide, 3)
     expected = function.evaluate(*where, backend="casadi")
     monkeypatch.setattr(llvm, "compile_interpreter", lambda: None)

@@ -50,7 +50,7 @@ def test_offsets_and_lengths_act_as_in_the_closed_forms(orthoglide):
     )
 
 
-def test_batches_equal_pinocchios_own_newton(orthoglide):
+def test_batches_equal_the_newton_iteration_of_pinocchio(orthoglide):
     names = orthoglide.parameters.select_model("full")
     rng = np.random.default_rng(4)
     scale = np.array([orthoglide.parameters[n].prior_std for n in names])

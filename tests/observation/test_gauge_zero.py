@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibrated import identified
 from models import TRUTH
 
-from orthocal import calibrate, load_plan, simulate_session
+from orthocal import load_plan, simulate_session
 from orthocal.calibration.refit import restore_session
 from orthocal.errors import SessionError
 from orthocal.estimation.fit import build_program, fit_problem
@@ -81,7 +82,7 @@ def test_degrees_of_freedom_count_free_zeros_only(session):
 def test_a_known_zero_survives_files_and_records(session, tmp_path):
     write_session(session, tmp_path / "again")
     again = load_session(tmp_path / "again")
-    record = restore_session(calibrate(session, "offsets"))
+    record = restore_session(identified(session, "offsets"))
     for other in (again, record):
         assert {n: s.zero for n, s in other.setups.items()} == {
             n: s.zero for n, s in session.setups.items()

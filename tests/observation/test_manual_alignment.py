@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibrated import identified
 from workshop import Workshop
 
 from orthocal import calibrate, draw_errors, load_plan, simulate_session
@@ -65,7 +66,7 @@ def test_sessions_that_are_joined_keep_what_was_active_in_each(plan):
             assert found[f"{label}/{name}"] == pytest.approx(value, abs=1e-15)
 
 
-def test_a_blade_and_what_is_known_exactly_are_as_drawn(plan):
+def test_blades_and_exact_mountings_are_at_their_nominal_position(plan):
     setups = {
         n: replace(s, sensor=replace(s.sensor, mounting=replace(s.sensor.mounting, lateral=0.0)))
         for n, s in plan.setups.items()
@@ -97,7 +98,7 @@ def test_a_ball_over_its_rod_is_recovered_as_such(plan):
     """Exact readings of a machine with large offsets: all gauges stand as they should."""
     truth = dict(zip(OFFSETS, (3 * MM, -2.5 * MM, 2 * MM), strict=True))
     session = simulate_session(plan, truth, exact=True).session
-    result = calibrate(session, "offsets")
+    result = identified(session, "offsets")
     for name, value in truth.items():
         assert result[name].value == pytest.approx(value, abs=1e-9)
     for p in result.sensors:

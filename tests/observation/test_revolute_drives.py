@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from calibrated import identified
 from linkages import joint, write_robot, write_wide_linkage
 from scipy.stats import binom, norm
 from tolerances import KINEMATICS, TRUTH_BACK
 
-from orthocal import calibrate, load_plan, load_session, write_session
+from orthocal import load_plan, load_session, write_session
 from orthocal.assessment.controller_entries import find_entries
 from orthocal.assessment.predictive import expect_rms, judge_deviations
 from orthocal.assessment.validation import validate_calibration
@@ -37,8 +38,11 @@ orthocal:
 
 
 SEEDS = 16
+"""Sessions whose deviations are compared with the predicted ones."""
+
+VALIDATED = 12
 """Sessions that are validated. If half as many were confirmed as predicted, 35 % in place of 70 %,
-two of three such tests would fail; at a quarter, 99 of 100."""
+58 % of such tests would fail; at a quarter, 97 %."""
 
 
 def write_fivebar(root, folder, *, yaml=YAML, drop=0.0):
@@ -95,7 +99,7 @@ def test_offsets_in_the_controller_lead_to_the_same_truth(tmp_path, robot, unit)
     results = []
     for plan in (plain, active):
         session = simulate_session(plan, OFFSETS, exact=True).session
-        results.append((session, calibrate(session, "offsets")))
+        results.append((session, identified(session, "offsets")))
     (first, one), (second, other) = results
     assert np.abs(first.values - second.values).max() > 1e-5
     for name, value in OFFSETS.items():
@@ -122,19 +126,20 @@ def test_what_was_identified_is_validated(tmp_path, robot):
     """Entered as found, it is confirmed; entered otherwise, the key that states it is named."""
     before = load_plan(write_plan(tmp_path / "a", robot))
     chances, confirmed, sizes = [], [], []
-    for seed in range(SEEDS):  # legs that turn by 6 degrees: how a gauge stands matters most
+    for seed in range(SEEDS):  # legs that turn by 6 degrees: the mounting of a gauge matters most
         first = simulate_session(before, OFFSETS, seed=seed)
-        found = calibrate(first.session, solver="variable-projection")
+        found = identified(first.session)
         entered = [round(e.enter * 1e3, 4) for e in find_entries(found)]
         folder = tmp_path / f"b{seed}"
         plan = load_plan(write_plan(folder, robot, f"{{offsets_mrad: {entered}}}"))
         second = simulate_session(plan, OFFSETS, seed=seed + 1000)
-        # the same dial in both sessions: at 10 mm its scale matters more than its noise
-        scales = [1.0 + s.nuisance["gauge.scale"] for s in (first, second)]
-        new = second.session.with_values(second.session.values * scales[0] / scales[1])
-        result = validate_calibration(found, new)
-        assert result.mistake is None
-        confirmed.append(result.confirmed)
+        if seed < VALIDATED:
+            # the same dial in both sessions: at 10 mm its scale matters more than its noise
+            scales = [1.0 + s.nuisance["gauge.scale"] for s in (first, second)]
+            new = second.session.with_values(second.session.values * scales[0] / scales[1])
+            result = validate_calibration(found, new)
+            assert result.mistake is None
+            confirmed.append(result.confirmed)
         # another dial, as it is predicted
         fit = repeat_fit(found, second.session)
         chances.append(judge_deviations(found, fit).p_value)
@@ -144,7 +149,7 @@ def test_what_was_identified_is_validated(tmp_path, robot):
     assert binom.cdf(np.sum(np.array(chances) >= BY_CHANCE), SEEDS, 1 - BY_CHANCE) > 0.01
     # an offset is compared with the one entered, which is as uncertain: 2 / √2 standard deviations
     kept = 2.0 * norm.cdf(2.0 / np.sqrt(2.0)) - 1.0
-    assert binom.cdf(sum(confirmed), SEEDS, (1 - BY_CHANCE) * kept**2) > 0.01
+    assert binom.cdf(sum(confirmed), VALIDATED, (1 - BY_CHANCE) * kept**2) > 0.01
     # mountings are what differs most
     predicted, achieved = np.sqrt(np.mean(np.square(sizes), axis=0))
     assert predicted > 2.0 * found.rms_after
@@ -257,7 +262,7 @@ def test_square_means_within_a_degree(root, tmp_path, degrees, good):
             load_plan(plan)
 
 
-def test_somebody_who_records_is_shown_degrees_as_the_controller_has_them(root, tmp_path):
+def test_recording_shows_the_degrees_of_the_controller(root, tmp_path):
     robot = write_fivebar(root, tmp_path / "rails")
     folder = write_plan(tmp_path / "s", robot, "{offsets_mrad: [6, -2]}")
     with open_recording(folder) as recording:

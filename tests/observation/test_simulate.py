@@ -37,7 +37,7 @@ def test_exact_readings_are_the_predictions_from_where_a_setup_begins(plan):
         assert simulated.zeros[name] == -predicted[own][0]
 
 
-def test_a_dial_is_set_where_it_stands_also_on_displaced_lines(root):
+def test_a_dial_is_zeroed_in_the_first_posture_also_on_displaced_lines(root):
     """At the coordinate of a line displaced by 20 mm no dial of ±5 mm could be read."""
     lines = load_plan(root / "tests/sessions/lines/plan.yaml")
     session = simulate_session(lines, ERRORS, seed=1).session
@@ -45,7 +45,7 @@ def test_a_dial_is_set_where_it_stands_also_on_displaced_lines(root):
     assert max(abs(v) for v in first.values()) < 0.25e-3
 
 
-def test_it_says_that_it_is_simulated(plan):
+def test_a_simulated_session_states_that_it_is_simulated(plan):
     session = simulate_session(plan, ERRORS, seed=5).session
     assert session.title.startswith("Simulated: ")
     assert "Simulated by orthocal, not measured (seed 5)" in session.source

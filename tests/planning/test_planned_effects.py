@@ -179,19 +179,25 @@ def test_the_paper_plan_has_one_approach(machine, orthoglide):
     assert {r.conditions for r in paper_plan(orthoglide, Equipment()).readings} == {None}
 
 
-def test_a_constant_temperature_does_not_determine_thermal_expansion(orthoglide):
-    """A day that warms by 8 K reduces the limit a little."""
+@pytest.fixture(scope="module")
+def warming(orthoglide):
+    """Plan of two setups on a day that warms by 8 K, a reading each half hour."""
     robot = with_effects(orthoglide, ["thermal", "drift"])
-    after = []
-    for temperatures in (None, (20.0, 28.0)):
-        equipment = replace(FEW, temperatures=temperatures, minutes_per_reading=30.0)
-        plan = plan_readings(robot, "full", equipment=equipment, setups=2, starts=1)
-        limits = {e.effect: e for e in plan.effects}
-        assert limits["thermal"].before == pytest.approx(3.0 * PPM)
-        assert limits["drift"].after < 0.9 * limits["drift"].before
-        after.append(limits["thermal"].after)
-    assert after[0] == pytest.approx(3.0 * PPM)
-    assert after[1] < after[0]
+    equipment = replace(FEW, temperatures=(20.0, 28.0), minutes_per_reading=30.0)
+    return plan_readings(robot, "full", equipment=equipment, setups=2, starts=1)
+
+
+def test_a_constant_temperature_does_not_determine_thermal_expansion(warming):
+    """A day that warms by 8 K reduces the limit a little."""
+    limits = {e.effect: e for e in warming.effects}
+    assert limits["thermal"].before == pytest.approx(3.0 * PPM)
+    assert limits["thermal"].after < limits["thermal"].before * (1.0 - 1e-4)
+    assert limits["drift"].after < 0.9 * limits["drift"].before
+    constant = replace(warming.equipment, temperatures=None).schedule(warming.session)
+    problem = warming.forecast.problem(constant)
+    limits = {e.effect: e for e in find_limits(problem, stated_sigma(constant.gauge))}
+    assert limits["thermal"].after == pytest.approx(3.0 * PPM)
+    assert limits["drift"].after < 0.9 * limits["drift"].before
 
 
 def test_further_readings_determine_drift(orthoglide):
@@ -307,8 +313,8 @@ def test_backlash_is_identified_on_a_day_that_gets_warmer(planned, tmp_path):
     errors = [w for k in "xyz" for w in ("--error", f"{k}_slide.backlash_mm=0.04")]
     words = ["simulate", "m", *errors, "--temperature", "20:28", "--seed", "2", "--out", "day"]
     assert run_orthocal(tmp_path, *words)[0] == 0
-    assert run_orthocal(tmp_path, "check", "day")[0] == 0
-    code, _, err = run_orthocal(tmp_path, "calibrate", "day", "--out", "one", "--json")
+    fast = ["--solver", "variable-projection"]
+    code, _, err = run_orthocal(tmp_path, "calibrate", "day", "--out", "one", "--json", *fast)
     assert code == 0, err
     calibration = load_calibration(tmp_path / "one")
     for k in "xyz":

@@ -120,8 +120,7 @@ def test_rounding_does_not_choose_between_mirrored_readings(aligned):
     assert all(choose() == first for _ in range(6))
 
 
-@pytest.mark.parametrize("aligned", [0, 1, 2])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("seed", "aligned"), [(0, 0), (1, 1), (2, 2), (3, 0)])
 def test_a_plan_is_nearly_the_best_of_all(seed, aligned):
     rng = np.random.default_rng(seed)
     candidates, sensitivities = draw_candidates(rng, aligned=aligned)

@@ -30,7 +30,7 @@ def draw_timed(seed, aligned):
 
 def test_setups_within_a_time_are_nearly_the_best_of_all():
     """A time of three setups at most is the hardest case: no other setup fits into the rest."""
-    ratios = [_ratio(seed, aligned) for seed in range(10) for aligned in (0, 1)]
+    ratios = [_ratio(seed, aligned) for seed in range(5) for aligned in (0, 1)]
     assert np.min(ratios) > 1.0 - 1e-6
     assert np.median(ratios) < 1.001
     assert np.quantile(ratios, 0.75) < 1.01

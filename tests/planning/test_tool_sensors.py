@@ -12,7 +12,7 @@ import pytest
 from bounds import rms_band
 from commands import run_orthocal
 from machines import frames
-from planned import QUICK, entered, quick_plan
+from planned import FEW, QUICK, entered, quick_plan
 from tolerances import SAME_OPTIMUM
 
 from orthocal import (
@@ -178,7 +178,8 @@ def test_the_search_agrees_with_the_forecast_of_its_plan(planned):
     assert nominal.reported.rms == pytest.approx(planned.expected.reported.rms, rel=0.25)
 
 
-def test_approaches_and_minutes_of_a_bar_follow_from_path_and_file(owned):
+def test_approaches_and_minutes_of_a_bar_follow_from_path_and_file(owned, monkeypatch):
+    monkeypatch.setattr(tool_candidates, "BALLS", tool_candidates.BALLS[:1])
     robot = replace(with_effects(entered("orthoglide"), ("backlash",)), legs={})
     slow = BAR + "minutes_per_setup: 20\nminutes_per_reading: 2\n"
     equipment = Equipment(owned=owned(bar=slow))
@@ -227,8 +228,8 @@ def test_a_wrong_file_is_refused_by_its_key(owned, text, place):
 
 @pytest.fixture(scope="module")
 def for_printer(owned):
-    """Plan of an hour for a linear delta with a bar, a plate and a probe."""
-    equipment = Equipment(owned=owned(bar=BAR, plate=PLATE, probe=PROBE), **QUICK)
+    """Plan of an hour for a linear delta with a bar and a probe."""
+    equipment = Equipment(owned=owned(bar=BAR, probe=PROBE), **FEW)
     return plan_readings(load_robot("linear_delta"), hours=1.0, equipment=equipment, starts=1)
 
 
@@ -360,9 +361,10 @@ def needed_range(robot, sensors, **options):
     ],
 )
 def test_the_range_of_a_bar_holds_the_tolerances_of_length_place_and_offsets(
-    owned, length, offset, entered, expected
+    owned, monkeypatch, length, offset, entered, expected
 ):
-    """Nobody sets the zero of a bar. A drive moves the tool about as far as itself."""
+    """The zero of a bar is not set. A drive moves the tool about as far as itself."""
+    monkeypatch.setattr(tool_candidates, "BALLS", tool_candidates.BALLS[:1])
     text = BAR.replace("[-25, 25]", "[-3, 3]").replace("unknown", length)
     sensors = owned(bar=text + "centre_tolerance_mm: 0.5\nscale_tolerance: 0\n")
     robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": offset})
@@ -370,10 +372,10 @@ def test_the_range_of_a_bar_holds_the_tolerances_of_length_place_and_offsets(
     assert needed_range(robot, sensors, entered=entered) == pytest.approx(expected, rel=0.05)
 
 
-def test_a_plan_says_which_sensor_has_too_short_a_range(owned):
+def test_a_sensor_with_too_short_a_range_is_named(owned):
     robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 0.4})
     short = owned(bar=BAR.replace("[-25, 25]", "[-2, 2]"))
-    plan = plan_readings(robot, hours=0.5, equipment=Equipment(owned=short, **QUICK), starts=1)
+    plan = plan_readings(robot, hours=0.5, equipment=Equipment(owned=short, **FEW), starts=1)
     assert {s.gauge for s in plan.session.setups.values()} == {"dial"}
     assert json.loads(plan_json(plan))["unusable_mm"]["bar"] == pytest.approx(4.3, abs=0.1)
     assert "Not in the plan: bar." in summarize(plan)
@@ -400,7 +402,8 @@ def without_legs():
 @pytest.fixture(scope="module")
 def tracked(owned):
     """Plan of half an hour with a tracker: 20 minutes of mounting, and 19 points."""
-    return plan_readings(without_legs(), hours=0.5, equipment=Equipment(owned=owned(track=TRACKER)))
+    equipment = Equipment(owned=owned(track=TRACKER))
+    return plan_readings(without_legs(), hours=0.5, equipment=equipment, starts=2)
 
 
 @pytest.mark.parametrize(("keys", "labels"), [("", "xyz"), (CORRELATED, "123")])
@@ -514,7 +517,7 @@ def test_the_curve_grows_a_setup_that_can_be_used_once(tracked):
 def test_a_plan_of_points_is_measured_and_calibrated(tmp_path):
     """From the command line: plan, sheet, a recorded point, simulated points, calibration."""
     (tmp_path / "track.yaml").write_text(TRACKER + CORRELATED)
-    words = ["orthoglide", "--with", tmp_path / "track.yaml", "--hours", 0.6, "--starts", 2]
+    words = ["orthoglide", "--with", tmp_path / "track.yaml", "--hours", 0.6, "--starts", 1]
     words += ["--along", 2, "--across-mm", 0, "--sections", 0.5]
     words += ["--tolerance", "*.offset_mm=1", "--out", tmp_path / "plan"]
     code, text, _ = run_orthocal(".", "plan", *map(str, words))
@@ -609,7 +612,7 @@ def test_programs_of_a_planar_bar_move_along_its_circle(planar, depth):
 def test_calibrated_planar_machines_have_the_expected_error_of_a_bar(planar):
     """The fixed balls lie off the plane of motion by 1 mm (standard deviation)."""
     assert planar.expected.reported.rms < 4.5e-6
-    assert_machines_have_the_expected_error(planar, count=25)
+    assert_machines_have_the_expected_error(planar, count=12)
 
 
 def simulate_planar(planar, seed):
@@ -617,7 +620,7 @@ def simulate_planar(planar, seed):
     return simulate_session(planar.session, errors, seed=seed).session
 
 
-@pytest.mark.parametrize("seed", [8, 14])
+@pytest.mark.parametrize("seed", [8])
 def test_both_solvers_agree_where_a_ball_is_off_the_plane(planar, seed):
     """Its height changes readings to second order: complete Gauss-Newton steps do not converge."""
     session = simulate_planar(planar, seed)
@@ -645,7 +648,7 @@ def test_points_on_a_planar_machine_lie_in_its_plane(owned):
     assert len(postures) == 25
 
 
-@pytest.mark.parametrize("seed", [0, 10, 18])
+@pytest.mark.parametrize("seed", [0, 18])
 def test_fixed_balls_off_the_plane_are_no_mistakes(planar, seed):
     """Their heights, of up to 3.9 mm, have the effect of another bar length to first order."""
     findings = judge_session(simulate_planar(planar, seed)).findings

@@ -7,11 +7,12 @@ import json
 import numpy as np
 import pytest
 from bounds import bound_um
+from calibrated import identified
 from machines import frame_pose
 from sensor_machines import assert_promises, calibrate_machines
 from tolerances import CLOSED_FORM
 
-from orthocal import calibrate, load_plan, load_session, write_session
+from orthocal import load_plan, load_session, write_session
 from orthocal.errors import SessionError
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import cube
@@ -109,7 +110,7 @@ def test_tool_errors_and_intervals_of_machines_with_all_errors(tmp_path, orthogl
         return (1.0 + scale) * (np.linalg.norm(balls - centre, axis=2) - RADIUS_MM * MM - length)
 
     space = cube(orthoglide, points_per_side=5)
-    assert_promises(calibrate_machines(plan, space, count=95, read=read))
+    assert_promises(calibrate_machines(plan, space, count=40, read=read))
 
 
 def test_a_simulated_session_comes_back_from_its_files(tmp_path):
@@ -171,7 +172,7 @@ def test_noise_of_two_gauges_is_found_on_a_machine_far_from_its_nominal_one(tmp_
     (tmp_path / "plan.yaml").write_text(json.dumps(plan))
     errors = {"a_slide.offset": 6e-3, "b_slide.offset": -7e-3, "c_slide.offset": 3e-3}
     session = simulate_session(load_plan(tmp_path / "plan.yaml"), errors, seed=1).session
-    found = calibrate(session, solver="variable-projection")
+    found = identified(session)
     assert found.noise.source == "gauge"
     assert found.noise.sigma == pytest.approx(np.hypot(5e-6, 1e-5 / np.sqrt(12.0)))
 

@@ -86,6 +86,6 @@ def test_a_class_with_another_kind_is_refused(install):
         load_plan(plan)
 
 
-def test_without_such_packages_there_are_the_own_kinds():
+def test_without_such_packages_there_are_the_built_in_kinds():
     own = {"leg", "ball_bar", "tool_indicator", "probe", "points", "distance"}
     assert set(sensor_kinds()) == own | {e.name for e in entry_points(group=GROUP)}

@@ -80,7 +80,7 @@ def test_crooked_readings_are_those_of_solids_that_touch(tmp_path, tip, oblique)
     beside = ObservationModel(session).alignment(error_map(session.robot).expand(ERRORS))
     rng, known = np.random.default_rng(0), nuisance_parameters(session)
     setups, missed = list(session.setups), 0
-    for _ in range(40):
+    for _ in range(20):
         values = 3.0 * rng.normal(size=len(known.parameters))
         values *= [p.prior_std for p in known.parameters]
         found = predict_readings(session, ERRORS, observations=o, nuisance=values)
@@ -92,7 +92,7 @@ def test_crooked_readings_are_those_of_solids_that_touch(tmp_path, tip, oblique)
             touched = workshop.read(r.setup, r.posture, stood)
             assert found[i] == pytest.approx(touched, abs=1e-9, nan_ok=True)
             missed += np.isnan(touched)
-    assert missed < 10  # a ball far beside its place passes the rod
+    assert missed < 5  # a ball far beside its place passes the rod
 
 
 def test_a_line_is_read_as_by_an_edge_without_a_radius(tmp_path, root):
@@ -134,7 +134,7 @@ def test_one_dial_has_one_scale_and_a_block_one_roll(tmp_path):
     assert {"setup.yx.square", "setup.zx.square", "setup.yz.roll"} <= {*shared}
 
 
-def test_of_two_days_the_dial_is_one_and_the_stands_are_two(tmp_path):
+def test_two_sessions_share_the_dial_and_not_the_mountings(tmp_path):
     days = [plan(tmp_path / day, yx=BLOCK, zx=BLOCK) for day in ("monday", "tuesday")]
     found = names(join_sessions(days))
     assert found.count("gauge.scale") == 1
@@ -142,7 +142,7 @@ def test_of_two_days_the_dial_is_one_and_the_stands_are_two(tmp_path):
     assert {"setup.monday/yx.pitch", "setup.tuesday/yx.pitch"} <= {*found}
 
 
-def test_what_is_known_exactly_is_no_unknown(tmp_path):
+def test_exact_mountings_have_no_nuisance_parameters(tmp_path):
     exact = ", direction_tolerance_mrad: 0, section_tolerance_mm: 0, lateral_tolerance_mm: 0"
     session = plan(tmp_path, yx=exact, zx=exact, yz=exact)
     assert names(session) == ["gauge.scale"]
@@ -151,14 +151,14 @@ def test_what_is_known_exactly_is_no_unknown(tmp_path):
     assert names(load_plan(tmp_path / "plan.yaml")) == []
 
 
-def test_it_is_written_and_read(tmp_path):
+def test_files_keep_the_mounting(tmp_path):
     own = ", stand: block, square_tolerance_mrad: 0.1, direction_tolerance_mrad: 8"
     made = plan(tmp_path / "plan", yx=own, zx=own, yz=", lateral_tolerance_mm: 0.4")
     truth = {n: v for n, v in ERRORS.items() if n.endswith("offset")}
     session = simulate_session(made, truth, seed=1).session
     again = load_session(write_session(session, tmp_path / "session"))
     assert [s.sensor for s in again.setups.values()] == [s.sensor for s in made.setups.values()]
-    found = calibrate(again)
+    found = calibrate(again, solver="variable-projection")
     loaded = load_calibration(write_calibration(found, tmp_path / "calibration.json"))
     assert [s.sensor for s in loaded.setups] == [s.sensor for s in made.setups.values()]
     assert [p.name for p in loaded.sensors] == names(made)
@@ -180,7 +180,7 @@ def test_it_is_written_and_read(tmp_path):
         ({"zx": ", scale_tolerance: 2"}, "setups.zx.scale_tolerance"),
     ],
 )
-def test_what_does_not_fit_is_refused_by_key(tmp_path, keys, message):
+def test_a_wrong_key_is_named(tmp_path, keys, message):
     with pytest.raises(SessionError) as caught:
         plan(tmp_path, **keys)
     assert message in str(caught.value)

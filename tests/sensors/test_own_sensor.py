@@ -1,4 +1,4 @@
-"""A sensor that orthocal has never heard of, in one file: nothing else has to know it."""
+"""A sensor of another package, in one file."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from calibrated import identified
 from conftest import marked_plots
 from gauges import exact
+from intervals import recorded_scores
+from scipy.stats import chi2
 from tolerances import SAME_OPTIMUM
 from tool_coordinate import ToolCoordinate
 
@@ -64,17 +67,23 @@ cycles: 2
 """
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(autouse=True, scope="module")
 def known():
     registry.register_sensor(ToolCoordinate)
     yield
     registry.unregister_sensor(ToolCoordinate.kind)
 
 
-@pytest.fixture
-def plan(tmp_path):
-    (tmp_path / "plan.yaml").write_text(PLAN)
-    return exact(load_plan(tmp_path / "plan.yaml"))
+@pytest.fixture(scope="module")
+def plan(known, tmp_path_factory):
+    path = tmp_path_factory.mktemp("plan") / "plan.yaml"
+    path.write_text(PLAN)
+    return exact(load_plan(path))
+
+
+@pytest.fixture(scope="module")
+def measured(plan):
+    return simulate_session(plan, TRUTH, seed=1).session
 
 
 def test_its_readings_are_those_of_the_tool(plan):
@@ -91,10 +100,10 @@ def test_its_readings_are_those_of_the_tool(plan):
 
 
 def test_nuisance_parameters_are_identified_with_the_machine(plan):
-    """Slopes of 2 and 3 in a thousand at 0.16 m of travel read to 2 µm: told to some 1e-5."""
+    """Slopes of 2 and 3 in a thousand at 0.16 m of travel, read to 2 µm: known to about 1e-5."""
     simulated = simulate_session(plan, TRUTH, seed=4)
     assert set(simulated.nuisance) == {"dial.d.slope", "setup.tz.slope"}
-    result = calibrate(simulated.session)
+    result = identified(simulated.session)
     for p in result.sensors:
         assert 0.0 < p.std_scatter < 0.2 * p.prior_std
         assert abs(p.value - simulated.nuisance[p.name]) < 4.0 * p.std
@@ -103,53 +112,58 @@ def test_nuisance_parameters_are_identified_with_the_machine(plan):
     assert [p.name for p in result.free] == list(TRUTH)
 
 
-def simulated_fits(plan, others=()):
-    """Truth and fit of 60 simulated sessions; errors named `others` are drawn."""
+def simulated_fits(plan, count, others=()):
+    """Truth by name, and fit, of simulated sessions; errors named `others` are drawn."""
     planned = build_problem(plan, model="offsets")
-    for seed in range(60):
+    for seed in range(count):
         errors = {**(draw_errors(plan.robot, others, seed=seed) if others else {}), **TRUTH}
         simulated = simulate_session(plan, errors, seed=seed)
         problem = planned.with_values(simulated.session.values)
-        truth = {**TRUTH, **simulated.nuisance}
-        yield [truth[n] for n in problem.free], fit_problem(problem, options=FAST)
+        yield {**TRUTH, **simulated.nuisance}, fit_problem(problem, options=FAST)
 
 
-def test_predicted_deviations_are_those_of_many_simulated_calibrations(plan):
-    """Offsets and slopes, both drawn: z scores of 60 fits, as calibrations have them."""
+def assert_unit_variance(scores):
+    """Compare the squares of independent standard normal scores with the 99 % band of χ²."""
+    low, high = chi2.interval(0.99, np.size(scores))
+    assert low < np.square(scores).sum() < high
+
+
+def test_predicted_covariance_is_that_of_simulated_calibrations(plan):
+    """Offsets and slopes, both drawn: independent scores of 20 fits."""
     scores = []
-    for truth, fit in simulated_fits(plan):
-        std = np.sqrt(np.diag(fit.covariance()))
-        scores.append((fit.solution.theta - truth) / std)
-    spread = np.sqrt(np.mean(np.square(scores), axis=0))
-    assert spread == pytest.approx(1.0, abs=0.3)  # 3 standard deviations of a spread of 60
-    result = calibrate(fit.problem.session, solver=FAST)
+    for truth, fit in simulated_fits(plan, 20):
+        covariance = fit.covariance()
+        error = fit.solution.theta - [truth[n] for n in fit.problem.free]
+        scores.append(np.linalg.solve(np.linalg.cholesky(covariance), error))
+    assert_unit_variance(scores)
+    result = build_record.assemble_calibration(fit)
     estimates = (*result.free, *result.sensors)
     assert [p.name for p in estimates] == list(fit.problem.free)
     assert [p.value for p in estimates] == fit.solution.theta.tolist()
     machine = np.sqrt(np.diag(result.model_covariance))
-    assert machine == pytest.approx(std[: len(machine)], rel=1e-12)
+    assert machine == pytest.approx(np.sqrt(np.diag(covariance))[: len(machine)], rel=1e-12)
 
 
 def test_standard_deviations_hold_on_machines_with_all_errors(plan):
-    """60 machines: offsets and slopes against standard deviations with unmodelled errors."""
-    scores, others = [], [n for n in machine_errors(plan.robot) if not n.endswith(".offset")]
-    for truth, fit in simulated_fits(plan, others):
+    """20 machines: offsets and slopes against standard deviations with unmodelled errors."""
+    others = [n for n in machine_errors(plan.robot) if not n.endswith(".offset")]
+    of_offsets, of_slopes = [], []
+    for truth, fit in simulated_fits(plan, 20, others):
         result = build_record.assemble_calibration(fit)
-        estimates = (*result.free, *result.sensors)
-        scores.append([(p.value - v) / p.std for p, v in zip(estimates, truth, strict=True)])
-    spread = np.sqrt(np.mean(np.square(scores), axis=0))
-    n = len(TRUTH)
-    assert spread[:n] == pytest.approx(1.0, abs=0.3)  # 3 standard deviations of a spread of 60
+        of_offsets.append(recorded_scores(result, TRUTH)[0])
+        total = np.sqrt(np.diag(result.total_covariance))
+        assert [p.std for p in result.free] == pytest.approx(total, rel=1e-9)
+        of_slopes.append([(p.value - truth[p.name]) / p.std for p in result.sensors])
+    assert_unit_variance(of_offsets)
     # the noise of the slopes is that of the residuals, which contain the other errors
-    assert (spread[n:] > 0.5).all()
-    assert (spread[n:] < 1.3).all()
+    count = np.size(of_slopes)
+    assert np.square(of_slopes).sum() < chi2.ppf(0.995, count)
+    assert np.square(of_slopes).sum() > 0.25 * chi2.ppf(0.005, count)
 
 
-@pytest.mark.parametrize("model", ["offsets", "full"])
-@pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
-def test_both_solvers_find_one_optimum(plan, model, hessian):
-    session = simulate_session(plan, TRUTH, seed=1).session
-    problem = build_problem(session, model=model)
+@pytest.mark.parametrize(("model", "hessian"), [("full", "gauss-newton"), ("offsets", "exact")])
+def test_both_solvers_find_one_optimum(measured, model, hessian):
+    problem = build_problem(measured, model=model)
     given = {"sigma": 2e-6}
     ours = VariableProjection(problem).solve(**given)
     ipopts = NonlinearProgram(problem, options=SolverOptions(hessian=hessian)).solve(**given)
@@ -158,8 +172,8 @@ def test_both_solvers_find_one_optimum(plan, model, hessian):
     assert np.abs((ours.theta - ipopts.theta) / problem.theta_scale).max() < 1e-6
 
 
-def test_its_slope_is_central_differences(plan):
-    problem = build_problem(simulate_session(plan, TRUTH, seed=1).session, model="lengths")
+def test_its_slope_is_central_differences(measured):
+    problem = build_problem(measured, model="lengths")
     theta = np.append(0.3 * problem.theta_scale[:-2], [1.5e-3, -1e-3])
     _, jacobian = problem.predict_and_jacobian(theta)
     for i in (0, 4, problem.n_free - 2, problem.n_free - 1):
@@ -169,13 +183,12 @@ def test_its_slope_is_central_differences(plan):
         assert np.abs(jacobian[:, i] - slope).max() < 1e-9
 
 
-def test_it_is_written_and_read(plan, tmp_path):
-    simulated = simulate_session(plan, TRUTH, seed=1)
-    path = write_session(simulated.session, tmp_path / "s")
+def test_it_is_written_and_read(plan, measured, tmp_path):
+    path = write_session(measured, tmp_path / "s")
     again = load_session(path)
     assert [s.sensor for s in again.setups.values()] == [s.sensor for s in plan.setups.values()]
     assert [s.gauge for s in again.setups.values()] == ["fine"] * 3 + ["dial"] * 2
-    result = calibrate(again)
+    result = calibrate(again, solver=FAST)
     write_calibration(result, tmp_path / "calibration.json")
     loaded = load_calibration(tmp_path / "calibration.json")
     assert json.loads(calibration_json(loaded)) == json.loads(calibration_json(result))
@@ -183,8 +196,9 @@ def test_it_is_written_and_read(plan, tmp_path):
     assert loaded.robot.name == "orthoglide"
 
 
-def test_it_is_in_answer_report_and_scene(plan, tmp_path, capsys):
-    path = write_session(simulate_session(plan, TRUTH, seed=1).session, tmp_path / "s")
+@pytest.mark.usefixtures("short_reports", "without_sensor_gains")
+def test_it_is_in_answer_report_and_scene(measured, tmp_path, capsys):
+    path = write_session(measured, tmp_path / "s")
     with marked_plots():
         make_program()(
             ["calibrate", str(path), "--out", str(tmp_path / "out")], standalone_mode=False
@@ -293,7 +307,7 @@ def test_a_sensor_that_was_changed_has_new_functions(tmp_path, root):
     assert found[1] == pytest.approx(5.0 * found[0], rel=1e-12)
 
 
-def test_a_sensor_that_shows_no_number_is_named_by_setup_and_posture(plan):
+def test_a_sensor_that_shows_no_number_is_named_by_setup_and_posture(plan, measured):
     """One that sees only tools beyond 20 mm."""
 
     class Broken(ToolCoordinate):
@@ -304,7 +318,6 @@ def test_a_sensor_that_shows_no_number_is_named_by_setup_and_posture(plan):
         name: replace(s, sensor=Broken("x", 1e-3, None)) if name == "tx" else s
         for name, s in plan.setups.items()
     }
-    session = simulate_session(plan, TRUTH, seed=1).session
-    session = replace(session, setups=broken)
+    session = replace(measured, setups=broken)
     with pytest.raises(SessionError, match=r"setups\.tx: the predicted reading in posture 'zero'"):
         calibrate(session)

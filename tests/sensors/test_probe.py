@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from calibrated import identified
 from intervals import assert_coverage, recorded_scores
 from machines import frame_pose
 from scipy.spatial.transform import Rotation
@@ -17,7 +18,6 @@ from tolerances import CLOSED_FORM
 
 from orthocal import (
     Choice,
-    calibrate,
     draw_errors,
     load_plan,
     load_robot,
@@ -130,10 +130,10 @@ def published(folder, printer):
 SIX = ["radius", "a_tower.tangential", "b_tower.tangential", "*.offset"]
 
 
-def test_klippers_answer_from_its_own_triggers(tmp_path, printer):
+def test_parameters_of_klipper_from_its_triggers(tmp_path, printer):
     """Six parameters without priors, as Klipper's search has them."""
     session = published(tmp_path, printer)
-    value = {p.name: p.value / MM for p in calibrate(session, Choice(free=SIX, prior=False)).free}
+    value = {p.name: p.value / MM for p in identified(session, Choice(free=SIX, prior=False)).free}
     radius = 140.0 + value["radius"]
     assert radius == pytest.approx(RADIUS_MM, abs=KLIPPER_MM)
     for name, angle, expected in zip("ab", (210.0, 330.0), ANGLES_DEG, strict=True):
@@ -148,9 +148,9 @@ def test_seven_triggers_determine_less_than_klipper_prints(tmp_path, printer):
     """Six decimals are printed. The readings leave a millimetre of radius, and with all errors of a
     printer they improve the offsets by half at most."""
     session = published(tmp_path, printer)
-    free = calibrate(session, Choice(free=SIX, prior=False))
+    free = identified(session, Choice(free=SIX, prior=False))
     assert free["radius"].std > 0.5e-3
-    complete = calibrate(session)
+    complete = identified(session)
     shares = {p.name: p.std / p.prior_std for p in complete.free if p.name.endswith(".offset")}
     assert min(shares.values()) > 0.4
 
@@ -168,7 +168,7 @@ def test_heights_of_printers_with_all_errors(tmp_path, printer):
     for seed in range(10):
         errors = draw_errors(robot, names, seed=seed)
         session = simulate_session(plan, errors, seed=seed).session
-        result = calibrate(session, solver="variable-projection")
+        result = identified(session)
         scores.append(recorded_scores(result, errors)[0])
         truth = LoopClosure(robot, free=names).forward(
             drives, theta=np.array([errors[n] for n in names])
@@ -186,7 +186,7 @@ def test_tool_errors_and_intervals_of_printers_with_all_errors(tmp_path, printer
     """The tool error is ten times that of other sensors: a bed does not show the scale."""
     plan = load_plan(bed(tmp_path, printer, rings()))
     space = cube(plan.robot, points_per_side=5)
-    outcome = calibrate_machines(plan, space, count=105)
+    outcome = calibrate_machines(plan, space, count=45)
     assert_promises(outcome)
     assert outcome.bound == pytest.approx(outcome.predicted, rel=0.05)
 

@@ -64,7 +64,7 @@ def evaluate(form, **values):
 
 def test_a_ball_touches_where_solids_do():
     rng, touched, missed = np.random.default_rng(0), 0, 0
-    for _ in range(COUNT // 10):
+    for _ in range(COUNT // 20):
         a, u, d, r, ball = draw(rng)
         c = a + rng.uniform(-0.2, 0.2) * u + rng.uniform(-0.01, 0.01, 3)
         found = evaluate(touch_by_ball, point=a, along=2.0 * u, radius=r + ball, tip=c, direction=d)
@@ -75,14 +75,14 @@ def test_a_ball_touches_where_solids_do():
         else:
             touched += 1
             assert found == pytest.approx(expected, abs=AGREED)
-    assert touched > 100
-    assert missed > 20
+    assert touched > 50
+    assert missed > 10
 
 
 def test_a_blade_touches_where_solids_do():
     """Its edge, an endless line, comes as near to the rod's axis as the radius."""
     rng = np.random.default_rng(1)
-    for _ in range(COUNT // 10):
+    for _ in range(COUNT // 20):
         a, u, d, r, _ = draw(rng)
         e = np.cross(u, d) + 0.1 * rng.normal(size=3)
         c = a + rng.uniform(-0.2, 0.2) * u + rng.uniform(-0.01, 0.01, 3)

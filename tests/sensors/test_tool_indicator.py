@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from bounds import bound_um
+from calibrated import identified
 from machines import frame_pose
 from scipy.spatial.transform import Rotation
 from sensor_machines import assert_promises, calibrate_machines
 from tolerances import CLOSED_FORM
 
 from orthocal import (
-    calibrate,
     load_plan,
     load_session,
     simulate_session,
@@ -198,7 +198,7 @@ def test_reversal_removes_the_error_of_the_square(tmp_path):
                 key = f"{loose}, along: {along}, reversed: {str(turned).lower()}"
                 plan.read(f"{turned}_{along}", across, key, points)
         session = simulate_session(plan.load(tmp_path / str(over)), ERRORS, seed=2)
-        result = calibrate(session.session)
+        result = identified(session.session)
         (found,) = (p for p in result.sensors if p.name == "square.granite.square")
         assert abs(found.value - session.nuisance[found.name]) < 4.0 * found.std
         return found.std
@@ -224,7 +224,7 @@ def test_bounds_beside_the_papers_readings(tmp_path, orthoglide, parts, design):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("parts", "count"),
-    [(("squares",), 340), (("plates",), 175), (("legs", "squares", "blocks"), 70)],
+    [(("squares",), 150), (("plates",), 75), (("legs", "squares", "blocks"), 40)],
 )
 def test_tool_errors_and_intervals_of_machines_with_all_errors(tmp_path, orthoglide, parts, count):
     """All errors at their priors; artefacts and mounting, too. The readings determine 3, 6 and 15

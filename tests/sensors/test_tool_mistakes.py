@@ -79,22 +79,20 @@ def test_a_mistake_is_named_with_its_place(sound, mistake):
         assert {p.setup for p in found[0].places} == {place}
 
 
-@pytest.mark.parametrize("seed", [0, 2])
-def test_a_bar_with_all_signs_reversed_is_named(tmp_path, seed):
+def test_a_bar_with_all_signs_reversed_is_named(tmp_path):
     """Beside readings of the legs; the fixed ball seems to be on the opposite side of its place."""
     plan = circles(tmp_path, legs=True)
     plan = plan.select(
         [r for r in plan.readings if not r.posture.endswith(("1", "3", "5", "7", "9"))]
     )
-    session = simulate_session(plan, errors_of(plan, seed), seed=seed).session
+    session = simulate_session(plan, errors_of(plan, 2), seed=2).session
     of_bar = np.array([session.setups[r.setup].gauge == "bar" for r in session.readings])
     (found,) = warnings_of(session.with_values(np.where(of_bar, -1.0, 1.0) * session.values))
     assert found.kind == "reversed sign"
     assert {p.setup for p in found.places} == {"xy", "yz", "zx"}
 
 
-@pytest.mark.parametrize("first", ["yz", "zx"])
-@pytest.mark.parametrize("size", [50e-6, 0.3e-3])
+@pytest.mark.parametrize(("first", "size"), [("yz", 50e-6), ("zx", 0.3e-3)])
 def test_a_ball_displaced_between_setups_is_named(tmp_path, first, size):
     plan = circles(tmp_path)
     errors = errors_of(plan, 1)
@@ -147,9 +145,9 @@ def test_a_square_that_was_turned_over_unstated_is_named(turned_over, wrong):
     assert found[0].places[0].setup == wrong[0]
 
 
-@pytest.mark.parametrize("height", [50.5, 49.0])
-def test_a_gauge_block_of_another_height_is_named(tmp_path, height):
+def test_a_gauge_block_of_another_height_is_named(tmp_path):
     """On the table and on the block by turns: nothing else explains that."""
+    height = 50.5
     plan = Plan()
     plan.legs()
     for axis, across in ("xy", "yz", "zx"):
@@ -192,11 +190,11 @@ def test_a_bar_that_was_readjusted_between_sessions_is_named(tmp_path, change):
     assert "before session session-2" in found.text
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_sessions_with_one_bar_are_not_accused(tmp_path, seed):
     assert warnings_of(two_sessions(tmp_path, seed, change=0.0)) == []
 
 
-def test_a_bar_of_another_name_has_a_length_of_its_own(tmp_path):
+def test_a_bar_of_another_name_has_another_length(tmp_path):
     """The remedy that the finding states."""
     assert warnings_of(two_sessions(tmp_path, 1, change=-0.3e-3, renamed=True)) == []

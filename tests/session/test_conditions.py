@@ -303,7 +303,7 @@ def test_an_import_changes_conditions_only_with_overwrite(tmp_path):
     assert not imported(folder, table.replace("21.0", "20.0")).changes
 
 
-def test_the_times_of_a_clock_are_left_out_unless_they_are_asked_for(tmp_path):
+def test_times_of_a_clock_are_omitted_by_default(tmp_path):
     folder = write(tmp_path / "first", PLANNED)
     table = IMPORTED.replace("2025-03-14 09:26", "9:26")
     result = imported(folder, table)

@@ -131,7 +131,7 @@ def test_joined_sessions_must_state_equal_tolerances(raw_cycles, stated, tmp_pat
     assert join_sessions(agreed).robot.parameters.stated == TOLERANCES
 
 
-def test_the_message_says_what_to_state(raw_cycles, stated, tmp_path):
+def test_the_message_names_the_key_to_state(raw_cycles, stated, tmp_path):
     other = state(raw_cycles, tmp_path, tolerances={**TOLERANCES, "*.offset_mm": 4.0})
     with pytest.raises(SessionError) as e:
         join_sessions([stated, other])

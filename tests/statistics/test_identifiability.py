@@ -64,7 +64,7 @@ def test_coefficients_are_per_unit_not_per_tolerance():
     assert found.alike[0].words == "a and b: only a + 4 b"
 
 
-def test_parameters_with_effects_below_the_noise_are_listed():
+def test_parameters_with_effects_below_the_noise_are_unobservable():
     found = analyse([A, 0.01 * B, C], ["a", "b", "c"])
     assert found.below_noise == ("b",)
     assert found.rank == 2

@@ -30,7 +30,7 @@ from orthocal.study.linearisation import build_linearisation_study
 from orthocal.study.runner import JOURNAL, open_results, run_study, to_parquet
 from orthocal.study.study import prepare_once, round_cell, run_task
 
-KILLS = 20
+KILLS = 8
 DRAWS = 60
 """Draws of each task."""
 FORK = multiprocessing.get_context("fork")
@@ -62,7 +62,7 @@ def undisturbed(study):
     return run_study(study)
 
 
-def test_killed_and_resumed_twenty_times(study, undisturbed, tmp_path):
+def test_killed_and_resumed_several_times(study, undisturbed, tmp_path):
     rng = np.random.default_rng(0)
     began = time.monotonic()
     run_task(study, 1)
@@ -94,8 +94,7 @@ def test_an_incomplete_line_is_computed_again(study, undisturbed, tmp_path):
         assert file.read_bytes() == whole
 
 
-@pytest.mark.parametrize("forked", [True, False])
-@pytest.mark.parametrize("workers", [2, 3])
+@pytest.mark.parametrize(("workers", "forked"), [(2, False), (3, True)])
 def test_results_do_not_depend_on_the_number_of_workers(
     study, undisturbed, workers, forked, monkeypatch
 ):

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibrated import identified
 from gauges import exact
 from scipy.optimize import least_squares
 
-from orthocal import Choice, calibrate, load_session
+from orthocal import Choice
 from orthocal.errors import NotIdentifiableError, ParameterError
 from orthocal.estimation.diagnostics.profile_likelihood import END_TOLERANCE, profile_interval
 from orthocal.estimation.fit import fit_problem
@@ -18,8 +19,8 @@ from orthocal.statistics.chance import confidence_factor
 from orthocal.statistics.zeros import project_out_zeros
 
 
-def test_where_the_problem_is_nearly_linear_it_is_students_interval(raw_cycles):
-    result = calibrate(raw_cycles, profile=["x_slide.offset"])
+def test_nearly_linear_problems_have_students_interval(raw_cycles):
+    result = identified(raw_cycles, profile=["x_slide.offset"])
     p = result["x_slide.offset"]
     # that of the readings' scatter, and beside it what errors that were not free may have done
     bias, known = result.unmodelled.bias_covariance[0, 0], result.model_covariance[0, 0]
@@ -31,7 +32,7 @@ def test_where_the_problem_is_nearly_linear_it_is_students_interval(raw_cycles):
     assert result["y_slide.offset"].interval is None
 
 
-def test_its_ends_cost_what_they_should_by_another_solver(experiment_2):
+def test_ends_of_an_interval_have_the_expected_cost_by_another_solver(experiment_2):
     """SciPy on the reduced problem, the offset held at the ends of its interval."""
     fit = fit_problem(build_problem(experiment_2, model="offsets"))
     problem, sigma = fit.problem, fit.noise.sigma
@@ -52,7 +53,7 @@ def test_its_ends_cost_what_they_should_by_another_solver(experiment_2):
         assert 2.0 * (cost(end) - best) == pytest.approx(factor**2, rel=5e-3)
 
 
-def test_where_the_problem_bends_it_is_not_symmetric(experiment_2):
+def test_the_interval_of_a_nonlinear_problem_is_not_symmetric(experiment_2):
     """At 99.9 % and three degrees of freedom the interval is 10 mm wide."""
     fit = fit_problem(build_problem(exact(experiment_2), model="offsets"))
     p = fit.solution.theta[0]
@@ -64,7 +65,7 @@ def test_where_the_problem_bends_it_is_not_symmetric(experiment_2):
 
 
 def test_a_bound_ends_an_interval(experiment_2):
-    result = calibrate(
+    result = identified(
         experiment_2,
         Choice(bounds={"x_slide.offset_m": (-1e-3, 0.5e-3)}),
         profile=["x_slide.offset"],
@@ -72,9 +73,8 @@ def test_a_bound_ends_an_interval(experiment_2):
     assert result["x_slide.offset"].interval == pytest.approx((-1e-3, 0.5e-3))
 
 
-def test_beside_a_prior_it_is_that_of_the_posterior(root):
-    session = load_session(root / "examples/raw-cycles")
-    result = calibrate(session, "lengths", profile=["x_leg.length"])
+def test_the_interval_with_a_prior_is_that_of_the_posterior(raw_cycles):
+    result = identified(raw_cycles, "lengths", profile=["x_leg.length"])
     p = result["x_leg.length"]
     i = [q.name for q in result.free].index(p.name)
     bias = np.sqrt(result.unmodelled.bias_covariance[i, i])
@@ -83,12 +83,12 @@ def test_beside_a_prior_it_is_that_of_the_posterior(root):
     assert p.interval == pytest.approx((p.value - half, p.value + half), abs=0.02 * half)
 
 
-def test_without_noise_or_a_free_parameter_there_is_none(experiment_2):
+def test_without_noise_or_a_free_parameter_there_is_no_interval(experiment_2):
     rows = tuple(experiment_2.readings[i] for i in (2, 0, 4))
     session = replace(experiment_2, readings=rows).with_gauge(
         replace(experiment_2.gauge, sigma=None)
     )
     with pytest.raises(NotIdentifiableError, match="the noise is unknown"):
-        calibrate(session, profile=["x_slide.offset"])
+        identified(session, profile=["x_slide.offset"])
     with pytest.raises(ParameterError, match="no free parameter to find the interval of"):
-        calibrate(experiment_2, profile=["x_leg.length"])
+        identified(experiment_2, profile=["x_leg.length"])

@@ -1,13 +1,16 @@
-"""What unmodelled errors do to an estimate: the formula against machines that have them."""
+"""Effect of unmodelled errors on an estimate: the formula against machines with these errors."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from calibrated import identified
 from drawn_machines import DrawnMachines
+from intervals import recorded_scores
 from models import JOINTS
+from scipy.stats import binom, chi2
 
-from orthocal import Choice, calibrate, simulate_session
+from orthocal import Choice, simulate_session
 from orthocal.assessment.judgement import FALSE_ALARM_RATE
 from orthocal.calibration import build_record as recording
 from orthocal.estimation.diagnostics.unmodelled import (
@@ -23,8 +26,16 @@ from orthocal.statistics.distributions import chi_square_tail
 from orthocal.statistics.zeros import project_out_zeros
 
 
-@pytest.mark.parametrize("name", ["x_slide.rz", "x_swivel.x", "y_coupler.x", "z_bar_b.z"])
-@pytest.mark.parametrize("model", ["offsets", "lengths"])
+@pytest.mark.parametrize(
+    ("model", "name"),
+    [
+        ("offsets", "x_slide.rz"),
+        ("offsets", "y_coupler.x"),
+        ("lengths", "x_swivel.x"),
+        ("lengths", "y_coupler.x"),
+        ("lengths", "z_bar_b.z"),
+    ],
+)
 def test_an_unmodelled_error_moves_the_estimate_by_its_leakage(exact_plan, name, model):
     """Perfect readings of a machine with one small error, calibrated without it."""
     probe = simulate_session(exact_plan, {}, exact=True).session
@@ -56,22 +67,22 @@ def machines(exact_plan):
     theta = BatchSolver(offsets).solve(values, sigma=1e-5).theta
     found, _, reached = offsets.simulate(theta)
     assert reached.all()
-    left = [project_out_zeros(r, offsets.observations) for r in values - found]
-    return theta, np.array(left)
+    residuals = [project_out_zeros(r, offsets.observations) for r in values - found]
+    return theta, np.array(residuals)
 
 
 @pytest.fixture(scope="module")
 def result(exact_plan):
-    return calibrate(simulate_session(exact_plan, {}, exact=True).session)
+    return identified(simulate_session(exact_plan, {}, exact=True).session)
 
 
-def test_residuals_of_machines_with_all_errors_are_as_large_as_foretold(result, machines):
+def test_residuals_of_machines_with_all_errors_have_the_predicted_rms(result, machines):
     rms = np.sqrt(np.mean(machines[1] ** 2))
     assert rms == pytest.approx(result.unmodelled.residual_rms, rel=0.06)
 
 
-def test_one_machine_in_a_hundred_leaves_as_much_as_is_called_worse(result, machines):
-    """Residuals' squares scatter as χ² of so many parts does; few machines are beyond its 99 %."""
+def test_one_machine_in_a_hundred_exceeds_the_limit_of_residuals(result, machines):
+    """Squares of residuals scatter as χ²; few machines are beyond its 99 %."""
     parts = result.unmodelled.residual_dof
     squares = np.mean(machines[1] ** 2, axis=1) / result.unmodelled.residual_rms**2
     assert 2.0 / squares.var() == pytest.approx(parts, rel=0.25)
@@ -79,8 +90,8 @@ def test_one_machine_in_a_hundred_leaves_as_much_as_is_called_worse(result, mach
     assert 0.0 < beyond < 0.025  # 10 of 1,000, and three standard deviations
 
 
-def test_the_offsets_of_machines_with_all_errors_scatter_as_foretold(result, machines):
-    """Whitened by the covariance foretold they are standard normal."""
+def test_offsets_of_machines_with_all_errors_have_the_predicted_covariance(result, machines):
+    """Whitened by the predicted covariance they are standard normal."""
     root = np.linalg.cholesky(result.unmodelled.bias_covariance)
     white = np.linalg.solve(root, machines[0].T)
     spread = np.linalg.eigvalsh(white @ white.T / white.shape[1])
@@ -101,48 +112,51 @@ def test_a_machine_has_all_errors_of_its_parts(orthoglide, biglide):
     assert not any(n.startswith("frame.x_tip") for n in machine_errors(biglide))
 
 
-def test_the_full_model_leaves_nothing_out(exact_plan):
+def test_the_full_model_has_no_unmodelled_errors(exact_plan):
     session = simulate_session(exact_plan, {"x_slide.offset": 1e-3}, seed=1).session
-    assert calibrate(session, "full").unmodelled.names == ()
+    assert identified(session, "full").unmodelled.names == ()
     free = exact_plan.robot.parameters.select(JOINTS)
-    found = calibrate(session, Choice(free=JOINTS, prior=True)).unmodelled
+    found = identified(session, Choice(free=JOINTS, prior=True)).unmodelled
     assert set(found.names) == set(machine_errors(exact_plan.robot)) - set(free)
     assert found.leakage.shape == (126, len(found.names))
     assert len(found.names) == 3 * 4 + 12 + 3  # ends of rods, feet, scales
 
 
-def test_with_a_sum_free_its_parts_may_still_differ(exact_plan):
-    """A leg's length is told by its coupler; the second rod may be longer than the first."""
+def test_parts_of_a_free_sum_may_differ(exact_plan):
+    """The coupler has the length of a leg; the second rod may be longer than the first."""
     session = simulate_session(exact_plan, {"x_slide.offset": 1e-3}, seed=1).session
-    found = calibrate(session, "lengths").unmodelled
+    found = identified(session, "lengths").unmodelled
     assert "x_coupler.x" not in found.names
     assert "frame.x_rod_b_tip.x" in found.names
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["offsets", "lengths"])
-def test_intervals_hold_what_they_say_with_all_errors_at_their_tolerances(
-    exact_plan, model, monkeypatch
-):
-    """100 sessions: what scatter alone would promise is missed by far, all together is not.
+def test_uncertainties_contain_unmodelled_errors(exact_plan, model, monkeypatch):
+    """30 machines with all errors: independent scores of three offsets each, 99 % band of χ².
 
-    Of 300 intervals of three offsets 95 % have a standard error of 1.3 %.
+    The scatter of the readings alone is exceeded by far.
     """
     machines = DrawnMachines(exact_plan, model=model)
-    # they hardly change from machine to machine, and take longest to find
+    # they hardly depend on the machine, and take longest to find
     monkeypatch.setattr(recording, "find_unmodelled_errors", lambda *_, **__: machines.others)
     known = machines.machine.free
-    free = [known.index(n) if n in known else -1 for n in machines.problem.free]
-    hits, scatter_hits, count = 0, 0, 0
-    for seed in range(100):
+    offsets = {n: known.index(n) for n in machines.problem.free if n in known}
+    scores, of_scatter, covered = [], [], []
+    for seed in range(30):
         rng = np.random.default_rng(seed)
         errors = machines.draw(rng)
-        fit = machines.fit(machines.read(rng, errors))
-        result = recording.assemble_calibration(fit)
-        for p, (low, high), at in zip(result.free, result.intervals, free, strict=True):
-            if at >= 0:
-                hits += low <= errors[at] <= high
-                scatter_hits += abs(p.value - errors[at]) < 2.0 * p.std_scatter
-                count += 1
-    assert 0.93 < hits / count < 0.99
-    assert scatter_hits / count < 0.6
+        result = recording.assemble_calibration(machines.fit(machines.read(rng, errors)))
+        truth = {n: errors[i] for n, i in offsets.items()}
+        scores.append(recorded_scores(result, truth)[0])
+        ends = dict(zip((p.name for p in result.free), result.intervals, strict=True))
+        for name, value in truth.items():
+            covered.append(ends[name][0] <= value <= ends[name][1])
+            of_scatter.append((result[name].value - value) / result[name].std_scatter)
+    count = np.size(scores)
+    assert count == 90
+    low, high = chi2.interval(0.99, count)
+    assert low < np.square(scores).sum() < high
+    assert np.mean(np.abs(of_scatter) < 2.0) < 0.6
+    # three offsets of a machine are correlated: the band of as many machines
+    assert np.mean(covered) >= binom.ppf(0.005, count // 3, 0.95) / (count // 3)

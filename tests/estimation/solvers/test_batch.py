@@ -15,7 +15,7 @@ from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
 
 SIGMA = 10e-6
-SETS = 40
+SETS = 12
 SHOWN = 4
 """Sets that are solved alone too."""
 
@@ -33,16 +33,19 @@ def draw(problem, spread=0.4, sets=SETS):
     return readings + noise, theta
 
 
-@pytest.mark.parametrize("loss", ["squares", "huber"])
+BOUNDS = {"bounds": {"x_slide.offset": (-1e-3, 1e-3)}}
+
+
 @pytest.mark.parametrize(
-    "given",
+    ("loss", "given"),
     [
-        {},
-        {"prior": True},
-        {"bounds": {"x_slide.offset": (-1e-3, 1e-3)}},
-        {"known": {"y_slide.offset": (0.1e-3, 0.05e-3)}},
+        ("squares", {}),
+        ("squares", BOUNDS),
+        ("squares", {"known": {"y_slide.offset": (0.1e-3, 0.05e-3)}}),
+        ("huber", {"prior": True}),
+        ("huber", BOUNDS),
     ],
-    ids=["plain", "prior", "bounds", "known"],
+    ids=["plain", "bounds", "known", "huber-prior", "huber-bounds"],
 )
 def test_each_set_has_the_optimum_that_it_has_alone(root, loss, given):
     session = exact(load_session(root / "examples/table1/experiment-2"))
@@ -91,9 +94,8 @@ def test_many_parameters_are_solved_at_once(sweep, loss):
 
 
 def test_a_machine_far_off_is_solved_alone_and_one_at_a_bound_is_not(root):
-    bounds = {"x_slide.offset": (-1e-3, 1e-3)}
     session = exact(load_session(root / "examples/sweep"))
-    problem = build_problem(session, model="full", bounds=bounds)
+    problem = build_problem(session, model="full", **BOUNDS)
     values, truth = draw(problem)
     values[3] += 2e-3 * np.sin(np.arange(values.shape[1]))  # hardly a machine reads like this
     found = BatchSolver(problem).solve(values, sigma=SIGMA)

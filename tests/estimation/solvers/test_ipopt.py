@@ -21,7 +21,6 @@ from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.statistics.zeros import project_out_zeros
 
 HUBER = Loss("huber")
-LOSSES = [SQUARES, HUBER]
 
 
 @pytest.fixture(scope="module")
@@ -41,9 +40,17 @@ def point(program, problem, size, seed=0):
     return x, program.parameter_values(sigma=2e-4, excluded=[1, 4])
 
 
-@pytest.mark.parametrize("size", [0.0, 1.5])
-@pytest.mark.parametrize("loss", LOSSES)
-@pytest.mark.parametrize("model", ["offsets", "lengths", "full"])
+@pytest.mark.parametrize(
+    ("model", "loss", "size"),
+    [
+        ("offsets", SQUARES, 0.0),
+        ("offsets", HUBER, 1.5),
+        ("lengths", SQUARES, 1.5),
+        ("full", HUBER, 0.0),
+        ("full", SQUARES, 1.5),
+    ],
+    ids=str,
+)
 def test_gradient_and_jacobian_are_exact(perfect, model, loss, size):
     problem = build_problem(perfect, model=model, prior=True)
     program = NonlinearProgram(problem, options=SolverOptions(loss=loss))
@@ -64,8 +71,11 @@ def test_gradient_and_jacobian_are_exact(perfect, model, loss, size):
     assert (np.abs(exact - numeric) / scale).max() < DERIVATIVE
 
 
-@pytest.mark.parametrize("size", [0.0, 1.5])
-@pytest.mark.parametrize(("model", "loss"), [("offsets", HUBER), ("full", SQUARES)])
+@pytest.mark.parametrize(
+    ("model", "loss", "size"),
+    [("offsets", HUBER, 0.0), ("offsets", HUBER, 1.5), ("full", SQUARES, 1.5)],
+    ids=str,
+)
 def test_the_exact_hessian_is_that_of_the_lagrangian(perfect, model, loss, size):
     problem = build_problem(perfect, model=model, prior=True)
     program = NonlinearProgram(problem, options=SolverOptions(hessian="exact", loss=loss))
@@ -110,7 +120,7 @@ def test_the_gauss_newton_hessian_is_the_exact_one_without_curvature(perfect):
 def test_perfect_data_give_the_truth_back_from_any_start(perfect, hessian):
     problem = build_problem(perfect, model="offsets")
     program = NonlinearProgram(problem, options=SolverOptions(hessian=hessian))
-    random = np.random.default_rng(0).uniform(-0.02, 0.02, (7, 3))
+    random = np.random.default_rng(0).uniform(-0.02, 0.02, (4, 3))
     for start in ([0.02, -0.02, 0.02], *random):
         solution = program.solve(sigma=1e-5, start=start)
         assert np.abs(solution.theta - list(TRUTH.values())).max() < TRUTH_BACK
@@ -119,7 +129,8 @@ def test_perfect_data_give_the_truth_back_from_any_start(perfect, hessian):
 
 @pytest.mark.parametrize(
     ("model", "loss"),
-    [("offsets", SQUARES), ("offsets", HUBER), ("lengths", HUBER), ("full", SQUARES)],
+    [("offsets", HUBER), ("full", SQUARES)],
+    ids=str,
 )
 def test_both_hessians_reach_the_same_optimum(exact_plan, model, loss):
     session = simulate_session(exact_plan, TRUTH, seed=3).session
@@ -136,11 +147,10 @@ def test_both_hessians_reach_the_same_optimum(exact_plan, model, loss):
     assert abs(found[0].objective / found[1].objective - 1.0) < 1e-9
 
 
-@pytest.mark.parametrize("model", ["offsets", "lengths"])
-def test_another_solver_finds_the_same(exact_plan, model):
+def test_another_solver_finds_the_same(exact_plan):
     """SciPy's least squares on the reduced problem, loops closed by Newton at every step."""
     session = simulate_session(exact_plan, TRUTH, seed=4).session
-    problem = build_problem(session, model=model)
+    problem = build_problem(session, model="lengths")
     solution = NonlinearProgram(problem).solve(sigma=1e-5)
 
     def residuals(theta_hat):

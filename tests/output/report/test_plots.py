@@ -67,7 +67,8 @@ def raw():
 
 @pytest.fixture(scope="module")
 def bound(experiment_2):
-    return calibrate(experiment_2, Choice(bounds={"x_slide.offset_m": (-0.1e-3, 0.1e-3)}))
+    choice = Choice(bounds={"x_slide.offset_m": (-0.1e-3, 0.1e-3)})
+    return calibrate(experiment_2, choice, solver="variable-projection")
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +80,7 @@ def unknown(root, tmp_path_factory):
     (folder / "session.yaml").write_text(text.replace("sigma_mm: 0.02, ", ""))
     rows = (source / "readings.csv").read_text().splitlines()
     (folder / "readings.csv").write_text("\n".join(rows[:2]) + "\n")
-    return calibrate(load_session(folder), "full")
+    return calibrate(load_session(folder), "full", solver="variable-projection")
 
 
 @pytest.fixture(scope="module")
@@ -260,7 +261,7 @@ def test_the_band_is_two_sigma_of_each_row(table1):
         np.testing.assert_allclose(width, 4.0 * sigma, atol=UNIT)
 
 
-def test_of_many_readings_the_largest_are_shown_and_that_is_said(sweep):
+def test_of_many_readings_the_largest_are_shown_with_a_note(sweep):
     assert "Readings before and after calibration: the 40 worst of 162" in texts(
         reading_plots.plot_residuals(sweep)
     )
@@ -439,7 +440,7 @@ def test_error_of_linearising_is_in_sigma_the_largest_first(sweep):
     assert axes.get_xlim()[1] > 0.1
 
 
-def test_linearised_solution_is_left_out_if_it_is_not_comparable(table1, bound, unknown):
+def test_the_linearised_solution_is_omitted_if_it_is_not_comparable(table1, bound, unknown):
     assert parameter_plots.plot_linearised(table1)
     assert parameter_plots.plot_linearised(unknown) == ""
     robust = replace(table1, solver=replace(table1.solver, loss="huber"))
@@ -454,7 +455,7 @@ def test_linearised_solution_is_left_out_if_it_is_not_comparable(table1, bound, 
     ]
 
 
-def test_few_parameters_are_in_their_own_unit(table1):
+def test_few_parameters_are_in_their_units(table1):
     figure = parameter_plots.plot_parameters.figure(table1)
     (axes,) = figure.axes  # without a prior the readings told all
     assert axes.get_xlabel() == "estimate [mm]"

@@ -19,6 +19,7 @@ from orthocal.output.report import tool_map
 from orthocal.printers.settings import DeltaSettings
 from orthocal.robot.model import Tcp
 
+QUICK = {"solver": "variable-projection"}
 SVG = "{http://www.w3.org/2000/svg}"
 
 GRID = 1e-9
@@ -35,7 +36,7 @@ WHICH = ("now", "entered", "uncertainty")
 
 @pytest.fixture(scope="module")
 def table1(experiment_2):
-    return calibrate(experiment_2, Choice(model="lengths", prior=True))
+    return calibrate(experiment_2, Choice(model="lengths", prior=True), **QUICK)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +59,7 @@ def planar(root, tmp_path_factory):
     )
     truth = {"x_slide.offset": 0.7e-3, "y_slide.offset": -1.1e-3}
     plan = load_plan(folder / "plan.yaml")
-    return calibrate(simulate_session(plan, truth, seed=1).session)
+    return calibrate(simulate_session(plan, truth, seed=1).session, **QUICK)
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +140,7 @@ def test_uncertainty_within_tolerances_is_that_of_the_assessment(planar):
 
 def test_a_machine_worse_than_its_tolerances_is_known_less_well(experiment_2):
     """The paper's machine has errors above its tolerances."""
-    calibration = calibrate(experiment_2)
+    calibration = calibrate(experiment_2, **QUICK)
     accuracy, excess = assess_tool(calibration), calibration.tolerance_scale.factor
     assert excess > 1.5
     within = assess_tool(identify(experiment_2, "offsets")[0])

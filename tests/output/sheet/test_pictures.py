@@ -117,7 +117,7 @@ def test_a_label_keeps_off_lines_and_stays_near_its_point():
     assert label.text == "rod a"
 
 
-def test_labels_without_room_are_left_out():
+def test_labels_without_room_are_omitted():
     picture = Picture(20.0, 8.0)
     for text in ("first", "second", "a label that is longer than the paper"):
         picture.label((10.0, 4.0), text)

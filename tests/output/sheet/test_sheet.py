@@ -161,7 +161,7 @@ def test_alignment_posture_comes_before_the_first(small):
     assert "gauge zero" in steps[3]
 
 
-def test_steps_say_how_to_mount_and_set_the_gauge(page):
+def test_steps_state_how_to_mount_and_align_the_gauge(page):
     ball, blade, line, pin = (words(s) for s in sections(page))
     for text in (ball, blade, line, pin):
         assert "The reading must grow. If it falls, enter every reading of this setup" in text
