@@ -64,7 +64,7 @@ def measure(folder, session, errors, seed):
 
 
 @pytest.fixture(scope="module")
-def machine(tmp_path_factory, short_reports):
+def machine(tmp_path_factory, short_reports, single_start):
     """Directory with a planned machine, its plan with a ball bar, and the machine's errors."""
     folder = tmp_path_factory.mktemp("bar")
     (folder / "bar.yaml").write_text(BAR)
