@@ -523,7 +523,7 @@ def test_linuxcnc_triggers_a_logger_in_every_posture_of_a_ball_bar(small, bar, t
     """At each trigger the slides rest in the posture, and the bar shows its simulated reading."""
     bar = replace(bar, readings=bar.readings[3:])  # quarters of circles
     (motion,), dwell = plan_motion(bar), 0.2
-    options = ProgramOptions(12_000.0, 3_000.0, dwell=dwell, trigger="0")
+    options = ProgramOptions(6000.0, 1500.0, dwell=dwell, trigger="0")
     program = write_program(bar, motion, options)
     recorded, (pauses,) = _run_nominal(small, program, tmp_path, output=True)
     assert len(pauses) == 2  # before the first motion, and where the bar is mounted
