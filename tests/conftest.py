@@ -56,7 +56,7 @@ def pytest_sessionstart(session):
 MORE_GARBAGE = (20_000, 20, 20)
 """Objects, and passes, after which garbage is looked for."""
 
-LONGEST = ("test_examples.py", "test_whole_walk.py", "test_fuzz.py")
+LONGEST = ("test_examples.py", "test_command_line_use.py", "test_fuzz.py")
 """Files with tests that take as long as a hundred others."""
 
 IN_LINUXCNC = (

@@ -359,7 +359,7 @@ def test_measurements_that_do_not_fit_are_named(printer, old, new, named):
         printer.session(analysis().replace(old, new, 1))
 
 
-def test_klippers_own_log_and_saved_distances(printer):
+def test_log_and_saved_distances_of_klipper(printer):
     """klippy.log has brackets; printer.cfg has distances less pillars, with stable positions."""
     plain = printer.session(analysis())
     logged = analysis().replace("=", " = [").replace(" CENTER_P", "]\nDELTA_ANALYZE CENTER_P")

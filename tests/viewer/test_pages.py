@@ -115,7 +115,7 @@ def test_scene_draws_without_requests(drawn):
     assert "deviation × 12" in text
 
 
-def test_whole_machine_is_in_view_beside_the_panels_at_every_size(drawn):
+def test_complete_machine_is_in_view_beside_the_panels_at_every_size(drawn):
     for size in SIZES:
         drawn.resize(size)
         left, right, top, bottom = drawn.page.evaluate(

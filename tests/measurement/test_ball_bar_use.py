@@ -48,8 +48,10 @@ def read(plan, errors, seed):
     observations, rng = build_observations(plan), np.random.default_rng(seed)
     drawn = []
     for p in nuisance_parameters(plan).parameters:
-        own = np.random.default_rng([SEED, *p.name.encode()]).normal()
-        drawn.append(CARE * p.prior_std * (own if p.name.startswith("gauge.") else rng.normal()))
+        of_gauge = np.random.default_rng([SEED, *p.name.encode()]).normal()
+        drawn.append(
+            CARE * p.prior_std * (of_gauge if p.name.startswith("gauge.") else rng.normal())
+        )
     exact = predict_readings(plan, errors, observations=observations, nuisance=np.array(drawn))
     shown, _ = show_readings(plan, observations, exact, rng=rng)
     return observations.rows(shown)
