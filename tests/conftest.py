@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from unittest.mock import patch
 
@@ -18,6 +19,7 @@ import pytest
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from gauges import exact
 
+import orthocal
 from orthocal import load_plan, load_robot, load_session
 from orthocal.robot import loading
 from orthocal.robot.model import Robot
@@ -54,7 +56,7 @@ def pytest_sessionstart(session):
 MORE_GARBAGE = (20_000, 20, 20)
 """Objects, and passes, after which garbage is looked for."""
 
-LONGEST = ("test_examples.py", "test_whole_walk.py", "test_fuzz.py")
+LONGEST = ("test_examples.py", "test_command_line_use.py", "test_fuzz.py")
 """Files with tests that take as long as a hundred others."""
 
 IN_LINUXCNC = (
@@ -144,6 +146,13 @@ def no_sensor_gains():
     with ExitStack() as patches:
         for module in (accuracy, first_plan, plan):
             patches.enter_context(patch.object(module, "find_sensor_gains", lambda *_: ()))
+        yield
+
+
+@pytest.fixture(scope="module")
+def single_start():
+    """Plans of `orthocal new` from one start of the search, which tests/planning verify."""
+    with patch.object(orthocal, "plan_readings", partial(orthocal.plan_readings, starts=1)):
         yield
 
 

@@ -61,11 +61,15 @@ def close(drives, lengths, start):
             rows += [tool - ends[0][0], (relative - relative.T)[[2, 0, 1], [1, 2, 0]]]
         return np.concatenate(rows)
 
-    angles = start
-    for _ in range(5):
-        slopes = central_differences(open_by, angles, step=1e-5)
-        angles = angles - np.linalg.solve(slopes, open_by(angles))
-    assert np.abs(open_by(angles)).max() < 1e-14
+    angles, opening = start, open_by(start)
+    for step in range(15):
+        if np.abs(opening).max() < 1e-14:
+            break
+        if step % 3 == 0:  # a Jacobian takes 36 evaluations, and changes little
+            jacobian = central_differences(open_by, angles, step=1e-5)
+        angles = angles - np.linalg.solve(jacobian, opening)
+        opening = open_by(angles)
+    assert np.abs(opening).max() < 1e-14
     return angles, follow(AXES[0], drives[0], angles[:6], lengths[:2])[0]
 
 

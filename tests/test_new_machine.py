@@ -223,8 +223,8 @@ def test_readings_are_not_overwritten(copied):
 
 
 @pytest.fixture(scope="module")
-def planned(tmp_path_factory, short_reports):
-    """A machine with a workspace and a tolerance by option, and a plan of a quarter of an hour."""
+def planned(tmp_path_factory, short_reports, single_start):
+    """A machine with options for its workspace and a tolerance, and a plan of 15 minutes."""
     mill = tmp_path_factory.mktemp("planned") / "mill"
     words = options(workspace_mm="40", tolerance="*.offset_mm=4", hours="0.25")
     return mill, orthocal("new", mill, *words)
@@ -485,10 +485,10 @@ def test_the_first_plan_of_a_delta_is_its_bed_and_names_what_helps(tmp_path):
     assert load_robot(tmp_path / "delta").workspace.tolist()[2] == [0.0, 0.14]
 
 
-def test_sensors_that_one_has_are_planned(tmp_path):
+def test_stated_sensors_are_planned(tmp_path, single_start, without_sensor_gains):
     bar = "sensor: ball_bar\nsigma_mm: 0.002\nrange_mm: [-5, 5]\nlength_mm: 50\n"
     (tmp_path / "bar.yaml").write_text(bar)
-    words = ["--with", tmp_path / "bar.yaml", "--hours", "0.5", "--tolerance", "*.offset_mm=1"]
+    words = ["--with", tmp_path / "bar.yaml", "--hours", "0.4", "--tolerance", "*.offset_mm=1"]
     code, said, err = orthocal("new", tmp_path / "delta", *DELTA, *words)
     assert code == 0, err
     session = load_plan(tmp_path / "delta/first")

@@ -17,9 +17,11 @@ from orthocal import (
     summarize,
 )
 from orthocal.calibration.file import calibration_document, write_calibration
+from orthocal.calibration.identify import identify
 from orthocal.errors import SessionError
 from orthocal.estimation import fit as fit_module
 from orthocal.estimation.fit import fit_problem
+from orthocal.estimation.loss import Loss
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.estimation.solvers.variable_projection import VariableProjection
@@ -35,8 +37,14 @@ def sweep(root):
     return load_session(root / "examples/sweep")
 
 
-def half(session, setups):
-    """The session's readings of some setups, the others never stood."""
+def estimate(*arguments, **options):
+    """Calibration without its assessment, which the assertions do not read."""
+    calibration, _ = identify(*arguments, **options)
+    return calibration
+
+
+def part_of(session, setups):
+    """Part of a session that has some of its setups."""
     return replace(
         session,
         setups={n: s for n, s in session.setups.items() if n in setups},
@@ -48,29 +56,26 @@ def half(session, setups):
 @pytest.mark.parametrize(
     ("model", "solver"), [("offsets", "ipopt"), ("full", "variable-projection")]
 )
-def test_two_halves_are_the_whole(sweep, model, solver):
-    """Setups in two sessions of one gauge, without its σ: what they find is what one finds.
-
-    With one noise for both: it is estimated for each session, and fixed here by stating it.
-    """
+def test_a_session_divided_into_two_gives_the_same_estimates(sweep, model, solver):
+    """With a stated noise of the gauge; otherwise each session has its estimated noise."""
     names = list(sweep.setups)
     stated = sweep.with_gauge(replace(sweep.gauge, sigma=0.5e-3, resolution=None))
-    parts = [half(stated, names[:3]), half(stated, names[3:])]
+    parts = [part_of(stated, names[:3]), part_of(stated, names[3:])]
     options = SolverOptions(solver=solver)
-    whole = calibrate(stated, model, solver=options)
-    joined = calibrate(parts, model, solver=options)
-    assert whole.noise.source == joined.noise.source == "gauge"
-    for p, q in zip(whole.free, joined.free, strict=True):
+    undivided = estimate(stated, model, solver=options)
+    joined = estimate(parts, model, solver=options)
+    assert undivided.noise.source == joined.noise.source == "gauge"
+    for p, q in zip(undivided.free, joined.free, strict=True):
         assert q.value == pytest.approx(p.value, abs=1e-9 * p.prior_std)
         assert q.std == pytest.approx(p.std, rel=1e-9)
-    assert [r.measured for r in joined.residuals] == [r.measured for r in whole.residuals]
-    left = np.array([[r.residual for r in c.residuals] for c in (whole, joined)])
-    assert np.abs(left[0] - left[1]).max() < 1e-12
+    assert [r.measured for r in joined.residuals] == [r.measured for r in undivided.residuals]
+    residuals = np.array([[r.residual for r in c.residuals] for c in (undivided, joined)])
+    assert np.abs(residuals[0] - residuals[1]).max() < 1e-12
 
 
 def test_a_session_counted_twice_halves_the_variance(raw_cycles):
     stated = exact(raw_cycles).with_gauge(replace(raw_cycles.gauge, sigma=50e-6, resolution=None))
-    once, twice = calibrate(stated), calibrate([stated, stated])
+    once, twice = estimate(stated), estimate([stated, stated])
     assert twice.model_covariance == pytest.approx(0.5 * once.model_covariance, rel=1e-7)
     for p, q in zip(once.free, twice.free, strict=True):
         assert q.value == pytest.approx(p.value, abs=1e-12)
@@ -78,18 +83,18 @@ def test_a_session_counted_twice_halves_the_variance(raw_cycles):
 
 
 def test_offsets_that_were_active_may_differ(root):
-    """Monday without any, Tuesday with Monday's: together they tell one machine."""
+    """Monday without active offsets, Tuesday with those of Monday: one machine."""
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
     monday = simulate_session(plan, TRUTH, exact=True).session
     entered = plan.with_controller([1.1e-3, -0.7e-3, 0.4e-3])
     tuesday = simulate_session(entered, TRUTH, exact=True).session
-    found = calibrate([monday, tuesday])
+    found = estimate([monday, tuesday])
     for name, value in TRUTH.items():
         assert found[name].value == pytest.approx(value, abs=1e-9)
     # what is entered next comes on top of what is active now
     assert found.active_offsets.tolist() == [1.1e-3, -0.7e-3, 0.4e-3]
     wrong = tuesday.with_controller(np.zeros(3))  # the readings contradict that
-    assert calibrate([monday, wrong]).rms_after > 5e-5 > 1e-8 > found.rms_after
+    assert estimate([monday, wrong]).rms_after > 5e-5 > 1e-8 > found.rms_after
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
@@ -98,7 +103,7 @@ def test_deviations_before_are_with_the_offsets_of_each_session(root, order):
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
     entered = plan.with_controller([1.1e-3, -0.7e-3, 0.4e-3])
     parts = [simulate_session(p, TRUTH, seed=k).session for k, p in enumerate((plan, entered))]
-    alone = [[r.deviation for r in calibrate(part, "offsets").residuals] for part in parts]
+    alone = [[r.deviation for r in estimate(part, "offsets").residuals] for part in parts]
     largest = [np.abs(deviations).max() for deviations in alone]
     assert largest[0] > 3.0 * largest[1]
     joined = calibrate([parts[k] for k in order], "offsets")
@@ -109,19 +114,19 @@ def test_deviations_before_are_with_the_offsets_of_each_session(root, order):
     assert [r.deviation for r in joined.residuals] == pytest.approx(expected, abs=1e-9)
 
 
-def test_noise_is_told_for_each_session(root):
-    """A dial of 5 µm and one of 40: as each alone is found, and the better one counts more."""
+def test_noise_is_estimated_for_each_session(root):
+    """Dials of 5 µm and of 40 µm: noise as if calibrated alone; the better one counts more."""
     plan = exact(load_plan(root / "examples/raw-cycles/plan.yaml"))
     plan = plan.with_gauge(replace(plan.gauge, sigma=None, resolution=None))
     fine = simulate_session(plan, TRUTH, seed=1, sigma=5e-6).session
     coarse = simulate_session(plan, TRUTH, seed=2, sigma=40e-6).session
-    found = calibrate([coarse, fine])
+    found = estimate([coarse, fine])
     assert [g.noise for g in found.gauges] == [
-        pytest.approx(calibrate(s).noise.sigma, rel=0.1) for s in (coarse, fine)
+        pytest.approx(estimate(s).noise.sigma, rel=0.1) for s in (coarse, fine)
     ]
     assert found.gauges[0].noise == pytest.approx(40e-6, rel=0.4)
     assert found.gauges[1].noise == pytest.approx(5e-6, rel=0.4)
-    alone = calibrate(fine)
+    alone = estimate(fine)
     for p, q in zip(alone.free, found.free, strict=True):
         assert q.std_scatter < p.std_scatter
         assert q.std_scatter > 0.9 * p.std_scatter
@@ -151,7 +156,7 @@ def test_deviations_of_mixed_sessions_are_those_of_many(root):
         std = np.sqrt(np.diag(fit.covariance())[:n])
         scores.append((values - [TRUTH[name] for name in names]) / std)
     assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1.0, abs=0.2)
-    found = calibrate(pair, solver=options)
+    found = estimate(pair, solver=options)
     assert [p.name for p in found.free] == list(names)
     assert [p.value for p in found.free] == values.tolist()
     known = np.sqrt(np.diag(found.model_covariance))
@@ -166,19 +171,17 @@ def test_both_solvers_weigh_gauges_alike(root):
     problem = build_problem(join_sessions(pair), model="lengths")
     problem = problem.with_noise_ratio(np.repeat([1.0, 0.25], problem.observations.size // 2))
     for loss in ("squares", "huber"):
-        from orthocal.estimation.loss import Loss
-
         options = SolverOptions(loss=Loss(loss))
         ours = VariableProjection(problem, options=options).solve(sigma=2e-5)
         for hessian in ("gauss-newton", "exact"):
-            given = replace(options, hessian=hessian)
-            ipopts = NonlinearProgram(problem, options=given).solve(sigma=2e-5)
+            chosen = replace(options, hessian=hessian)
+            ipopts = NonlinearProgram(problem, options=chosen).solve(sigma=2e-5)
             difference = np.abs(ours.theta - ipopts.theta) / problem.theta_scale
             assert difference.max() < 1e-6
             assert np.abs(ours.zeros - ipopts.zeros).max() < 1e-9
 
 
-def test_what_is_joined_is_written_read_and_found_again(root, tmp_path):
+def test_a_joined_calibration_is_written_and_read(root, tmp_path):
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
     for i, day in enumerate(("monday", "tuesday")):
         write_session(simulate_session(plan, TRUTH, seed=i).session, tmp_path / day)

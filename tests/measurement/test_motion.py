@@ -18,7 +18,14 @@ import pytest
 from linuxcnc import Joint, play, run_programs
 from machines import place
 
-from orthocal import calibrate, export_calibration, load_plan, simulate_session
+from orthocal import (
+    Machine,
+    calibrate,
+    draw_errors,
+    export_calibration,
+    load_plan,
+    simulate_session,
+)
 from orthocal.builder.build import make_robot
 from orthocal.builder.machine_file import Counting
 from orthocal.builder.orthoglide import Orthoglide
@@ -53,12 +60,18 @@ setups:
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory):
-    """A plan on a machine of other dimensions, with three joint conventions."""
+def directory(tmp_path_factory):
+    """Directory with a machine of other dimensions and three joint conventions."""
     folder = tmp_path_factory.mktemp("motion")
     make_robot(SMALL, folder / "mine", counting=COUNTING)
-    (folder / "plan.yaml").write_text(PLAN)
-    return load_plan(folder / "plan.yaml")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def small(directory):
+    """Plan with a dial at two legs of that machine."""
+    (directory / "plan.yaml").write_text(PLAN)
+    return load_plan(directory / "plan.yaml")
 
 
 @pytest.fixture(scope="module")
@@ -425,19 +438,19 @@ CONTROLLER_STATES = {
 
 
 @cache
-def _export_nominal(session, half_side):
+def _export_nominal(session):
     """Files of the module with nominal kinematics, from exact readings of a session."""
     gauges = {n: replace(g, range=None) for n, g in session.gauges.items()}
     anything = replace(session, gauges=gauges)
     exact = simulate_session(anything, {}, exact=True).session
-    options = ExportOptions(module=True, half_side=half_side)
+    options = ExportOptions(module=True, half_side=0.055, within=0.1e-6)
     return export_calibration(calibrate(exact, "offsets"), "linuxcnc", anyway=True, options=options)
 
 
-def _run_nominal(session, program, folder, before=((),), *, output=False, half_side=0.055):
+def _run_nominal(session, program, folder, before=((),), *, output=False):
     """A program on nominal legs, after lines of MDI; as `run_programs`."""
     robot = session.robot
-    files = _export_nominal(session, half_side)
+    files = _export_nominal(session)
     for name, text in files.items():
         (folder / name).write_text(text)
     switch = [d.zero / MM + 10.0 for d in robot.drives]
@@ -469,9 +482,9 @@ STANDSTILL = 50
 def test_linuxcnc_takes_up_backlash_from_the_stated_side(small, sided, tmp_path):
     """Slides that stay behind by half of the backlash, however they went before."""
     motion = plan_motion(sided)[0]
-    program = write_program(sided, motion, ProgramOptions(feed=6000.0, approach_feed=1500.0))
+    program = write_program(sided, motion, ProgramOptions(feed=12_000.0, approach_feed=3_000.0))
     # the driver resumes at once
-    slides, (pauses,) = _run_nominal(small, program.replace("\nM0", "\nG4 P0.2\nM0"), tmp_path)
+    slides, (pauses,) = _run_nominal(small, program.replace("\nM0", "\nG4 P0.1\nM0"), tmp_path)
     still = np.abs(np.diff(slides, axis=0)).max(axis=1) < 1e-6
     edges = np.flatnonzero(np.diff(np.r_[False, still, False].astype(int)))
     begun = [a for a, b in edges.reshape(-1, 2) if b - a > STANDSTILL]
@@ -485,22 +498,7 @@ def test_linuxcnc_takes_up_backlash_from_the_stated_side(small, sided, tmp_path)
     assert actual[at] - slides[at] == pytest.approx(-backlash / 2.0 * sides, abs=1e-6)
 
 
-def test_linuxcnc_triggers_a_logger_in_every_posture_at_rest(small, unlimited, tmp_path):
-    motion, dwell = plan_motion(unlimited)[0], 0.5
-    options = ProgramOptions(6000.0, 1500.0, dwell=dwell, trigger="0")
-    program = write_program(unlimited, motion, options)
-    recorded, (pauses,) = _run_nominal(small, program, tmp_path, output=True)
-    slides, output = recorded[:, :-1], recorded[:, -1]
-    assert len(pauses) == 1
-    rising = np.flatnonzero(np.diff(output, prepend=0.0) > 0.5)
-    read = [stop for stop in motion.stops if stop.role == "reading"]
-    assert slides[rising] == pytest.approx(np.array([s.drives for s in read]) / MM, abs=5e-4)
-    for k in rising:
-        before = slides[max(k - int(0.9e3 * dwell), 0) : k]
-        assert np.abs(before - slides[k]).max() < 1e-6
-
-
-BAR = """robot: orthoglide
+BAR = """robot: mine
 gauge: {sigma_mm: 0.002, range_mm: [-0.5, 0.5]}
 postures:
   a: {tcp_mm: [54, -3, -40]}
@@ -512,13 +510,43 @@ setups:
 """
 
 
-@pytest.fixture
-def bar(tmp_path):
+@pytest.fixture(scope="module")
+def bar(directory):
     """Plan of a ball bar: quarters of circles, and half a circle over the pole."""
-    (tmp_path / "plan.yaml").write_text(BAR)
-    session = load_plan(tmp_path / "plan.yaml")
+    (directory / "bar.yaml").write_text(BAR)
+    session = load_plan(directory / "bar.yaml")
     rows = [Reading("bar", name) for name in "abcadb"]
     return replace(session, readings=tuple(replace(r, cycle=i + 1) for i, r in enumerate(rows)))
+
+
+def test_linuxcnc_triggers_a_logger_in_every_posture_of_a_ball_bar(small, bar, tmp_path):
+    """At each trigger the slides rest in the posture, and the bar shows its simulated reading."""
+    bar = replace(bar, readings=bar.readings[3:])  # quarters of circles
+    (motion,), dwell = plan_motion(bar), 0.2
+    options = ProgramOptions(6000.0, 1500.0, dwell=dwell, trigger="0")
+    program = write_program(bar, motion, options)
+    recorded, (pauses,) = _run_nominal(small, program, tmp_path, output=True)
+    assert len(pauses) == 2  # before the first motion, and where the bar is mounted
+    slides, output = recorded[:, :-1], recorded[:, -1]
+    rising = np.flatnonzero(np.diff(output, prepend=0.0) > 0.5)
+    read = [stop for stop in motion.stops if stop.role == "reading"]
+    assert slides[rising] == pytest.approx(np.array([s.drives for s in read]) / MM, abs=5e-4)
+    for k in rising:
+        before = slides[max(k - int(0.9e3 * dwell), 0) : k]
+        assert np.abs(before - slides[k]).max() < 1e-6
+
+    def shown(errors, slides):
+        """Reading of the bar, by its definition, [m]."""
+        ball = Machine(bar.robot, errors).forward(slides * MM) + np.array([0.0, 0.0, -40.0]) * MM
+        return np.linalg.norm(ball - np.array([4.0, -3.0, -80.0]) * MM, axis=1) - 50.0 * MM
+
+    errors = draw_errors(bar.robot, ["*.offset"], seed=2, tolerances={"*.offset_mm": 1.0})
+    wide = replace(bar, gauges={"": replace(bar.gauge, range=None)})
+    expected = simulate_session(wide, errors, exact=True).session.values
+    assert np.ptp(expected) > 0.3 * MM
+    assert shown(errors, slides[rising]) == pytest.approx(expected, abs=1e-6)
+    # between the readings the bar stays on its sphere, from the first trigger to the last
+    assert np.abs(shown({}, slides[rising[0] : rising[-1] : 20])).max() < 20e-6
 
 
 def test_a_ball_bar_keeps_its_length_between_its_readings(bar):

@@ -129,7 +129,7 @@ def test_what_was_measured_is_a_session_of_the_rows_that_were_read(plan):
     assert complete.alignment_postures == loaded.alignment_postures
 
 
-def test_what_nobody_touched_stays_byte_by_byte(root, tmp_path):
+def test_unchanged_rows_remain_byte_by_byte(root, tmp_path):
     folder = shutil.copytree(root / "examples/table1/experiment-2", tmp_path / "s")
     before = (folder / "readings.csv").read_bytes()
     with open_recording(folder) as r:

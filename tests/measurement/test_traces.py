@@ -116,7 +116,7 @@ def test_a_reversal_ends_a_bin_and_changes_the_approach(plan, machine):
 
 def test_noise_of_bins_is_that_of_their_means(plan, machine):
     _, read = machine
-    points = circle("yz", 20_000)
+    points = circle("yz", 6_000)
     trace = Trace(points, read(points, 7))
     binned = bin_trace(trace)
     count = len(points) / len(binned.values)

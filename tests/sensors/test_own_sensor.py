@@ -204,7 +204,7 @@ def test_it_is_in_answer_report_and_scene(measured, tmp_path, capsys):
             ["calibrate", str(path), "--out", str(tmp_path / "out")], standalone_mode=False
         )
     answer = capsys.readouterr().out
-    assert "legs x, y and tool" in answer
+    assert "legs x, y and the tool" in answer
     assert "dial.d.slope" in (tmp_path / "out/report.html").read_text()
     make_program()(
         ["view", str(tmp_path / "out"), "--html", str(tmp_path / "v.html")], standalone_mode=False

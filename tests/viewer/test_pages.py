@@ -115,7 +115,7 @@ def test_scene_draws_without_requests(drawn):
     assert "deviation × 12" in text
 
 
-def test_whole_machine_is_in_view_beside_the_panels_at_every_size(drawn):
+def test_complete_machine_is_in_view_beside_the_panels_at_every_size(drawn):
     for size in SIZES:
         drawn.resize(size)
         left, right, top, bottom = drawn.page.evaluate(
@@ -329,7 +329,7 @@ def test_no_text_of_a_plot_is_cut_off(browser, tmp_path):
 
 def test_picture_has_the_requested_size(tmp_path):
     require_browser()
-    width, height = 640, 480
+    width, height = 480, 360
     text = scene_of(EXPERIMENT_2).to_html()
     path = take_picture(text, tmp_path / "a.png", width=width, height=height)
     with Image.open(path) as image:

@@ -152,7 +152,7 @@ def test_linuxcnc_moves_the_calibrated_machine(two_rounds):
     assert np.sqrt(np.mean(np.sum(deviation**2, axis=1))) < 3.0 * expected.absolute.rms
 
 
-EFFECTS = "--tolerance *.offset_mm=2 --effects backlash,thermal --temperature 18:26"
+EFFECTS = "--tolerance *.offset_mm=2 --effects backlash,thermal"
 TEMPERATURES = "18:26", "19:27"
 """Temperatures of the first and the last reading of both sessions, [°C]."""
 
@@ -176,9 +176,11 @@ def warming_machine(tmp_path_factory, short_reports):
     With the output of two commands.
     """
     folder, printed = tmp_path_factory.mktemp("warming"), {}
-    options = DIMENSIONS.removesuffix("--effects none --paper") + EFFECTS
+    options = DIMENSIONS.replace("--effects none", EFFECTS)
+    run(folder, "new", "mill", *options.split())
+    few = "--along", "5", "--sections", "0.5", "--starts", "1", "--temperature", TEMPERATURES[0]
     with no_sensor_gains():
-        run(folder, "new", "mill", *options.split())
+        run(folder, "plan", "mill", *few, "--out", "mill/both-sides")
 
     def identify(name, *sessions):  # without its report
         (folder / name).mkdir()
@@ -187,7 +189,16 @@ def warming_machine(tmp_path_factory, short_reports):
 
     truth = [f"--error={d}_slide.backlash_mm={BACKLASH / MM:g}" for d in "xyz"]
     draw = "--draw", "full", "--seed", SEED, *truth
-    run(folder, "simulate", "mill/first", *draw, "--temperature", TEMPERATURES[0], "--out", "one")
+    run(
+        folder,
+        "simulate",
+        "mill/both-sides",
+        *draw,
+        "--temperature",
+        TEMPERATURES[0],
+        "--out",
+        "one",
+    )
     run(folder, "check", "one")
     identify("first", "one")
     printed["compare"] = " ".join(run(folder, "compare", "one", "--models", "offsets").split())
