@@ -217,6 +217,9 @@ def validate_calibration(
     agreement = _describe_agreement(refit, test, expected_rms, explained=bool(changes))
     confirmed = None if math.isnan(test.p_value) else _confirmation(agreement, changes, judgement)
     joint = _calibrate_jointly(calibration, all_sessions, anomalies) if confirmed else None
+    if joint is not None and assessment_of(joint).decision.verdict != "enter":
+        changes = [f for f in assessment_of(joint).findings if f.severity != "note"]
+        confirmed, joint = False, None
     entries, notes = _choose_entries(
         calibration, refit, joint, confirmed=confirmed, wrongly_entered=wrongly_entered
     )
@@ -371,7 +374,10 @@ def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
 def _find_changes(
     all_sessions: Session, anomalies: Anomalies, judgement: Judgement
 ) -> tuple[Anomaly | None, list[Finding], bool]:
-    """Changes between the sessions of a calibration and the new sessions.
+    """Changes between the sessions of a calibration and the new ones, and mistakes in both.
+
+    Mistakes in the new sessions count here only if these sessions alone do not show any: the
+    earlier readings make them visible.
 
     Args:
         all_sessions: The session of the calibration and the new ones, joined.
@@ -379,12 +385,19 @@ def _find_changes(
         judgement: Judgement of the new sessions alone.
 
     Returns:
-        The first change of a session or None, findings about all changes, and whether the offsets
-        of the calibration were entered wrongly.
+        The first change of a session or None, findings about all changes and mistakes, and whether
+        the offsets of the calibration were entered wrongly.
     """
-    changes = tuple(a for a in anomalies.found if a.between_sessions)
-    if not changes and judgement.verdict != "enter":  # findings of the new sessions explain them
-        return None, [], False
+    changes = anomalies.found
+    if judgement.verdict != "enter":
+        earlier = len(all_sessions.parts[0].readings)
+        changes = tuple(
+            a
+            for a in anomalies.found
+            if a.between_sessions or any(row < earlier for row in a.explanation.rows)
+        )
+        if not changes:  # findings of the new sessions explain the deviations
+            return None, [], False
     mistake = next((a for a in changes if a.explanation.sessions), None)
     findings = describe_anomalies(all_sessions, replace(anomalies, found=changes))
     if mistake is None:
@@ -480,14 +493,15 @@ def _decide(
 ) -> Decision:
     """Decision about a validation.
 
-    Its reason states anomalies first, then the agreement, then the changes that explain it. Its
-    action is the first one of the anomalies, the changes and the agreement.
+    Its reason states anomalies first, then the agreement, then the changes that explain it; or the
+    changes first, if the deviations are as predicted. Its action is the first one of the anomalies, the changes and the agreement.
     """
     anomalies = [f for f in judgement.findings if f.severity != "note"][:1]
+    explained = [agreement, *changes] if agreement.severity != "note" else [*changes, agreement]
     headlines = {True: words.CONFIRMED, False: words.NOT_CONFIRMED, None: words.INCONCLUSIVE}
     return Decision(
         verdict_of([*judgement.findings, agreement, *changes]),
         headlines[confirmed],
-        " ".join(f.text for f in (*anomalies, agreement, *changes)),
+        " ".join(f.text for f in (*anomalies, *explained)),
         next((f.action for f in (*anomalies, *changes, agreement) if f.action), ""),
     )

@@ -258,6 +258,26 @@ def test_validate_and_calibrate_agree_on_the_same_sessions(name, model, seed):
     assert judged <= {f.kind for f in result.assessment.findings}
 
 
+@pytest.mark.slow
+def test_a_reversed_setup_that_only_the_new_readings_show_is_named():
+    """The verdict is that of both sessions; the first session alone shows nothing."""
+    plan = plan_of("workshop")
+    errors = draw_machine(plan.robot, 2)
+    sound = simulate_session(plan, errors, seed=2).session
+    signs = [-1.0 if r.setup == "xy" else 1.0 for r in sound.readings]
+    calibration = calibrate(sound.with_values(signs * sound.values), "full", **QUICK)
+    assert calibration.assessment.decision.verdict == "enter"
+    entered = plan.with_controller(np.round(entered_offsets(calibration), 6))
+    session = simulate_session(entered, errors, seed=1002).session
+    result = validate_calibration(calibration, session)
+    assert result.confirmed is False
+    assert result.joint is None
+    assert result.assessment.decision.verdict == "review"
+    (found,) = result.assessment.of_kind("ambiguous")  # zx of the new session may be reversed, too
+    assert {p.setup for p in found.places} == {"session-1/xy"}
+    assert "the signs of setup session-1/xy are reversed" in result.assessment.decision.reason
+
+
 def test_a_change_that_keeps_the_offsets_is_found_by_validation_alone(plan):
     """The axis of a drive turned by 1 mrad."""
     errors, _, calibration = calibrated_machine("raw-cycles", None, 1)

@@ -318,7 +318,7 @@ def fit_settings(session):
     """Settings of Klipper, with the tool error of the calibration but without its assessment."""
     result, _ = identify(session, solver="variable-projection")
     tool = assess_tool(result).after.sizes.aligned.rms
-    return replace(fit_firmware(result, "klipper"), tool_unknown=tool)
+    return replace(fit_firmware(result, "klipper"), tool_uncertainty=tool)
 
 
 @pytest.mark.parametrize("changed", [5, pytest.param(3, marks=pytest.mark.slow)])

@@ -33,8 +33,8 @@ def beyond_tolerances(scale: float, limit: float, *, firmware: bool) -> Finding:
         "Check that the settings of the log are those with which it was probed. Then clean the bed "
         "and the nozzle, and probe again."
         if firmware
-        else "Check signs, lines and setups. If they are right, adjust the machine mechanically "
-        "first."
+        else "Check signs, lines and setups, and that robot and dimensions are those of this "
+        "machine. If all are right, adjust the machine mechanically first."
     )
     return reject(
         "beyond tolerances",

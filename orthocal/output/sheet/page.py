@@ -46,10 +46,10 @@ SHEET = "sheet.html"
 """Name of the sheet's file."""
 
 END = (
-    "Compare the readings of the first posture with each other. If they differ by more than {}, "
-    "repeat this setup: the gauge or the machine was displaced. "
+    "Compare the last reading with {}: posture and approach are the same. If they differ by more "
+    "than {}, repeat this setup: the gauge or the machine was displaced. "
 )
-"""Check after the readings of a setup; {} is the largest usual difference."""
+"""Check after the readings of a setup: the first reading, and the largest usual difference."""
 
 FROM_ANOTHER_SIDE = (
     "The last reading repeats the first posture from another side: backlash may change it. "
@@ -250,13 +250,15 @@ def _compare_closing(session: Session, motion: SetupMotion) -> str:
     setup = session.setups[motion.setup]
     if isinstance(setup.sensor, Points):
         return END_OF_POINTS
-    approach = {stop.line: stop.approach for stop in motion.stops}
-    closing = [stop for stop in motion.stops if stop.repeats is not None]
-    if any(stop.approach != approach[stop.repeats] for stop in closing):
+    first, last = motion.stops[0], motion.stops[-1]
+    if last is first or last.posture != first.posture:
+        return ""
+    if last.repeats is None or last.approach != first.approach:
         return FROM_ANOTHER_SIDE
     gauge = session.gauges[setup.gauge]
     largest = max(MAX_STEPS * (gauge.resolution or 0.0), MAX_STDS * (gauge.sigma or 0.0))
-    return END.format(f"{_short(largest)} mm" if largest else "two steps of the dial")
+    reading = "0" if first.role == "subtracted" else f"that of line {last.repeats}"
+    return END.format(reading, f"{_short(largest)} mm" if largest else "two steps of the dial")
 
 
 def _steps(session: Session, motion: SetupMotion, gauge: GaugePosition) -> list[str]:
