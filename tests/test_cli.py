@@ -280,6 +280,19 @@ def test_accuracy_over_a_cube_and_at_points(calibrated, tmp_path):
     assert float(rows[0]["std_x_um"]) > 387
     code, out, _ = orthocal("accuracy", calibrated, points, "--json")
     assert json.loads(out)["points"] == 2
+    assert json.loads(out)["decision"]["verdict"] == "enter"
+
+
+def test_accuracy_states_a_verdict_against_entering(root, tmp_path):
+    """The first line is that of `calibrate`."""
+    printed = tmp_path / "out"
+    experiment = root / "examples/table1/experiment-1-printed"
+    code, answer, _ = orthocal("calibrate", experiment, "--out", printed)
+    assert code == 3
+    _, out, _ = orthocal("accuracy", printed)
+    words = " ".join(answer.split())
+    assert out.startswith("Do not enter offsets from these readings. ")
+    assert " ".join(out.split())[:100] in words
 
 
 def test_options_for_free_known_and_bounded_parameters(experiment, root):

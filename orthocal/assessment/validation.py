@@ -259,6 +259,9 @@ def _apply_stated(
         SessionError: If a session belongs to the calibration, an adjustment does not fit, or
             tolerances differ from those of the calibration.
     """
+    for session in sessions:
+        if calibration.session.firmware is None:
+            require_calibrated_robot(calibration, session)
     robot, settings = calibration.robot.with_tolerances(tolerances), calibration.session.firmware
     placed = sessions
     if settings is not None:
@@ -494,7 +497,8 @@ def _decide(
     """Decision about a validation.
 
     Its reason states anomalies first, then the agreement, then the changes that explain it; or the
-    changes first, if the deviations are as predicted. Its action is the first one of the anomalies, the changes and the agreement.
+    changes first, if the deviations are as predicted. Its action is the first one of the anomalies,
+    the changes and the agreement.
     """
     anomalies = [f for f in judgement.findings if f.severity != "note"][:1]
     explained = [agreement, *changes] if agreement.severity != "note" else [*changes, agreement]

@@ -46,6 +46,10 @@ def load_calibration(path: str | Path) -> Calibration:
     """
     file = Path(path)
     if is_folder(file):
+        if exists(file / "session.yaml") and not exists(file / "calibration.json"):
+            raise CalibrationFileError(
+                f"is a session, no calibration; {CREATE_HINT}", where=str(file)
+            )
         file = file / "calibration.json"
     if not exists(file):
         raise CalibrationFileError(f"there is no such file; {CREATE_HINT}", where=str(file))

@@ -33,16 +33,24 @@ _ATTRIBUTE = r"""(?<![\w:.-]){name}\s*=\s*(?P<quote>["'])(?P<value>.*?)(?P=quote
 def export_urdf(calibration: Calibration) -> dict[str, str]:
     """Texts of the robot's URDF with the identified errors, and of its unchanged YAML.
 
-    Scales of drives are in scales.csv, because a URDF cannot express them.
+    A URDF has placements only. Scales of drives are in scales.csv, and errors of effects such as
+    backlash in effects.csv.
 
     Raises:
         ExportError: If the URDF cannot express an error.
     """
     robot = calibration.robot
     urdf, description = (robot.content[p.name].decode() for p in (robot.urdf, robot.yaml))
-    errors = robot.parameters.expand(calibration.errors)
+    rigid, effects = dict[str, float](), list[str]()
+    for name, value in calibration.errors.items():
+        p = robot.parameters[name]
+        if robot.parameters.are_rigid(name):
+            rigid[name] = value
+        elif value:
+            effects.append(f"{name},{tidy(value * p.edge_factor)},{p.edge_unit}\n")
+    errors = robot.parameters.expand(rigid)
     text = _correct_origins(urdf, _find_twists(robot, errors), robot)
-    _require_calibrated(robot.with_errors(calibration.errors), text)
+    _require_calibrated(robot.with_errors(rigid), text)
     files = {robot.urdf.name: text, robot.yaml.name: description}
     scales = [
         f"{e.owner},{tidy(value / PPM)}\n"
@@ -51,6 +59,8 @@ def export_urdf(calibration: Calibration) -> dict[str, str]:
     ]
     if scales:  # a drive that is commanded to q moves to (1 + scale) q
         files["scales.csv"] = "drive,scale_ppm\n" + "".join(scales)
+    if effects:
+        files["effects.csv"] = "parameter,value,unit\n" + "".join(effects)
     return files
 
 
@@ -70,8 +80,6 @@ def _find_twists(robot: Robot, errors: Mapping[str, float]) -> dict[str, list[Ar
         if e.kind == "offset":
             offsets[e.owner] = joint_axis(robot.model, robot.model.getJointId(e.owner)) * value
             continue
-        if e.axis < 0:
-            raise ExportError(f"{name} is not an error of a placement: a URDF cannot express it")
         owner = mounts.get(e.owner) if e.of_frame else e.owner
         if owner is None:
             raise ExportError(

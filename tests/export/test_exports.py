@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from commands import run_orthocal
+from effect_plans import effect_plan
 
 from orthocal import (
     ExportError,
@@ -168,6 +169,20 @@ def test_urdf_is_the_calibrated_machine(full, tmp_path):
     expected = full.machine.forward(drives)
     assert np.abs(LoopClosure(robot).forward(drives * gain) - expected).max() < 1e-9
     assert np.abs(expected - points).max() > 1e-3
+
+
+def test_errors_of_effects_are_beside_the_urdf():
+    truth = {"x_slide.offset": 1e-3, "x_slide.backlash": 40e-6, "z_slide.backlash": 25e-6}
+    session = simulate_session(effect_plan("backlash"), truth, seed=1, sigma=3e-6).session
+    calibration = calibrate(session, "offsets", solver="variable-projection")
+    files = export_calibration(calibration, "urdf", anyway=True)
+    rows = list(csv.DictReader(io.StringIO(files["effects.csv"])))
+    expected = {n: v for n, v in calibration.errors.items() if n.endswith("backlash") and v}
+    assert {r["parameter"]: float(r["value"]) for r in rows} == pytest.approx(
+        {name: 1e3 * value for name, value in expected.items()}, rel=1e-9
+    )
+    assert {r["unit"] for r in rows} == {"mm"}
+    assert len(expected) >= 2
 
 
 def test_urdf_changes_in_origins_only(full):

@@ -127,7 +127,10 @@ def render_accuracy(
         values = (*aligned, sizes.relative.rms, sizes.absolute.rms)
         cells.append((name, *("" if v is None else um(v) for v in values)))
     headers = ("[µm]", "RMS", "95 %", "worst point", "translation removed", "absolute")
-    first, notes = [], [f"Over {accuracy.workspace.words}. {COLUMNS_NOTE}"]
+    decision, first = assessment_of(calibration).decision, list[str]()
+    if decision.verdict != "enter":
+        first.append(f"{decision.headline} {decision.reason}".rstrip())
+    notes = [f"Over {accuracy.workspace.words}. {COLUMNS_NOTE}"]
     if accuracy.use.declared is None:
         notes.append(describe_conditions_of(calibration, accuracy.use.conditions[0]))
     if accuracy.after is None:
@@ -135,7 +138,7 @@ def render_accuracy(
             "The uncertainty after calibration is unknown, because the noise of the readings is."
         )
     else:
-        first = _describe_expected(calibration, accuracy)
+        first += _describe_expected(calibration, accuracy)
         scale = calibration.tolerance_scale.factor
         scaled = f", after the calibration times {scale:.1f}" if scale > 1.0 else ""
         notes.append(UNCERTAINTY_NOTE.format(scaled))
@@ -288,7 +291,7 @@ def accuracy_json(calibration: Calibration, accuracy: ToolAccuracy) -> str:
 
     after = accuracy.after
     document = {
-        "schema": "orthocal/accuracy/2",
+        "schema": "orthocal/accuracy/3",
         "robot": calibration.robot_record.name,
         "model": calibration.model,
         "points": len(accuracy.points),
@@ -297,5 +300,6 @@ def accuracy_json(calibration: Calibration, accuracy: ToolAccuracy) -> str:
         "offsets_entered": sizes(accuracy.measure(accuracy.deviation_with_entries)),
         "uncertainty_before": sizes(accuracy.before.sizes),
         "uncertainty_after": None if after is None else sizes(after.sizes),
+        "decision": assessment_of(calibration).decision.to_document(),
     }
     return format_json(document)

@@ -296,7 +296,7 @@ class RecordingText:
         lines = [self.wrap(text, indent="  ")]
         if is_far(row.value, mean, std):
             differs = f"Line {row.line}{of} differs by {mm(abs(row.value - mean))} mm."
-            check = f"Check the {'point' if of else self.instrument(index)}."
+            check = f"Check the {'point' if of else self.instrument(index)}, and the lines before."
             lines.append(self.wrap(f"{differs} {check}", indent="  ", first="! "))
         return "\n".join(lines)
 
