@@ -11,7 +11,13 @@ import numpy as np
 import pytest
 from effect_plans import effect_plan
 
-from orthocal import ExportOptions, calibrate, export_calibration, simulate_session
+from orthocal import (
+    ExportOptions,
+    calibrate,
+    export_calibration,
+    simulate_session,
+    validate_calibration,
+)
 from orthocal.assessment.assess import assess
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.controller_entries import (
@@ -27,6 +33,7 @@ from orthocal.kinematics.conditions import UseConditions
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.output.text.answer import render_answer
 from orthocal.output.text.layout import to_text
+from orthocal.output.text.validation import render_validation
 from orthocal.units import MM
 
 QUICK = {"solver": "variable-projection"}
@@ -186,6 +193,23 @@ def test_a_session_that_states_no_compensation_is_asked_for_it(plan, calibration
     (asked,) = calibrate(both, "offsets", **QUICK).assessment.of_kind(kind)
     assert "second" in asked.text
     assert "first" not in asked.text
+
+
+def test_validation_shows_the_backlash_of_its_tool_error(plan, calibration):
+    """The offsets were entered, the backlash was not."""
+    entered = plan.with_controller(entered_offsets(calibration).round(6))
+    session = simulate_session(entered, TRUTH, seed=4, sigma=NOISE).session
+    validation = validate_calibration(
+        calibration, replace(session, compensation=(JointTrim(),) * 3)
+    )
+    judged = assess(validation.joint)
+    assert judged.keeps_offsets
+    text = to_text(render_validation(validation))
+    assert "with this backlash" in text
+    assert "Offsets from" not in text
+    for e in judged.backlash:
+        if e.change:
+            assert re.search(rf"{e.drive} +0\.000 +{e.enter / MM:.3f} ", text)
 
 
 def test_backlash_alone_is_entered_where_the_offsets_stay(plan):

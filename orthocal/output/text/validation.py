@@ -72,11 +72,14 @@ def render_validation(
         rows = [(e.drive, signed(e.enter * e.edge_factor), e.edge_unit) for e in validation.enter]
         parts.append(section("Values to enter", table_of(("drive", "new", "unit"), rows)))
     further = bool(judged.of_kind("further change"))
+    source = "the new readings" if validation.joint is None else "all readings"
+    backlash = assessment_of(answer).backlash
     if assessment_of(answer).entries and (further or complete):
-        source = "the new readings" if validation.joint is None else "all readings"
-        backlash = [Text(), render_backlash(answer)] if assessment_of(answer).backlash else []
-        values = Group(entry_table(answer), *map(Text, describe_columns(answer)), *backlash)
+        shown = [Text(), render_backlash(answer)] if backlash else []
+        values = Group(entry_table(answer), *map(Text, describe_columns(answer)), *shown)
         parts.append(section(f"Offsets from {source}", values))
+    elif tool and any(e.change for e in backlash):
+        parts.append(section(f"Backlash from {source}", render_backlash(answer)))
     if complete:
         parts += _details(validation, all_rows=all_rows)
     parts += _next_step(validation, further=further)
