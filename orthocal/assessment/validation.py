@@ -216,18 +216,16 @@ def validate_calibration(
     expected_rms, test = expect_rms(calibration, fit), judge_deviations(calibration, fit)
     agreement = _describe_agreement(refit, test, expected_rms, explained=bool(changes))
     confirmed = None if math.isnan(test.p_value) else _confirmation(agreement, changes, judgement)
-    joint = _calibrate_jointly(calibration, all_sessions, anomalies) if confirmed else None
-    if joint is not None and assessment_of(joint).decision.verdict != "enter":
-        changes = [f for f in assessment_of(joint).findings if f.severity != "note"]
-        confirmed, joint = False, None
+    joint = None
+    if confirmed:
+        joint, against = _calibrate_jointly(calibration, all_sessions, anomalies)
+        confirmed, changes = not against, against or changes
     entries, notes = _choose_entries(
         calibration, refit, joint, confirmed=confirmed, wrongly_entered=wrongly_entered
     )
     repetition = measure_repetition(calibration, refit)
     stated = all(one.controller_offsets is not None for one in new_sessions)
-    exceeded = _is_expected(test.p_value) is False
-    notes += [words.describe_repetition(repetition, exceeded=exceeded)]
-    notes += [] if stated else [words.controller_assumed()]
+    notes += _describe_comparison(repetition, test, stated=stated)
     return Validation(
         confirmed=confirmed,
         offsets_stated=stated,
@@ -246,6 +244,15 @@ def validate_calibration(
             entries=entries,
         ),
     )
+
+
+def _describe_comparison(
+    repetition: Repetition, test: DeviationTest, *, stated: bool
+) -> list[Finding]:
+    """Findings about repeated residuals, and about active offsets that no session states."""
+    exceeded = _is_expected(test.p_value) is False
+    repeated = words.describe_repetition(repetition, exceeded=exceeded)
+    return [repeated] if stated else [repeated, words.controller_assumed()]
 
 
 def _apply_stated(
@@ -300,12 +307,15 @@ def _confirmation(
 
 def _calibrate_jointly(
     calibration: Calibration, all_sessions: Session, anomalies: Anomalies
-) -> Calibration:
-    """Assessed calibration from all sessions."""
+) -> tuple[Calibration | None, list[Finding]]:
+    """Assessed calibration from all sessions; or None, and the findings against its values."""
     judgement = judge_session(all_sessions, anomalies=anomalies)
     fit = repeat_fit(calibration, all_sessions, tolerance_scale=judgement.tolerance_scale)
     joint = assemble_calibration(fit)
-    return replace(joint, assessment=assess(joint, all_sessions, judgement=judgement))
+    assessment = assess(joint, all_sessions, judgement=judgement)
+    if assessment.decision.verdict != "enter":
+        return None, [f for f in assessment.findings if f.severity != "note"]
+    return replace(joint, assessment=assessment), []
 
 
 def _require_new(calibration: Calibration, sessions: Sequence[Session]) -> None:
