@@ -263,16 +263,15 @@ def _apply_stated(
     A session that states no tolerances has those of the calibration.
 
     Raises:
-        SessionError: If a session belongs to the calibration, an adjustment does not fit, or
-            tolerances differ from those of the calibration.
+        SessionError: If a session is of another robot or belongs to the calibration, an adjustment
+            does not fit, or tolerances differ from those of the calibration.
     """
-    for session in sessions:
-        if calibration.session.firmware is None:
-            require_calibrated_robot(calibration, session)
     robot, settings = calibration.robot.with_tolerances(tolerances), calibration.session.firmware
     placed = sessions
     if settings is not None:
         placed = on_one_printer(sessions, calibration.robot, settings.homed)
+    for session in placed:
+        require_calibrated_robot(calibration, session)
     restated = [
         session.with_tolerances(
             tolerances if session.robot.parameters.stated else robot.parameters.stated
@@ -337,11 +336,10 @@ def _adjust_to_sessions(calibration: Calibration, sessions: Sequence[Session]) -
     """Calibration of the machine with the mechanical adjustments that new sessions state.
 
     Raises:
-        SessionError: If a session is of another robot, or sessions state different adjustments.
+        SessionError: If sessions state different adjustments.
     """
     first = sessions[0]
     for session in sessions:
-        require_calibrated_robot(calibration, session)
         if subtract_amounts(session.adjusted, first.adjusted):
             raise SessionError(
                 "states other adjustments than the session before it; validate them separately",

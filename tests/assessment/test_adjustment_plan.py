@@ -144,6 +144,7 @@ def test_uncertainties_of_amounts_are_those_of_sampled_machines(machines):
     for _ in range(200):
         search._set_deviation(deviation + field @ (root @ rng.normal(size=n)))
         found.append(search.fit(chosen)[chosen])
+    # four standard errors of a standard deviation from 200 draws
     assert np.std(found, axis=0) == pytest.approx(stated, rel=0.2)
 
 

@@ -416,9 +416,9 @@ def test_rows_and_plans_state_pairs(tmp_path, printer):
 
 @pytest.mark.slow
 def test_tool_errors_of_printers_with_distances(tmp_path):
-    """12 printers with all errors, 41 heights and 12 distances: within 1.15 of the promise."""
+    """20 printers with all errors, 41 heights and 12 distances: within 1.15 of the promise."""
     squares, promised = [], []
-    for seed in range(12):
+    for seed in range(20):
         drawn, settings = draw_printer(tmp_path, seed), nominal()
         rng = np.random.default_rng((seed, 2))
         z = drawn.probe(settings, rings(), noise=NOISE_MM, rng=rng)
