@@ -120,8 +120,8 @@ class LinearModel:
             return hidden
         theta = np.zeros(self.problem.n_free)
         theta[hidden] = 1.0
-        beside = self.linearise(theta, (), about.passive, keep_jacobian=True)
-        return np.asarray(hidden[np.abs(beside.jacobian[:, hidden]).max(axis=0) > self.sigma])
+        displaced = self.linearise(theta, (), about.passive, keep_jacobian=True)
+        return np.asarray(hidden[np.abs(displaced.jacobian[:, hidden]).max(axis=0) > self.sigma])
 
     @property
     def offsets(self) -> dict[str, int]:

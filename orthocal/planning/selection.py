@@ -431,8 +431,8 @@ class Gains:
         for which in set(range(len(search.reduced))) - stacked:
             setup, pairs = search.reduced[which], search.pairs[which].with_count(count)
             if (gauges is None or setup.gauge in gauges) and pairs.flat.size:
-                found = self.gain_of(setup).best_pairs(pairs, 1)
-                ranked += [(gain, which, pair) for gain, pair in found]
+                best = self.gain_of(setup).best_pairs(pairs, 1)
+                ranked += [(gain, which, pair) for gain, pair in best]
         return sorted(ranked, key=lambda r: r[1])
 
 
@@ -455,8 +455,8 @@ def _exchange_readings(planned: PlannedSetup, gain: Gain) -> PlannedSetup:
     setup, chosen = gain.setup, list(planned.chosen)
     for _ in range(MAX_PASSES):
         before = list(chosen)
-        begun = gain.begin_with(chosen[0])
-        gains = begun.exchange_gains(chosen)
+        aligned = gain.begin_with(chosen[0])
+        gains = aligned.exchange_gains(chosen)
         for place, old in enumerate(before):
             others = chosen[:place] + chosen[place + 1 :]
             # the range about a new first reading must contain all others
@@ -466,7 +466,7 @@ def _exchange_readings(planned: PlannedSetup, gain: Gain) -> PlannedSetup:
             allowed[others] = False
             chosen[place] = first_largest(np.where(allowed, gains[place], -1.0))
             if chosen[place] != old:
-                gains = begun.exchange_gains(chosen)
+                gains = aligned.exchange_gains(chosen)
         if chosen == before:
             break
     return PlannedSetup(planned.candidate, tuple(chosen))

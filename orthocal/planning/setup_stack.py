@@ -56,18 +56,10 @@ class SetupStack:
         gains = pair_gains(product, spread, noise, absolute=self.absolute)
         gains = np.where(possible, gains, -1.0).reshape(len(self.which), -1)
         best = first_largest_of_rows(gains)
-        found = gains[np.arange(len(best)), best]
+        largest = gains[np.arange(len(best)), best]
         first, second = np.divmod(best, self.possible.shape[1])
-        return [
-            (gain, i, pair)
-            for gain, i, pair in zip(
-                found.tolist(),
-                self.which.tolist(),
-                zip(first.tolist(), second.tolist(), strict=True),
-                strict=True,
-            )
-            if gain >= 0.0
-        ]
+        columns = (a.tolist() for a in (largest, self.which, first, second))
+        return [(gain, i, (j, k)) for gain, i, j, k in zip(*columns, strict=True) if gain >= 0.0]
 
 
 def stack_setups(setups: Sequence[CandidateSetup], which: Iterable[int]) -> Iterator[SetupStack]:

@@ -181,8 +181,8 @@ class BallBar(ToolSensor):
         offset = np.array(self.tool) - np.array(self.centre)
         ends = np.array([start + offset, end + offset])
         if normal is not None:  # about the foot of the fixed ball in the plane
-            beside = (ends[0] @ normal) * normal
-            ends, offset = ends - beside, offset - beside
+            height = (ends[0] @ normal) * normal
+            ends, offset = ends - height, offset - height
         radii = np.linalg.norm(ends, axis=1)
         first, last = ends / np.maximum(radii, 1e-12)[:, None]
         across = last - (first @ last) * first

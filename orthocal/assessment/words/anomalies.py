@@ -381,13 +381,13 @@ def _wrong_reading(session: Session, e: Explanation) -> str:
     subject = _subject(session, e)
     if not _is_trigger(session, e):
         return f"{subject} was misread or mistyped"
-    excess = e.amount or 0.0  # of the prescribed height over the height of the trigger
+    height = e.amount or 0.0  # the prescribed one, above that of the trigger
     side, cause = (
         ("above", "a bump, dirt or filament, or a trigger that came too early")
-        if excess < 0.0
+        if height < 0.0
         else ("below", "a dent, or a trigger that came too late")
     )
-    return f"{subject} triggered {mm(abs(excess))} mm {side} the surface of the others: {cause}"
+    return f"{subject} triggered {mm(abs(height))} mm {side} the surface of the others: {cause}"
 
 
 def _is_trigger(session: Session, e: Explanation) -> bool:

@@ -459,5 +459,5 @@ def _columns(rows: Array) -> ca.MX:
 def _rest_of_triangle(n: int, n_first: int) -> tuple[Indices, Indices]:
     """Positions in the upper triangle of n variables, except that of the first n_first."""
     rows, columns = np.triu_indices(n)
-    rest = columns >= n_first
-    return rows[rest], columns[rest]
+    later = columns >= n_first
+    return rows[later], columns[later]

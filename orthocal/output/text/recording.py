@@ -249,8 +249,8 @@ class RecordingText:
         rows = self._recording.rows
         row = rows[index]
         missing = self._recording.missing_count
-        left = f" ({missing} of {self._recording.count} missing)" if missing else ""
-        lines = [self.wrap(f"Line {row.line}: {self.label(row)}{left}")]
+        state = f" ({missing} of {self._recording.count} missing)" if missing else ""
+        lines = [self.wrap(f"Line {row.line}: {self.label(row)}{state}")]
         for posture in (row.posture, *([row.minus] if row.minus else [])):
             name = f"{posture}: " if row.minus else ""
             lines.append(self._coordinates(posture, name))
