@@ -7,17 +7,19 @@ import re
 import shutil
 from contextlib import nullcontext
 from functools import cache
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 from commands import run_here, run_line, run_orthocal, run_script
-from conftest import ROOT, marked_reports
+from conftest import ROOT, marked_reports, no_sensor_gains
 
 import orthocal
 from orthocal import calibrate, draw_scene, load_session
 from orthocal.effects import registry as effect_registry
 from orthocal.errors import NotIdentifiableError
 from orthocal.observation.simulate import load_errors
+from orthocal.planning import selection
 from orthocal.sensors import registry as sensor_registry
 from orthocal.session.session import Purpose
 
@@ -45,6 +47,9 @@ def test_example_runs_from_anywhere(run_example, script):
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 WITH_REPORTS = ("README.md", "docs/viewing.md")
 """Pages whose commands build reports; on the others a mark replaces them."""
+
+SHOWN = {"docs/adjusting.md": 3, "docs/controllers.md": 3, "docs/measuring.md": 2}
+"""Pages that show what commands print, with the number of texts; plans of others start once."""
 
 
 def blocks(language, page):
@@ -125,7 +130,9 @@ def run_page(make_directory, short_reports):
     def run(page):
         printed = Printed()
         printed.directory = make_directory()
-        with nullcontext() if page in WITH_REPORTS else marked_reports():
+        reports = nullcontext() if page in WITH_REPORTS else marked_reports()
+        plans = nullcontext() if page in SHOWN else patch.object(selection, "MIN_STARTS", 1)
+        with reports, plans, no_sensor_gains():
             for command, expected in commands(page):
                 done = run_line(printed.directory, command)
                 assert done.returncode == expected, f"{command}: {done.stderr}"
@@ -148,7 +155,7 @@ def test_tutorial_shows_what_its_commands_print(root, tmp_path):
     for language, block in re.findall(r"```(sh|text)\n(.*?)```", text, flags=re.DOTALL):
         if language == "sh":
             for line in lines_of(block):
-                with marked_reports():
+                with marked_reports(), no_sensor_gains():
                     done = run_line(tmp_path, line)
                 assert done.returncode == 0, f"{line}: {done.stderr}"
                 printed = [row.rstrip() for row in done.stdout.splitlines()]
@@ -170,10 +177,7 @@ def test_tutorial_shows_what_its_commands_print(root, tmp_path):
     assert f"x_slide has {enter:+.3f} mm to enter and {identified:+.3f} mm identified" in results
 
 
-@pytest.mark.parametrize(
-    ("page", "texts"),
-    [("docs/adjusting.md", 3), ("docs/controllers.md", 3), ("docs/measuring.md", 2)],
-)
+@pytest.mark.parametrize(("page", "texts"), SHOWN.items())
 def test_a_page_shows_what_its_commands_print(root, run_page, page, texts):
     """A text that follows commands shows lines that the last of them prints."""
     printed, last, shown = run_page(page), "", 0

@@ -58,15 +58,19 @@ def pair_gains(product: Array, spread: Array, noise: float, *, absolute: bool) -
     With a free gauge zero only the difference of the readings counts.
 
     Args:
-        product: A C T C Aᵀ, shape (..., m, m).
-        spread: V, shape (..., m, m), [m²].
+        product: A C T C Aᵀ, shape (..., m, m); overwritten.
+        spread: V, shape (..., m, m), [m²]; overwritten.
         noise: σ², [m²].
         absolute: Whether the gauge zero is known.
     """
-    q, v = (np.diagonal(x, axis1=-2, axis2=-1)[..., None] for x in (product, spread))
+    q, v = (np.diagonal(x, axis1=-2, axis2=-1)[..., None].copy() for x in (product, spread))
     if not absolute:
-        gains = q + q.mT - 2.0 * product
-        return np.asarray(gains / (v + v.mT - 2.0 * spread + 2.0 * noise))
+        for matrix, diagonal in ((product, q), (spread, v + noise)):
+            matrix *= -2.0
+            matrix += diagonal
+            matrix += diagonal.mT
+        product /= spread
+        return product
     variance = v + noise
     gains = q * variance.mT
     gains = gains + gains.mT - 2.0 * product * spread
@@ -198,8 +202,8 @@ class SetupGain:
             return []
         absolute = self.setup.absolute
         if not self.aligned:
-            product = self.effect @ self.effect.T
-            gains = pair_gains(product, self.spread, self.noise, absolute=absolute)[i, j]
+            product, spread = self.effect @ self.effect.T, self.spread.copy()
+            gains = pair_gains(product, spread, self.noise, absolute=absolute)[i, j]
         else:
             gains = self.gains(np.column_stack([i, j])) if absolute else self._aligned_gains()[i, j]
         ranked: list[tuple[float, tuple[int, int]]] = []

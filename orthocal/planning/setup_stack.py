@@ -18,6 +18,9 @@ from orthocal.planning.candidates import CandidateSetup
 from orthocal.planning.information_gain import pair_gains
 from orthocal.planning.ranking import first_largest_of_rows
 
+PAIRS_AT_ONCE = 40_000
+"""Number of pairs whose gains are computed together; their matrices stay in the cache."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SetupStack:
@@ -49,17 +52,24 @@ class SetupStack:
             noise: σ², [m²].
             count: Number of readings that the gauge's range must allow.
         """
-        possible = self.possible & (self.within_range >= count)[:, :, None]
-        effect = self.jacobian @ root
-        product = effect @ effect.mT
-        spread = (self.jacobian @ covariance) @ self.jacobian.mT + self.covariance
-        gains = pair_gains(product, spread, noise, absolute=self.absolute)
-        gains = np.where(possible, gains, -1.0).reshape(len(self.which), -1)
-        best = first_largest_of_rows(gains)
-        largest = gains[np.arange(len(best)), best]
-        first, second = np.divmod(best, self.possible.shape[1])
-        columns = (a.tolist() for a in (largest, self.which, first, second))
-        return [(gain, i, (j, k)) for gain, i, j, k in zip(*columns, strict=True) if gain >= 0.0]
+        best: list[tuple[float, int, tuple[int, int]]] = []
+        at_once = max(1, PAIRS_AT_ONCE // self.possible[0].size)
+        for begin in range(0, len(self.which), at_once):
+            some = slice(begin, begin + at_once)
+            jacobian = self.jacobian[some]
+            effect = jacobian @ root
+            spread = (jacobian @ covariance) @ jacobian.mT
+            spread += self.covariance[some]
+            gains = pair_gains(effect @ effect.mT, spread, noise, absolute=self.absolute)
+            possible = self.possible[some] & (self.within_range[some] >= count)[:, :, None]
+            np.putmask(gains, ~possible, -1.0)
+            gains = gains.reshape(len(gains), -1)
+            at = first_largest_of_rows(gains)
+            largest = gains[np.arange(len(at)), at].tolist()
+            rows = (x.tolist() for x in np.divmod(at, self.possible.shape[1]))
+            columns = zip(largest, self.which[some].tolist(), *rows, strict=True)
+            best += [(gain, i, (j, k)) for gain, i, j, k in columns if gain >= 0.0]
+        return best
 
 
 def stack_setups(setups: Sequence[CandidateSetup], which: Iterable[int]) -> Iterator[SetupStack]:
