@@ -84,6 +84,10 @@ def test_ignored_backlash_costs_what_the_covariance_predicts(folder):
     known = summarise_accuracy(identified, run_study(identified, workers=1))
     assert known.all_effects is None
     assert known.after == pytest.approx(s.all_effects, rel=1e-9)
+    tools = np.array([table.columns[c] for c in ("tool_um", "tool_all_effects_um")]) * 1e-6
+    costs = [-np.subtract(*np.sqrt((np.delete(tools, i, 1) ** 2).mean(1))) for i in range(16)]
+    jackknife = np.std(costs) * np.sqrt(15.0)
+    assert s.cost_standard_error == pytest.approx(jackknife, rel=0.1)
     document = report_study(table).document
     assert document["ignored"] == ["backlash"]
     assert document["after_all_effects_um"] == pytest.approx(1e6 * s.all_effects)
