@@ -187,6 +187,12 @@ def assessment_of(calibration: Calibration) -> Assessment:
     return calibration.assessment or assess(calibration)
 
 
+def changes_offsets(calibration: Calibration) -> bool:
+    """Whether offsets are to be entered, and other errors were identified that then remain."""
+    firmware = calibration.session.firmware is not None
+    return not (calibration.only_offsets or firmware or assessment_of(calibration).keeps_offsets)
+
+
 def check_session(session: Session, *, judgement: Judgement | None = None) -> Assessment:
     """Assess readings before anything is calibrated from them.
 

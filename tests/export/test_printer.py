@@ -18,6 +18,7 @@ from orthocal import (
     ExportError,
     calibrate,
     draw_errors,
+    draw_scene,
     export_calibration,
     load_calibration,
     load_session,
@@ -29,6 +30,7 @@ from orthocal.calibration.refit import restore_covariances
 from orthocal.export.printer import describe_next
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.measurement.importing.printer_log import import_printer_log
+from orthocal.output.scene.tool_errors import TOOL_ENTERED
 from orthocal.output.text.accuracy import FIRMWARE_NOTE
 from orthocal.output.text.answer import PRINT
 from orthocal.output.text.layout import to_text
@@ -339,6 +341,7 @@ def test_offsets_of_a_printer_are_not_to_be_entered(calibrated, tmp_path):
     _, calibration = calibrated
     assert calibration.assessment.entries == ()
     assert calibration.assessment.decision.verdict == "enter"
+    assert not any(TOOL_ENTERED in entry.nodes for entry in draw_scene(calibration).legend)
     write_calibration(calibration, tmp_path / "one")
     done = run_orthocal(tmp_path, "again", "one", "--out", "two")
     assert done.returncode == 2

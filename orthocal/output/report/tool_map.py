@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import RectBivariateSpline
 
 from orthocal.arrays import Array
-from orthocal.assessment.assess import assessment_of
+from orthocal.assessment.assess import changes_offsets
 from orthocal.assessment.tool_error import ToolAccuracy
 from orthocal.calibration.calibration import Calibration
 from orthocal.output.report.figure import Plot, open_figure
@@ -91,9 +91,8 @@ def plot_tool_map(calibration: Calibration, accuracy: ToolAccuracy, *, which: Fi
         which: The present error, the error with the offsets entered, or the uncertainty.
 
     Returns:
-        The inline `<svg>`. It is "" in four cases: the points are not such a grid; the uncertainty
-        is unknown; no offsets are entered; or only offsets were identified, so that the error with
-        the offsets entered is zero by definition.
+        The inline `<svg>`; "" if the points are not such a grid, the uncertainty is unknown, or the
+        offsets do not change or are the only identified errors.
     """
     return Plot(f"tool-{which}", _draw_tool_map)(calibration, accuracy, which)
 
@@ -101,12 +100,9 @@ def plot_tool_map(calibration: Calibration, accuracy: ToolAccuracy, *, which: Fi
 def _draw_tool_map(calibration: Calibration, accuracy: ToolAccuracy, which: Field) -> Figure | None:
     """Figure with one panel per plane; None without content."""
     lines = _find_grid(accuracy.points)
-    enters_offsets = (
-        calibration.session.firmware is None and not assessment_of(calibration).keeps_offsets
-    )
     shown = {
         "now": True,
-        "entered": enters_offsets and not calibration.only_offsets,
+        "entered": changes_offsets(calibration),
         "uncertainty": accuracy.after is not None,
     }
     if lines is None or not shown[which]:

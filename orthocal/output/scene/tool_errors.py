@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocal.arrays import Array
+from orthocal.assessment.assess import changes_offsets
 from orthocal.assessment.tool_error import ToolAccuracy, assess_tool
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, RobotError
@@ -69,10 +70,10 @@ def draw_tool_errors(drawing: MachineScene, calibration: Calibration, *, shown: 
     scale, targets = f"× {scene.tool_scale:g}", accuracy.targets[chosen]
     width = ARROW_WIDTH * drawing.size
     _draw_deviations(scene, TOOL_NOW, targets, now[chosen], NOW_COLOUR, width)
-    _draw_deviations(scene, TOOL_ENTERED, targets, entered[chosen], ENTERED_COLOUR, width)
     text = f"Tool error now, {region}, aligned: up to {um(now_largest)} µm ({scale})"
     scene.explain(LegendEntry(text, (TOOL_NOW,), css(NOW_COLOUR), "arrow", shown))
-    if entered_largest > NEGLIGIBLE:
+    if changes_offsets(calibration):
+        _draw_deviations(scene, TOOL_ENTERED, targets, entered[chosen], ENTERED_COLOUR, width)
         text = f"Tool error, offsets entered: up to {um(entered_largest)} µm ({scale})"
         scene.explain(LegendEntry(text, (TOOL_ENTERED,), css(ENTERED_COLOUR), "arrow", shown))
     headline = f"Tool error now: up to {um(now_largest)} µm over {region}, workpiece aligned."

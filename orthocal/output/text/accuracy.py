@@ -11,7 +11,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from orthocal.arrays import Array
-from orthocal.assessment.assess import assessment_of
+from orthocal.assessment.assess import assessment_of, changes_offsets
 from orthocal.assessment.effect_limits import DETERMINED
 from orthocal.assessment.remaining_errors import RemainingError, find_remaining_errors
 from orthocal.assessment.tool_error import (
@@ -112,9 +112,7 @@ def render_accuracy(
         further: Expected tool errors after another hour.
     """
     rows = [("identified error, now", accuracy.measure(accuracy.deviation))]
-    keep = assessment_of(calibration).keeps_offsets
-    firmware = calibration.session.firmware is not None
-    if not (calibration.only_offsets or keep or firmware):
+    if changes_offsets(calibration):
         entered = accuracy.measure(accuracy.deviation_with_entries)
         rows.append(("identified error, offsets entered", entered))
     rows.append(("uncertainty before calibration", accuracy.before.sizes))
