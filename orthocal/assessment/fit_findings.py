@@ -102,7 +102,8 @@ def _convergence(calibration: Calibration) -> list[Finding]:
     """Finding about noise that did not converge."""
     if calibration.solver.noise_converged:
         return []
-    return [words.noise_not_converged(calibration.noise.sigma)]
+    gauges = len(calibration.session.gauges)
+    return [words.noise_not_converged(calibration.noise.sigma, gauges=gauges)]
 
 
 def _standstill(calibration: Calibration) -> list[Finding]:

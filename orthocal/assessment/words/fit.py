@@ -24,13 +24,16 @@ def noise_unknown() -> Finding:
     )
 
 
-def noise_not_converged(sigma: float) -> Finding:
+def noise_not_converged(sigma: float, *, gauges: int) -> Finding:
     """Finding that the noise still differs between the last two solutions."""
+    several = (
+        "Calibrate without the readings of one gauge, to see which gauge contradicts the others."
+    )
     return note(
         "no convergence",
         "The estimated noise of a reading differs between the last two solutions, so the values "
         "and their ± are approximate.",
-        "State gauge.sigma_mm, or repeat all readings in cycles.",
+        "State gauge.sigma_mm, or repeat all readings in cycles." if gauges == 1 else several,
         sigma_mm=sigma / MM,
     )
 
