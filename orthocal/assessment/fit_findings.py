@@ -102,7 +102,7 @@ def _convergence(calibration: Calibration) -> list[Finding]:
     """Finding about noise that did not converge."""
     if calibration.solver.noise_converged:
         return []
-    gauges = len(calibration.session.gauges)
+    gauges = len(calibration.gauges)
     return [words.noise_not_converged(calibration.noise.sigma, gauges=gauges)]
 
 

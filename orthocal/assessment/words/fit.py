@@ -26,9 +26,7 @@ def noise_unknown() -> Finding:
 
 def noise_not_converged(sigma: float, *, gauges: int) -> Finding:
     """Finding that the noise still differs between the last two solutions."""
-    several = (
-        "Calibrate without the readings of one gauge, to see which gauge contradicts the others."
-    )
+    several = "Calibrate without the readings of one gauge, to see which contradicts the others."
     return note(
         "no convergence",
         "The estimated noise of a reading differs between the last two solutions, so the values "
