@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from functools import cached_property, lru_cache
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array, Indices
 from orthocal.errors import ClosureError, SessionError
@@ -81,6 +82,12 @@ class LinearModel:
         """Standard deviation of a reading of the first gauge, [m]; all entries refer to it."""
         self.dof = o.size - o.n_zeros
         self.labels, self.session_of_entry = label_sessions(session, o.setup)
+        self.reference = self.problem.active_theta.copy()
+        """Free parameters of the reference, shape (n_free,), [SI]: the controller corrects its
+        offsets and backlashes as stated. It is the mean of the prior."""
+        for drive, backlash in zip(session.robot.drives, self.compensated.max(axis=0), strict=True):
+            if (name := f"{drive.name}.backlash") in free:
+                self.reference[self.problem.free.index(name)] = backlash
         self._counts = np.bincount(o.zero, minlength=o.n_zeros).astype(np.float64)
         self._incidence = self.problem.zero_incidence
 
@@ -133,10 +140,27 @@ class LinearModel:
     @property
     def active(self) -> Array:
         """Offsets stated as active in the controller, shape (n_sessions, n_drives), [m, rad]."""
-        active = _active_by_setup(self.problem.session)
+        return self._of_sessions(_active_by_setup(self.problem.session))
+
+    @property
+    def compensated(self) -> Array:
+        """Backlashes that the controller compensates as stated, (n_sessions, n_drives), [m, rad].
+
+        They are 0 if not stated.
+        """
+        session = self.problem.session
+        none = [0.0] * len(session.robot.drives)
+        by_setup = [
+            session.compensation if s.compensation is None else s.compensation
+            for s in session.setups.values()
+        ]
+        return self._of_sessions([[t.lost_motion for t in c] or none for c in by_setup])
+
+    def _of_sessions(self, by_setup: Sequence[ArrayLike]) -> Array:
+        """Values of the first setup of each session, from those of all setups."""
         setup_of_entry = self.problem.observations.setup
         first_entries = [np.argmax(self.session_of_entry == k) for k in range(len(self.labels))]
-        return np.array([active[setup_of_entry[i]] for i in first_entries])
+        return np.array([by_setup[setup_of_entry[i]] for i in first_entries])
 
     @property
     def order(self) -> Indices:
@@ -283,7 +307,7 @@ class LinearModel:
         place = {key: m for m, key in enumerate(distinct)}
         errors = (theta + np.array(list(distinct.values()))) * self.problem.theta_scale
         of_session = np.array([place[s.tobytes()] for s in session_shifts])
-        return self.problem.active_theta + errors, of_session
+        return self.reference + errors, of_session
 
     def _predict(self, machines: Array, starts: Array | None) -> tuple[Array, Array, Array]:
         """Predicted entries, their Jacobians and the passive coordinates of machines.

@@ -54,7 +54,7 @@ def test_the_evidence_of_one_parameter_is_its_integral(true, scale):
     zero = np.zeros(7)
     about = ModelLinearisation(zero, jacobian, likelihood, errors, sizes, np.zeros(1), zero)
     gain = about.log_positive_share(
-        readings, np.array([True]), tolerance_scale=scale, noise_scale=1.0
+        readings, np.array([True]), np.zeros(1), tolerance_scale=scale, noise_scale=1.0
     )
     covariance = scale**2 * jacobian @ jacobian.T + sigma**2 * np.eye(7)
     found = multivariate_normal(zero, covariance).logpdf(readings) + gain

@@ -71,8 +71,8 @@ def test_offsets_that_are_not_as_stated_are_named(plan, active, kind, drives):
     e = anomaly.explanation
     assert (e.kind, e.sessions) == (kind, ("session-2",))
     assert e.drives == tuple(plan.robot.drives[i].name for i in drives)
-    if e.offsets:
-        assert np.array(e.offsets) == pytest.approx(active, abs=1e-9)
+    if e.active:
+        assert np.array(e.active) == pytest.approx(active, abs=1e-9)
     else:  # the change of the machine that has the same effect
         assert e.amount == pytest.approx(-0.8e-3, abs=0.2e-3)
     assert found.explained
@@ -118,7 +118,7 @@ def test_wrongly_entered_offsets_are_named_where_others_were_active(plan, way, d
     e = anomaly.explanation
     assert (e.kind, e.sessions) == (WAYS[way][0], ("session-2",))
     assert e.drives == tuple(plan.robot.drives[i].name for i in drives)
-    assert np.array(e.offsets) == pytest.approx(active, abs=1e-9)
+    assert np.array(e.active) == pytest.approx(active, abs=1e-9)
     assert anomaly.between_sessions
 
 

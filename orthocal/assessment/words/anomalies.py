@@ -24,7 +24,7 @@ from orthocal.measurement.motion.approach import label_reading
 from orthocal.sensors.protocol import states_readings
 from orthocal.session.session import Session, split_label
 from orthocal.text import printable, spans
-from orthocal.units import EDGE_UNITS, MM, UM, Unit
+from orthocal.units import DRIVE_UNITS, EDGE_UNITS, MM, UM, Unit
 
 MAX_PLACES = 20
 """Largest number of places in a finding."""
@@ -156,7 +156,7 @@ def _unexplained(session: Session, result: Anomalies) -> Finding:
 
 
 def _between_sessions(session: Session, anomaly: Anomaly) -> Finding:
-    """Finding about a machine that changed, or offsets that were not entered as stated."""
+    """Finding about a machine that changed, or numbers that were not entered as stated."""
     e = anomaly.explanation
     text = _capitalised(f"{_text(session, e)}.")
     others = [_text(session, c) for c in (*anomaly.causes, *anomaly.alternatives) if c != e]
@@ -168,12 +168,12 @@ def _between_sessions(session: Session, anomaly: Anomaly) -> Finding:
             p = session.robot.parameters[name]
             numbers[f"{name}_by_{p.edge_unit}"] = e.amount * p.edge_factor
             numbers[f"{name}_std_{p.edge_unit}"] = (e.std or 0.0) * p.edge_factor
-    if e.offsets:
-        for drive, active in zip(session.robot.drives, e.offsets, strict=True):
+    if e.active:
+        for drive, active in zip(session.robot.drives, e.active, strict=True):
             if drive.name in e.drives:
                 numbers[f"{drive.name}_active_{drive.edge_unit}"] = active * drive.edge_factor
     names = e.drives or e.parameters
-    file = _file_of(session, e.sessions[0])
+    file = _file_of(session, e.sessions[0]) if e.sessions else None
     return review(
         e.kind,
         text,
@@ -372,6 +372,8 @@ def _text(session: Session, e: Explanation) -> str:
         ),
         "offsets entered twice": lambda: _entered(e, "was added twice", "were added twice"),
         "offsets interchanged": lambda: _entered(e, "was interchanged", "were interchanged"),
+        "backlash not entered": lambda: _compensated(e, "does not compensate", "twice"),
+        "backlash halved": lambda: _compensated(e, "compensates only half of", "1.5 times"),
     }
     return texts[e.kind]()
 
@@ -537,6 +539,20 @@ def _entered(e: Explanation, one: str, several: str) -> str:
     return f"in session {e.sessions[0]} the {which} {how}"
 
 
+def _compensated(e: Explanation, part: str, grown: str) -> str:
+    """Clause about a backlash that the controller does not compensate as stated.
+
+    Args:
+        e: The explanation.
+        part: Verb phrase for the compensation.
+        grown: Size of the backlash that a single session does not distinguish from this.
+    """
+    text = f"the controller {part} the stated backlash of {joined(e.drives)}"
+    if e.sessions:
+        return f"in session {e.sessions[0]} {text}"
+    return f"{text}, or the backlash is {grown} the stated one"
+
+
 def _remedy(session: Session, e: Explanation) -> str:
     """Action after an anomaly with one explanation."""
     if e.scope == "reading" and (e.factor is not None or e.kind == "misread dial"):
@@ -610,19 +626,23 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
 
 
 def _session_remedy(session: Session, e: Explanation) -> str:
-    """Action for a change between sessions."""
-    first = e.sessions[0]
+    """Action for numbers that were entered wrongly, or a change between sessions."""
     if session.firmware is not None:
         return (
             "Calibrate the last log alone and export its settings: they must belong to the present "
             "printer."
         )
     if e.kind != "machine changed":
+        number = "backlash" if e.kind.startswith("backlash") else "offsets"
+        key = f"controller.{number}_{DRIVE_UNITS[session.robot.drives[0].unit][0]}"
+        which = f"session {e.sessions[0]}" if e.sessions else "session.yaml"
+        complete = " LinuxCNC's BACKLASH is the complete backlash." * (e.kind == "backlash halved")
         return (
-            f"Compare the offsets in the controller with `controller.offsets_mm` of session "
-            f"{first}. If the session states the wrong ones, correct them there; otherwise enter "
-            "the right ones and measure again."
+            f"Compare the {number} in the controller with `{key}` of {which}.{complete} If the "
+            "session states wrong numbers, correct them there; otherwise enter the right ones and "
+            "measure again."
         )
+    first = e.sessions[0]
     if e.apart:
         first = f"{joined(e.sessions)} and the others"
         return (
