@@ -30,6 +30,7 @@ from typer.testing import CliRunner
 from unmodelled_machines import EffectSearch, plan_with_conditions, read_machines
 
 from orthocal import check_session, join_sessions, load_plan, simulate_session
+from orthocal.assessment.judgement import judge_session
 from orthocal.cli import make_program
 from orthocal.effects.compensation import JointTrim
 from orthocal.hypotheses import family_scores, search
@@ -266,10 +267,10 @@ def print_backlash(console: Console, sessions: int) -> None:
                 accused = named = 0
                 for seed in range(count):
                     session = compensated_session(plan, seed, parts, level=level, earlier=earlier)
-                    found = search.find_anomalies(session).found
-                    accused += bool(found)
-                    kinds = [a.explanation.kind.partition(" ")[0] for a in found]
-                    drives = [a.explanation.drives for a in found]
+                    found = search.find_anomalies(session)
+                    accused += judge_session(session, anomalies=found).verdict != "enter"
+                    kinds = [a.explanation.kind.partition(" ")[0] for a in found.found]
+                    drives = [a.explanation.drives for a in found.found]
                     named += kinds == ["backlash"] and drives == [wrong]
                 row = ("two" if earlier else "one", name, f"{level:g}", count, accused, named)
                 table.add_row(*map(str, row))
