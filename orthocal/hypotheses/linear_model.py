@@ -88,7 +88,9 @@ class LinearModel:
         for drive, backlash in zip(session.robot.drives, self.compensated.max(axis=0), strict=True):
             if (name := f"{drive.name}.backlash") in free:
                 self.reference[self.problem.free.index(name)] = backlash
-        self._counts = np.bincount(o.zero, minlength=o.n_zeros).astype(np.float64)
+        counts = np.bincount(o.zero, minlength=o.n_zeros).astype(np.float64)
+        self._shares = np.divide(1.0, counts, out=np.zeros_like(counts), where=~o.zero_known)
+        """Share of one entry in each free gauge zero, 0 for known zeros, shape (n_zeros,)."""
         self._incidence = self.problem.zero_incidence
 
     def at_reference(self, *, keep_jacobian: bool) -> ModelLinearisation:
@@ -466,7 +468,7 @@ class LinearModel:
         if patterns.tails is not None:  # then each entry is one row divided by its noise ratio
             scale = np.asarray(self.to_entries.sum(axis=1))
             square += patterns.tails.product(scale[:, None] ** 2, power=2)[:, 0]
-        square -= self._sums_by_zero(patterns) ** 2 @ (1.0 / self._counts)
+        square -= self._sums_by_zero(patterns) ** 2 @ self._shares
         along = patterns.product(self.to_entries @ directions.T)
         cross = patterns.product((self.to_entries @ deviation)[:, None])[:, 0]
         return Products(along, np.maximum(square, 0.0)), cross
@@ -481,7 +483,7 @@ class LinearModel:
         """
         patterns = self._without_tails(patterns)
         one, other = (p.rows @ self.to_entries for p in (patterns, others))
-        means = self._sums_by_zero(patterns) * self._sums_by_zero(others) @ (1.0 / self._counts)
+        means = self._sums_by_zero(patterns) * self._sums_by_zero(others) @ self._shares
         return row_products(one, other) - means
 
     def _sums_by_zero(self, patterns: Patterns) -> Array:
