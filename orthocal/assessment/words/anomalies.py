@@ -343,7 +343,7 @@ def _text(session: Session, e: Explanation) -> str:
         "displaced gauge": lambda: _displaced(session, e),
         "displaced artefact": lambda: _displaced_artefact(session, e),
         "wrong dimension": lambda: _other_dimension(session, e),
-        "readjusted dimension": lambda: _readjusted(e),
+        "readjusted dimension": lambda: _readjusted(session, e),
         "drift": lambda: _drifted(e),
         "backlash": lambda: (
             f"the drives have backlash: {_amounts(e)}. Readings differ by up to "
@@ -483,15 +483,22 @@ def _other_dimension(session: Session, e: Explanation) -> str:
     """Clause about a wrong dimension with its true and stated size."""
     true, stated = _dimensions_mm(e)
     what = e.names[0].rpartition(".")[2].removesuffix("_mm")
-    return f"the {what} in {_subject(session, e)} is {plain(true)} mm, not {stated:g} mm"
+    zeroed = f", or the dial was not zeroed at {stated:g} mm" * _has_known_zero(session, e)
+    return f"the {what} in {_subject(session, e)} is {plain(true)} mm, not {stated:g} mm{zeroed}"
 
 
-def _readjusted(e: Explanation) -> str:
+def _readjusted(session: Session, e: Explanation) -> str:
     """A dimension that differs from a session on, with both sizes."""
     true, stated = _dimensions_mm(e)
     what = e.names[0].rpartition(".")[2].removesuffix("_mm")
     since = f" before session {e.names[2]}" if len(e.names) > 2 else ""
-    return f"the {what} was changed{since}: it is {plain(true)} mm there, not {stated:g} mm"
+    zeroed = f", or the dial was not zeroed at {stated:g} mm" * _has_known_zero(session, e)
+    return f"the {what} was changed{since}: it is {plain(true)} mm there, not {stated:g} mm{zeroed}"
+
+
+def _has_known_zero(session: Session, e: Explanation) -> bool:
+    """True if a wrong dimension changes all readings as a wrong gauge zero does: bars."""
+    return any(session.setups[name].zero == "known" for name in e.setups)
 
 
 def _swapped(session: Session, e: Explanation) -> str:
@@ -581,13 +588,15 @@ def _remedy(session: Session, e: Explanation) -> str:
         return "If so, fasten the probe and the bed, probe again and import the new log."
     if e.kind == "inconsistent posture" and e.scope == "postures":
         return "Check its coordinates, and read it again."
+    zeroed = " If the dial was zeroed on the machine, state `zero: free` there."
+    zeroed *= _has_known_zero(session, e)
     remedies = {
         "displaced artefact": ("Check `reversed` of its setups. " if _can_turn(session, e) else "")
         + "If it was displaced, give it another name in the later setups.",
-        "wrong dimension": f"If so, measure it, and correct `{''.join(e.names[:1])}`.",
+        "wrong dimension": f"If so, measure it, and correct `{''.join(e.names[:1])}`.{zeroed}",
         "readjusted dimension": "If so, state the present "
         f"`{''.join(e.names[:1])}` in that session. If it is unknown, give its gauge another name "
-        "there.",
+        f"there.{zeroed}",
         "inconsistent setup": "Check its leg, direction, section and the mounting of its gauge; "
         "then read it again, or leave it out.",
         "swapped rows": "If so, swap them back.",
