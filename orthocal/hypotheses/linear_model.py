@@ -169,20 +169,27 @@ class LinearModel:
         """Sessions in the order of measuring, shape (n_sessions,).
 
         The times of the readings determine the order if all readings state them. Otherwise sessions
-        without active offsets come first; all others have the order in which they were joined.
+        whose controller corrects nothing come first; all others have the order in which they were
+        joined.
         """
-        session = self.problem.session
-        keys: list[datetime | bool] = [bool(a.any()) for a in self.active]
-        times: dict[str, list[datetime | None]] = {}
-        for r in session.readings:
-            time = None if r.conditions is None else r.conditions.time
-            times.setdefault(split_label(r.setup, joined=session.joined)[0], []).append(time)
-        if session.joined and not any(None in of_session for of_session in times.values()):
-            start = {
-                k: min(t.replace(tzinfo=t.tzinfo or UTC) for t in v if t) for k, v in times.items()
-            }
-            keys = [start[label] for label in self.labels]
+        corrections = np.hstack([self.active, self.compensated])
+        keys: list[datetime | bool] = [bool(c.any()) for c in corrections]
+        if times := self.times:
+            keys = [times[label] for label in self.labels]
         return np.array(sorted(range(len(self.labels)), key=keys.__getitem__))
+
+    @property
+    def times(self) -> dict[str, datetime]:
+        """Time of the first reading of each joined session; empty unless all readings state it."""
+        session = self.problem.session
+        times: dict[str, list[datetime]] = {}
+        for r in session.readings:
+            if not session.joined or r.conditions is None or r.conditions.time is None:
+                return {}
+            label, _ = split_label(r.setup, joined=True)
+            time = r.conditions.time
+            times.setdefault(label, []).append(time.replace(tzinfo=time.tzinfo or UTC))
+        return {label: min(of_session) for label, of_session in times.items()}
 
     @cached_property
     def to_entries(self) -> Sparse:

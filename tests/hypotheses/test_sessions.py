@@ -12,6 +12,7 @@ from calibrated import plan_of
 from made_mistakes import sound_session
 
 from orthocal import draw_errors, simulate_session
+from orthocal.assessment.judgement import judge_session
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.hypotheses.families.sessions import divide_sessions, enter_wrongly
 from orthocal.hypotheses.linear_model import LinearModel
@@ -278,17 +279,35 @@ def test_the_order_in_which_sessions_are_joined_does_not_matter(plan):
     assert anomaly.explanation.amount == pytest.approx(0.6e-3, abs=0.1e-3)
 
 
+def at(session, day):
+    """The session with the time of a day."""
+    conditions = Conditions(time=datetime(2026, 1, day))
+    return session.select([replace(r, conditions=conditions) for r in session.readings])
+
+
 def test_sessions_are_in_the_order_of_their_times(plan):
     """Otherwise those without active offsets come first."""
     sessions = [plan.with_controller(v) for v in (ENTERED, 0.0 * ENTERED, ENTERED)]
     assert LinearModel(join_sessions(sessions)).order.tolist() == [1, 0, 2]
-    timed = [
-        s.select(
-            [replace(r, conditions=Conditions(time=datetime(2026, 1, day))) for r in s.readings]
-        )
-        for s, day in zip(sessions, (3, 2, 1), strict=True)
-    ]
+    timed = [at(s, day) for s, day in zip(sessions, (3, 2, 1), strict=True)]
     assert LinearModel(join_sessions(timed)).order.tolist() == [2, 1, 0]
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_sessions_in_another_order_are_noted(plan, timed):
+    """The later one by its times, or the one that states active offsets."""
+    sessions = [
+        simulate_session(plan.with_controller(v), {}, seed=k).session
+        for k, v in enumerate((0.0 * ENTERED, 0.0 * ENTERED if timed else ENTERED))
+    ]
+    if timed:
+        sessions = [at(s, day) for s, day in zip(sessions, (1, 2), strict=True)]
+    for given, notes in ((sessions, []), (sessions[::-1], ["session-1"])):
+        found = [f for f in judge_session(join_sessions(given)).findings if f.kind == "wrong order"]
+        assert [f.severity for f in found] == ["note"] * len(notes)
+        assert all(
+            f"{name} is the latest" in f.action for f, name in zip(found, notes, strict=True)
+        )
 
 
 def test_few_sessions_are_divided_in_all_ways():

@@ -207,6 +207,27 @@ def describe_no_change(sizes: dict[str, float], undetectable: Sequence[str]) -> 
     return note("no change", text, **{f"seen_from_{u}": size for u, size in sizes.items()})
 
 
+def describe_wrong_order(given: str, last: str, *, timed: bool) -> Finding:
+    """Finding about joined sessions that were not given in the order of measuring.
+
+    Args:
+        given: Session that was given last.
+        last: Session that was measured last.
+        timed: Whether the times of the readings state this; otherwise the active offsets.
+    """
+    reason = (
+        f"session {last} was measured later"
+        if timed
+        else f"its controller corrects nothing, unlike that of session {last}"
+    )
+    return note(
+        "wrong order",
+        f"The present offsets are assumed to be those of session {given}, which was given last. "
+        f"But {reason}.",
+        f"If session {last} is the latest, give it last.",
+    )
+
+
 def _numbers(result: Anomalies, anomaly: Anomaly) -> dict[str, float]:
     """Numbers of the finding about an anomaly."""
     return {
