@@ -271,7 +271,7 @@ def print_backlash(console: Console, sessions: int) -> None:
                     accused += judge_session(session, anomalies=found).verdict != "enter"
                     kinds = [a.explanation.kind.partition(" ")[0] for a in found.found]
                     drives = [a.explanation.drives for a in found.found]
-                    named += kinds == ["backlash"] and drives == [wrong]
+                    named += kinds == ["backlash"] and (drives == [wrong] or not wrong)
                 row = ("two" if earlier else "one", name, f"{level:g}", count, accused, named)
                 table.add_row(*map(str, row))
     console.print(table)
