@@ -9,12 +9,18 @@ from datetime import datetime
 import numpy as np
 import pytest
 from calibrated import plan_of
+from effect_plans import effect_plan
 from made_mistakes import sound_session
 
 from orthocal import draw_errors, simulate_session
 from orthocal.assessment.judgement import judge_session
+from orthocal.effects.compensation import JointTrim
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
-from orthocal.hypotheses.families.sessions import divide_sessions, enter_wrongly
+from orthocal.hypotheses.families.sessions import (
+    divide_sessions,
+    enter_backlash_wrongly,
+    enter_wrongly,
+)
 from orthocal.hypotheses.linear_model import LinearModel
 from orthocal.hypotheses.search import find_anomalies
 from orthocal.measurement.joining import join_sessions
@@ -151,6 +157,89 @@ def test_wrong_offsets_are_listed_once():
         "offsets interchanged",
     }
     assert list(enter_wrongly(before, before)) == []
+
+
+@pytest.fixture(scope="module")
+def sided():
+    """Each posture is approached from both sides."""
+    plan = effect_plan("backlash")
+    return plan.with_gauge(replace(plan.gauge, sigma=5e-6, resolution=10e-6))
+
+
+def compensate(plan, backlash, parts, *, seed=1):
+    """Session of a machine whose controller compensates parts of the stated backlash.
+
+    Args:
+        plan: The readings.
+        backlash: That of each drive, which the session states, [m].
+        parts: Compensation of the controller relative to the stated one, of each drive.
+        seed: Of the readings.
+    """
+    errors = draw_errors(plan.robot, machine_errors(plan.robot), seed=1)
+    errors |= {f"{d.name}.offset": 0.0 for d in plan.robot.drives}
+    errors |= {f"{d.name}.backlash": backlash for d in plan.robot.drives}
+    active = tuple(JointTrim(backlash * p) for p in parts)
+    session = simulate_session(replace(plan, compensation=active), errors, seed=seed).session
+    return replace(session, compensation=(JointTrim(backlash),) * len(active))
+
+
+@pytest.mark.parametrize(
+    ("parts", "kind", "drives"),
+    [
+        ((0.0, 0.0, 0.0), "backlash not entered", "xyz"),
+        ((1.0, 0.0, 1.0), "backlash not entered", "y"),
+        ((0.5, 0.5, 0.5), "backlash halved", "xyz"),
+    ],
+)
+def test_backlash_that_the_controller_does_not_compensate_as_stated_is_named(
+    sided, parts, kind, drives
+):
+    first = replace(compensate(sided, 0.12e-3, (0.0, 0.0, 0.0)), compensation=())
+    (found,) = find_anomalies(
+        join_sessions([first, compensate(sided, 0.12e-3, parts, seed=2)])
+    ).found
+    e = found.explanation
+    assert (e.kind, e.sessions, found.ambiguous) == (kind, ("session-2",), False)
+    assert e.drives == tuple(f"{d}_slide" for d in drives)
+    assert e.active == pytest.approx(np.multiply(parts, 0.12e-3))
+
+
+@pytest.mark.parametrize("by_table", [False, True])
+def test_a_single_session_shows_a_large_backlash_that_was_not_entered(sided, by_table):
+    """The machine is sound if the controller compensates it, although it exceeds its tolerance."""
+    size = 0.14e-3
+    stated = JointTrim(size)
+    if by_table:
+        table = np.array([[-0.2, size / 2, -size / 2], [0.4, size / 2, -size / 2]])
+        stated = JointTrim(table=table)
+
+    def judge(parts):
+        session = compensate(sided, size, parts)
+        return judge_session(replace(session, compensation=(stated,) * 3)).findings
+
+    assert {f.severity for f in judge((1.0, 1.0, 1.0))} <= {"note"}
+    (found,) = (f for f in judge((0.0, 0.0, 0.0)) if f.severity != "note")
+    assert found.kind == "backlash not entered"
+    assert found.text == (
+        "The controller does not compensate the stated backlash of x_slide, y_slide and z_slide, "
+        "or the backlash is twice the stated one."
+    )
+    assert {p.parameter for p in found.places} == {"x_slide", "y_slide", "z_slide"}
+
+
+def test_each_wrong_backlash_is_considered_once():
+    """A part of the drives, all of them, none entered or the previous ones, or half."""
+    found = list(enter_backlash_wrongly(np.array([0.0, 2e-5]), np.array([4e-5, 6e-5])))
+    assert [(k, d, np.round(a, 9).tolist()) for k, d, a in found] == [
+        ("backlash not entered", (0, 1), [0.0, 2e-5]),
+        ("backlash not entered", (0,), [0.0, 6e-5]),
+        ("backlash not entered", (1,), [4e-5, 2e-5]),
+        ("backlash not entered", (0, 1), [0.0, 0.0]),
+        ("backlash not entered", (1,), [4e-5, 0.0]),
+        ("backlash halved", (0, 1), [2e-5, 3e-5]),
+        ("backlash halved", (0,), [2e-5, 6e-5]),
+        ("backlash halved", (1,), [4e-5, 3e-5]),
+    ]
 
 
 def place(session, row):
