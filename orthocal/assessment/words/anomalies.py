@@ -393,8 +393,8 @@ def _text(session: Session, e: Explanation) -> str:
         ),
         "offsets entered twice": lambda: _entered(e, "was added twice", "were added twice"),
         "offsets interchanged": lambda: _entered(e, "was interchanged", "were interchanged"),
-        "backlash not entered": lambda: _compensated(e, "does not compensate", "twice"),
-        "backlash halved": lambda: _compensated(e, "compensates only half of", "1.5 times"),
+        "backlash not entered": lambda: _compensated(session, e),
+        "backlash halved": lambda: _compensated(session, e),
     }
     return texts[e.kind]()
 
@@ -567,18 +567,21 @@ def _entered(e: Explanation, one: str, several: str) -> str:
     return f"in session {e.sessions[0]} the {which} {how}"
 
 
-def _compensated(e: Explanation, part: str, grown: str) -> str:
+def _compensated(session: Session, e: Explanation) -> str:
     """Clause about a backlash that the controller does not compensate as stated.
 
-    Args:
-        e: The explanation.
-        part: Verb phrase for the compensation.
-        grown: Size of the backlash that a single session does not distinguish from this.
+    A single session does not distinguish it from a larger backlash.
     """
-    text = f"the controller {part} the stated backlash of {joined(e.drives)}"
+    drives = zip(session.robot.drives, e.active, strict=True)
+    part, size = "does not compensate the stated", "twice"
+    if e.kind == "backlash halved":
+        part, size = "compensates only half of the stated", "1.5 times"
+    elif any(active for drive, active in drives if drive.name in e.drives):
+        part = "still compensates the previous"
+    text = f"the controller {part} backlash of {joined(e.drives)}"
     if e.sessions:
         return f"in session {e.sessions[0]} {text}"
-    return f"{text}, or the backlash is {grown} the stated one"
+    return f"{text}, or the backlash is {size} the stated one"
 
 
 def _remedy(session: Session, e: Explanation) -> str:
