@@ -387,12 +387,10 @@ def _text(session: Session, e: Explanation) -> str:
             f"the controller's offset of {joined(e.drives)} in session {joined(e.sessions)} is "
             f"not the stated one{_amount_of_change(session, e)}"
         ),
-        "offsets not entered": lambda: _entered(e, "was not entered", "were not entered"),
-        "offsets reversed": lambda: _entered(
-            e, "was entered with the wrong sign", "were entered with the wrong sign"
-        ),
-        "offsets entered twice": lambda: _entered(e, "was added twice", "were added twice"),
-        "offsets interchanged": lambda: _entered(e, "was interchanged", "were interchanged"),
+        "offsets not entered": lambda: _entered(e, "not entered"),
+        "offsets reversed": lambda: _entered(e, "entered with the wrong sign"),
+        "offsets entered twice": lambda: _entered(e, "added twice"),
+        "offsets interchanged": lambda: _entered(e, "interchanged"),
         "backlash not entered": lambda: _compensated(session, e),
         "backlash halved": lambda: _compensated(session, e),
     }
@@ -560,11 +558,10 @@ def _amount_of_change(session: Session, e: Explanation) -> str:
     return f" by {signed(e.amount * p.edge_factor)}{uncertainty} {p.edge_unit}"
 
 
-def _entered(e: Explanation, one: str, several: str) -> str:
-    """Clause about wrongly entered offsets; the verb phrase is for one or for several offsets."""
-    which = f"{'offset' if len(e.drives) == 1 else 'offsets'} of {joined(e.drives)}"
-    how = one if len(e.drives) == 1 else several
-    return f"in session {e.sessions[0]} the {which} {how}"
+def _entered(e: Explanation, how: str) -> str:
+    """Clause about wrongly entered offsets."""
+    which = "offset of {} was" if len(e.drives) == 1 else "offsets of {} were"
+    return f"in session {e.sessions[0]} the {which.format(joined(e.drives))} {how}"
 
 
 def _compensated(session: Session, e: Explanation) -> str:
