@@ -297,6 +297,17 @@ def test_misread_turn_is_named_at_once_and_by_check(root, run, tmp_path):
     assert out.endswith(f"Next: correct or repeat these readings,\n  orthocal record {folder}\n")
 
 
+def test_a_contradiction_names_the_lines_of_the_most_likely_mistakes(root, run, tmp_path):
+    """A wrong sign that only a later reading of another posture shows, without clear evidence."""
+    session = sound_session(load_plan(root / "examples/workshop/plan.yaml"), 0, entered=False)
+    values = session.values
+    values[5] *= -1.0
+    blank(root / "examples/workshop", tmp_path / "typed")
+    _, out, _ = run(tmp_path / "typed", *(f"{v / MM:.3f}" for v in values[:8]))
+    _, last = out.split("! Line 9 differs by ")
+    assert "\n  Check the dial, and lines 5 to 7: the mistake may be there.\n" in last
+
+
 def test_reversed_setup_is_named_at_its_end_and_by_check(root, run, tmp_path):
     folder = tmp_path / "typed"
     values = blank(root / "examples/raw-cycles", folder)
@@ -603,7 +614,7 @@ def test_points_are_recorded_and_compared_with_their_prediction(tmp_path, run):
     assert "Setup track, 1 of 1: 8 readings" in out
     assert "Not recorded: type x, y and z of the point" in out
     assert "Not recorded: '1 2' is no point" in out
-    differs = re.search(r"! Line 9 y differs by ([0-9.]+) mm. Check the point.", out)
+    differs = re.search(r"! Line 9 y differs by ([0-9.]+) mm\.", out)
     assert float(differs[1]) == pytest.approx(1.0, abs=0.1)
     recorded = [[float(row[f"{k}_mm"]) for k in "xyz"] for row in rows_of(tmp_path)]
     assert np.array(recorded) == pytest.approx(np.vstack([points[:-1], slip]), abs=5e-4)

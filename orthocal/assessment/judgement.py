@@ -22,7 +22,11 @@ from orthocal.assessment.plausibility import (
     find_scattered,
 )
 from orthocal.assessment.words import plausibility as words
-from orthocal.assessment.words.anomalies import describe_anomalies, describe_no_change
+from orthocal.assessment.words.anomalies import (
+    describe_anomalies,
+    describe_no_change,
+    describe_wrong_order,
+)
 from orthocal.calibration.assessment_record import Finding, Severity, Verdict
 from orthocal.estimation.tolerance_scale import AS_STATED, ToleranceScale, trial_scales
 from orthocal.hypotheses.anomaly import Anomalies
@@ -107,9 +111,11 @@ def judge_session(session: Session, *, anomalies: Anomalies | None = None) -> Ju
         elif scale.factor > 1.0:
             scale_findings = [words.above_tolerances(scale.factor)]
     no_change = [] if mistakes or not session.joined else [_describe_detectable(session)]
+    order = _describe_order(session) if session.joined else []
     unshown_effects = find_unshown_effects(session)
     return Judgement(
-        rank([*implausible, *mistakes, *no_change, *scale_findings, *unshown_effects]), scale
+        rank([*implausible, *mistakes, *order, *no_change, *scale_findings, *unshown_effects]),
+        scale,
     )
 
 
@@ -234,6 +240,15 @@ def _independent_contrasts(
     )
     variances, rotation = np.linalg.eigh(whitened[:, 1:] @ whitened[:, 1:].T)
     return rotation.T @ whitened[:, 0], np.maximum(variances, 0.0), rest_square, model.dof - rank
+
+
+def _describe_order(session: Session) -> list[Finding]:
+    """Finding about joined sessions that were not given in the order of measuring."""
+    model = linear_model(session)
+    last = model.labels[model.order[-1]]
+    if last == model.labels[-1]:
+        return []
+    return [describe_wrong_order(model.labels[-1], last, timed=bool(model.times))]
 
 
 def _describe_detectable(session: Session) -> Finding:

@@ -142,7 +142,11 @@ def compute_log_evidence(
             logs += [
                 [
                     linearisation.log_positive_share(
-                        deviation, positive, tolerance_scale=float(scale), noise_scale=float(noise)
+                        deviation,
+                        positive,
+                        linear.reference / linear.problem.theta_scale,
+                        tolerance_scale=float(scale),
+                        noise_scale=float(noise),
                     )
                     for noise in noises
                 ]

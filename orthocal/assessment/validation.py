@@ -104,7 +104,7 @@ class Validation:
     """Joint calibration from all sessions with its assessment; None if the calibration is not
     confirmed."""
     mistake: Anomaly | None
-    """Wrongly entered offsets, or another change between the sessions; None without any."""
+    """Wrongly entered numbers, or another change between the sessions; None without any."""
     enter: tuple[ControllerEntry, ...]
     """Values to enter. Those of the calibration if they were entered wrongly, or if the joint
     calibration changes none of them; otherwise those of `final_calibration`."""
@@ -172,7 +172,7 @@ def _mistake_document(mistake: Anomaly) -> dict[str, Any]:
         "session": e.sessions[0],
         "drives": list(e.drives),
         "parameters": list(e.parameters),
-        "active": list(e.offsets) or None,
+        "active": list(e.active) or None,
         "change": e.amount,
         "change_std": e.std,
         "log_evidence": mistake.log_evidence,
@@ -397,7 +397,7 @@ def _find_changes(
 
     Returns:
         The first change of a session or None, findings about all changes and mistakes, and whether
-        the offsets of the calibration were entered wrongly.
+        offsets or backlashes of the calibration were entered wrongly.
     """
     changes = anomalies.found
     if judgement.verdict != "enter":

@@ -47,6 +47,7 @@ FindingKind = Literal[
     "inconsistent readings",
     "no change",
     "change unknown",
+    "wrong order",
     "scattered repeats",
     "readings missing",
     "no anomaly",

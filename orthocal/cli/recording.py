@@ -16,6 +16,7 @@ from orthocal.calibration.assessment_record import Finding
 from orthocal.cli.printing import put_out
 from orthocal.errors import OrthocalError, SessionError
 from orthocal.hypotheses.linear_model import linear_model
+from orthocal.hypotheses.search import find_suspected_rows
 from orthocal.io.tables.numerals import parse_typed_point, parse_typed_reading, plain_minus
 from orthocal.measurement.files.readings_checks import parse_temperature, require_approach
 from orthocal.measurement.recording import Recording
@@ -300,8 +301,11 @@ class Dialogue:
         self._say(self._text.confirmation(index))
         following = self._next
         is_end_of_setup = following is None or recording.rows[following].setup != row.setup
+        warned = False
         if self._is_doubtful(index) or is_end_of_setup or corrected:
-            self._judge(last=index)
+            warned = self._judge(last=index)
+        if not warned and self._far & {recording.rows[i].key for i in recording.point(index)}:
+            self._say(self._text.suspects(index, self._find_suspected_lines()))
         self._ask_for(following)
 
     def _is_doubtful(self, index: int) -> bool:
@@ -317,9 +321,7 @@ class Dialogue:
         if not self._can_judge or not self._recording.is_located:
             return False
         rows = self._recording.rows
-        findings = (*self._warnings, *self._hidden)
-        point = set(self._recording.point(index))
-        excluded = {i for f in findings for i in find_rows(f, rows)} - point
+        excluded = self._rows_with_warning() - set(self._recording.point(index))
         session = self._recording.measured(without=excluded)
         position = sum(r.is_read and i not in excluded for i, r in enumerate(rows[:index]))
         try:
@@ -334,19 +336,37 @@ class Dialogue:
             self._far.add(rows[index].key)
         return is_doubtful(session, position, mean, std)
 
-    def _judge(self, *, last: int | None = None) -> None:
+    def _rows_with_warning(self) -> set[int]:
+        """Indices of the rows that present or hidden findings name."""
+        findings = (*self._warnings, *self._hidden)
+        return {i for f in findings for i in find_rows(f, self._recording.rows)}
+
+    def _find_suspected_lines(self) -> list[int]:
+        """Lines of the most likely mistakes, if no finding names a line; empty if unknown."""
+        excluded, rows = self._rows_with_warning(), self._recording.rows
+        measured = [r for i, r in enumerate(rows) if r.is_read and i not in excluded]
+        try:
+            suspected = find_suspected_rows(self._recording.measured(without=excluded))
+        except (OrthocalError, np.linalg.LinAlgError):
+            return []
+        return sorted({measured[i].line or 0 for i in suspected})
+
+    def _judge(self, *, last: int | None = None) -> bool:
         """Judge the present readings; print new and resolved warnings.
 
         A complete session is judged as by `check`; `_show` prints its warnings.
 
         Args:
             last: Index of the row that was just read.
+
+        Returns:
+            True if there are new warnings.
         """
         recording = self._recording
         is_empty = len(recording.missing) == len(recording.rows)
         if not self._can_judge or is_empty or not recording.is_located:
             self._warnings = self._hidden = ()
-            return
+            return False
         try:
             if recording.missing:
                 warnings = find_warnings(recording.measured())
@@ -357,7 +377,7 @@ class Dialogue:
             hidden = [f for f in absent if self._is_hidden(f, warnings)]
         except (OrthocalError, np.linalg.LinAlgError) as e:
             self._stop_judging(e)
-            return
+            return False
         resolved = [f for f in absent if f not in hidden]
         self._warnings, self._hidden = warnings, tuple(hidden)
         if recording.missing:
@@ -365,6 +385,7 @@ class Dialogue:
                 self._say(self._text.warning(finding, last=last))
         if resolved:
             self._say(self._text.resolved(resolved))
+        return bool(new)
 
     def _is_hidden(self, finding: Finding, warnings: Sequence[Finding]) -> bool:
         """True if a finding occurs again without all other doubtful readings.

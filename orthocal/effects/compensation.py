@@ -49,6 +49,13 @@ class JointTrim:
         columns = [np.interp(joints, self.table[:, 0], self.table[:, k]) for k in (1, 2)]
         return np.stack(columns, axis=1)
 
+    @property
+    def lost_motion(self) -> float:
+        """Compensated backlash; the mean over the rows of a table, [m, rad]."""
+        if self.table is None:
+            return self.backlash
+        return float((self.table[:, 1] - self.table[:, 2]).mean())
+
 
 MAX_COMP_FILE_ENTRIES = 256
 """Largest number of entries of a COMP_FILE of LinuxCNC."""

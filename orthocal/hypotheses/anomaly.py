@@ -33,6 +33,8 @@ AnomalyKind = Literal[
     "offsets entered twice",
     "offsets interchanged",
     "offset of one drive",
+    "backlash not entered",
+    "backlash halved",
     "machine changed",
 ]
 """Kinds of anomaly. `offset of one drive`: an offset that differs from the stated one and matches
@@ -51,8 +53,10 @@ WRONGLY_ENTERED: tuple[AnomalyKind, ...] = (
     "offsets reversed",
     "offsets entered twice",
     "offsets interchanged",
+    "backlash not entered",
+    "backlash halved",
 )
-"""Kinds that state which offsets the controller has instead of the stated ones."""
+"""Kinds that state which numbers the controller has instead of the stated ones."""
 
 Scope = Literal[
     "reading", "posture", "postures", "cycle", "setup", "setups", "leg", "legs", "gauge", "session"
@@ -95,13 +99,14 @@ class Explanation:
     """Row offset: True if the first of the rows was not read, False if the row before was written
     twice, so that the last reading was lost."""
     drives: tuple[str, ...] = ()
-    """Drives whose offsets are concerned."""
-    offsets: tuple[float, ...] = ()
-    """Offsets in the controller instead of the stated ones, one per drive, [m, rad]."""
+    """Drives whose offsets or backlashes are concerned."""
+    active: tuple[float, ...] = ()
+    """Offsets or backlashes in the controller instead of the stated ones, one per drive,
+    [m, rad]."""
     effect: str = ""
     """Name of an effect of the machine or its gauges that the model lacks."""
     parameters: tuple[str, ...] = ()
-    """Error parameters that changed, or the parameters of an effect."""
+    """Error parameters that changed or that the controller corrects, or those of an effect."""
     amounts: tuple[float, ...] = ()
     """Value of each parameter of an effect, [SI]."""
     stds: tuple[float, ...] = ()
@@ -114,13 +119,13 @@ class Explanation:
     """Whether the machine changed for these sessions only, not from the first of them on."""
 
     def agrees_with(self, other: Explanation) -> bool:
-        """True if both concern the same drives and sessions, or the same rows.
+        """True if both concern the same parameters and sessions, or the same rows.
 
         Rows of a kind in PERSISTENT may differ by one.
         """
         if not self.rows or not other.rows:
-            same = self.drives == other.drives and self.sessions == other.sessions
-            return self == other or (bool(self.drives) and same)
+            same = self.parameters == other.parameters and self.sessions == other.sessions
+            return self == other or (bool(self.parameters) and same)
         if set(self.rows) == set(other.rows):
             no_setups = not (self.setups or other.setups)
             return len(self.rows) == 1 or self.kind == other.kind or no_setups

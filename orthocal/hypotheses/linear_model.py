@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from functools import cached_property, lru_cache
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from orthocal.arrays import Array, Indices
 from orthocal.errors import ClosureError, SessionError
@@ -81,7 +82,15 @@ class LinearModel:
         """Standard deviation of a reading of the first gauge, [m]; all entries refer to it."""
         self.dof = o.size - o.n_zeros
         self.labels, self.session_of_entry = label_sessions(session, o.setup)
-        self._counts = np.bincount(o.zero, minlength=o.n_zeros).astype(np.float64)
+        self.reference = self.problem.active_theta.copy()
+        """Free parameters of the reference, shape (n_free,), [SI]: the controller corrects its
+        offsets and backlashes as stated. It is the mean of the prior."""
+        for drive, backlash in zip(session.robot.drives, self.compensated.max(axis=0), strict=True):
+            if (name := f"{drive.name}.backlash") in free:
+                self.reference[self.problem.free.index(name)] = backlash
+        counts = np.bincount(o.zero, minlength=o.n_zeros).astype(np.float64)
+        self._shares = np.divide(1.0, counts, out=np.zeros_like(counts), where=~o.zero_known)
+        """Share of one entry in each free gauge zero, 0 for known zeros, shape (n_zeros,)."""
         self._incidence = self.problem.zero_incidence
 
     def at_reference(self, *, keep_jacobian: bool) -> ModelLinearisation:
@@ -133,30 +142,54 @@ class LinearModel:
     @property
     def active(self) -> Array:
         """Offsets stated as active in the controller, shape (n_sessions, n_drives), [m, rad]."""
-        active = _active_by_setup(self.problem.session)
+        return self._of_sessions(_active_by_setup(self.problem.session))
+
+    @property
+    def compensated(self) -> Array:
+        """Backlashes that the controller compensates as stated, (n_sessions, n_drives), [m, rad].
+
+        They are 0 if not stated.
+        """
+        session = self.problem.session
+        none = [0.0] * len(session.robot.drives)
+        by_setup = [
+            session.compensation if s.compensation is None else s.compensation
+            for s in session.setups.values()
+        ]
+        return self._of_sessions([[t.lost_motion for t in c] or none for c in by_setup])
+
+    def _of_sessions(self, by_setup: Sequence[ArrayLike]) -> Array:
+        """Values of the first setup of each session, from those of all setups."""
         setup_of_entry = self.problem.observations.setup
         first_entries = [np.argmax(self.session_of_entry == k) for k in range(len(self.labels))]
-        return np.array([active[setup_of_entry[i]] for i in first_entries])
+        return np.array([by_setup[setup_of_entry[i]] for i in first_entries])
 
     @property
     def order(self) -> Indices:
         """Sessions in the order of measuring, shape (n_sessions,).
 
         The times of the readings determine the order if all readings state them. Otherwise sessions
-        without active offsets come first; all others have the order in which they were joined.
+        whose controller corrects nothing come first; all others have the order in which they were
+        joined.
         """
-        session = self.problem.session
-        keys: list[datetime | bool] = [bool(a.any()) for a in self.active]
-        times: dict[str, list[datetime | None]] = {}
-        for r in session.readings:
-            time = None if r.conditions is None else r.conditions.time
-            times.setdefault(split_label(r.setup, joined=session.joined)[0], []).append(time)
-        if session.joined and not any(None in of_session for of_session in times.values()):
-            start = {
-                k: min(t.replace(tzinfo=t.tzinfo or UTC) for t in v if t) for k, v in times.items()
-            }
-            keys = [start[label] for label in self.labels]
+        corrections = np.hstack([self.active, self.compensated])
+        keys: list[datetime | bool] = [bool(c.any()) for c in corrections]
+        if times := self.times:
+            keys = [times[label] for label in self.labels]
         return np.array(sorted(range(len(self.labels)), key=keys.__getitem__))
+
+    @property
+    def times(self) -> dict[str, datetime]:
+        """Time of the first reading of each joined session; empty unless all readings state it."""
+        session = self.problem.session
+        times: dict[str, list[datetime]] = {}
+        for r in session.readings:
+            if not session.joined or r.conditions is None or r.conditions.time is None:
+                return {}
+            label, _ = split_label(r.setup, joined=True)
+            time = r.conditions.time
+            times.setdefault(label, []).append(time.replace(tzinfo=time.tzinfo or UTC))
+        return {label: min(of_session) for label, of_session in times.items()}
 
     @cached_property
     def to_entries(self) -> Sparse:
@@ -283,7 +316,7 @@ class LinearModel:
         place = {key: m for m, key in enumerate(distinct)}
         errors = (theta + np.array(list(distinct.values()))) * self.problem.theta_scale
         of_session = np.array([place[s.tobytes()] for s in session_shifts])
-        return self.problem.active_theta + errors, of_session
+        return self.reference + errors, of_session
 
     def _predict(self, machines: Array, starts: Array | None) -> tuple[Array, Array, Array]:
         """Predicted entries, their Jacobians and the passive coordinates of machines.
@@ -442,7 +475,7 @@ class LinearModel:
         if patterns.tails is not None:  # then each entry is one row divided by its noise ratio
             scale = np.asarray(self.to_entries.sum(axis=1))
             square += patterns.tails.product(scale[:, None] ** 2, power=2)[:, 0]
-        square -= self._sums_by_zero(patterns) ** 2 @ (1.0 / self._counts)
+        square -= self._sums_by_zero(patterns) ** 2 @ self._shares
         along = patterns.product(self.to_entries @ directions.T)
         cross = patterns.product((self.to_entries @ deviation)[:, None])[:, 0]
         return Products(along, np.maximum(square, 0.0)), cross
@@ -457,7 +490,7 @@ class LinearModel:
         """
         patterns = self._without_tails(patterns)
         one, other = (p.rows @ self.to_entries for p in (patterns, others))
-        means = self._sums_by_zero(patterns) * self._sums_by_zero(others) @ (1.0 / self._counts)
+        means = self._sums_by_zero(patterns) * self._sums_by_zero(others) @ self._shares
         return row_products(one, other) - means
 
     def _sums_by_zero(self, patterns: Patterns) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -52,26 +51,35 @@ class ModelLinearisation:
         return np.asarray(self.error_directions @ (e2 * self.singular_values / variance * along))
 
     def log_positive_share(
-        self, deviation: Array, positive: Mask, *, tolerance_scale: float, noise_scale: float
+        self,
+        deviation: Array,
+        positive: Mask,
+        reference: Array,
+        *,
+        tolerance_scale: float,
+        noise_scale: float,
     ) -> float:
-        """Gain of the log likelihood by half-normal instead of normal priors.
+        """Gain of the log likelihood by truncated instead of normal priors.
 
-        The gain is ln 2ᵏ P(θ₊ > 0 | y) for the k errors θ₊ that are never negative. Their prior
-        density is twice the normal density, and only the positive part of the posterior counts.
+        The gain is ln P(θ₊ > 0 | y) − ln P(θ₊ > 0) for the errors θ₊ that are never negative. For
+        a reference of 0 the priors are half-normal, and P(θ₊ > 0) = 2⁻ᵏ for k errors.
 
         Args:
             deviation: Readings minus predictions, shape (n_entries,), zeros projected out, [m].
             positive: Mask of the errors that are never negative, shape (n_free,).
+            reference: Errors of the reference, shape (n_free,), [prior std].
             tolerance_scale: Tolerance scale e.
             noise_scale: Noise scale s.
         """
         scales = {"tolerance_scale": tolerance_scale, "noise_scale": noise_scale}
-        mean = self.errors_for(deviation, **scales)[positive]
+        prior_mean = reference[positive]
+        mean = prior_mean + self.errors_for(deviation, **scales)[positive]
         resolved = tolerance_scale**2 * self.singular_values**2
         resolved /= resolved + (noise_scale * self.likelihood.sigma) ** 2
         rows = self.error_directions[positive]
-        covariance = tolerance_scale**2 * (np.eye(len(rows)) - rows * resolved @ rows.T)
-        return len(rows) * math.log(2.0) + log_positive_share(mean, covariance)
+        prior = tolerance_scale**2 * np.eye(len(rows))
+        covariance = prior - tolerance_scale**2 * (rows * resolved @ rows.T)
+        return log_positive_share(mean, covariance) - log_positive_share(prior_mean, prior)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

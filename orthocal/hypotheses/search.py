@@ -82,6 +82,24 @@ def find_anomalies(session: Session) -> Anomalies:
     return _Search(session, linear).run()
 
 
+def find_suspected_rows(session: Session) -> tuple[int, ...]:
+    """Rows of the most likely single mistakes, however weak their evidence.
+
+    Args:
+        session: Readings that contradict each other.
+
+    Raises:
+        ClosureError: If the machine cannot reach a posture.
+        RobotError: If closures of the robot depend on each other.
+    """
+    search = _Search(session, linear_model(session))
+    families = list_families(search.model, Rows(session), grouped=False)
+    scored = list(search.scorer.score(search.sound, families))
+    least = max(float(e.max(initial=-np.inf)) for _, e in scored) - SIMILAR_LOG_BAYES
+    rows = {i for f, e in scored for h in np.flatnonzero(e > least) for i in f.explain(int(h)).rows}
+    return tuple(sorted(rows))
+
+
 class _Search:
     """The search in one session."""
 

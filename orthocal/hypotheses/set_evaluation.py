@@ -53,7 +53,7 @@ class SetEvaluator:
 
     def __init__(self, model: LinearModel, values: Array) -> None:
         self.model, self.values = model, values
-        self._keep_jacobian = len(model.labels) > 1
+        self._keep_jacobian = len(model.labels) > 1 or bool(model.compensated.any())
         start = model.at_reference(keep_jacobian=self._keep_jacobian)
         self.sound = self.evaluate((), start)
 

@@ -28,7 +28,7 @@ def test_every_kind_has_a_sentence(root, kind):
         std=1e-4,
         missing=True,
         drives=(drive,),
-        offsets=(1e-3,) * len(session.robot.drives),
+        active=(1e-3,) * len(session.robot.drives),
         sessions=("first", "second"),
         parameters=(f"{drive}.offset",),
     )

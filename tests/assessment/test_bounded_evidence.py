@@ -44,24 +44,26 @@ def test_the_share_of_several_variables_is_that_of_draws(size):
 
 
 @pytest.mark.parametrize("true", [-0.7, 0.1, 2.0])
-@pytest.mark.parametrize("scale", [1.0, 2.5])
-def test_the_evidence_of_one_parameter_is_its_integral(true, scale):
-    """y = J b + n with b ≥ 0 half-normal, in one dimension by quadrature."""
+@pytest.mark.parametrize(("scale", "reference"), [(1.0, 0.0), (2.5, 0.0), (2.5, 1.3)])
+def test_the_evidence_of_one_parameter_is_its_integral(true, scale, reference):
+    """y = J b + n with b ≥ 0 normal about a reference, in one dimension by quadrature."""
     rng = np.random.default_rng(3)
     jacobian, sigma = rng.normal(size=(7, 1)), 0.8
     readings = true * jacobian[:, 0] + sigma * rng.normal(size=7)
     likelihood, errors, sizes = build_likelihood(jacobian, sigma=sigma, dof=7, stated=True)
     zero = np.zeros(7)
     about = ModelLinearisation(zero, jacobian, likelihood, errors, sizes, np.zeros(1), zero)
+    deviation, mean = readings - reference * jacobian[:, 0], np.array([reference])
     gain = about.log_positive_share(
-        readings, np.array([True]), tolerance_scale=scale, noise_scale=1.0
+        deviation, np.array([True]), mean, tolerance_scale=scale, noise_scale=1.0
     )
     covariance = scale**2 * jacobian @ jacobian.T + sigma**2 * np.eye(7)
-    found = multivariate_normal(zero, covariance).logpdf(readings) + gain
+    found = multivariate_normal(zero, covariance).logpdf(deviation) + gain
 
     def density(b):
         noise = norm(0.0, sigma).pdf(readings - jacobian[:, 0] * b).prod()
-        return noise * 2.0 * norm(0.0, scale).pdf(b)
+        prior = norm(reference, scale)
+        return noise * prior.pdf(b) / prior.sf(0.0)
 
     expected, _ = quad(density, 0.0, 12.0 * scale, epsabs=0.0, epsrel=1e-10, limit=200)
     assert found == pytest.approx(math.log(expected), abs=1e-8)

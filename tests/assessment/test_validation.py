@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 from calibrated import calibrated, identified, plan_of, session_of
+from effect_plans import FEW, effect_plan
 from models import TRUTH
 from scipy.stats import binom
 from scipy.stats import t as student
@@ -23,7 +24,11 @@ from orthocal import (
     validate_calibration,
 )
 from orthocal.assessment.assess import assessment_of
-from orthocal.assessment.controller_entries import entered_offsets, find_entries
+from orthocal.assessment.controller_entries import (
+    compensation_to_enter,
+    entered_offsets,
+    find_entries,
+)
 from orthocal.assessment.judgement import judge_session
 from orthocal.assessment.predictive import Repetition, judge_deviations, measure_repetition
 from orthocal.assessment.words.anomalies import describe_evidence
@@ -327,6 +332,24 @@ def test_values_to_enter_after_a_mistake(plan, mistake, kind, by_calibration):
     expected = right if by_calibration else right + (right - mistake(right))
     assert entered == pytest.approx(expected, abs=0.0 if by_calibration else 0.1e-3)
     assert all(f"{e.enter * 1e3:+.3f}" in text for e in result.enter)
+
+
+def test_values_to_enter_after_a_backlash_that_was_not_entered():
+    plan = effect_plan("backlash", setups=FEW).with_controller(np.zeros(3))
+    errors = draw_errors(plan.robot, machine_errors(plan.robot), seed=1)
+    errors |= {f"{d.name}.offset": 0.2e-3 for d in plan.robot.drives}
+    errors |= {f"{d.name}.backlash": 60e-6 for d in plan.robot.drives}
+    calibration = calibrate(simulate_session(plan, errors, seed=1).session, "full", **QUICK)
+    entered = plan.with_controller(entered_offsets(calibration))
+    session = simulate_session(entered, errors, seed=2).session
+    session = replace(session, compensation=compensation_to_enter(calibration))
+    result = validate_calibration(calibration, session)
+    assert result.confirmed is False
+    assert result.mistake.explanation.kind == "backlash not entered"
+    assert result.mistake.explanation.drives == ("x_slide", "y_slide", "z_slide")
+    assert json.loads(result_json(result))["mistake"]["active"] == [0.0] * 3
+    found = [e.enter for e in result.enter]
+    assert found == pytest.approx(entered_offsets(calibration).tolist())
 
 
 def test_identified_offsets_in_place_of_those_to_enter_are_not_confirmed(plan):

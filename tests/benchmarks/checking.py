@@ -4,6 +4,7 @@ python tests/benchmarks/checking.py                     a few sessions of every 
 python tests/benchmarks/checking.py --sessions 10 --sound 334
 python tests/benchmarks/checking.py --pairs 40          two reversed signs in different setups
 python tests/benchmarks/checking.py --effects 1000      effects that the model lacks
+python tests/benchmarks/checking.py --backlash 1000     backlash that was entered as stated, or not
 """
 
 from __future__ import annotations
@@ -14,21 +15,24 @@ import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import numpy as np
-from made_mistakes import SIZES, is_named, make_mistakes, sound_session
+from made_mistakes import SIZES, is_named, make_mistakes, sound_machine, sound_session
 from rich import box
 from rich.console import Console
 from rich.table import Table
 from typer.testing import CliRunner
 from unmodelled_machines import EffectSearch, plan_with_conditions, read_machines
 
-from orthocal import check_session, load_plan
+from orthocal import check_session, join_sessions, load_plan, simulate_session
+from orthocal.assessment.judgement import judge_session
 from orthocal.cli import make_program
+from orthocal.effects.compensation import JointTrim
 from orthocal.hypotheses import family_scores, search
 from orthocal.hypotheses.families.wrong_readings import inconsistent_groups
 from orthocal.hypotheses.family_scores import CLEAR_LOG_BAYES, SIMILAR_LOG_BAYES
@@ -211,6 +215,68 @@ def print_misnamed(console: Console, sessions: int) -> None:
     console.print(f"{named} of {made} mistakes taken for an effect")
 
 
+ENTERED = {
+    "as stated": (1.0, 1.0, 1.0),
+    "not at all": (0.0, 0.0, 0.0),
+    "by half": (0.5, 0.5, 0.5),
+    "but for one drive": (1.0, 0.0, 1.0),
+}
+"""Compensation of the controller relative to the stated one, and what it is called."""
+
+
+def compensated_session(plan, seed: int, parts, *, level: float, earlier: bool):
+    """A session that states backlash to 0.01 mm, and may follow one without compensation.
+
+    Args:
+        plan: Readings of each session.
+        seed: Of the machine and its readings.
+        parts: Compensation of the controller relative to the stated one, shape (n_drives,).
+        level: Factor of the tolerances of backlash of the machine.
+        earlier: Whether a session without compensation precedes.
+    """
+    errors, _ = sound_machine(plan, seed, entered=True)
+    names = [f"{d.name}.backlash" for d in plan.robot.drives]
+    errors |= {n: level * errors[n] for n in names}
+    rng = np.random.default_rng((seed, 5))
+    stated = [max(round(errors[n] + 5e-6 * rng.normal(), 5), 0.0) for n in names]
+    near = [errors[f"{d.name}.offset"] + 20e-6 * rng.normal() for d in plan.robot.drives]
+
+    def measured(active, seed):
+        trims = tuple(JointTrim(b) for b in active)
+        used = replace(plan.with_controller(near), compensation=trims)
+        return simulate_session(used, errors, seed=seed).session
+
+    session = measured(np.multiply(stated, parts), seed)
+    session = replace(session, compensation=tuple(JointTrim(b) for b in stated))
+    return join_sessions([measured((0.0,) * 3, seed + 10**6), session]) if earlier else session
+
+
+def print_backlash(console: Console, sessions: int) -> None:
+    """Print how often a wrongly entered backlash is named, and how many sound sessions are accused.
+
+    A tenth as many sessions have each mistake.
+    """
+    table = Table("sessions", "entered", "times tolerance", "made", "accused", "named")
+    for earlier in (False, True):
+        plan = plan_with_conditions(("yx", "xy", "xz") if earlier else None)
+        plan = plan.with_effects(["backlash"])
+        for name, parts in ENTERED.items():
+            wrong = tuple(d.name for d, p in zip(plan.robot.drives, parts, strict=True) if p < 1.0)
+            count = sessions // (4 if not wrong else 40)
+            for level in (1.0, 3.0):
+                accused = named = 0
+                for seed in range(count):
+                    session = compensated_session(plan, seed, parts, level=level, earlier=earlier)
+                    found = search.find_anomalies(session)
+                    accused += judge_session(session, anomalies=found).verdict != "enter"
+                    kinds = [a.explanation.kind.partition(" ")[0] for a in found.found]
+                    drives = [a.explanation.drives for a in found.found]
+                    named += kinds == ["backlash"] and (drives == [wrong] or not wrong)
+                row = ("two" if earlier else "one", name, f"{level:g}", count, accused, named)
+                table.add_row(*map(str, row))
+    console.print(table)
+
+
 def a_drift(mistake) -> bool:
     """Whether a mistake is a drift, which is an effect too."""
     return "drift" in mistake.kinds
@@ -224,11 +290,15 @@ def main() -> None:
     parser.add_argument("--size", action="append", type=float)
     parser.add_argument("--pairs", type=int, help="pairs of reversed signs on each plan")
     parser.add_argument("--effects", type=int, help="machines without and, a fifth, with effects")
+    parser.add_argument("--backlash", type=int, help="sessions that state backlash")
     given = parser.parse_args()
     console = Console(width=100)
     if given.effects:
         print_effects(console, given.effects)
         print_misnamed(console, given.sessions)
+        return
+    if given.backlash:
+        print_backlash(console, given.backlash)
         return
     if given.pairs:
         print_pairs(console, given.pairs)

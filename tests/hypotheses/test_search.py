@@ -224,9 +224,10 @@ def test_three_mistakes_in_different_setups_are_found_together(sheet):
     assert not found.ambiguous
 
 
-def test_products_by_cumulative_sums_are_those_of_dense_patterns(cycles):
-    """For displaced gauges and row offsets."""
-    session = join_sessions([cycles, cycles])
+@pytest.mark.parametrize("name", ["raw-cycles", "linear_delta"])
+def test_products_by_cumulative_sums_are_those_of_dense_patterns(name):
+    """For displaced gauges and row offsets; the zero of a ball bar is known."""
+    session = join_sessions([session_of(name)] * 2)
     assert len(session.readings) > MAX_DENSE_COLUMNS  # the patterns of fewer rows are dense
     model, rows = LinearModel(session), Rows(session)
     about = model.linearise(np.zeros(model.problem.n_free), (), None, keep_jacobian=False)
@@ -238,7 +239,7 @@ def test_products_by_cumulative_sums_are_those_of_dense_patterns(cycles):
                 continue
             found, cross = model.products(patterns, about, deviation)
             dense = model.entries(to_dense(patterns.to_sparse()))
-            assert found.along == pytest.approx(dense @ about.likelihood.directions.T, abs=1e-12)
+            assert found.along == pytest.approx(dense @ about.likelihood.directions.T, abs=1e-9)
             assert found.square == pytest.approx((dense**2).sum(axis=1), rel=1e-9, abs=1e-14)
             assert cross == pytest.approx(dense @ deviation, rel=1e-9, abs=1e-12)
             tested += family.count
@@ -249,6 +250,20 @@ def test_products_by_cumulative_sums_are_those_of_dense_patterns(cycles):
             )
             assert inner == pytest.approx((one * other).sum(axis=1), rel=1e-9, abs=1e-12)
     assert tested > 100
+
+
+@pytest.mark.parametrize("filled", [True, False])
+def test_a_reading_missed_near_the_end_is_named(filled):
+    """Another setup has a known zero; the last row is filled with the last reading, or missing."""
+    session = sound_session(plan_of("linear_delta"), 0, entered=True)
+    rows = Rows(session).setups["bed"]
+    values = session.values
+    values[rows[-4:-1]] = values[rows[-3:]]
+    chosen = [i for i in range(values.size) if filled or i != rows[-1]]
+    session = session.select([session.readings[i] for i in chosen]).with_values(values[chosen])
+    (found,) = find_anomalies(session).found
+    e = found.explanation
+    assert (e.kind, e.missing, e.rows[0], found.ambiguous) == ("row offset", True, rows[-4], False)
 
 
 def test_large_offsets_are_no_anomaly(tmp_path):

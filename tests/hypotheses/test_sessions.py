@@ -9,11 +9,18 @@ from datetime import datetime
 import numpy as np
 import pytest
 from calibrated import plan_of
+from effect_plans import effect_plan
 from made_mistakes import sound_session
 
 from orthocal import draw_errors, simulate_session
+from orthocal.assessment.judgement import judge_session
+from orthocal.effects.compensation import JointTrim
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
-from orthocal.hypotheses.families.sessions import divide_sessions, enter_wrongly
+from orthocal.hypotheses.families.sessions import (
+    divide_sessions,
+    enter_backlash_wrongly,
+    enter_wrongly,
+)
 from orthocal.hypotheses.linear_model import LinearModel
 from orthocal.hypotheses.search import find_anomalies
 from orthocal.measurement.joining import join_sessions
@@ -71,8 +78,8 @@ def test_offsets_that_are_not_as_stated_are_named(plan, active, kind, drives):
     e = anomaly.explanation
     assert (e.kind, e.sessions) == (kind, ("session-2",))
     assert e.drives == tuple(plan.robot.drives[i].name for i in drives)
-    if e.offsets:
-        assert np.array(e.offsets) == pytest.approx(active, abs=1e-9)
+    if e.active:
+        assert np.array(e.active) == pytest.approx(active, abs=1e-9)
     else:  # the change of the machine that has the same effect
         assert e.amount == pytest.approx(-0.8e-3, abs=0.2e-3)
     assert found.explained
@@ -118,7 +125,7 @@ def test_wrongly_entered_offsets_are_named_where_others_were_active(plan, way, d
     e = anomaly.explanation
     assert (e.kind, e.sessions) == (WAYS[way][0], ("session-2",))
     assert e.drives == tuple(plan.robot.drives[i].name for i in drives)
-    assert np.array(e.offsets) == pytest.approx(active, abs=1e-9)
+    assert np.array(e.active) == pytest.approx(active, abs=1e-9)
     assert anomaly.between_sessions
 
 
@@ -150,6 +157,89 @@ def test_wrong_offsets_are_listed_once():
         "offsets interchanged",
     }
     assert list(enter_wrongly(before, before)) == []
+
+
+@pytest.fixture(scope="module")
+def sided():
+    """Each posture is approached from both sides."""
+    plan = effect_plan("backlash")
+    return plan.with_gauge(replace(plan.gauge, sigma=5e-6, resolution=10e-6))
+
+
+def compensate(plan, backlash, parts, *, seed=1):
+    """Session of a machine whose controller compensates parts of the stated backlash.
+
+    Args:
+        plan: The readings.
+        backlash: That of each drive, which the session states, [m].
+        parts: Compensation of the controller relative to the stated one, of each drive.
+        seed: Of the readings.
+    """
+    errors = draw_errors(plan.robot, machine_errors(plan.robot), seed=1)
+    errors |= {f"{d.name}.offset": 0.0 for d in plan.robot.drives}
+    errors |= {f"{d.name}.backlash": backlash for d in plan.robot.drives}
+    active = tuple(JointTrim(backlash * p) for p in parts)
+    session = simulate_session(replace(plan, compensation=active), errors, seed=seed).session
+    return replace(session, compensation=(JointTrim(backlash),) * len(active))
+
+
+@pytest.mark.parametrize(
+    ("parts", "kind", "drives"),
+    [
+        ((0.0, 0.0, 0.0), "backlash not entered", "xyz"),
+        ((1.0, 0.0, 1.0), "backlash not entered", "y"),
+        ((0.5, 0.5, 0.5), "backlash halved", "xyz"),
+    ],
+)
+def test_backlash_that_the_controller_does_not_compensate_as_stated_is_named(
+    sided, parts, kind, drives
+):
+    first = replace(compensate(sided, 0.12e-3, (0.0, 0.0, 0.0)), compensation=())
+    (found,) = find_anomalies(
+        join_sessions([first, compensate(sided, 0.12e-3, parts, seed=2)])
+    ).found
+    e = found.explanation
+    assert (e.kind, e.sessions, found.ambiguous) == (kind, ("session-2",), False)
+    assert e.drives == tuple(f"{d}_slide" for d in drives)
+    assert e.active == pytest.approx(np.multiply(parts, 0.12e-3))
+
+
+@pytest.mark.parametrize("by_table", [False, True])
+def test_a_single_session_shows_a_large_backlash_that_was_not_entered(sided, by_table):
+    """The machine is sound if the controller compensates it, although it exceeds its tolerance."""
+    size = 0.14e-3
+    stated = JointTrim(size)
+    if by_table:
+        table = np.array([[-0.2, size / 2, -size / 2], [0.4, size / 2, -size / 2]])
+        stated = JointTrim(table=table)
+
+    def judge(parts):
+        session = compensate(sided, size, parts)
+        return judge_session(replace(session, compensation=(stated,) * 3)).findings
+
+    assert {f.severity for f in judge((1.0, 1.0, 1.0))} <= {"note"}
+    (found,) = (f for f in judge((0.0, 0.0, 0.0)) if f.severity != "note")
+    assert found.kind == "backlash not entered"
+    assert found.text == (
+        "The controller does not compensate the stated backlash of x_slide, y_slide and z_slide, "
+        "or the backlash is twice the stated one."
+    )
+    assert {p.parameter for p in found.places} == {"x_slide", "y_slide", "z_slide"}
+
+
+def test_each_wrong_backlash_is_considered_once():
+    """A part of the drives, all of them, none entered or the previous ones, or half."""
+    found = list(enter_backlash_wrongly(np.array([0.0, 2e-5]), np.array([4e-5, 6e-5])))
+    assert [(k, d, np.round(a, 9).tolist()) for k, d, a in found] == [
+        ("backlash not entered", (0, 1), [0.0, 2e-5]),
+        ("backlash not entered", (0,), [0.0, 6e-5]),
+        ("backlash not entered", (1,), [4e-5, 2e-5]),
+        ("backlash not entered", (0, 1), [0.0, 0.0]),
+        ("backlash not entered", (1,), [4e-5, 0.0]),
+        ("backlash halved", (0, 1), [2e-5, 3e-5]),
+        ("backlash halved", (0,), [2e-5, 6e-5]),
+        ("backlash halved", (1,), [4e-5, 3e-5]),
+    ]
 
 
 def place(session, row):
@@ -278,17 +368,35 @@ def test_the_order_in_which_sessions_are_joined_does_not_matter(plan):
     assert anomaly.explanation.amount == pytest.approx(0.6e-3, abs=0.1e-3)
 
 
+def at(session, day):
+    """The session with the time of a day."""
+    conditions = Conditions(time=datetime(2026, 1, day))
+    return session.select([replace(r, conditions=conditions) for r in session.readings])
+
+
 def test_sessions_are_in_the_order_of_their_times(plan):
     """Otherwise those without active offsets come first."""
     sessions = [plan.with_controller(v) for v in (ENTERED, 0.0 * ENTERED, ENTERED)]
     assert LinearModel(join_sessions(sessions)).order.tolist() == [1, 0, 2]
-    timed = [
-        s.select(
-            [replace(r, conditions=Conditions(time=datetime(2026, 1, day))) for r in s.readings]
-        )
-        for s, day in zip(sessions, (3, 2, 1), strict=True)
-    ]
+    timed = [at(s, day) for s, day in zip(sessions, (3, 2, 1), strict=True)]
     assert LinearModel(join_sessions(timed)).order.tolist() == [2, 1, 0]
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_sessions_in_another_order_are_noted(plan, timed):
+    """The later one by its times, or the one that states active offsets."""
+    sessions = [
+        simulate_session(plan.with_controller(v), {}, seed=k).session
+        for k, v in enumerate((0.0 * ENTERED, 0.0 * ENTERED if timed else ENTERED))
+    ]
+    if timed:
+        sessions = [at(s, day) for s, day in zip(sessions, (1, 2), strict=True)]
+    for given, notes in ((sessions, []), (sessions[::-1], ["session-1"])):
+        found = [f for f in judge_session(join_sessions(given)).findings if f.kind == "wrong order"]
+        assert [f.severity for f in found] == ["note"] * len(notes)
+        assert all(
+            f"{name} is the latest" in f.action for f, name in zip(found, notes, strict=True)
+        )
 
 
 def test_few_sessions_are_divided_in_all_ways():

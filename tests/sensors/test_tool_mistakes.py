@@ -167,6 +167,28 @@ def test_a_gauge_block_of_another_height_is_named(tmp_path):
     assert found.numbers["stated_mm"] == height
 
 
+@pytest.mark.parametrize("wrong", [("yz",), ("xy", "yz", "zx")], ids="-".join)
+def test_a_bar_that_was_zeroed_on_the_machine_is_named(tmp_path, wrong):
+    """Each setup has another zero. A bar of another length has the same change in all setups."""
+    plan = circles(tmp_path)
+    sensors = {n: replace(s.sensor, length_std=0.0) for n, s in plan.setups.items()}
+    plan = replace(
+        plan,
+        setups={n: replace(s, sensor=sensors[n], zero="known") for n, s in plan.setups.items()},
+    )
+    session = simulate_session(plan, errors_of(plan, 1), seed=1).session
+    assert warnings_of(session) == []
+    zeros = dict(zip(wrong, (0.31e-3, -0.22e-3, 0.17e-3), strict=False))
+    session = session.with_values([r.value + zeros.get(r.setup, 0.0) for r in session.readings])
+    found = warnings_of(session)
+    assert {f.kind for f in found} == {"wrong dimension"}
+    assert {p.setup for f in found for p in f.places} == set(wrong)
+    assert "or the dial was not zeroed at 50 mm" in found[0].text
+    assert "`zero: free`" in found[0].action
+    free = {n: replace(s, zero="free") if n in wrong else s for n, s in session.setups.items()}
+    assert warnings_of(replace(session, setups=free)) == []
+
+
 def two_sessions(folder, seed, *, change, renamed=False):
     """Three circles of one bar on two days; before the second one it was readjusted, [m]."""
     plan = circles(folder)

@@ -24,7 +24,7 @@ from orthocal.measurement.motion.approach import label_reading
 from orthocal.sensors.protocol import states_readings
 from orthocal.session.session import Session, split_label
 from orthocal.text import printable, spans
-from orthocal.units import EDGE_UNITS, MM, UM, Unit
+from orthocal.units import DRIVE_UNITS, EDGE_UNITS, MM, UM, Unit
 
 MAX_PLACES = 20
 """Largest number of places in a finding."""
@@ -156,7 +156,7 @@ def _unexplained(session: Session, result: Anomalies) -> Finding:
 
 
 def _between_sessions(session: Session, anomaly: Anomaly) -> Finding:
-    """Finding about a machine that changed, or offsets that were not entered as stated."""
+    """Finding about a machine that changed, or numbers that were not entered as stated."""
     e = anomaly.explanation
     text = _capitalised(f"{_text(session, e)}.")
     others = [_text(session, c) for c in (*anomaly.causes, *anomaly.alternatives) if c != e]
@@ -168,12 +168,12 @@ def _between_sessions(session: Session, anomaly: Anomaly) -> Finding:
             p = session.robot.parameters[name]
             numbers[f"{name}_by_{p.edge_unit}"] = e.amount * p.edge_factor
             numbers[f"{name}_std_{p.edge_unit}"] = (e.std or 0.0) * p.edge_factor
-    if e.offsets:
-        for drive, active in zip(session.robot.drives, e.offsets, strict=True):
+    if e.active:
+        for drive, active in zip(session.robot.drives, e.active, strict=True):
             if drive.name in e.drives:
                 numbers[f"{drive.name}_active_{drive.edge_unit}"] = active * drive.edge_factor
     names = e.drives or e.parameters
-    file = _file_of(session, e.sessions[0])
+    file = _file_of(session, e.sessions[0]) if e.sessions else None
     return review(
         e.kind,
         text,
@@ -205,6 +205,27 @@ def describe_no_change(sizes: dict[str, float], undetectable: Sequence[str]) -> 
     if undetectable:
         text += f" A change of {joined(tuple(undetectable), 'or')} would not."
     return note("no change", text, **{f"seen_from_{u}": size for u, size in sizes.items()})
+
+
+def describe_wrong_order(given: str, last: str, *, timed: bool) -> Finding:
+    """Finding about joined sessions that were not given in the order of measuring.
+
+    Args:
+        given: Session that was given last.
+        last: Session that was measured last.
+        timed: Whether the times of the readings state this; otherwise the active offsets.
+    """
+    reason = (
+        f"session {last} was measured later"
+        if timed
+        else f"its controller corrects nothing, unlike that of session {last}"
+    )
+    return note(
+        "wrong order",
+        f"The present offsets are assumed to be those of session {given}, which was given last. "
+        f"But {reason}.",
+        f"If session {last} is the latest, give it last.",
+    )
 
 
 def _numbers(result: Anomalies, anomaly: Anomaly) -> dict[str, float]:
@@ -343,7 +364,7 @@ def _text(session: Session, e: Explanation) -> str:
         "displaced gauge": lambda: _displaced(session, e),
         "displaced artefact": lambda: _displaced_artefact(session, e),
         "wrong dimension": lambda: _other_dimension(session, e),
-        "readjusted dimension": lambda: _readjusted(e),
+        "readjusted dimension": lambda: _readjusted(session, e),
         "drift": lambda: _drifted(e),
         "backlash": lambda: (
             f"the drives have backlash: {_amounts(e)}. Readings differ by up to "
@@ -366,12 +387,12 @@ def _text(session: Session, e: Explanation) -> str:
             f"the controller's offset of {joined(e.drives)} in session {joined(e.sessions)} is "
             f"not the stated one{_amount_of_change(session, e)}"
         ),
-        "offsets not entered": lambda: _entered(e, "was not entered", "were not entered"),
-        "offsets reversed": lambda: _entered(
-            e, "was entered with the wrong sign", "were entered with the wrong sign"
-        ),
-        "offsets entered twice": lambda: _entered(e, "was added twice", "were added twice"),
-        "offsets interchanged": lambda: _entered(e, "was interchanged", "were interchanged"),
+        "offsets not entered": lambda: _entered(e, "not entered"),
+        "offsets reversed": lambda: _entered(e, "entered with the wrong sign"),
+        "offsets entered twice": lambda: _entered(e, "added twice"),
+        "offsets interchanged": lambda: _entered(e, "interchanged"),
+        "backlash not entered": lambda: _compensated(session, e),
+        "backlash halved": lambda: _compensated(session, e),
     }
     return texts[e.kind]()
 
@@ -481,15 +502,22 @@ def _other_dimension(session: Session, e: Explanation) -> str:
     """Clause about a wrong dimension with its true and stated size."""
     true, stated = _dimensions_mm(e)
     what = e.names[0].rpartition(".")[2].removesuffix("_mm")
-    return f"the {what} in {_subject(session, e)} is {plain(true)} mm, not {stated:g} mm"
+    zeroed = f", or the dial was not zeroed at {stated:g} mm" * _has_known_zero(session, e)
+    return f"the {what} in {_subject(session, e)} is {plain(true)} mm, not {stated:g} mm{zeroed}"
 
 
-def _readjusted(e: Explanation) -> str:
+def _readjusted(session: Session, e: Explanation) -> str:
     """A dimension that differs from a session on, with both sizes."""
     true, stated = _dimensions_mm(e)
     what = e.names[0].rpartition(".")[2].removesuffix("_mm")
     since = f" before session {e.names[2]}" if len(e.names) > 2 else ""
-    return f"the {what} was changed{since}: it is {plain(true)} mm there, not {stated:g} mm"
+    zeroed = f", or the dial was not zeroed at {stated:g} mm" * _has_known_zero(session, e)
+    return f"the {what} was changed{since}: it is {plain(true)} mm there, not {stated:g} mm{zeroed}"
+
+
+def _has_known_zero(session: Session, e: Explanation) -> bool:
+    """True if a wrong dimension changes all readings as a wrong gauge zero does: bars."""
+    return any(session.setups[name].zero == "known" for name in e.setups)
 
 
 def _swapped(session: Session, e: Explanation) -> str:
@@ -530,11 +558,27 @@ def _amount_of_change(session: Session, e: Explanation) -> str:
     return f" by {signed(e.amount * p.edge_factor)}{uncertainty} {p.edge_unit}"
 
 
-def _entered(e: Explanation, one: str, several: str) -> str:
-    """Clause about wrongly entered offsets; the verb phrase is for one or for several offsets."""
-    which = f"{'offset' if len(e.drives) == 1 else 'offsets'} of {joined(e.drives)}"
-    how = one if len(e.drives) == 1 else several
-    return f"in session {e.sessions[0]} the {which} {how}"
+def _entered(e: Explanation, how: str) -> str:
+    """Clause about wrongly entered offsets."""
+    which = "offset of {} was" if len(e.drives) == 1 else "offsets of {} were"
+    return f"in session {e.sessions[0]} the {which.format(joined(e.drives))} {how}"
+
+
+def _compensated(session: Session, e: Explanation) -> str:
+    """Clause about a backlash that the controller does not compensate as stated.
+
+    A single session does not distinguish it from a larger backlash.
+    """
+    drives = zip(session.robot.drives, e.active, strict=True)
+    part, size = "does not compensate the stated", "twice"
+    if e.kind == "backlash halved":
+        part, size = "compensates only half of the stated", "1.5 times"
+    elif any(active for drive, active in drives if drive.name in e.drives):
+        part = "still compensates the previous"
+    text = f"the controller {part} backlash of {joined(e.drives)}"
+    if e.sessions:
+        return f"in session {e.sessions[0]} {text}"
+    return f"{text}, or the backlash is {size} the stated one"
 
 
 def _remedy(session: Session, e: Explanation) -> str:
@@ -565,13 +609,15 @@ def _remedy(session: Session, e: Explanation) -> str:
         return "If so, fasten the probe and the bed, probe again and import the new log."
     if e.kind == "inconsistent posture" and e.scope == "postures":
         return "Check its coordinates, and read it again."
+    zeroed = " If the dial was zeroed on the machine, state `zero: free` there."
+    zeroed *= _has_known_zero(session, e)
     remedies = {
         "displaced artefact": ("Check `reversed` of its setups. " if _can_turn(session, e) else "")
         + "If it was displaced, give it another name in the later setups.",
-        "wrong dimension": f"If so, measure it, and correct `{''.join(e.names[:1])}`.",
+        "wrong dimension": f"If so, measure it, and correct `{''.join(e.names[:1])}`.{zeroed}",
         "readjusted dimension": "If so, state the present "
         f"`{''.join(e.names[:1])}` in that session. If it is unknown, give its gauge another name "
-        "there.",
+        f"there.{zeroed}",
         "inconsistent setup": "Check its leg, direction, section and the mounting of its gauge; "
         "then read it again, or leave it out.",
         "swapped rows": "If so, swap them back.",
@@ -610,19 +656,23 @@ def _repeat(session: Session, *explanations: Explanation) -> str:
 
 
 def _session_remedy(session: Session, e: Explanation) -> str:
-    """Action for a change between sessions."""
-    first = e.sessions[0]
+    """Action for numbers that were entered wrongly, or a change between sessions."""
     if session.firmware is not None:
         return (
             "Calibrate the last log alone and export its settings: they must belong to the present "
             "printer."
         )
     if e.kind != "machine changed":
+        number = "backlash" if e.kind.startswith("backlash") else "offsets"
+        key = f"controller.{number}_{DRIVE_UNITS[session.robot.drives[0].unit][0]}"
+        which = f"session {e.sessions[0]}" if e.sessions else "session.yaml"
+        complete = " LinuxCNC's BACKLASH is the complete backlash." * (e.kind == "backlash halved")
         return (
-            f"Compare the offsets in the controller with `controller.offsets_mm` of session "
-            f"{first}. If the session states the wrong ones, correct them there; otherwise enter "
-            "the right ones and measure again."
+            f"Compare the {number} in the controller with `{key}` of {which}.{complete} If the "
+            "session states wrong numbers, correct them there; otherwise enter the right ones and "
+            "measure again."
         )
+    first = e.sessions[0]
     if e.apart:
         first = f"{joined(e.sessions)} and the others"
         return (

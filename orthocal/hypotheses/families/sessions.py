@@ -1,11 +1,12 @@
-"""Changes between joined sessions: offsets that differ from the stated ones, a changed machine.
+"""Numbers of the controller that differ from the stated ones, and changes between joined sessions.
 
-If a session states the offsets E but its controller has C, its machine appears to differ by E − C.
+If a session states the offsets or backlashes E but its controller has C, its machine appears to
+have errors that differ by E − C.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations, permutations
 
 import numpy as np
@@ -26,66 +27,70 @@ DETECTABLE_CHANGE = 5.5
 """Smallest change, relative to its standard deviation, with clear evidence."""
 
 ROUNDING = 1e-6
-"""Differences of offsets up to this are neglected, [m, rad]."""
+"""Differences of stated numbers up to this are neglected, [m, rad]."""
+
+Mistake = tuple[AnomalyKind, tuple[int, ...], Array]
+"""Kind of mistake, indices of the drives concerned, and the numbers in the controller, shape
+(n_drives,), [m, rad]."""
+
+Enter = Callable[[Array, Array], Iterator[Mistake]]
+"""Mistakes of entering numbers, from the previous and the stated ones."""
 
 
 def changes_between_sessions(model: LinearModel) -> Iterator[Family]:
-    """Wrongly entered offsets and changes of the machine; none for a single session."""
-    if len(model.labels) < 2:
-        return
-    offsets = _wrong_offsets(model)
-    if offsets is not None:
-        yield offsets
-    yield from _changed(model)
+    """Wrongly entered numbers and changes of the machine; for a single session only backlash."""
+    yield from _of_controller(model, "backlash", model.compensated, enter_backlash_wrongly)
+    if len(model.labels) > 1:
+        yield from _of_controller(model, "offset", model.active, enter_wrongly)
+        yield from _changed(model)
 
 
-def _wrong_offsets(model: LinearModel) -> Family | None:
-    """Offsets of a session that were entered wrongly, each mistake once."""
+def _of_controller(
+    model: LinearModel, parameter: str, stated: Array, enter: Enter
+) -> Iterator[Family]:
+    """Numbers of a session that were entered wrongly, each mistake once; none without a mistake.
+
+    Args:
+        model: The linearised model.
+        parameter: Name of the error of a drive that the controller corrects.
+        stated: Stated numbers, shape (n_sessions, n_drives), [m, rad].
+        enter: Mistakes of entering them.
+    """
     drives = [d.name for d in model.problem.robot.drives]
-    place, active, labels = model.offsets, model.active, model.labels
-    scale = model.problem.theta_scale
-    mistakes: list[tuple[AnomalyKind, int, tuple[int, ...], Array]] = []
-    previous = [np.zeros(len(drives)), *active[model.order]]
+    names = [f"{name}.{parameter}" for name in drives]
+    if not set(names) <= set(model.problem.free):
+        return
+    place = [model.problem.free.index(name) for name in names]
+    explanations, shifts = [], []
+    previous = [np.zeros(len(drives)), *stated[model.order]]
     for before, k in zip(previous, model.order.tolist(), strict=False):
-        for kind, concerned, entered in enter_wrongly(before, active[k]):
-            mistakes.append((kind, k, concerned, entered))
-    if not mistakes or len(place) < len(drives):
-        return None
-
-    explanations = [
-        Explanation(
-            kind,
-            "session",
-            drives=tuple(drives[i] for i in concerned),
-            offsets=tuple(entered.tolist()),
-            sessions=(labels[k],),
-        )
-        for kind, k, concerned, entered in mistakes
-    ]
-    shifts = []
-    for _, k, _, entered in mistakes:
-        direction = np.zeros(scale.size)
-        for i, name in enumerate(drives):
-            direction[place[name]] = (active[k, i] - entered[i]) / scale[place[name]]
-        shifts.append(MachineShift(np.arange(len(labels)) == k, direction))
-    return Family.of(explanations, shifts=shifts)
+        for kind, concerned, active in enter(before, stated[k]):
+            explanations.append(
+                Explanation(
+                    kind,
+                    "session",
+                    drives=tuple(drives[i] for i in concerned),
+                    parameters=tuple(names[i] for i in concerned),
+                    active=tuple(active.tolist()),
+                    sessions=tuple(filter(None, model.labels[k : k + 1])),
+                )
+            )
+            direction = np.zeros(model.problem.n_free)
+            direction[place] = (stated[k] - active) / model.problem.theta_scale[place]
+            shifts.append(MachineShift(np.arange(len(model.labels)) == k, direction))
+    if explanations:
+        yield Family.of(explanations, shifts=shifts)
 
 
-def enter_wrongly(
-    before: Array, stated: Array
-) -> Iterator[tuple[AnomalyKind, tuple[int, ...], Array]]:
+def enter_wrongly(before: Array, stated: Array) -> Iterator[Mistake]:
     """Offsets that the controller may have instead of the stated ones.
 
     Args:
         before: Previously active offsets, shape (n_drives,), [m, rad].
         stated: Offsets that were to be entered, shape (n_drives,), [m, rad].
-
-    Yields:
-        Kind of mistake, indices of the drives concerned, and offsets in the controller, shape
-        (n_drives,), [m, rad]; each set of offsets once.
     """
     change, n = stated - before, stated.size
-    mistakes: tuple[tuple[AnomalyKind, Array], ...] = (
+    mistakes: list[tuple[AnomalyKind, Array]] = [
         ("offsets not entered", before),
         ("offsets not entered", np.zeros(n)),
         ("offsets reversed", -stated),
@@ -93,30 +98,51 @@ def enter_wrongly(
         ("offsets entered twice", 2.0 * stated),
         ("offsets entered twice", before + stated),
         ("offsets entered twice", stated + change),
+    ]
+    if n <= MAX_DRIVES:
+        mistakes += [("offsets interchanged", stated[list(p)]) for p in permutations(range(n))]
+    return _by_drives(stated, mistakes)
+
+
+def enter_backlash_wrongly(before: Array, stated: Array) -> Iterator[Mistake]:
+    """Backlashes that the controller may compensate instead of the stated ones.
+
+    A controller that is told half of the lost motion compensates half of it.
+
+    Args:
+        before: Previously compensated backlashes, shape (n_drives,), [m, rad].
+        stated: Backlashes that were to be entered, shape (n_drives,), [m, rad].
+    """
+    return _by_drives(
+        stated,
+        [
+            ("backlash not entered", before),
+            ("backlash not entered", np.zeros_like(stated)),
+            ("backlash halved", 0.5 * stated),
+        ],
     )
+
+
+def _by_drives(stated: Array, mistakes: Sequence[tuple[AnomalyKind, Array]]) -> Iterator[Mistake]:
+    """Mistakes of all drives and of some of them, each set of numbers once.
+
+    Args:
+        stated: Stated numbers, shape (n_drives,), [m, rad].
+        mistakes: Kind of mistake, and numbers of all drives in the controller, (n_drives,).
+    """
+    n = stated.size
     seen: set[tuple[int, ...]] = {(0,) * n}
-
-    def is_new(values: Array) -> bool:
-        key = tuple(np.round((values - stated) / ROUNDING).astype(np.int64).tolist())
-        new = key not in seen
-        seen.add(key)
-        return new
-
     for kind, values in mistakes:
         differing = np.flatnonzero(np.abs(values - stated) > ROUNDING).tolist()
-        sizes = range(len(differing), 0, -1) if n <= MAX_DRIVES else (len(differing),)
-        for drives in (d for count in sizes if count for d in combinations(differing, count)):
-            entered = stated.copy()
-            entered[list(drives)] = values[list(drives)]
-            if is_new(entered):
-                yield kind, drives, entered
-    if n > MAX_DRIVES:
-        return
-    for order in permutations(range(n)):
-        entered = stated[list(order)]
-        if is_new(entered):
-            changed = np.abs(entered - stated) > ROUNDING
-            yield "offsets interchanged", tuple(np.flatnonzero(changed).tolist()), entered
+        apart = n <= MAX_DRIVES and kind != "offsets interchanged"
+        for count in range(len(differing), 0 if apart else len(differing) - 1, -1):
+            for drives in combinations(differing, count):
+                active = stated.copy()
+                active[list(drives)] = values[list(drives)]
+                key = tuple(np.round((active - stated) / ROUNDING).astype(np.int64).tolist())
+                if key not in seen:
+                    seen.add(key)
+                    yield kind, drives, active
 
 
 def _changed(model: LinearModel) -> Iterator[Family]:

@@ -51,6 +51,7 @@ MOST_LISTED = 4
 """Further findings that the short answer lists."""
 
 LISTED: tuple[FindingKind, ...] = (
+    "wrong order",
     "no change",
     "change unknown",
     "above tolerances",

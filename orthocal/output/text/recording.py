@@ -34,6 +34,9 @@ from orthocal.units import DRIVE_UNITS, MM, format_fixed, to_mm, trim_zeros
 WIDEST = 100
 """Largest width of a line, [columns]."""
 
+MAX_SUSPECTS = 3
+"""Most lines of possible mistakes that are listed."""
+
 GLUE = "\u00a0"
 """Space at which no line ends."""
 
@@ -296,9 +299,23 @@ class RecordingText:
         lines = [self.wrap(text, indent="  ")]
         if is_far(row.value, mean, std):
             differs = f"Line {row.line}{of} differs by {mm(abs(row.value - mean))} mm."
-            check = f"Check the {'point' if of else self.instrument(index)}, and the lines before."
-            lines.append(self.wrap(f"{differs} {check}", indent="  ", first="! "))
+            lines.append(self.wrap(differs, indent="  ", first="! "))
         return "\n".join(lines)
+
+    def suspects(self, index: int, lines: Sequence[int]) -> str:
+        """Advice for a row that contradicts the others without a finding.
+
+        Args:
+            index: Index of the row.
+            lines: Lines of the most likely mistakes; too many of them are not listed.
+        """
+        is_point = len(self._recording.point(index)) > 1
+        others = [n for n in lines if n != self._recording.rows[index].line]
+        where = "the lines before"
+        if 0 < len(others) <= MAX_SUSPECTS:
+            where = f"{spans(others, 'line')}: the mistake may be there"
+        noun = "point" if is_point else self.instrument(index)
+        return self.wrap(f"Check the {noun}, and {where}.", indent="  ")
 
     def warning(self, finding: Finding, *, last: int | None = None) -> str:
         """A finding about the readings so far, in the words of `check`.
