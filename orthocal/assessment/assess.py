@@ -160,13 +160,14 @@ def assess(
         *([_no_change_needed(entries, chosen.best)] if keep else []),
         *entry_findings,
         *([] if firmware else _compensation_findings(calibration, chosen.backlash)),
-        *describe_recommendation(
+        *chosen.unreached,
+    ]
+    if judgement.verdict == "enter":
+        notes += describe_recommendation(
             recommendation or recommend_model(session_used),
             judged_scale=judgement.tolerance_scale.factor,
             identified=calibration.model,
-        ),
-        *chosen.unreached,
-    ]
+        )
     findings = rank([*judgement.findings, *notes])
     return Assessment(
         decision=_decide(

@@ -50,13 +50,16 @@ class Comparison:
     """Correlation of the residuals of the recommended model with those of another session."""
     repeat_title: str
     """Title of the other session; empty if there is none."""
-    recommendation: Recommendation
-    effects: EffectComparison | None
-    """Effects beside geometry; None if the readings cannot show any."""
     judgement: Judgement
     """Judgement of the readings, independent of the model."""
+    recommendation: Recommendation | None
+    """Recommended model; None unless the verdict is `enter`."""
+    effects: EffectComparison | None
+    """Effects beside geometry; None if the readings cannot show any, or the verdict is not
+    `enter`."""
     assessments: tuple[Assessment, ...]
-    """Assessment of the calibration of each result, as `calibrate` states it."""
+    """Assessment of the calibration of each result, as `calibrate` states it; empty unless the
+    verdict is `enter`."""
 
     def __getitem__(self, model: str) -> ModelResult:
         for result in self.results:
@@ -67,9 +70,10 @@ class Comparison:
     @property
     def best(self) -> ModelResult | None:
         """The recommended model if it was compared; otherwise the largest model."""
-        by_name = {r.model: r for r in self.results}
         largest = self.results[-1] if self.results else None
-        return by_name.get(self.recommendation.model, largest)
+        if self.recommendation is None:
+            return largest
+        return {r.model: r for r in self.results}.get(self.recommendation.model, largest)
 
     @property
     def assessment(self) -> Assessment:
@@ -78,8 +82,9 @@ class Comparison:
 
     def to_json(self) -> str:
         """Comparison as a JSON document, SI units."""
+        recommendation = self.recommendation
         document = {
-            "schema": "orthocal/comparison/4",
+            "schema": "orthocal/comparison/5",
             "title": self.title,
             "noise": finite_or_none(self.noise.sigma),
             "noise_source": self.noise.source,
@@ -90,11 +95,12 @@ class Comparison:
                 for u in self.undetermined
             ],
             "repetition": None if self.repetition is None else self.repetition.to_document(),
-            "recommendation": {
-                "model": self.recommendation.model,
-                "tolerance_scale": self.recommendation.tolerance_scale,
+            "recommendation": recommendation
+            and {
+                "model": recommendation.model,
+                "tolerance_scale": recommendation.tolerance_scale,
                 "log_evidence": {
-                    e.model: finite_or_none(e.log_evidence) for e in self.recommendation.evidence
+                    e.model: finite_or_none(e.log_evidence) for e in recommendation.evidence
                 },
             },
             "effects": None if self.effects is None else _effects_document(self.effects),
@@ -112,6 +118,9 @@ def compare_models(
     judgement: Judgement | None = None,
 ) -> Comparison:
     """Identify several models from a session, linearised and exactly, and recommend one.
+
+    Unless the verdict on the readings is `enter`, the comparison has no recommendation and no tool
+    error, because both would depend on doubtful readings.
 
     Args:
         sessions: The session, or several, or paths to them.
@@ -137,7 +146,16 @@ def compare_models(
     build = partial(build_problem, session, tolerance_scale=judgement.tolerance_scale)
     names = models or session.robot.parameters.models
     results, undetermined = _score_models(build, names, noise.sigma, options)
-    recommendation = recommend_model(session, models)
+    recommendation, effects = None, None
+    assessments: tuple[Assessment, ...] = ()
+    if judgement.verdict == "enter":
+        recommendation, effects = recommend_model(session, models), compare_effects(session)
+        assessments = tuple(
+            assess(r.calibration, session, judgement=judgement, recommendation=recommendation)
+            for r in results
+        )
+    else:
+        results = tuple(replace(r, tool=None, linearisation_cost=None) for r in results)
     comparison = Comparison(
         title=session.title,
         labels=tuple(
@@ -149,13 +167,10 @@ def compare_models(
         undetermined=undetermined,
         repetition=None,
         repeat_title=join_sessions(others).title if others else "",
-        recommendation=recommendation,
-        effects=compare_effects(session),
         judgement=judgement,
-        assessments=tuple(
-            assess(r.calibration, session, judgement=judgement, recommendation=recommendation)
-            for r in results
-        ),
+        recommendation=recommendation,
+        effects=effects,
+        assessments=assessments,
     )
     if comparison.best is None or not others:
         return comparison
@@ -200,17 +215,26 @@ def _score_with_prior(
 
 
 def _assess(comparison: Comparison) -> Assessment:
-    """Assessment of a comparison: judgement of the readings and findings about the models."""
+    """Assessment of a comparison: judgement of the readings and findings about the models.
+
+    Unless the verdict is `enter`, it contains the judgement alone.
+    """
     judgement, best = comparison.judgement, comparison.best
+    recommendation = comparison.recommendation
+    if recommendation is None:
+        lead = judgement.findings[0]
+        headline = SESSION_HEADLINES[judgement.verdict]
+        decision = Decision(judgement.verdict, headline, lead.text, lead.action)
+        return Assessment(decision, judgement.findings, (), None)
     notes = words.describe_recommendation(
-        comparison.recommendation, judged_scale=judgement.tolerance_scale.factor
+        recommendation, judged_scale=judgement.tolerance_scale.factor
     )
     notes += [words.not_determined(u.model, u.reason) for u in comparison.undetermined]
     notes += words.describe_effects(comparison.effects, len(comparison.labels))
     tool = None
     if best is not None:
         best_assessment = comparison.assessments[comparison.results.index(best)]
-        notes += _models_not_recommended(comparison, best)
+        notes += _models_not_recommended(recommendation, comparison.results, best)
         notes += best_assessment.of_kind(*get_args(NoiseKind))
         if comparison.repetition is not None:
             title = comparison.repeat_title
@@ -230,9 +254,10 @@ def _assess(comparison: Comparison) -> Assessment:
     )
 
 
-def _models_not_recommended(comparison: Comparison, best: ModelResult) -> list[Finding]:
+def _models_not_recommended(
+    recommendation: Recommendation, results: Sequence[ModelResult], best: ModelResult
+) -> list[Finding]:
     """Findings about the models that are not recommended."""
-    recommendation = comparison.recommendation
     return [
         words.not_recommended(
             r.model,
@@ -240,7 +265,7 @@ def _models_not_recommended(comparison: Comparison, best: ModelResult) -> list[F
             r.exact.prediction_rms,
             best.exact.prediction_rms,
         )
-        for r in comparison.results
+        for r in results
         if r is not best
     ]
 
