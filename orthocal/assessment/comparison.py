@@ -230,7 +230,8 @@ def _assess(comparison: Comparison) -> Assessment:
         recommendation, judged_scale=judgement.tolerance_scale.factor
     )
     notes += [words.not_determined(u.model, u.reason) for u in comparison.undetermined]
-    notes += words.describe_effects(comparison.effects, len(comparison.labels))
+    if comparison.effects is not None:
+        notes += words.describe_effects(comparison.effects, len(comparison.labels))
     tool = None
     if best is not None:
         best_assessment = comparison.assessments[comparison.results.index(best)]
@@ -310,6 +311,8 @@ def _effects_document(comparison: EffectComparison) -> dict[str, Any]:
     """Entries of the JSON document about effects."""
     return {
         "recommended": list(comparison.recommended),
+        "stated": list(comparison.stated),
+        "shown": list(comparison.shown),
         "weighed": [
             {
                 "effects": list(w.effects),
