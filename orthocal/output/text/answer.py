@@ -156,7 +156,8 @@ def print_decision(assessment: Assessment, *, details: bool = False) -> None:
 
 def render_headline(decision: Decision) -> Text:
     """Headline of a decision, and its reason."""
-    headline = (decision.headline, STYLES[decision.verdict])
+    doubtful = decision.verdict == "enter" and decision.exit_code  # not confirmed
+    headline = (decision.headline, STYLES["review" if doubtful else decision.verdict])
     return Text.assemble(headline, f" {decision.reason}".rstrip())
 
 
