@@ -15,6 +15,7 @@ from orthocal.assessment.judgement import Judgement, judge_session, rank
 from orthocal.assessment.predictive import Repetition, measure_repetition
 from orthocal.assessment.recommendation import Recommendation, recommend_model
 from orthocal.assessment.scores import ModelResult, Score, Undetermined, score_model
+from orthocal.assessment.wording import describe_actions
 from orthocal.assessment.words import comparison as words
 from orthocal.assessment.words.entries import SESSION_HEADLINES
 from orthocal.assessment.words.validation import describe_repetition
@@ -224,7 +225,8 @@ def _assess(comparison: Comparison) -> Assessment:
     if recommendation is None:
         lead = judgement.findings[0]
         headline = SESSION_HEADLINES[judgement.verdict]
-        decision = Decision(judgement.verdict, headline, lead.text, lead.action)
+        action = describe_actions(judgement.findings)
+        decision = Decision(judgement.verdict, headline, lead.text, action)
         return Assessment(decision, judgement.findings, (), None)
     notes = words.describe_recommendation(
         recommendation, judged_scale=judgement.tolerance_scale.factor

@@ -27,6 +27,7 @@ from orthocal.assessment.predictive import (
     judge_deviations,
     measure_repetition,
 )
+from orthocal.assessment.wording import describe_actions
 from orthocal.assessment.words import validation as words
 from orthocal.calibration.adjusting import adjust_calibration
 from orthocal.calibration.assessment_record import (
@@ -497,7 +498,7 @@ def _decide(
     """Decision about a validation, with the verdict on all sessions.
 
     Its reason states the agreement and the findings that decide, those first if the deviations are
-    as predicted. Its action is the first one of these findings and the agreement.
+    as predicted. Its action is that of these findings, otherwise that of the agreement.
 
     Args:
         confirmed: Whether the calibration is confirmed; None if unknown.
@@ -511,6 +512,6 @@ def _decide(
         verdict_of(against),
         headlines[confirmed],
         " ".join(f.text for f in reasons),
-        next((f.action for f in (*against, agreement) if f.action), ""),
+        describe_actions(against) or agreement.action,
         confirmed,
     )
