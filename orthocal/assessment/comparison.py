@@ -117,6 +117,7 @@ def compare_models(
     repeat: Given | Sequence[Given] | None = None,
     options: SolverOptions | None = None,
     judgement: Judgement | None = None,
+    report: Callable[[str], None] = lambda text: None,
 ) -> Comparison:
     """Identify several models from a session, linearised and exactly, and recommend one.
 
@@ -130,6 +131,7 @@ def compare_models(
         repeat: Another session of the same rows, or several, whose residuals are compared.
         options: Solver and its options.
         judgement: Judgement of the sessions with these tolerances, if it was computed already.
+        report: Function that is called with lines about the progress.
 
     Raises:
         ParameterError: If a model or name is unknown.
@@ -146,10 +148,11 @@ def compare_models(
     judgement = judgement or judge_session(session)
     build = partial(build_problem, session, tolerance_scale=judgement.tolerance_scale)
     names = models or session.robot.parameters.models
-    results, undetermined = _score_models(build, names, noise.sigma, options)
+    results, undetermined = _score_models(build, names, noise.sigma, options, report)
     recommendation, effects = None, None
     assessments: tuple[Assessment, ...] = ()
     if judgement.verdict == "enter":
+        report("comparing the evidence for models and effects")
         recommendation, effects = recommend_model(session, models), compare_effects(session)
         assessments = tuple(
             assess(r.calibration, session, judgement=judgement, recommendation=recommendation)
@@ -185,10 +188,12 @@ def _score_models(
     models: Sequence[str],
     noise: float,
     options: SolverOptions | None,
+    report: Callable[[str], None],
 ) -> tuple[tuple[ModelResult, ...], tuple[Undetermined, ...]]:
     """Results of the models, the smallest first, and models that are not identifiable."""
     results, undetermined = [], []
     for model in dict.fromkeys(models):
+        report(f"identifying model {model}, and predicting each setup from the others")
         result = _score_with_prior(partial(build, model=model), noise, options)
         if isinstance(result, Undetermined):
             undetermined.append(result)
