@@ -53,12 +53,12 @@ class Comparison:
     """Title of the other session; empty if there is none."""
     judgement: Judgement
     """Judgement of the readings, independent of the model."""
-    recommendation: Recommendation | None
+    recommendation: Recommendation | None = None
     """Recommended model; None unless the verdict is `enter`."""
-    effects: EffectComparison | None
+    effects: EffectComparison | None = None
     """Effects beside geometry; None if the readings cannot show any, or the verdict is not
     `enter`."""
-    assessments: tuple[Assessment, ...]
+    assessments: tuple[Assessment, ...] = ()
     """Assessment of the calibration of each result, as `calibrate` states it; empty unless the
     verdict is `enter`."""
 
@@ -144,27 +144,15 @@ def compare_models(
     session = join_sessions(gathered)
     others = _gather_repeats(() if repeat is None else repeat, tolerances or {}, gathered)
     noise = find_known_noise(session)
-    several_cycles = len({r.cycle for r in session.readings}) > 1
     judgement = judgement or judge_session(session)
     build = partial(build_problem, session, tolerance_scale=judgement.tolerance_scale)
     names = models or session.robot.parameters.models
     results, undetermined = _score_models(build, names, noise.sigma, options, report)
-    recommendation, effects = None, None
-    assessments: tuple[Assessment, ...] = ()
-    if judgement.verdict == "enter":
-        report("comparing the evidence for models and effects")
-        recommendation, effects = recommend_model(session, models), compare_effects(session)
-        assessments = tuple(
-            assess(r.calibration, session, judgement=judgement, recommendation=recommendation)
-            for r in results
-        )
-    else:
+    if judgement.verdict != "enter":
         results = tuple(replace(r, tool=None, linearisation_cost=None) for r in results)
     comparison = Comparison(
         title=session.title,
-        labels=tuple(
-            r.label + (f", cycle {r.cycle}" if several_cycles else "") for r in session.readings
-        ),
+        labels=_label_rows(session),
         noise=noise,
         independent=results[0].redundancy + results[0].rank if results else 0,
         results=results,
@@ -172,15 +160,35 @@ def compare_models(
         repetition=None,
         repeat_title=join_sessions(others).title if others else "",
         judgement=judgement,
-        recommendation=recommendation,
-        effects=effects,
-        assessments=assessments,
     )
+    if judgement.verdict == "enter":
+        report("comparing the evidence for models and effects")
+        comparison = _recommend(comparison, session, models)
     if comparison.best is None or not others:
         return comparison
     best = comparison.best.calibration
     repeated = repeat_calibration(best, others)
     return replace(comparison, repetition=measure_repetition(best, repeated))
+
+
+def _recommend(comparison: Comparison, session: Session, models: Sequence[str]) -> Comparison:
+    """Comparison with recommendations, and with assessments of its results."""
+    judgement, recommendation = comparison.judgement, recommend_model(session, models)
+    return replace(
+        comparison,
+        recommendation=recommendation,
+        effects=compare_effects(session),
+        assessments=tuple(
+            assess(r.calibration, session, judgement=judgement, recommendation=recommendation)
+            for r in comparison.results
+        ),
+    )
+
+
+def _label_rows(session: Session) -> tuple[str, ...]:
+    """Labels of the readings, with the cycle if there are several."""
+    several = len({r.cycle for r in session.readings}) > 1
+    return tuple(r.label + (f", cycle {r.cycle}" if several else "") for r in session.readings)
 
 
 def _score_models(

@@ -221,9 +221,8 @@ def validate_calibration(
         SolverError: If the fit of the new readings does not converge.
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
-    gathered = gather_sessions(sessions)
-    calibration, new_sessions = _apply_stated(calibration, gathered, tolerances or {})
-    measured = [_with_active_offsets(calibration, one) for one in new_sessions]
+    calibration, new = _apply_stated(calibration, gather_sessions(sessions), tolerances or {})
+    measured = [_with_active_offsets(calibration, one) for one in new]
     fit, refit = _refit(calibration, join_sessions(measured))
     all_sessions = join_sessions([restore_session(calibration), *measured])
     anomalies = find_anomalies(all_sessions)
@@ -234,15 +233,12 @@ def validate_calibration(
     confirmed = _confirmation(agreement, judgement, changed=mistake is not None)
     joint, findings = None, judgement.findings
     if confirmed:
-        joint = _calibrate_jointly(calibration, all_sessions, judgement)
-        if assessment_of(joint).decision.verdict != "enter":  # an offset is held by a bound
-            findings, joint, confirmed = assessment_of(joint).findings, None, False
-    wrongly_entered = mistake is not None and _is_wrongly_entered(all_sessions, mistake)
-    entries, notes = _choose_entries(
-        calibration, refit, joint, confirmed=confirmed, wrongly_entered=wrongly_entered
-    )
+        joint, findings = _calibrate_jointly(calibration, all_sessions, judgement)
+        confirmed = joint is not None
+    wrongly = _is_wrongly_entered(all_sessions, mistake)
+    entries, notes = _choose_entries(calibration, refit, joint, confirmed, wrongly)
     repetition = measure_repetition(calibration, refit)
-    stated = all(one.controller_offsets is not None for one in new_sessions)
+    stated = all(one.controller_offsets is not None for one in new)
     notes += _describe_comparison(repetition, test, stated=stated)
     return Validation(
         confirmed=confirmed,
@@ -330,11 +326,14 @@ def _confirmation(agreement: Finding, judgement: Judgement, *, changed: bool) ->
 
 def _calibrate_jointly(
     calibration: Calibration, all_sessions: Session, judgement: Judgement
-) -> Calibration:
-    """Assessed calibration from all sessions."""
+) -> tuple[Calibration | None, tuple[Finding, ...]]:
+    """Assessed calibration from all sessions, or None if an offset is held by a bound; findings."""
     fit = repeat_fit(calibration, all_sessions, tolerance_scale=judgement.tolerance_scale)
     joint = assemble_calibration(fit)
-    return replace(joint, assessment=assess(joint, all_sessions, judgement=judgement))
+    assessment = assess(joint, all_sessions, judgement=judgement)
+    if assessment.decision.verdict != "enter":
+        return None, assessment.findings
+    return replace(joint, assessment=assessment), judgement.findings
 
 
 def _require_new(calibration: Calibration, sessions: Sequence[Session]) -> None:
@@ -402,8 +401,10 @@ def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
     return session
 
 
-def _is_wrongly_entered(all_sessions: Session, mistake: Anomaly) -> bool:
-    """True if a new session has wrongly entered offsets."""
+def _is_wrongly_entered(all_sessions: Session, mistake: Anomaly | None) -> bool:
+    """True if the mistake is that a new session has wrongly entered offsets."""
+    if mistake is None:
+        return False
     new = all_sessions.labels[len(all_sessions.parts[0].setups) :]
     return mistake.explanation.kind in WRONGLY_ENTERED and mistake.explanation.sessions[0] in new
 
@@ -449,7 +450,6 @@ def _choose_entries(
     calibration: Calibration,
     refit: Calibration,
     joint: Calibration | None,
-    *,
     confirmed: bool | None,
     wrongly_entered: bool,
 ) -> tuple[tuple[ControllerEntry, ...], list[Finding]]:
