@@ -250,7 +250,9 @@ def test_forward_and_inverse_are_inverse_commands(calibrated, tmp_path):
 def test_compare_recommends_a_model_and_exits_with_the_verdict(experiment, root):
     repeat = experiment.parent / "experiment-3"
     code, out, err = orthocal("compare", experiment, "--repeat", repeat)
-    assert (code, err) == (0, "")
+    assert code == 0
+    for model in ("offsets", "lengths", "full"):  # progress
+        assert f"model {model}," in err
     assert "Recommended model: full." in out
     assert "unknown whether the same deviations remain in 'Experiment 3" in " ".join(out.split())
     code, out, _ = orthocal(
@@ -392,7 +394,7 @@ def test_verdict_is_printed_although_the_solver_fails(root, tmp_path, monkeypatc
     write_session(session.with_values(values), tmp_path / "swapped")
     code, out, err = orthocal(*words, tmp_path / "swapped")
     assert code == 3
-    assert err == ""
+    assert "converge" not in err
     decision = check_session(load_session(tmp_path / "swapped")).decision
     if "--json" in words:
         document = json.loads(out)

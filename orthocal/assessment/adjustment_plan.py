@@ -41,7 +41,7 @@ from orthocal.assessment.controller_entries import (
 )
 from orthocal.assessment.tool_error import assess_placed, require_tool, summarise_tool
 from orthocal.calibration.adjusting import adjust_calibration
-from orthocal.calibration.assessment_record import ControllerEntry, ToolErrorSummary
+from orthocal.calibration.assessment_record import BacklashEntry, ControllerEntry, ToolErrorSummary
 from orthocal.calibration.calibration import Calibration, propagate_stds
 from orthocal.effects.adjustment import LEVER_SHARE, Adjustment, find_adjustments
 from orthocal.errors import ParameterError, RobotError
@@ -49,7 +49,11 @@ from orthocal.kinematics.sensitivity import ToolSensitivity
 from orthocal.statistics import chance
 
 LEAST_GAIN = 0.04
-"""Relative reduction of the expected tool error below which no adjustment is added."""
+"""Relative reduction of the expected tool error below which no adjustment is proposed. It is also
+at least LEAST_STEP, so that the printed tool error shows it."""
+
+LEAST_STEP = 1e-6
+"""Last digit of the printed tool errors, [m]."""
 
 WORTHWHILE = 0.15
 """Relative reduction of the expected tool error below which no adjustment is advised."""
@@ -70,8 +74,9 @@ class PlannedAdjustment:
     """Amount, rounded to a multiple of the smallest step, [m]."""
     uncertainty: float
     """Expanded uncertainty of the best amount, [m]; NaN if unknown."""
-    tool_error: float
-    """Expected tool error after this and all adjustments before it, offsets entered again, [m]."""
+    tool_error: float | None
+    """Expected tool error after this and all adjustments before it, offsets entered again, [m].
+    None if it is lower only with the next adjustment, too (`is_gain`)."""
 
     @property
     def turns(self) -> float | None:
@@ -149,7 +154,36 @@ def plan_adjustments(
     changes = backlash_changes(calibration, backlash)
     search = _Search(calibration, tool.compensating(changes), candidates, before.compensated)
     chosen = search.choose()
-    amounts, after, entries = np.zeros(len(candidates)), before, assessment_of(calibration).entries
+    while True:
+        amounts, after, entries = _set_amounts(search, chosen, before, backlash)
+        adjustments = search.order(chosen, amounts, before.entered, after.entered)
+        if not adjustments or adjustments[-1].tool_error is not None:
+            break
+        last = candidates.index(adjustments[-1].adjustment)  # then the others are fitted again
+        chosen = [i for i in chosen if i != last]
+    return AdjustmentPlan(
+        adjustments=adjustments,
+        entries=entries,
+        before=before,
+        after=after,
+        displacement_uncertainty=search.displacement_uncertainty(chosen),
+    )
+
+
+def _set_amounts(
+    search: _Search,
+    chosen: Sequence[int],
+    before: ToolErrorSummary,
+    backlash: Sequence[BacklashEntry],
+) -> tuple[Array, ToolErrorSummary, tuple[ControllerEntry, ...]]:
+    """Amounts of chosen adjustments, with the tool error and the offsets of the adjusted machine.
+
+    The loops of the adjusted machine are closed, and the amounts are corrected for it.
+    """
+    calibration, tool = search.calibration, search.tool
+    changes = backlash_changes(calibration, backlash)
+    amounts = np.zeros(len(search.candidates))
+    after, entries = before, assessment_of(calibration).entries
     for _ in range(MAX_CORRECTIONS if chosen else 0):
         improved = search.round(chosen, search.fit(chosen))
         if np.array_equal(improved, amounts):
@@ -159,16 +193,14 @@ def plan_adjustments(
         placed = place_tool(adjusted, tool.workspace.once(tool.use.size))
         entries = compute_entries(adjusted, placed.compensating(changes))
         accuracy = assess_placed(adjusted, placed, entries, backlash)
-        summary = summarise_tool(adjusted, accuracy)
-        after = summary or before
+        after = summarise_tool(adjusted, accuracy) or before
         search.correct(amounts, accuracy.deviation_with_entries)
-    return AdjustmentPlan(
-        adjustments=search.order(chosen, amounts, after.entered),
-        entries=entries,
-        before=before,
-        after=after,
-        displacement_uncertainty=search.displacement_uncertainty(chosen),
-    )
+    return amounts, after, entries
+
+
+def is_gain(before: float, after: float, count: int = 1) -> bool:
+    """True if `count` adjustments lower the expected tool error, [m], enough to be proposed."""
+    return after < min((1.0 - LEAST_GAIN) ** count * before, before - count * LEAST_STEP)
 
 
 class _Search:
@@ -252,7 +284,10 @@ class _Search:
                 [self._columns[:, columns], np.diag(LEVER_SHARE * self._column_norms[columns])]
             )
             right = np.append(-self._deviation, np.zeros(len(columns)))
-            amounts[columns] = lsq_linear(rows * limit, right, (-1.0, 1.0)).x * limit
+            unit = max(
+                float(np.linalg.norm(right)), LEAST_STEP
+            )  # lsq_linear's tolerance is absolute
+            amounts[columns] = lsq_linear(rows * limit / unit, right / unit, (-1.0, 1.0)).x * limit
         return amounts
 
     def choose(self) -> list[int]:
@@ -266,7 +301,7 @@ class _Search:
                 if not trials:
                     return chosen
                 best = min(trials, key=lambda t: self.error(self.fit(t)))
-                if self.error(self.fit(best)) < (1.0 - LEAST_GAIN) ** count * current:
+                if is_gain(current, self.error(self.fit(best)), count):
                     break
             else:
                 return chosen
@@ -341,13 +376,14 @@ class _Search:
         )
 
     def order(
-        self, chosen: Sequence[int], amounts: Array, after: float
+        self, chosen: Sequence[int], amounts: Array, before: float, after: float
     ) -> tuple[PlannedAdjustment, ...]:
         """Adjustments in the order of their gain.
 
         Args:
             chosen: Indices of the adjustments.
             amounts: All amounts, shape (n_candidates,), [m].
+            before: Expected tool error without them, [m].
             after: Expected tool error after all of them, [m].
         """
         if not chosen:
@@ -356,7 +392,7 @@ class _Search:
             zip(chosen, self.uncertainties(chosen).tolist(), strict=True)
         )
         pending = [i for i in chosen if amounts[i] != 0.0]
-        amounts_set, planned = np.zeros_like(amounts), []
+        amounts_set, planned, shown = np.zeros_like(amounts), [], before
         while pending:
             trials = {
                 i: self.error(np.where(np.arange(amounts_set.size) == i, amounts, amounts_set))
@@ -366,9 +402,14 @@ class _Search:
             pending.remove(best)
             amounts_set[best] = amounts[best]
             tool_error = trials[best] if pending else after
+            gains = is_gain(shown, tool_error)
+            shown = tool_error if gains else shown
             planned.append(
                 PlannedAdjustment(
-                    self.candidates[best], float(amounts[best]), uncertainty[best], tool_error
+                    self.candidates[best],
+                    float(amounts[best]),
+                    uncertainty[best],
+                    tool_error if gains else None,
                 )
             )
         return tuple(planned)

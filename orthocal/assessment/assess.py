@@ -26,6 +26,7 @@ from orthocal.assessment.judgement import Judgement, judge_session, rank, verdic
 from orthocal.assessment.printer_settings import fit_firmware
 from orthocal.assessment.recommendation import Recommendation, recommend_model
 from orthocal.assessment.tool_error import assess_placed, require_tool, summarise_tool
+from orthocal.assessment.wording import describe_actions
 from orthocal.assessment.words import entries as words
 from orthocal.assessment.words.comparison import describe_recommendation
 from orthocal.calibration.assessment_record import (
@@ -160,13 +161,14 @@ def assess(
         *([_no_change_needed(entries, chosen.best)] if keep else []),
         *entry_findings,
         *([] if firmware else _compensation_findings(calibration, chosen.backlash)),
-        *describe_recommendation(
+        *chosen.unreached,
+    ]
+    if judgement.verdict == "enter":
+        notes += describe_recommendation(
             recommendation or recommend_model(session_used),
             judged_scale=judgement.tolerance_scale.factor,
             identified=calibration.model,
-        ),
-        *chosen.unreached,
-    ]
+        )
     findings = rank([*judgement.findings, *notes])
     return Assessment(
         decision=_decide(
@@ -215,10 +217,9 @@ def check_session(session: Session, *, judgement: Judgement | None = None) -> As
         no_anomaly = words.no_anomaly(len(session.readings), within_tolerances=within)
         findings = rank([*findings, no_anomaly])
     lead = next((f for f in findings if f.severity != "note"), findings[-1])
-    decision = Decision(
-        judgement.verdict, words.SESSION_HEADLINES[judgement.verdict], lead.text, lead.action
-    )
-    return Assessment(decision, findings, (), None)
+    action = describe_actions(findings) or lead.action
+    headline = words.SESSION_HEADLINES[judgement.verdict]
+    return Assessment(Decision(judgement.verdict, headline, lead.text, action), findings, (), None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -402,7 +403,7 @@ def _decide(findings: Sequence[Finding], *, firmware: bool, backlash: bool) -> D
     verdict, lead = verdict_of(findings), findings[0]
     headlines = words.FIRMWARE_HEADLINES if firmware else words.HEADLINES
     if verdict != "enter":
-        return Decision(verdict, headlines[verdict], lead.text, lead.action)
+        return Decision(verdict, headlines[verdict], lead.text, describe_actions(findings))
     for kind, headline in KEEPING.items():
         finding = first_of(findings, kind)
         if finding is not None and firmware:

@@ -15,6 +15,7 @@ from orthocal.assessment.judgement import Judgement, judge_session, rank
 from orthocal.assessment.predictive import Repetition, measure_repetition
 from orthocal.assessment.recommendation import Recommendation, recommend_model
 from orthocal.assessment.scores import ModelResult, Score, Undetermined, score_model
+from orthocal.assessment.wording import describe_actions
 from orthocal.assessment.words import comparison as words
 from orthocal.assessment.words.entries import SESSION_HEADLINES
 from orthocal.assessment.words.validation import describe_repetition
@@ -50,13 +51,16 @@ class Comparison:
     """Correlation of the residuals of the recommended model with those of another session."""
     repeat_title: str
     """Title of the other session; empty if there is none."""
-    recommendation: Recommendation
-    effects: EffectComparison | None
-    """Effects beside geometry; None if the readings cannot show any."""
     judgement: Judgement
     """Judgement of the readings, independent of the model."""
-    assessments: tuple[Assessment, ...]
-    """Assessment of the calibration of each result, as `calibrate` states it."""
+    recommendation: Recommendation | None = None
+    """Recommended model; None unless the verdict is `enter`."""
+    effects: EffectComparison | None = None
+    """Effects beside geometry; None if the readings cannot show any, or the verdict is not
+    `enter`."""
+    assessments: tuple[Assessment, ...] = ()
+    """Assessment of the calibration of each result, as `calibrate` states it; empty unless the
+    verdict is `enter`."""
 
     def __getitem__(self, model: str) -> ModelResult:
         for result in self.results:
@@ -67,9 +71,10 @@ class Comparison:
     @property
     def best(self) -> ModelResult | None:
         """The recommended model if it was compared; otherwise the largest model."""
-        by_name = {r.model: r for r in self.results}
         largest = self.results[-1] if self.results else None
-        return by_name.get(self.recommendation.model, largest)
+        if self.recommendation is None:
+            return largest
+        return {r.model: r for r in self.results}.get(self.recommendation.model, largest)
 
     @property
     def assessment(self) -> Assessment:
@@ -78,8 +83,9 @@ class Comparison:
 
     def to_json(self) -> str:
         """Comparison as a JSON document, SI units."""
+        recommendation = self.recommendation
         document = {
-            "schema": "orthocal/comparison/4",
+            "schema": "orthocal/comparison/5",
             "title": self.title,
             "noise": finite_or_none(self.noise.sigma),
             "noise_source": self.noise.source,
@@ -90,11 +96,12 @@ class Comparison:
                 for u in self.undetermined
             ],
             "repetition": None if self.repetition is None else self.repetition.to_document(),
-            "recommendation": {
-                "model": self.recommendation.model,
-                "tolerance_scale": self.recommendation.tolerance_scale,
+            "recommendation": recommendation
+            and {
+                "model": recommendation.model,
+                "tolerance_scale": recommendation.tolerance_scale,
                 "log_evidence": {
-                    e.model: finite_or_none(e.log_evidence) for e in self.recommendation.evidence
+                    e.model: finite_or_none(e.log_evidence) for e in recommendation.evidence
                 },
             },
             "effects": None if self.effects is None else _effects_document(self.effects),
@@ -110,8 +117,12 @@ def compare_models(
     repeat: Given | Sequence[Given] | None = None,
     options: SolverOptions | None = None,
     judgement: Judgement | None = None,
+    report: Callable[[str], None] = lambda text: None,
 ) -> Comparison:
     """Identify several models from a session, linearised and exactly, and recommend one.
+
+    Unless the verdict on the readings is `enter`, the comparison has no recommendation and no tool
+    error, because both would depend on doubtful readings.
 
     Args:
         sessions: The session, or several, or paths to them.
@@ -120,6 +131,7 @@ def compare_models(
         repeat: Another session of the same rows, or several, whose residuals are compared.
         options: Solver and its options.
         judgement: Judgement of the sessions with these tolerances, if it was computed already.
+        report: Function that is called with lines about the progress.
 
     Raises:
         ParameterError: If a model or name is unknown.
@@ -132,31 +144,26 @@ def compare_models(
     session = join_sessions(gathered)
     others = _gather_repeats(() if repeat is None else repeat, tolerances or {}, gathered)
     noise = find_known_noise(session)
-    several_cycles = len({r.cycle for r in session.readings}) > 1
     judgement = judgement or judge_session(session)
     build = partial(build_problem, session, tolerance_scale=judgement.tolerance_scale)
     names = models or session.robot.parameters.models
-    results, undetermined = _score_models(build, names, noise.sigma, options)
-    recommendation = recommend_model(session, models)
+    results, undetermined = _score_models(build, names, noise.sigma, options, report)
+    if judgement.verdict != "enter":
+        results = tuple(replace(r, tool=None, linearisation_cost=None) for r in results)
     comparison = Comparison(
         title=session.title,
-        labels=tuple(
-            r.label + (f", cycle {r.cycle}" if several_cycles else "") for r in session.readings
-        ),
+        labels=_label_rows(session),
         noise=noise,
         independent=results[0].redundancy + results[0].rank if results else 0,
         results=results,
         undetermined=undetermined,
         repetition=None,
         repeat_title=join_sessions(others).title if others else "",
-        recommendation=recommendation,
-        effects=compare_effects(session),
         judgement=judgement,
-        assessments=tuple(
-            assess(r.calibration, session, judgement=judgement, recommendation=recommendation)
-            for r in results
-        ),
     )
+    if judgement.verdict == "enter":
+        report("comparing the evidence for models and effects")
+        comparison = _recommend(comparison, session, models)
     if comparison.best is None or not others:
         return comparison
     best = comparison.best.calibration
@@ -164,15 +171,37 @@ def compare_models(
     return replace(comparison, repetition=measure_repetition(best, repeated))
 
 
+def _recommend(comparison: Comparison, session: Session, models: Sequence[str]) -> Comparison:
+    """Comparison with recommendations, and with assessments of its results."""
+    judgement, recommendation = comparison.judgement, recommend_model(session, models)
+    return replace(
+        comparison,
+        recommendation=recommendation,
+        effects=compare_effects(session),
+        assessments=tuple(
+            assess(r.calibration, session, judgement=judgement, recommendation=recommendation)
+            for r in comparison.results
+        ),
+    )
+
+
+def _label_rows(session: Session) -> tuple[str, ...]:
+    """Labels of the readings, with the cycle if there are several."""
+    several = len({r.cycle for r in session.readings}) > 1
+    return tuple(r.label + (f", cycle {r.cycle}" if several else "") for r in session.readings)
+
+
 def _score_models(
     build: Callable[..., CalibrationProblem],
     models: Sequence[str],
     noise: float,
     options: SolverOptions | None,
+    report: Callable[[str], None],
 ) -> tuple[tuple[ModelResult, ...], tuple[Undetermined, ...]]:
     """Results of the models, the smallest first, and models that are not identifiable."""
     results, undetermined = [], []
     for model in dict.fromkeys(models):
+        report(f"identifying model {model}, and predicting each setup from the others")
         result = _score_with_prior(partial(build, model=model), noise, options)
         if isinstance(result, Undetermined):
             undetermined.append(result)
@@ -200,17 +229,28 @@ def _score_with_prior(
 
 
 def _assess(comparison: Comparison) -> Assessment:
-    """Assessment of a comparison: judgement of the readings and findings about the models."""
+    """Assessment of a comparison: judgement of the readings and findings about the models.
+
+    Unless the verdict is `enter`, it contains the judgement alone.
+    """
     judgement, best = comparison.judgement, comparison.best
+    recommendation = comparison.recommendation
+    if recommendation is None:
+        lead = judgement.findings[0]
+        headline = SESSION_HEADLINES[judgement.verdict]
+        action = describe_actions(judgement.findings)
+        decision = Decision(judgement.verdict, headline, lead.text, action)
+        return Assessment(decision, judgement.findings, (), None)
     notes = words.describe_recommendation(
-        comparison.recommendation, judged_scale=judgement.tolerance_scale.factor
+        recommendation, judged_scale=judgement.tolerance_scale.factor
     )
     notes += [words.not_determined(u.model, u.reason) for u in comparison.undetermined]
-    notes += words.describe_effects(comparison.effects, len(comparison.labels))
+    if comparison.effects is not None:
+        notes += words.describe_effects(comparison.effects, len(comparison.labels))
     tool = None
     if best is not None:
         best_assessment = comparison.assessments[comparison.results.index(best)]
-        notes += _models_not_recommended(comparison, best)
+        notes += _models_not_recommended(recommendation, comparison.results, best)
         notes += best_assessment.of_kind(*get_args(NoiseKind))
         if comparison.repetition is not None:
             title = comparison.repeat_title
@@ -230,9 +270,10 @@ def _assess(comparison: Comparison) -> Assessment:
     )
 
 
-def _models_not_recommended(comparison: Comparison, best: ModelResult) -> list[Finding]:
+def _models_not_recommended(
+    recommendation: Recommendation, results: Sequence[ModelResult], best: ModelResult
+) -> list[Finding]:
     """Findings about the models that are not recommended."""
-    recommendation = comparison.recommendation
     return [
         words.not_recommended(
             r.model,
@@ -240,7 +281,7 @@ def _models_not_recommended(comparison: Comparison, best: ModelResult) -> list[F
             r.exact.prediction_rms,
             best.exact.prediction_rms,
         )
-        for r in comparison.results
+        for r in results
         if r is not best
     ]
 
@@ -285,6 +326,8 @@ def _effects_document(comparison: EffectComparison) -> dict[str, Any]:
     """Entries of the JSON document about effects."""
     return {
         "recommended": list(comparison.recommended),
+        "stated": list(comparison.stated),
+        "shown": list(comparison.shown),
         "weighed": [
             {
                 "effects": list(w.effects),

@@ -1,8 +1,12 @@
 """Comparison of effects beside geometry by the evidence of the readings.
 
-The evidence is the marginal likelihood of the complete model with a set of effects. Effects are
-added one after the other as long as the evidence for them is strong. The cross-validation error of
-setups is reported, but does not decide, as it depends on few readings.
+Effects that the session or its robot states are recommended, whatever the evidence for them: they
+are a part of the complete model, and their tolerances say how large they may be. `calibrate`
+estimates them for the same reason, and decides for each drive what to enter. Other effects are
+added one after the other as long as the evidence for them is strong.
+
+The evidence is the marginal likelihood of the complete model with a set of effects. The
+cross-validation error of setups is reported, but does not decide, as it depends on few readings.
 """
 
 from __future__ import annotations
@@ -38,11 +42,13 @@ class EffectComparison:
     """Comparison of effects that could be identified beside geometry."""
 
     weighed: tuple[WeighedEffects, ...]
-    """No effect first, then each effect by itself, then combinations of supported effects."""
+    """No effect first, then the stated ones together, then others that were tried."""
     recommended: tuple[str, ...]
-    """Effects with strong evidence, regardless of the cross-validation error."""
-    identified: tuple[str, ...]
-    """Effects that the session or its robot chooses."""
+    """The stated effects, and others with strong evidence."""
+    stated: tuple[str, ...]
+    """Effects that the session or its robot states."""
+    shown: tuple[str, ...]
+    """Recommended effects for which the evidence is strong."""
     named: tuple[str, ...]
     """Errors of recommended effects that no model contains; they are named by `--free`."""
     lacking: Mapping[str, tuple[int, str]]
@@ -51,12 +57,13 @@ class EffectComparison:
 
     @property
     def best(self) -> WeighedEffects:
-        """The recommended set."""
-        return next(w for w in self.weighed if w.effects == self.recommended)
+        """The recommended effects, without those that were not weighed."""
+        weighed = {name for w in self.weighed for name in w.effects}
+        return next(w for w in self.weighed if set(w.effects) == weighed & set(self.recommended))
 
 
 def compare_effects(session: Session) -> EffectComparison | None:
-    """Compare the effects that a session or its robot chooses; without a choice all possible ones.
+    """Compare the effects that a session or its robot states; without a choice all possible ones.
 
     Without a choice, drift is compared only if the time of the readings is stated, not their order.
 
@@ -70,11 +77,11 @@ def compare_effects(session: Session) -> EffectComparison | None:
         ClosureError: If the nominal machine cannot reach a posture.
     """
     candidates, lacking = _candidates(session)
-    chosen = tuple(session.robot.effect_names)
+    stated = tuple(session.robot.effect_names)
     if not candidates:
-        return EffectComparison((), (), chosen, (), lacking) if lacking else None
+        return EffectComparison((), stated, stated, (), (), lacking) if lacking else None
     present = [e.name for e in measurable_effects(session.robot)]
-    not_measurable = [n for n in chosen if n not in present]
+    not_measurable = [n for n in stated if n not in present]
     model = complete_model(session.robot.parameters)
     evidence_and_rms: dict[tuple[str, ...], tuple[float, float]] = {}
 
@@ -89,18 +96,25 @@ def compare_effects(session: Session) -> EffectComparison | None:
         return evidence_and_rms[trial][0]
 
     log_evidence(())
-    supported: tuple[str, ...] = ()
+    supported = [n for n in candidates if n in stated]
     while remaining := [n for n in candidates if n not in supported]:
         most_likely = max(remaining, key=lambda n: log_evidence((*supported, n)))
         if log_evidence((*supported, most_likely)) < log_evidence(supported) + STRONG:
             break
-        supported = order_effects((*supported, most_likely))
+        supported.append(most_likely)
+    shown = [
+        name
+        for name in supported
+        if log_evidence(supported) >= log_evidence([n for n in supported if n != name]) + STRONG
+    ]
     weighed = [
         WeighedEffects(effects, evidence - evidence_and_rms[()][0], rms)
         for effects, (evidence, rms) in evidence_and_rms.items()
     ]
-    named = errors_of_no_model(session.with_effects(supported).robot)
-    return EffectComparison(tuple(weighed), supported, chosen, named, lacking)
+    named = errors_of_no_model(session.with_effects(order_effects(supported)).robot)
+    recommended = order_effects((*stated, *supported))
+    shown_in_order = order_effects(shown)
+    return EffectComparison(tuple(weighed), recommended, stated, shown_in_order, named, lacking)
 
 
 def _candidates(session: Session) -> tuple[list[str], dict[str, tuple[int, str]]]:

@@ -115,16 +115,17 @@ def score_model(
     rank = assume_others_known(linearisation.information, problem.n_machine).rank
     calibration = assemble_calibration(fit)
     tool = _assess_tool(calibration)
+    effective = _effective_parameters(fit)
     return ModelResult(
         model=problem.selection.label,
         n_free=problem.n_machine,
         rank=rank,
         redundancy=fit.independent_readings - rank,
-        effective=_effective_parameters(fit),
+        effective=effective,
         prior=bool(problem.machine_selection.prior.any()),
         by_choice=by_choice,
-        linearised=_score(fit, linearisation, "linearised", noise),
-        exact=_score(fit, linearisation, "exact", noise),
+        linearised=_score(fit, linearisation, "linearised", noise, effective),
+        exact=_score(fit, linearisation, "exact", noise, effective),
         calibration=calibration,
         tool=tool,
         linearisation_cost=None if tool is None else _linearisation_cost(fit, tool),
@@ -146,15 +147,25 @@ def _effective_parameters(fit: Fit) -> float:
     ).effective_parameters
 
 
-def _score(fit: Fit, linearisation: LinearProblem, method: Method, noise: float) -> Score:
-    """Score of one method; `noise` is the standard deviation of a reading, [m]."""
+def _score(
+    fit: Fit, linearisation: LinearProblem, method: Method, noise: float, effective: float
+) -> Score:
+    """Score of one method.
+
+    Args:
+        fit: Fit of the model.
+        linearisation: Linearisation of its problem.
+        method: The method.
+        noise: Standard deviation of a reading, [m].
+        effective: Effective number of parameters.
+    """
     problem, observations = fit.problem, fit.problem.observations
     theta = fit.linearised_theta if method == "linearised" else fit.solution.theta
     try:
         residual = project_out_zeros(problem.values - problem.predict(theta), observations)
     except ClosureError:  # the linearised machine cannot reach a posture
         residual = np.full(observations.size, np.nan)
-    count, effective = observations.size - observations.n_zeros, _effective_parameters(fit)
+    count = observations.size - observations.n_zeros
     sum_of_squares = float(residual @ residual)
     rows = observations.rows(residual)
     k = effective + 1.0  # with the noise

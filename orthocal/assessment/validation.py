@@ -1,8 +1,9 @@
 """Validation of a calibration by a new session.
 
-The new session is measured with the calibrated offsets active in the controller. The calibration
-is confirmed if the new readings deviate as predicted, within the uncertainty of the calibration,
-and no change between the sessions is found. New readings can still improve a confirmed
+The new session is measured with the calibrated offsets active in the controller. The verdict is
+that of all sessions together, as `check` and `calibrate` state it. The calibration is confirmed if
+it is `enter`, and the new readings deviate as predicted, within the uncertainty of the calibration.
+New readings can still improve a confirmed
 calibration. Then the values to enter come from a joint calibration of all sessions.
 """
 
@@ -26,10 +27,11 @@ from orthocal.assessment.predictive import (
     judge_deviations,
     measure_repetition,
 )
+from orthocal.assessment.wording import describe_actions
 from orthocal.assessment.words import validation as words
-from orthocal.assessment.words.anomalies import describe_anomalies
 from orthocal.calibration.adjusting import adjust_calibration
 from orthocal.calibration.assessment_record import (
+    EXIT_CODES,
     Assessment,
     ControllerEntry,
     Decision,
@@ -44,7 +46,7 @@ from orthocal.calibration.refit import repeat_fit, restore_session
 from orthocal.effects.adjustment import subtract_amounts
 from orthocal.errors import SessionError
 from orthocal.estimation.fit import Fit
-from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomalies, Anomaly
+from orthocal.hypotheses.anomaly import WRONGLY_ENTERED, Anomaly
 from orthocal.hypotheses.search import find_anomalies
 from orthocal.io.documents import format_json
 from orthocal.io.fields import finite_or_none
@@ -82,12 +84,25 @@ ENTRY_KINDS: tuple[FindingKind, ...] = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ValidationDecision(Decision):
+    """Decision about a validation: the verdict of all sessions, and whether it is confirmed."""
+
+    confirmed: bool | None
+    """See `Validation.confirmed`."""
+
+    @property
+    def exit_code(self) -> int:
+        """0 if the calibration is confirmed, otherwise 3."""
+        return EXIT_CODES["enter" if self.confirmed else "review"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Validation:
     """Comparison of a new session with the predictions of a calibration."""
 
     confirmed: bool | None
     """True if the calibration is confirmed; None if it predicts nothing, or if the new readings
-    agree with it but have anomalies."""
+    agree with it but the sessions have anomalies."""
     offsets_stated: bool
     """True if the session states the active offsets; otherwise the calibrated ones are assumed."""
     expected_rms: float
@@ -206,25 +221,24 @@ def validate_calibration(
         SolverError: If the fit of the new readings does not converge.
     """
     require_kind(calibration, Calibration, expected="a Calibration, such as load_calibration(...)")
-    gathered = gather_sessions(sessions)
-    calibration, new_sessions = _apply_stated(calibration, gathered, tolerances or {})
-    measured = [_with_active_offsets(calibration, one) for one in new_sessions]
-    judgement, fit, refit = _refit(calibration, join_sessions(measured))
+    calibration, new = _apply_stated(calibration, gather_sessions(sessions), tolerances or {})
+    measured = [_with_active_offsets(calibration, one) for one in new]
+    fit, refit = _refit(calibration, join_sessions(measured))
     all_sessions = join_sessions([restore_session(calibration), *measured])
     anomalies = find_anomalies(all_sessions)
-    mistake, changes, wrongly_entered = _find_changes(all_sessions, anomalies, judgement)
+    judgement = judge_session(all_sessions, anomalies=anomalies)
+    mistake = next((a for a in anomalies.found if a.explanation.sessions), None)
     expected_rms, test = expect_rms(calibration, fit), judge_deviations(calibration, fit)
-    agreement = _describe_agreement(refit, test, expected_rms, explained=bool(changes))
-    confirmed = None if math.isnan(test.p_value) else _confirmation(agreement, changes, judgement)
-    joint = None
+    agreement = _describe_agreement(refit, test, expected_rms, judgement)
+    confirmed = _confirmation(agreement, judgement, changed=mistake is not None)
+    joint, findings = None, judgement.findings
     if confirmed:
-        joint, against = _calibrate_jointly(calibration, all_sessions, anomalies)
-        confirmed, changes = not against, against or changes
-    entries, notes = _choose_entries(
-        calibration, refit, joint, confirmed=confirmed, wrongly_entered=wrongly_entered
-    )
+        joint, findings = _calibrate_jointly(calibration, all_sessions, judgement)
+        confirmed = joint is not None
+    wrongly = _is_wrongly_entered(all_sessions, mistake)
+    entries, notes = _choose_entries(calibration, refit, joint, confirmed, wrongly)
     repetition = measure_repetition(calibration, refit)
-    stated = all(one.controller_offsets is not None for one in new_sessions)
+    stated = all(one.controller_offsets is not None for one in new)
     notes += _describe_comparison(repetition, test, stated=stated)
     return Validation(
         confirmed=confirmed,
@@ -239,8 +253,8 @@ def validate_calibration(
         repetition=repetition,
         assessment=replace(
             assessment_of(joint or refit),
-            decision=_decide(confirmed, judgement, agreement, changes),
-            findings=rank([*judgement.findings, agreement, *changes, *notes]),
+            decision=_decide(confirmed, findings, agreement),
+            findings=rank([*findings, agreement, *notes]),
             entries=entries,
         ),
     )
@@ -285,36 +299,41 @@ def _apply_stated(
     return calibration, restated
 
 
-def _refit(calibration: Calibration, session: Session) -> tuple[Judgement, Fit, Calibration]:
-    """Judgement, fit and assessed calibration of new readings.
+def _refit(calibration: Calibration, session: Session) -> tuple[Fit, Calibration]:
+    """Fit and assessed calibration of new readings.
 
     The nominal readings of the calibration are the predicted ones.
     """
-    judgement, fit = judge_session(session), repeat_fit(calibration, session)
+    fit = repeat_fit(calibration, session)
     refit = assemble_calibration(fit, nominal=np.array([p.value for p in calibration.free]))
-    refit = replace(refit, assessment=assess(refit, session, judgement=judgement))
-    return judgement, fit, refit
+    return fit, replace(refit, assessment=assess(refit, session))
 
 
-def _confirmation(
-    agreement: Finding, changes: Sequence[Finding], judgement: Judgement
-) -> bool | None:
-    """True if new readings confirm the predictions; None if they agree but have anomalies."""
-    agrees = agreement.severity == "note" and not changes
-    return None if agrees and judgement.verdict != "enter" else agrees
+def _confirmation(agreement: Finding, judgement: Judgement, *, changed: bool) -> bool | None:
+    """True if new readings confirm the predictions; None if that is unknown.
+
+    Args:
+        agreement: Finding about the agreement of the new readings.
+        judgement: Judgement of all sessions.
+        changed: Whether a change between the sessions was found.
+    """
+    if agreement.kind == "nothing predicted":
+        return None
+    if agreement.severity != "note" or changed:
+        return False
+    return True if judgement.verdict == "enter" else None
 
 
 def _calibrate_jointly(
-    calibration: Calibration, all_sessions: Session, anomalies: Anomalies
-) -> tuple[Calibration | None, list[Finding]]:
-    """Assessed calibration from all sessions; or None, and the findings against its values."""
-    judgement = judge_session(all_sessions, anomalies=anomalies)
+    calibration: Calibration, all_sessions: Session, judgement: Judgement
+) -> tuple[Calibration | None, tuple[Finding, ...]]:
+    """Assessed calibration from all sessions, or None if an offset is held by a bound; findings."""
     fit = repeat_fit(calibration, all_sessions, tolerance_scale=judgement.tolerance_scale)
     joint = assemble_calibration(fit)
     assessment = assess(joint, all_sessions, judgement=judgement)
     if assessment.decision.verdict != "enter":
-        return None, [f for f in assessment.findings if f.severity != "note"]
-    return replace(joint, assessment=assessment), []
+        return None, assessment.findings
+    return replace(joint, assessment=assessment), judgement.findings
 
 
 def _require_new(calibration: Calibration, sessions: Sequence[Session]) -> None:
@@ -382,44 +401,16 @@ def _with_active_offsets(calibration: Calibration, session: Session) -> Session:
     return session
 
 
-def _find_changes(
-    all_sessions: Session, anomalies: Anomalies, judgement: Judgement
-) -> tuple[Anomaly | None, list[Finding], bool]:
-    """Changes between the sessions of a calibration and the new ones, and mistakes in both.
-
-    Mistakes in the new sessions count here only if these sessions alone do not show any: the
-    earlier readings make them visible.
-
-    Args:
-        all_sessions: The session of the calibration and the new ones, joined.
-        anomalies: Anomalies of all their readings.
-        judgement: Judgement of the new sessions alone.
-
-    Returns:
-        The first change of a session or None, findings about all changes and mistakes, and whether
-        offsets or backlashes of the calibration were entered wrongly.
-    """
-    changes = anomalies.found
-    if judgement.verdict != "enter":
-        earlier = len(all_sessions.parts[0].readings)
-        changes = tuple(
-            a
-            for a in anomalies.found
-            if a.between_sessions or any(row < earlier for row in a.explanation.rows)
-        )
-        if not changes:  # findings of the new sessions explain the deviations
-            return None, [], False
-    mistake = next((a for a in changes if a.explanation.sessions), None)
-    findings = describe_anomalies(all_sessions, replace(anomalies, found=changes))
+def _is_wrongly_entered(all_sessions: Session, mistake: Anomaly | None) -> bool:
+    """True if the mistake is that a new session has wrongly entered offsets or backlashes."""
     if mistake is None:
-        return None, findings, False
+        return False
     new = all_sessions.labels[len(all_sessions.parts[0].setups) :]
-    e = mistake.explanation
-    return mistake, findings, e.kind in WRONGLY_ENTERED and e.sessions[0] in new
+    return mistake.explanation.kind in WRONGLY_ENTERED and mistake.explanation.sessions[0] in new
 
 
 def _describe_agreement(
-    refit: Calibration, test: DeviationTest, expected: float, *, explained: bool
+    refit: Calibration, test: DeviationTest, expected: float, judgement: Judgement
 ) -> Finding:
     """Finding about the agreement of the deviations with their prediction.
 
@@ -427,7 +418,7 @@ def _describe_agreement(
         refit: Fit of the new readings, assessed.
         test: Test of the deviations.
         expected: Predicted RMS of the deviations, [m].
-        explained: Whether a change between the sessions explains the deviations.
+        judgement: Judgement of all sessions; its anomalies explain the deviations.
     """
     achieved = refit.rms_before
     limit = test.critical_factor * achieved
@@ -446,7 +437,7 @@ def _describe_agreement(
         return words.larger_than_predicted(
             achieved,
             limit,
-            None if explained else refit.rms_after,
+            refit.rms_after if judgement.verdict == "enter" else None,
             explains=refit.rms_after < EXPLAINED_RATIO * achieved,
             firmware=refit.session.firmware is not None,
             numbers=numbers,
@@ -459,11 +450,12 @@ def _choose_entries(
     calibration: Calibration,
     refit: Calibration,
     joint: Calibration | None,
-    *,
     confirmed: bool | None,
     wrongly_entered: bool,
 ) -> tuple[tuple[ControllerEntry, ...], list[Finding]]:
     """Values to enter after the new readings, and findings about them.
+
+    New readings that cannot be trusted give no values.
 
     Args:
         calibration: The validated calibration.
@@ -474,7 +466,8 @@ def _choose_entries(
     """
     assessment, findings = assessment_of(joint or refit), _find_further_change(joint)
     keep = wrongly_entered or (confirmed is not False and not findings)
-    entries = find_entries(calibration) if keep else assessment.entries
+    trusted = assessment.entries if assessment.decision.verdict == "enter" else ()
+    entries = find_entries(calibration) if keep else trusted
     if not wrongly_entered:
         findings += assessment.of_kind(*ENTRY_KINDS)
     return entries, findings
@@ -500,20 +493,25 @@ def _expect_largest(calibration: Calibration, expected_rms: float) -> float:
 
 
 def _decide(
-    confirmed: bool | None, judgement: Judgement, agreement: Finding, changes: Sequence[Finding]
-) -> Decision:
-    """Decision about a validation.
+    confirmed: bool | None, findings: Sequence[Finding], agreement: Finding
+) -> ValidationDecision:
+    """Decision about a validation, with the verdict on all sessions.
 
-    Its reason states anomalies first, then the agreement, then the changes that explain it; or the
-    changes first, if the deviations are as predicted. Its action is the first one of the anomalies,
-    the changes and the agreement.
+    Its reason states the agreement and the findings that decide, those first if the deviations are
+    as predicted. Its action is that of these findings, otherwise that of the agreement.
+
+    Args:
+        confirmed: Whether the calibration is confirmed; None if unknown.
+        findings: Findings about all sessions.
+        agreement: Finding about the agreement of the new readings.
     """
-    anomalies = [f for f in judgement.findings if f.severity != "note"][:1]
-    explained = [agreement, *changes] if agreement.severity != "note" else [*changes, agreement]
+    against = [f for f in findings if f.severity != "note"]
+    reasons = [agreement, *against] if agreement.severity != "note" else [*against, agreement]
     headlines = {True: words.CONFIRMED, False: words.NOT_CONFIRMED, None: words.INCONCLUSIVE}
-    return Decision(
-        verdict_of([*judgement.findings, agreement, *changes]),
+    return ValidationDecision(
+        verdict_of(against),
         headlines[confirmed],
-        " ".join(f.text for f in (*anomalies, *explained)),
-        next((f.action for f in (*anomalies, *changes, agreement) if f.action), ""),
+        " ".join(f.text for f in reasons),
+        describe_actions(against) or agreement.action,
+        confirmed,
     )

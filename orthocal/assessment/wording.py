@@ -11,6 +11,9 @@ from orthocal.arrays import Array
 from orthocal.calibration.assessment_record import Finding, FindingKind, Place
 from orthocal.units import MM, UM
 
+MOST_ACTIONS = 3
+"""Largest number of actions in the next step of a decision."""
+
 ALONG_AXIS = 0.9999
 """Cosine above which a direction is named after an axis of the world."""
 
@@ -42,6 +45,36 @@ def review(
 def reject(kind: FindingKind, text: str, action: str = "", /, **numbers: float) -> Finding:
     """Finding after which the readings must not be used."""
     return Finding(kind, "reject", text, action, numbers)
+
+
+def describe_actions(findings: Sequence[Finding]) -> str:
+    """Actions of the findings that are not notes: one sentence, or a numbered list with places.
+
+    The list has at most MOST_ACTIONS lines, then the number of further findings.
+    """
+    found: dict[str, Finding] = {}
+    for finding in findings:
+        if finding.severity != "note" and finding.action:
+            found.setdefault(finding.action, finding)
+    if len(found) < 2:
+        return next(iter(found), "")
+    lines = [
+        f"{i}. {_after_place(finding)}"
+        for i, finding in enumerate(list(found.values())[:MOST_ACTIONS], start=1)
+    ]
+    further = len(found) - len(lines)
+    remaining = [f"Then {counted(further, 'further finding')} above."] if further else []
+    return "\n  ".join(["do the following.", *lines, *remaining])
+
+
+def _after_place(finding: Finding) -> str:
+    """Action of a finding after its first place, such as "Setup yx, line 4: read it again."."""
+    place, action = finding.places[0] if finding.places else Place(), finding.action
+    if place.setup is None and place.parameter is None:
+        return action
+    line = "" if place.line is None else f", line {place.line}"
+    label = place.parameter if place.setup is None else f"Setup {place.setup}{line}"
+    return f"{label}: {action[0].lower()}{action[1:]}"
 
 
 def parameter_places(*names: str) -> tuple[Place, ...]:

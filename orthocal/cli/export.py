@@ -91,7 +91,7 @@ def export(
     if "kinematics.ini" in files:
         _note_payload(result, payload)
     if to == "linuxcnc":
-        _note_latching(result, options)
+        _note_latching(result, options, ini, module="kinematics.ini" in files)
     if "README.md" in files and result.session.firmware is None:
         put_out(f"Next: follow {out / 'README.md'}.")
 
@@ -118,14 +118,23 @@ def _show_settings(
             put_out(printable(describe_next(fit, saved, out), keep="\n"))
 
 
-def _note_latching(calibration: orthocal.Calibration, options: orthocal.ExportOptions) -> None:
+def _note_latching(
+    calibration: orthocal.Calibration,
+    options: orthocal.ExportOptions,
+    ini: Path | None,
+    *,
+    module: bool,
+) -> None:
     """Note the assumed directions in which homing latches the switches."""
     from orthocal.export.linuxcnc.export import assumes_latching
 
     if assumes_latching(calibration, options):
+        unstated = "" if ini is None else f" ({ini} does not state it for every joint)"
         put_note(
-            "Assumed: HOME_LATCH_VEL of all joints is positive. If not, use --ini FILE or "
-            "--latched: HOME_OFFSET contains half of the backlash with this sign."
+            f"Assumed: HOME_LATCH_VEL of all joints is positive{unstated}. "
+            f"{'The module' if module else 'HOME_OFFSET'} contains half of the backlash with this "
+            f"sign. If it is negative, state the signs by {'--ini FILE or ' * (ini is None)}"
+            "--latched."
         )
 
 

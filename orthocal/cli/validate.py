@@ -29,8 +29,8 @@ def validate(
 ) -> None:
     """Compare new readings with the predictions of a calibration.
 
-    Exit code 0: the calibration is confirmed. 3: it is not, or the new readings contradict each
-    other; the reason is printed.
+    Exit code 0: the calibration is confirmed. 3: it is not, or the readings have an anomaly; the
+    reason is printed.
 
     Args:
         sessions (NEW_SESSION...): Measured with the entered offsets in the controller.

@@ -69,6 +69,18 @@ def nuisance_parameters(session: Session) -> NuisanceParameters:
     return NuisanceParameters(tuple(parameters.values()), tuple(of_setup))
 
 
+def nominal_values(session: Session) -> dict[str, float]:
+    """Nuisance parameter to the nominal value of its quantity, [unit], if that is not 0.
+
+    A parameter whose setups state different values has none.
+    """
+    values: dict[str, set[float]] = {}
+    for setup in session.setups.values():
+        for p in setup.sensor.nuisance_parameters:
+            values.setdefault(f"{_owner(p, setup, session)}.{p.name}", set()).add(p.nominal)
+    return {name: v for name, (v, *others) in values.items() if v and not others}
+
+
 def _owner(parameter: NuisanceParameter, setup: Setup, session: Session) -> str:
     """Owner of a nuisance parameter: a gauge, an object that setups share, or the setup."""
     if parameter.of_gauge:

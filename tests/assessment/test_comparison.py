@@ -10,9 +10,14 @@ import numpy as np
 import pytest
 from calibrated import calibrated, session_of
 
-from orthocal import summarize
+from orthocal import calibrate, summarize
 from orthocal.assessment.comparison import compare_models
-from orthocal.assessment.recommendation import STRONG, ModelEvidence, Recommendation
+from orthocal.assessment.recommendation import (
+    STRONG,
+    ModelEvidence,
+    Recommendation,
+    recommend_model,
+)
 from orthocal.assessment.wording import tool_mm
 from orthocal.assessment.words.comparison import describe_recommendation
 from orthocal.errors import ParameterError
@@ -21,6 +26,7 @@ from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import build_problem
 from orthocal.estimation.solvers.ipopt import NonlinearProgram
 from orthocal.output.text.comparison import MORE
+from orthocal.output.text.summary import result_json
 from orthocal.statistics.zeros import project_out_zeros
 
 QUICK = SolverOptions("variable-projection")
@@ -87,6 +93,31 @@ def test_compare_and_calibrate_recommend_the_same_model(name, request):
     (second,) = calibration.assessment.of_kind("recommended")
     assert model in first.text
     assert model in second.text
+
+
+@pytest.mark.parametrize("case", ["reject", "review"])
+def test_doubtful_readings_get_no_recommendation(case, raw_cycles):
+    """Neither a model nor a tool error, in text and JSON; `calibrate` recommends none, too."""
+    session = session_of("table1/experiment-1-printed")
+    if case == "review":
+        sides = [-1.0 if r.setup == "yx" else 1.0 for r in raw_cycles.readings]
+        session = raw_cycles.with_values(raw_cycles.values * sides)
+    compared = compare_models(session, models=["offsets"], options=QUICK)
+    assessed, judgement = compared.assessment, compared.judgement
+    assert judgement.verdict == case
+    assert (compared.recommendation, compared.effects, assessed.tool) == (None, None, None)
+    assert assessed.findings == judgement.findings
+    document = json.loads(result_json(compared))
+    assert document["decision"]["verdict"] == case
+    assert document["recommendation"] is None
+    assert "tool" not in document
+    assert {m["tool_uncertainty"] for m in document["models"]} == {None}
+    text = summarize(compared)
+    assert "ecommended" not in text
+    assert "tool error" not in text
+    assert assessed.decision.action.split()[0] in text
+    calibration = calibrate(session, "offsets", solver="variable-projection")
+    assert not calibration.assessment.of_kind("recommended")
 
 
 def test_residuals_of_offsets_repeat(experiment_2):
@@ -255,8 +286,9 @@ def test_the_summary_has_all_scores(table1):
 def test_readings_without_deviation_support_offsets_and_small_tolerances(raw_cycles):
     still = raw_cycles.with_values(np.zeros(len(raw_cycles.readings)))
     found = compare_models(still, models=["offsets", "lengths"], options=QUICK)
-    assert found.recommendation.log_evidence_of("offsets") > STRONG
-    assert found.recommendation.tolerance_scale < 0.2
+    recommendation = recommend_model(still, ["offsets", "lengths"])
+    assert recommendation.log_evidence_of("offsets") > STRONG
+    assert recommendation.tolerance_scale < 0.2
     assert math.isfinite(found["lengths"].exact.aicc)
 
 

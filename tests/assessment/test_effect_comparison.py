@@ -10,15 +10,17 @@ import numpy as np
 import pytest
 from calibrated import session_of
 from commands import run_orthocal
-from effect_plans import FEW, effect_plan
+from effect_plans import ALL, FEW, effect_plan
 from slack import Slack, SlackKeys
 
-from orthocal import simulate_session, write_session
+from orthocal import calibrate, simulate_session, write_session
 from orthocal.assessment.comparison import compare_models
 from orthocal.assessment.effect_comparison import compare_effects
+from orthocal.assessment.recommendation import STRONG
 from orthocal.assessment.words.comparison import describe_effects
 from orthocal.calibration.assessment_record import EXIT_CODES
 from orthocal.effects import registry
+from orthocal.effects.registry import order_effects
 from orthocal.estimation.options import SolverOptions
 from orthocal.hypotheses.linear_model import LinearModel
 
@@ -38,12 +40,12 @@ def compared(session):
     return compare_effects(session.with_effects(["backlash"]))
 
 
-def test_the_supported_effect_is_recommended(session):
+def test_stated_effects_are_recommended_and_the_visible_one_is_named(session):
     found = compare_effects(session.with_effects(None))
-    assert found.recommended == ("backlash",)
-    assert [w.effects for w in found.weighed[:5]] == [
-        (), *((n,) for n in ("backlash", "thermal", "screw", "drift")),
-    ]  # fmt: skip
+    assert found.recommended == found.stated == ALL
+    assert found.shown == ("backlash",)
+    alone = [tuple(e for e in ALL if e != name) for name in ALL]
+    assert [w.effects for w in found.weighed] == [(), ALL, *alone]
     assert found.best.log_evidence > 10.0
     assert found.best.prediction_rms < found.weighed[0].prediction_rms
     assert found.weighed[0].log_evidence == 0.0
@@ -52,15 +54,27 @@ def test_the_supported_effect_is_recommended(session):
 def test_candidates_are_those_chosen(session):
     found = compare_effects(session.with_effects(["thermal"]))
     assert [w.effects for w in found.weighed] == [(), ("thermal",)]
-    assert found.recommended == ()
+    assert (found.recommended, found.shown) == (("thermal",), ())
     assert compare_effects(session.with_effects([])) is None
 
 
-def test_a_machine_without_effects_needs_none():
+def test_a_machine_without_effects_shows_none():
     errors = {n: v for n, v in ERRORS.items() if "backlash" not in n}
     plan = effect_plan(setups=FEW)
     session = simulate_session(plan, errors, seed=4).session.with_effects(["backlash", "drift"])
-    assert compare_effects(session).recommended == ()
+    assert compare_effects(session).shown == ()
+
+
+def test_an_effect_whose_values_are_entered_is_recommended():
+    """The evidence is about all drives together and weak; one drive has a determined backlash."""
+    plan = effect_plan("backlash")
+    plan = plan.with_gauge(replace(plan.gauge, sigma=6e-6))
+    session = simulate_session(plan, {"y_slide.backlash": 20e-6}, seed=4, sigma=6e-6).session
+    found = compare_effects(session)
+    assert found.best.log_evidence < STRONG
+    assert (found.recommended, found.shown) == (("backlash",), ())
+    entries = calibrate(session, "offsets", solver="variable-projection").assessment.backlash
+    assert [bool(e.change) for e in entries] == [False, True, False]
 
 
 @pytest.fixture
@@ -76,9 +90,12 @@ def slack():
 def test_an_effect_of_another_package_is_compared_like_those_of_orthocal(slack):
     """Its parameters explain backlash, and the periodic errors of the screws besides."""
     found = compare_effects(slack)
-    alone = {w.effects for w in found.weighed if len(w.effects) < 2}
-    assert {("backlash",), ("thermal",), ("drift",), ("slack",)} < alone
-    assert found.recommended == ("slack",)
+    assert {"backlash", "thermal", "drift", "slack"} <= {
+        n for w in found.weighed for n in w.effects
+    }
+    assert found.stated == ("thermal",)
+    assert found.recommended == ("thermal", "slack")
+    assert found.shown == ("slack",)
     assert found.best.log_evidence > 10.0
     assert set(found.named) == {e.name for e in Slack.from_keys(SlackKeys(), slack.robot).errors}
     (note, *_) = describe_effects(found, 40)
@@ -118,24 +135,15 @@ def test_without_the_effect_a_comparison_asks_for_a_review(session, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("identified", "option"),
-    [(("backlash",), ""), (("thermal",), "thermal,backlash"), ((), "backlash")],
+    ("stated", "option"),
+    [(("backlash",), ""), (("thermal",), "backlash,thermal"), ((), "backlash")],
 )
-def test_the_option_is_named_unless_the_effect_is_identified(compared, identified, option):
-    """It includes the identified effects, because it replaces their choice."""
-    (note, *_) = describe_effects(replace(compared, identified=identified), 40)
+def test_the_option_is_named_unless_the_effect_is_stated(compared, stated, option):
+    """It includes the stated effects, because it replaces their choice."""
+    recommended = order_effects({*stated, "backlash"})
+    (note, *_) = describe_effects(replace(compared, stated=stated, recommended=recommended), 40)
     assert note.kind == "effects recommended"
-    stated = re.findall(r"--effects (\S+)`", note.action)
-    assert [set(s.split(",")) for s in stated] == ([set(option.split(","))] if option else [])
-
-
-def test_the_evidence_decides_where_omitted_setups_disagree(compared):
-    none, best = compared.weighed
-    worse = replace(best, prediction_rms=1.5 * none.prediction_rms)
-    texts = [
-        describe_effects(replace(compared, weighed=(none, w)), 40)[0].text for w in (best, worse)
-    ]
-    assert ["the evidence of all readings" in text for text in texts] == [False, True]
+    assert re.findall(r"--effects (\S+)`", note.action) == ([option] if option else [])
 
 
 def test_a_comparison_of_models_recommends_the_effect(session):
@@ -145,5 +153,5 @@ def test_a_comparison_of_models_recommends_the_effect(session):
     assert note.numbers["log_evidence"] > 10.0
     assert found.assessment.decision.verdict == "enter"
     document = json.loads(found.to_json())["effects"]
-    assert document["recommended"] == ["backlash"]
+    assert document["recommended"] == document["stated"] == document["shown"] == ["backlash"]
     assert len(document["weighed"]) == 2

@@ -30,7 +30,10 @@ from orthocal import (
 )
 from orthocal.assessment import assess, comparison
 from orthocal.assessment.judgement import judge_session
+from orthocal.assessment.wording import describe_actions
 from orthocal.calibration.assessment_record import EXIT_CODES, Finding, FindingKind, Severity
+from orthocal.output.text.answer import render_decision
+from orthocal.output.text.layout import to_text
 from orthocal.output.text.summary import result_json
 from orthocal.session.session import Conditions
 
@@ -247,6 +250,28 @@ def test_the_readings_of_an_unfinished_session_are_judged(cycles, root, tmp_path
     done = run_orthocal(tmp_path, "check", ".")
     assert (done.returncode, done.stdout) == (2, "")
     assert "no reading is entered yet" in done.stderr
+
+
+def test_the_next_step_of_a_decision_is_about_each_finding(cycles):
+    """Each action is stated once, in the list; after three the number of the others."""
+    largest = np.abs(cycles.values).argsort()[::-1]
+    wrong = change(cycles, largest[0], -cycles.values[largest[0]])
+    other = next(i for i in largest if wrong.readings[i].setup != wrong.readings[largest[0]].setup)
+    assessed = check_session(change(wrong, other, -cycles.values[other]))
+    lead, second = [f for f in assessed.findings if f.severity == "review"]
+    lines = assessed.decision.action.splitlines()[1:]
+    assert len(lines) == 2
+    for line, finding in zip(lines, (lead, second), strict=True):
+        assert finding.action[1:] in line
+        assert f"line {finding.places[0].line}:" in line
+    text = " ".join(to_text(render_decision(assessed)).split())
+    assert text.count(" ".join(second.action.split())[1:]) == 1
+    five = [replace(lead, action=f"Do {i}.") for i in range(5)]
+    assert [line.split()[0] for line in describe_actions(five).splitlines()[1:]] == [
+        "1.", "2.", "3.", "Then",
+    ]  # fmt: skip
+    assert "2 further" in describe_actions(five)
+    assert describe_actions([lead]) == describe_actions([lead, lead]) == lead.action
 
 
 @pytest.fixture

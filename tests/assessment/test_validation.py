@@ -18,7 +18,9 @@ from tolerances import THREE_DECIMALS_MM
 from orthocal import (
     Choice,
     calibrate,
+    check_session,
     draw_errors,
+    join_sessions,
     simulate_session,
     summarize,
     validate_calibration,
@@ -361,6 +363,34 @@ def test_identified_offsets_in_place_of_those_to_enter_are_not_confirmed(plan):
     result = validate_calibration(calibration, session)
     assert result.confirmed is False
     assert not result.nothing_to_change
+
+
+def test_the_verdict_is_that_of_all_sessions_and_the_exit_code_the_confirmation(plan):
+    """New readings with three times the noise: nothing odd in all of them, but not as predicted."""
+    errors, first, calibration = calibrated_machine("raw-cycles", "full", 0)
+    entered = plan.with_controller(entered_offsets(calibration))
+    session = simulate_session(entered, errors, seed=4, sigma=15e-6).session
+    result = validate_calibration(calibration, session)
+    assert result.assessment.of_kind("larger than predicted")
+    document = json.loads(result_json(result))
+    assert document["confirmed"] is False
+    assert document["decision"]["exit_code"] == 3
+    checked = check_session(join_sessions([first, session]))
+    assert document["decision"]["verdict"] == checked.decision.verdict == "enter"
+
+
+def test_values_from_readings_with_a_mistake_are_not_entered(plan):
+    """The machine has changed besides, so that a change between the sessions is found."""
+    errors, first, calibration = calibrated_machine("raw-cycles", None, 3)
+    right = entered_offsets(calibration)
+    moved = {**errors, "y_slide.offset": errors["y_slide.offset"] + 0.5e-3}
+    session = measure(plan, moved, right, stated=right, seed=7)
+    session = session.with_values(session.values + 0.3e-3 * (np.arange(len(session.values)) == 4))
+    result = validate_calibration(calibration, session)
+    assert assessment_of(result.refit).decision.verdict == "review"
+    assert result.enter == result.assessment.entries == ()
+    checked = check_session(join_sessions([first, session]))
+    assert result.assessment.decision.verdict == checked.decision.verdict == "review"
 
 
 @pytest.mark.slow

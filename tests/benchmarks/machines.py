@@ -4,8 +4,12 @@ python tests/benchmarks/machines.py                  three machines of every pla
 python tests/benchmarks/machines.py --machines 100   the long form
 
 Machines have none, one, two or three mistakes in their readings, their offsets entered or not, one
-session or two. Exit code 1 if verdicts differ, or if a promise of the sessions without a mistake is
-not kept: the tool error, or the coverage of the intervals.
+session or two. If a calibration says to enter its offsets, another session is measured with them:
+without a mistake, with one in its readings, or with other offsets than it states. `validate` then
+has the verdict of `check` and `calibrate` on all sessions.
+
+Exit code 1 if verdicts differ, or if a promise of the sessions without a mistake is not kept: the
+tool error, or the coverage of the intervals.
 """
 
 from __future__ import annotations
@@ -35,7 +39,8 @@ from orthocal import (
     simulate_session,
     write_session,
 )
-from orthocal.assessment.controller_entries import entered_offsets
+from orthocal.assessment.controller_entries import entered_offsets, offsets_to_enter
+from orthocal.errors import OrthocalError
 from orthocal.units import MM
 
 EXAMPLES = ("raw-cycles", "sweep", "workshop")
@@ -53,6 +58,8 @@ class Counts:
 
     verdicts: Counter = field(default_factory=Counter)
     """Machines by number of mistakes and verdict."""
+    validated: Counter = field(default_factory=Counter)
+    """Sessions with calibrated offsets by their mistake and the answer of `validate`."""
     differing: list = field(default_factory=list)
     """Seeds of machines about which commands differ, and their verdicts."""
     tool: list = field(default_factory=list)
@@ -69,6 +76,43 @@ def spoil(session, rng, mistakes):
         if made is not None and not np.array_equal(made.values, session.values):
             session, mistakes = session.with_values(made.values), mistakes - 1
     return session
+
+
+AGAIN = ("no mistake", "wrong reading", "offsets not entered", "offsets reversed")
+"""Mistakes of the session that is measured with the calibrated offsets."""
+
+
+def measure_again(plan, errors, calibration, seed):
+    """Session that states the offsets of a calibration, and its mistake; None out of reach."""
+    before, stated = calibration.active_offsets, offsets_to_enter(calibration)
+    rng = np.random.default_rng((seed, 6))
+    mistake = AGAIN[rng.integers(len(AGAIN))]
+    actual = {AGAIN[2]: before, AGAIN[3]: 2.0 * before - stated}.get(mistake, stated)
+    try:
+        session = simulate_session(
+            plan.with_controller(actual), errors, seed=20_000 + seed
+        ).session.with_controller(stated)
+    except OrthocalError:
+        return None
+    if mistake == AGAIN[1]:
+        session = spoil(session, rng, 1)
+    return session, mistake
+
+
+def validate(folder, before, session, mistake, counts):
+    """Verdicts on sessions with another one that was measured after their calibration."""
+    write_session(session, folder / "again")
+    done = run_orthocal(folder, "validate", "full", "again", "--json")
+    document = json.loads(done.stdout)
+    decision, confirmed = document["decision"], document["confirmed"]
+    counts.validated[mistake, confirmed, decision["verdict"]] += 1
+    verdicts = {"validate": decision["verdict"]}
+    if done.returncode != (0 if confirmed and decision["verdict"] == "enter" else 3):
+        verdicts["validate"] = "other exit code"
+    for name in ("check", "calibrate"):
+        done = run_orthocal(folder, name, *before, "again", "--json")
+        verdicts[name] = json.loads(done.stdout)["decision"]["verdict"]
+    return verdicts
 
 
 def find_verdicts(folder, sessions):
@@ -139,8 +183,16 @@ def examine(folder, plan, seed, counts):
     counts.verdicts[mistakes, verdicts["check"]] += 1
     if not agree(verdicts):
         counts.differing.append((seed, verdicts))
-    if not mistakes and verdicts["calibrate"] == "enter":
-        keep_promises(load_calibration(folder / "full"), errors, counts)
+    if verdicts["calibrate full"] != "enter":
+        return
+    calibration = load_calibration(folder / "full")
+    again = measure_again(plan, errors, calibration, seed)
+    if again is not None:
+        verdicts = validate(folder, sessions, *again, counts)
+        if not agree(verdicts):
+            counts.differing.append((seed, again[1], verdicts))
+    if not mistakes:
+        keep_promises(calibration, errors, counts)
 
 
 def keep_promises(calibration, errors, counts):
@@ -164,7 +216,9 @@ def report(name, counts):
     show(f"\n{name}")
     for (mistakes, verdict), number in sorted(counts.verdicts.items()):
         show(f"  {mistakes} mistakes, {verdict}: {number}")
-    for seed, verdicts in counts.differing:
+    for (mistake, confirmed, verdict), number in sorted(counts.validated.items(), key=str):
+        show(f"  again with {mistake}: {verdict}, confirmed {confirmed}: {number}")
+    for seed, *verdicts in counts.differing:
         show(f"  machine {seed}: {verdicts}")
     kept = not counts.differing
     if counts.tool:

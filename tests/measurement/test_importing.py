@@ -271,7 +271,7 @@ FORMS = [
          "{}:2: 'null' is not a posture; postures: zero, x_max, x_-40"),
     text("twice", HEAD + "xy;zero;0,5\nXY;Zero;0,6\n",
          "{}:3: repeats xy zero of cycle 1, first in line 2; number repeated measurements in the "
-         "column 'cycle'"),
+         "column 'cycle', and different sides of approach in 'approach'"),
     text("two-readings-a-row", "setup;posture;Messwert_mm;Anzeige_mm\nxy;zero;0,5;0,6\n",
          "{}:1: several columns have the role reading: 'Messwert_mm' (#3) and 'Anzeige_mm' (#4); "
          "choose one by --column reading=HEADING"),

@@ -142,10 +142,15 @@ def test_export_takes_home_and_latching_from_the_file(folder, one, plain):
     assert "--latched" in twice.stderr
 
 
-def test_latching_is_positive_by_default_and_said_to_be(folder, one):
+def test_latching_is_positive_by_default_and_said_to_be(folder, one, plain):
     home = ["--home-offset", "352.5,340,-3.25"]
     default = export(folder, one, "default", *home)
-    assert "Assumed: HOME_LATCH_VEL of all joints is positive" in default.stderr
+    assert "Assumed: HOME_LATCH_VEL of all joints is positive. " in default.stderr
+    lines = [v for v in plain.read_text().splitlines() if not v.startswith("HOME_LATCH_VEL")]
+    (folder / "unlatched.ini").write_text("\n".join(lines))
+    by_file = export(folder, one, "unlatched", "--ini", folder / "unlatched.ini")
+    assert "unlatched.ini does not state it" in by_file.stderr
+    assert "--ini" not in by_file.stderr
     stated = export(folder, one, "stated", *home, "--latched", "+,+,+")
     assert "Assumed" not in stated.stderr
     texts = [(folder / name / "joints.ini").read_text() for name in ("default", "stated")]
@@ -184,7 +189,7 @@ def test_again_says_what_differs_in_the_file_of_another_calibration(folder, one,
     done = run_orthocal(folder, "again", one, "--out", "third", "--ini", "plain.ini")
     assert done.returncode == 0
     text = " ".join(done.stderr.split())
-    expected = f"JOINT_0 has BACKLASH 0.000 mm instead of BACKLASH {float(backlash):.3f} mm"
+    expected = f"JOINT_0 has no BACKLASH instead of BACKLASH {float(backlash):.3f} mm"
     assert expected in text
     assert len(re.findall(r"JOINT_\d has", text)) == 3
     assert "other offsets" not in text  # an INI file states none

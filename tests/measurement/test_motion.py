@@ -608,6 +608,21 @@ def test_a_posture_is_passed_where_its_approach_has_the_other_direction(bar):
         plan_motion(replace(bar, readings=tuple(rows)))
 
 
+def test_the_closing_reading_of_a_bar_repeats_the_first_one(bar):
+    """The path chooses the approach of the first reading, as nothing is mounted before it."""
+    setups = {"bar": replace(bar.setups["bar"], aligned_at="a")}
+    rows = tuple(Reading("bar", name, cycle=1 + i // 3) for i, name in enumerate("adba"))
+    (motion,) = plan_motion(replace(bar, setups=setups, readings=rows))
+    first, *_, last = motion.stops
+    assert (first.approach, last.approach) == ("pnn", "pnn")
+    assert last.repeats == first.line
+    # a session may state the side of the path to the second posture
+    begin = replace(rows[0], conditions=Conditions("nnn"))
+    (other,) = plan_motion(replace(bar, setups=setups, readings=(begin, *rows[1:])))
+    assert (other.stops[0].approach, other.stops[-1].approach) == ("nnn", "pnn")
+    assert other.stops[-1].repeats is None
+
+
 def test_a_path_returns_to_its_first_posture_from_either_side(bar):
     """Readings state the approaches that the path gives them; the return states none."""
     rows = tuple(Reading("bar", name) for name in "adb")

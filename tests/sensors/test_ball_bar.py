@@ -12,13 +12,15 @@ from machines import frame_pose
 from sensor_machines import assert_promises, calibrate_machines
 from tolerances import CLOSED_FORM
 
-from orthocal import load_plan, load_session, write_session
+from orthocal import calibrate, load_plan, load_session, write_session
 from orthocal.errors import SessionError
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import cube
 from orthocal.observation.model import predict_readings
 from orthocal.observation.sensor_groups import nuisance_parameters
 from orthocal.observation.simulate import simulate_session
+from orthocal.output.text.layout import to_text
+from orthocal.output.text.tables import render_sensors
 from orthocal.sensors.ball_bar import BallBar
 from orthocal.units import MM
 
@@ -111,6 +113,18 @@ def test_tool_errors_and_intervals_of_machines_with_all_errors(tmp_path, orthogl
 
     space = cube(orthoglide, points_per_side=5)
     assert_promises(calibrate_machines(plan, space, count=40, read=read))
+
+
+def test_the_printed_length_is_that_of_the_bar(tmp_path):
+    """The stated length with its estimated error; also where two sessions share it."""
+    plan = circles(tmp_path, legs=True)
+    sessions = [simulate_session(plan, ERRORS, seed=s).session for s in (3, 4)]
+    for measured in (sessions[:1], sessions):
+        calibration = calibrate(measured, "offsets", solver="variable-projection")
+        (error,) = [p.value for p in calibration.sensors if p.name == "gauge.bar.length"]
+        rows = [line.split() for line in to_text(render_sensors(calibration)).splitlines()]
+        (row,) = [r for r in rows if r[:1] == ["gauge.bar.length"]]
+        assert float(row[1]) == pytest.approx(RADIUS_MM + error / MM, abs=6e-4)
 
 
 def test_a_simulated_session_comes_back_from_its_files(tmp_path):

@@ -9,7 +9,6 @@ from orthocal.assessment.recommendation import Recommendation
 from orthocal.assessment.wording import joined, mm, note, tool_mm
 from orthocal.assessment.words.effects import identify_effects
 from orthocal.calibration.assessment_record import Finding
-from orthocal.effects.registry import order_effects
 from orthocal.io.documents import LARGEST_NUMBER
 from orthocal.units import MM, UM
 
@@ -57,15 +56,13 @@ def describe_recommendation(
     return findings
 
 
-def describe_effects(comparison: EffectComparison | None, readings: int) -> list[Finding]:
+def describe_effects(comparison: EffectComparison, readings: int) -> list[Finding]:
     """Findings about recommended effects and about effects whose conditions are missing.
 
     Args:
-        comparison: The comparison; None without candidates.
+        comparison: The comparison.
         readings: Number of readings.
     """
-    if comparison is None:
-        return []
     notes = [
         note(
             "effect not weighed",
@@ -77,34 +74,30 @@ def describe_effects(comparison: EffectComparison | None, readings: int) -> list
     ]
     if not comparison.weighed:
         return notes
-    best = comparison.best
-    if comparison.recommended:
-        text, action = _describe_recommended_effects(comparison)
-    else:
+    names, best = comparison.recommended, comparison.best
+    texts = [f"Recommended effects: {joined(names) if names else 'none'}."]
+    if comparison.stated:
+        texts.append(
+            f"The machine states {joined(comparison.stated)}, so every model contains "
+            f"{'it' if len(comparison.stated) == 1 else 'them'}."
+        )
+    unshown = [n for n in best.effects if n not in comparison.shown]
+    if comparison.shown:
+        texts.append(f"The readings clearly show {joined(comparison.shown)}.")
+    if unshown:
+        entering = "; `calibrate` decides for each drive whether to enter it"
+        texts.append(
+            f"The readings together do not clearly show {joined(unshown)}"
+            f"{entering if 'backlash' in unshown else ''}."
+        )
+    if not best.effects:
         single = [w.effects[0] for w in comparison.weighed if len(w.effects) == 1]
-        text, action = "Recommended effects: none. The readings do not clearly show ", ""
-        text += f"{joined(single, 'or')}; effects that the machine states may stay."
+        texts.append(f"The readings do not clearly show {joined(single, 'or')}.")
+    action = ""
+    if comparison.named or set(names) - set(comparison.stated):
+        action = identify_effects(names, comparison.named)
     numbers = {"log_evidence": best.log_evidence, "prediction_rms_mm": best.prediction_rms / MM}
-    return [note("effects recommended", text, action, **numbers), *notes]
-
-
-def _describe_recommended_effects(comparison: EffectComparison) -> tuple[str, str]:
-    """Text and action of the finding about recommended effects."""
-    names, without, best = comparison.recommended, comparison.weighed[0], comparison.best
-    them, are = ("it", "is") if len(names) == 1 else ("them", "are")
-    with_mm, without_mm = mm(best.prediction_rms), mm(without.prediction_rms)
-    text = (
-        f"Recommended effects: {joined(names)}. The readings are much more likely with {them} "
-        f"(ln evidence {best.log_evidence:+.1f}). RMS prediction error of left-out setups: "
-        f"{with_mm} mm with {them}, {without_mm} mm without."
-    )
-    if float(with_mm) > float(without_mm):
-        text += " The recommendation follows the evidence of all readings."
-    if comparison.named or set(names) - set(comparison.identified):
-        effects = order_effects({*comparison.identified, *names})
-        return text, identify_effects(effects, comparison.named)
-    listed = joined(names)
-    return f"{text} {listed[:1].upper()}{listed[1:]} {are} identified already.", ""
+    return [note("effects recommended", " ".join(texts), action, **numbers), *notes]
 
 
 def not_recommended(

@@ -150,8 +150,16 @@ def _compensation_lines(joint: int, home: JointHome) -> list[str]:
     return lines
 
 
-def _describe_compensation(homes: Sequence[JointHome], *, stated: bool) -> str:
-    """Paragraph about BACKLASH and COMP_FILE; empty without them."""
+def _describe_compensation(
+    homes: Sequence[JointHome], *, stated: bool, module: bool = False
+) -> str:
+    """Paragraph about BACKLASH and COMP_FILE; empty without them.
+
+    Args:
+        homes: Homes of the joints.
+        stated: Whether the signs of HOME_LATCH_VEL are stated.
+        module: Whether a module displaces the joints, instead of HOME_OFFSET.
+    """
     paragraphs = []
     with_backlash = [(i, h) for i, h in enumerate(homes) if h.compensation.backlash]
     if with_backlash:
@@ -162,13 +170,15 @@ def _describe_compensation(homes: Sequence[JointHome], *, stated: bool) -> str:
         )
         paragraphs.append(
             f"**Backlash:** {listed}.\nLinuxCNC compensates it by the lines BACKLASH, or by the "
-            "columns of COMP_FILE. HOME_OFFSET contains half of\nthe backlash, with the sign of "
-            "HOME_LATCH_VEL. HOME_LATCH_VEL and HOME_SEARCH_VEL must have the signs stated here."
+            f"columns of COMP_FILE. {'The module' if module else 'HOME_OFFSET'} contains half of\n"
+            "the backlash, with the sign of HOME_LATCH_VEL"
+            f"{': HOME_OFFSET does not change' if module else ''}. HOME_LATCH_VEL and "
+            "HOME_SEARCH_VEL\nmust have the signs stated here."
         )
         if not stated and any(map(_depends_on_latching, homes)):
             paragraphs[-1] += (
-                "\nThe signs + are assumed, because no option states them. `--ini FILE` reads them "
-                "from your INI file,\n`--latched` states them."
+                "\nThe signs + are assumed, because neither an INI file (`--ini FILE`) nor "
+                "`--latched` states them."
             )
     tables = [h.compensation for h in homes if h.compensation.table is not h.was.table]
     tables = [c for c in tables if c.table is not None]
@@ -356,7 +366,7 @@ def write_module_page(
         "tool": millimetres(approximation.tool),
         "checked": approximation.checked,
         "nominal": nominal,
-        "compensation": _describe_compensation(homes, stated=stated)
+        "compensation": _describe_compensation(homes, stated=stated, module=True)
         + _describe_conditions(approximation)
         + _describe_undetermined(calibration),
         "old_values": f" ({', '.join(old)})" if old else "",

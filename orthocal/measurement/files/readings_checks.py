@@ -166,10 +166,11 @@ class _AcceptedReadings:
             SessionError: If the reading disagrees with the previous ones; names file and line.
         """
         if reading.key in self._first_lines:
+            sides = ", and different sides of approach in 'approach'" * (reading.approach is None)
             raise SessionError(
                 f"repeats {reading.label} of cycle {reading.cycle}, first in line "
                 f"{self._first_lines[reading.key]}; number repeated measurements in the column "
-                "'cycle'",
+                f"'cycle'{sides}",
                 where=row.where,
             )
         self._first_lines[reading.key] = row.line

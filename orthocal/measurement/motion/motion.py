@@ -10,6 +10,7 @@ conditions: the drives reach it, the tip stays on the rod, and the dial stays in
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -469,7 +470,9 @@ def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path
     """Stops on the path that a sensor prescribes, with their approaches and predicted readings.
 
     If the stated approach of a reading has the opposite direction, the tool passes the posture and
-    approaches it on the way back.
+    approaches it on the way back. A gauge that is aligned in its first posture arrives there as it
+    will from the last one, unless the reading states another approach: the closing reading then
+    has the approach of the first.
 
     Raises:
         SessionError: If the path leaves the workspace, or no direction has the stated approach.
@@ -477,15 +480,17 @@ def _follow_path(session: Session, setup: str, stops: Sequence[Stop], path: Path
     robot, length = session.robot, approach_share(session) * USUAL_LENGTH
     first = np.asarray(stops[0].point)
     others = [s.point for s in stops if s.point is not None and not np.allclose(s.point, first)]
-    ahead = path(first, np.asarray(others[0])) if others else np.array([first, first + length])
-    begin = 2.0 * first - _walk(ahead, length)  # nothing is mounted yet
-    position, checked, polylines = begin, list[Stop](), []
+    ends = [np.asarray(others[i]) for i in (-1, 0)] if others else [first + length]
+    # nothing is mounted yet: the tool comes from the last posture, or from the second one
+    possible = [np.vstack([_walk(path(first, end), length), first]) for end in ends]
+    position, begin, checked, polylines = first, first, list[Stop](), []
     for stop in stops:
         point = np.asarray(stop.point)
-        corners = np.vstack([begin, point]) if not checked else path(position, point)
-        if checked and np.allclose(position, point):  # away from the posture and back
-            corners = np.vstack([point, begin, point])
-        arrival = _arrive(session, setup, stop, corners, length)
+        if checked:  # in the same posture again: away from it and back
+            stays = np.allclose(position, point)
+            possible = [np.vstack([point, begin, point]) if stays else path(position, point)]
+        arrival = _arrive(session, setup, stop, possible, length)
+        position = position if checked else np.asarray(arrival.approach_point)
         checked.append(arrival)
         begin = np.asarray(arrival.approach_point)
         polylines.append([position, *arrival.via, begin, point])
@@ -516,24 +521,27 @@ def _require_paths(
     return [path for path in paths if path is not None]
 
 
-def _arrive(session: Session, setup: str, stop: Stop, corners: Array, length: float) -> Stop:
+def _arrive(
+    session: Session, setup: str, stop: Stop, possible: Sequence[Array], length: float
+) -> Stop:
     """Stop that is approached along a path: forwards, or backwards after passing the posture.
 
     Args:
         session: The session.
         setup: Name of the setup.
         stop: The stop, with its stated approach.
-        corners: Path to it, shape (n, n_coordinates), [m].
+        possible: Paths to it, each of shape (n, n_coordinates), [m]; the first that has the stated
+            approach is followed.
         length: Length of the approach, [m].
 
     Raises:
         SessionError: If neither direction has the stated approach.
     """
-    point, closure = corners[-1], nominal_closure(session.robot)
-    before = _walk(corners[::-1], length)
-    beyond = 2.0 * point - before
+    point, closure = possible[0][-1], nominal_closure(session.robot)
     approaches = []
-    for begin in (before, beyond):
+    for corners, forwards in itertools.product(possible, (True, False)):
+        before = _walk(corners[::-1], length)
+        begin = before if forwards else 2.0 * point - before
         drives = closure.inverse(begin[None])[0]
         approach = name_approach(stop.drives - drives)
         approaches.append(approach)
@@ -546,7 +554,7 @@ def _arrive(session: Session, setup: str, stop: Stop, corners: Array, length: fl
             where=f"{session.path or 'session'}: postures.{stop.posture}",
         )
     via = corners[1:]
-    if begin is before:
+    if forwards:
         remaining = np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1)[::-1])[::-1]
         via = corners[1:-1][remaining[1:] > length]
     return replace(

@@ -28,6 +28,8 @@ from orthocal.units import MM
 
 SCHEMA = "orthocal/adjustment/1"
 
+TOGETHER = "No tool error: this adjustment lowers it only together with the next one."
+
 MORE = "--details lists these adjustments."
 
 
@@ -78,7 +80,7 @@ def render_plan(
                 describe_setting(p),
                 signed(p.amount / MM),
                 plain(p.uncertainty / MM),
-                plain(p.tool_error / MM),
+                "" if p.tool_error is None else plain(p.tool_error / MM),
             )
             for i, p in enumerate(plan.adjustments, start=1)
         ]
@@ -87,6 +89,7 @@ def render_plan(
         notes = [
             "Amount, ± and tool error are in mm. The tool error is that after this adjustment and "
             "those before it, with the offsets entered again.",
+            *([TOGETHER] if any(p.tool_error is None for p in plan.adjustments) else []),
             "±: in 19 of 20 cases the best amount lies within it.",
             *notes,
         ]

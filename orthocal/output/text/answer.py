@@ -102,7 +102,7 @@ def render_answer(
     assessment = assessment_of(calibration)
     parts: list[RenderableType] = [render_subject(calibration), Text()] if heading else []
     parts += [render_headline(assessment.decision), Text()]
-    notes = [f.words for f in _listed(calibration, assessment)]
+    notes = [_describe(f, assessment.decision) for f in _listed(calibration, assessment)]
     if assessment.decision.verdict == "enter":
         parts += _values(calibration, assessment) + _tool(calibration, assessment)
         notes += describe_undetermined(calibration, further)
@@ -139,7 +139,7 @@ def render_decision(assessment: Assessment, *, details: bool = False) -> Rendera
     """
     decision = assessment.decision
     parts: list[RenderableType] = [render_headline(decision)]
-    further = [f.words for f in assessment.findings if f.text != decision.reason]
+    further = [_describe(f, decision) for f in assessment.findings if f.text != decision.reason]
     if further:
         parts += [Text(), bullets(further)]
     if decision.action:
@@ -150,6 +150,11 @@ def render_decision(assessment: Assessment, *, details: bool = False) -> Rendera
     return Group(*parts)
 
 
+def _describe(finding: Finding, decision: Decision) -> str:
+    """Text of a finding, and its action if the decision does not contain it."""
+    return finding.text if finding.action[1:] in decision.action else finding.words
+
+
 def print_decision(assessment: Assessment, *, details: bool = False) -> None:
     """Print a decision about readings: in colour on a terminal."""
     print_rich(render_decision(assessment, details=details))
@@ -157,7 +162,8 @@ def print_decision(assessment: Assessment, *, details: bool = False) -> None:
 
 def render_headline(decision: Decision) -> Text:
     """Headline of a decision, and its reason."""
-    headline = (decision.headline, STYLES[decision.verdict])
+    doubtful = decision.verdict == "enter" and decision.exit_code  # not confirmed
+    headline = (decision.headline, STYLES["review" if doubtful else decision.verdict])
     return Text.assemble(headline, f" {decision.reason}".rstrip())
 
 

@@ -14,7 +14,7 @@ from orthocal.assessment.wording import tool_mm
 from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.entries import describe_region
 from orthocal.calibration.assessment_record import FindingKind
-from orthocal.output.text.answer import STYLES
+from orthocal.output.text.answer import STYLES, render_decision
 from orthocal.output.text.layout import (
     EXPANDED,
     MANY_ROWS,
@@ -46,21 +46,25 @@ def render_comparison(
 ) -> RenderableType:
     """A comparison as rich renderables: the short answer, and on demand the details."""
     c, assessed = comparison, comparison.assessment
-    (recommended,) = assessed.of_kind("recommended")
-    short = [f.words for f in assessed.findings if f.kind not in RESEARCH]
     answer: list[RenderableType] = [
         Text("Comparison of models", style="bold"),
         *([Text(c.title)] if c.title else []),
         Text(),
-        Text(assessed.decision.headline, style=STYLES[assessed.decision.verdict]),
-        Text(recommended.text),
-        Text(),
-        Padding(_tool_errors(c), (0, 0, 0, 2)),
-        bullets(short),
     ]
+    recommended = assessed.of_kind("recommended")
+    if recommended:
+        answer += [
+            Text(assessed.decision.headline, style=STYLES[assessed.decision.verdict]),
+            Text(recommended[0].text),
+            Text(),
+            Padding(_tool_errors(c), (0, 0, 0, 2)),
+            bullets([f.words for f in assessed.findings if f.kind not in RESEARCH]),
+        ]
+    else:
+        answer.append(render_decision(assessed))
     if not (details or all_rows):
         return Group(*answer, Text(MORE))
-    further = [f.words for f in assessed.findings if f.kind in RESEARCH and f != recommended]
+    further = [f.words for f in assessed.findings if f.kind in RESEARCH and f not in recommended]
     further += [e for f in assessed.findings if (e := describe_evidence(f))]
     noise = (
         f"{counted(c.independent, 'independent reading')}; σ of a reading: "
@@ -94,10 +98,11 @@ def _tool_errors(comparison: Comparison) -> RenderableType:
 
 def _scores(comparison: Comparison) -> RenderableType:
     rows: list[tuple[str, ...]] = []
+    chosen = comparison.recommendation
     for result in comparison.results:
         after = None if result.tool is None else result.tool.after
         checked = result.redundancy > 0
-        evidence = comparison.recommendation.log_evidence_of(result.model)
+        evidence = math.nan if chosen is None else chosen.log_evidence_of(result.model)
         for score in (result.linearised, result.exact):
             first = score.method == "linearised"
             # without redundancy the residuals do not check the model

@@ -14,7 +14,9 @@ from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.fit import MAX_LISTED
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
+from orthocal.calibration.refit import restore_session
 from orthocal.estimation.diagnostics.residual_rows import ResidualRow
+from orthocal.observation.sensor_groups import nominal_values
 from orthocal.output.text.answer import name_values
 from orthocal.output.text.layout import (
     NOISE_SOURCES,
@@ -262,12 +264,16 @@ def render_sensors(calibration: Calibration) -> RenderableType | None:
         note = "Weights are by σ estimated: from repeated cycles, else from the residuals."
         parts.append(noted(table, note))
     if calibration.sensors:
-        rows = []
+        rows, nominal = [], nominal_values(restore_session(calibration))
         for p in calibration.sensors:
             half = calibration.expand_estimate(p)
             f = p.edge_factor
+            actual = nominal.get(p.name, 0.0) + p.value
             limits = (plain(half * f), plain(show_limit(p.prior_std) * f))
-            rows.append((p.name, signed(p.value * f), *limits, p.edge_unit))
+            rows.append((p.name, signed(actual * f), *limits, p.edge_unit))
         table = table_of(("nuisance parameter", "estimate", "±", "tolerance", "unit"), rows)
-        parts.append(noted(table, "Estimated together with the errors of the machine."))
+        meaning = "Estimated together with the errors of the machine."
+        if any(p.name in nominal for p in calibration.sensors):
+            meaning += " Lengths and positions are actual ones, not differences from stated ones."
+        parts.append(noted(table, meaning))
     return Group(*parts) if parts else None

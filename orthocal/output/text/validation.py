@@ -35,6 +35,8 @@ from orthocal.units import MM
 DETAILS: tuple[FindingKind, ...] = (
     "must change",
     "not significant",
+    "no change",
+    "change unknown",
     "repetition unknown",
     "residuals differ",
 )
