@@ -107,7 +107,7 @@ def enter_wrongly(before: Array, stated: Array) -> Iterator[Mistake]:
 def enter_backlash_wrongly(before: Array, stated: Array) -> Iterator[Mistake]:
     """Backlashes that the controller may compensate instead of the stated ones.
 
-    A controller that is told half of the lost motion compensates half of it.
+    A controller in which half of the lost motion is entered compensates half of it.
 
     Args:
         before: Previously compensated backlashes, shape (n_drives,), [m, rad].
