@@ -143,10 +143,14 @@ def compare_models(
     require_names(models or (), argument="models")
     session = join_sessions(gathered)
     others = _gather_repeats(() if repeat is None else repeat, tolerances or {}, gathered)
-    noise = find_known_noise(session)
-    judgement = judgement or judge_session(session)
-    build = partial(build_problem, session, tolerance_scale=judgement.tolerance_scale)
     names = models or session.robot.parameters.models
+    for name in names:
+        session.robot.parameters.select_model(name)  # unknown names are refused
+    noise = find_known_noise(session)
+    if judgement is None:
+        report("searching the readings for anomalies")
+        judgement = judge_session(session)
+    build = partial(build_problem, session, tolerance_scale=judgement.tolerance_scale)
     results, undetermined = _score_models(build, names, noise.sigma, options, report)
     if judgement.verdict != "enter":
         results = tuple(replace(r, tool=None, linearisation_cost=None) for r in results)

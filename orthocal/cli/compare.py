@@ -44,14 +44,11 @@ def compare(
     loaded = load_each_once(sessions, effects=chosen, tolerance=tolerance)
     others = load_each_once(repeat, effects=chosen, tolerance=tolerance) if repeat else None
     session = orthocal.join_sessions(loaded)
-    put_note("orthocal: searching the readings for anomalies")
-    judgement = orthocal.judge_session(session)
-    with judgement_on_failure(session, judgement, json=json, details=details):
+    with judgement_on_failure(session, json=json, details=details):
         comparison = orthocal.compare_models(
             loaded,
             models=split_globs([models] if models else None),
             repeat=others,
-            judgement=judgement,
             report=lambda text: put_note(f"orthocal: {text}"),
         )
     deliver_judged(comparison, json=json, details=details, all_rows=all_rows)
