@@ -25,6 +25,7 @@ from orthocal.estimation.weighting import (
     initial_sigma,
     leverages,
     split_by_gauge,
+    stated_sigma,
 )
 from orthocal.statistics.information import (
     Information,
@@ -41,7 +42,7 @@ SIGMA_TOLERANCE = 0.03
 """Relative change of sigma at which it has converged: with a prior it changes no parameter by more
 than a twentieth of its standard deviation."""
 
-MAX_SIGMA_ROUNDS = 8
+MAX_SIGMA_ROUNDS = 24
 """Largest number of solutions until sigma and the noise ratios converge. Otherwise, as when sigma
 alternates between cycles and residuals, the last solution is returned, marked as not converged."""
 
@@ -339,7 +340,10 @@ def _estimate_noise_ratio(
     evaluation: _Evaluation,
     sigma: float,
 ) -> Array:
-    """Noise of each entry relative to the first gauge, from the residuals, (n_entries,)."""
+    """Noise of each entry relative to the first gauge, from the residuals, (n_entries,).
+
+    Multiplied by sigma, it is not below the stated noise of a gauge.
+    """
     if len(groups) < 2:
         return problem.noise_ratio
     covariance = evaluation.information.posterior(
@@ -353,7 +357,10 @@ def _estimate_noise_ratio(
         values=problem.values * problem.noise_ratio,
         sigma=sigma * problem.noise_ratio,
     )
-    return np.asarray(std / std[groups[0].entries][0])
+    ratio = std / std[groups[0].entries][0]
+    for g in groups[1:]:
+        ratio[g.entries] = np.maximum(ratio[g.entries], stated_sigma(g.gauge) / sigma)
+    return np.asarray(ratio)
 
 
 def floored_sigma(noise: Noise) -> float:

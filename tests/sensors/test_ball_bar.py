@@ -12,7 +12,8 @@ from machines import frame_pose
 from sensor_machines import assert_promises, calibrate_machines
 from tolerances import CLOSED_FORM
 
-from orthocal import calibrate, load_plan, load_session, write_session
+from orthocal import SolverOptions, calibrate, draw_errors, load_plan, load_session, write_session
+from orthocal.calibration.identify import identify
 from orthocal.errors import SessionError
 from orthocal.kinematics.loop_closure import LoopClosure
 from orthocal.kinematics.workspace import cube
@@ -95,6 +96,17 @@ def test_bounds_beside_the_papers_readings(tmp_path, orthoglide, length, zero, p
     space = cube(orthoglide, points_per_side=5)
     found = bound_um(circles(tmp_path, length=length, zero=zero, legs=True), space)
     assert found == pytest.approx(published, rel=0.10)
+
+
+def test_no_gauge_counts_as_finer_than_stated(tmp_path):
+    plan = circles(tmp_path, legs=True)
+    errors = draw_errors(plan.robot, ["*"], seed=3, tolerances={"*.offset_mm": 1.0})
+    session = simulate_session(plan, errors, seed=3).session
+    found, _ = identify(session, "full", solver=SolverOptions(solver="variable-projection"))
+    assert found.solver.noise_converged
+    for gauge in found.gauges:
+        rounding = (gauge.resolution or 0.0) / np.sqrt(12.0)
+        assert gauge.noise > 0.9999 * np.hypot(gauge.sigma, rounding)
 
 
 @pytest.mark.slow
