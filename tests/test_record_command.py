@@ -239,7 +239,7 @@ ENTRIES = {
     ),
     "none": (["burn"], [], "Not recorded: 'burn' is not a command; `help` lists them."),
     "too much": (["skip 3"], [], "Not recorded: `skip` has no argument '3'."),
-    "two ways": (["1,234", "1.234"], ["1.234"], "'1,234' may be 1.234 or 1234; write 1.234"),
+    "comma": (["1,234"], ["1.234"], "Line 3"),
     "range": (["5.5"], [], "yx zero: reading_mm is 5.5; the gauge's range allows a reading from"),
     "resolution": (
         ["0.123"],
@@ -558,6 +558,17 @@ def test_side_of_approach_is_asked_for_if_the_plan_states_none(folder, run):
     # the same command continues, and asks again
     _, out, _ = run(folder, "n", "0.05")
     assert [r["approach"] for r in rows_of(folder)][4:] == ["nnn", ""]
+
+
+def test_a_planned_side_of_approach_stays(folder, run):
+    run(folder, "0.01")
+    file = folder / "readings.csv"
+    head, *rows = file.read_text().splitlines()
+    file.write_text("\n".join([f"{head},approach", *(f"{row},ppp" for row in rows), ""]))
+    _, out, _ = run(folder, "side n", "0.02")
+    assert "Noted with the next readings" not in out
+    assert "The plan states the side of this reading: ppp" in " ".join(out.split())
+    assert [r["approach"] for r in rows_of(folder)] == ["ppp"] * 6
 
 
 def test_no_condition_is_asked_for_without_effects(folder, run):

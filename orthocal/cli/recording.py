@@ -246,8 +246,11 @@ class Dialogue:
                 self._command(word.lower(), arguments)
             else:
                 index = self._require_row()
-                point = len(self._recording.point(index)) > 1
-                self._record(index, (parse_typed_point if point else parse_typed_reading)(line))
+                if len(self._recording.point(index)) > 1:
+                    self._record(index, parse_typed_point(line))
+                else:
+                    largest = self._recording.largest_reading(index)
+                    self._record(index, parse_typed_reading(line, largest=largest))
         except SessionError as e:
             self._note(f"Not recorded: {e}.")
 
@@ -277,6 +280,9 @@ class Dialogue:
             row = self._recording.rows[self._asked]
             if name == "temperature":  # answers the question of this setup
                 self._conditions.answer("temperature", "", row)
+            elif row.approach is not None:
+                self._note(self._text.planned_side(row.approach))
+                return
             self._note(self._text.conditions(self._conditions.of(row)))
 
     def _keep(self) -> None:

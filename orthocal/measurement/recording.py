@@ -228,6 +228,13 @@ class Recording:
         empty = [i for i in self.missing if self.rows[i].key not in skipped]
         return min(empty, key=lambda i: (setups.index(self.rows[i].setup), i), default=None)
 
+    def largest_reading(self, index: int) -> float:
+        """Size that no reading of a row exceeds, [m]: twice the range of the gauge if stated."""
+        setup = self.session.setups[self.rows[index].setup]
+        range_ = self.session.gauges[setup.gauge].range
+        largest = largest_reading(setup.sensor)
+        return largest if range_ is None else min(largest, 2.0 * max(map(abs, range_)))
+
     def read(self, index: int, value: float | Array, conditions: Conditions | None = None) -> None:
         """Record a reading or a point; it is on disk when this returns.
 

@@ -355,7 +355,7 @@ def test_again_names_the_tables_of_an_export(complete, tmp_path):
     (tmp_path / "without.ini").write_text(lines)
     done = run_orthocal(tmp_path, *words, "other", "--ini", "without.ini")
     text = " ".join(done.stderr.split())
-    assert "JOINT_0 has no BACKLASH instead of a table (COMP_FILE)" in text
+    assert "JOINT_0 has BACKLASH 0 or none instead of a table (COMP_FILE)" in text
     assert "JOINT_1" not in text
 
 

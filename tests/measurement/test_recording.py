@@ -407,6 +407,12 @@ def test_numbers_as_people_type_them(text, value):
     assert not np.signbit(parse_typed_reading("-0"))
 
 
+def test_a_comma_is_decimal_if_the_number_would_exceed_the_range():
+    assert parse_typed_reading("-1,781", largest=0.01) == pytest.approx(-1.781e-3)
+    with pytest.raises(SessionError, match="may be"):
+        parse_typed_reading("1,781", largest=2.0)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -100,7 +100,7 @@ def _describe(drive: Drive, trim: JointTrim, other: JointTrim | None = None) -> 
     if trim.table is not None:
         both = other is not None and other.table is not None
         return "another table" if both else "a table (COMP_FILE)"
-    return f"BACKLASH {_show(drive, trim.backlash)}" if trim.backlash else "no BACKLASH"
+    return f"BACKLASH {_show(drive, trim.backlash)}" if trim.backlash else "BACKLASH 0 or none"
 
 
 def _show(drive: Drive, value: float, *, sign: bool = False) -> str:

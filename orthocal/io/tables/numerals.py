@@ -6,6 +6,7 @@ The other numerals of the table decide. If they do not, the result contains the 
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -153,11 +154,13 @@ def infer_decimal_sign(numerals: Iterable[Numeral]) -> DecimalSign:
     return DecimalSign("point", None)
 
 
-def parse_typed_reading(text: str) -> float:
+def parse_typed_reading(text: str, *, largest: float = math.inf) -> float:
     """Reading typed by the operator, [m].
 
     Args:
         text: Number in mm, such as 0.12, -0,35 or +1.2 mm.
+        largest: Largest possible reading, [m]; a comma that would mean a larger one is a decimal
+            comma.
 
     Raises:
         SessionError: If the text is not a number, has another unit, or has two possible values.
@@ -177,13 +180,13 @@ def parse_typed_reading(text: str) -> float:
             )
         raise SessionError(f"'{shown}' is neither a number nor a command; help lists those")
     sign, digits = number.groups()
-    if _THOUSANDS.fullmatch(digits):
-        decimal, grouped = digits.replace(",", "."), digits.replace(",", "")
+    decimal, grouped = digits.replace(",", "."), digits.replace(",", "")
+    if _THOUSANDS.fullmatch(digits) and float(grouped) * MM <= largest:
         raise SessionError(
             f"'{shown}' may be {sign}{decimal} or {sign}{grouped}; write {sign}{decimal} with a "
             f"point, or {sign}{grouped} without a separator"
         )
-    value = float(digits.replace(",", ".")) * MM
+    value = float(decimal) * MM
     return (-value if sign == "-" else value) + 0.0
 
 

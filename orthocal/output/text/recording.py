@@ -101,6 +101,12 @@ class RecordingText:
             noted.append(f"{conditions.temperature:g} °C")
         return f"Noted with the next readings: {', '.join(noted) or 'no temperature'}."
 
+    def planned_side(self, approach: str) -> str:
+        """The plan states the side of a reading, so that it cannot be set."""
+        return (
+            f"The plan states the side of this reading: {approach}. `side` changes no such reading."
+        )
+
     def clock(self, *, on: bool) -> str:
         """True if the time of each reading is noted."""
         if on:
