@@ -304,7 +304,9 @@ def describe_use_parts(tool: ToolErrorSummary) -> list[str]:
             effects_text = joined([*part.effects]).capitalize()
             verb = "adds" if len(part.effects) == 1 else "add"
             circumstances = " if the tool is used from both sides"
-            circumstances += "" if negligible else "; to approach all positions from one side avoids it"
+            circumstances += (
+                "" if negligible else "; to approach all positions from one side avoids it"
+            )
             lines.append(f"{effects_text} {verb} {amount}{circumstances}.")
         elif part.condition == "temperature" and tool.use.temperature is not None:
             lines.append(
