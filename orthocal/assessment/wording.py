@@ -67,6 +67,15 @@ def describe_actions(findings: Sequence[Finding]) -> str:
     return "\n  ".join(["do the following.", *lines, *remaining])
 
 
+def join_texts(texts: Sequence[str]) -> str:
+    """Texts of findings in one text; after a list the next one begins a new line."""
+    joined_texts = ""
+    for i, text in enumerate(texts):
+        separator = "\n" if i and "\n" in texts[i - 1] else " " * bool(i)
+        joined_texts += separator + text
+    return joined_texts
+
+
 def _after_place(finding: Finding) -> str:
     """Action of a finding after its first place, such as "Setup yx, line 4: read it again."."""
     place, action = finding.places[0] if finding.places else Place(), finding.action
