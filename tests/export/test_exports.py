@@ -160,8 +160,7 @@ def test_sessions_in_another_order_are_noted_with_the_values(disordered, root, t
 def test_a_refusal_states_every_finding_with_its_action(turned):
     """Every sentence begins with a capital, also after a list."""
     findings = [
-        review("ambiguous", f"Finding {i}.", f"do {i}.", (Place(setup=f"s{i}"),))
-        for i in range(5)
+        review("ambiguous", f"Finding {i}.", f"do {i}.", (Place(setup=f"s{i}"),)) for i in range(5)
     ]
     for count in (1, 2, 5):
         decided = Decision("review", "Check.", "Finding 0.", describe_actions(findings[:count]))
