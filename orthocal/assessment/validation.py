@@ -27,7 +27,7 @@ from orthocal.assessment.predictive import (
     judge_deviations,
     measure_repetition,
 )
-from orthocal.assessment.wording import describe_actions
+from orthocal.assessment.wording import describe_actions, join_texts
 from orthocal.assessment.words import validation as words
 from orthocal.calibration.adjusting import adjust_calibration
 from orthocal.calibration.assessment_record import (
@@ -122,7 +122,8 @@ class Validation:
     """Wrongly entered numbers, or another change between the sessions; None without any."""
     enter: tuple[ControllerEntry, ...]
     """Values to enter. Those of the calibration if they were entered wrongly, or if the joint
-    calibration changes none of them; otherwise those of `final_calibration`."""
+    calibration changes none of them; those of the joint calibration if it changes them. Empty if
+    the calibration is not confirmed for another reason."""
     repetition: Repetition
     """Correlation of the residuals of both fits."""
     assessment: Assessment
@@ -154,7 +155,7 @@ class Validation:
                 "expanded_uncertainty": finite_or_none(expanded_uncertainty(final, e)),
                 "significant": is_significant(final, e),
             }
-            for e in assessment_of(final).entries
+            for e in (assessment_of(final).entries if self.confirmed else ())
         ]
         document = {
             "schema": "orthocal/validation/4",
@@ -170,7 +171,7 @@ class Validation:
             "as_expected": self.as_expected,
             "excess_probability": finite_or_none(self.excess_probability),
             "joint": self.joint is not None,
-            "nothing_to_change": self.nothing_to_change,
+            "nothing_to_change": self.nothing_to_change if self.confirmed else None,
             "changes": changes,
             "mistake": None if self.mistake is None else _mistake_document(self.mistake),
             "enter": [{"drive": e.drive, "unit": e.unit, "value": e.enter} for e in self.enter],
@@ -236,7 +237,7 @@ def validate_calibration(
         joint, findings = _calibrate_jointly(calibration, all_sessions, judgement)
         confirmed = joint is not None
     wrongly = _is_wrongly_entered(all_sessions, mistake)
-    entries, notes = _choose_entries(calibration, refit, joint, confirmed, wrongly)
+    entries, notes = _choose_entries(calibration, joint, wrongly_entered=wrongly)
     repetition = measure_repetition(calibration, refit)
     stated = all(one.controller_offsets is not None for one in new)
     notes += _describe_comparison(repetition, test, stated=stated)
@@ -251,11 +252,12 @@ def validate_calibration(
         mistake=mistake,
         enter=entries,
         repetition=repetition,
-        assessment=replace(
-            assessment_of(joint or refit),
-            decision=_decide(confirmed, findings, agreement),
-            findings=rank([*findings, agreement, *notes]),
-            entries=entries,
+        assessment=Assessment(
+            _decide(confirmed, findings, agreement),
+            rank([*findings, agreement, *notes]),
+            entries,
+            None if joint is None else assessment_of(joint).tool,
+            () if joint is None else assessment_of(joint).backlash,
         ),
     )
 
@@ -447,36 +449,26 @@ def _describe_agreement(
 
 
 def _choose_entries(
-    calibration: Calibration,
-    refit: Calibration,
-    joint: Calibration | None,
-    confirmed: bool | None,
-    wrongly_entered: bool,
+    calibration: Calibration, joint: Calibration | None, *, wrongly_entered: bool
 ) -> tuple[tuple[ControllerEntry, ...], list[Finding]]:
     """Values to enter after the new readings, and findings about them.
 
-    New readings that cannot be trusted give no values.
+    A calibration that is not confirmed has no values, unless it was entered wrongly.
 
     Args:
         calibration: The validated calibration.
-        refit: Fit of the new readings, assessed.
         joint: Joint calibration; None if the calibration is not confirmed.
-        confirmed: Whether the calibration is confirmed; None if unknown.
         wrongly_entered: Whether the offsets of the calibration were entered wrongly.
     """
-    assessment, findings = assessment_of(joint or refit), _find_further_change(joint)
-    keep = wrongly_entered or (confirmed is not False and not findings)
-    trusted = assessment.entries if assessment.decision.verdict == "enter" else ()
-    entries = find_entries(calibration) if keep else trusted
-    if not wrongly_entered:
-        findings += assessment.of_kind(*ENTRY_KINDS)
-    return entries, findings
-
-
-def _find_further_change(joint: Calibration | None) -> list[Finding]:
-    """Finding about offsets that the joint calibration changes; empty if there is none."""
     if joint is None:
-        return []
+        return (find_entries(calibration) if wrongly_entered else ()), []
+    assessment, findings = assessment_of(joint), _find_further_change(joint)
+    entries = assessment.entries if findings else find_entries(calibration)
+    return entries, [*findings, *assessment.of_kind(*ENTRY_KINDS)]
+
+
+def _find_further_change(joint: Calibration) -> list[Finding]:
+    """Finding about offsets that the joint calibration changes; empty if there is none."""
     assessment = assessment_of(joint)
     if assessment.keeps_offsets:
         return []
@@ -511,7 +503,7 @@ def _decide(
     return ValidationDecision(
         verdict_of(against),
         headlines[confirmed],
-        " ".join(f.text for f in reasons),
+        join_texts([f.text for f in reasons]),
         describe_actions(against) or agreement.action,
         confirmed,
     )

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from orthocal.arrays import Array
-from orthocal.calibration.assessment_record import Finding, FindingKind, Place
+from orthocal.calibration.assessment_record import Assessment, Finding, FindingKind, Place
 from orthocal.units import MM, UM
 
 MOST_ACTIONS = 3
@@ -65,6 +65,36 @@ def describe_actions(findings: Sequence[Finding]) -> str:
     further = len(found) - len(lines)
     remaining = [f"Then {counted(further, 'further finding')} above."] if further else []
     return "\n  ".join(["do the following.", *lines, *remaining])
+
+
+def describe_refusal(assessment: Assessment) -> str:
+    """Headline of an assessment, and the findings that decide with their actions.
+
+    One paragraph without line breaks. Several findings are numbered, at most MOST_ACTIONS.
+    """
+    texts = [
+        f"{f.text} {capitalized(f.action)}" for f in assessment.findings if f.severity != "note"
+    ]
+    items = texts[:MOST_ACTIONS]
+    if len(texts) > 1:
+        items = [f"{i}. {text}" for i, text in enumerate(items, start=1)]
+    if further := len(texts) - len(items):
+        items.append(f"{counted(further, 'further finding')}: see the report.")
+    return " ".join(" ".join([assessment.decision.headline, *items]).split())
+
+
+def capitalized(sentence: str) -> str:
+    """A sentence with a capital first letter."""
+    return sentence[:1].upper() + sentence[1:]
+
+
+def join_texts(texts: Sequence[str]) -> str:
+    """Texts of findings in one text; after a list the next one begins a new line."""
+    joined_texts = ""
+    for i, text in enumerate(texts):
+        separator = "\n" if i and "\n" in texts[i - 1] else " " * bool(i)
+        joined_texts += separator + text
+    return joined_texts
 
 
 def _after_place(finding: Finding) -> str:

@@ -59,7 +59,7 @@ def again(
             tables of the last session.
     """
     from orthocal.assessment.controller_entries import compensation_to_enter
-    from orthocal.export.formats import require_entering
+    from orthocal.export.formats import note_wrong_order, require_entering
     from orthocal.measurement.files.linuxcnc_ini import read_controller_joints
 
     require_new_session(out, FILES, force=force)
@@ -83,6 +83,8 @@ def again(
     if problem:
         put_note(problem)
     orthocal.write_session(new, out, comment=comment, extra=sheet, blank=True)
+    if order := note_wrong_order(result):
+        put_note(order)
     if amounts:
         settings = ", ".join(f"{name} {v / MM:+.3f} mm" for name, v in amounts.items())
         put_out(f"Set these adjustments before you measure: {settings}.")

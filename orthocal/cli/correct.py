@@ -220,12 +220,14 @@ class _Correction:
 
     def list_notes(self, warning: str) -> list[str]:
         """Notes about the corrected program; empty ones do not apply."""
+        from orthocal.export.formats import note_wrong_order
         from orthocal.output.text.conditions import describe_assumed
 
         summary, tools = self.corrector.summary, self.interpreter.tools.used
         notes = [
             _describe(summary, self.field, self.tolerance),
             self.for_controller,
+            note_wrong_order(self.result),
             _describe_tip(self.controller.tip) or _describe_tools(tools),
             describe_assumed(self.result, self.conditions, fields=CONDITIONS),
             self._describe_backlash(),

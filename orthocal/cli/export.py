@@ -91,6 +91,7 @@ def export(
     if "kinematics.ini" in files:
         _note_payload(result, payload)
     if to == "linuxcnc":
+        _note_order(result)
         _note_latching(result, options, ini, module="kinematics.ini" in files)
     if "README.md" in files and result.session.firmware is None:
         put_out(f"Next: follow {out / 'README.md'}.")
@@ -116,6 +117,14 @@ def _show_settings(
             fit = fit_firmware(calibration, name)
             put_out(describe_settings(fit))
             put_out(printable(describe_next(fit, saved, out), keep="\n"))
+
+
+def _note_order(calibration: orthocal.Calibration) -> None:
+    """Note that the present offsets may be those of an earlier session."""
+    from orthocal.export.formats import note_wrong_order
+
+    if order := note_wrong_order(calibration):
+        put_note(order)
 
 
 def _note_latching(

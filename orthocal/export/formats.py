@@ -12,6 +12,7 @@ import yaml
 from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.calibrated_tool import find_tool
 from orthocal.assessment.controller_entries import entered_offsets, find_entries
+from orthocal.assessment.wording import describe_refusal
 from orthocal.calibration.calibration import Calibration
 from orthocal.errors import ClosureError, ExportError, ParameterError
 from orthocal.export.linuxcnc.export import OPTIONS, ExportOptions, export_linuxcnc
@@ -131,8 +132,9 @@ def export_calibration(
         )
     else:
         files = EXPORTERS[to](calibration)
-    warning = warn_against_verdict(calibration)
-    return _add_warning(files, warning) if warning else files
+    if to == "linuxcnc":
+        files = _add_warning(files, note_wrong_order(calibration))
+    return _add_warning(files, warn_against_verdict(calibration))
 
 
 def require_entering(calibration: Calibration) -> None:
@@ -141,9 +143,14 @@ def require_entering(calibration: Calibration) -> None:
     Raises:
         ExportError: If the verdict is not `enter`.
     """
-    decision = assessment_of(calibration).decision
-    if decision.verdict != "enter":
-        raise ExportError(decision.words)
+    assessment = assessment_of(calibration)
+    if assessment.decision.verdict != "enter":
+        raise ExportError(describe_refusal(assessment))
+
+
+def note_wrong_order(calibration: Calibration) -> str:
+    """Note that the present offsets may be those of an earlier session; empty otherwise."""
+    return " ".join(f.words for f in assessment_of(calibration).of_kind("wrong order"))
 
 
 def warn_against_verdict(calibration: Calibration) -> str:
@@ -155,7 +162,9 @@ def warn_against_verdict(calibration: Calibration) -> str:
 
 
 def _add_warning(files: dict[str, str], warning: str) -> dict[str, str]:
-    """Files with a warning at the beginning of errors.yaml or README.md."""
+    """Files with a warning, if it is not empty, at the beginning of errors.yaml or README.md."""
+    if not warning:
+        return files
     if "errors.yaml" in files:
         return {**files, "errors.yaml": f"# {warning}\n{files['errors.yaml']}"}
     page = files.get("README.md", "")

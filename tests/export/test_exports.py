@@ -7,6 +7,7 @@ import hashlib
 import io
 import re
 import shutil
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -27,6 +28,8 @@ from orthocal import (
     write_calibration,
 )
 from orthocal.assessment.controller_entries import entered_offsets
+from orthocal.assessment.wording import MOST_ACTIONS, describe_actions, review
+from orthocal.calibration.assessment_record import Assessment, Decision, Place
 from orthocal.export.urdf import _correct_origins, _find_twists
 from orthocal.kinematics.loop_closure import LoopClosure, nominal_closure
 from orthocal.observation.simulate import load_errors
@@ -44,8 +47,6 @@ def full(root):
 @pytest.fixture(scope="module")
 def turned(root):
     """A machine whose setup zy was read with the wrong sign: to be reviewed."""
-    from dataclasses import replace
-
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
     truth = {"x_slide.offset": 1.2e-3, "y_slide.offset": -0.8e-3, "z_slide.offset": 0.5e-3}
     session = simulate_session(plan, truth, seed=1).session
@@ -122,6 +123,58 @@ def test_against_the_verdict_nothing_is_written_by_command(turned, tmp_path):
             assert first == "%"
             assert comments[-1].startswith("; Written against the verdict 'review'")
         shutil.rmtree(out)
+
+
+@pytest.fixture(scope="module")
+def disordered(root):
+    """Calibration of two sessions, the one with active offsets given first."""
+    plan = load_session(root / "examples/workshop")
+    truth = {f"{d.name}.offset": 1e-3 for d in plan.robot.drives}
+    sessions = [
+        simulate_session(plan.with_controller([v] * 3), truth, seed=k).session
+        for k, v in enumerate((0.0, 0.7e-3))
+    ]
+    calibration = calibrate(sessions[::-1], solver="variable-projection")
+    assert [f.severity for f in calibration.assessment.of_kind("wrong order")] == ["note"]
+    return calibration
+
+
+@pytest.mark.parametrize("command", ["export", "again", "correct"])
+def test_sessions_in_another_order_are_noted_with_the_values(disordered, root, tmp_path, command):
+    """Their present offsets may be others, so that the written ones would count twice."""
+    file = write_calibration(disordered, tmp_path / "calibration.json")
+    (tmp_path / "part.ngc").write_text(PROGRAM)
+    words = {
+        "export": ["--to", "linuxcnc", "--offsets"],
+        "again": ["--session", str(root / "examples/workshop")],
+        "correct": ["part.ngc"],
+    }
+    done = run_orthocal(tmp_path, command, str(file), *words[command], "--out", "out")
+    assert done.returncode == 0, done.stderr
+    (found,) = disordered.assessment.of_kind("wrong order")
+    assert found.words in done.stderr
+    if command == "export":
+        assert found.words in (tmp_path / "out/README.md").read_text()
+
+
+def test_a_refusal_states_every_finding_with_its_action(turned):
+    """Every sentence begins with a capital, also after a list."""
+    findings = [
+        review("ambiguous", f"Finding {i}.", f"do {i}.", (Place(setup=f"s{i}"),)) for i in range(5)
+    ]
+    for count in (1, 2, 5):
+        decided = Decision("review", "Check.", "Finding 0.", describe_actions(findings[:count]))
+        judged = Assessment(decided, tuple(findings[:count]), (), None)
+        with pytest.raises(ExportError) as refused:
+            export_calibration(replace(turned, assessment=judged), "yaml")
+        text = str(refused.value)
+        shown = min(count, MOST_ACTIONS)
+        assert all(f"Finding {i}. Do {i}." in text for i in range(shown))
+        assert f"Finding {shown}." not in text
+        assert text.count("Finding 0.") == 1
+        assert "\\n" not in text
+        assert not re.search(r"[a-z]\. +[a-z]", text)
+        assert ("1. " in text) == (count > 1)
 
 
 def test_a_corrected_program_is_marked_and_not_corrected_again(full, tmp_path):

@@ -24,9 +24,10 @@ from orthocal import (
 from orthocal.assessment.controller_entries import expanded_uncertainty
 from orthocal.assessment.words.entries import describe_tool_error
 from orthocal.output.report.page import build_report
-from orthocal.output.text.answer import LISTED, MORE, MOST_LISTED, render_answer
+from orthocal.output.text.answer import LISTED, MORE, MOST_LISTED, name_values, render_answer
 from orthocal.output.text.layout import to_text
 from orthocal.output.text.summary import render_calibration
+from orthocal.output.text.tables import RECOMMENDING
 from orthocal.statistics.chance import coverage_factor
 
 MOST_LINES = 40
@@ -161,7 +162,9 @@ def test_all_findings_that_decide_are_listed(answers, name):
     ranks = [order[f.severity] for f in found.findings]
     assert ranks == sorted(ranks)
     details = answers.complete(name)
-    assert all(" ".join(f.text.split()) in details for f in found.findings)
+    omitted = () if found.decision.verdict == "enter" else RECOMMENDING
+    listed = [f for f in found.findings if f.kind not in omitted]
+    assert all(" ".join(f.text.split()) in details for f in listed)
 
 
 @pytest.mark.parametrize("name", ["table1/experiment-2", "raw-cycles", "250 mm", "workshop"])
@@ -190,15 +193,15 @@ def test_few_contrasts_widen_the_scaled_errors(answers):
     ("name", "verdict"), [("table1/experiment-1-printed", "reject"), ("turned", "review")]
 )
 def test_doubtful_readings_offer_nothing_to_enter(answers, name, verdict):
-    """Neither values nor the tool error with them; the details have both."""
+    """Neither values nor the tool error with them; the details list values, not to be entered."""
     calibration = answers[name]
     assert calibration.assessment.decision.verdict == verdict
     short, details = summarize(calibration), summarize(calibration, details=True)
     assert "x_slide" not in short.split()
-    assert "x_slide" in details.partition("\nValues to enter\n")[2].split()
+    assert "Values to enter" not in details
+    assert "x_slide" in details.partition("\nValues (do not enter them)\n")[2].split()
     (tool,) = calibration.assessment.of_kind("tool error")
-    assert tool.text not in short
-    assert tool.text in details
+    assert not any(tool.text in text for text in (short, details))
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -214,8 +217,8 @@ def test_one_tool_error_in_one_sentence_everywhere(answers, name):
     assert stated.numbers["entered_um"] == pytest.approx(found.tool.entered * 1e6)
     shown = found.decision.verdict == "enter"
     assert words_of(calibration).count(sentence) == shown
-    # the section of the tool and the findings
-    assert answers.complete(name).count(sentence) == 2 + shown
+    # the short answer, the section of the tool and the findings
+    assert answers.complete(name).count(sentence) == 3 * shown
     assert ("With all identified errors corrected: " in words_of(calibration)) == (
         shown and not calibration.only_offsets
     )
@@ -265,7 +268,7 @@ def test_details_and_all_hold_the_answer_and_the_rest(answers):
         assert details.startswith(answer)
         for title in (
             *("Method", "Parameters", "Readings", "Residuals", "Tool error"),
-            *("Findings", "Values to enter", "For research"),
+            *("Findings", name_values(calibration), "For research"),
         ):
             assert f"\n{title}\n" in details
             assert f"\n{title}\n" not in summarize(calibration)

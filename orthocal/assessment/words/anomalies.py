@@ -215,15 +215,18 @@ def describe_wrong_order(given: str, last: str, *, timed: bool) -> Finding:
         last: Session that was measured last.
         timed: Whether the times of the readings state this; otherwise the active offsets.
     """
-    reason = (
-        f"session {last} was measured later"
-        if timed
-        else f"its controller corrects nothing, unlike that of session {last}"
+    assumed = (
+        f"The present offsets are assumed to be those of session {given}, which was given last."
     )
+    if timed:
+        return review(
+            "wrong order",
+            f"{assumed} But session {last} was measured later.",
+            f"Give session {last} last, or correct the times of the readings.",
+        )
     return note(
         "wrong order",
-        f"The present offsets are assumed to be those of session {given}, which was given last. "
-        f"But {reason}.",
+        f"{assumed} But its controller corrects nothing, unlike that of session {last}.",
         f"If session {last} is the latest, give it last.",
     )
 

@@ -136,7 +136,8 @@ def render_accuracy(
             "The uncertainty after calibration is unknown, because the noise of the readings is."
         )
     else:
-        first += _describe_expected(calibration, accuracy)
+        if decision.verdict == "enter":
+            first += _describe_expected(calibration, accuracy)
         scale = calibration.tolerance_scale.factor
         scaled = f", after the calibration times {scale:.1f}" if scale > 1.0 else ""
         notes.append(UNCERTAINTY_NOTE.format(scaled))

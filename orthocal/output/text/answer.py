@@ -372,7 +372,10 @@ def describe_machine(calibration: Calibration) -> str:
 
 def name_values(calibration: Calibration) -> str:
     """Heading of `render_values`: what happens to the offsets."""
-    return "Offsets" if assessment_of(calibration).keeps_offsets else "Values to enter"
+    assessment = assessment_of(calibration)
+    if assessment.decision.verdict != "enter":
+        return "Values (do not enter them)"
+    return "Offsets" if assessment.keeps_offsets else "Values to enter"
 
 
 def render_values(calibration: Calibration) -> RenderableType:
@@ -385,14 +388,15 @@ def render_values(calibration: Calibration) -> RenderableType:
         return noted(Text(settings), EXPANDED)
     if not assessment.entries:
         return noted(Text("None: no offset was identified."), EXPANDED)
-    complete = assessment.decision.verdict == "enter" and calibration.only_offsets
+    trusted = assessment.decision.verdict == "enter"
+    complete = trusted and calibration.only_offsets
     table = entry_table(calibration, identified=not calibration.only_offsets)
     keep, stated = assessment.keeps_offsets, assessment.entries[0].active is not None
     meaning = "Slide coordinate = encoder coordinate + offset."
-    notes = [meaning, *([NEW_NOTE] if stated and not keep else [])]
+    notes = [meaning, *([NEW_NOTE] if trusted and stated and not keep else [])]
     notes += [f.words for f in assessment.of_kind("controller not stated")]
     notes.append(EXPANDED)
-    if not calibration.only_offsets:
+    if trusted and not calibration.only_offsets:
         notes.append(
             "For a controller that corrects nothing else the best value is "
             f"`{'best' if keep else 'new'}`; it compensates a part of the other errors. "

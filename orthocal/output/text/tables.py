@@ -12,6 +12,7 @@ from orthocal.assessment.assess import assessment_of
 from orthocal.assessment.fit_findings import find_held, find_unresolved
 from orthocal.assessment.words.anomalies import describe_evidence
 from orthocal.assessment.words.fit import MAX_LISTED
+from orthocal.calibration.assessment_record import FindingKind
 from orthocal.calibration.calibration import Calibration
 from orthocal.calibration.records import ParameterEstimate
 from orthocal.calibration.refit import restore_session
@@ -34,6 +35,14 @@ from orthocal.units import MM, UM, show_limit
 
 MANY_PARAMETERS = 12
 """Number of parameters above which only identified ones are listed."""
+
+RECOMMENDING: tuple[FindingKind, ...] = (
+    "no change needed",
+    "must change",
+    "not significant",
+    "tool error",
+)
+"""Kinds of findings that recommend values, which doubtful readings do not."""
 
 NOTHING = 1e-8
 """Deviations below this are zero, [m]."""
@@ -99,7 +108,8 @@ def _parameter_notes(c: Calibration, *, omitted: int, by_noise: bool) -> list[st
     """Sentences under the table of the parameters."""
     notes = []
     if not c.only_offsets and assessment_of(c).entries:
-        notes.append(f"Offsets of the slides. The best ones to enter differ: see {name_values(c)}.")
+        enter = " to enter" * (assessment_of(c).decision.verdict == "enter")
+        notes.append(f"Offsets of the slides. The best ones{enter} differ: see {name_values(c)}.")
     if omitted:
         notes.append(f"{omitted} more are resolved by less than half; --all lists them.")
     held = [p for p in c.parameters if not p.free]
@@ -182,13 +192,19 @@ def render_identifiability(calibration: Calibration, *, all_rows: bool = False) 
 
 
 def render_findings(calibration: Calibration) -> RenderableType:
-    """All findings except those about identifiability, which `render_identifiability` lists."""
-    findings = assessment_of(calibration).findings
+    """All findings about readings and values to enter.
+
+    `render_identifiability` lists those about identifiability. Findings about values to enter are
+    omitted if the readings are doubtful.
+    """
+    assessment = assessment_of(calibration)
+    trusted = assessment.decision.verdict == "enter"
+    omitted = ("inseparable", "below the noise", *(() if trusted else RECOMMENDING))
     return bullets(
         [
             f"{f.words} {describe_evidence(f)}".strip()
-            for f in findings
-            if f.kind not in ("inseparable", "below the noise")
+            for f in assessment.findings
+            if f.kind not in omitted
         ]
     )
 

@@ -66,7 +66,7 @@ def render_validation(
         Text(validation.refit.session.title),
         Text(),
         render_headline(judged.decision),
-        Text(),
+        *([Text()] if tool or findings else []),
         *map(Text, tool),
         bullets(findings),
     ]
@@ -74,14 +74,13 @@ def render_validation(
         rows = [(e.drive, signed(e.enter * e.edge_factor), e.edge_unit) for e in validation.enter]
         parts.append(section("Values to enter", table_of(("drive", "new", "unit"), rows)))
     further = bool(judged.of_kind("further change"))
-    source = "the new readings" if validation.joint is None else "all readings"
-    backlash = assessment_of(answer).backlash
-    if assessment_of(answer).entries and (further or complete):
+    backlash = judged.backlash
+    if validation.confirmed and assessment_of(answer).entries and (further or complete):
         shown = [Text(), render_backlash(answer)] if backlash else []
         values = Group(entry_table(answer), *map(Text, describe_columns(answer)), *shown)
-        parts.append(section(f"Offsets from {source}", values))
+        parts.append(section("Offsets from all readings", values))
     elif tool and any(e.change for e in backlash):
-        parts.append(section(f"Backlash from {source}", render_backlash(answer)))
+        parts.append(section("Backlash from all readings", render_backlash(answer)))
     if complete:
         parts += _details(validation, all_rows=all_rows)
     parts += _next_step(validation, further=further)
