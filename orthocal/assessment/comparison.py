@@ -140,12 +140,9 @@ def compare_models(
         ClosureError: If the machine cannot reach a posture.
     """
     gathered = [s.with_tolerances(tolerances or {}) for s in gather_sessions(sessions)]
-    require_names(models or (), argument="models")
     session = join_sessions(gathered)
     others = _gather_repeats(() if repeat is None else repeat, tolerances or {}, gathered)
-    names = models or session.robot.parameters.models
-    for name in names:
-        session.robot.parameters.select_model(name)  # unknown names are refused
+    names = _require_models(session, models)
     noise = find_known_noise(session)
     if judgement is None:
         report("searching the readings for anomalies")
@@ -171,8 +168,18 @@ def compare_models(
     if comparison.best is None or not others:
         return comparison
     best = comparison.best.calibration
-    repeated = repeat_calibration(best, others)
-    return replace(comparison, repetition=measure_repetition(best, repeated))
+    return replace(
+        comparison, repetition=measure_repetition(best, repeat_calibration(best, others))
+    )
+
+
+def _require_models(session: Session, models: Sequence[str]) -> Sequence[str]:
+    """Names of models, by default all of the robot; unknown ones raise a ParameterError."""
+    require_names(models or (), argument="models")
+    parameters = session.robot.parameters
+    for name in models or ():
+        parameters.select_model(name)
+    return models or parameters.models
 
 
 def _recommend(comparison: Comparison, session: Session, models: Sequence[str]) -> Comparison:
