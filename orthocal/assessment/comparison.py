@@ -142,8 +142,7 @@ def compare_models(
     gathered = [s.with_tolerances(tolerances or {}) for s in gather_sessions(sessions)]
     session = join_sessions(gathered)
     others = _gather_repeats(() if repeat is None else repeat, tolerances or {}, gathered)
-    names = _require_models(session, models)
-    noise = find_known_noise(session)
+    names, noise = _require_models(session, models), find_known_noise(session)
     if judgement is None:
         report("searching the readings for anomalies")
         judgement = judge_session(session)
@@ -168,9 +167,8 @@ def compare_models(
     if comparison.best is None or not others:
         return comparison
     best = comparison.best.calibration
-    return replace(
-        comparison, repetition=measure_repetition(best, repeat_calibration(best, others))
-    )
+    repetition = measure_repetition(best, repeat_calibration(best, others))
+    return replace(comparison, repetition=repetition)
 
 
 def _require_models(session: Session, models: Sequence[str]) -> Sequence[str]:
