@@ -7,8 +7,8 @@ from typing import get_args
 import pytest
 
 from orthocal import load_session
-from orthocal.assessment.words.anomalies import _text
-from orthocal.hypotheses.anomaly import AnomalyKind, Explanation
+from orthocal.assessment.words.anomalies import _text, describe_anomalies
+from orthocal.hypotheses.anomaly import Anomalies, Anomaly, AnomalyKind, Explanation
 
 
 @pytest.mark.parametrize("kind", get_args(AnomalyKind))
@@ -33,3 +33,27 @@ def test_every_kind_has_a_sentence(root, kind):
         parameters=(f"{drive}.offset",),
     )
     assert len(_text(session, explanation).split()) > 3
+
+
+def test_an_effect_among_several_explanations_is_tried_first(root):
+    """To calibrate with it costs no reading."""
+    session = load_session(root / "examples/raw-cycles")
+    setup = next(iter(session.setups))
+    sign = Explanation("reversed sign", "reading", rows=(3,), setups=(setup,), factor=-1.0)
+    backlash = Explanation(
+        "backlash",
+        "reading",
+        rows=(0, 1),
+        effect="backlash",
+        parameters=("x_slide.backlash",),
+        amounts=(2e-5,),
+        stds=(4e-6,),
+        units=("m",),
+    )
+    for others, first in ((backlash,), "Calibrate with `--effects backlash`."), ((sign,), "Read "):
+        anomaly = Anomaly(sign, 9.0, None, alternatives=others)
+        (finding,) = describe_anomalies(
+            session, Anomalies((anomaly,), 9.0, True, 1e-4, 1e-5, 1.0, 1.0)
+        )
+        assert finding.kind == "ambiguous"
+        assert finding.action.startswith(first)

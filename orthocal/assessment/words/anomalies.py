@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from orthocal.assessment.wording import (
     joined,
@@ -60,7 +60,7 @@ def describe_anomaly(session: Session, result: Anomalies, anomaly: Anomaly) -> F
     text = _looks_as_if(session, anomaly, descriptions)
     if e.amounts:
         numbers["amount_um"] = (e.amount or 0.0) / UM
-        action = _effect_remedy(session, result)
+        action = _effect_remedy(session, [a.explanation for a in result.found])
         return review(e.kind, text, action, _effect_places(session, e), **numbers)
     if e.kind in ("wrong dimension", "readjusted dimension"):
         numbers["dimension_mm"], numbers["stated_mm"] = _dimensions_mm(e)
@@ -98,9 +98,9 @@ def _effect_places(session: Session, e: Explanation) -> tuple[Place, ...]:
     return tuple(Place(parameter=name) for name, *_ in _significant_amounts(e))
 
 
-def _effect_remedy(session: Session, result: Anomalies) -> str:
+def _effect_remedy(session: Session, explanations: Iterable[Explanation]) -> str:
     """Advice to calibrate with all missing effects in addition to those of the robot."""
-    missing = [a.explanation.effect for a in result.found if a.explanation.amounts]
+    missing = [e.effect for e in explanations if e.amounts]
     robot = with_effects(session.robot, (*session.robot.effect_names, *missing))
     return identify_effects(robot.effect_names, errors_of_no_model(robot))
 
@@ -128,10 +128,15 @@ def _ambiguous(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding
     explanations = (*(anomaly.causes or (anomaly.explanation,)), *anomaly.alternatives)
     texts = dict.fromkeys(f"  {_lines(session, e)}{_text(session, e)}" for e in explanations)
     listed = ";\n".join(texts)
+    action = _repeat(session, *explanations)
+    if any(e.amounts for e in explanations):  # costs no reading
+        effect = _effect_remedy(session, explanations)
+        repeat = f"{action[0].lower()}{action[1:]}"
+        action = f"{effect} If the readings still contradict each other, {repeat}"
     return review(
         "ambiguous",
         f"The readings contradict each other. One of these may have happened:\n{listed}.",
-        _repeat(session, *explanations),
+        action,
         tuple(p for e in explanations for p in _places(session, e)[:1]),
         **_numbers(result, anomaly),
     )
