@@ -67,6 +67,16 @@ def composed(text: str) -> str:
     return unicodedata.normalize("NFC", text)
 
 
+def capitalised(text: str) -> str:
+    """A text with a capital first letter."""
+    return text[:1].upper() + text[1:]
+
+
+def uncapitalised(text: str) -> str:
+    """A text with a small first letter."""
+    return text[:1].lower() + text[1:]
+
+
 def shorten(text: str) -> str:
     """A value, shortened for a message."""
     return text if len(text) <= LONGEST_SHOWN else f"{text[: LONGEST_SHOWN - 3]}..."

@@ -284,9 +284,8 @@ class _Search:
                 [self._columns[:, columns], np.diag(LEVER_SHARE * self._column_norms[columns])]
             )
             right = np.append(-self._deviation, np.zeros(len(columns)))
-            unit = max(
-                float(np.linalg.norm(right)), LEAST_STEP
-            )  # lsq_linear's tolerance is absolute
+            # the tolerance of lsq_linear is absolute
+            unit = max(float(np.linalg.norm(right)), LEAST_STEP)
             amounts[columns] = lsq_linear(rows * limit / unit, right / unit, (-1.0, 1.0)).x * limit
         return amounts
 

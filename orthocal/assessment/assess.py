@@ -190,7 +190,7 @@ def assessment_of(calibration: Calibration) -> Assessment:
 
 
 def changes_offsets(calibration: Calibration) -> bool:
-    """Whether offsets are to be entered, and other errors were identified that then remain."""
+    """True if offsets are to be entered and other identified errors then remain."""
     firmware = calibration.session.firmware is not None
     return not (calibration.only_offsets or firmware or assessment_of(calibration).keeps_offsets)
 

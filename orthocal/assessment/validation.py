@@ -3,8 +3,8 @@
 The new session is measured with the calibrated offsets active in the controller. The verdict is
 that of all sessions together, as `check` and `calibrate` state it. The calibration is confirmed if
 it is `enter`, and the new readings deviate as predicted, within the uncertainty of the calibration.
-New readings can still improve a confirmed
-calibration. Then the values to enter come from a joint calibration of all sessions.
+New readings can still improve a confirmed calibration. Then the values to enter come from a joint
+calibration of all sessions.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ import numpy as np
 
 from orthocal.arrays import Array
 from orthocal.calibration.assessment_record import Assessment, Finding, FindingKind, Place
+from orthocal.text import capitalised, uncapitalised
 from orthocal.units import MM, UM
 
 MOST_ACTIONS = 3
@@ -73,7 +74,7 @@ def describe_refusal(assessment: Assessment) -> str:
     One paragraph without line breaks. Several findings are numbered, at most MOST_ACTIONS.
     """
     texts = [
-        f"{f.text} {capitalized(f.action)}" for f in assessment.findings if f.severity != "note"
+        f"{f.text} {capitalised(f.action)}" for f in assessment.findings if f.severity != "note"
     ]
     items = texts[:MOST_ACTIONS]
     if len(texts) > 1:
@@ -81,11 +82,6 @@ def describe_refusal(assessment: Assessment) -> str:
     if further := len(texts) - len(items):
         items.append(f"{counted(further, 'further finding')}: see the report.")
     return " ".join(" ".join([assessment.decision.headline, *items]).split())
-
-
-def capitalized(sentence: str) -> str:
-    """A sentence with a capital first letter."""
-    return sentence[:1].upper() + sentence[1:]
 
 
 def join_texts(texts: Sequence[str]) -> str:
@@ -104,7 +100,7 @@ def _after_place(finding: Finding) -> str:
         return action
     line = "" if place.line is None else f", line {place.line}"
     label = place.parameter if place.setup is None else f"Setup {place.setup}{line}"
-    return f"{label}: {action[0].lower()}{action[1:]}"
+    return f"{label}: {uncapitalised(action)}"
 
 
 def parameter_places(*names: str) -> tuple[Place, ...]:

@@ -151,7 +151,8 @@ def _describe_entries(new: orthocal.Session, *, changes: bool) -> str:
             "states no offsets (`controller`)."
         )
     if down := [d.name for d in new.robot.drives if d.direction < 0]:
-        text += f" In the controller the sign is opposite for {', '.join(down)}: it counts down."
+        they = "it counts" if len(down) == 1 else "they count"
+        text += f" In the controller the sign is opposite for {', '.join(down)}: {they} down."
     if backlash := describe_trims(new.robot, new.compensation):
         text += (
             f"\nCheck that the controller compensates this backlash: {backlash}. If it does not, "

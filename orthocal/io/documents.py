@@ -31,7 +31,7 @@ from pydantic_core import PydanticCustomError
 from orthocal.errors import OrthocalError
 from orthocal.io.files import read_file
 from orthocal.io.strict_yaml import DEEPEST, LARGEST_YAML, LONGEST_NUMBER, load_yaml
-from orthocal.text import composed, shorten, text_problem
+from orthocal.text import composed, shorten, text_problem, uncapitalised
 
 Record = TypeVar("Record")
 
@@ -444,7 +444,7 @@ def _describe_expected(kind: str, message: str, context: Mapping[str, Any]) -> s
         count = context["min_length" if kind == "too_short" else "max_length"]
         bound = "least" if kind == "too_short" else "most"
         return f"at {bound} {count} item{'' if count == 1 else 's'}"
-    expected = message[0].lower() + message[1:]
+    expected = uncapitalised(message)
     return expected.removeprefix("input should be ").removeprefix("a valid ")
 
 

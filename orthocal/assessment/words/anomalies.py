@@ -23,7 +23,7 @@ from orthocal.hypotheses.anomaly import Anomalies, Anomaly, Explanation
 from orthocal.measurement.motion.approach import label_reading
 from orthocal.sensors.protocol import states_readings
 from orthocal.session.session import Session, split_label
-from orthocal.text import printable, spans
+from orthocal.text import capitalised, printable, spans, uncapitalised
 from orthocal.units import DRIVE_UNITS, EDGE_UNITS, MM, UM, Unit
 
 MAX_PLACES = 20
@@ -88,7 +88,7 @@ def _looks_as_if(session: Session, anomaly: Anomaly, descriptions: Sequence[str]
     if len(descriptions) == 1:
         sentences = [f"it looks as if {listed}.", predicted]
     first, *others = [s for s in sentences if s]
-    return " ".join(map(_capitalised, [f"{_lines(session, e)}{first}", *others]))
+    return " ".join(map(capitalised, [f"{_lines(session, e)}{first}", *others]))
 
 
 def _effect_places(session: Session, e: Explanation) -> tuple[Place, ...]:
@@ -131,7 +131,7 @@ def _ambiguous(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding
     action = _repeat(session, *explanations)
     if any(e.amounts for e in explanations):  # costs no reading
         effect = _effect_remedy(session, explanations)
-        repeat = f"{action[0].lower()}{action[1:]}"
+        repeat = uncapitalised(action)
         action = f"{effect} If the readings still contradict each other, {repeat}"
     return review(
         "ambiguous",
@@ -163,7 +163,7 @@ def _unexplained(session: Session, result: Anomalies) -> Finding:
 def _between_sessions(session: Session, anomaly: Anomaly) -> Finding:
     """Finding about a machine that changed, or numbers that were not entered as stated."""
     e = anomaly.explanation
-    text = _capitalised(f"{_text(session, e)}.")
+    text = capitalised(f"{_text(session, e)}.")
     others = [_text(session, c) for c in (*anomaly.causes, *anomaly.alternatives) if c != e]
     if others:
         text += f" The readings do not distinguish this from: {'; '.join(others)}."
@@ -313,11 +313,6 @@ def _lines(session: Session, e: Explanation) -> str:
     lines = sorted(set(lines))  # the three readings of a point have the same line
     file = "" if session.firmware is None else " of readings.csv"  # not lines of the log
     return f"{spans(lines, 'line')}{file}: "
-
-
-def _capitalised(text: str) -> str:
-    """A text with a capital first letter."""
-    return f"{text[:1].upper()}{text[1:]}"
 
 
 def _row(session: Session, row: int) -> str:
@@ -695,5 +690,5 @@ def _session_remedy(session: Session, e: Explanation) -> str:
     return (
         "First make sure that all sessions state the active offsets (`controller.offsets_mm`): "
         "offsets entered in between look the same. Otherwise: "
-        f"{calibrate_apart[0].lower()}{calibrate_apart[1:]}"
+        f"{uncapitalised(calibrate_apart)}"
     )

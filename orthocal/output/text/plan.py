@@ -42,6 +42,7 @@ from orthocal.sensors.protocol import tool_path
 from orthocal.sensors.tool_indicator import ToolIndicator
 from orthocal.session.points import one_row_per_point
 from orthocal.session.session import Reading, Session
+from orthocal.text import capitalised
 from orthocal.units import EDGE_UNITS, MM, UM
 
 FORMS: dict[Criterion, str] = {
@@ -184,7 +185,7 @@ def _undetermined_offsets(plan: MeasuringPlan | FixedPlan) -> list[str]:
 def _describe_limits(effect: EffectLimits) -> str:
     """Limit of an effect before and after the readings, in a sentence."""
     before, after = (_limit_words(effect, v) for v in (effect.before, effect.after))
-    name = f"{effect.words[:1].upper()}{effect.words[1:]}"
+    name = capitalised(effect.words)
     if effect.determined:
         return f"{name}: known to ±{after} after these readings (tolerance ±{before})."
     return f"{name}: these readings do not determine it; it keeps its tolerance of ±{before}."
