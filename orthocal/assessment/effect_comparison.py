@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthocal.assessment.recommendation import STRONG, compute_log_evidence
-from orthocal.effects.loading import errors_of_no_model, measurable_effects
+from orthocal.effects.loading import measurable_effects
 from orthocal.effects.registry import find_effect, order_effects
 from orthocal.errors import RobotError
 from orthocal.estimation.selection import complete_model
@@ -49,8 +49,6 @@ class EffectComparison:
     """Effects that the session or its robot states."""
     shown: tuple[str, ...]
     """Recommended effects for which the evidence is strong."""
-    named: tuple[str, ...]
-    """Errors of recommended effects that no model contains; they are named by `--free`."""
     lacking: Mapping[str, tuple[int, str]]
     """Effect that was not compared, mapped to the number of readings that lack its conditions and
     the place of the first one."""
@@ -79,7 +77,7 @@ def compare_effects(session: Session) -> EffectComparison | None:
     candidates, lacking = _candidates(session)
     stated = tuple(session.robot.effect_names)
     if not candidates:
-        return EffectComparison((), stated, stated, (), (), lacking) if lacking else None
+        return EffectComparison((), stated, stated, (), lacking) if lacking else None
     present = [e.name for e in measurable_effects(session.robot)]
     not_measurable = [n for n in stated if n not in present]
     model = complete_model(session.robot.parameters)
@@ -89,10 +87,9 @@ def compare_effects(session: Session) -> EffectComparison | None:
         trial = order_effects(names)
         if trial not in evidence_and_rms:
             with_them = session.with_effects((*not_measurable, *trial))
-            free = errors_of_no_model(with_them.robot)
-            errors = linear_model(with_them, free=free).predict_left_out(session.values)
+            errors = linear_model(with_them).predict_left_out(session.values)
             rms = float(np.sqrt(np.mean(errors**2)))
-            evidence_and_rms[trial] = compute_log_evidence(with_them, model, free=free)[0], rms
+            evidence_and_rms[trial] = compute_log_evidence(with_them, model)[0], rms
         return evidence_and_rms[trial][0]
 
     log_evidence(())
@@ -111,10 +108,9 @@ def compare_effects(session: Session) -> EffectComparison | None:
         WeighedEffects(effects, evidence - evidence_and_rms[()][0], rms)
         for effects, (evidence, rms) in evidence_and_rms.items()
     ]
-    named = errors_of_no_model(session.with_effects(order_effects(supported)).robot)
     recommended = order_effects((*stated, *supported))
     shown_in_order = order_effects(shown)
-    return EffectComparison(tuple(weighed), recommended, stated, shown_in_order, named, lacking)
+    return EffectComparison(tuple(weighed), recommended, stated, shown_in_order, lacking)
 
 
 def _candidates(session: Session) -> tuple[list[str], dict[str, tuple[int, str]]]:

@@ -22,7 +22,6 @@ from orthocal.assessment.effect_limits import find_limits
 from orthocal.assessment.words import effects as words
 from orthocal.calibration.assessment_record import Finding
 from orthocal.effects.loading import (
-    errors_of_no_model,
     measurable_effects,
     neutral_values,
 )
@@ -109,8 +108,7 @@ def _shows_expansion(session: Session) -> bool:
 
 def _inseparable(session: Session) -> Iterator[Finding]:
     """Findings about parameters of effects that are inseparable."""
-    free = errors_of_no_model(session.robot)
-    model = linear_model(session, free=free)
+    model = linear_model(session)
     linearisation = model.at_reference(keep_jacobian=True)
     effects = {e.name: e for e in measurable_effects(session.robot)}
     indices_of_effects = _members(session, model.problem.free)

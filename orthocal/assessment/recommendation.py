@@ -113,21 +113,18 @@ def _recommend(session: Session, models: tuple[str, ...]) -> Recommendation:
     return Recommendation(complete, float(TRIAL_SCALES[best]), tuple(evidence), gain)
 
 
-def compute_log_evidence(
-    session: Session, model: str, *, free: tuple[str, ...] = ()
-) -> tuple[float, Array]:
+def compute_log_evidence(session: Session, model: str) -> tuple[float, Array]:
     """Log evidence at the stated tolerances, and at all TRIAL_SCALES, shape (n_scales,).
 
     Args:
         session: The session, or several that were joined.
         model: Name of the model.
-        free: Names of errors that are free in addition to those of the model.
     """
     total, by_scale = 0.0, np.zeros(TRIAL_SCALES.size)
     for part in split_sessions(session):
         if len(part.readings) < 2:  # one reading usually determines only a gauge zero
             continue
-        linear = linear_model(part, model, free=free)
+        linear = linear_model(part, model)
         linearisation = linear.most_likely(part.values)
         deviation = linear.entries(part.values[None])[0] - linearisation.expected
         noises, log_weights = np.ones(1), np.zeros(1)

@@ -269,9 +269,7 @@ class AdjustmentChanges(Effect):
         """Build the effect for a robot with adjustments."""
         adjustments = find_adjustments(robot)
         errors = (
-            ElementaryError(
-                f"{a.name}{SETTING}", cls.name, a.name, "m", a.rounding_std, complete=True
-            )
+            ElementaryError(f"{a.name}{SETTING}", cls.name, a.name, "m", a.rounding_std)
             for a in adjustments
         )
         return cls(adjustments, tuple(errors))

@@ -50,13 +50,7 @@ class Backlash(Effect):
         }
         errors = (
             ElementaryError(
-                f"{d.name}.backlash",
-                cls.name,
-                d.name,
-                d.unit,
-                stds[d.unit],
-                complete=True,
-                positive=True,
+                f"{d.name}.backlash", cls.name, d.name, d.unit, stds[d.unit], positive=True
             )
             for d in robot.drives
         )

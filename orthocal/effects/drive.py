@@ -44,15 +44,12 @@ class DriveErrors(Effect):
         """Build the effect for a robot (see `Effect.from_keys`)."""
         stds = {"m": read_limit(keys.offset_mm) * MM, "rad": read_limit(keys.offset_mrad) * MRAD}
         offsets = (
-            ElementaryError(
-                f"{d.name}.offset", "offset", d.name, d.unit, stds[d.unit], complete=True
-            )
+            ElementaryError(f"{d.name}.offset", "offset", d.name, d.unit, stds[d.unit])
             for d in robot.drives
         )
         scale = read_limit(keys.scale_ppm) * PPM
         scales = (
-            ElementaryError(f"{d.name}.scale", "scale", d.name, "1", scale, complete=True)
-            for d in robot.drives
+            ElementaryError(f"{d.name}.scale", "scale", d.name, "1", scale) for d in robot.drives
         )
         return cls(robot, (*offsets, *scales))
 

@@ -177,11 +177,6 @@ def measurable_effects(robot: Robot) -> tuple[Effect, ...]:
     )
 
 
-def errors_of_no_model(robot: Robot) -> tuple[str, ...]:
-    """Names of errors of effects that no model identifies: those that are not `complete`."""
-    return tuple(e.name for f in measurable_effects(robot) for e in f.errors if not e.complete)
-
-
 def neutral_values(robot: Robot) -> dict[Condition, float]:
     """Values of conditions that are not stated, under which the effects change nothing."""
     values = dict(NEUTRAL)

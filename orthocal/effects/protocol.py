@@ -92,7 +92,7 @@ class Effect:
 
     errors: tuple[ElementaryError, ...] = ()
     """Parameters of the machine with their priors, 0 for the nominal machine. Every model
-    identifies the `complete` ones."""
+    identifies them."""
     setup_errors: tuple[ElementaryError, ...] = ()
     """Parameters of each setup, whose names are prefixed with that of the setup."""
     period: float | None = None

@@ -63,7 +63,7 @@ class Screw(Effect):
                     where="lead_mm",
                 )
         errors = (
-            ElementaryError(f"{d.name}.{kind}", cls.name, d.name, "m", std, complete=True)
+            ElementaryError(f"{d.name}.{kind}", cls.name, d.name, "m", std)
             for d in linear
             for kind in SCREW_COMPONENTS
         )

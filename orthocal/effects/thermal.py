@@ -70,8 +70,7 @@ class Thermal(Effect):
         stated = {"legs": keys.legs_ppm * PPM, "screws": keys.screws_ppm * PPM}
         std = read_limit(keys.tolerance_ppm) * PPM
         errors = (
-            ElementaryError(f"{part}.expansion", cls.name, part, "1/K", std, complete=True)
-            for part in stated
+            ElementaryError(f"{part}.expansion", cls.name, part, "1/K", std) for part in stated
         )
         return cls(robot, keys.reference_C, stated, _fixed_points(keys, robot), tuple(errors))
 

@@ -522,23 +522,20 @@ class LinearModel:
         return float(np.sqrt(np.mean(self.problem.observations.rows(residuals) ** 2)))
 
 
-def linear_model(
-    session: Session, model: str | None = None, *, free: tuple[str, ...] = ()
-) -> LinearModel:
+def linear_model(session: Session, model: str | None = None) -> LinearModel:
     """Linearised model of a session, cached for sessions with the same rows.
 
     Args:
         session: A session, or several joined ones.
         model: Name of the model of the errors that the machine may have; all errors by default.
-        free: Names of errors in addition to those of the model.
 
     Raises:
         RobotError: If closures of the robot depend on each other.
-        ParameterError: If the model or a name is unknown.
+        ParameterError: If the model is unknown.
     """
     robot = session.robot
     names = machine_errors(robot) if model is None else robot.parameters.select_model(model)
-    return _cached_model(_Rows(session, (*names, *free)))
+    return _cached_model(_Rows(session, names))
 
 
 class _Rows:

@@ -33,6 +33,7 @@ from orthocal.sensors.leg_indicator import LegIndicator
 from orthocal.sensors.tips import Tip
 from orthocal.session.points import names_in_files
 from orthocal.session.session import Conditions, Posture, Reading, Session, Setup
+from orthocal.statistics.zeros import eliminate_zero
 from orthocal.units import MM
 
 POSITIONS_ACROSS = 5
@@ -57,7 +58,7 @@ ON_AXIS = 0.999
 """Smallest cosine between a leg and an axis of the world that count as parallel."""
 
 ZERO_PRIOR = 0.01
-"""Prior standard deviation of a gauge zero, [m]; larger than any reading."""
+"""Prior standard deviation of each free zero of a point, [m]; larger than any reading."""
 
 MIN_READINGS = 2
 """Fewest readings of a setup: a single one only determines the gauge zero."""
@@ -92,14 +93,14 @@ class CandidateSetup:
     """Sensitivity of the readings to the state, shape (m width, n_state), [m per prior std],
     averaged over the postures in which the gauge may be aligned."""
     covariance: Array
-    """Covariance of the readings from the setup's nuisance parameters and zero, shape
-    (m width, m width), [m²]."""
+    """Covariance of the readings from the setup's nuisance parameters, for points with their free
+    zeros, shape (m width, m width), [m²]."""
     reachable: NDArray[np.bool_]
     """Mask of readings (columns) within the range of a gauge that begins in another reading (rows),
     shape (m, m)."""
     aligned: tuple[AlignedParameter, ...] = ()
     absolute: bool = False
-    """Whether the gauge zero is known."""
+    """Whether the gauge zero is known. The free zero of a single reading has no prior."""
     gauge: str = ""
     """Name of the gauge."""
     width: int = 1
@@ -115,6 +116,23 @@ class CandidateSetup:
         first = np.asarray(chosen, dtype=np.int64)[..., None] * self.width
         rows = first + np.arange(self.width)
         return rows.reshape(*rows.shape[:-2], rows.shape[-2] * self.width)
+
+    def weights_of(self, chosen: Sequence[int], noise: float) -> Array:
+        """Inverse covariance of some readings, with a free gauge zero eliminated.
+
+        Args:
+            chosen: The readings.
+            noise: Variance of a reading, [m²].
+
+        Returns:
+            Shape (n_chosen width, n_chosen width), [1/m²].
+        """
+        rows = self.numbers(chosen)
+        covariance = self.covariance[np.ix_(rows, rows)] + noise * np.eye(len(rows))
+        weights: Array = np.linalg.inv(covariance)
+        if self.absolute or self.width > 1:
+            return weights
+        return eliminate_zero(weights)[0]
 
     def jacobian_of(self, chosen: Sequence[int]) -> Array:
         """Jacobian of some readings if the gauge is aligned in the first.
@@ -262,7 +280,8 @@ def measure_candidates(
                 reachable &= span <= 0.5 * (limits[1] - limits[0])
                 each = np.diag(span) if absolute else span
                 spans.setdefault(base, []).append(float(np.median(each)))
-            covariance[of_part, of_part] += 0.0 if absolute else (ZERO_PRIOR / ratio) ** 2
+            if width > 1 and not absolute:
+                covariance[of_part, of_part] += (ZERO_PRIOR / ratio) ** 2
         candidate = CandidateSetup(
             *(name, rows[::width], by_state, covariance, reachable, tuple(aligned), absolute),
             *(base, width),

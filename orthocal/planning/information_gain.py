@@ -6,7 +6,8 @@ Readings S of the setup reduce tr(T C) by
     tr[(V_SS + σ² I)⁻¹ Q_SS],  V = A C Aᵀ + D,  Q = A C T C Aᵀ
 
 with A the Jacobian of the readings and D the covariance from the setup's nuisance parameters. A
-reading is one number (`SetupGain`) or a point of three (`PointGain`).
+reading is one number (`SetupGain`) or a point of three (`PointGain`). A free zero of single
+readings is eliminated exactly: the inverse of V_SS + σ² I becomes that of `eliminate_zero`.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from orthocal.arrays import Array, Indices
 from orthocal.planning.candidates import CandidateSetup
 from orthocal.planning.ranking import first_largest
+from orthocal.statistics.zeros import eliminate_zero
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,6 +169,9 @@ class SetupGain:
                 covariance = a.product(other)[first]
                 outer = sensitivity[:, :, None] * other.sensitivity[sets][:, None, :]
                 spread += covariance[:, None, None] * outer
+        if not self.setup.absolute:  # differences from the first reading have no zero
+            effect = effect[:, 1:] - effect[:, :1]
+            spread = (spread[:, 1:, 1:] - spread[:, 1:, :1]) - spread[:, :1, 1:] + spread[:, :1, :1]
         return np.asarray((effect * np.linalg.solve(spread, effect)).sum(axis=(1, 2)))
 
     def exchange_gains(self, rows: list[int]) -> Array:
@@ -176,10 +181,13 @@ class SetupGain:
         −w wᵀ / w_p. Residual effects and variances of all readings change by one product each.
         """
         spread = self.spread[rows]
-        inverse = np.linalg.inv(self._covariance(spread, rows))
-        solved, weighted = inverse @ spread, inverse @ self.effect[rows]
+        inverse: Array = np.linalg.inv(self._covariance(spread, rows))
+        in_zero, of_zero = np.zeros(len(rows)), 0.0
+        if not self.setup.absolute:
+            inverse, in_zero, of_zero = eliminate_zero(inverse)
+        solved, weighted = inverse @ spread + in_zero[:, None], inverse @ self.effect[rows]
         effect = self.effect - solved.T @ self.effect[rows]
-        variance = self.variance - np.vecdot(spread.T, solved.T)
+        variance = self.variance - np.vecdot(spread.T, solved.T) - in_zero @ spread + of_zero
         share = solved / inverse.diagonal()[:, None]
         gains = np.vecdot(weighted, weighted)[:, None] * share
         gains += 2.0 * (weighted @ effect.T)
@@ -251,7 +259,12 @@ class SetupGain:
         columns, change = np.empty((count, len(variance))), np.empty_like(effect)
         chosen, gains = list(pair), list[float]()
         excluded = ~self.setup.reachable[pair[0]]
-        for k in range(count):
+        reference, own = np.zeros_like(variance), 0.0
+        if not self.setup.absolute:  # differences from the first reading have no zero
+            reference, own = spread[pair[0]], spread[pair[0], pair[0]] + self.noise
+            effect, variance = effect - effect[pair[0]], variance - 2.0 * reference + own
+            columns[0], gains = 0.0, [0.0]
+        for k in range(len(gains), count):
             if k >= len(chosen):
                 excluded[chosen] = True
                 single = self._single_gains(effect, variance)
@@ -260,14 +273,14 @@ class SetupGain:
                 if excluded[best]:
                     break
                 chosen.append(best)
-            row, column = chosen[k], spread[chosen[k]]
+            row, column = chosen[k], spread[chosen[k]] - reference - (reference[chosen[k]] - own)
             if k:
                 column = column - columns[:k, row] @ columns[:k]
             pivot = math.sqrt(column[row] + self.noise)
             column, share = np.divide(column, pivot, out=columns[k]), effect[row] / pivot
             gains.append(float(share @ share) + (gains[-1] if gains else 0.0))
             np.multiply(column[:, None], share, out=change)
-            effect = np.subtract(effect, change, out=effect if k else None)
+            effect = np.subtract(effect, change, out=None if effect is self.effect else effect)
             variance = variance - column**2
         return tuple(gains), tuple(chosen)
 

@@ -44,7 +44,7 @@ from orthocal.planning.expected_error import (
 from orthocal.planning.further_readings import FurtherReadings, find_further_readings
 from orthocal.planning.plan_comparison import Alternative, Comparison
 from orthocal.planning.planned_session import build_session
-from orthocal.planning.ranking import best_of
+from orthocal.planning.ranking import best_of, is_less
 from orthocal.planning.selection import KILLED, PlannedSetup, PlannedSetups, SetupSearch
 from orthocal.planning.sensor_gains import SensorGain, find_sensor_gains
 from orthocal.planning.timed_search import TimedSearch
@@ -143,7 +143,8 @@ class MeasuringPlan:
             for usual in self.compared
             if usual.expected is not None
         ]
-        return [plan for plan in usual_plans if plan[0] < self.expected.rms_by(self.criterion)]
+        error = self.expected.rms_by(self.criterion)
+        return [plan for plan in usual_plans if is_less(plan[0], error)]
 
     @property
     def enough(self) -> Stage | None:
@@ -182,7 +183,7 @@ def plan_readings(
         workspace: Region over which the tool error is computed; by default the robot's.
         criterion: Figure to minimise; see `planning.expected_error.Criterion`.
         seed: Seed of the random starts of the search.
-        starts: Number of starts of the search; by default 3, or more for few candidates.
+        starts: Number of starts of the search; by default 1, or more for few candidates.
         reference: Name of the robot in the session; by default that of the model.
         workers: Number of processes; the plan does not depend on it.
         report: Called with a line of text as the work proceeds.
@@ -269,7 +270,7 @@ def _plan(
     error, setups = better
     improved = search.improve(setups)
     expected = compare(improved).expect_plan()
-    best = improved if expected.rms_by(work.criterion) < error else search.plan_of(setups)
+    best = improved if is_less(expected.rms_by(work.criterion), error) else search.plan_of(setups)
     return _evaluate(timed, best, compare(best), work)
 
 

@@ -52,8 +52,9 @@ class ElementaryError:
         prior_std: Standard deviation before the calibration, [unit].
         of_frame: True if the owner is a frame, False if it is a joint.
         axis: Component of the twist of a placement, 0 to 5; -1 for errors of other kinds.
-        complete: True if it is part of the complete model, unless it is redundant. Complete errors
-            of effects other than geometry and drives are part of every model.
+        complete: False for placements that no complete model contains. Other errors are part of the
+            complete model, unless they are redundant. Those of named effects are part of every
+            model.
         positive: True for a value of at least 0 with a half-normal prior.
     """
 
@@ -64,7 +65,7 @@ class ElementaryError:
     prior_std: float
     of_frame: bool = False
     axis: int = -1
-    complete: bool = False
+    complete: bool = True
     positive: bool = False
 
 
@@ -181,7 +182,7 @@ class ParameterSet:
 
     @cached_property
     def of_effects(self) -> tuple[str, ...]:
-        """Complete errors of effects other than geometry and drives, which every model contains."""
+        """Errors of effects other than geometry and drives, which every model contains."""
         return tuple(
             e.name
             for e in self.elementary.values()

@@ -1,7 +1,8 @@
 """Exact elimination of gauge zeros.
 
 The optimal gauge zero of several readings is their mean. Therefore the mean over all entries with
-the same zero is subtracted from readings and Jacobians.
+the same zero is subtracted from readings and Jacobians. With correlated readings it is their
+weighted mean.
 """
 
 from __future__ import annotations
@@ -31,3 +32,20 @@ def project_out_zeros(
     means = totals / np.where(counts > 0.0, counts, 1.0)[:, None]
     means[observations.zero_known] = 0.0
     return np.asarray((flat - means[observations.zero]).reshape(values.shape))
+
+
+def eliminate_zero(weights: Array) -> tuple[Array, Array, float]:
+    """Inverse covariance W of readings with one free zero, P = W − W 1 1ᵀ W / (1ᵀ W 1).
+
+    A zero with a large prior variance gives the same, but its rounding errors are large.
+
+    Args:
+        weights: W, shape (k, k).
+
+    Returns:
+        P, shape (k, k); the weights W 1 / (1ᵀ W 1) of the readings in the zero, shape (k,); and
+        the variance of the zero, 1 / (1ᵀ W 1).
+    """
+    sums = weights.sum(axis=1)
+    variance = 1.0 / float(sums.sum())
+    return weights - np.outer(sums, sums) * variance, sums * variance, variance

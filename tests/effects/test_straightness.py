@@ -31,6 +31,9 @@ from orthocal.sensors.tips import Tip
 ACTIVE = np.array([1.5e-3, -2.0e-3, 0.7e-3])
 """[m] Offsets that are active while the gauges are mounted."""
 
+EXACT = 1e-7
+"""σ of exact readings, [m]: the prior of a bow changes it by less than 1e-9."""
+
 BOWS = {"x_slide.bow": 40e-6, "y_slide.bow": -25e-6, "z_slide.bow": 60e-6}
 
 
@@ -132,9 +135,9 @@ def test_solvers_find_bows_from_exact_readings(plan, touching):
         NonlinearProgram(problem, options=SolverOptions(hessian="exact")),
     ]
     for program in programs:
-        found = program.solve(sigma=1e-6)
+        found = program.solve(sigma=EXACT)
         assert np.abs(found.theta - expected).max() < SAME_OPTIMUM
-    batch = BatchSolver(problem).solve(np.tile(problem.values, (2, 1)), sigma=1e-6)
+    batch = BatchSolver(problem).solve(np.tile(problem.values, (2, 1)), sigma=EXACT)
     assert np.abs(batch.theta - expected).max() < SAME_OPTIMUM
 
 

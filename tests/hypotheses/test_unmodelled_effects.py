@@ -158,11 +158,8 @@ def test_an_effect_of_another_package_is_named_by_its_description(slack):
     assert finding.kind == "other effect"
     assert Slack.describe(None) in finding.text
     assert {"x_slide.slack", "y_slide.slack"} <= {p.parameter for p in finding.places}
-    # the remedy frees parameters that the complete model lacks
-    effects, model, free = re.search(
-        r"--effects (\S+) --model (\S+) --free '(\S+)'`", finding.action
-    ).groups()
-    choice = Choice(model, free=free.split(","), effects=effects.split(","))
+    (effects,) = re.search(r"--effects (\S+)`", finding.action).groups()
+    choice = Choice(effects=effects.split(","))
     result, _ = identify(session, choice, solver="variable-projection")
     slack_of_x = next(p for p in result.free if p.name == "x_slide.slack")
     assert slack_of_x.value == pytest.approx(30e-6, abs=3.0 * slack_of_x.std)

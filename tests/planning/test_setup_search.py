@@ -15,8 +15,6 @@ from orthocal.runtime import worker_pool
 
 SIGMA = 0.5
 STATE = 4
-ZERO = 1e3
-"""Prior standard deviation of a gauge zero, much larger than SIGMA."""
 
 
 def draw_candidates(rng, *, setups=3, readings=4, nuisance=1, aligned=0):
@@ -27,7 +25,7 @@ def draw_candidates(rng, *, setups=3, readings=4, nuisance=1, aligned=0):
         of_nuisance = 0.5 * rng.normal(size=(readings, nuisance))
         h = np.sort(rng.uniform(0.0, 3.0, readings))
         reachable = np.abs(h[:, None] - h[None]) < 2.0
-        covariance = of_nuisance @ of_nuisance.T + ZERO**2
+        covariance = of_nuisance @ of_nuisance.T
         parameters = tuple(
             AlignedParameter(rng.normal(size=readings), rng.normal(size=(readings, STATE)))
             for _ in range(aligned)
@@ -72,7 +70,7 @@ def posterior(candidates, sensitivities, setups):
             rows.append(row / SIGMA)
     design = np.array(rows)
     precision = np.ones(STATE + count * width)
-    precision[STATE + width - 1 :: width] = 1.0 / ZERO**2
+    precision[STATE + width - 1 :: width] = 0.0  # gauge zeros have no prior
     return np.linalg.inv(design.T @ design + np.diag(precision))[:STATE, :STATE]
 
 

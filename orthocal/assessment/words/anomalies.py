@@ -18,7 +18,7 @@ from orthocal.assessment.wording import (
 )
 from orthocal.assessment.words.effects import identify_effects
 from orthocal.calibration.assessment_record import Finding, Place
-from orthocal.effects.loading import errors_of_no_model, robot_effects, with_effects
+from orthocal.effects.loading import robot_effects, with_effects
 from orthocal.hypotheses.anomaly import Anomalies, Anomaly, Explanation
 from orthocal.measurement.motion.approach import label_reading
 from orthocal.sensors.protocol import states_readings
@@ -102,7 +102,7 @@ def _effect_remedy(session: Session, explanations: Iterable[Explanation]) -> str
     """Advice to calibrate with all missing effects in addition to those of the robot."""
     missing = [e.effect for e in explanations if e.amounts]
     robot = with_effects(session.robot, (*session.robot.effect_names, *missing))
-    return identify_effects(robot.effect_names, errors_of_no_model(robot))
+    return identify_effects(robot.effect_names)
 
 
 def _describe_effect(session: Session, name: str) -> str:

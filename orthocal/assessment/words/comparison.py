@@ -94,8 +94,8 @@ def describe_effects(comparison: EffectComparison, readings: int) -> list[Findin
         single = [w.effects[0] for w in comparison.weighed if len(w.effects) == 1]
         texts.append(f"The readings do not clearly show {joined(single, 'or')}.")
     action = ""
-    if comparison.named or set(names) - set(comparison.stated):
-        action = identify_effects(names, comparison.named)
+    if set(names) - set(comparison.stated):
+        action = identify_effects(names)
     numbers = {"log_evidence": best.log_evidence, "prediction_rms_mm": best.prediction_rms / MM}
     return [note("effects recommended", " ".join(texts), action, **numbers), *notes]
 

@@ -17,20 +17,9 @@ EFFECT_NOUNS = {
 """Noun phrases for the effects of orthocal."""
 
 
-def identify_effects(effects: Sequence[str], free: Sequence[str]) -> str:
-    """Advice to identify effects.
-
-    Args:
-        effects: Names of all effects to identify.
-        free: Names of their parameters that no model contains.
-    """
-    names = ",".join(effects)
-    if not free:
-        return f"Calibrate with `--effects {names}`."
-    kinds = [f"*.{name.rpartition('.')[2]}" for name in free]
-    globs = [k if kinds.count(k) > 1 else n for k, n in zip(kinds, free, strict=True)]
-    patterns = ",".join(dict.fromkeys(globs))
-    return f"Calibrate with `--effects {names} --model full --free '{patterns}'`."
+def identify_effects(effects: Sequence[str]) -> str:
+    """Advice to identify effects, whose names are stated."""
+    return f"Calibrate with `--effects {','.join(effects)}`."
 
 
 def approach_not_stated() -> Finding:

@@ -195,7 +195,7 @@ def _limit_words(effect: EffectLimits, limit: float) -> str:
     """A limit of an effect with its unit."""
     unit, factor = EDGE_UNITS[effect.unit]
     words = unit.replace("_per_", "/").replace("um/", "µm/")
-    return tool_mm(limit) if words == "mm" else f"{limit / factor:.2g} {words}"
+    return tool_mm(limit) if words == "mm" else f"{limit / factor:.3g} {words}"
 
 
 def _describe_further(further: FurtherReadings) -> str:
