@@ -129,7 +129,7 @@ class CandidateSetup:
         """
         rows = self.numbers(chosen)
         covariance = self.covariance[np.ix_(rows, rows)] + noise * np.eye(len(rows))
-        weights: Array = np.linalg.inv(covariance)
+        weights = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         if self.absolute or self.width > 1:
             return weights
         return eliminate_zero(weights)[0]

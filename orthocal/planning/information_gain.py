@@ -181,7 +181,8 @@ class SetupGain:
         −w wᵀ / w_p. Residual effects and variances of all readings change by one product each.
         """
         spread = self.spread[rows]
-        inverse: Array = np.linalg.inv(self._covariance(spread, rows))
+        covariance = self._covariance(spread, rows)
+        inverse = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         in_zero, of_zero = np.zeros(len(rows)), 0.0
         if not self.setup.absolute:
             inverse, in_zero, of_zero = eliminate_zero(inverse)
