@@ -44,7 +44,7 @@ MAX_PAIRS = 3
 MAX_PASSES = 4
 """Most passes that exchange each reading of a setup."""
 
-MAX_STARTS = 10
+MAX_STARTS = 30
 """Most starts by default."""
 
 MIN_TOTAL_CANDIDATES = 10_000
