@@ -37,10 +37,10 @@ orthocal:
 """
 
 
-SEEDS = 16
+SEEDS = 10
 """Sessions whose deviations are compared with the predicted ones."""
 
-VALIDATED = 12
+VALIDATED = 6
 """Sessions that are validated. If half as many were confirmed as predicted, 35 % in place of 70 %,
 58 % of such tests would fail; at a quarter, 97 %."""
 
