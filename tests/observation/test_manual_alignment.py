@@ -9,7 +9,7 @@ import pytest
 from calibrated import identified
 from workshop import Workshop
 
-from orthocal import calibrate, draw_errors, load_plan, simulate_session
+from orthocal import draw_errors, load_plan, simulate_session
 from orthocal.estimation.options import SolverOptions
 from orthocal.kinematics.error_map import error_map
 from orthocal.measurement.joining import join_sessions
@@ -81,7 +81,7 @@ def test_both_solvers_find_one_optimum(plan):
     projected, *others = (
         [*result.free, *result.sensors]
         for result in (
-            calibrate(session, "full", solver=SolverOptions(solver, hessian))
+            identified(session, "full", solver=SolverOptions(solver, hessian))
             for solver, hessian in (
                 ("variable-projection", "gauss-newton"),
                 ("ipopt", "gauss-newton"),
