@@ -34,6 +34,7 @@ from orthocal.hypotheses.hypothesis import Family, Rows, SystematicEffect
 from orthocal.hypotheses.hypothesis_set import (
     HypothesisSet,
     Term,
+    adds_a_setup,
     distinct_terms,
     explain_with_amounts,
     find_alternatives,
@@ -176,7 +177,11 @@ class _Search:
         if len(state.terms) + 2 <= MAX_ANOMALIES:
             pairs, total = self.scorer.pairs(state, scored)
         best = float(log_of_sum(np.array([*totals, total]))) if totals else -np.inf
-        if best < REFIT_LOG_BAYES and not likely_effects:
+        far = self.sets.evaluate_all(
+            [(*state.terms, t) for t in self.scorer.far_terms(scored)], self.sets.reference
+        )
+        is_far_clear = any(_is_clear(s, state) for s in far)
+        if best < REFIT_LOG_BAYES and not likely_effects and not is_far_clear:
             return None, []
         scored += list(self.scorer.score(state, inconsistent_groups(rows)))
         single = self.scorer.shortlist(scored)
@@ -185,7 +190,7 @@ class _Search:
             *pairs,
             *self._drive_combinations(state, scored),
         ]
-        extended = self.sets.evaluate_all(
+        extended = far + self.sets.evaluate_all(
             [(*state.terms, *added) for added in additions], state.about
         )
         likeliest = min(extended, key=negative_log_posterior)
@@ -207,7 +212,8 @@ class _Search:
         simplest = min(near, key=lambda s: s.size)
         if is_same_place(simplest, near[0]):
             simplest = near[0]
-        return simplest, [s for s in near if s is not simplest]
+        # a setup whose sign makes no difference casts no doubt on the other one
+        return simplest, [s for s in near if s is not simplest and not adds_a_setup(s, simplest)]
 
     def _lacking(self, state: HypothesisSet) -> list[SystematicEffect]:
         """Effects of the machine that a state lacks."""

@@ -92,6 +92,24 @@ def test_a_bar_with_all_signs_reversed_is_named(tmp_path):
     assert {p.setup for p in found.places} == {"xy", "yz", "zx"}
 
 
+@pytest.mark.parametrize("seed", [3, 31])
+def test_a_later_bar_with_all_signs_reversed_is_named(tmp_path, seed):
+    """To first order about the readings as stated, the reversed sign has no evidence."""
+    plan = circles(tmp_path, length="0", legs=True)
+    first = plan.select([r for r in plan.readings if r.setup.startswith("leg")])
+    later = plan.select([r for r in plan.readings if r.posture in {f"xy_{k}" for k in EVEN}])
+    errors = errors_of(plan, seed)
+    legs = simulate_session(first, errors, seed=seed).session
+    bar = simulate_session(later, errors, seed=seed + 50).session
+    assert not warnings_of(join_sessions([legs, bar]))
+    (found,) = warnings_of(join_sessions([legs, bar.with_values(-bar.values)]))
+    assert found.kind == "reversed sign"
+    assert [p.setup for p in found.places] == ["session-2/xy"]
+
+
+EVEN = (0, 2, 4, 6, 8, 10, 12, 14)
+
+
 @pytest.mark.parametrize(("first", "size"), [("yz", 50e-6), ("zx", 0.3e-3)])
 def test_a_ball_displaced_between_setups_is_named(tmp_path, first, size):
     plan = circles(tmp_path)
