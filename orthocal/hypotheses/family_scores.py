@@ -32,7 +32,7 @@ SIMILAR_LOG_BAYES = 3.0
 REFIT_LOG_BAYES = 4.0
 """Smallest log Bayes factor, to first order, of hypotheses that are relinearised."""
 
-N_FAMILIES = 32.0
+N_FAMILIES = 33.0
 """Number of families that share the prior probability; each effect is as likely as a family."""
 
 MAX_REFITTED = 8

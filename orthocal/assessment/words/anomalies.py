@@ -468,14 +468,12 @@ def _displaced(session: Session, e: Explanation) -> str:
 def _offset(session: Session, e: Explanation) -> str:
     """Clause about readings that were written into a wrong row."""
     first = _row(session, e.rows[0])
+    of_setup = f" of setup {e.names[0]}" if e.scope == "setup" else ""
     if e.missing:
-        return (
-            f"{first} was not read, and all later readings of setup {e.names[0]} are one line "
-            "too early"
-        )
+        return f"{first} was not read, and all later readings{of_setup} are one line too early"
     return (
-        f"the reading before {first} was written twice, and all later readings of setup "
-        f"{e.names[0]} are one line too late"
+        f"the reading before {first} was written twice, and all later readings{of_setup} are one "
+        "line too late"
     )
 
 
