@@ -18,7 +18,7 @@ from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.linear import require_finite
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import select_parameters
-from orthocal.estimation.weighting import assumed_sigma, initial_noise_ratio
+from orthocal.estimation.weighting import assumed_sigma, initial_sigmas, split_by_gauge
 from orthocal.hypotheses.hypothesis import (
     MAX_DENSE_COLUMNS,
     MachineShift,
@@ -75,11 +75,15 @@ class LinearModel:
         free = machine_errors(session.robot) if names is None else names
         selection = select_parameters(session.robot.parameters, free=free, prior=True)
         problem = CalibrationProblem(session, selection)
-        self.problem = problem.with_noise_ratio(initial_noise_ratio(session, problem.observations))
-        o = self.problem.observations
+        o = problem.observations
+        gauges = split_by_gauge(session, o)
+        sigmas = np.full(o.size, assumed_sigma(session.gauge))
+        if len(gauges) > 1:
+            sigmas = initial_sigmas(session, o)
         self.stated = session.gauge.sigma is not None
-        self.sigma = assumed_sigma(session.gauge)
+        self.sigma = float(sigmas[gauges[0].entries][0])
         """Standard deviation of a reading of the first gauge, [m]; all entries refer to it."""
+        self.problem = problem.with_noise_ratio(sigmas / self.sigma)
         self.dof = o.size - o.n_zeros
         self.labels, self.session_of_entry = label_sessions(session, o.setup)
         self.reference = self.problem.active_theta.copy()

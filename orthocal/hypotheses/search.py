@@ -86,6 +86,8 @@ def find_anomalies(session: Session) -> Anomalies:
 def find_suspected_rows(session: Session) -> tuple[int, ...]:
     """Rows of the most likely single mistakes, however weak their evidence.
 
+    A row offset counts with its first row only: the others are right but for their place.
+
     Args:
         session: Readings that contradict each other.
 
@@ -97,7 +99,8 @@ def find_suspected_rows(session: Session) -> tuple[int, ...]:
     families = list_families(search.model, Rows(session), grouped=False)
     scored = list(search.scorer.score(search.sound, families))
     least = max(float(e.max(initial=-np.inf)) for _, e in scored) - SIMILAR_LOG_BAYES
-    rows = {i for f, e in scored for h in np.flatnonzero(e > least) for i in f.explain(int(h)).rows}
+    likely = [f.explain(int(h)) for f, e in scored for h in np.flatnonzero(e > least)]
+    rows = {i for e in likely for i in (e.rows[:1] if e.kind == "row offset" else e.rows)}
     return tuple(sorted(rows))
 
 
