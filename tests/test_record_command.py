@@ -305,7 +305,7 @@ def test_a_contradiction_names_the_lines_of_the_most_likely_mistakes(root, run, 
     blank(root / "examples/workshop", tmp_path / "typed")
     _, out, _ = run(tmp_path / "typed", *(f"{v / MM:.3f}" for v in values[:8]))
     _, last = out.split("! Line 9 differs by ")
-    assert "\n  Check the dial, and lines 3, 5 and 7: the mistake may be there.\n" in last
+    assert "\n  Check the dial, and lines 3, 5, 7: the mistake may be there.\n" in last
 
 
 def test_reversed_setup_is_named_at_its_end_and_by_check(root, run, tmp_path):
