@@ -406,6 +406,34 @@ class LinearModel:
         )
         return (math.nan if math.isinf(std) else float(rows[row] - amount)), float(std)
 
+    def compare_row(self, rows: Array, row: int) -> tuple[float, float]:
+        """Prediction of a reading, with a larger std than by `predict_row` if it is not linear.
+
+        Readings are not linear over offsets of some mm. So a reading far from its prediction may
+        show another machine that explains all readings nearly as well. In terms of the misfits to
+        all readings and to the others, std = |y_i − mean| / √(χ²_all − χ²_others). It is that of
+        `predict_row` if readings are linear.
+
+        Args:
+            rows: Readings, shape (n_rows,), [m].
+            row: Index of the reading.
+
+        Raises:
+            ClosureError: If the nominal machine cannot reach a posture.
+        """
+        mean, std = self.predict_row(rows, row)
+        deviation = abs(rows[row] - mean)
+        if not deviation > std:
+            return mean, std
+        with_mean = np.where(np.arange(rows.size) == row, mean, rows)
+        misfits = []
+        for values in (rows, with_mean):
+            (entries,) = self.entries(values[None])
+            about = self.approach(entries, np.zeros_like(entries))
+            misfits.append(about.likelihood.misfit(entries - about.expected))
+        increase = max(misfits[0] - misfits[1], 0.0)
+        return mean, max(std, deviation / max(math.sqrt(increase), 1.0))
+
     def predict_left_out(self, rows: Array) -> Array:
         """Readings of each setup minus their predictions from all other setups, (n_rows,), [m].
 
