@@ -175,6 +175,7 @@ def plain_mistakes() -> dict[str, Make]:
     def shift(which: str, part: float) -> Make:
         def make(s: Sheet):
             rows = s.pick(s.cycles if which.endswith("cycle") else s.setups)
+            rows = s.every() if which.endswith("session") else rows
             at = min(
                 max(int(part * rows.size), 0 if which.startswith("missed") else 1), rows.size - 2
             )
@@ -260,6 +261,8 @@ def plain_mistakes() -> dict[str, Make]:
         "misread by 0.1 mm": lambda s: s.plus(s.row(), s.sign() * 0.1 * MM, "misread dial"),
         "digits transposed": transposed,
         "two slips": two_slips,
+        "step missed, all later setups": shift("missed session", 0.3),
+        "step doubled, all later setups": shift("doubled session", 0.3),
     }
 
 

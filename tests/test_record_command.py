@@ -18,10 +18,11 @@ import pytest
 from commands import orthocal
 from made_mistakes import sound_session
 
-from orthocal import check_session, load_session, simulate_session, write_session
+from orthocal import check_session, draw_errors, load_session, simulate_session, write_session
 from orthocal.assessment.wording import review
 from orthocal.calibration.assessment_record import Place
 from orthocal.cli import recording
+from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.measurement.files.session_file import load_plan
 from orthocal.measurement.motion.motion import guide
 from orthocal.measurement.recording import SUFFIX, open_recording
@@ -305,7 +306,18 @@ def test_a_contradiction_names_the_lines_of_the_most_likely_mistakes(root, run, 
     blank(root / "examples/workshop", tmp_path / "typed")
     _, out, _ = run(tmp_path / "typed", *(f"{v / MM:.3f}" for v in values[:8]))
     _, last = out.split("! Line 9 differs by ")
-    assert "\n  Check the dial, and lines 5 to 7: the mistake may be there.\n" in last
+    assert "\n  Check the dial, and lines 3, 5, 7: the mistake may be there.\n" in last
+
+
+def test_a_reading_that_shows_another_offset_is_no_contradiction(root, run, tmp_path):
+    """Large offsets, whose signs the first setup does not show."""
+    plan = load_plan(root / "examples/workshop/plan.yaml")
+    errors = draw_errors(plan.robot, machine_errors(plan.robot), seed=34)
+    values = simulate_session(plan, errors, seed=34).session.values
+    blank(root / "examples/workshop", tmp_path / "typed")
+    _, out, _ = run(tmp_path / "typed", *(f"{v / MM:.3f}" for v in values[:5]))
+    assert "The other readings predict -2.22" in out
+    assert "differs by" not in out
 
 
 def test_reversed_setup_is_named_at_its_end_and_by_check(root, run, tmp_path):

@@ -258,7 +258,7 @@ def _choose_values(calibration: Calibration) -> _ValuesToEnter:
     keep = not firmware and _keeps_offsets(calibration, entries, error_now, best)
     if entries and not keep:
         return _ValuesToEnter(entries, backlash, keep, best, best, unreached)
-    if not is_worth_changing(calibration, calibrated_tool, backlash):
+    if not is_worth_changing(calibration, backlash, None if best is None else best.now, error_now):
         backlash = tuple(e.kept for e in backlash)
     tool, _ = _summarise_tool(calibration, calibrated_tool, active_entries, backlash)
     return _ValuesToEnter(active_entries, backlash, keep, tool, best, unreached)

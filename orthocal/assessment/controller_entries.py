@@ -3,8 +3,10 @@
 The true offsets are not the best ones if legs and axes have errors, too: other offsets compensate
 a part of them. The offsets to enter minimise the tool error over the workspace.
 
-A backlash or a periodic error of a screw is entered if the readings determine it. Then it, or its
-change, is larger than its expanded uncertainty, or entering it lowers the expected tool error.
+A backlash is entered by the rule for offsets: if that lowers the expected tool error by at least
+WORTH_ENTERING. It is determined if it, or its change, is larger than its expanded uncertainty. The
+backlash of a drive that is not determined is omitted, unless such drives alone lower the tool error
+so much. A periodic error of a screw is entered if it is determined, or by that rule.
 """
 
 from __future__ import annotations
@@ -122,7 +124,12 @@ def compute_backlash(
         changes.append(_backlash_change(entry))
         determined.append(max(value, abs(value - active_backlash)) > uncertainty)
     entering = _choose_changes(calibration, tool, changes, determined)
-    return tuple(e if enter else e.kept for e, enter in zip(entries, entering, strict=True))
+    entered = tuple(e if enter else e.kept for e, enter in zip(entries, entering, strict=True))
+    together: dict[str, float] = {}
+    for e in entered:
+        together |= _backlash_change(e)
+    lowered = _changes_tool(calibration, tool, together)
+    return tuple(e.kept for e in entries) if lowered is False else entered
 
 
 def _backlash_change(entry: BacklashEntry) -> dict[str, float]:
@@ -182,7 +189,7 @@ def find_screw_effect(robot: Robot) -> Screw | None:
 
 
 def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
-    """Periodic errors of screws to enter, by the rule for backlash; empty if there are none.
+    """Periodic errors of screws to enter; empty if there are none.
 
     An amplitude is determined if (A, B) is outside the ellipse that contains 95 % of the estimates
     around 0, or outside that around the active values.
@@ -260,20 +267,27 @@ def expanded_uncertainty(calibration: Calibration, entry: ControllerEntry | Back
 
 
 def is_worth_changing(
-    calibration: Calibration, tool: CalibratedTool | None, entries: Sequence[BacklashEntry]
+    calibration: Calibration,
+    entries: Sequence[BacklashEntry],
+    now: float | None,
+    then: float | None,
 ) -> bool:
-    """True if the backlash is worth entering although the offsets are kept."""
-    changes: dict[str, float] = {}
-    for e in entries:
-        changes |= _backlash_change(e)
-    return any(
-        abs(e.change) > expanded_uncertainty(calibration, e) for e in entries
-    ) or _changes_tool(calibration, tool, changes)
+    """True if the backlash is worth entering although the offsets are kept.
+
+    Args:
+        calibration: The calibration.
+        entries: The backlash to enter.
+        now: Tool error with the present backlash, [m]; None if unknown.
+        then: Tool error with that to enter, [m]. If it is None, significance decides.
+    """
+    if now is not None and then is not None:
+        return lowers(now, then)
+    return any(abs(e.change) > expanded_uncertainty(calibration, e) for e in entries)
 
 
 def _changes_tool(
     calibration: Calibration, tool: CalibratedTool | None, changes: Mapping[str, float]
-) -> bool:
+) -> bool | None:
     """True if changes of the controller's correction lower the expected tool error enough.
 
     The tool error is computed to first order, as if all other errors were corrected.
@@ -282,12 +296,15 @@ def _changes_tool(
         calibration: The calibration.
         tool: Its tool over the workspace; None if there is none.
         changes: Parameter to its change, [SI].
+
+    Returns:
+        None if the tool error with these changes is unknown.
     """
     names = [] if tool is None else list(tool.free)
     nonzero = {n: change for n, change in changes.items() if change}
     columns = [names.index(n) for n in nonzero if n in names]
     if tool is None or not columns or not np.isfinite(calibration.model_covariance).all():
-        return False
+        return None
     change = np.array([nonzero[names[i]] for i in columns])
     covariance = calibration.error_covariances[0]
     aligned, _ = weighted_fields(tool, tool.jacobian[:, :, : len(covariance)])

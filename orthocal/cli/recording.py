@@ -331,7 +331,7 @@ class Dialogue:
         session = self._recording.measured(without=excluded)
         position = sum(r.is_read and i not in excluded for i, r in enumerate(rows[:index]))
         try:
-            mean, std = linear_model(session).predict_row(session.values, position)
+            mean, std = linear_model(session).compare_row(session.values, position)
         except (OrthocalError, np.linalg.LinAlgError) as e:
             self._stop_judging(e)
             return False

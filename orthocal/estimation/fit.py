@@ -21,8 +21,8 @@ from orthocal.estimation.weighting import (
     SMALLEST_SIGMA,
     GaugeReadings,
     estimate_gauge_sigmas,
-    initial_noise_ratio,
     initial_sigma,
+    initial_sigmas,
     leverages,
     split_by_gauge,
     stated_sigma,
@@ -209,8 +209,8 @@ def fit_problem(
     began = time.perf_counter()
     groups = split_by_gauge(problem.session, problem.observations)
     if len(groups) > 1 and (problem.noise_ratio == 1.0).all():
-        ratio = initial_noise_ratio(problem.session, problem.observations)
-        problem = problem.with_noise_ratio(ratio)
+        sigmas = initial_sigmas(problem.session, problem.observations)
+        problem = problem.with_noise_ratio(sigmas / sigmas[groups[0].entries][0])
     linear = linearise_problem(problem)
     require_determined(problem, linear.information)
     program = build_program(problem, options) if program is None else program.with_problem(problem)

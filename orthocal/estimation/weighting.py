@@ -75,17 +75,20 @@ def initial_sigma(gauge: Gauge, repeatability: tuple[float, int]) -> float:
     return assumed_sigma(gauge)
 
 
-def initial_noise_ratio(session: Session, observations: Observations) -> Array:
-    """Noise of each entry relative to the first gauge, before the first solution, (n_entries,)."""
-    groups = split_by_gauge(session, observations)
-    result = np.ones(observations.size)
-    if len(groups) < 2:
-        return result
+def initial_sigmas(session: Session, observations: Observations) -> Array:
+    """Standard deviation of each entry before the first solution, shape (n_entries,), [m].
+
+    The scatter of repeated cycles of a gauge with a stated noise is that of most of its setups, so
+    that it does not contain a mistake in one of them.
+    """
     values = observations.values(session.values)
-    for g in groups:
+    result = np.empty(observations.size)
+    for g in split_by_gauge(session, observations):
         repeatability = _repeatability(values, observations, g)
+        if g.gauge.sigma is not None and repeatability[1]:
+            repeatability = _median_repeatability(values, observations, g), repeatability[1]
         result[g.entries] = initial_sigma(g.gauge, repeatability)
-    return np.asarray(result / result[groups[0].entries][0])
+    return result
 
 
 def estimate_gauge_sigmas(
@@ -130,6 +133,20 @@ def estimate_gauge_sigmas(
 def _repeatability(values: Array, o: Observations, group: GaugeReadings) -> tuple[float, int]:
     """Scatter of the repeated cycles of a gauge, [m], and its degrees of freedom."""
     return estimate_repeatability(values[group.entries], o.only(group.entries))
+
+
+def _median_repeatability(values: Array, o: Observations, group: GaugeReadings) -> float:
+    """Median over the setups of a gauge of the scatter of repeated cycles, [m].
+
+    Squares are divided by the median of χ²/ν (Wilson and Hilferty, 1931).
+    """
+    squares = []
+    for setup in np.unique(o.setup[group.entries]):
+        entries = o.setup == setup
+        scatter, dof = estimate_repeatability(values[entries], o.only(entries))
+        if dof:
+            squares.append(scatter**2 / (1.0 - 2.0 / (9.0 * dof)) ** 3)
+    return float(np.sqrt(np.median(squares)))
 
 
 def leverages(

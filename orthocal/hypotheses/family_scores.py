@@ -32,7 +32,7 @@ SIMILAR_LOG_BAYES = 3.0
 REFIT_LOG_BAYES = 4.0
 """Smallest log Bayes factor, to first order, of hypotheses that are relinearised."""
 
-N_FAMILIES = 32.0
+N_FAMILIES = 33.0
 """Number of families that share the prior probability; each effect is as likely as a family."""
 
 MAX_REFITTED = 8
@@ -183,11 +183,7 @@ class FamilyScorer:
         )
 
     def shortlist(self, scored: Sequence[tuple[Family, Array]]) -> list[Term]:
-        """The most likely single hypotheses, and the most likely one of each kind.
-
-        Reversed signs of absolute readings are always included, except of pairs of setups. They are
-        far from the linearisation: a fixed ball is on the opposite side of its nominal position.
-        """
+        """The most likely single hypotheses, and the most likely one of each kind."""
         ranked = sorted(
             (
                 (float(evidence[h]), i, h)
@@ -205,17 +201,22 @@ class FamilyScorer:
             if evidence > 0.0 and key not in kinds:
                 kinds.add(key)
                 chosen.append(t)
-        chosen = chosen[:MAX_REFITTED]
-        present = {t.explanation for t in chosen}
+        return chosen[:MAX_REFITTED]
+
+    def far_terms(self, scored: Sequence[tuple[Family, Array]]) -> list[Term]:
+        """Reversed signs of absolute readings, except of pairs of setups.
+
+        They are far from the linearisation about the readings as stated, where a fixed ball is on
+        the opposite side of its nominal position. So their evidence to first order does not count.
+        """
         setups = self.model.problem.session.setups
         absolute = {name for name, setup in setups.items() if setup.zero == "known"}
-        return chosen + [
+        return [
             self.term(family, h)
             for family, _ in scored
             if family.log_volume is not None and absolute
             for h, e in enumerate(map(family.explain, range(family.count)))
             if e.kind == "reversed sign" and e.scope != "setups" and absolute.intersection(e.setups)
-            if e not in present
         ]
 
     def pairs(

@@ -143,6 +143,19 @@ def is_same_place(one: HypothesisSet, other: HypothesisSet) -> bool:
     return not any(_unmatched(one.terms, other.terms))
 
 
+def adds_a_setup(other: HypothesisSet, chosen: HypothesisSet) -> bool:
+    """True if another set is the chosen one with the sign of one more setup reversed."""
+    return len(other.terms) == len(chosen.terms) and all(
+        t is u
+        or (
+            t.explanation.kind == u.explanation.kind == "reversed sign"
+            and t.explanation.scope == "setups"
+            and set(t.explanation.setups) > set(u.explanation.setups) > set()
+        )
+        for t, u in zip(other.terms, chosen.terms, strict=True)
+    )
+
+
 def share_rows(one: Term, other: Term) -> bool:
     """True if two hypotheses concern a common row."""
     return bool(set(one.explanation.rows) & set(other.explanation.rows))

@@ -117,6 +117,13 @@ class Likelihood:
         """Products of dense vectors (h, n_entries), zeros projected out, [m]."""
         return Products(vectors @ self.directions.T, (vectors**2).sum(axis=1))
 
+    def misfit(self, deviation: Array) -> float:
+        """Misfit dᵀ V⁻¹ d of a deviation (n_entries,), [m], with tolerances and noise as stated."""
+        along = self.directions @ deviation
+        perpendicular = max(float(deviation @ deviation - along @ along), 0.0)
+        noise = self.sigma**2
+        return float((along**2 / (self.variances + noise)).sum()) + perpendicular / noise
+
     def estimate_amounts(self, deviation: Array, effects: Array) -> tuple[Array, Array]:
         """Generalised least-squares estimate of the amount of each effect alone, without prior.
 

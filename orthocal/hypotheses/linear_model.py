@@ -18,7 +18,7 @@ from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.linear import require_finite
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import select_parameters
-from orthocal.estimation.weighting import assumed_sigma, initial_noise_ratio
+from orthocal.estimation.weighting import assumed_sigma, initial_sigmas, split_by_gauge
 from orthocal.hypotheses.hypothesis import (
     MAX_DENSE_COLUMNS,
     MachineShift,
@@ -75,11 +75,15 @@ class LinearModel:
         free = machine_errors(session.robot) if names is None else names
         selection = select_parameters(session.robot.parameters, free=free, prior=True)
         problem = CalibrationProblem(session, selection)
-        self.problem = problem.with_noise_ratio(initial_noise_ratio(session, problem.observations))
-        o = self.problem.observations
+        o = problem.observations
+        gauges = split_by_gauge(session, o)
+        sigmas = np.full(o.size, assumed_sigma(session.gauge))
+        if len(gauges) > 1:
+            sigmas = initial_sigmas(session, o)
         self.stated = session.gauge.sigma is not None
-        self.sigma = assumed_sigma(session.gauge)
+        self.sigma = float(sigmas[gauges[0].entries][0])
         """Standard deviation of a reading of the first gauge, [m]; all entries refer to it."""
+        self.problem = problem.with_noise_ratio(sigmas / self.sigma)
         self.dof = o.size - o.n_zeros
         self.labels, self.session_of_entry = label_sessions(session, o.setup)
         self.reference = self.problem.active_theta.copy()
@@ -401,6 +405,34 @@ class LinearModel:
             entries - about.expected, effect[None]
         )
         return (math.nan if math.isinf(std) else float(rows[row] - amount)), float(std)
+
+    def compare_row(self, rows: Array, row: int) -> tuple[float, float]:
+        """Prediction of a reading, with a larger std than by `predict_row` if it is not linear.
+
+        Readings are not linear over offsets of some mm. So a reading far from its prediction may
+        show another machine that explains all readings nearly as well. In terms of the misfits to
+        all readings and to the others, std = |y_i − mean| / √(χ²_all − χ²_others). It is that of
+        `predict_row` if readings are linear.
+
+        Args:
+            rows: Readings, shape (n_rows,), [m].
+            row: Index of the reading.
+
+        Raises:
+            ClosureError: If the nominal machine cannot reach a posture.
+        """
+        mean, std = self.predict_row(rows, row)
+        deviation = abs(rows[row] - mean)
+        if not deviation > std:
+            return mean, std
+        with_mean = np.where(np.arange(rows.size) == row, mean, rows)
+        misfits = []
+        for values in (rows, with_mean):
+            (entries,) = self.entries(values[None])
+            about = self.approach(entries, np.zeros_like(entries))
+            misfits.append(about.likelihood.misfit(entries - about.expected))
+        increase = max(misfits[0] - misfits[1], 0.0)
+        return mean, max(std, deviation / max(math.sqrt(increase), 1.0))
 
     def predict_left_out(self, rows: Array) -> Array:
         """Readings of each setup minus their predictions from all other setups, (n_rows,), [m].

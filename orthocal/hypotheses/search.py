@@ -34,6 +34,7 @@ from orthocal.hypotheses.hypothesis import Family, Rows, SystematicEffect
 from orthocal.hypotheses.hypothesis_set import (
     HypothesisSet,
     Term,
+    adds_a_setup,
     distinct_terms,
     explain_with_amounts,
     find_alternatives,
@@ -85,6 +86,8 @@ def find_anomalies(session: Session) -> Anomalies:
 def find_suspected_rows(session: Session) -> tuple[int, ...]:
     """Rows of the most likely single mistakes, however weak their evidence.
 
+    A row offset counts with its first row only: the others are right but for their place.
+
     Args:
         session: Readings that contradict each other.
 
@@ -96,7 +99,8 @@ def find_suspected_rows(session: Session) -> tuple[int, ...]:
     families = list_families(search.model, Rows(session), grouped=False)
     scored = list(search.scorer.score(search.sound, families))
     least = max(float(e.max(initial=-np.inf)) for _, e in scored) - SIMILAR_LOG_BAYES
-    rows = {i for f, e in scored for h in np.flatnonzero(e > least) for i in f.explain(int(h)).rows}
+    likely = [f.explain(int(h)) for f, e in scored for h in np.flatnonzero(e > least)]
+    rows = {i for e in likely for i in (e.rows[:1] if e.kind == "row offset" else e.rows)}
     return tuple(sorted(rows))
 
 
@@ -176,7 +180,11 @@ class _Search:
         if len(state.terms) + 2 <= MAX_ANOMALIES:
             pairs, total = self.scorer.pairs(state, scored)
         best = float(log_of_sum(np.array([*totals, total]))) if totals else -np.inf
-        if best < REFIT_LOG_BAYES and not likely_effects:
+        far = self.sets.evaluate_all(
+            [(*state.terms, t) for t in self.scorer.far_terms(scored)], self.sets.reference
+        )
+        is_far_clear = any(_is_clear(s, state) for s in far)
+        if best < REFIT_LOG_BAYES and not likely_effects and not is_far_clear:
             return None, []
         scored += list(self.scorer.score(state, inconsistent_groups(rows)))
         single = self.scorer.shortlist(scored)
@@ -185,7 +193,7 @@ class _Search:
             *pairs,
             *self._drive_combinations(state, scored),
         ]
-        extended = self.sets.evaluate_all(
+        extended = far + self.sets.evaluate_all(
             [(*state.terms, *added) for added in additions], state.about
         )
         likeliest = min(extended, key=negative_log_posterior)
@@ -207,7 +215,8 @@ class _Search:
         simplest = min(near, key=lambda s: s.size)
         if is_same_place(simplest, near[0]):
             simplest = near[0]
-        return simplest, [s for s in near if s is not simplest]
+        # a setup whose sign makes no difference casts no doubt on the other one
+        return simplest, [s for s in near if s is not simplest and not adds_a_setup(s, simplest)]
 
     def _lacking(self, state: HypothesisSet) -> list[SystematicEffect]:
         """Effects of the machine that a state lacks."""

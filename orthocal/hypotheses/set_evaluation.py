@@ -48,14 +48,15 @@ class SetEvaluator:
         values: The readings, shape (n_rows,), [m].
 
     Attributes:
+        reference: The linearisation about the machine without errors.
         sound: The set without hypotheses.
     """
 
     def __init__(self, model: LinearModel, values: Array) -> None:
         self.model, self.values = model, values
         self._keep_jacobian = len(model.labels) > 1 or bool(model.compensated.any())
-        start = model.at_reference(keep_jacobian=self._keep_jacobian)
-        self.sound = self.evaluate((), start)
+        self.reference = model.at_reference(keep_jacobian=self._keep_jacobian)
+        self.sound = self.evaluate((), self.reference)
 
     def evaluate(self, terms: Sequence[Term], start: ModelLinearisation) -> HypothesisSet:
         """Score a set of hypotheses, relinearised as in `evaluate_all`."""

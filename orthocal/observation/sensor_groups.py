@@ -15,7 +15,8 @@ from orthocal.sensors.protocol import NuisanceParameter
 from orthocal.session.session import Session, Setup, split_label
 
 OF_GAUGE = "gauge."
-"""Beginning of the names of parameters of a gauge, which all its setups and sessions share."""
+"""Beginning of the names of parameters of a gauge, which all its setups share, and all sessions
+that state the same nominal value."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,26 +71,42 @@ def nuisance_parameters(session: Session) -> NuisanceParameters:
 
 
 def nominal_values(session: Session) -> dict[str, float]:
-    """Nuisance parameter to the nominal value of its quantity, [unit], if that is not 0.
-
-    A parameter whose setups state different values has none.
-    """
-    values: dict[str, set[float]] = {}
-    for setup in session.setups.values():
-        for p in setup.sensor.nuisance_parameters:
-            values.setdefault(f"{_owner(p, setup, session)}.{p.name}", set()).add(p.nominal)
-    return {name: v for name, (v, *others) in values.items() if v and not others}
+    """Nuisance parameter to the nominal value of its quantity, [unit], if that is not 0."""
+    return {
+        f"{_owner(p, setup, session)}.{p.name}": p.nominal
+        for setup in session.setups.values()
+        for p in setup.sensor.nuisance_parameters
+        if p.nominal
+    }
 
 
 def _owner(parameter: NuisanceParameter, setup: Setup, session: Session) -> str:
     """Owner of a nuisance parameter: a gauge, an object that setups share, or the setup."""
     if parameter.of_gauge:
-        _, gauge = split_label(setup.gauge, joined=session.joined)
+        gauge = _shared_gauge(parameter, setup, session)
         return f"gauge.{gauge}" if gauge else "gauge"
     if parameter.shared_by is not None:
         label, _ = split_label(setup.name, joined=session.joined)
         return f"{label}/{parameter.shared_by}" if label else parameter.shared_by
     return f"setup.{setup.name}"
+
+
+def _shared_gauge(parameter: NuisanceParameter, setup: Setup, session: Session) -> str:
+    """Gauge that owns a parameter of a gauge.
+
+    Joined sessions share it if they state the same nominal value, such as the length of a bar.
+    The sessions with another value than the first one have a gauge with the label of theirs.
+    """
+    _, gauge = split_label(setup.gauge, joined=session.joined)
+    if not session.joined:
+        return gauge
+    owner_of_value: dict[float, str] = {}
+    for other in session.setups.values():
+        if split_label(other.gauge, joined=True)[1] == gauge:
+            for p in other.sensor.nuisance_parameters:
+                if p.of_gauge and p.name == parameter.name:
+                    owner_of_value.setdefault(p.nominal, other.gauge if owner_of_value else gauge)
+    return owner_of_value[parameter.nominal]
 
 
 def group_sensors(session: Session, observations: Observations) -> tuple[SensorGroup, ...]:

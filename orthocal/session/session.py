@@ -283,8 +283,9 @@ class Session:
 
     @property
     def gauge(self) -> Gauge:
-        """The first gauge. The noise of other gauges is stated relative to it."""
-        return next(iter(self.gauges.values()))
+        """The first gauge with readings. The noise of other gauges is stated relative to it."""
+        used = {self.setups[r.setup].gauge for r in self.readings}
+        return ([g for n, g in self.gauges.items() if n in used] or [*self.gauges.values()])[0]
 
     def with_gauge(self, gauge: Gauge) -> Session:
         """Session with one gauge for all setups."""

@@ -35,11 +35,14 @@ def test_every_kind_has_a_sentence(root, kind):
     assert len(_text(session, explanation).split()) > 3
 
 
-def test_an_effect_among_several_explanations_is_tried_first(root):
-    """To calibrate with it costs no reading."""
+def test_an_action_that_costs_no_reading_comes_first(root):
+    """Calibrate with an effect; reverse signs of setups."""
     session = load_session(root / "examples/raw-cycles")
-    setup = next(iter(session.setups))
-    sign = Explanation("reversed sign", "reading", rows=(3,), setups=(setup,), factor=-1.0)
+    sign = Explanation("reversed sign", "reading", rows=(3,), factor=-1.0)
+    setup, other = (
+        Explanation("reversed sign", "setup", rows=(row,), setups=(name,), factor=-1.0)
+        for row, name in zip((0, 9), session.setups, strict=False)
+    )
     backlash = Explanation(
         "backlash",
         "reading",
@@ -50,8 +53,12 @@ def test_an_effect_among_several_explanations_is_tried_first(root):
         stds=(4e-6,),
         units=("m",),
     )
-    for others, first in ((backlash,), "Calibrate with `--effects backlash`."), ((sign,), "Read "):
-        anomaly = Anomaly(sign, 9.0, None, alternatives=others)
+    for explanation, alternative, first in (
+        (sign, backlash, "Calibrate with `--effects backlash`."),
+        (sign, setup, "Read "),
+        (setup, other, "Look at the mounting of the gauge. If a minus sign was forgotten, reverse"),
+    ):
+        anomaly = Anomaly(explanation, 9.0, None, alternatives=(alternative,))
         (finding,) = describe_anomalies(
             session, Anomalies((anomaly,), 9.0, True, 1e-4, 1e-5, 1.0, 1.0)
         )

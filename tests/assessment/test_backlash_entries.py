@@ -138,8 +138,11 @@ def test_the_tool_error_is_that_with_the_entered_backlash(calibration):
     assert tool.without_backlash > 1.1 * tool.entered
 
 
-def test_an_undetermined_backlash_is_entered_if_that_lowers_the_tool_error(calibration):
-    """Its uncertainty is its value; it must change the tool by a third of the remaining error."""
+def test_a_backlash_is_entered_if_that_lowers_the_tool_error(calibration):
+    """It must change the tool by a third of the remaining error.
+
+    Its uncertainty is its value, or 0.
+    """
     tool = find_tool(calibration)
     index = next(i for i, p in enumerate(calibration.parameters) if p.name == "x_slide.backlash")
     p = calibration.parameters[index]
@@ -158,6 +161,16 @@ def test_an_undetermined_backlash_is_entered_if_that_lowers_the_tool_error(calib
         (x, *_) = compute_backlash(vague_at, tool)
         assert x.identified < expanded_uncertainty(vague_at, x)
         assert (x.enter == value) is entered
+        sure = replace(vague, std=0.0, std_scatter=0.0, std_scaled=0.0)
+        unmodelled = calibration.unmodelled
+        sure_at = replace(
+            vague_at,
+            unmodelled=replace(unmodelled, leakage=0.0 * unmodelled.leakage),
+            parameters=tuple(sure if q is p else q for q in calibration.parameters),
+        )
+        (x, *_) = compute_backlash(sure_at, tool)
+        assert x.identified > expanded_uncertainty(sure_at, x)
+        assert (x.enter == value) is entered
 
 
 def test_backlash_that_the_controller_compensates_stays(plan, calibration):
@@ -171,7 +184,9 @@ def test_backlash_that_the_controller_compensates_stays(plan, calibration):
     assert found.keeps_offsets
     assert not any(e.change for e in found.backlash)
     assert found.tool.without_backlash is None
-    assert not is_worth_changing(second, find_tool(second), found.backlash)
+    assert not is_worth_changing(second, found.backlash, None, None)
+    assert not is_worth_changing(second, found.backlash, 1.0, 0.96)
+    assert is_worth_changing(second, found.backlash, 1.0, 0.94)
     text = to_text(render_answer(second, saved=Path("out")))
     assert text.count(" stays ") == 2
     assert "Next: nothing to enter" in text or "Next: correct" in text

@@ -73,7 +73,7 @@ def test_an_effect_whose_values_are_entered_is_recommended():
     found = compare_effects(session)
     assert found.best.log_evidence < STRONG
     assert (found.recommended, found.shown) == (("backlash",), ())
-    entries = calibrate(session, "offsets", solver="variable-projection").assessment.backlash
+    entries = calibrate(session, "full", solver="variable-projection").assessment.backlash
     assert [bool(e.change) for e in entries] == [False, True, False]
 
 

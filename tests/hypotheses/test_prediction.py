@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from calibrated import plan_of, session_of
 
+from orthocal import draw_errors, simulate_session
 from orthocal.estimation.diagnostics.unmodelled import machine_errors
 from orthocal.estimation.problem import build_problem
 from orthocal.hypotheses.linear_model import CONVERGED_CHANGE, MAX_STEPS, LinearModel
@@ -108,9 +109,23 @@ def test_repeated_readings_predict_their_mean():
     plan = plan_of("raw-cycles")
     rows = [r for r in plan.readings if (r.setup, r.posture) == ("yx", "x_max")]
     session = plan.select(rows).with_values(np.array([0.1, 0.12, 0.7]) * MM)
-    mean, std = LinearModel(session).predict_row(session.values, 2)
-    assert mean == pytest.approx(0.11 * MM, abs=1e-12)
-    assert std == pytest.approx(np.hypot(0.01, 0.01 / np.sqrt(12.0)) * MM * np.sqrt(1.5))
+    for predict in (LinearModel(session).predict_row, LinearModel(session).compare_row):
+        mean, std = predict(session.values, 2)
+        assert mean == pytest.approx(0.11 * MM, abs=1e-12)
+        assert std == pytest.approx(np.hypot(0.01, 0.01 / np.sqrt(12.0)) * MM * np.sqrt(1.5))
+
+
+def test_a_reading_that_shows_another_offset_does_not_contradict_the_others():
+    """The offset of slide z changes the first setup to second order: its sign is unknown."""
+    plan = plan_of("workshop")
+    errors = draw_errors(plan.robot, machine_errors(plan.robot), seed=34)
+    session = part(simulate_session(plan, errors, seed=34).session, 5)
+    model, value = LinearModel(session), session.values[4]
+    mean, std = model.predict_row(session.values, 4)
+    assert abs(value - mean) > 10.0 * std
+    same, larger = model.compare_row(session.values, 4)
+    assert same == mean
+    assert abs(value - mean) < 3.0 * larger
 
 
 def test_the_first_reading_of_a_setup_has_no_prediction():

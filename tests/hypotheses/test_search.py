@@ -165,6 +165,7 @@ NAMED = [
     *("all in um", "leg ten times", "reading a tenth", "sign of two setups"),
     *("sign of a posture, all cycles", "neighbouring rows exchanged", "legs exchanged"),
     *("step missed in the middle", "dial stuck for 3", "misread by 1 mm", "two slips"),
+    *("step missed, all later setups", "step doubled, all later setups"),
 ]
 """Mistakes of all kinds that two cycles show clearly."""
 

@@ -309,6 +309,45 @@ def test_readings_are_compared_with_the_noise_of_their_gauge(raw_cycles):
         assert not any(row in a.explanation.rows for a in found)
 
 
+@pytest.fixture(scope="module")
+def days(raw_cycles):
+    """Two sessions of one machine, with a closing reading of each setup."""
+    rows = [r for r in raw_cycles.readings if r.cycle == 1 or (r.cycle, r.posture) == (2, "zero")]
+    plan = raw_cycles.select(rows)
+    errors = draw_errors(raw_cycles.robot, machine_errors(raw_cycles.robot), seed=4)
+    return [simulate_session(plan, errors, seed=seed).session for seed in (4, 5)]
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_displaced_gauge_is_named_beside_another_session(days, order):
+    """The closing reading that differs does not count as noise. A drift may look the same."""
+    values = days[0].values
+    rows = [i for i, r in enumerate(days[0].readings) if r.setup == "xy"][-2:]
+    values[rows] += 0.3e-3
+    sessions = [days[0].with_values(values), days[1]]
+    (found,) = find_anomalies(join_sessions([sessions[i] for i in order])).found
+    e = found.explanation
+    assert (e.kind, {a.kind for a in found.alternatives}) == ("displaced gauge", {"drift"})
+    assert [i % len(values) for i in e.rows] == rows
+    assert e.amount == pytest.approx(0.3e-3, abs=0.05e-3)
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_gauge_with_more_noise_than_stated_is_no_change_of_the_machine(days, order):
+    values = days[0].values
+    values += 5.0 * days[0].gauge.sigma * np.random.default_rng(1).normal(size=values.size)
+    sessions = [days[0].with_values(values), days[1]]
+    found = find_anomalies(join_sessions([sessions[i] for i in order]))
+    assert (found.found, found.explained) == ((), True)
+
+
+def test_a_gauge_without_readings_is_not_that_of_the_readings(days):
+    gauges = {"fine": replace(days[0].gauge, sigma=1e-7, resolution=None), **days[0].gauges}
+    session = replace(days[0], gauges=gauges)
+    assert session.gauge == days[0].gauge
+    assert LinearModel(session).sigma == LinearModel(days[0]).sigma
+
+
 @pytest.mark.slow
 def test_memory_is_linear_in_the_readings(raw_cycles):
     """All families consider all readings of a setup."""

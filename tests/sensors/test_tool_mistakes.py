@@ -13,7 +13,7 @@ from orthocal import draw_errors, simulate_session
 from orthocal.assessment.judgement import judge_session
 from orthocal.measurement.joining import join_sessions
 from orthocal.observation.model import predict_readings
-from orthocal.observation.sensor_groups import nuisance_parameters
+from orthocal.observation.sensor_groups import nominal_values, nuisance_parameters
 
 SQUARE = "kind: square, name: granite, square_tolerance_mrad: 1, straight_tolerance_mm: 0.002"
 BLOCK = "kind: gauge_block, height_mm: 50, height_tolerance_mm: 0.0005, table_mm: -25"
@@ -90,6 +90,24 @@ def test_a_bar_with_all_signs_reversed_is_named(tmp_path):
     (found,) = warnings_of(session.with_values(np.where(of_bar, -1.0, 1.0) * session.values))
     assert found.kind == "reversed sign"
     assert {p.setup for p in found.places} == {"xy", "yz", "zx"}
+
+
+@pytest.mark.parametrize("seed", [3, 31])
+def test_a_later_bar_with_all_signs_reversed_is_named(tmp_path, seed):
+    """To first order about the readings as stated, the reversed sign has no evidence."""
+    plan = circles(tmp_path, length="0", legs=True)
+    first = plan.select([r for r in plan.readings if r.setup.startswith("leg")])
+    later = plan.select([r for r in plan.readings if r.posture in {f"xy_{k}" for k in EVEN}])
+    errors = errors_of(plan, seed)
+    legs = simulate_session(first, errors, seed=seed).session
+    bar = simulate_session(later, errors, seed=seed + 50).session
+    assert not warnings_of(join_sessions([legs, bar]))
+    (found,) = warnings_of(join_sessions([legs, bar.with_values(-bar.values)]))
+    assert found.kind == "reversed sign"
+    assert [p.setup for p in found.places] == ["session-2/xy"]
+
+
+EVEN = (0, 2, 4, 6, 8, 10, 12, 14)
 
 
 @pytest.mark.parametrize(("first", "size"), [("yz", 50e-6), ("zx", 0.3e-3)])
@@ -189,16 +207,27 @@ def test_a_bar_that_was_zeroed_on_the_machine_is_named(tmp_path, wrong):
     assert warnings_of(replace(session, setups=free)) == []
 
 
-def two_sessions(folder, seed, *, change, renamed=False):
-    """Three circles of one bar on two days; before the second one it was readjusted, [m]."""
+def two_sessions(folder, seed, *, change, stated=None):
+    """Three circles of one bar on two days; before the second one it was readjusted.
+
+    Args:
+        folder: Of the plan.
+        seed: Of the machine.
+        change: Change of the length, [m].
+        stated: What the second session states: another `name` of the gauge, or `length`.
+    """
     plan = circles(folder)
     errors = errors_of(plan, seed)
     first = simulate_session(plan, errors, seed=seed)
     bar = {n: v for n, v in first.nuisance.items() if n.startswith("gauge.")}
     second = simulate_session(plan, {**errors, **bar}, seed=seed + 100).session
-    if renamed:
-        setups = {n: replace(s, gauge="other") for n, s in second.setups.items()}
+    setups = second.setups
+    if stated == "name":
+        setups = {n: replace(s, gauge="other") for n, s in setups.items()}
         second = replace(second, gauges={"other": second.gauge}, setups=setups)
+    if stated == "length":
+        bars = {n: replace(s.sensor, length=s.sensor.length + 0.5e-3) for n, s in setups.items()}
+        second = replace(second, setups={n: replace(setups[n], sensor=b) for n, b in bars.items()})
     return join_sessions([first.session, second.with_values(np.array(second.values) - change)])
 
 
@@ -217,6 +246,23 @@ def test_sessions_with_one_bar_are_not_accused(tmp_path, seed):
     assert warnings_of(two_sessions(tmp_path, seed, change=0.0)) == []
 
 
-def test_a_bar_of_another_name_has_another_length(tmp_path):
-    """The remedy that the finding states."""
-    assert warnings_of(two_sessions(tmp_path, 1, change=-0.3e-3, renamed=True)) == []
+@pytest.mark.parametrize("stated", ["name", "length"])
+def test_a_bar_of_another_name_or_stated_length_has_another_length(tmp_path, stated):
+    """The remedy that the finding states. Both sessions have one scale if the name is the same."""
+    session = two_sessions(tmp_path, 1, change=-0.3e-3, stated=stated)
+    assert warnings_of(session) == []
+    names = {p.name for p in nuisance_parameters(session).parameters if "gauge" in p.name}
+    assert (
+        names
+        == {"gauge.bar.length", "gauge.bar.scale"}
+        | {
+            "name": {"gauge.other.length", "gauge.other.scale"},
+            "length": {"gauge.session-2/bar.length"},
+        }[stated]
+    )
+    values = nominal_values(session)
+    later = {"name": "other", "length": "session-2/bar"}[stated]
+    assert values["gauge.bar.length"] == pytest.approx(50e-3)
+    assert values[f"gauge.{later}.length"] == pytest.approx(
+        50.5e-3 if stated == "length" else 50e-3
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 
 from orthocal.assessment.wording import (
     joined,
@@ -129,6 +130,11 @@ def _ambiguous(session: Session, result: Anomalies, anomaly: Anomaly) -> Finding
     texts = dict.fromkeys(f"  {_lines(session, e)}{_text(session, e)}" for e in explanations)
     listed = ";\n".join(texts)
     action = _repeat(session, *explanations)
+    if all(e.kind == "reversed sign" and e.setups for e in explanations):  # nothing to read again
+        action = _remedy(
+            session,
+            replace(explanations[0], setups=tuple(n for e in explanations for n in e.setups)),
+        )
     if any(e.amounts for e in explanations):  # costs no reading
         effect = _effect_remedy(session, explanations)
         repeat = uncapitalised(action)
@@ -462,14 +468,12 @@ def _displaced(session: Session, e: Explanation) -> str:
 def _offset(session: Session, e: Explanation) -> str:
     """Clause about readings that were written into a wrong row."""
     first = _row(session, e.rows[0])
+    of_setup = f" of setup {e.names[0]}" if e.scope == "setup" else ""
     if e.missing:
-        return (
-            f"{first} was not read, and all later readings of setup {e.names[0]} are one line "
-            "too early"
-        )
+        return f"{first} was not read, and all later readings{of_setup} are one line too early"
     return (
-        f"the reading before {first} was written twice, and all later readings of setup "
-        f"{e.names[0]} are one line too late"
+        f"the reading before {first} was written twice, and all later readings{of_setup} are one "
+        "line too late"
     )
 
 

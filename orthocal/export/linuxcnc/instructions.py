@@ -231,7 +231,7 @@ def _describe_conditions(approximation: Approximation) -> str:
 
 
 def _describe_undetermined(calibration: Calibration) -> str:
-    """Paragraph about drives whose change of backlash is not determined; empty without any."""
+    """Paragraph about drives whose backlash does not change; empty without any."""
     return _describe_unchanged(
         calibration,
         "Backlash",
@@ -244,7 +244,7 @@ def _describe_undetermined(calibration: Calibration) -> str:
 
 
 def _describe_undetermined_screws(calibration: Calibration) -> str:
-    """Paragraph about periodic errors that are undetermined and not in the tables; may be empty."""
+    """Paragraph about periodic errors that are not in the tables; empty without any."""
     screws = [e for e in find_screws(calibration) if not e.change.any()]
     return _describe_unchanged(
         calibration, "Periodic error of the screw", [(e.drive, e.uncertainty) for e in screws]
@@ -270,7 +270,10 @@ def _describe_unchanged(
     if not texts:
         return ""
     listed = ", ".join(texts)
-    return f"\n**{quantity} unchanged, because its change is not determined:** {listed}.\n"
+    return (
+        f"\n**{quantity} unchanged, because its change is not determined or hardly lowers the tool "
+        f"error:** {listed}.\n"
+    )
 
 
 def write_home_page(calibration: Calibration, homes: Sequence[JointHome], *, stated: bool) -> str:

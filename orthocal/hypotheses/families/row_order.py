@@ -161,7 +161,7 @@ def _backwards(rows: Rows) -> list[Explanation]:
 
 
 class _Offsets(NamedTuple):
-    """Row offsets of one kind in a setup or cycle."""
+    """Row offsets of one kind in a setup, a cycle or a session."""
 
     rows: Indices
     """Rows in the order of measuring, shape (m,)."""
@@ -180,7 +180,7 @@ class _Offsets(NamedTuple):
 
 
 def row_offsets(rows: Rows) -> Iterator[Family]:
-    """A reading skipped or written twice, in a setup or in one of its cycles.
+    """A reading skipped or written twice: in a setup or one of its cycles, and beyond a setup.
 
     If a reading was skipped, the last row contains the reading of the first wrong row, or another
     one. If a reading was written twice, the last one is lost. The lost reading has an unknown
@@ -188,15 +188,42 @@ def row_offsets(rows: Rows) -> Iterator[Family]:
     """
     dials = rows.written & ~rows.paired
     setups = {n: i for n, i in rows.setups.items() if dials[i].all()}
-    segments = [indices for indices in setups.values() if indices.size >= MIN_ROWS]
+    segments = [*setups.values()]
     segments += [
         indices
         for (name, _), indices in rows.cycles.items()
-        if name in setups and MIN_ROWS <= indices.size < setups[name].size
+        if name in setups and indices.size < setups[name].size
     ]
-    if not segments:
+    yield from _row_offsets(rows, "setup", [(i, i.size - 1) for i in segments])
+    label = dict(zip(rows.session.setups, rows.session.labels, strict=True))
+    sessions = group_rows(label[r.setup] for r in rows.session.readings)
+    read = [i[dials[i]] for i in sessions.values()]
+    # an offset that begins in the last setup is one of that setup
+    last = [[rows.session.readings[k].setup for k in i] for i in read]
+    yield from _row_offsets(
+        rows, "session", [(i, s.index(s[-1])) for i, s in zip(read, last, strict=True) if s]
+    )
+
+
+def _row_offsets(
+    rows: Rows, scope: Scope, segments: Sequence[tuple[Indices, int]]
+) -> Iterator[Family]:
+    """Family of the row offsets of some segments; none if all segments are short.
+
+    Args:
+        rows: The rows.
+        scope: Scope of the offsets.
+        segments: Rows in the order of measuring, and the number of rows in which an offset may
+            begin.
+    """
+    offsets = [
+        _offsets(i, rows.values[i], begins, missing=missing)
+        for i, begins in segments
+        if i.size >= MIN_ROWS and begins
+        for missing in (True, False)
+    ]
+    if not offsets:
         return
-    offsets = [_offsets(i, rows.values[i], missing=m) for i in segments for m in (True, False)]
     sizes = [o.position.size for o in offsets]
     group = np.repeat(np.arange(len(offsets)), sizes)
     position, start, corrected, correction, lost = (
@@ -208,7 +235,7 @@ def row_offsets(rows: Rows) -> Iterator[Family]:
         cycles = {rows.session.readings[i].cycle for i in indices}
         return Explanation(
             "row offset",
-            "setup",
+            scope,
             tuple(indices.tolist()),
             names=(rows.session.readings[indices[0]].setup,),
             cycle=cycles.pop() if len(cycles) == 1 else None,
@@ -223,9 +250,16 @@ def row_offsets(rows: Rows) -> Iterator[Family]:
     yield Family(explain, count, count, edits, effects)
 
 
-def _offsets(indices: Indices, values: Array, *, missing: bool) -> _Offsets:
-    """Row offsets of one kind in some rows, one per row in which it may begin."""
-    k = np.arange(0 if missing else 1, indices.size - 1)
+def _offsets(indices: Indices, values: Array, begins: int, *, missing: bool) -> _Offsets:
+    """Row offsets of one kind in some rows, one per row in which it may begin.
+
+    Args:
+        indices: The rows, shape (m,).
+        values: Their readings, shape (m,), [m].
+        begins: Number of first rows that may be skipped, or written twice.
+        missing: Whether a reading was skipped, not written twice.
+    """
+    k = np.arange(begins) if missing else np.arange(1, min(begins + 1, indices.size - 1))
     if missing:  # rows after k get the reading of the row before, row k gets the last one
         base = np.append(0.0, values[:-1] - values[1:])
         return _Offsets(indices, base, k, k + 1, indices[k], values[-1] - values[k], indices[k])

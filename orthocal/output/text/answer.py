@@ -408,15 +408,17 @@ def render_values(calibration: Calibration) -> RenderableType:
 def render_backlash(calibration: Calibration) -> RenderableType:
     """Backlash for the controller to take up, drive by drive; a line if there is none to enter."""
     entries = assessment_of(calibration).backlash
-    rows, halves = [], []
+    rows, halves, known = [], [], False
     for e in entries:
-        factor = e.edge_factor
-        half = plain(expanded_uncertainty(calibration, e) * factor)
-        unchanged = "stays" if e.active else "not determined"
+        factor, uncertainty = e.edge_factor, expanded_uncertainty(calibration, e)
+        half = plain(uncertainty * factor)
+        is_known = e.active > 0.0 or e.identified > uncertainty
+        known |= is_known or bool(e.change)
+        unchanged = "stays" if is_known else "not determined"
         enter = plain(e.enter * factor) if e.change else unchanged
         rows.append((e.drive, plain(e.active * factor), enter, half, e.edge_unit))
         halves.append(f"±{half} {e.edge_unit}")
-    if not any(e.change or e.active for e in entries):
+    if not known:
         return Text(f"Backlash: not determined ({max(halves)}).")
     return table_of(("backlash", "now", "new", "±", "unit"), rows)
 
