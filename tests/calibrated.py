@@ -9,10 +9,15 @@ from conftest import ROOT
 from folders import session_folder
 
 from orthocal import calibrate, draw_scene, load_plan, load_session
+from orthocal.assessment.judgement import Judgement
 from orthocal.calibration.identify import identify
+from orthocal.estimation.tolerance_scale import AS_STATED
 from orthocal.output.report.page import build_report
 
 EXPERIMENT_2 = "table1/experiment-2"
+
+UNJUDGED = {"solver": "variable-projection", "judgement": Judgement((), AS_STATED)}
+"""Options of a calibration whose readings are taken as sound: half of the time of a judged one."""
 
 
 @cache
