@@ -343,7 +343,7 @@ def test_notes_never_change_the_verdict(kind, cycles, table1):
 
 def test_an_offset_at_a_bound_is_to_be_reviewed(cycles):
     bounds = {"x_slide.offset_m": (-1e-3, 0.5e-3)}
-    found = calibrate(cycles, Choice("offsets", bounds=bounds), **QUICK).assessment
+    found = calibrate(cycles, Choice("offsets", bounds=bounds), **UNJUDGED).assessment
     (held,) = found.of_kind("held by a bound")
     assert held.numbers == {"value_mm": pytest.approx(0.5)}
     assert found.decision.verdict == "review"
@@ -374,7 +374,7 @@ def test_the_tool_error_is_that_of_the_accuracy():
 
 def test_a_robot_without_a_tool_is_out_of_reach(table1):
     bare = replace(table1["2"], robot=replace(table1["2"].robot, tcp=None))
-    found = calibrate(bare, **QUICK).assessment
+    found = calibrate(bare, **UNJUDGED).assessment
     assert found.decision.verdict == "enter"
     assert found.of_kind("out of reach")
     assert found.tool is None

@@ -295,7 +295,7 @@ def test_a_change_that_keeps_the_offsets_is_found_by_validation_alone(plan):
     session = simulate_session(entered, turned, seed=5).session
     result = validate_calibration(calibration, session)
     assert result.nothing_to_change
-    assert calibrate(session, **QUICK).assessment.keeps_offsets
+    assert calibrate(session, **UNJUDGED).assessment.keeps_offsets
     assert result.confirmed is False
     assert result.mistake.explanation.parameters == ("x_slide.rz",)
     assert result.assessment.of_kind("machine changed")

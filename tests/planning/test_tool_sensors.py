@@ -10,13 +10,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bounds import rms_band
+from calibrated import identified
 from commands import run_orthocal
 from machines import frames
 from planned import FEW, QUICK, entered
 from tolerances import SAME_OPTIMUM
 
 from orthocal import (
-    calibrate,
     load_plan,
     load_robot,
     plan_readings,
@@ -258,7 +258,7 @@ def test_a_plan_for_a_printer_is_measured_and_calibrated(for_printer):
     offsets = {"*.offset_mm": 1.0}
     errors = draw_errors(forecast.robot, forecast.names, seed=3, tolerances=offsets)
     readings = simulate_session(for_printer.session, errors, seed=3).session
-    calibration = calibrate(readings, solver="variable-projection")
+    calibration = identified(readings)
     remaining = np.array([calibration[n].value - errors[n] for n in forecast.names])
     assert tool_rms(forecast, remaining) < 2.0 * for_printer.expected.reported.rms
 
