@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibrated import UNJUDGED
+from calibrated import SOUND, UNJUDGED
 from effect_plans import effect_plan
 
 from orthocal import (
@@ -46,7 +46,6 @@ TRUTH = {
 """Drive z has no backlash."""
 
 NOISE = 6e-6
-SOUND = UNJUDGED["judgement"]
 
 
 @pytest.fixture(scope="module")

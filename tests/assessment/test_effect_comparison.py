@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibrated import UNJUDGED, session_of
+from calibrated import SOUND, UNJUDGED, session_of
 from effect_plans import ALL, FEW, effect_plan
 from slack import Slack
 
@@ -140,7 +140,7 @@ def test_a_comparison_of_models_recommends_the_effect(session):
         session.with_effects(["backlash"]),
         models=["offsets"],
         options=QUICK,
-        judgement=UNJUDGED["judgement"],
+        judgement=SOUND,
     )
     (note,) = found.assessment.of_kind("effects recommended")
     assert note.action == ""

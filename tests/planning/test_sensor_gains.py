@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from functools import cache
+from unittest.mock import patch
 
 import pytest
 from calibrated import UNJUDGED
@@ -14,6 +15,7 @@ from orthocal import calibrate, plan_readings, simulate_session, summarize
 from orthocal.output.report import page
 from orthocal.output.text import accuracy
 from orthocal.planning import plan as planning
+from orthocal.planning import tool_candidates
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.owned_sensors import load_owned_sensor
 from orthocal.planning.sensor_gains import find_sensor_gains
@@ -24,6 +26,13 @@ resolution_mm: 0.001
 length_mm: 50
 length_tolerance_mm: unknown
 """
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_balls():
+    """Five positions of a fixed ball, in place of eleven."""
+    with patch.object(tool_candidates, "BALLS", tool_candidates.BALLS[:5]):
+        yield
 
 
 @cache

@@ -5,7 +5,9 @@ from __future__ import annotations
 import itertools
 import json
 import re
+from contextlib import contextmanager
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -72,6 +74,13 @@ TRACKER = "sensor: points\nsigma_mm: 0.01\ntarget_mm: [0, 0, -40]\n"
 CORRELATED = "covariance_um2: [[90, 40, 0], [40, 60, 0], [0, 0, 400]]\n"
 
 
+@contextmanager
+def few_balls(count):
+    """Some of the positions of a fixed ball."""
+    with patch.object(tool_candidates, "BALLS", tool_candidates.BALLS[:count]):
+        yield
+
+
 @pytest.fixture(scope="module")
 def owned(tmp_path_factory):
     """Sensors of files with these names and texts."""
@@ -90,8 +99,9 @@ def owned(tmp_path_factory):
 def planned(owned):
     """Plan of two hours with a dial at the legs, a bar, a square and a plate."""
     sensors = owned(bar=BAR, square=SQUARE, plate=PLATE)
-    equipment = Equipment(owned=sensors, **QUICK)
-    return plan_readings(entered("orthoglide"), hours=2.0, equipment=equipment, starts=1)
+    equipment = Equipment(owned=sensors, **FEW)
+    with few_balls(7):
+        return plan_readings(entered("orthoglide"), hours=2.0, equipment=equipment, starts=1)
 
 
 def test_every_candidate_posture_touches_its_artefact(owned, orthoglide):
@@ -229,7 +239,8 @@ def test_a_wrong_file_is_refused_by_its_key(owned, text, place):
 def for_printer(owned):
     """Plan of an hour for a linear delta with a bar and a probe."""
     equipment = Equipment(owned=owned(bar=BAR, probe=PROBE), **FEW)
-    return plan_readings(load_robot("linear_delta"), hours=1.0, equipment=equipment, starts=1)
+    with few_balls(3):
+        return plan_readings(load_robot("linear_delta"), hours=1.0, equipment=equipment, starts=1)
 
 
 def test_postures_of_sensors_at_the_tool_stay_above_the_bed(for_printer):
@@ -374,7 +385,8 @@ def test_the_range_of_a_bar_holds_the_tolerances_of_length_place_and_offsets(
 def test_a_sensor_with_too_short_a_range_is_named(owned):
     robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 0.4})
     short = owned(bar=BAR.replace("[-25, 25]", "[-2, 2]"))
-    plan = plan_readings(robot, hours=0.3, equipment=Equipment(owned=short, **FEW), starts=1)
+    with few_balls(1):
+        plan = plan_readings(robot, hours=0.3, equipment=Equipment(owned=short, **FEW), starts=1)
     assert {s.gauge for s in plan.session.setups.values()} == {"dial"}
     assert json.loads(plan_json(plan))["unusable_mm"]["bar"] == pytest.approx(4.3, abs=0.1)
     assert "Not in the plan: bar." in summarize(plan)
