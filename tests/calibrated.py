@@ -9,10 +9,18 @@ from conftest import ROOT
 from folders import session_folder
 
 from orthocal import calibrate, draw_scene, load_plan, load_session
+from orthocal.assessment.judgement import Judgement
 from orthocal.calibration.identify import identify
+from orthocal.estimation.tolerance_scale import AS_STATED
 from orthocal.output.report.page import build_report
 
 EXPERIMENT_2 = "table1/experiment-2"
+
+SOUND = Judgement((), AS_STATED)
+"""Judgement of readings without anomalies, of a machine within its tolerances."""
+
+UNJUDGED = {"solver": "variable-projection", "judgement": SOUND}
+"""Options of a calibration whose readings are assumed sound; a judged one needs twice the time."""
 
 
 @cache

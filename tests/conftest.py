@@ -18,6 +18,7 @@ import pytest
 # other's way
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from gauges import exact
+from planned import FEW
 
 import orthocal
 from orthocal import load_plan, load_robot, load_session
@@ -150,9 +151,12 @@ def no_sensor_gains():
 
 
 @pytest.fixture(scope="module")
-def single_start():
-    """Plans of `orthocal new` from one start of the search, which tests/planning verify."""
-    with patch.object(orthocal, "plan_readings", partial(orthocal.plan_readings, starts=1)):
+def quick_plans():
+    """Plans of `orthocal new` with few candidates and one start; tests/planning verify plans."""
+    with (
+        patch.object(orthocal, "Equipment", partial(orthocal.Equipment, **FEW)),
+        patch.object(orthocal, "plan_readings", partial(orthocal.plan_readings, starts=1)),
+    ):
         yield
 
 

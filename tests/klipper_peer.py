@@ -20,11 +20,11 @@ ENOUGH = 1e-5
 MOST_ROUNDS = 10_000
 
 
-def descend(cost, start):
-    """Coordinate descent from a start; the values, and the number of rounds."""
+def descend(cost, start, most):
+    """Coordinate descent from a start in at most so many rounds; the values, and their number."""
     values, steps = np.array(start), np.ones(len(start))
     least, rounds = cost(values), 0
-    while steps.sum() > ENOUGH and rounds < MOST_ROUNDS:
+    while steps.sum() > ENOUGH and rounds < most:
         rounds += 1
         for k in range(len(values)):
             for sign in (1.0, -1.0):
@@ -40,7 +40,7 @@ def descend(cost, start):
     return values, rounds
 
 
-def calibrate_as_klipper(settings, travel, trigger, *, extended=False):
+def calibrate_as_klipper(settings, travel, trigger, *, extended=False, most=MOST_ROUNDS):
     """New settings from the travel below the endstops at the triggers.
 
     Args:
@@ -48,6 +48,7 @@ def calibrate_as_klipper(settings, travel, trigger, *, extended=False):
         travel: Shape (K, 3), [mm].
         trigger: Height of the nozzle at the trigger, [mm].
         extended: Whether the rods are free.
+        most: Largest number of rounds.
     """
 
     def unpack(values):
@@ -65,7 +66,7 @@ def calibrate_as_klipper(settings, travel, trigger, *, extended=False):
 
     start = [settings.radius, *settings.angles[:2], *settings.endstops]
     start += list(settings.rods) if extended else []
-    values, rounds = descend(cost, start)
+    values, rounds = descend(cost, start, most)
     return unpack(values), rounds
 
 

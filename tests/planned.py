@@ -22,4 +22,4 @@ def entered(robot):
 @cache
 def quick_plan(robot="orthoglide"):
     """Plan with a dial at the legs of a packaged robot."""
-    return plan_readings(entered(robot), equipment=Equipment(**QUICK), starts=1)
+    return plan_readings(entered(robot), equipment=Equipment(**FEW), starts=1)

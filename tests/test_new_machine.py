@@ -13,11 +13,12 @@ import sys
 import numpy as np
 import pytest
 import yaml
+from calibrated import identified
 from commands import orthocal
 from folders import files_of
 from lxml import etree
 
-from orthocal import calibrate, load_plan, load_robot
+from orthocal import load_plan, load_robot, load_session
 from orthocal.builder.build import remake_robot
 from orthocal.builder.orthoglide import Orthoglide
 from orthocal.cli import dialogue as asking
@@ -26,6 +27,7 @@ from orthocal.errors import ClosureError, ParameterError
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.output.scene.drawing import draw_scene
+from orthocal.planning import tool_candidates
 from orthocal.session.session import Purpose
 
 SIZES = {
@@ -189,6 +191,9 @@ def test_what_is_read_on_it_calibrates_it(made, tmp_path):
         {"x": 0.0, "y": 1.5, "z": 0.0}, abs=0.002
     )
     assert code == 0
+    assert "y_slide counts down." in " ".join(text.split())
+    row = next(line.split() for line in text.splitlines() if line.split()[:1] == ["y_slide"])
+    assert row[-2] == f"{-float(row[2]):+.3f}"  # the change of the joint
 
 
 def test_a_machine_is_made_again_after_a_change(copied):
@@ -223,7 +228,7 @@ def test_readings_are_not_overwritten(copied):
 
 
 @pytest.fixture(scope="module")
-def planned(tmp_path_factory, short_reports, single_start):
+def planned(tmp_path_factory, short_reports, quick_plans):
     """A machine with options for its workspace and a tolerance, and a plan of 15 minutes."""
     mill = tmp_path_factory.mktemp("planned") / "mill"
     words = options(workspace_mm="40", tolerance="*.offset_mm=4", hours="0.25")
@@ -319,17 +324,6 @@ def test_dimensions_alone_are_no_robot(copied):
     (copied / "mill.yaml").unlink()
     code, _, err = orthocal("new", copied, "--again")
     assert (code, "contains machine.yaml but no YAML of a robot" in err) == (2, True)
-
-
-def test_entries_of_joints_that_count_down_are_described(made, tmp_path):
-    words = ["--out", tmp_path / "try", "--error", "y_slide.offset_mm=1.5"]
-    code, _, err = orthocal("simulate", made / "first", *words)
-    assert code == 0, err
-    _, text, _ = orthocal("calibrate", tmp_path / "try", "--model", "offsets")
-    said = " ".join(text.split())
-    assert "y_slide counts down." in said
-    row = next(line.split() for line in text.splitlines() if line.split()[:1] == ["y_slide"])
-    assert row[-2] == f"{-float(row[2]):+.3f}"  # the change of the joint
 
 
 def test_sheets_with_readings_stay_unchanged(copied):
@@ -460,7 +454,7 @@ def test_machines_of_other_kinds_are_made_and_calibrated(tmp_path, kind):
     name = robot.drives[1].name
     error = ["--error", f"{name}.offset_mm=1.5", "--exact"]
     assert orthocal("simulate", folder / "first", "--out", out, *error).returncode == 0
-    found = calibrate(out, "offsets")
+    found = identified(load_session(out), "offsets")
     for drive in robot.drives:
         expected = 1.5e-3 if drive.name == name else 0.0
         assert found[f"{drive.name}.offset"].value == pytest.approx(expected, abs=2e-6)
@@ -485,7 +479,8 @@ def test_the_first_plan_of_a_delta_is_its_bed_and_names_what_helps(tmp_path):
     assert load_robot(tmp_path / "delta").workspace.tolist()[2] == [0.0, 0.14]
 
 
-def test_stated_sensors_are_planned(tmp_path, single_start, without_sensor_gains):
+def test_stated_sensors_are_planned(tmp_path, monkeypatch, quick_plans, without_sensor_gains):
+    monkeypatch.setattr(tool_candidates, "BALLS", tool_candidates.BALLS[:2])
     bar = "sensor: ball_bar\nsigma_mm: 0.002\nrange_mm: [-5, 5]\nlength_mm: 50\n"
     (tmp_path / "bar.yaml").write_text(bar)
     words = ["--with", tmp_path / "bar.yaml", "--hours", "0.4", "--tolerance", "*.offset_mm=1"]

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import plans
 import pytest
-from calibrated import identified, plan_of, session_of
+from calibrated import UNJUDGED, identified, plan_of, session_of
 from closed_form import inverse
 from conftest import ROOT
 from derivatives import assert_derivative
@@ -225,7 +225,7 @@ def test_the_workspace_of_a_small_machine_is_within_its_reach(tmp_path):
     session = simulate_session(
         load_plan(plans.write(tmp_path, plan)), {"x_slide.offset": 1e-3}, seed=1
     ).session
-    result = calibrate(session, "offsets", solver="variable-projection")
+    result = calibrate(session, "offsets", **UNJUDGED)
     # drives end 30 mm beyond the zero: 8 % to spare, in whole millimetres, as in the plan
     assert assess_tool(result).workspace.half_side == pytest.approx(0.027)
     assert find_workspace(session.robot).half_side == pytest.approx(0.027)
@@ -393,7 +393,7 @@ def test_figures_at_the_tool_are_those_of_the_stated_workspace(tmp_path):
     box = np.array([[-0.05, 0.06], [-0.06, 0.05], [-0.07, 0.04]])
     robot = make_robot(Orthoglide(workspace=tuple(map(tuple, box))), tmp_path / "mine")
     session = simulate_session(paper_plan(robot, Equipment()), {"x_slide.offset": 1e-3}, seed=1)
-    result = calibrate(session.session, "offsets", solver="variable-projection")
+    result = calibrate(session.session, "offsets", **UNJUDGED)
     found = assess_tool(result)
     assert found.workspace.limits == pytest.approx(box)
     assert json.loads(accuracy_json(result, found))["box"] == pytest.approx(box)

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from adjusting import reached, shimmed_plan
-from calibrated import calibrated
+from calibrated import UNJUDGED, calibrated
 from commands import orthocal as run
 
 from orthocal import (
@@ -32,7 +32,6 @@ from orthocal.output.report.page import build_report
 from orthocal.output.text.adjustment import render_plan
 from orthocal.output.text.layout import to_text
 
-QUICK = {"solver": "variable-projection"}
 SEEDS = (4,)
 
 
@@ -40,7 +39,7 @@ def machine_of(plan, seed, **options):
     """Errors of a machine, and its calibration from simulated readings."""
     errors = draw_errors(plan.robot, plan.robot.parameters.patterns("full"), seed=seed)
     session = simulate_session(plan, errors, seed=seed, sigma=3e-6).session
-    return errors, calibrate(session, **QUICK, **options)
+    return errors, calibrate(session, **UNJUDGED, **options)
 
 
 @pytest.fixture(scope="module")
@@ -178,7 +177,7 @@ def test_an_adjusted_calibration_is_the_machine_with_its_amounts(machines):
 def test_a_machine_of_right_angles_needs_no_adjustment(plan):
     errors = {"x_slide.offset": 0.4e-3, "y_slide.offset": -0.6e-3}
     session = simulate_session(plan, errors, seed=1, sigma=3e-6, exact=True).session
-    planned = plan_adjustments(calibrate(session, **QUICK))
+    planned = plan_adjustments(calibrate(session, **UNJUDGED))
     assert planned.judgement == "small gain"
     assert planned.gain < 0.05
 
@@ -186,7 +185,7 @@ def test_a_machine_of_right_angles_needs_no_adjustment(plan):
 def test_a_plan_after_an_adjustment_with_small_gain_is_refused(plan, tmp_path):
     errors = {"x_slide.offset": 0.4e-3, "y_slide.rz": 1.4e-3}
     session = simulate_session(plan, errors, seed=1, sigma=3e-6).session
-    write_calibration(calibrate(session, **QUICK), tmp_path / "calibration.json")
+    write_calibration(calibrate(session, **UNJUDGED), tmp_path / "calibration.json")
     code, out, _ = run("adjust", tmp_path, "--json")
     document = json.loads(out)
     assert not document["worthwhile"]

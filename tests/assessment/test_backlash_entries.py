@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calibrated import SOUND, UNJUDGED
 from effect_plans import effect_plan
 
 from orthocal import (
@@ -36,7 +37,6 @@ from orthocal.output.text.layout import to_text
 from orthocal.output.text.validation import render_validation
 from orthocal.units import MM
 
-QUICK = {"solver": "variable-projection"}
 TRUTH = {
     "x_slide.offset": 0.8e-3,
     "y_slide.offset": -0.5e-3,
@@ -56,7 +56,9 @@ def plan():
 
 @pytest.fixture(scope="module")
 def calibration(plan):
-    return calibrate(simulate_session(plan, TRUTH, seed=3, sigma=NOISE).session, "offsets", **QUICK)
+    return calibrate(
+        simulate_session(plan, TRUTH, seed=3, sigma=NOISE).session, "offsets", **UNJUDGED
+    )
 
 
 def by_drive(calibration):
@@ -99,7 +101,7 @@ def test_a_compensation_table_has_the_same_decision(plan):
     both = plan.with_effects(["backlash", "screw"])
     truth = {**TRUTH, "x_slide.screw_sin": 15e-6, "z_slide.screw_sin": 15e-6}
     session = simulate_session(both, truth, seed=3, sigma=NOISE).session
-    calibration = calibrate(session, "full", **QUICK)
+    calibration = calibrate(session, "full", **UNJUDGED)
     found = by_drive(calibration)
     assert found["x"].enter > 0.0
     assert found["z"].enter == 0.0
@@ -177,7 +179,7 @@ def test_backlash_that_the_controller_compensates_stays(plan, calibration):
     trims = tuple(JointTrim(e.enter) for e in calibration.assessment.backlash)
     again = replace(plan.with_controller(entered_offsets(calibration).round(6)), compensation=trims)
     second = calibrate(
-        simulate_session(again, TRUTH, seed=4, sigma=NOISE).session, "offsets", **QUICK
+        simulate_session(again, TRUTH, seed=4, sigma=NOISE).session, "offsets", **UNJUDGED
     )
     found = second.assessment
     assert [e.active for e in found.backlash] == pytest.approx([t.backlash for t in trims])
@@ -199,13 +201,13 @@ def test_a_session_that_states_no_compensation_is_asked_for_it(plan, calibration
     stated = (JointTrim(0.02 * MM), JointTrim(), JointTrim())
     for trims in ((JointTrim(),) * 3, stated):
         record = replace(calibration.session, compensation=trims)
-        assessed = assess(replace(calibration, assessment=None, session=record))
+        assessed = assess(replace(calibration, assessment=None, session=record), judgement=SOUND)
         assert not assessed.of_kind(kind)
     plans = [replace(plan, compensation=stated, path=Path("first/session.yaml"))]
     plans.append(replace(plan, path=Path("second/session.yaml")))
     sessions = [simulate_session(p, TRUTH, seed=6, sigma=NOISE).session for p in plans]
     both = [replace(s, path=p.path) for s, p in zip(sessions, plans, strict=True)]
-    (asked,) = calibrate(both, "offsets", **QUICK).assessment.of_kind(kind)
+    (asked,) = calibrate(both, "offsets", **UNJUDGED).assessment.of_kind(kind)
     assert "second" in asked.text
     assert "first" not in asked.text
 
@@ -217,7 +219,7 @@ def test_validation_shows_the_backlash_of_its_tool_error(plan, calibration):
     validation = validate_calibration(
         calibration, replace(session, compensation=(JointTrim(),) * 3)
     )
-    judged = assess(validation.joint)
+    judged = assess(validation.joint, judgement=SOUND)
     assert judged.keeps_offsets
     text = to_text(render_validation(validation))
     assert "with this backlash" in text
@@ -230,7 +232,7 @@ def test_validation_shows_the_backlash_of_its_tool_error(plan, calibration):
 def test_backlash_alone_is_entered_where_the_offsets_stay(plan):
     entered = plan.with_controller(np.array([0.8e-3, -0.5e-3, 0.0]))
     session = simulate_session(entered, TRUTH, seed=5, sigma=NOISE).session
-    found = calibrate(session, "offsets", **QUICK)
+    found = calibrate(session, "offsets", **UNJUDGED)
     judged = found.assessment
     assert judged.keeps_offsets
     assert any(e.change for e in judged.backlash)

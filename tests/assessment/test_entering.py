@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import plans
 import pytest
-from calibrated import calibrated
+from calibrated import UNJUDGED, calibrated
 from conftest import ROOT
 from drawn_machines import DrawnMachines
 from machines import write_orthoglide
@@ -60,7 +60,7 @@ def test_offsets_to_enter_have_the_least_tool_error(quarter):
     """Their gain is their derivative by the parameters."""
     machines = DrawnMachines(quarter)
     errors = machines.by_name(machines.draw(np.random.default_rng(1)))
-    result = calibrate(simulate_session(quarter, errors, seed=1).session, "full", **QUICK)
+    result = calibrate(simulate_session(quarter, errors, seed=1).session, "full", **UNJUDGED)
     tool = find_tool(result)
     space = tool.workspace
     best = entered_offsets(result)
@@ -92,7 +92,7 @@ def test_the_tool_error_with_the_offsets_to_enter_is_the_predicted_one(quarter):
     """
     machines = DrawnMachines(quarter)
     errors_by_offsets = {"chosen": [], "identified": [], "offsets": [], "predicted": []}
-    for seed in range(6):
+    for seed in range(4):
         drawn = machines.draw(np.random.default_rng(100 + seed))
         errors = machines.by_name(drawn)
         session = simulate_session(quarter, errors, seed=seed).session
@@ -148,7 +148,7 @@ def test_offsets_that_were_identified_as_a_sum_are_entered(summed):
 
 
 def test_offsets_identified_as_a_sum_beside_lengths_have_the_least_tool_error(summed):
-    result = calibrate(summed, Choice(free=["common", "*_leg.length"]), **QUICK)
+    result = calibrate(summed, Choice(free=["common", "*_leg.length"]), **UNJUDGED)
     entries = find_entries(result)
     assert [e.drive for e in entries] == ["x_slide", "y_slide", "z_slide"]
     assert all(np.isfinite(e.std) for e in entries)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from calibrated import UNJUDGED
 from machines import place, reading_by_pinocchio
 
 from orthocal import calibrate, load_plan, simulate_session
@@ -42,13 +43,13 @@ def test_the_deviation_of_a_rod_from_its_line_is_that_by_pinocchio(raw_cycles):
 
 
 def test_an_assumed_line_is_named_where_it_matters(root, raw_cycles):
-    (assumed,) = calibrate(raw_cycles, "full", **QUICK).assessment.of_kind("line assumed")
+    (assumed,) = calibrate(raw_cycles, "full", **UNJUDGED).assessment.of_kind("line assumed")
     assert assumed.numbers["off_line_mm"] == pytest.approx(0.032, abs=1e-3)
     assert "`touches: a`" in assumed.action
     coarse = raw_cycles.with_values(raw_cycles.values)
     coarse = coarse.with_gauge(type(coarse.gauge)(0.1 * MM, 0.01 * MM, None))
-    assert not calibrate(coarse, **QUICK).assessment.of_kind("line assumed")
+    assert not calibrate(coarse, **UNJUDGED).assessment.of_kind("line assumed")
     plan = load_plan(root / "examples/workshop/plan.yaml")
     on_rods = simulate_session(plan, {}, seed=0).session
     assert find_idealised(on_rods) is None
-    assert not calibrate(on_rods, "offsets", **QUICK).assessment.of_kind("line assumed")
+    assert not calibrate(on_rods, "offsets", **UNJUDGED).assessment.of_kind("line assumed")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibrated import calibrated, session_of
+from calibrated import UNJUDGED, calibrated, session_of
 
 from orthocal import calibrate, restore_session, simulate_session
 from orthocal.assessment.assess import is_significant
@@ -43,7 +43,7 @@ def entered():
     again = session.with_controller(offsets_to_enter(first))
     # with the same noise the readings give the same offsets
     second = simulate_session(again, truth, seed=4).session
-    return first, calibrate(second, solver="variable-projection")
+    return first, calibrate(second, **UNJUDGED)
 
 
 @pytest.mark.parametrize("number", [2, 3])

@@ -8,6 +8,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from calibrated import UNJUDGED
 from commands import run_orthocal
 
 from orthocal import assess_tool, calibrate
@@ -27,7 +28,7 @@ BEYOND_TRAVEL = [0.1, 0.0, 0.0]
 
 @pytest.fixture(scope="module")
 def calibration(experiment_2):
-    return calibrate(experiment_2, solver="variable-projection")
+    return calibrate(experiment_2, **UNJUDGED)
 
 
 @pytest.fixture(autouse=True)

@@ -7,6 +7,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from calibrated import UNJUDGED
 from commands import run_orthocal
 
 from orthocal import calibrate
@@ -22,7 +23,7 @@ HEADER = "x_mm,y_mm,z_mm\n"
 @pytest.fixture(scope="module")
 def folder(experiment_2, tmp_path_factory):
     path = tmp_path_factory.mktemp("calibration")
-    calibration = calibrate(experiment_2, solver="variable-projection")
+    calibration = calibrate(experiment_2, **UNJUDGED)
     write_calibration(calibration, path / "calibration.json")
     return path
 

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from calibrated import calibrated, identified, plan_of, session_of
+from calibrated import UNJUDGED, calibrated, identified, plan_of, session_of
 from effect_plans import FEW, effect_plan
 from models import TRUTH
 from scipy.stats import binom
@@ -78,7 +78,7 @@ def calibrated_machine(name, model, seed):
     plan = plan_of(name)
     errors = draw_machine(plan.robot, seed)
     session = simulate_session(plan, errors, seed=seed).session
-    return errors, session, calibrate(session, model, **QUICK)
+    return errors, session, calibrate(session, model, **UNJUDGED)
 
 
 def measure(plan, errors, active, *, stated, seed):
@@ -165,7 +165,7 @@ def test_a_session_with_other_offsets_is_refused(paper, experiment_3):
 
 def test_only_identified_offsets_must_be_active(experiment_3):
     choice = Choice(free=["x_slide.offset", "z_slide.offset"])
-    calibration = calibrate(session_of("table1/experiment-2"), choice, **QUICK)
+    calibration = calibrate(session_of("table1/experiment-2"), choice, **UNJUDGED)
     entered = np.add(entered_offsets(calibration), [0.0, 0.3e-3, 0.0])
     validation = validate_calibration(calibration, experiment_3.with_controller(entered))
     assert validation.offsets_stated
@@ -190,7 +190,7 @@ def test_another_robot_is_refused(paper, experiment_3, biglide):
 def test_a_calibration_without_redundant_readings_predicts_nothing(experiment_3):
     session = session_of("table1/experiment-2")
     few = session.select([r for r in session.readings if r.setup in ("yx", "xy", "xz")])
-    result = validate_calibration(calibrate(few, **QUICK), experiment_3)
+    result = validate_calibration(calibrate(few, **UNJUDGED), experiment_3)
     assert result.as_expected is None
     assert result.assessment.of_kind("nothing predicted")
     assert result.assessment.decision.exit_code == 3
@@ -210,7 +210,7 @@ def test_repetition_is_unknown_where_the_fit_absorbs_the_shared_lines():
 @pytest.fixture(scope="module")
 def calibration(plan):
     """Calibration of a machine without errors except offsets."""
-    return calibrate(simulate_session(plan, TRUTH, seed=1).session, **QUICK)
+    return calibrate(simulate_session(plan, TRUTH, seed=1).session, **UNJUDGED)
 
 
 def test_several_sessions_are_validated_together(plan, calibration):
@@ -298,7 +298,7 @@ def test_a_change_that_keeps_the_offsets_is_found_by_validation_alone(plan):
     session = simulate_session(entered, turned, seed=5).session
     result = validate_calibration(calibration, session)
     assert result.nothing_to_change
-    assert calibrate(session, **QUICK).assessment.keeps_offsets
+    assert calibrate(session, **UNJUDGED).assessment.keeps_offsets
     assert result.confirmed is False
     assert result.mistake.explanation.parameters == ("x_slide.rz",)
     assert result.assessment.of_kind("machine changed")
@@ -363,7 +363,7 @@ def test_values_to_enter_after_a_backlash_that_was_not_entered():
     errors = draw_errors(plan.robot, machine_errors(plan.robot), seed=1)
     errors |= {f"{d.name}.offset": 0.2e-3 for d in plan.robot.drives}
     errors |= {f"{d.name}.backlash": 60e-6 for d in plan.robot.drives}
-    calibration = calibrate(simulate_session(plan, errors, seed=1).session, "full", **QUICK)
+    calibration = calibrate(simulate_session(plan, errors, seed=1).session, "full", **UNJUDGED)
     entered = plan.with_controller(entered_offsets(calibration))
     session = simulate_session(entered, errors, seed=2).session
     session = replace(session, compensation=compensation_to_enter(calibration))
@@ -439,7 +439,7 @@ def test_a_mistake_is_named_by_eighteen_readings_of_rods():
     tolerances = {"*.offset_mm": 4.0}
     errors = draw_errors(plan.robot, ["*"], seed=seed, tolerances=tolerances)
     session = simulate_session(plan, errors, seed=seed).session
-    calibration = calibrate(session, Choice("full", tolerances=tolerances), **QUICK)
+    calibration = calibrate(session, Choice("full", tolerances=tolerances), **UNJUDGED)
     right = entered_offsets(calibration)
     again = measure(plan, errors, -right, stated=right, seed=1000 + seed)
     result = validate_calibration(calibration, again)

@@ -374,7 +374,7 @@ def test_both_solvers_identify_the_same_errors(simulated):
 def test_a_batch_is_solved_like_single_sets(simulated):
     problem = build_problem(simulated.session, free=FREE, prior=True)
     rng = np.random.default_rng(8)
-    values = problem.values + 1e-6 * rng.normal(size=(3, problem.observations.size))
+    values = problem.values + 1e-6 * rng.normal(size=(2, problem.observations.size))
     batch = BatchSolver(problem).solve(values, sigma=1e-6)
     for row, theta in zip(values, batch.theta, strict=True):
         alone = VariableProjection(problem).solve(sigma=1e-6, values=row)

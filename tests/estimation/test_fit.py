@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from calibrated import identified
+from calibrated import UNJUDGED, identified
 from models import TRUTH
 from scipy.optimize import lsq_linear
 from tolerances import SAME_OPTIMUM
@@ -120,10 +120,10 @@ def test_the_robust_covariance_is_that_of_many_simulated_calibrations(exact_plan
 
 
 def test_readings_without_deviation_are_explained(exact_plan):
-    still = calibrate(simulate_session(exact_plan, {}, exact=True).session)
+    still = calibrate(simulate_session(exact_plan, {}, exact=True).session, **UNJUDGED)
     (found,) = still.assessment.of_kind("no deviation")
     assert found.numbers["before_rms_mm"] == pytest.approx(0.0, abs=1e-9)
-    assert not calibrate(plan_with_truth(exact_plan)).assessment.of_kind("no deviation")
+    assert not calibrate(plan_with_truth(exact_plan), **UNJUDGED).assessment.of_kind("no deviation")
 
 
 def plan_with_truth(exact_plan):
@@ -132,7 +132,7 @@ def plan_with_truth(exact_plan):
 
 def test_parameters_without_sensitivity_are_explained(exact_plan):
     """The platform's own placement is seen by no reading of leg x alone."""
-    result = calibrate(plan_with_truth(exact_plan), Choice(free=["frame.tcp.*"]))
+    result = calibrate(plan_with_truth(exact_plan), Choice(free=["frame.tcp.*"]), **UNJUDGED)
     (found,) = result.assessment.of_kind("no sensitivity")
     assert {p.parameter for p in found.places} == {p.name for p in result.free}
     assert set(result.identifiability.below_noise) == {p.name for p in result.free}
@@ -150,11 +150,11 @@ def test_noise_that_does_not_converge_is_reported(session, monkeypatch):
     """Without tolerance no two estimates agree, so that all rounds end without convergence."""
     from orthocal.estimation import fit
 
-    converged = calibrate(session, "full")
+    converged = calibrate(session, "full", **UNJUDGED)
     assert converged.solver.noise_converged
     assert not converged.assessment.of_kind("no convergence")
     monkeypatch.setattr(fit, "SIGMA_TOLERANCE", 0.0)
-    result = calibrate(session, "full")
+    result = calibrate(session, "full", **UNJUDGED)
     assert not result.solver.noise_converged
     (finding,) = result.assessment.of_kind("no convergence")
     assert finding.severity == "note"

@@ -24,7 +24,7 @@ from orthocal.observation.simulate import show_readings
 from orthocal.units import MM
 
 SIZES = """--leg-mm 250 --travel-mm 100:325 --attachment-mm 30 --rods-apart-mm 60 --rod-radius-mm 4
---counts up,down,up --at-zero-mm 0 --effects none --hours 0.5"""
+--counts up,down,up --at-zero-mm 0 --effects none --hours 0.25"""
 BAR = """sensor: ball_bar
 sigma_mm: 0.002
 resolution_mm: 0.001
@@ -66,7 +66,7 @@ def measure(folder, session, errors, seed):
 
 
 @pytest.fixture(scope="module")
-def machine(tmp_path_factory, short_reports, single_start):
+def machine(tmp_path_factory, short_reports, quick_plans):
     """Directory with a planned machine, its plan with a ball bar, and the machine's errors."""
     folder = tmp_path_factory.mktemp("bar")
     (folder / "bar.yaml").write_text(BAR)

@@ -22,7 +22,7 @@ from orthocal.measurement.importing.long_table import make_long_table
 
 NAMES = {"setup": ["xy", "yx"], "posture": ["zero", "x_max", "x_-40"]}
 PLACES = [(s, p) for s in NAMES["setup"] for p in NAMES["posture"]]
-EXAMPLES = int(os.environ.get("ORTHOCAL_EXAMPLES", "400"))
+EXAMPLES = int(os.environ.get("ORTHOCAL_EXAMPLES", "200"))
 """Number of examples; more in a long run."""
 
 HEADINGS = {

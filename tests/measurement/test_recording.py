@@ -25,7 +25,7 @@ from orthocal.measurement.recording import SUFFIX, open_recording
 from orthocal.runtime.interrupts import ending_at_interrupt
 from orthocal.units import MM
 
-KILLS = 25
+KILLS = 12
 """A third of kills fall between journal and CSV: 25 without one are unlikely (4e-5)."""
 FORK = multiprocessing.get_context("fork")
 

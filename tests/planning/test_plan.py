@@ -68,10 +68,10 @@ def test_plans_are_better_than_manual_ones(orthoglide, tip, setups, each, most):
     Without a tip the dial reads the line between the rods.
     """
     choice = Choice(free=JOINTS, prior=True, tolerances=OFFSETS)
-    sections = (0.2, 0.4, 0.6, 0.8)
+    sections = (0.2, 0.8)
     box = np.array([[-0.1, 0.06]] * 3)
     equipment = Equipment(
-        gauge=DIAL, tip=tip, mounting=Mounting(lateral=0.0), sections=sections, box=box, along=9
+        gauge=DIAL, tip=tip, mounting=Mounting(lateral=0.0), sections=sections, box=box, along=5
     )
     forecast = ToolForecast(
         orthoglide, choice.select(orthoglide.parameters), cube(orthoglide, points_per_side=5)
@@ -143,7 +143,7 @@ def assert_machines_have_the_expected_error(plan, *, machines):
 
 
 def test_calibrated_machines_have_the_expected_tool_error(planned):
-    assert_machines_have_the_expected_error(planned, machines=40)
+    assert_machines_have_the_expected_error(planned, machines=25)
 
 
 def test_the_expected_tool_error_is_for_the_stated_workspace(tmp_path):
@@ -154,7 +154,7 @@ def test_the_expected_tool_error_is_for_the_stated_workspace(tmp_path):
     assert plan.forecast.workspace.half_side == pytest.approx(0.08)
     small = ToolForecast(robot, plan.forecast.selection, cube(robot, half_side=0.06))
     assert plan.expected.reported.rms > 1.2 * small.after(plan.session).reported.rms
-    assert_machines_have_the_expected_error(plan, machines=12)
+    assert_machines_have_the_expected_error(plan, machines=8)
 
 
 def test_readings_of_machines_at_tolerance_stay_in_the_gauges_range(planned):

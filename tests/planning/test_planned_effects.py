@@ -50,7 +50,7 @@ def machine(orthoglide):
 @pytest.fixture(scope="module")
 def planned(machine):
     """First plan of a machine; its search has fewer candidates and starts than a user's plan."""
-    equipment = replace(first_equipment(machine, Equipment()), along=7, across=0.0)
+    equipment = replace(first_equipment(machine, Equipment()), along=5, across=0.0)
     return plan_readings(machine, "full", equipment=equipment, starts=1)
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 from functools import cache
+from unittest.mock import patch
 
 import pytest
+from calibrated import UNJUDGED
 from conftest import marked_plots
 from planned import QUICK, quick_plan
 
@@ -13,17 +15,24 @@ from orthocal import calibrate, plan_readings, simulate_session, summarize
 from orthocal.output.report import page
 from orthocal.output.text import accuracy
 from orthocal.planning import plan as planning
+from orthocal.planning import tool_candidates
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.owned_sensors import load_owned_sensor
 from orthocal.planning.sensor_gains import find_sensor_gains
 
-FAST = "variable-projection"
 BAR = """sensor: ball_bar
 sigma_mm: 0.002
 resolution_mm: 0.001
 length_mm: 50
 length_tolerance_mm: unknown
 """
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_balls():
+    """Five positions of a fixed ball, in place of eleven."""
+    with patch.object(tool_candidates, "BALLS", tool_candidates.BALLS[:5]):
+        yield
 
 
 @cache
@@ -73,7 +82,7 @@ def test_offsets_that_leg_readings_do_not_determine_are_named_with_the_best_sens
     assert "ball bar" in best.words
     assert best.rms < 0.1 * plan.expected.reported.rms
     simulated = simulate_session(plan.session, {"a_slide.offset": 3e-4}).session
-    calibration = calibrate(simulated, solver=FAST)
+    calibration = calibrate(simulated, **UNJUDGED)
     for text in (answer, summarize(calibration)):
         words = " ".join(text.split())
         sentence = next(s for s in words.split(". ") if "do not determine the offset of" in s)
@@ -90,13 +99,13 @@ def test_the_report_of_a_calibration_names_the_same_sensors(monkeypatch):
     monkeypatch.setattr(page, "_scene", lambda _: "<!-- scene -->")
     session = quick_plan().session
     readings = simulate_session(session, {"x_slide.offset": 0.2e-3}, seed=1).session
-    calibration = calibrate(readings, solver=FAST)
+    calibration = calibrate(readings, **UNJUDGED)
     with marked_plots():
         text = " ".join(page.build_report(calibration).split())
     assert "Another hour, with all errors corrected: " in text
     assert "with a ball bar of 50 mm" in text
     assert "do not determine" not in summarize(calibration)
-    offsets = calibrate(readings, "offsets", solver=FAST)
+    offsets = calibrate(readings, "offsets", **UNJUDGED)
     assert "Another hour" not in summarize(offsets, details=True)
 
 

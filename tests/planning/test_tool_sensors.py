@@ -5,18 +5,20 @@ from __future__ import annotations
 import itertools
 import json
 import re
+from contextlib import contextmanager
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 from bounds import rms_band
+from calibrated import identified
 from commands import run_orthocal
 from machines import frames
-from planned import FEW, QUICK, entered, quick_plan
+from planned import FEW, QUICK, entered
 from tolerances import SAME_OPTIMUM
 
 from orthocal import (
-    calibrate,
     load_plan,
     load_robot,
     plan_readings,
@@ -72,6 +74,13 @@ TRACKER = "sensor: points\nsigma_mm: 0.01\ntarget_mm: [0, 0, -40]\n"
 CORRELATED = "covariance_um2: [[90, 40, 0], [40, 60, 0], [0, 0, 400]]\n"
 
 
+@contextmanager
+def few_balls(count):
+    """Some of the positions of a fixed ball."""
+    with patch.object(tool_candidates, "BALLS", tool_candidates.BALLS[:count]):
+        yield
+
+
 @pytest.fixture(scope="module")
 def owned(tmp_path_factory):
     """Sensors of files with these names and texts."""
@@ -90,8 +99,9 @@ def owned(tmp_path_factory):
 def planned(owned):
     """Plan of two hours with a dial at the legs, a bar, a square and a plate."""
     sensors = owned(bar=BAR, square=SQUARE, plate=PLATE)
-    equipment = Equipment(owned=sensors, **QUICK)
-    return plan_readings(entered("orthoglide"), hours=2.0, equipment=equipment, starts=1)
+    equipment = Equipment(owned=sensors, **FEW)
+    with few_balls(7):
+        return plan_readings(entered("orthoglide"), hours=2.0, equipment=equipment, starts=1)
 
 
 def test_every_candidate_posture_touches_its_artefact(owned, orthoglide):
@@ -166,7 +176,6 @@ def test_two_hours_are_better_than_manual_plans_of_two_and_five_hours(planned):
     assert paper == pytest.approx(5.5e-6, rel=0.1)
     assert sweep < 5.0e-6
     assert planned.expected.reported.rms < min(4.0e-6, 0.9 * sweep) < paper
-    assert planned.expected.reported.rms < 0.4 * quick_plan().expected.reported.rms
 
 
 def test_the_search_agrees_with_the_forecast_of_its_plan(planned):
@@ -230,7 +239,8 @@ def test_a_wrong_file_is_refused_by_its_key(owned, text, place):
 def for_printer(owned):
     """Plan of an hour for a linear delta with a bar and a probe."""
     equipment = Equipment(owned=owned(bar=BAR, probe=PROBE), **FEW)
-    return plan_readings(load_robot("linear_delta"), hours=1.0, equipment=equipment, starts=1)
+    with few_balls(3):
+        return plan_readings(load_robot("linear_delta"), hours=1.0, equipment=equipment, starts=1)
 
 
 def test_postures_of_sensors_at_the_tool_stay_above_the_bed(for_printer):
@@ -259,7 +269,7 @@ def test_a_plan_for_a_printer_is_measured_and_calibrated(for_printer):
     offsets = {"*.offset_mm": 1.0}
     errors = draw_errors(forecast.robot, forecast.names, seed=3, tolerances=offsets)
     readings = simulate_session(for_printer.session, errors, seed=3).session
-    calibration = calibrate(readings, solver="variable-projection")
+    calibration = identified(readings)
     remaining = np.array([calibration[n].value - errors[n] for n in forecast.names])
     assert tool_rms(forecast, remaining) < 2.0 * for_printer.expected.reported.rms
 
@@ -375,7 +385,8 @@ def test_the_range_of_a_bar_holds_the_tolerances_of_length_place_and_offsets(
 def test_a_sensor_with_too_short_a_range_is_named(owned):
     robot = load_robot("orthoglide").with_tolerances({"*.offset_mm": 0.4})
     short = owned(bar=BAR.replace("[-25, 25]", "[-2, 2]"))
-    plan = plan_readings(robot, hours=0.5, equipment=Equipment(owned=short, **FEW), starts=1)
+    with few_balls(1):
+        plan = plan_readings(robot, hours=0.3, equipment=Equipment(owned=short, **FEW), starts=1)
     assert {s.gauge for s in plan.session.setups.values()} == {"dial"}
     assert json.loads(plan_json(plan))["unusable_mm"]["bar"] == pytest.approx(4.3, abs=0.1)
     assert "Not in the plan: bar." in summarize(plan)
@@ -403,7 +414,7 @@ def without_legs():
 def tracked(owned):
     """Plan of half an hour with a tracker: 20 minutes of mounting, and 19 points."""
     equipment = Equipment(owned=owned(track=TRACKER))
-    return plan_readings(without_legs(), hours=0.5, equipment=equipment, starts=2)
+    return plan_readings(without_legs(), hours=0.5, equipment=equipment, starts=1)
 
 
 @pytest.mark.parametrize(("keys", "labels"), [("", "xyz"), (CORRELATED, "123")])
@@ -517,7 +528,7 @@ def test_the_curve_grows_a_setup_that_can_be_used_once(tracked):
 def test_a_plan_of_points_is_measured_and_calibrated(tmp_path):
     """From the command line: plan, sheet, a recorded point, simulated points, calibration."""
     (tmp_path / "track.yaml").write_text(TRACKER + CORRELATED)
-    words = ["orthoglide", "--with", tmp_path / "track.yaml", "--hours", 0.6, "--starts", 1]
+    words = ["orthoglide", "--with", tmp_path / "track.yaml", "--hours", 0.45, "--starts", 1]
     words += ["--along", 2, "--across-mm", 0, "--sections", 0.5]
     words += ["--tolerance", "*.offset_mm=1", "--out", tmp_path / "plan"]
     code, text, _ = run_orthocal(".", "plan", *map(str, words))
@@ -620,10 +631,9 @@ def simulate_planar(planar, seed):
     return simulate_session(planar.session, errors, seed=seed).session
 
 
-@pytest.mark.parametrize("seed", [8])
-def test_both_solvers_agree_where_a_ball_is_off_the_plane(planar, seed):
+def test_both_solvers_agree_where_a_ball_is_off_the_plane(planar):
     """Its height changes readings to second order: complete Gauss-Newton steps do not converge."""
-    session = simulate_planar(planar, seed)
+    session = simulate_planar(planar, 8)
     problem = planar.forecast.problem(session)
     drives = [problem.free.index(f"{d.name}.offset") for d in session.robot.drives]
     one, other = (
@@ -648,8 +658,7 @@ def test_points_on_a_planar_machine_lie_in_its_plane(owned):
     assert len(postures) == 25
 
 
-@pytest.mark.parametrize("seed", [0, 18])
-def test_fixed_balls_off_the_plane_are_no_mistakes(planar, seed):
+def test_fixed_balls_off_the_plane_are_no_mistakes(planar):
     """Their heights, of up to 3.9 mm, have the effect of another bar length to first order."""
-    findings = judge_session(simulate_planar(planar, seed)).findings
+    findings = judge_session(simulate_planar(planar, 18)).findings
     assert {f.severity for f in findings} <= {"note"}

@@ -30,8 +30,8 @@ from orthocal.study.linearisation import build_linearisation_study
 from orthocal.study.runner import JOURNAL, open_results, run_study, to_parquet
 from orthocal.study.study import prepare_once, round_cell, run_task
 
-KILLS = 8
-DRAWS = 60
+KILLS = 5
+DRAWS = 30
 """Draws of each task."""
 FORK = multiprocessing.get_context("fork")
 
