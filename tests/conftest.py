@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 from contextlib import ExitStack, contextmanager
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
@@ -150,9 +150,15 @@ def no_sensor_gains():
 
 
 @pytest.fixture(scope="module")
-def single_start():
-    """Plans of `orthocal new` from one start of the search, which tests/planning verify."""
-    with patch.object(orthocal, "plan_readings", partial(orthocal.plan_readings, starts=1)):
+def quick_plans():
+    """Plans of `orthocal new` from few candidates and one start, which tests/planning verify."""
+    plan_readings = orthocal.plan_readings
+
+    def plan_quickly(*robot_and_choice, equipment, **options):
+        few = replace(equipment, along=5, across=0.0)
+        return plan_readings(*robot_and_choice, equipment=few, starts=1, **options)
+
+    with patch.object(orthocal, "plan_readings", plan_quickly):
         yield
 
 

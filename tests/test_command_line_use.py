@@ -29,6 +29,7 @@ from orthocal import (
     load_calibration,
     load_plan,
     load_robot,
+    restore_session,
     simulate_session,
 )
 from orthocal.assessment.controller_entries import find_entries
@@ -257,6 +258,12 @@ def test_part_of_a_machine_with_effects_has_the_expected_error(warming_machine):
     assert {r["approach"] for r in readings} == {"ppp", "nnn"}
     assert {float(r["temperature_C"]) for r in readings} >= {18.0, 26.0}
     first, both = (load_calibration(folder / name) for name in ("first", "both"))
+    # the next session has the same approaches, without temperatures and times
+    plan = load_plan(folder / "mill/second").readings
+    before = restore_session(first).readings
+    assert [(r.key, r.approach) for r in plan] == [(r.key, r.approach) for r in before]
+    assert {(r.conditions.temperature, r.conditions.time) for r in plan} == {(None, None)}
+    assert "temperature [°C]" in (folder / "mill/second/sheet.html").read_text()
     assert "The calibration is confirmed." in validated
     # the first alone corrects all errors, too, but from half of the readings
     assert "orthocal calibrate one two --out two-calibration" in validated

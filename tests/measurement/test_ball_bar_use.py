@@ -66,7 +66,7 @@ def measure(folder, session, errors, seed):
 
 
 @pytest.fixture(scope="module")
-def machine(tmp_path_factory, short_reports, single_start):
+def machine(tmp_path_factory, short_reports, quick_plans):
     """Directory with a planned machine, its plan with a ball bar, and the machine's errors."""
     folder = tmp_path_factory.mktemp("bar")
     (folder / "bar.yaml").write_text(BAR)
@@ -74,6 +74,7 @@ def machine(tmp_path_factory, short_reports, single_start):
     run(folder, "new", "mill", *SIZES.split(), "--tolerance", tolerance, "--with", "bar.yaml")
     plan = load_plan(folder / "mill/first")
     errors = draw_errors(plan.robot, ["*"], seed=SEED, tolerances={"*.offset_mm": 1.0})
+    assert plan.robot.effect_names == ()
     assert {s.sensor.kind for s in plan.setups.values()} == {"ball_bar"}
     return folder, plan, errors
 

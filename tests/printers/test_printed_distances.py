@@ -323,7 +323,6 @@ def test_a_slip_of_04_that_is_not_named_is_within_the_stated_tool_error(printer,
         errors.append((real, math.hypot(fit.new.tool_rms, fit.tool_uncertainty) / MM))
     (sound, _), (wrong, expected) = errors
     assert 0.01 < wrong - sound < 0.05
-    print("XX",wrong,sound)
     assert wrong < 0.75 * expected
 
 
