@@ -3,8 +3,8 @@
 new → record → check → calibrate → enter → record → validate → calibrate → export → LinuxCNC. The
 machine is simulated with all errors at their tolerances and realistic gauge misalignment.
 
-With effects beside geometry: new → simulate → calibrate → export → again → simulate → validate →
-calibrate both → correct. The independent simulator makes the part.
+With effects beside geometry: new → simulate → check → calibrate → export → again → simulate →
+validate → calibrate both → correct. The independent simulator makes the part.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from orthocal import (
     load_calibration,
     load_plan,
     load_robot,
+    restore_session,
     simulate_session,
 )
 from orthocal.assessment.controller_entries import find_entries
@@ -173,12 +174,12 @@ FIRST_HOLE = 3
 def warming_machine(tmp_path_factory, short_reports):
     """Directory of two sessions on days that warm by 8 K, up to the corrected program.
 
-    With the output of two commands.
+    With the output of `validate`.
     """
-    folder, printed = tmp_path_factory.mktemp("warming"), {}
+    folder = tmp_path_factory.mktemp("warming")
     options = DIMENSIONS.replace("--effects none", EFFECTS)
     run(folder, "new", "mill", *options.split())
-    few = "--along", "5", "--sections", "0.5", "--starts", "1", "--temperature", TEMPERATURES[0]
+    few = "--along", "3", "--sections", "0.5", "--starts", "1", "--temperature", TEMPERATURES[0]
     with no_sensor_gains():
         run(folder, "plan", "mill", *few, "--out", "mill/both-sides")
 
@@ -199,13 +200,14 @@ def warming_machine(tmp_path_factory, short_reports):
         "--out",
         "one",
     )
+    run(folder, "check", "one")
     identify("first", "one")
     home = "--offsets", "--home-offset", "0,0,0", "--latched=+,+,+"
     run(folder, "export", "first", "--to", "linuxcnc", *home, "--out", "cnc")
     run(folder, "again", "first", "--ini", "cnc/joints.ini", "--out", "mill/second")
     same = "--errors", "one/truth.yaml", "--seed", SEED + 1
     run(folder, "simulate", "mill/second", *same, "--temperature", TEMPERATURES[1], "--out", "two")
-    printed["validate"] = " ".join(run(folder, "validate", "first", "two").split())
+    validated = " ".join(run(folder, "validate", "first", "two").split())
     identify("both", "one", "two")
     drilled = [
         f"N{n} {'G1' if n > 1 else 'G0'} X{x} Y{y} Z{z} F600"
@@ -214,7 +216,7 @@ def warming_machine(tmp_path_factory, short_reports):
     (folder / "part.ngc").write_text("\n".join(["G21 G90 G61", *drilled, "M2", ""]))
     options = "--offsets", "active", "--temperature", CUTTING_TEMPERATURE
     run(folder, "correct", "both", "part.ngc", *options, "--out", "good.ngc")
-    return folder, printed
+    return folder, validated
 
 
 def drill(folder, program):
@@ -250,15 +252,21 @@ def drill(folder, program):
 
 @pytest.mark.slow
 def test_part_of_a_machine_with_effects_has_the_expected_error(warming_machine):
-    folder, printed = warming_machine
+    folder, validated = warming_machine
     with open(folder / "one/readings.csv") as file:
         readings = list(csv.DictReader(file))
     assert {r["approach"] for r in readings} == {"ppp", "nnn"}
     assert {float(r["temperature_C"]) for r in readings} >= {18.0, 26.0}
     first, both = (load_calibration(folder / name) for name in ("first", "both"))
-    assert "The calibration is confirmed." in printed["validate"]
+    # the next session has the same approaches, without temperatures and times
+    plan = load_plan(folder / "mill/second").readings
+    before = restore_session(first).readings
+    assert [(r.key, r.approach) for r in plan] == [(r.key, r.approach) for r in before]
+    assert {(r.conditions.temperature, r.conditions.time) for r in plan} == {(None, None)}
+    assert "temperature [°C]" in (folder / "mill/second/sheet.html").read_text()
+    assert "The calibration is confirmed." in validated
     # the first alone corrects all errors, too, but from half of the readings
-    assert "orthocal calibrate one two --out two-calibration" in printed["validate"]
+    assert "orthocal calibrate one two --out two-calibration" in validated
     for p in both.free:
         if p.name.endswith(".backlash"):  # three of them, to 99.7 %
             half = 1.5 * both.expand_estimate(p)

@@ -74,6 +74,7 @@ def machine(tmp_path_factory, short_reports, quick_plans):
     run(folder, "new", "mill", *SIZES.split(), "--tolerance", tolerance, "--with", "bar.yaml")
     plan = load_plan(folder / "mill/first")
     errors = draw_errors(plan.robot, ["*"], seed=SEED, tolerances={"*.offset_mm": 1.0})
+    assert plan.robot.effect_names == ()
     assert {s.sensor.kind for s in plan.setups.values()} == {"ball_bar"}
     return folder, plan, errors
 

@@ -11,9 +11,7 @@ from commands import run_orthocal
 
 from orthocal import (
     draw_errors,
-    load_calibration,
     load_plan,
-    restore_session,
     simulate_session,
     write_session,
 )
@@ -304,29 +302,3 @@ def test_simulated_readings_state_the_conditions_of_effects(planned, tmp_path):
     )
     write_session(plan, tmp_path / "plan", blank=True)
     assert {c.approach for c in simulated()} == {"ppp"}
-
-
-@pytest.mark.usefixtures("short_reports", "without_sensor_gains")
-def test_backlash_is_identified_on_a_day_that_gets_warmer(planned, tmp_path):
-    """Backlash of 0.04 mm, from 20 to 28 °C."""
-    write_session(planned.session.with_effects(["backlash", "thermal"]), tmp_path / "m", blank=True)
-    errors = [w for k in "xyz" for w in ("--error", f"{k}_slide.backlash_mm=0.04")]
-    words = ["simulate", "m", *errors, "--temperature", "20:28", "--seed", "2", "--out", "day"]
-    assert run_orthocal(tmp_path, *words)[0] == 0
-    fast = ["--solver", "variable-projection"]
-    code, _, err = run_orthocal(tmp_path, "calibrate", "day", "--out", "one", "--json", *fast)
-    assert code == 0, err
-    calibration = load_calibration(tmp_path / "one")
-    for k in "xyz":
-        value = calibration.errors[f"{k}_slide.backlash"]
-        assert value == pytest.approx(0.04 * MM, abs=0.02 * MM)
-    # the next session has the same approaches, without temperatures and times
-    assert run_orthocal(tmp_path, "again", "one", "--out", "two", "--anyway")[0] == 0
-    before, after = (load_plan(tmp_path / name).readings for name in ("day", "two"))
-    assert [r.key for r in after] == [r.key for r in before]
-    assert {(r.conditions.temperature, r.conditions.time) for r in after} == {(None, None)}
-    head = (tmp_path / "two/readings.csv").read_text().partition("\n")[0]
-    assert {"approach", "temperature_C"} <= set(head.split(","))
-    assert "temperature [°C]" in (tmp_path / "two/sheet.html").read_text()
-    restored = restore_session(calibration).readings
-    assert [r.conditions for r in restored] == [r.conditions for r in before]

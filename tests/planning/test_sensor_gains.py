@@ -97,6 +97,10 @@ def test_offsets_that_leg_readings_do_not_determine_are_named_with_the_best_sens
 
 def test_the_report_of_a_calibration_names_the_same_sensors(monkeypatch):
     monkeypatch.setattr(page, "_scene", lambda _: "<!-- scene -->")
+    gains, forecasts = gains_of("orthoglide"), []
+    monkeypatch.setattr(
+        accuracy, "find_sensor_gains", lambda *of: (forecasts.append(of[0]), gains)[1]
+    )
     session = quick_plan().session
     readings = simulate_session(session, {"x_slide.offset": 0.2e-3}, seed=1).session
     calibration = calibrate(readings, **UNJUDGED)
@@ -104,6 +108,7 @@ def test_the_report_of_a_calibration_names_the_same_sensors(monkeypatch):
         text = " ".join(page.build_report(calibration).split())
     assert "Another hour, with all errors corrected: " in text
     assert "with a ball bar of 50 mm" in text
+    assert len(forecasts) == 1
     assert "do not determine" not in summarize(calibration)
     offsets = calibrate(readings, "offsets", **UNJUDGED)
     assert "Another hour" not in summarize(offsets, details=True)

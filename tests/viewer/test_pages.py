@@ -141,7 +141,7 @@ def scene_page(name):
     return (scene_of(name) if name == EXPERIMENT_2 else draw_scene(session_of(name))).to_html()
 
 
-@pytest.mark.parametrize("name", [EXPERIMENT_2, "lines", "sweep"])
+@pytest.mark.parametrize("name", [EXPERIMENT_2, "sweep"])
 def test_no_label_covers_another_or_a_panel_or_a_dial_at_any_size(opened, name):
     key = "calibration" if name == EXPERIMENT_2 else name
     found = opened(key, lambda: scene_page(name))
@@ -243,11 +243,10 @@ def test_boxes_of_the_legend_show_and_hide(drawn):
 
 
 def test_other_scenes_draw_too(browser, root, tmp_path, fivebar):
-    """A robot without readings and with sticks for links, a plan, and a single posture."""
+    """A robot without readings and with sticks for links, and a plan."""
     scenes = {
         "fivebar": draw_scene(fivebar),
         "plan": draw_scene(load_plan(root / "tests/sessions/lines/plan.yaml")),
-        "true": scene_of("raw-cycles", posture="x_max", exaggeration=1.0),
     }
     for name, scene in scenes.items():
         path = scene.save(tmp_path / f"{name}.html")
