@@ -84,13 +84,15 @@ def load_session(path: str | Path, *, partial: bool = False) -> Session:
     return locate_stations(session)
 
 
-def _load_session(file: Path, content: bytes, keys: SessionKeys) -> Session:
+def _load_session(
+    file: Path, content: bytes, keys: SessionKeys, wrong: list[SessionError] | None = None
+) -> Session:
     """Session with readings, stations not located; readings of empty cells are NaN."""
     plan, readings_path = _build_unread(file, keys)
     table = read_file(readings_path, error=SessionError)
     with content_withheld_outside(file.parent, readings_path):
         rows = read_rows(readings_path, table)
-        readings, points = check_readings(rows, plan, file=readings_path)
+        readings, points = check_readings(rows, plan, file=readings_path, wrong=wrong)
     session = replace(
         plan,
         setups=points.setups,
@@ -162,10 +164,15 @@ def load_plan(path: str | Path) -> Session:
     )
 
 
-def load_rows(path: str | Path) -> Session:
+def load_rows(path: str | Path, *, wrong: list[SessionError] | None = None) -> Session:
     """Read a plan as `load_plan` does; missing readings are NaN.
 
     In a plan without a readings.csv all readings are missing, and its `readings_path` is None.
+
+    Args:
+        path: The session.yaml, or its directory.
+        wrong: List that is set to the errors of readings out of range, which become NaN. By
+            default, and if most readings are out of range, the first error is raised.
 
     Raises:
         SessionError: If a file is wrong; names file and line or key.
@@ -173,7 +180,7 @@ def load_rows(path: str | Path) -> Session:
     """
     file, content, keys = _read_keys(Path(path))
     if keys.readings is not None:
-        return locate_stations(_load_session(file, content, keys), partial=True)
+        return locate_stations(_load_session(file, content, keys, wrong), partial=True)
     stated = _read_setups(file, keys)
     count = keys.cycles * sum(len(s.postures or keys.postures) for s, _ in stated.values())
     if count > MOST_READINGS:
