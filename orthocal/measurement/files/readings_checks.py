@@ -14,6 +14,7 @@ from orthocal.kinematics.conditions import find_approach_problem
 from orthocal.measurement.files.point_rows import PointRows
 from orthocal.measurement.files.readings_file import CONDITIONS, COORDINATES, RawReading
 from orthocal.measurement.files.session_keys import MOST_READINGS
+from orthocal.observation.conditions import needed_conditions
 from orthocal.robot.description import HIGHEST_C, LOWEST_C
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import (
@@ -63,7 +64,8 @@ def check_readings(
     Raises:
         SessionError: If a row is wrong; names file and line.
     """
-    accepted, points = _AcceptedReadings(file), PointRows(session)
+    needs_approach = "approach" in needed_conditions(session.robot)
+    accepted, points = _AcceptedReadings(file, needs_approach=needs_approach), PointRows(session)
     for row in rows:
         for reading in parse_row(row, session, points):
             setup = points.setups[reading.setup]
@@ -175,13 +177,15 @@ class _AcceptedReadings:
 
     Args:
         file: File of the rows, for messages.
+        needs_approach: Whether an effect of the machine depends on the approach.
     """
 
-    def __init__(self, file: Path) -> None:
+    def __init__(self, file: Path, *, needs_approach: bool) -> None:
         self.readings: list[Reading] = []
         self.places: list[str] = []
         """File and line of each reading."""
         self._file = file
+        self._needs_approach = needs_approach
         self._first_lines: dict[ReadingKey, int] = {}
         self._first_line_by_zoned: dict[bool, int] = {}
         self._absolute: set[tuple[str, int]] = set()
@@ -199,13 +203,7 @@ class _AcceptedReadings:
             SessionError: If the reading disagrees with the previous ones; names file and line.
         """
         if reading.key in self._first_lines:
-            sides = ", and different sides of approach in 'approach'" * (reading.approach is None)
-            raise SessionError(
-                f"repeats {reading.label} of cycle {reading.cycle}, first in line "
-                f"{self._first_lines[reading.key]}; number repeated measurements in the column "
-                f"'cycle'{sides}",
-                where=row.where,
-            )
+            raise SessionError(self._describe_repetition(reading), where=row.where)
         self._first_lines[reading.key] = row.line
         self._require_consistent_time_zone(row, reading.conditions)
         if len(self.readings) >= MOST_READINGS:
@@ -214,6 +212,21 @@ class _AcceptedReadings:
             self._require_independent(reading, row.where)
         self.readings.append(reading)
         self.places.append(row.where)
+
+    def _describe_repetition(self, reading: Reading) -> str:
+        """Problem of a reading whose row exists already."""
+        repeats = (
+            f"repeats {reading.label} of cycle {reading.cycle}, first in line "
+            f"{self._first_lines[reading.key]}"
+        )
+        if self._needs_approach and all(r.approach is None for r in self.readings):
+            return (
+                f"{repeats}; the column 'approach' is missing or empty. Copy it from the plan: it "
+                "states the side from which each posture was approached. Number repetitions from "
+                "one side in the column 'cycle'"
+            )
+        sides = ", and different sides of approach in 'approach'" * (reading.approach is None)
+        return f"{repeats}; number repeated measurements in the column 'cycle'{sides}"
 
     def _require_consistent_time_zone(self, row: RawReading, conditions: Conditions | None) -> None:
         """Refuse times with and without time zone in one session."""
