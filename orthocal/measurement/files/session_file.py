@@ -53,6 +53,7 @@ from orthocal.sensors.protocol import (
 from orthocal.sensors.registry import read_setup
 from orthocal.session.points import base_name
 from orthocal.session.session import Gauge, Purpose, Reading, Session, Setup
+from orthocal.text import list_some
 from orthocal.units import MM, show_limit
 
 SESSION = "session.yaml"
@@ -60,7 +61,7 @@ SESSION = "session.yaml"
 MAX_SEARCHED = 200
 """Largest number of directory entries searched for a session."""
 
-MAX_LISTED = 5
+MAX_LISTED = 3
 """Largest number of sessions of subdirectories in a message."""
 
 OTHER_SUFFIXES = (".csv", ".json", ".urdf")
@@ -283,7 +284,9 @@ def _read_keys(path: Path) -> tuple[Path, bytes, SessionKeys]:
     """Path, content and keys of the session.yaml at a path or in a directory."""
     file = path / SESSION if is_folder(path) else path
     if file.suffix.lower() in OTHER_SUFFIXES:
-        raise SessionError("is no session.yaml", where=str(file))
+        session = file.with_name(SESSION)
+        hint = f"; its session is {session}" if exists(session) else list_sessions(file.parent)
+        raise SessionError(f"is no {SESSION}{hint}", where=str(file))
     if file is not path and not exists(file):
         raise SessionError(_describe_content(path), where=str(path))
     if not exists(file) and (similar := get_close_matches(path.name, _names_in(path.parent), n=1)):
@@ -300,11 +303,16 @@ def _describe_content(folder: Path) -> str:
     """Problem of a directory without a session.yaml: it is a calibration, or contains sessions."""
     if exists(folder / "calibration.json"):
         return "is a calibration; name the session that it was made from"
-    sessions = sorted(f.parent for f in islice(folder.glob(f"*/{SESSION}"), MAX_SEARCHED))
-    if not sessions:
-        return f"is a directory without {SESSION}"
-    listed = [str(s) for s in sessions[:MAX_LISTED]] + ["..."] * (len(sessions) > MAX_LISTED)
-    return f"is a directory without {SESSION}; sessions in it: {', '.join(listed)}"
+    return f"is a directory without {SESSION}{list_sessions(folder)}"
+
+
+def list_sessions(folder: Path) -> str:
+    """Sessions in a directory, or one level deeper, as the end of a message; empty without any."""
+    for pattern in (f"*/{SESSION}", f"*/*/{SESSION}"):
+        sessions = sorted(str(f.parent) for f in islice(folder.glob(pattern), MAX_SEARCHED))
+        if sessions:
+            return f"; sessions there: {list_some(sessions, MAX_LISTED)}"
+    return ""
 
 
 def _names_in(folder: Path) -> list[str]:
