@@ -244,7 +244,7 @@ ENTRIES = {
     "resolution": (
         ["0.123"],
         ["0.123"],
-        "! Finer than the gauge (line 2): 1 of 1 readings have more digits",
+        "! Finer than the gauge (line 2): 1 of 1 readings are in inches, or",
     ),
     "no text": (["\ufffd\x1b[2J"], [], r"is neither a number nor a command"),
 }
