@@ -9,6 +9,7 @@ import math
 from typing import Literal
 
 MM = 1e-3
+INCH = 25.4 * MM
 UM = 1e-6
 MRAD = 1e-3
 DEG = math.pi / 180.0

@@ -505,6 +505,11 @@ def test_sessions_with_the_same_readings_are_refused(days, tmp_path):
         f"orthocal: {copy}/readings.csv: has the same readings as {monday}/session.yaml: a copy "
         "that was not measured again?\n"
     )
+    head, first, *rows = (monday / "readings.csv").read_text().splitlines()
+    (copy / "readings.csv").write_text("\n".join([head, first, f"{rows[0]}1", *rows[1:-1]]) + "\n")
+    code, _, err = orthocal("check", monday, copy)
+    assert code == 2
+    assert f"{monday}/session.yaml except line 3: a copy" in err
 
 
 def test_again_repeats_the_last_of_several_sessions(days, tmp_path):

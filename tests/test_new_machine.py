@@ -212,7 +212,9 @@ def test_a_machine_is_made_again_after_a_change(copied):
 def test_readings_are_not_overwritten(copied):
     file = copied / "first/readings.csv"
     head, *rows = file.read_text().splitlines()
-    file.write_text("\n".join([head, *(row.replace(",,", ",0.12,") for row in rows)]) + "\n")
+    read = [row.replace(",,", ",0.12,") for row in rows]
+    read[0] = rows[0].replace(",,", ",12,")  # out of range, but measured
+    file.write_text("\n".join([head, *read]) + "\n")
     before = files_of(copied)
     for words in (
         ["new", copied, *options(), "--paper"],

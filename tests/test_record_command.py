@@ -245,7 +245,7 @@ ENTRIES = {
     "resolution": (
         ["0.123"],
         ["0.123"],
-        "! Finer than the gauge (line 2): 1 of 1 readings have more digits",
+        "! Finer than the gauge (line 2): 1 of 1 readings are in inches, or",
     ),
     "no text": (["\ufffd\x1b[2J"], [], r"is neither a number nor a command"),
 }
@@ -504,6 +504,24 @@ def test_session_that_another_process_records_is_refused(folder, run):
         f"orthocal: {folder}/readings.csv{SUFFIX}: these readings are being recorded by another "
         "process; one at a time\n"
     )
+
+
+def test_reading_out_of_range_is_read_again(folder, run):
+    """Nothing is written before a reading is typed, and a wrong unit is refused."""
+    table = "setup,posture,cycle,reading_mm\nyx,zero,1,0.1\nyx,x_max,1,12.3\nyx,x_min,1,0.3\n"
+    with (folder / "session.yaml").open("a") as stream:
+        stream.write("readings: readings.csv\n")
+    csv = folder / "readings.csv"
+    csv.write_text(table)
+    code, out, _ = run(folder)
+    assert code == 0
+    assert "readings.csv:3: reading_mm is 12.3;" in " ".join(out.split())
+    assert csv.read_text() == table
+    run(folder, "12.2", "1.23")
+    assert cells(folder) == ["0.10", "1.23", "0.30"]
+    csv.write_text(table.replace("0.1", "100").replace("0.3", "30"))
+    code, _, err = run(folder)
+    assert (code, "for readings in µm" in err) == (2, True)
 
 
 def with_effects(folder, effects, table=None):

@@ -18,6 +18,7 @@ from orthocal.estimation.fit import Fit, fit_problem
 from orthocal.estimation.options import SolverOptions
 from orthocal.estimation.problem import CalibrationProblem, build_problem
 from orthocal.estimation.weighting import stated_sigma
+from orthocal.hypotheses.families.unit_and_sign import decimal_step
 from orthocal.hypotheses.hypothesis import Rows
 from orthocal.measurement.joining import split_sessions
 from orthocal.measurement.motion.approach import label_reading
@@ -26,7 +27,7 @@ from orthocal.sensors.protocol import states_readings
 from orthocal.session.session import Gauge, Session
 from orthocal.statistics.chance import chance_of_excess
 from orthocal.statistics.zeros import project_out_zeros
-from orthocal.units import MM
+from orthocal.units import INCH, MM
 
 STEP_TOLERANCE = 1e-3
 """Rounding error of a reading, in steps of the gauge."""
@@ -63,7 +64,7 @@ SAME_LENGTH = 5.0
 """Largest difference of lengths of equal legs, in prior standard deviations of a translation."""
 
 MISTAKE_PROBABILITY = 1e-6
-"""Probability by chance below which differences of repeated readings are a mistake."""
+"""Probability by chance below which differences of repeated readings, or steps, are a mistake."""
 
 
 def find_implausible(session: Session, *, explained: bool = False) -> tuple[Finding, ...]:
@@ -126,9 +127,26 @@ def find_finer(session: Session) -> Iterator[Finding]:
     for name, gauge in session.gauges.items():
         rows = _rows_of(session, name)
         if finer := _finer_rows(session, rows, gauge):
-            yield words.finer_than_gauge(
-                len(finer), len(rows), gauge.resolution or 0.0, *_first(session, finer)
-            )
+            step = gauge.resolution or 0.0
+            inches = _fit_inches(session.values[rows], step)
+            first = _first(session, finer)
+            yield words.finer_than_gauge(len(finer), len(rows), step, *first, inches=inches)
+
+
+def _fit_inches(values: Array, step: float) -> bool:
+    """True if readings are multiples of a step if they are in inches, and not by chance.
+
+    Args:
+        values: Readings between the steps if they are in mm, shape (n,), [m].
+        step: Step of their gauge, [m].
+    """
+    values = values[values != 0.0]
+    to_inches = INCH / MM
+    half_width = 0.5 * to_inches * decimal_step(values) / step + STEP_TOLERANCE
+    steps = to_inches * values / step
+    by_chance = (2.0 * half_width) ** len(values)
+    fit = np.abs(steps - np.round(steps)) <= half_width
+    return bool(fit.all()) and by_chance < MISTAKE_PROBABILITY
 
 
 def _rows_of(session: Session, gauge_name: str) -> list[int]:

@@ -8,9 +8,17 @@ from pathlib import Path
 import orthocal
 from orthocal.cli.options import state_tolerances
 from orthocal.errors import SessionError
+from orthocal.text import spans
 
 FEWEST_DIFFERENT = 4
 """Fewest different values with which equal readings show that a session is a copy."""
+
+FEWEST_COMPARED = 8
+"""Fewest compared readings of which most, not all, are equal in a copy."""
+
+COPY_CHANCE = 1e-4
+"""Chance of equal readings below which a session is a copy. It is an upper limit: it assumes that
+the gauges were mounted exactly as before."""
 
 
 def load_each_once(
@@ -29,7 +37,7 @@ def load_each_once(
         partial: Whether some of the readings may be missing.
 
     Raises:
-        SessionError: If two sessions are the same, or have the same readings.
+        SessionError: If two sessions are the same, or have the same readings, or nearly so.
         ParameterError: If an effect does not exist, or a tolerance is invalid.
     """
     sessions: list[orthocal.Session] = []
@@ -40,12 +48,8 @@ def load_each_once(
                 "is the same session as one before it; its readings would count twice",
                 where=str(path),
             )
-        original = next((other for other in sessions if _same_readings(session, other)), None)
-        if original is not None:
-            raise SessionError(
-                f"has the same readings as {original.path}: a copy that was not measured again?",
-                where=str(session.readings_path or path),
-            )
+        for other in sessions:
+            _require_measured_again(session, other)
         sessions.append(session)
     if effects is not None:
         from orthocal.robot.parameters import errors_at
@@ -68,12 +72,58 @@ def load_joined(
     )
 
 
-def _same_readings(one: orthocal.Session, other: orthocal.Session) -> bool:
-    """True for equal rows with equal values, which two measurements do not have."""
-    rows = [
-        [(r.setup, r.posture, r.minus, r.cycle, r.value) for r in s.readings] for s in (one, other)
-    ]
-    return rows[0] == rows[1] and len({r[-1] for r in rows[0]}) >= FEWEST_DIFFERENT
+def _require_measured_again(session: orthocal.Session, other: orthocal.Session) -> None:
+    """Refuse a session that is a copy of another one, with no or few readings changed.
+
+    Raises:
+        SessionError: If it is a copy; names both sessions and the lines that differ.
+    """
+    values = {r.key: r.value for r in other.readings if r.is_read}
+    common = [r for r in session.readings if r.is_read and r.key in values]
+    equal = [r for r in common if r.value == values[r.key]]
+    complete = len(equal) == len(session.readings) == len(other.readings)
+    if len({r.value for r in equal}) < FEWEST_DIFFERENT or not (
+        complete or _are_copied(session, common, equal)
+    ):
+        return
+    lines = sorted({r.line for r in common if r not in equal and r.line is not None})
+    exception = f" except {spans(lines, 'line')}" if lines else ""
+    raise SessionError(
+        f"has the same readings as {other.path}{exception}: a copy that was not measured again?",
+        where=str(session.readings_path or session.path),
+    )
+
+
+def _are_copied(
+    session: orthocal.Session, common: Sequence[orthocal.Reading], equal: Sequence[orthocal.Reading]
+) -> bool:
+    """True if the noise of the gauges excludes so many equal readings in two measurements.
+
+    The first reading of a setup does not count, because the dial is set there. Gauges must have
+    been mounted anew: there are several setups, and their mounting has tolerances. Most readings
+    must differ from each other: readings near 0 on an exact machine hardly depend on the mounting.
+
+    Args:
+        session: One of the sessions.
+        common: Readings of the session that the other one has, too.
+        equal: Those of them that are equal in both.
+    """
+    from orthocal.statistics.chance import chance_of_equal_readings
+
+    first = {r.setup: r.key for r in reversed(common)}
+    setups = [session.setups[name] for name in first]
+    gauges = [session.gauges[s.gauge] for s in setups]
+    steps = [(g.sigma, g.resolution) for g in gauges if g.sigma and g.resolution]
+    count, n_equal = (sum(r.key != first[r.setup] for r in rows) for rows in (common, equal))
+    mounted_anew = len(setups) > 1 and all(
+        any(n.prior_std > 0.0 and not n.of_gauge for n in s.sensor.nuisance_parameters)
+        for s in setups
+    )
+    varied = 2 * len({r.value for r in equal}) >= count
+    if not (mounted_anew and varied) or len(steps) < len(gauges) or count < FEWEST_COMPARED:
+        return False
+    sigma, step = min(steps, key=lambda s: s[0] / s[1])
+    return chance_of_equal_readings(n_equal, count, sigma=sigma, step=step) < COPY_CHANCE
 
 
 def state_conditions(

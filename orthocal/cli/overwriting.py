@@ -77,11 +77,12 @@ def _require_no_readings(directory: Path) -> None:
 
     if not exists(directory / SESSION):
         return
+    out_of_range: list[SessionError] = []
     try:
-        session = load_rows(directory)
+        session = load_rows(directory, wrong=out_of_range)
     except OrthocalError:  # not a valid session
         return
-    count = sum(r.is_read for r in session.readings)
+    count = sum(r.is_read for r in session.readings) + len(out_of_range)
     if count and not session.source.startswith(SIMULATED):
         raise SessionError(
             f"contains {count} readings, which --force does not overwrite; move them first",

@@ -20,9 +20,7 @@ from orthocal.gcode.path import (
     arc_about,
     center_of_radius,
 )
-from orthocal.units import MM
-
-INCH = 25.4 * MM
+from orthocal.units import INCH, MM
 
 LARGEST_COORDINATE = 1e3
 """Largest accepted coordinate of a point, [m]."""

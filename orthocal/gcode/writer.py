@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from orthocal.gcode.interpreter import INCH, STOPS, Modes, Step
+from orthocal.gcode.interpreter import STOPS, Modes, Step
 from orthocal.gcode.lines import Line, PointLine, Word
 from orthocal.gcode.segmentation import Segments
-from orthocal.units import MM
+from orthocal.units import INCH, MM
 
 FEWEST_DECIMALS = {MM: 4, INCH: 5}
 """Fewest decimals of a coordinate by unit."""

@@ -154,6 +154,7 @@ class Recording:
         digest: Digest of the CSV on disk.
         restored: Number of changes that a killed recording had not written to the CSV.
         edited: Whether the CSV differs from all versions that the killed recording wrote.
+        wrong: Errors of readings out of range in the CSV, which count as missing.
     """
 
     def __init__(
@@ -165,11 +166,13 @@ class Recording:
         digest: str,
         restored: int = 0,
         edited: bool = False,
+        wrong: Sequence[SessionError] = (),
     ) -> None:
         self.session = session
         self.rows = tuple(rows)
         self.restored = restored
         self.edited = edited
+        self.wrong = tuple(wrong)
         self._journal = journal
         self._digest = digest
 
@@ -260,6 +263,7 @@ class Recording:
                 difference=self.session.is_difference(row),
                 where=row.label_with_cycle,
                 largest=largest_reading(setup.sensor),
+                of_setup_mm=[r.value / MM for r in self.rows if r.setup == row.setup and r.is_read],
             )
             if conditions is not None:
                 check_conditions(
@@ -343,6 +347,8 @@ class Recording:
 def open_recording(path: str | Path) -> Iterator[Recording]:
     """Open a session for recording; a plan without a readings.csv gets one.
 
+    Readings out of range count as missing, so that they can be read again.
+
     Args:
         path: The session.yaml, or its directory.
 
@@ -351,7 +357,8 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
         OrthocalError: If another process records the session, or its journal is damaged.
         OutputError: If its directory is not writable.
     """
-    session = load_rows(path)
+    wrong: list[SessionError] = []
+    session = load_rows(path, wrong=wrong)
     csv = _csv_of(session)
     _files_to_add(session)  # refused before anything is written
     with open_journal_file(
@@ -359,11 +366,11 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
     ) as journal:
         lines = _read_lines(journal)
         if _is_outdated(session):  # another process may have written before the lock
-            session = load_rows(path)
+            session = load_rows(path, wrong=wrong)
         for file, content in _files_to_add(session).items():
             write_file(file, content)
         if session.readings_path is None:
-            session = load_rows(path)
+            session = load_rows(path, wrong=wrong)
         rows = session.readings
         table = read_file(csv, error=SessionError)
         pending, edited = _find_pending(lines, _digest(table))
@@ -375,9 +382,15 @@ def open_recording(path: str | Path) -> Iterator[Recording]:
         if pending:
             table = _table(rows, session)
             _write(csv, table)
-            session = load_rows(path)
+            session = load_rows(path, wrong=wrong)
         recording = Recording(
-            session, rows, journal, digest=_digest(table), restored=len(pending), edited=edited
+            session,
+            rows,
+            journal,
+            digest=_digest(table),
+            restored=len(pending),
+            edited=edited,
+            wrong=wrong,
         )
         try:
             yield recording

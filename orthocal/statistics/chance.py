@@ -40,6 +40,30 @@ def chance_of_excess(chi_square: float, dof: float, *, cycles_dof: float = 0.0) 
     return f_tail(excess_dof, cycles_dof, excess_square / excess_dof)
 
 
+def chance_of_equal_readings(equal: int, count: int, *, sigma: float, step: float) -> float:
+    """Probability that at least some of a number of repeated readings are equal to the last digit.
+
+    Two readings of one quantity differ by d with standard deviation √2 σ before they are rounded.
+    Then they are equal with probability E[max(0, 1 − |d|/step)].
+
+    Args:
+        equal: Number of equal readings.
+        count: Number of repeated readings.
+        sigma: Standard deviation of one reading, [m].
+        step: Step to which the dial is read, [m].
+    """
+    s = math.sqrt(2.0) * sigma / step
+    if s == 0.0:
+        return 1.0
+    chance = math.erf(1.0 / (s * math.sqrt(2.0))) + s * math.sqrt(2.0 / math.pi) * math.expm1(
+        -0.5 / s**2
+    )
+    return sum(
+        math.comb(count, k) * chance**k * (1.0 - chance) ** (count - k)
+        for k in range(equal, count + 1)
+    )
+
+
 def confidence_factor(dof: float, level: float = 0.95) -> float:
     """Half width of a confidence interval, in standard deviations."""
     tail = 0.5 + level / 2.0

@@ -50,7 +50,11 @@ def test_the_examples_are_plausible(name):
 
 def test_readings_in_inches_are_found(session):
     inches = session.with_values(np.round(session.values / 25.4, 7))
-    assert "finer than the gauge" in kinds(inches)
+    (finer,) = (f for f in find_implausible(inches) if f.kind == "finer than the gauge")
+    assert finer.text.startswith("All 54 readings appear to be in inches")
+    coarse = session.with_values(np.round(session.values / 25.4, 6))  # no multiples in inches
+    (finer,) = (f for f in find_implausible(coarse) if f.kind == "finer than the gauge")
+    assert "readings are in inches, or have more digits than the gauge shows" in finer.text
     assert "residuals too small" in kinds(inches)
     found = [f for f in judge_session(inches).findings if f.severity != "note"]
     assert [f.kind for f in found] == ["wrong unit"]

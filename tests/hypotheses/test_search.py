@@ -128,6 +128,15 @@ def test_a_setup_that_no_hypothesis_explains_is_named(cycles):
     assert (found.kind, [p.setup for p in found.places]) == ("inconsistent setup", ["zx"])
 
 
+@pytest.mark.parametrize("closing", [1, 3])
+def test_closing_reading_is_no_cycle_of_its_own(cycles, closing):
+    """All other readings of its setup are no group beside the setup, either."""
+    rows = [r for r in cycles.readings if r.setup == "yx"][: 3 + closing]
+    families = wrong_units_and_signs(Rows(cycles.select(rows)), cycles.gauge.sigma)
+    scopes = {f.explain(h).scope for f in families for h in range(f.count)}
+    assert ("cycle" in scopes) == (closing > 1)
+
+
 def test_a_sigma_in_a_wrong_unit_is_the_only_finding(cycles):
     for sigma in (1e-3, 5e-3):
         wrong = cycles.with_gauge(replace(cycles.gauge, sigma=sigma, resolution=1e-5))

@@ -20,6 +20,7 @@ from orthocal.estimation.solvers.batch import BatchSolver
 from orthocal.observation.model import predict_readings
 from orthocal.observation.observations import Observations, build_observations
 from orthocal.statistics.chance import (
+    chance_of_equal_readings,
     chance_of_excess,
     confidence_factor,
     coverage_factor,
@@ -271,6 +272,19 @@ def test_an_information_without_readings_has_no_rank():
     information = Information(np.zeros((0, 2)))
     assert information.rank == 0
     assert not information.identifiable.any()
+
+
+def test_chance_of_equal_readings():
+    """Two dials are read to 10 µm with scatter of 5 µm, at any phase of their scale."""
+    rng = np.random.default_rng(0)
+    actual = rng.uniform(-1.0, 1.0, 200_000)
+    one, other = (np.round((actual + rng.normal(0.0, 5e-3, actual.size)) / 0.01) for _ in "ab")
+    single = chance_of_equal_readings(1, 1, sigma=5e-6, step=1e-5)
+    assert np.mean(one == other) == pytest.approx(single, abs=0.005)
+    assert chance_of_equal_readings(2, 3, sigma=5e-6, step=1e-5) == pytest.approx(
+        stats.binom.sf(1, 3, single)
+    )
+    assert chance_of_equal_readings(9, 9, sigma=0.0, step=1e-5) == 1.0
 
 
 def test_the_chance_of_an_excess_over_cycles_is_an_f_test():

@@ -56,14 +56,42 @@ def above_tolerances(scale: float) -> Finding:
 
 
 def finer_than_gauge(
-    count: int, total: int, step: float, where: str, value: float, places: Sequence[Place]
+    count: int,
+    total: int,
+    step: float,
+    where: str,
+    value: float,
+    places: Sequence[Place],
+    *,
+    inches: bool,
 ) -> Finding:
-    """Finding about readings between the steps of the gauge."""
+    """Finding about readings between the steps of the gauge.
+
+    Args:
+        count: Number of readings between the steps.
+        total: Number of readings of the gauge.
+        step: Step of the gauge, [m].
+        where: File and line of the first of them.
+        value: Its value, [m].
+        places: Places of all of them.
+        inches: Whether all readings of the gauge are multiples of the step if they are in inches.
+    """
+    first = f"The first is {value / MM:.6g} mm in {where}."
+    text, action = (
+        f"{count} of {total} readings are in inches, or have more digits than the gauge shows "
+        f"(resolution {step / MM:g} mm). {first}",
+        "Make sure that the readings are in mm, not in inches, and that the resolution is right.",
+    )
+    if inches:
+        text, action = (
+            f"All {total} readings appear to be in inches: multiplied by 25.4, they are multiples "
+            f"of the resolution, {step / MM:g} mm. {first}",
+            "If so, multiply these readings by 25.4, or use `orthocal import --unit inch`.",
+        )
     return review(
         "finer than the gauge",
-        f"{count} of {total} readings have more digits than the gauge shows (resolution "
-        f"{step / MM:g} mm). The first is {value / MM:.6g} mm in {where}.",
-        "Make sure that the readings are in mm, not in inches, and that the resolution is right.",
+        text,
+        action,
         places,
         finer=float(count),
         resolution_mm=step / MM,

@@ -51,10 +51,10 @@ def wrong_units_and_signs(rows: Rows, sigma: float) -> Iterator[Family]:
     if 3 < len(names) <= MAX_PAIRED_SETUPS:
         pairs = combinations(names, 2)
         yield factor_family(rows, [_reversed("setups", rows.of_setups(p), p) for p in pairs])
-    groups += [
+    groups += [  # not the closing reading of a setup, and all its readings but this one
         _reversed("cycle", indices, names=(name,), cycle=cycle)
         for (name, cycle), indices in rows.cycles.items()
-        if name in names and len(indices) < len(rows.setups[name])
+        if name in names and 1 < len(indices) < len(rows.setups[name]) - 1
     ]
     yield _scaled(rows, groups, "wrong unit", UNITS, sigma)
     yield _scaled(rows, groups, "decimal point", DECIMAL_POINTS, sigma)
@@ -117,7 +117,7 @@ def _scaled(
     sigma: float,
 ) -> Family:
     """Family of groups multiplied by each factor after which the decimal step is plausible."""
-    steps = [_step(rows.values[list(g.rows)]) for g in groups]
+    steps = [decimal_step(rows.values[list(g.rows)]) for g in groups]
     explanations = [
         replace(g, kind=kind, factor=factor)
         for factor in factors
@@ -135,7 +135,7 @@ def _dimensions(rows: Rows, group: Explanation) -> int:
     return len(group.rows) - len({readings[i].setup for i in group.rows if rows.single[i]})
 
 
-def _step(values: Array) -> float:
+def decimal_step(values: Array) -> float:
     """Largest decimal step (1 mm, 0.1 mm, …) that divides all values, [m]; 0 if there is none."""
     for decimals in range(MAX_DECIMALS):
         step = 10.0**-decimals * MM

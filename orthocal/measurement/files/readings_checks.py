@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from orthocal.kinematics.conditions import find_approach_problem
 from orthocal.measurement.files.point_rows import PointRows
 from orthocal.measurement.files.readings_file import CONDITIONS, COORDINATES, RawReading
 from orthocal.measurement.files.session_keys import MOST_READINGS
+from orthocal.observation.conditions import needed_conditions
 from orthocal.robot.description import HIGHEST_C, LOWEST_C
 from orthocal.robot.model import Robot
 from orthocal.sensors.protocol import (
@@ -31,12 +33,19 @@ UNIT_HINT = "; for readings in µm use `orthocal import --unit um`"
 UNIT_HINT_RATIO = 5.0
 """Ratio of a reading to the range of the gauge above which a wrong unit is suspected."""
 
+POINT_HINT_RATIO = 1.5
+"""Ratio of a reading to the range of the gauge above which its decimal point is suspected."""
+
 ROUNDING_MM = 1e-9
 """Excess over the range of a gauge that may be a rounding error, [mm]."""
 
 
 def check_readings(
-    rows: Iterable[RawReading], session: Session, *, file: Path
+    rows: Iterable[RawReading],
+    session: Session,
+    *,
+    file: Path,
+    wrong: list[SessionError] | None = None,
 ) -> tuple[tuple[Reading, ...], PointRows]:
     """Readings of a table, checked against their session and each other; NaN for empty cells.
 
@@ -46,6 +55,8 @@ def check_readings(
         rows: The rows.
         session: The session with its setups, postures and gauges.
         file: File of the rows, for messages.
+        wrong: List that is set to the errors of readings out of range; these readings become NaN.
+            By default, and if most readings are out of range, the first error is raised.
 
     Returns:
         The readings, and all setups of the session with the additional ones.
@@ -53,14 +64,47 @@ def check_readings(
     Raises:
         SessionError: If a row is wrong; names file and line.
     """
-    accepted, points = _AcceptedReadings(file), PointRows(session)
+    needs_approach = "approach" in needed_conditions(session.robot)
+    accepted, points = _AcceptedReadings(file, needs_approach=needs_approach), PointRows(session)
     for row in rows:
         for reading in parse_row(row, session, points):
             setup = points.setups[reading.setup]
             accepted.add(row, reading, of_pair=reads_pairs(setup.sensor))
     if not accepted.readings:
         raise SessionError("holds no readings", where=str(file))
-    return tuple(accepted.readings), points
+    out_of_range = _find_out_of_range(accepted, points)
+    n_read = sum(reading.is_read for reading in accepted.readings)
+    if out_of_range and (wrong is None or 2 * len(out_of_range) > n_read):
+        raise next(iter(out_of_range.values()))
+    if wrong is not None:
+        wrong[:] = out_of_range.values()
+    readings = tuple(
+        replace(reading, value=math.nan) if place in out_of_range else reading
+        for reading, place in zip(accepted.readings, accepted.places, strict=True)
+    )
+    return readings, points
+
+
+def _find_out_of_range(accepted: _AcceptedReadings, points: PointRows) -> dict[str, SessionError]:
+    """Errors of readings beyond the range of their gauge or sensor, by file and line."""
+    errors: dict[str, SessionError] = {}
+    values_mm: dict[str, list[float]] = {}
+    for reading in accepted.readings:
+        values_mm.setdefault(reading.setup, []).append(reading.value / MM)
+    for reading, place in zip(accepted.readings, accepted.places, strict=True):
+        setup = points.setups[reading.setup]
+        try:
+            check_range(
+                reading.value / MM,
+                points.gauges[setup.gauge],
+                difference=is_difference(reading.minus, setup.sensor),
+                where=place,
+                largest=largest_reading(setup.sensor),
+                of_setup_mm=values_mm[reading.setup],
+            )
+        except SessionError as e:
+            errors.setdefault(place, e)
+    return errors
 
 
 def require_read(session: Session, *, partial: bool = False) -> None:
@@ -115,21 +159,10 @@ def parse_row(row: RawReading, session: Session, points: PointRows) -> list[Read
         )
     cycle, conditions = parse_cycle(row.cycle, row.where), parse_conditions(row, session.robot)
     value_by_setup = points.split(row, values) if points.is_point(row) else {row.setup: values[0]}
-    minus = row.minus or None
-    readings = []
-    for name, value in value_by_setup.items():
-        setup = points.setups[name]
-        check_range(
-            value / MM,
-            points.gauges[setup.gauge],
-            difference=is_difference(minus, setup.sensor),
-            where=row.where,
-            largest=largest_reading(setup.sensor),
-        )
-        readings.append(
-            Reading(name, row.posture, minus, cycle, value, row.line, conditions=conditions)
-        )
-    return readings
+    return [
+        Reading(name, row.posture, row.minus or None, cycle, value, row.line, conditions=conditions)
+        for name, value in value_by_setup.items()
+    ]
 
 
 def _parse_value(row: RawReading, column: str) -> float:
@@ -144,11 +177,15 @@ class _AcceptedReadings:
 
     Args:
         file: File of the rows, for messages.
+        needs_approach: Whether an effect of the machine depends on the approach.
     """
 
-    def __init__(self, file: Path) -> None:
+    def __init__(self, file: Path, *, needs_approach: bool) -> None:
         self.readings: list[Reading] = []
+        self.places: list[str] = []
+        """File and line of each reading."""
         self._file = file
+        self._needs_approach = needs_approach
         self._first_lines: dict[ReadingKey, int] = {}
         self._first_line_by_zoned: dict[bool, int] = {}
         self._absolute: set[tuple[str, int]] = set()
@@ -166,13 +203,7 @@ class _AcceptedReadings:
             SessionError: If the reading disagrees with the previous ones; names file and line.
         """
         if reading.key in self._first_lines:
-            sides = ", and different sides of approach in 'approach'" * (reading.approach is None)
-            raise SessionError(
-                f"repeats {reading.label} of cycle {reading.cycle}, first in line "
-                f"{self._first_lines[reading.key]}; number repeated measurements in the column "
-                f"'cycle'{sides}",
-                where=row.where,
-            )
+            raise SessionError(self._describe_repetition(reading), where=row.where)
         self._first_lines[reading.key] = row.line
         self._require_consistent_time_zone(row, reading.conditions)
         if len(self.readings) >= MOST_READINGS:
@@ -180,6 +211,22 @@ class _AcceptedReadings:
         if not of_pair:
             self._require_independent(reading, row.where)
         self.readings.append(reading)
+        self.places.append(row.where)
+
+    def _describe_repetition(self, reading: Reading) -> str:
+        """Problem of a reading whose row exists already."""
+        repeats = (
+            f"repeats {reading.label} of cycle {reading.cycle}, first in line "
+            f"{self._first_lines[reading.key]}"
+        )
+        if self._needs_approach and all(r.approach is None for r in self.readings):
+            return (
+                f"{repeats}; the column 'approach' is missing or empty. Copy it from the plan: it "
+                "states the side from which each posture was approached. Number repetitions from "
+                "one side in the column 'cycle'"
+            )
+        sides = ", and different sides of approach in 'approach'" * (reading.approach is None)
+        return f"{repeats}; number repeated measurements in the column 'cycle'{sides}"
 
     def _require_consistent_time_zone(self, row: RawReading, conditions: Conditions | None) -> None:
         """Refuse times with and without time zone in one session."""
@@ -377,6 +424,7 @@ def check_range(
     difference: bool,
     where: str,
     largest: float = LARGEST_READING,
+    of_setup_mm: Collection[float] = (),
 ) -> None:
     """Refuse a reading beyond the range of the gauge or of its kind of sensor. NaN passes.
 
@@ -386,26 +434,31 @@ def check_range(
         difference: Whether the reading is a difference of two postures.
         where: File and line, or name of the reading, for messages.
         largest: Largest reading of the kind of sensor, [m].
+        of_setup_mm: Readings of the setup, [mm]. If most are in range, a larger reading may have a
+            misplaced decimal point.
 
     Raises:
         SessionError: If the reading is out of range.
     """
-    if abs(value_mm) > largest / MM:
-        raise SessionError(
-            f"reading_mm is {value_mm:g}; expected a number within ±{largest / MM:g}, the limit "
-            f"of this kind of sensor{UNIT_HINT}",
-            where=where,
-        )
-    if gauge.range is None:
-        return
-    lowest, highest = (v / MM for v in gauge.range)
-    if difference:
+    largest_mm = largest / MM
+    range_mm = (-largest_mm, largest_mm) if gauge.range is None else [v / MM for v in gauge.range]
+    lowest, highest = range_mm
+    if difference and gauge.range is not None:
         lowest, highest = lowest - highest, highest - lowest
-    if value_mm < lowest - ROUNDING_MM or value_mm > highest + ROUNDING_MM:
-        kind = "a difference" if difference else "a reading"
-        hint = UNIT_HINT if abs(value_mm) > UNIT_HINT_RATIO * max(-lowest, highest) else ""
-        raise SessionError(
-            f"reading_mm is {value_mm:g}; the gauge's range allows {kind} from "
-            f"{lowest:g} to {highest:g}{hint}",
-            where=where,
+    lowest, highest = lowest - ROUNDING_MM, highest + ROUNDING_MM
+    beyond_sensor = abs(value_mm) > largest_mm
+    if not beyond_sensor and not (value_mm < lowest or value_mm > highest):
+        return
+    ratio = abs(value_mm) / max(-lowest, highest)
+    n_in_range = sum(lowest <= v <= highest for v in of_setup_mm)
+    hint = UNIT_HINT if beyond_sensor or ratio > UNIT_HINT_RATIO else ""
+    if ratio > POINT_HINT_RATIO and 2 * n_in_range > len(of_setup_mm):
+        hint = "; its decimal point may be misplaced"
+    if beyond_sensor:
+        expected = (
+            f"expected a number within ±{largest_mm:g}, the limit of this kind of sensor{hint}"
         )
+    else:
+        kind = "a difference" if difference else "a reading"
+        expected = f"the gauge's range allows {kind} from {lowest:g} to {highest:g}{hint}"
+    raise SessionError(f"reading_mm is {value_mm:g}; {expected}", where=where)

@@ -53,6 +53,7 @@ from orthocal.sensors.protocol import (
 from orthocal.sensors.registry import read_setup
 from orthocal.session.points import base_name
 from orthocal.session.session import Gauge, Purpose, Reading, Session, Setup
+from orthocal.text import list_some
 from orthocal.units import MM, show_limit
 
 SESSION = "session.yaml"
@@ -60,7 +61,7 @@ SESSION = "session.yaml"
 MAX_SEARCHED = 200
 """Largest number of directory entries searched for a session."""
 
-MAX_LISTED = 5
+MAX_LISTED = 3
 """Largest number of sessions of subdirectories in a message."""
 
 OTHER_SUFFIXES = (".csv", ".json", ".urdf")
@@ -84,13 +85,15 @@ def load_session(path: str | Path, *, partial: bool = False) -> Session:
     return locate_stations(session)
 
 
-def _load_session(file: Path, content: bytes, keys: SessionKeys) -> Session:
+def _load_session(
+    file: Path, content: bytes, keys: SessionKeys, wrong: list[SessionError] | None = None
+) -> Session:
     """Session with readings, stations not located; readings of empty cells are NaN."""
     plan, readings_path = _build_unread(file, keys)
     table = read_file(readings_path, error=SessionError)
     with content_withheld_outside(file.parent, readings_path):
         rows = read_rows(readings_path, table)
-        readings, points = check_readings(rows, plan, file=readings_path)
+        readings, points = check_readings(rows, plan, file=readings_path, wrong=wrong)
     session = replace(
         plan,
         setups=points.setups,
@@ -162,10 +165,15 @@ def load_plan(path: str | Path) -> Session:
     )
 
 
-def load_rows(path: str | Path) -> Session:
+def load_rows(path: str | Path, *, wrong: list[SessionError] | None = None) -> Session:
     """Read a plan as `load_plan` does; missing readings are NaN.
 
     In a plan without a readings.csv all readings are missing, and its `readings_path` is None.
+
+    Args:
+        path: The session.yaml, or its directory.
+        wrong: List that is set to the errors of readings out of range, which become NaN. By
+            default, and if most readings are out of range, the first error is raised.
 
     Raises:
         SessionError: If a file is wrong; names file and line or key.
@@ -173,7 +181,7 @@ def load_rows(path: str | Path) -> Session:
     """
     file, content, keys = _read_keys(Path(path))
     if keys.readings is not None:
-        return locate_stations(_load_session(file, content, keys), partial=True)
+        return locate_stations(_load_session(file, content, keys, wrong), partial=True)
     stated = _read_setups(file, keys)
     count = keys.cycles * sum(len(s.postures or keys.postures) for s, _ in stated.values())
     if count > MOST_READINGS:
@@ -276,7 +284,9 @@ def _read_keys(path: Path) -> tuple[Path, bytes, SessionKeys]:
     """Path, content and keys of the session.yaml at a path or in a directory."""
     file = path / SESSION if is_folder(path) else path
     if file.suffix.lower() in OTHER_SUFFIXES:
-        raise SessionError("is no session.yaml", where=str(file))
+        session = file.with_name(SESSION)
+        hint = f"; its session is {session}" if exists(session) else list_sessions(file.parent)
+        raise SessionError(f"is no {SESSION}{hint}", where=str(file))
     if file is not path and not exists(file):
         raise SessionError(_describe_content(path), where=str(path))
     if not exists(file) and (similar := get_close_matches(path.name, _names_in(path.parent), n=1)):
@@ -293,11 +303,16 @@ def _describe_content(folder: Path) -> str:
     """Problem of a directory without a session.yaml: it is a calibration, or contains sessions."""
     if exists(folder / "calibration.json"):
         return "is a calibration; name the session that it was made from"
-    sessions = sorted(f.parent for f in islice(folder.glob(f"*/{SESSION}"), MAX_SEARCHED))
-    if not sessions:
-        return f"is a directory without {SESSION}"
-    listed = [str(s) for s in sessions[:MAX_LISTED]] + ["..."] * (len(sessions) > MAX_LISTED)
-    return f"is a directory without {SESSION}; sessions in it: {', '.join(listed)}"
+    return f"is a directory without {SESSION}{list_sessions(folder)}"
+
+
+def list_sessions(folder: Path) -> str:
+    """Sessions in a directory, or one level deeper, as the end of a message; empty without any."""
+    for pattern in (f"*/{SESSION}", f"*/*/{SESSION}"):
+        sessions = sorted(str(f.parent) for f in islice(folder.glob(pattern), MAX_SEARCHED))
+        if sessions:
+            return f"; sessions there: {list_some(sessions, MAX_LISTED)}"
+    return ""
 
 
 def _names_in(folder: Path) -> list[str]:

@@ -154,6 +154,9 @@ class RecordingText:
                 f"{recording.path.name} was edited after the last recording was interrupted; its "
                 "content counts."
             )
+        parts += [
+            f"{e}. It counts as missing: type it again." for e in recording.wrong[:MAX_SUSPECTS]
+        ]
         parts.append(
             f"{self._what_to_type()} It is stored at once. `help` lists the commands. "
             "Lines are those of the sheet and of readings.csv."

@@ -9,7 +9,7 @@ from orthocal.calibration.file import load_calibration
 from orthocal.effects.loading import load_robot
 from orthocal.errors import OrthocalError
 from orthocal.io.files import exists, is_folder
-from orthocal.measurement.files.session_file import load_plan
+from orthocal.measurement.files.session_file import list_sessions, load_plan
 from orthocal.robot.loading import packaged_robots
 from orthocal.robot.model import Robot
 from orthocal.session.session import Session
@@ -48,7 +48,7 @@ def load_subject(path: str | Path) -> Subject:
     if not any(file.glob("*.urdf")):
         raise OrthocalError(
             "contains no calibration.json and no session.yaml, and is no robot directory: it "
-            "contains no *.urdf",
+            f"contains no *.urdf{list_sessions(file)}",
             where=str(path),
         )
     return load_robot(file.resolve())
