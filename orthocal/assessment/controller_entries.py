@@ -3,10 +3,9 @@
 The true offsets are not the best ones if legs and axes have errors, too: other offsets compensate
 a part of them. The offsets to enter minimise the tool error over the workspace.
 
-A backlash is entered by the rule for offsets: if that lowers the expected tool error by at least
-WORTH_ENTERING. It is determined if it, or its change, is larger than its expanded uncertainty. The
-backlash of a drive that is not determined is omitted, unless such drives alone lower the tool error
-so much. A periodic error of a screw is entered if it is determined, or by that rule.
+A backlash or a periodic error of a screw is entered if the readings determine it. Then it, or its
+change, is larger than its expanded uncertainty, or entering it lowers the expected tool error. A
+backlash alone, beside offsets that are kept, is entered by the rule for offsets (WORTH_ENTERING).
 """
 
 from __future__ import annotations
@@ -37,8 +36,8 @@ ENTERED_DECIMALS = 6
 """Decimals of an entered offset in m or rad: 1 µm, 1 µrad."""
 
 WORTH_ENTERING = 0.05
-"""Smallest relative reduction of the expected tool error for which offsets are entered, or a
-correction of all errors is recommended."""
+"""Smallest relative reduction of the expected tool error for which offsets or a backlash alone are
+entered, or a correction of all errors is recommended."""
 
 ELLIPSE_FACTOR = math.sqrt(-2.0 * math.log(0.05)) / 1.96
 """Radius of the ellipse that contains 95 % of two estimates, relative to the expanded uncertainty
@@ -124,12 +123,7 @@ def compute_backlash(
         changes.append(_backlash_change(entry))
         determined.append(max(value, abs(value - active_backlash)) > uncertainty)
     entering = _choose_changes(calibration, tool, changes, determined)
-    entered = tuple(e if enter else e.kept for e, enter in zip(entries, entering, strict=True))
-    together: dict[str, float] = {}
-    for e in entered:
-        together |= _backlash_change(e)
-    lowered = _changes_tool(calibration, tool, together)
-    return tuple(e.kept for e in entries) if lowered is False else entered
+    return tuple(e if enter else e.kept for e, enter in zip(entries, entering, strict=True))
 
 
 def _backlash_change(entry: BacklashEntry) -> dict[str, float]:
@@ -189,7 +183,7 @@ def find_screw_effect(robot: Robot) -> Screw | None:
 
 
 def find_screws(calibration: Calibration) -> tuple[ScrewEntry, ...]:
-    """Periodic errors of screws to enter; empty if there are none.
+    """Periodic errors of screws to enter, by the rule for backlash; empty if there are none.
 
     An amplitude is determined if (A, B) is outside the ellipse that contains 95 % of the estimates
     around 0, or outside that around the active values.
@@ -272,7 +266,7 @@ def is_worth_changing(
     now: float | None,
     then: float | None,
 ) -> bool:
-    """True if the backlash is worth entering although the offsets are kept.
+    """True if the backlash is worth entering although the offsets are kept: the rule for offsets.
 
     Args:
         calibration: The calibration.
@@ -287,7 +281,7 @@ def is_worth_changing(
 
 def _changes_tool(
     calibration: Calibration, tool: CalibratedTool | None, changes: Mapping[str, float]
-) -> bool | None:
+) -> bool:
     """True if changes of the controller's correction lower the expected tool error enough.
 
     The tool error is computed to first order, as if all other errors were corrected.
@@ -296,15 +290,12 @@ def _changes_tool(
         calibration: The calibration.
         tool: Its tool over the workspace; None if there is none.
         changes: Parameter to its change, [SI].
-
-    Returns:
-        None if the tool error with these changes is unknown.
     """
     names = [] if tool is None else list(tool.free)
     nonzero = {n: change for n, change in changes.items() if change}
     columns = [names.index(n) for n in nonzero if n in names]
     if tool is None or not columns or not np.isfinite(calibration.model_covariance).all():
-        return None
+        return False
     change = np.array([nonzero[names[i]] for i in columns])
     covariance = calibration.error_covariances[0]
     aligned, _ = weighted_fields(tool, tool.jacobian[:, :, : len(covariance)])
