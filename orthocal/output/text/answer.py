@@ -369,7 +369,7 @@ def describe_machine(calibration: Calibration) -> str:
         travel[name] = f"{low} … {high} {word.replace('deg', '°')}".replace("∞ …", "−∞ …")
     words = []
     if calibration.robot_record.legs:
-        words.append(describe_legs(dict(calibration.robot_record.legs)))
+        words.append(describe_legs(calibration.robot))
     if len(set(travel.values())) == 1:
         words.append(f"travel {next(iter(travel.values()))}")
     else:
