@@ -69,7 +69,8 @@ def _unshown_backlash(session: Session) -> Iterator[Finding]:
         if len({letters[i] for letters in approaches} - {"u"}) < 2
     }
     if one_sided:
-        yield words.approached_from_one_side(one_sided)
+        common = len(approaches) == len(session.readings) and len(set(approaches)) == 1
+        yield words.approached_from_one_side(one_sided, common=common)
 
 
 def _unshown_expansion(session: Session) -> Iterator[Finding]:

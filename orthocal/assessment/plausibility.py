@@ -213,7 +213,7 @@ def _dimensions(session: Session, problem: CalibrationProblem) -> Finding | None
     )
     if deviation < MIN_WRONG_MACHINE or deviation < WRONG_MACHINE_RATIO * measured:
         return None
-    return words.wrong_dimensions(describe_legs(_lengths(session.robot)), deviation, measured)
+    return words.wrong_dimensions(describe_legs(session.robot), deviation, measured)
 
 
 def _too_small(session: Session, fit: Fit) -> Finding | None:
@@ -286,7 +286,7 @@ def _legs(robot: Robot) -> Finding | None:
     tolerance = max((robot.parameters[n].prior_std for n in errors), default=0.0)
     if max(lengths.values()) - min(lengths.values()) < SAME_LENGTH * tolerance:
         return None
-    return words.legs_differ(describe_legs(lengths), lengths)
+    return words.legs_differ(describe_legs(robot), lengths)
 
 
 def _check_repeats(session: Session, name: str) -> Finding | None:
@@ -329,12 +329,12 @@ def _lengths(robot: Robot) -> dict[str, float]:
     return {name: leg.length for name, leg in robot.legs.items()}
 
 
-def describe_legs(lengths: dict[str, float]) -> str:
-    """Lengths of legs in words, such as "legs of 310.25 mm"."""
-    shown = {name: f"{length / MM:g}" for name, length in lengths.items()}
+def describe_legs(robot: Robot) -> str:
+    """Lengths of legs in words, such as "legs of 310.25 mm"; "rods of ..." on a linear delta."""
+    shown = {name: f"{length / MM:g}" for name, length in _lengths(robot).items()}
     if len(set(shown.values())) == 1:
-        return f"legs of {next(iter(shown.values()))} mm"
-    return f"legs of {', '.join(f'{n} {v}' for n, v in shown.items())} mm"
+        return f"{robot.leg_noun} of {next(iter(shown.values()))} mm"
+    return f"{robot.leg_noun} of {', '.join(f'{n} {v}' for n, v in shown.items())} mm"
 
 
 def _rms(values: Array | Sequence[float]) -> float:

@@ -70,6 +70,7 @@ FindingKind = Literal[
     "linearisation error",
     "inseparable",
     "effect not shown",
+    "common approach",
     "effects inseparable",
     "below the noise",
     "line assumed",

@@ -50,12 +50,12 @@ FIRST = "first"
 """Name of the directory of the first session, in the directory of the machine."""
 
 BED_WORDS = (
-    "All slides together move the tool without turning a leg, so that readings of the legs say "
+    "All slides together move the tool without turning a rod, so that readings of the rods say "
     "little about this machine. The plan measures the bed with the dial at the tool. The bed is "
     "assumed to be flat to 0.02 mm (session.yaml). Name other sensors, such as a ball bar, by "
     "--with FILE. For the log of a printer's probe use orthocal import."
 )
-"""Note about the plan of a machine whose legs do not determine its offsets."""
+"""Note about the plan of a machine whose rods do not determine its offsets."""
 
 COMMENT = (
     "A plan. Print sheet.html and measure: run `orthocal record .` in this directory, or fill\n"
@@ -431,7 +431,7 @@ def _require_bed(kind: type[Dimensions], options: FirstPlanOptions) -> None:
     for option, stated in (("--paper", options.paper), ("--hours", options.hours is not None)):
         if stated:
             raise ParameterError(
-                f"readings of the legs say little about a {kind.kind}, and the readings of its bed "
+                f"readings of the rods say little about a {kind.kind}, and the readings of its bed "
                 "are fixed; name other sensors by --with",
                 where=option,
             )

@@ -33,7 +33,7 @@ DESCRIPTIONS = {
     BAR: "a ball bar of 50 mm",
     "usual_square": "a square and a dial at the tool",
     "usual_plate": "a surface plate and a dial at the tool",
-    DIAL: "a dial at the legs",
+    DIAL: "a dial at the {legs}",
 }
 """Descriptions of the usual sensors, by the names of their gauges."""
 
@@ -109,7 +109,7 @@ def find_sensor_gains(
         if plan.setups:
             gains.append(
                 SensorGain(
-                    words=DESCRIPTIONS[name or DIAL],
+                    words=DESCRIPTIONS[name or DIAL].format(legs=robot.leg_noun),
                     setups=len(plan.setups),
                     readings=sum(len(s.chosen) + 1 for s in plan.setups),
                     minutes=timed.minutes(plan.setups),

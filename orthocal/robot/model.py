@@ -224,6 +224,11 @@ class Robot:
     """True if placements depend on the mechanical adjustments of each session."""
 
     @property
+    def leg_noun(self) -> str:
+        """Noun for the legs in messages: rods, as on a linear delta, unless they follow slides."""
+        return "legs" if all(leg.follows_slide for leg in self.legs.values()) else "rods"
+
+    @property
     def effect_names(self) -> tuple[str, ...]:
         """Effects of the machine in addition to those of geometry and drives."""
         return tuple(self.declared.effects) if self.chosen_effects is None else self.chosen_effects

@@ -14,6 +14,8 @@ from orthocal.assessment.effect_limits import DETERMINED
 from orthocal.assessment.effect_separability import MAX_R_SQUARED, WARMER, find_unshown_effects
 from orthocal.estimation.problem import CalibrationProblem
 from orthocal.estimation.selection import select_parameters
+from orthocal.output.text.answer import render_decision
+from orthocal.output.text.layout import to_text
 from orthocal.statistics.zeros import project_out_zeros
 
 
@@ -49,6 +51,14 @@ def test_an_approach_from_one_side_is_one_note(plan):
     assessment = check_session(session)
     assert len(assessment.of_kind("effect not shown")) == 1
     assert assessment.decision.verdict == "enter"
+
+
+def test_common_approach_of_a_plan_is_a_detail(plan):
+    session = under(plan, lambda _, c: replace(c, approach="ppp")).with_effects(["backlash"])
+    assessment = check_session(simulate_session(session, {}).session)
+    assert len(assessment.of_kind("common approach")) == 1
+    short, long = (to_text(render_decision(assessment, details=d)) for d in (False, True))
+    assert ("same side" in short, "same side" in long) == (False, True)
 
 
 def test_readings_without_conditions_show_no_effect(plan):

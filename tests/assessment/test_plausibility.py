@@ -14,7 +14,7 @@ from models import TRUTH
 
 from orthocal import join_sessions, load_plan, load_robot, simulate_session, summarize
 from orthocal.assessment.judgement import judge_session
-from orthocal.assessment.plausibility import find_implausible, find_impossible_gauges
+from orthocal.assessment.plausibility import describe_legs, find_implausible, find_impossible_gauges
 from orthocal.calibration.file import calibration_json
 from orthocal.errors import RobotError
 from orthocal.output.text.answer import describe_machine
@@ -89,6 +89,7 @@ def test_the_dimensions_of_the_machine_are_printed():
     result = calibrated("raw-cycles")
     assert describe_machine(result) == "legs of 310.25 mm, travel 120 … 390 mm"
     assert "Machine: legs of 310.25 mm, travel 120 … 390 mm" in summarize(result)
+    assert describe_legs(plan_of("linear_delta").robot) == "rods of 280 mm"
     document = json.loads(calibration_json(result))["robot"]
     assert dict(document["legs"]) == pytest.approx(dict.fromkeys("xyz", 0.31025))
     assert document["travel"][0] == ["x_slide", "m", 0.12, 0.39]

@@ -32,15 +32,17 @@ def approach_not_stated() -> Finding:
     )
 
 
-def approached_from_one_side(drives: Mapping[str, str]) -> Finding:
+def approached_from_one_side(drives: Mapping[str, str], *, common: bool) -> Finding:
     """Finding about drives that all readings approach from one side.
 
     Args:
         drives: Drive to a posture that would show its backlash.
+        common: Whether all readings have the same approach, as a plan chose it. Then the short
+            answer does not contain the finding.
     """
     postures = joined(list(dict.fromkeys(drives.values())))
     return note(
-        "effect not shown",
+        "common approach" if common else "effect not shown",
         f"All readings approach {joined(list(drives))} from the same side. They cannot show "
         f"{'its' if len(drives) == 1 else 'their'} backlash, whatever its size.",
         f"Approach {postures} also from the other side.",

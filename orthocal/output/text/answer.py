@@ -68,6 +68,9 @@ LISTED: tuple[FindingKind, ...] = (
 )
 """Kinds of notes that the short answer lists."""
 
+DETAILS: tuple[FindingKind, ...] = ("common approach",)
+"""Kinds of findings about readings that only `--details` prints."""
+
 STYLES: dict[Verdict, str] = {"enter": "bold green", "review": "bold yellow", "reject": "bold red"}
 
 LONGEST_LINE = 150
@@ -131,15 +134,19 @@ def render_next(words: str, commands: Sequence[str] = ()) -> RenderableType:
 
 
 def render_decision(assessment: Assessment, *, details: bool = False) -> RenderableType:
-    """A decision about readings, all findings, and the next step.
+    """A decision about readings, its findings, and the next step.
 
     Args:
         assessment: The assessment.
-        details: Whether to list the evidence for each finding.
+        details: Whether to list all findings, and the evidence for each.
     """
     decision = assessment.decision
     parts: list[RenderableType] = [render_headline(decision)]
-    further = [_describe(f, decision) for f in assessment.findings if f.text != decision.reason]
+    further = [
+        _describe(f, decision)
+        for f in assessment.findings
+        if f.text != decision.reason and (details or f.kind not in DETAILS)
+    ]
     if further:
         parts += [Text(), bullets(further)]
     if decision.action:
@@ -362,7 +369,7 @@ def describe_machine(calibration: Calibration) -> str:
         travel[name] = f"{low} … {high} {word.replace('deg', '°')}".replace("∞ …", "−∞ …")
     words = []
     if calibration.robot_record.legs:
-        words.append(describe_legs(dict(calibration.robot_record.legs)))
+        words.append(describe_legs(calibration.robot))
     if len(set(travel.values())) == 1:
         words.append(f"travel {next(iter(travel.values()))}")
     else:
