@@ -280,13 +280,10 @@ def measure_candidates(
                 reachable &= span <= 0.5 * (limits[1] - limits[0])
                 each = np.diag(span) if absolute else span
                 spans.setdefault(base, []).append(float(np.median(each)))
-            if width > 1 and not absolute:
-                covariance[of_part, of_part] += (ZERO_PRIOR / ratio) ** 2
-        candidate = CandidateSetup(
-            *(name, rows[::width], by_state, covariance, reachable, tuple(aligned), absolute),
-            *(base, width),
-        )
-        setups.append(candidate)
+            zero = 0.0 if absolute or width == 1 else ZERO_PRIOR / ratio
+            covariance[of_part, of_part] += zero**2
+        candidate = name, rows[::width], by_state, covariance, reachable, tuple(aligned), absolute
+        setups.append(CandidateSetup(*candidate, base, width))
     median = float(np.median(margins)) if margins else 0.0
     needed = {gauge: float(np.median(v)) for gauge, v in spans.items()}
     return Candidates(session, problem, tuple(setups), sigma, state, median, needed)
