@@ -14,6 +14,7 @@ from commands import orthocal
 from conftest import marked_reports
 from typer.main import get_command
 
+import orthocal as package
 from orthocal import (
     __version__,
     check_session,
@@ -197,7 +198,9 @@ def test_printed_json_is_the_file_with_decision_and_findings(written, tmp_path):
     assert load_calibration(tmp_path / "again.json").assessment.decision.verdict == "enter"
 
 
-def test_details_and_all_rows_lengthen_the_answer(experiment):
+def test_details_and_all_rows_lengthen_the_answer(experiment, written, monkeypatch):
+    made = load_calibration(written[0])
+    monkeypatch.setattr(package, "calibrate", lambda *_, **__: made)
     short, details, everything = (
         orthocal("calibrate", experiment, *words).stdout for words in ([], ["--details"], ["--all"])
     )
@@ -297,12 +300,12 @@ def test_accuracy_states_a_verdict_against_entering(root, tmp_path):
     assert " ".join(out.split())[:100] in words
 
 
-def test_options_for_free_known_and_bounded_parameters(experiment, root):
+def test_options_for_free_known_and_bounded_parameters(experiment):
     code, out, err = orthocal(
-        "calibrate", root / "examples/sweep", "--json",
+        "calibrate", experiment, "--json",
         "--model", "lengths", "--free", "x_coupler.rz,!z_leg.length",
         "--known", "y_leg.length_mm=0.05±0.02", "--known", "z_slide.offset_mm=0.2",
-        "--tolerance", "*.offset_mm=4", "--bound", "x_slide.offset_mm=-1:-0.5",
+        "--tolerance", "*.offset_mm=4", "--bound", "x_slide.offset_mm=-0.2:1",
         "--profile", "y_leg.length",
     )  # fmt: skip
     assert code == 3  # an offset is at its bound
@@ -312,7 +315,7 @@ def test_options_for_free_known_and_bounded_parameters(experiment, root):
         "x_slide.offset", "y_slide.offset", "x_coupler.rz", "x_leg.length", "y_leg.length",
         "z_slide.offset",
     ]  # fmt: skip
-    assert rows["x_slide.offset"]["at_bound"] == "upper"
+    assert rows["x_slide.offset"]["at_bound"] == "lower"
     assert rows["y_slide.offset"]["prior_std"] == 2e-3
     assert (rows["y_leg.length"]["mean"], rows["y_leg.length"]["prior_std"]) == (5e-5, 1e-5)
     assert rows["y_leg.length"]["interval"][0] < rows["y_leg.length"]["value"]

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
+from calibrated import SOUND
 from commands import run_orthocal
 from programs import distances, read_polyline
 
@@ -192,7 +193,7 @@ def test_planar_robots_and_robots_without_a_tool(biglide, orthoglide):
 
 @pytest.fixture(scope="module")
 def calibration(experiment_2):
-    return calibrate(experiment_2)
+    return calibrate(experiment_2, judgement=SOUND)
 
 
 @pytest.fixture

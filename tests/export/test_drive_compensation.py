@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibrated import SOUND
 from commands import run_orthocal
 from effect_plans import write_plan
 from linuxcnc import Joint, play, require_linuxcnc, run_program
@@ -79,7 +80,7 @@ def calibration(tmp_path_factory):
     )
     plan = load_plan(folder).with_controller(ACTIVE)
     session = simulate_session(plan, TRUTH, seed=4, sigma=0.5e-6).session
-    result = calibrate(session, Choice("offsets"), solver="variable-projection")
+    result = calibrate(session, Choice("offsets"), solver="variable-projection", judgement=SOUND)
     # unmodelled errors make some backlash and periodic errors insignificant, which this machine has
     # as identified
     entered = tuple(replace(e, enter=e.identified) for e in result.assessment.backlash)
@@ -197,7 +198,7 @@ def test_tables_and_home_offset_keep_the_path(calibration, tmp_path):
     nominal.mkdir()
     plan = load_plan(write_plan(tmp_path / "plain", effects="", joints=JOINTS))
     exact = simulate_session(plan.with_controller(np.zeros(3)), {}, exact=True).session
-    plain = calibrate(exact, "offsets", solver="variable-projection")
+    plain = calibrate(exact, "offsets", solver="variable-projection", judgement=SOUND)
     module = export_calibration(plain, "linuxcnc", anyway=True, options=ExportOptions(module=True))
     for name, text in module.items():
         (nominal / name).write_text(text)
@@ -297,7 +298,7 @@ def complete(tmp_path_factory):
     truth = {n: v for n, v in TRUTH.items() if not n.startswith("y_slide.screw")}
     truth |= {"x_slide.screw_cos": -11e-6, "z_slide.screw_sin": -15e-6}
     session = simulate_session(plan, truth, seed=4, sigma=1e-6).session
-    return calibrate(session, "full", solver="variable-projection")
+    return calibrate(session, "full", solver="variable-projection", judgement=SOUND)
 
 
 def test_significant_periodic_errors_are_entered(complete):

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from calibrated import SOUND
 from effect_plans import write_plan, write_robot
 from independent import Expansion, IndependentMachine, States
 from linuxcnc import require_linuxcnc, run_programs
@@ -217,7 +218,9 @@ def test_joints_follow_the_pin_in_linuxcnc(tmp_path):
     session = simulate_session(
         plan.with_controller(np.array([0.4, -0.1, 0.2]) * MM), truth, exact=True
     )
-    result = calibrate(session.session, Choice("offsets"), solver="variable-projection")
+    result = calibrate(
+        session.session, Choice("offsets"), solver="variable-projection", judgement=SOUND
+    )
     options = ExportOptions(module=True, within=WITHIN)
     files = export_calibration(result, "linuxcnc", anyway=True, options=options)
     for name, text in files.items():

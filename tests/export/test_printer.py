@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calibrated import SOUND
 from commands import run_orthocal
 from simulated_printer import Printer, nominal, read_settings, rings, write_log
 
@@ -114,7 +115,7 @@ def calibrated(tmp_path_factory):
         probe_log("klipper", printer, nominal(), np.random.default_rng(2))
     )
     session = import_printer_log(folder / "log.txt").session
-    return printer, calibrate(session, solver="linearised")
+    return printer, calibrate(session, solver="linearised", judgement=SOUND)
 
 
 def test_no_nearby_settings_are_better(calibrated):
@@ -331,7 +332,7 @@ def test_accuracy_of_a_printer_names_no_offsets(calibrated, tmp_path):
 
 
 def test_other_sessions_are_refused(root):
-    calibration = calibrate(load_session(root / "examples/raw-cycles"), "offsets")
+    calibration = calibrate(load_session(root / "examples/raw-cycles"), "offsets", judgement=SOUND)
     with pytest.raises(ExportError, match=r"controller\.firmware"):
         export_calibration(calibration, "klipper", anyway=True)
 

@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from calibrated import SOUND
 from workshop import Crooked, Workshop
 
 from orthocal import (
@@ -158,7 +159,7 @@ def test_files_keep_the_mounting(tmp_path):
     session = simulate_session(made, truth, seed=1).session
     again = load_session(write_session(session, tmp_path / "session"))
     assert [s.sensor for s in again.setups.values()] == [s.sensor for s in made.setups.values()]
-    found = calibrate(again, solver="variable-projection")
+    found = calibrate(again, solver="variable-projection", judgement=SOUND)
     loaded = load_calibration(write_calibration(found, tmp_path / "calibration.json"))
     assert [s.sensor for s in loaded.setups] == [s.sensor for s in made.setups.values()]
     assert [p.name for p in loaded.sensors] == names(made)

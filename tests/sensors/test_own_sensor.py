@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,7 +10,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from calibrated import identified
+from calibrated import SOUND, identified
 from conftest import marked_plots
 from gauges import exact
 from intervals import recorded_scores
@@ -145,10 +144,13 @@ def test_predicted_covariance_is_that_of_simulated_calibrations(plan):
 
 
 def test_standard_deviations_hold_on_machines_with_all_errors(plan):
-    """20 machines: offsets and slopes against standard deviations with unmodelled errors."""
+    """12 machines: offsets and slopes against standard deviations with unmodelled errors.
+
+    Standard deviations that are wrong by a factor of 1.5 are refused.
+    """
     others = [n for n in machine_errors(plan.robot) if not n.endswith(".offset")]
     of_offsets, of_slopes = [], []
-    for truth, fit in simulated_fits(plan, 20, others):
+    for truth, fit in simulated_fits(plan, 12, others):
         result = build_record.assemble_calibration(fit)
         of_offsets.append(recorded_scores(result, TRUTH)[0])
         total = np.sqrt(np.diag(result.total_covariance))
@@ -188,7 +190,7 @@ def test_it_is_written_and_read(plan, measured, tmp_path):
     again = load_session(path)
     assert [s.sensor for s in again.setups.values()] == [s.sensor for s in plan.setups.values()]
     assert [s.gauge for s in again.setups.values()] == ["fine"] * 3 + ["dial"] * 2
-    result = calibrate(again, solver=FAST)
+    result = calibrate(again, solver=FAST, judgement=SOUND)
     write_calibration(result, tmp_path / "calibration.json")
     loaded = load_calibration(tmp_path / "calibration.json")
     assert json.loads(calibration_json(loaded)) == json.loads(calibration_json(result))
@@ -282,10 +284,14 @@ print(float(h[0, 0]))
 """
 
 
-def test_a_sensor_that_was_changed_has_new_functions(tmp_path, root):
+def test_a_sensor_that_was_changed_has_new_functions(tmp_path, root, monkeypatch, capsys):
     """What is kept on disk is of the code that it was built by, of sensors from outside, too."""
-    found = []
-    for factor in (1.0, 5.0):
+    monkeypatch.setenv("ORTHOCAL_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # both modules are as long and as old
+    code = OWN.format(folder=str(tmp_path))
+
+    def write(factor):
         (tmp_path / "own.py").write_text(
             f"import sys; sys.path.insert(0, {str(root / 'tests')!r})\n"
             "from tool_coordinate import ToolCoordinate\n"
@@ -294,17 +300,17 @@ def test_a_sensor_that_was_changed_has_new_functions(tmp_path, root):
             "    def expression(self, view, robot):\n"
             f"        return {factor} * (0.1 + super().expression(view, robot))\n"
         )
-        code = OWN.format(folder=str(tmp_path))
-        environment = {**os.environ, "ORTHOCAL_CACHE": str(tmp_path / "cache")}
-        done = subprocess.run(
-            [sys.executable, "-c", code],
-            env=environment,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        found.append(float(done.stdout))
-    assert found[1] == pytest.approx(5.0 * found[0], rel=1e-12)
+
+    write(1.0)
+    try:
+        exec(code, {})
+    finally:
+        sys.modules.pop("own", None)
+    before = float(capsys.readouterr().out)
+    assert list((tmp_path / "cache").iterdir())
+    write(5.0)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert float(done.stdout) == pytest.approx(5.0 * before, rel=1e-12)
 
 
 def test_a_sensor_that_shows_no_number_is_named_by_setup_and_posture(plan, measured):

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibrated import SOUND
 from machines import frame_pose
 from scipy.spatial.transform import Rotation
 from sensor_machines import assert_promises, calibrate_machines
@@ -143,7 +144,7 @@ def test_a_session_of_points_is_calibrated(tmp_path):
     errors = draw_errors(plan.robot, plan.robot.parameters.select_model("full"), seed=3)
     session = simulate_session(plan, errors, seed=1).session
     write_session(session, tmp_path / "session")
-    calibration = calibrate(tmp_path / "session", solver="variable-projection")
+    calibration = calibrate(tmp_path / "session", solver="variable-projection", judgement=SOUND)
     assert calibration.assessment.decision.verdict == "enter"
     for name in ("x_slide.offset", "y_slide.offset", "z_slide.offset"):
         parameter = next(p for p in calibration.free if p.name == name)

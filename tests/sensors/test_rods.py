@@ -5,7 +5,7 @@ from __future__ import annotations
 import machines
 import numpy as np
 import pytest
-from calibrated import identified
+from calibrated import SOUND, identified
 
 from orthocal import (
     LegIndicator,
@@ -211,7 +211,7 @@ def test_it_is_written_and_read(tmp_path):
     again = load_session(write_session(session, tmp_path / "out"))
     for name, setup in session.setups.items():
         assert again.setups[name].sensor == setup.sensor
-    made = calibrate(again, solver="variable-projection")
+    made = calibrate(again, solver="variable-projection", judgement=SOUND)
     loaded = load_calibration(write_calibration(made, tmp_path / "calibration.json"))
     assert [s.sensor for s in loaded.setups] == [s.sensor for s in made.setups]
     assert {s.sensor.describe().rpartition(", ")[2] for s in loaded.setups} == {"blade on rod a"}

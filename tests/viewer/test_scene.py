@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 import pytest
-from calibrated import EXPERIMENT_2, calibrated, rename_setups, scene_of, session_of
+from calibrated import EXPERIMENT_2, SOUND, calibrated, rename_setups, scene_of, session_of
 from gauges import exact
 from tolerances import KINEMATICS
 
@@ -169,7 +169,7 @@ def test_machine_without_deviation_needs_no_ghost(root):
     """The true and the estimated machine are the nominal one."""
     plan = load_plan(root / "examples/raw-cycles/plan.yaml")
     session = simulate_session(plan, {}, exact=True).session
-    scene = draw_scene(calibrate(session))
+    scene = draw_scene(calibrate(session, judgement=SOUND))
     assert not links(scene, drawing.GHOST)
     assert scene.exaggeration == 1.0
     assert "does not deviate" in " ".join(scene.facts)
@@ -182,7 +182,7 @@ def test_active_offsets_move_the_ghost(root):
     offsets = np.array([1e-3, -2e-3, 0.5e-3])
     postures = {n: replace(p, drives=p.drives - offsets) for n, p in session.postures.items()}
     active = replace(session, controller_offsets=offsets, postures=postures)
-    scene = draw_scene(calibrate(active), posture="x_max")
+    scene = draw_scene(calibrate(active, judgement=SOUND), posture="x_max")
     robot = session.robot
     drives = session.postures["x_max"].drives
     passive = robot.close_with_pinocchio(drives, robot.reference_passive)
@@ -274,7 +274,7 @@ def test_of_many_gauges_the_overview_names_the_worst(full):
 def test_deviations_of_a_session_are_those_of_its_calibration(name):
     """Two ways to the same numbers: without a fit, and from the residuals of a fit."""
     session = exact(session_of(name))  # without nuisance parameters of the mounting
-    rows = calibrate(session).residuals
+    rows = calibrate(session, judgement=SOUND).residuals
     mean = {}
     for row in rows:
         mean.setdefault((row.setup, row.posture, row.minus), []).append(row.deviation)

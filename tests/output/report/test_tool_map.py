@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from calibrated import SOUND
 from matplotlib import colormaps
 from matplotlib.colors import to_rgb
 
@@ -36,7 +37,7 @@ WHICH = ("now", "entered", "uncertainty")
 
 @pytest.fixture(scope="module")
 def table1(experiment_2):
-    return calibrate(experiment_2, Choice(model="lengths", prior=True), **QUICK)
+    return calibrate(experiment_2, Choice(model="lengths", prior=True), **QUICK, judgement=SOUND)
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +60,7 @@ def planar(root, tmp_path_factory):
     )
     truth = {"x_slide.offset": 0.7e-3, "y_slide.offset": -1.1e-3}
     plan = load_plan(folder / "plan.yaml")
-    return calibrate(simulate_session(plan, truth, seed=1).session, **QUICK)
+    return calibrate(simulate_session(plan, truth, seed=1).session, **QUICK, judgement=SOUND)
 
 
 @pytest.fixture(scope="module")
