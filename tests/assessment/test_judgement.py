@@ -327,7 +327,7 @@ NOTES = {
             c.with_effects(["backlash"]),
             readings=tuple(replace(r, conditions=Conditions("ppp")) for r in c.readings),
         ),
-        **UNJUDGED,
+        solver="variable-projection",
     ),
     "earlier readings": lambda c, t: calibrate(c.with_controller(np.full(3, 1e-3)), **UNJUDGED),
 }
