@@ -180,3 +180,12 @@ def test_a_trace_at_rest_is_refused(plan):
         with_traces(plan, {"xy": Trace(np.zeros((100, 3)), np.zeros(100))})
     with pytest.raises(SessionError, match="is not a setup"):
         with_traces(plan, {"ab": Trace(circle("xy", 100), np.zeros(100))})
+
+
+@pytest.mark.parametrize("samples", [500, 1000])
+def test_a_trace_with_few_samples_is_refused(plan, samples):
+    """Most of its bins have fewer samples than a line and its noise need."""
+    trace = Trace(circle("xy", samples), np.zeros(samples))
+    with pytest.raises(SessionError, match=f"has {samples} samples on a path of") as caught:
+        with_traces(plan, {"xy": trace})
+    assert "expected at least 8" in str(caught.value)

@@ -139,13 +139,21 @@ def bin_trace(trace: Trace) -> BinnedTrace:
     Bins are shortened until the averaging error is small, or they have too few samples.
 
     Raises:
-        SessionError: If the tool does not move.
+        SessionError: If the tool does not move, or most of its path has too few samples.
     """
     steps = np.linalg.norm(np.diff(trace.points, axis=0), axis=1)
     length = np.concatenate([[0.0], np.cumsum(steps)])
     runs = _split_runs(trace.points, length)
     if not runs:
         raise SessionError("does not move; expected the commanded position of every sample")
+    n_usable = sum(len(_split_bins(length, run, 1)) for run in runs)
+    n_bins = sum(_count_bins(length, run, 1) for run in runs)
+    if 2 * n_usable < n_bins:
+        raise SessionError(
+            f"has {len(length)} samples on a path of {length[-1] / MM:.0f} mm; expected at least "
+            f"{FEWEST_SAMPLES} at different positions on every {LONGEST_BIN / MM:g} mm: a smaller "
+            "feed, or more samples per second"
+        )
     smooth = np.zeros(len(length))
     for run in runs:
         smooth[run] = Chebyshev.fit(length[run], trace.values[run], DEGREE)(length[run])
@@ -192,13 +200,18 @@ def _split_runs(points: Array, length: Array) -> list[slice]:
     ]
 
 
+def _count_bins(length: Array, run: slice, count: int) -> int:
+    """Number of bins of a run, with `count` bins per `LONGEST_BIN`."""
+    along = length[run]
+    return max(int(np.ceil(count * (along[-1] - along[0]) / LONGEST_BIN)), 1)
+
+
 def _split_bins(length: Array, run: slice, count: int) -> list[Indices]:
     """Indices of the samples of each bin of a run, with `count` bins per `LONGEST_BIN`.
 
     Samples at rest, which do not advance along the path, are omitted.
     """
-    along = length[run]
-    number = max(int(np.ceil(count * (along[-1] - along[0]) / LONGEST_BIN)), 1)
+    along, number = length[run], _count_bins(length, run, count)
     edges = along[0] + np.arange(1, number) / number * (along[-1] - along[0])
     moving = np.flatnonzero(np.diff(along, prepend=-1.0) > 0.0)
     bins = np.split(moving, np.searchsorted(along[moving], edges))
