@@ -92,7 +92,7 @@ def test_the_tool_error_with_the_offsets_to_enter_is_the_predicted_one(quarter):
     """
     machines = DrawnMachines(quarter)
     errors_by_offsets = {"chosen": [], "identified": [], "offsets": [], "predicted": []}
-    for seed in range(4):
+    for seed in range(6):
         drawn = machines.draw(np.random.default_rng(100 + seed))
         errors = machines.by_name(drawn)
         session = simulate_session(quarter, errors, seed=seed).session

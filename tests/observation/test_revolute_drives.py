@@ -37,10 +37,10 @@ orthocal:
 """
 
 
-SEEDS = 10
+SEEDS = 16
 """Sessions whose deviations are compared with the predicted ones."""
 
-VALIDATED = 6
+VALIDATED = 12
 """Sessions that are validated. If half as many were confirmed as predicted, 35 % in place of 70 %,
 58 % of such tests would fail; at a quarter, 97 %."""
 
