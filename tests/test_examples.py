@@ -7,6 +7,7 @@ import re
 import shutil
 from contextlib import nullcontext
 from functools import cache
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from orthocal import calibrate, draw_scene, load_session
 from orthocal.effects import registry as effect_registry
 from orthocal.errors import NotIdentifiableError
 from orthocal.observation.simulate import load_errors
+from orthocal.planning import selection
 from orthocal.sensors import registry as sensor_registry
 from orthocal.session.session import Purpose
 
@@ -47,7 +49,7 @@ WITH_REPORTS = ("README.md", "docs/viewing.md")
 """Pages whose commands build reports; on the others a mark replaces them."""
 
 SHOWN = {"docs/adjusting.md": 3, "docs/controllers.md": 3, "docs/measuring.md": 2}
-"""Pages that show what commands print, with the number of texts."""
+"""Pages that show what commands print, with the number of texts; plans of others start once."""
 
 
 def blocks(language, page):
@@ -129,7 +131,8 @@ def run_page(make_directory, short_reports):
         printed = Printed()
         printed.directory = make_directory()
         reports = nullcontext() if page in WITH_REPORTS else marked_reports()
-        with reports, no_sensor_gains():
+        plans = nullcontext() if page in SHOWN else patch.object(selection, "MIN_STARTS", 1)
+        with reports, plans, no_sensor_gains():
             for command, expected in commands(page):
                 done = run_line(printed.directory, command)
                 assert done.returncode == expected, f"{command}: {done.stderr}"

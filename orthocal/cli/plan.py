@@ -67,8 +67,8 @@ class PlanOptions:
         criterion (aligned|relative|absolute|worst|A|D|E): For research: figure to minimise.
             RMS tool error after aligning the workpiece, after shifting it, or absolute; worst tool
             error; or trace, determinant or largest eigenvalue of the covariance.
-        starts (N): For research: number of starts of the search; default: 10000 divided by the
-            number of candidate readings, at least 1 and at most 30.
+        starts (N): For research: number of starts of the search; default: 20000 divided by the
+            number of candidate readings, at least 3 and at most 30.
     """
 
     model: Model = None

@@ -183,7 +183,7 @@ def plan_readings(
         workspace: Region over which the tool error is computed; by default the robot's.
         criterion: Figure to minimise; see `planning.expected_error.Criterion`.
         seed: Seed of the random starts of the search.
-        starts: Number of starts of the search; by default 1, or more for few candidates.
+        starts: Number of starts of the search; by default 3, or more for few candidates.
         reference: Name of the robot in the session; by default that of the model.
         workers: Number of processes; the plan does not depend on it.
         report: Called with a line of text as the work proceeds.
