@@ -64,7 +64,7 @@ USUAL_SETUPS = 6
 
 APPROACH_GOAL = 0.4
 """Largest remaining part of the uncertainty of backlash that a plan aims for. Then the tool can be
-used from both of_approach, or the controller compensates backlash."""
+used from both sides, or the controller compensates backlash."""
 
 APPROACH_EMPHASIS = 3.0
 """Factor of tool errors from backlash in a second search, for a plan that reaches the goal."""

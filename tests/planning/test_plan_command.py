@@ -200,6 +200,18 @@ def test_other_gauges_without_a_gain_are_not_listed(headline):
     assert "mirror" not in text
 
 
+def test_a_number_of_setups_is_proposed_unless_the_plan_is_as_good(headline):
+    enough = headline.enough
+    proposed = f"With {enough.setups} setups"
+    shorter = replace(enough, minutes=enough.minutes - 15.0, error=1.01 * enough.error)
+    assert proposed in summarize(replace(headline, stage=shorter))
+    as_good = replace(shorter, error=0.99 * enough.error)
+    assert "setups gain less than 5% an hour" in summarize(replace(headline, stage=as_good))
+    assert proposed not in summarize(replace(headline, stage=as_good))
+    longer = replace(as_good, minutes=enough.minutes + 60.0)
+    assert proposed in summarize(replace(headline, stage=longer))
+
+
 def halve(expected):
     """Expected tool error of half the size."""
     sizes = expected.tool.sizes

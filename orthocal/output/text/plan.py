@@ -356,6 +356,8 @@ def _when_enough(plan: MeasuringPlan) -> str:
             f"More setups gain more than {HOURLY_GAIN:.0%} an hour: expect {tool_mm(last.error)} "
             f"with {counted(last.setups, 'setup')} ({show_duration(last.minutes)})."
         )
+    if plan.stage.minutes <= enough.minutes and plan.stage.error <= enough.error:
+        return f"Further setups gain less than {HOURLY_GAIN:.0%} an hour."
     return (
         f"With {counted(enough.setups, 'setup')} ({show_duration(enough.minutes)}) expect "
         f"{tool_mm(enough.error)}. More setups gain less than {HOURLY_GAIN:.0%} an hour."
