@@ -53,17 +53,17 @@ def describe_actions(findings: Sequence[Finding]) -> str:
 
     The list has at most MOST_ACTIONS lines, then the number of further findings.
     """
-    found: dict[str, Finding] = {}
+    by_action: dict[str, Finding] = {}
     for finding in findings:
         if finding.severity != "note" and finding.action:
-            found.setdefault(finding.action, finding)
-    if len(found) < 2:
-        return next(iter(found), "")
+            by_action.setdefault(finding.action, finding)
+    if len(by_action) < 2:
+        return next(iter(by_action), "")
     lines = [
         f"{i}. {_after_place(finding)}"
-        for i, finding in enumerate(list(found.values())[:MOST_ACTIONS], start=1)
+        for i, finding in enumerate(list(by_action.values())[:MOST_ACTIONS], start=1)
     ]
-    further = len(found) - len(lines)
+    further = len(by_action) - len(lines)
     remaining = [f"Then {counted(further, 'further finding')} above."] if further else []
     return "\n  ".join(["do the following.", *lines, *remaining])
 

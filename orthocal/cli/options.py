@@ -100,7 +100,7 @@ def command(group: typer.Typer = app, *, name: str | None = None) -> Callable[[C
 
         parameters = _list_parameters(function)
         call.__name__ = function.__name__
-        call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined] # of callables
         call.__annotations__ = {p.name: p.annotation for p in parameters}
         text, _, _ = (inspect.getdoc(function) or "").partition("\n\nArgs:\n")
         group.command(name, help=text)(call)
@@ -126,7 +126,7 @@ def _list_parameters(source: Callable[..., Any]) -> list[inspect.Parameter]:
     return parameters
 
 
-def _describe(parameter: inspect.Parameter, hint: Any, metavar: str, words: str) -> Any:  # noqa: ANN401
+def _describe(parameter: inspect.Parameter, hint: Any, metavar: str, words: str) -> Any:  # noqa: ANN401 - annotations
     """Annotation of a parameter with its metavar and help."""
     if hasattr(hint, "__metadata__"):
         kind, info = get_args(hint)

@@ -70,7 +70,7 @@ class Screw(Effect):
         return cls(robot, keys.lead_mm * MM, tuple(errors))
 
     @property
-    def period(self) -> float:  # type: ignore[override]
+    def period(self) -> float:  # type: ignore[override] # a field of other effects
         """Lead of the screws, [m]."""
         return self.lead
 

@@ -61,7 +61,7 @@ class FixedPlan:
     session: Session
     forecast: ToolForecast
     minutes: float
-    known: Expected
+    before: Expected
     expected: Expected
     first_round: Expected
     effects: tuple[EffectLimits, ...]
@@ -90,7 +90,7 @@ def expect_fixed(session: Session, choice: Choice, equipment: Equipment) -> Fixe
         session=session,
         forecast=forecast,
         minutes=equipment.minutes_of(session),
-        known=forecast.before,
+        before=forecast.before,
         expected=forecast.after(scheduled),
         first_round=forecast.after(scheduled, entered=False),
         effects=find_limits(forecast.problem(scheduled), stated_sigma(scheduled.gauge)),

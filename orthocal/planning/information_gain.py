@@ -50,8 +50,8 @@ class Pairs:
         """Pairs whose first reading has at least `count` readings within the gauge's range."""
         if (self.within_range >= count).all():
             return self
-        kept = self.within_range[self.first] >= count
-        return Pairs(self.first[kept], self.second[kept], self.flat[kept], self.within_range)
+        enough = self.within_range[self.first] >= count
+        return Pairs(self.first[enough], self.second[enough], self.flat[enough], self.within_range)
 
 
 def pair_gains(product: Array, spread: Array, noise: float, *, absolute: bool) -> Array:
@@ -260,10 +260,12 @@ class SetupGain:
         columns, change = np.empty((count, len(variance))), np.empty_like(effect)
         chosen, gains = list(pair), list[float]()
         excluded = ~self.setup.reachable[pair[0]]
-        reference, own = np.zeros_like(variance), 0.0
+        covariances, first_variance = np.zeros_like(variance), 0.0
         if not self.setup.absolute:  # differences from the first reading have no zero
-            reference, own = spread[pair[0]], spread[pair[0], pair[0]] + self.noise
-            effect, variance = effect - effect[pair[0]], variance - 2.0 * reference + own
+            covariances = spread[pair[0]]
+            first_variance = spread[pair[0], pair[0]] + self.noise
+            effect = effect - effect[pair[0]]
+            variance = variance - 2.0 * covariances + first_variance
             columns[0], gains = 0.0, [0.0]
         for k in range(len(gains), count):
             if k >= len(chosen):
@@ -274,7 +276,8 @@ class SetupGain:
                 if excluded[best]:
                     break
                 chosen.append(best)
-            row, column = chosen[k], spread[chosen[k]] - reference - (reference[chosen[k]] - own)
+            row = chosen[k]
+            column = spread[row] - covariances - (covariances[row] - first_variance)
             if k:
                 column = column - columns[:k, row] @ columns[:k]
             pivot = math.sqrt(column[row] + self.noise)

@@ -85,7 +85,7 @@ class MeasuringPlan:
     forecast: ToolForecast
     criterion: Criterion
     minutes: float
-    known: Expected
+    before: Expected
     """Expected error before: from the priors of the machine, or after the readings of a session."""
     expected: Expected
     """Expected error after the plan, with small offsets because the controller corrects them. If
@@ -378,7 +378,7 @@ def _evaluate(
     minutes = comparison.equipment.minutes_of(plan)
     each = None if comparison.equipment.owned else round(readings / setups)
     with worker_budget(work.workers):
-        curve, helps, compared, expected, first_round, nominal, known, limits = call_in_parallel(
+        curve, helps, compared, expected, first_round, nominal, before, limits = call_in_parallel(
             (
                 lambda: compute_curve(search, each, setups),
                 comparison.list_alternatives,
@@ -402,7 +402,7 @@ def _evaluate(
         forecast=forecast,
         criterion=work.criterion,
         minutes=minutes,
-        known=known,
+        before=before,
         expected=expected,
         first_round=first_round,
         compared=compared,

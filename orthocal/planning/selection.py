@@ -223,13 +223,13 @@ class SetupSearch:
             plan = self.empty
             for count, drawn in start:
                 plan = self.extend(plan, drawn or self._find_best(plan.information, count))
-            kept: set[int] = set()  # setups of this plan for which no better one was found
+            unimproved: set[int] = set()  # setups of this plan for which no better one was found
             for _ in range(MAX_ROUNDS):
                 before = plan.error
                 for k in range(len(plan.setups)):
-                    if k not in kept:
+                    if k not in unimproved:
                         exchanged = self._exchange(plan, k)
-                        kept = {*kept, k} if exchanged is plan else set()
+                        unimproved = {*unimproved, k} if exchanged is plan else set()
                         plan = exchanged
                 if plan.error > before * (1.0 - MIN_IMPROVEMENT):
                     break

@@ -150,14 +150,14 @@ class TimedSearch:
 
     def _improve(self, plan: PlannedSetups, minutes: float, *, together: int) -> PlannedSetups:
         """Exchange setups, one or two at a time, until the gain is small."""
-        kept: set[tuple[PlannedSetup, ...]] = set()  # setups for which no better ones were found
+        unimproved: set[tuple[PlannedSetup, ...]] = set()  # no better setups were found for these
         for _ in range(MAX_ROUNDS):
             before = plan.error
             for old in combinations(plan.setups, together):
-                if old in kept or not Counter(old) <= Counter(plan.setups):
+                if old in unimproved or not Counter(old) <= Counter(plan.setups):
                     continue
                 exchanged = self._exchange(plan, old, minutes)
-                kept = {*kept, old} if exchanged is plan else set()
+                unimproved = {*unimproved, old} if exchanged is plan else set()
                 plan = exchanged
             if plan.error > before * (1.0 - MIN_IMPROVEMENT):
                 break

@@ -133,7 +133,7 @@ def _write(folder: int, key: str, content: bytes) -> None:
         with open(descriptor, "wb") as stream:
             stream.write(_MAGIC + _digest(key, content) + content)
         os.rename(temporary, _name(key), src_dir_fd=folder, dst_dir_fd=folder)
-    except BaseException:
+    except BaseException:  # after an interrupt, too, no part remains
         with suppress(OSError):
             os.unlink(temporary, dir_fd=folder)
         raise

@@ -122,7 +122,7 @@ class Probe(ToolIndicator):
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
         """Direction and form of the surface, and the trigger height."""
-        surface = ToolIndicator.nuisance_parameters.fget(self)  # type: ignore[attr-defined]
+        surface = self._artefact_parameters()
         trigger = (NuisanceParameter("trigger", "m", self.trigger_std),) * (self.trigger_std > 0.0)
         return (*surface, *trigger)
 

@@ -319,7 +319,11 @@ class ToolIndicator(ToolSensor):
 
     @property
     def nuisance_parameters(self) -> tuple[NuisanceParameter, ...]:
-        """Direction and errors of the artefact and scale of the dial, if their std is above 0.
+        """Direction and errors of the artefact and scale of the dial, if their std is above 0."""
+        return self._artefact_parameters()
+
+    def _artefact_parameters(self) -> tuple[NuisanceParameter, ...]:
+        """Nuisance parameters of the artefact and the dial.
 
         Both arms of a square share its yaw. A square that is turned over has another yaw.
         """

@@ -153,11 +153,11 @@ def test_uncertainties_of_amounts_are_those_of_sampled_machines(machines):
     field = search._without_offsets(search.tool.jacobian[:, :, :n])
     deviation = search._without_offsets(search.tool.deviation(calibration.active_offsets))
     found = []
-    for _ in range(200):
+    for _ in range(800):
         search._set_deviation(deviation + field @ (root @ rng.normal(size=n)))
         found.append(search.fit(chosen)[chosen])
-    # four standard errors of a standard deviation from 200 draws
-    assert np.std(found, axis=0) == pytest.approx(stated, rel=0.2)
+    # four standard errors of a standard deviation from 800 draws
+    assert np.std(found, axis=0) == pytest.approx(stated, rel=0.1)
 
 
 def test_an_adjusted_calibration_is_the_machine_with_its_amounts(machines):

@@ -112,7 +112,7 @@ def test_the_bed_determines_a_delta_better_than_its_legs(delta):
     """
     choice = Choice("full")
     bed = expect_fixed(bed_plan(delta, Equipment()), choice, Equipment())
-    assert bed.known.reported.rms == pytest.approx(0.98e-3, rel=0.02)
+    assert bed.before.reported.rms == pytest.approx(0.98e-3, rel=0.02)
     assert bed.expected.reported.rms < 0.17e-3
     legs = paper_plan(delta, Equipment(tip=None))
     assert len(legs.readings) == 24

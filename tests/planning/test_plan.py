@@ -92,7 +92,7 @@ def test_the_error_of_the_search_is_the_posterior_of_the_session(planned):
     )
     forecast = planned.forecast
     without, complete = (forecast.about_nominal(s).reported.rms for s in (once, planned.session))
-    factor = planned.curve[0].error / planned.known.reported.rms
+    factor = planned.curve[0].error / planned.before.reported.rms
     assert planned.stage.error / factor == pytest.approx(without, rel=1e-4)
     assert planned.stage.error == pytest.approx(planned.expected.reported.rms)
     assert complete < without  # each first posture is read again
@@ -223,10 +223,10 @@ def test_further_setups_combine_with_the_measured_session(orthoglide, root):
         orthoglide, choice, setups=2, measured=measured, equipment=Equipment(**FEW), starts=1
     )
     forecast = plan.forecast
-    assert plan.known.reported.rms == pytest.approx(
+    assert plan.before.reported.rms == pytest.approx(
         forecast.after(measured, entered=False).reported.rms
     )
-    assert plan.expected.reported.rms < plan.known.reported.rms
+    assert plan.expected.reported.rms < plan.before.reported.rms
     # the curve begins with the readings of the session, with the same dial
     joined = join_sessions([measured.with_tolerances(OFFSETS), plan.session])
     once = replace(joined, readings=tuple(r for r in joined.readings if r.cycle == 1))

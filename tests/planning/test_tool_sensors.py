@@ -255,7 +255,7 @@ def test_postures_of_sensors_at_the_tool_stay_above_the_bed(for_printer):
     points = np.array([session.postures[n].values for n in used])
     low, high = robot.workspace.T
     assert ((points >= low - 1e-9) & (points <= high + 1e-9)).all()
-    assert for_printer.expected.reported.rms < 0.05 * for_printer.known.reported.rms
+    assert for_printer.expected.reported.rms < 0.05 * for_printer.before.reported.rms
 
 
 @pytest.mark.usefixtures("without_sensor_gains")

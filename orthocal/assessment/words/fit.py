@@ -18,8 +18,8 @@ def noise_unknown() -> Finding:
     """Finding that neither residuals nor the session determine the noise."""
     return note(
         "noise unknown",
-        "No independent reading is left to estimate the noise, and the session does not state the "
-        "gauge's noise: the uncertainty is unknown.",
+        "There are as many parameters as readings, so these do not show the noise, and the session "
+        "does not state the noise of the gauge. The uncertainty is unknown.",
         "State gauge.sigma_mm, or repeat the readings in cycles.",
     )
 

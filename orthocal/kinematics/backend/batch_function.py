@@ -162,7 +162,7 @@ class _MappedBlock:
         self._buffer, self.evaluate = mapped.buffer()
         self.inputs = [np.zeros((size, function.nnz_in(i))) for i in range(function.n_in())]
         self.outputs = [np.zeros((size, function.nnz_out(i))) for i in range(function.n_out())]
-        # CasADi's type information describes the C++ call, with a pointer and a size
+        # ignored: CasADi's type information describes the C++ call, with a pointer and a size
         for i, a in enumerate(self.inputs):
             self._buffer.set_arg(i, memoryview(a.reshape(-1)))  # type: ignore[call-arg,arg-type]
         for i, a in enumerate(self.outputs):

@@ -135,7 +135,7 @@ def describe_size(session: Session) -> str:
 def describe_expected(plan: MeasuringPlan | FixedPlan) -> list[str]:
     """Expected tool error with its conditions, and the readings that are impossible at first."""
     first, workspace = plan.first_round, plan.forecast.workspace
-    expected, before, now = (tool_mm(e.reported.rms) for e in (plan.expected, first, plan.known))
+    expected, before, now = (tool_mm(e.reported.rms) for e in (plan.expected, first, plan.before))
     figures = f"now {now}, {before} after this measurement, {expected} after a second one"
     if plan.complements:
         figures = f"{expected} with these readings added, {now} with those of the session alone"
@@ -227,9 +227,9 @@ def _how_to_measure(plan: MeasuringPlan) -> list[str]:
             f"Go to the first posture{only} and set the dial to the middle of its range there."
         )
     fixed = {setup.sensor.kind for setup in session.setups.values() if setup.zero == "known"}
-    if known := [noun for kind, noun in KNOWN_ZERO.items() if kind in fixed]:
+    if nouns := [noun for kind, noun in KNOWN_ZERO.items() if kind in fixed]:
         words.append(
-            f"Do not set the zero of {joined(known)} on the machine: readings are absolute."
+            f"Do not set the zero of {joined(nouns)} on the machine: readings are absolute."
         )
     length = approach_length(session)
     stated = any(r.approach for r in session.readings)
@@ -273,8 +273,8 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
 
     def alternative(a: Alternative) -> dict[str, Any]:
         names = ("name", "setups", "readings", "minutes")
-        known = {name: getattr(a, name) for name in names}
-        return {**known, "in_range": a.expected is not None, **sizes(a.expected)}
+        numbers = {name: getattr(a, name) for name in names}
+        return {**numbers, "in_range": a.expected is not None, **sizes(a.expected)}
 
     def stage(s: Stage) -> dict[str, float]:
         return {**asdict(s), "error": s.error / _unit(plan)}
@@ -293,7 +293,7 @@ def plan_document(plan: MeasuringPlan) -> dict[str, Any]:
         "closing_readings": closing,
         "minutes": plan.minutes,
         "candidates": plan.candidates,
-        "before": sizes(plan.known),
+        "before": sizes(plan.before),
         "expected": sizes(plan.expected),
         "first_round": {**sizes(plan.first_round), "lost": plan.first_round.lost},
         "compared": [alternative(a) for a in plan.compared],
