@@ -487,7 +487,7 @@ def test_ctrl_c_ends_a_recording_on_a_terminal(folder):
     while not ended and time.monotonic() < end:
         if b"orthocal record" not in shown:  # readline may miss the first of them
             os.kill(child, signal.SIGINT)
-        until(b"orthocal record", within=2.0)
+        until(b"orthocal record", within=5.0)
         ended, status = os.waitpid(child, os.WNOHANG)
     assert ended
     os.close(terminal)
