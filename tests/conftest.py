@@ -141,11 +141,10 @@ def module_without_sensor_gains():
 @contextmanager
 def no_sensor_gains():
     """No gains of usual sensors: they are four searches of a plan each time."""
-    from orthocal.output.text import accuracy
-    from orthocal.planning import first_plan, plan
+    from orthocal.planning import first_plan, plan, sensor_gains
 
     with ExitStack() as patches:
-        for module in (accuracy, first_plan, plan):
+        for module in (sensor_gains, first_plan, plan):
             patches.enter_context(patch.object(module, "find_sensor_gains", lambda *_: ()))
         yield
 

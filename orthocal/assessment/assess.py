@@ -23,7 +23,6 @@ from orthocal.assessment.controller_entries import (
 )
 from orthocal.assessment.fit_findings import find_fit_findings
 from orthocal.assessment.judgement import Judgement, judge_session, rank, verdict_of
-from orthocal.assessment.printer_settings import fit_firmware
 from orthocal.assessment.recommendation import Recommendation, recommend_model
 from orthocal.assessment.tool_error import assess_placed, require_tool, summarise_tool
 from orthocal.assessment.wording import describe_actions
@@ -318,6 +317,8 @@ def _setting_findings(calibration: Calibration, tool: ToolErrorSummary | None) -
     settings = calibration.session.firmware
     if settings is None:
         return []
+    from orthocal.assessment.printer_settings import fit_firmware
+
     try:
         fit = fit_firmware(calibration, settings.firmware, tool=tool)
     except ExportError:  # no bed, or no workspace; the export names it

@@ -13,9 +13,8 @@ from planned import QUICK, quick_plan
 
 from orthocal import calibrate, plan_readings, simulate_session, summarize
 from orthocal.output.report import page
-from orthocal.output.text import accuracy
 from orthocal.planning import plan as planning
-from orthocal.planning import tool_candidates
+from orthocal.planning import sensor_gains, tool_candidates
 from orthocal.planning.equipment import Equipment
 from orthocal.planning.owned_sensors import load_owned_sensor
 from orthocal.planning.sensor_gains import find_sensor_gains
@@ -75,7 +74,7 @@ def test_offsets_that_leg_readings_do_not_determine_are_named_with_the_best_sens
         searches.append(searches[0] if searches else find_sensor_gains(*arguments))
         return searches[0]
 
-    for module in (planning, accuracy):
+    for module in (planning, sensor_gains):
         monkeypatch.setattr(module, "find_sensor_gains", find_once)
     answer = summarize(plan)
     ((best, *_),) = searches
@@ -99,7 +98,7 @@ def test_the_report_of_a_calibration_names_the_same_sensors(monkeypatch):
     monkeypatch.setattr(page, "_scene", lambda _: "<!-- scene -->")
     gains, forecasts = gains_of("orthoglide"), []
     monkeypatch.setattr(
-        accuracy, "find_sensor_gains", lambda *of: (forecasts.append(of[0]), gains)[1]
+        sensor_gains, "find_sensor_gains", lambda *of: (forecasts.append(of[0]), gains)[1]
     )
     session = quick_plan().session
     readings = simulate_session(session, {"x_slide.offset": 0.2e-3}, seed=1).session

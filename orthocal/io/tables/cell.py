@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from decimal import Decimal
 from typing import Literal
 
+ZIP_SIGNATURE = b"PK\x03\x04"
+"""First bytes of a workbook."""
+
 MOST_ROWS = 200_000
 """Maximum number of rows of a table; a session has at most 50,000 readings."""
 
@@ -15,6 +18,9 @@ MOST_CELLS = 600_000
 
 MOST_COLUMNS = 500
 """Maximum number of columns of a table."""
+
+MergedCells = tuple[int, int, int]
+"""Column from 0, first row and last row from 1 of cells of one column that are merged."""
 
 CellKind = Literal["text", "number", "date", "boolean", "unsaved formula", "scaled number"]
 """Kind of a cell.

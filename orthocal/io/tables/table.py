@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from orthocal.errors import SessionError
-from orthocal.io.tables.cell import BLANK, Row, column_letters
+from orthocal.io.tables.cell import BLANK, ZIP_SIGNATURE, MergedCells, Row, column_letters
 from orthocal.io.tables.delimited import (
     HEADER_ROWS,
     FindHeader,
@@ -17,7 +17,6 @@ from orthocal.io.tables.delimited import (
     find_separator,
     split_rows,
 )
-from orthocal.io.tables.workbook import ZIP_SIGNATURE, MergedCells, read_workbook
 from orthocal.text import shorten
 
 
@@ -128,6 +127,8 @@ def _read_sheet(
     path: Path, content: bytes, find_header: FindHeader, expected: str, sheet: str | None
 ) -> Table:
     """Table with the expected headings from a workbook."""
+    from orthocal.io.tables.workbook import read_workbook
+
     sheets = read_workbook(content, where=str(path), sheet=sheet)
     matching = [(s, i) for s in sheets if (i := find_header(s.rows[:HEADER_ROWS])) is not None]
     names = ", ".join(f"'{s.name}'" for s, _ in matching) or ", ".join(

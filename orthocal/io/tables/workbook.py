@@ -30,14 +30,12 @@ from orthocal.io.tables.cell import (
     MOST_ROWS,
     Cell,
     CellKind,
+    MergedCells,
     Row,
     make_row,
 )
 from orthocal.io.tables.numerals import format_decimal
 from orthocal.text import shorten, text_problem
-
-ZIP_SIGNATURE = b"PK\x03\x04"
-"""First bytes of a workbook."""
 
 LARGEST_CONTENT = 32 * 2**20
 """Maximum size of all unpacked parts, [bytes]; 50,000 rows of ten cells take 22 MiB."""
@@ -77,9 +75,6 @@ _DATE_CODE = re.compile(r"[dmhys]", re.I)
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]{1,3})?")
 _ADDRESS = re.compile(r"([A-Z]{1,3})([0-9]{1,10})")
 _DOCTYPE = re.compile(rb"<!(?:DOCTYPE|ENTITY)")
-
-MergedCells = tuple[int, int, int]
-"""Column from 0, first row and last row from 1 of cells of one column that are merged."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from orthocal.errors import SessionError
 from orthocal.io.documents import MOST_CSV_ROWS, csv_rows, read_text
-from orthocal.io.tables.cell import Row
+from orthocal.io.tables.cell import ZIP_SIGNATURE, Row
 from orthocal.io.tables.delimited import SEPARATORS, decode, stated_separator
 from orthocal.io.tables.numerals import (
     DecimalSign,
@@ -30,7 +30,6 @@ from orthocal.io.tables.numerals import (
     plain_minus,
 )
 from orthocal.io.tables.table import Table, read_table
-from orthocal.io.tables.workbook import ZIP_SIGNATURE
 from orthocal.measurement.files.session_keys import MOST_READINGS
 from orthocal.measurement.importing.headings import EXPECTED, Columns, choose_columns, find_header
 from orthocal.text import composed, shorten

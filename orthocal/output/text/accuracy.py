@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Group, RenderableType
 from rich.text import Text
@@ -34,9 +34,10 @@ from orthocal.estimation.selection import complete_model, select_parameters
 from orthocal.io.documents import format_json
 from orthocal.output.text.conditions import describe_conditions_of
 from orthocal.output.text.layout import noted, print_rich, table_of, um
-from orthocal.planning.expected_error import ToolForecast, state_noise
-from orthocal.planning.sensor_gains import SensorGain, find_sensor_gains
 from orthocal.units import MM, UM, read_limit
+
+if TYPE_CHECKING:
+    from orthocal.planning.sensor_gains import SensorGain
 
 POINT_COLUMNS = (
     *("x_mm", "y_mm", "z_mm"),
@@ -209,6 +210,9 @@ def expect_further_hour(
         accuracy: Its tool errors over a stated region or under stated conditions; by default the
             workspace of the robot and its conditions of use.
     """
+    from orthocal.planning.expected_error import ToolForecast, state_noise
+    from orthocal.planning.sensor_gains import find_sensor_gains
+
     nothing = FurtherHour(math.nan, ())
     if calibration.only_offsets:
         return nothing
